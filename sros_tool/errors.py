@@ -1,0 +1,62 @@
+"""The errors of sros: each says what happened, why, and what to do.
+
+The library raises; only the command line prints.  ``exit_status`` is what the command line
+returns for an uncaught error: 1 for "no or failed", 2 for wrong usage.
+"""
+
+from __future__ import annotations
+
+
+class SrosError(Exception):
+    """Base of every error that sros raises on purpose.
+
+    ``what`` is a clause without a final full stop and without a leading "Unable to ...";
+    ``why`` and ``remedy`` are whole sentences, or empty.
+    """
+
+    exit_status = 1
+
+    def __init__(self, what: str, why: str = "", remedy: str = "") -> None:
+        super().__init__(what, why, remedy)
+        self.what = what
+        self.why = why
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        parts = [self.what.rstrip("."), self.why.strip().rstrip("."), self.remedy.strip()]
+        text = ". ".join(part for part in parts if part)
+        return " ".join(text.split())
+
+
+class UsageError(SrosError):
+    """An argument or an option that cannot be meant."""
+
+    exit_status = 2
+
+
+class NameInvalid(SrosError):
+    """A name that ROS 2 or DDS Security does not accept."""
+
+
+class DocumentError(SrosError):
+    """An XML, TOML or S/MIME document that cannot be read as what it claims to be."""
+
+
+class PolicyError(DocumentError):
+    """A policy file that is malformed or contradicts itself."""
+
+
+class PkiError(SrosError):
+    """A key, certificate or signature that does not hold."""
+
+
+class KeystoreError(SrosError):
+    """A keystore that is missing, broken, busy, or would be weakened."""
+
+
+class PermissionsError(SrosError):
+    """A file or folder that the operating system does not let sros read or write."""
+
+
+class RuntimeUnavailable(SrosError):
+    """A DDS stack, an RMW or a privilege that is not there."""
