@@ -34,7 +34,7 @@ class UsageError(SrosError):
     exit_status = 2
 
 
-class NameInvalid(SrosError):
+class InvalidNameError(SrosError):
     """A name that ROS 2 or DDS Security does not accept."""
 
 
@@ -54,9 +54,5 @@ class KeystoreError(SrosError):
     """A keystore that is missing, broken, busy, or would be weakened."""
 
 
-class PermissionsError(SrosError):
-    """A file or folder that the operating system does not let sros read or write."""
-
-
-class RuntimeUnavailable(SrosError):
+class UnavailableError(SrosError):
     """A DDS stack, an RMW or a privilege that is not there."""

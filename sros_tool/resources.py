@@ -1,0 +1,30 @@
+"""Where the files that ship with sros are: policies and keystore templates.
+
+In a wheel they lie inside the package; in a checkout they stand at the top of the repository.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def _shipped(name: str) -> Path:
+    inside = _PACKAGE / name
+    return inside if inside.is_dir() else _PACKAGE.parent / name
+
+
+def policies_dir() -> Path:
+    """The folder of the example policies and of the common parts that they include."""
+    return _shipped("policies")
+
+
+def templates_dir() -> Path:
+    """The folder of the keystore templates, one TOML file each."""
+    return _shipped("keystore_templates")
+
+
+def unpacked_dds_dir() -> Path:
+    """The folder of a checkout in which its demo command unpacks a DDS, where apt cannot."""
+    return _PACKAGE.parent / ".dds"
