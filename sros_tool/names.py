@@ -1,0 +1,179 @@
+"""ROS names: their grammar, how a policy's names expand, and what they are called in DDS.
+
+Sources: ROS 2 design "Topic and Service Names" and "Topic and Service name mapping to DDS";
+rcl's ``validate_topic_name`` and ``rmw_validate_namespace``; the table of ros2/sros2's
+permission translation.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from sros_tool.errors import InvalidNameError
+
+MAX_COMMON_NAME = 64
+"""Longest enclave name in characters: that of an X.509 common name (RFC 5280)."""
+
+ROS_DISCOVERY_TOPIC = "ros_discovery_info"
+"""The DDS topic by which every ROS 2 participant announces its nodes (rmw_dds_common)."""
+
+_TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
+_WILDCARDS = frozenset("*?[")
+# One segment of a name in a policy: the letters of a ROS name, * ? and plain [sets].
+_EXPRESSION = re.compile(
+    r"(?:~(?=/|\Z))?(?:[A-Za-z0-9_/*?]|\[!?[A-Za-z0-9_/]+(?:-[A-Za-z0-9_]+)*\])*\Z"
+)
+
+
+def check_enclave_name(name: str) -> str:
+    """Return ``name`` if it is a valid enclave name, else raise `InvalidNameError`.
+
+    An enclave name is absolute, has the grammar of a ROS namespace, and fits into the common
+    name of a certificate.
+    """
+    problem = _enclave_problem(name)
+    if problem:
+        raise InvalidNameError(
+            f"{name!r} is not a valid enclave name",
+            problem,
+            "Use an absolute name of letters, digits and underscores, such as /robot/camera.",
+        )
+    return name
+
+
+def _enclave_problem(name: str) -> str:
+    if not name:
+        return "It is empty."
+    if not name.startswith("/"):
+        return "It does not start with '/'."
+    if len(name) > MAX_COMMON_NAME:
+        return (
+            f"It has {len(name)} characters, and the common name of an X.509 certificate holds "
+            f"{MAX_COMMON_NAME}."
+        )
+    if name == "/":
+        return ""
+    if name.endswith("/"):
+        return "It ends with '/'."
+    for token in name[1:].split("/"):
+        if not token:
+            return "It contains '//'."
+        if not _TOKEN.match(token):
+            if token[0].isdigit() and token.isalnum():
+                return f"Its part {token!r} starts with a digit."
+            return f"Its part {token!r} is not made of letters, digits and underscores."
+    return ""
+
+
+def is_expression(name: str) -> bool:
+    """Whether ``name`` holds a wildcard, and so stands for many names."""
+    return not _WILDCARDS.isdisjoint(name)
+
+
+def expression_problem(text: str) -> str:
+    """Why ``text`` cannot be the name of a topic, service or action in a policy; "" if it can.
+
+    Allowed are relative, private (``~``, ``~/x``) and absolute ROS names, with the wildcards
+    ``*``, ``?``, ``[abc]``, ``[a-c]`` and ``[!a-c]``, which every DDS vendor reads alike.
+    """
+    if not text:
+        return "It is empty."
+    if text != text.strip() or any(c.isspace() for c in text):
+        return "It contains white space, which no ROS name has."
+    if text[0] == "~" and len(text) > 1 and text[1] != "/":
+        return "After '~' there must be a '/', as in ~/get_parameters."
+    if "[^" in text or "[:" in text:
+        return "DDS vendors disagree about [^...] and [:class:]; [!...] and plain sets work alike."
+    if not _EXPRESSION.match(text):
+        return "It contains a character that no ROS name has."
+    if "//" in text:
+        return "It contains '//'."
+    if text.endswith("/"):
+        return "It ends with '/'."
+    for token in text.split("/"):
+        if token and token[0].isdigit() and not is_expression(token):
+            return f"Its part {token!r} starts with a digit."
+    return ""
+
+
+def check_namespace(ns: str) -> str:
+    """Return the namespace of a profile, normalised, else raise `InvalidNameError`.
+
+    "" stands for "/", one trailing slash is dropped; wildcards are allowed.
+    """
+    text = ns if ns == "/" else ns.removesuffix("/")
+    if not text:
+        return "/"
+    problem = "" if text == "/" else expression_problem(text)
+    if not problem and not text.startswith("/"):
+        problem = "A namespace starts with '/'."
+    if problem:
+        raise InvalidNameError(f"{ns!r} is not a valid namespace", problem, "")
+    return text
+
+
+def expand(name: str, ns: str, node: str) -> str:
+    """The absolute name of ``name`` used by ``node`` in ``ns``.
+
+    ``/x`` stays; ``~`` and ``~/x`` become ns/node and ns/node/x; anything else ns/name.
+    """
+    if name.startswith("/"):
+        return name
+    prefix = ns if ns.endswith("/") else ns + "/"
+    if name.startswith("~"):
+        return f"{prefix}{node}{name[1:]}"
+    return prefix + name
+
+
+@dataclass(frozen=True, slots=True)
+class DdsNames:
+    """The DDS topics behind one right: what its holder writes and what it reads."""
+
+    publish: tuple[str, ...]
+    subscribe: tuple[str, ...]
+
+
+_ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")
+_ACTION_TOPICS = ("feedback", "status")
+
+
+def dds_names(right: str, fqn: str) -> DdsNames:
+    """The DDS topics that ``right`` on the absolute ROS name ``fqn`` stands for.
+
+    ``right`` is publish or subscribe (topics), request or reply (services), call or execute
+    (actions).
+    """
+    return _DDS_NAMES[right](fqn)
+
+
+def _client(fqn: str) -> DdsNames:
+    return DdsNames((f"rq{fqn}Request",), (f"rr{fqn}Reply",))
+
+
+def _server(fqn: str) -> DdsNames:
+    return DdsNames((f"rr{fqn}Reply",), (f"rq{fqn}Request",))
+
+
+def _action_client(fqn: str) -> DdsNames:
+    return DdsNames(
+        tuple(f"rq{fqn}/_action/{s}Request" for s in _ACTION_SERVICES),
+        tuple(f"rr{fqn}/_action/{s}Reply" for s in _ACTION_SERVICES)
+        + tuple(f"rt{fqn}/_action/{t}" for t in _ACTION_TOPICS),
+    )
+
+
+def _action_server(fqn: str) -> DdsNames:
+    client = _action_client(fqn)
+    replies, topics = client.subscribe[:3], client.subscribe[3:]
+    return DdsNames(replies + topics, client.publish)
+
+
+_DDS_NAMES = {
+    "publish": lambda fqn: DdsNames((f"rt{fqn}",), ()),
+    "subscribe": lambda fqn: DdsNames((), (f"rt{fqn}",)),
+    "request": _client,
+    "reply": _server,
+    "call": _action_client,
+    "execute": _action_server,
+}

@@ -1,0 +1,1 @@
+"""Keys, certificates and S/MIME signatures: bytes in, bytes out."""

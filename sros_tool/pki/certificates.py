@@ -1,0 +1,154 @@
+"""X.509 certificates of authorities and enclaves, as DDS Security asks for them."""
+
+from __future__ import annotations
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.x509.oid import NameOID
+
+from sros_tool.errors import PkiError
+from sros_tool.pki.keys import PrivateKey, PublicKey
+from sros_tool.validity import Window
+
+_CA_USAGE = x509.KeyUsage(
+    digital_signature=True,  # it signs governance and permissions documents too
+    content_commitment=False,
+    key_encipherment=False,
+    data_encipherment=False,
+    key_agreement=False,
+    key_cert_sign=True,
+    crl_sign=True,
+    encipher_only=False,
+    decipher_only=False,
+)
+_LEAF_USAGE = x509.KeyUsage(
+    digital_signature=True,
+    content_commitment=False,
+    key_encipherment=False,
+    data_encipherment=False,
+    key_agreement=False,
+    key_cert_sign=False,
+    crl_sign=False,
+    encipher_only=False,
+    decipher_only=False,
+)
+_NOT_A_CA = x509.BasicConstraints(ca=False, path_length=None)
+_A_CA = x509.BasicConstraints(ca=True, path_length=1)
+
+
+def common_name(text: str) -> x509.Name:
+    """The distinguished name ``CN=text``, all that a portable subject consists of."""
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
+
+
+def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certificate:
+    """A self-signed certificate authority.
+
+    It carries BasicConstraints, KeyUsage and both key identifiers, without which OpenSSL's
+    strict check (``-x509_strict``, used by Fast DDS) refuses chains.
+    """
+    public = key.public_key()
+    identifier = x509.SubjectKeyIdentifier.from_public_key(public)
+    return (
+        _builder(name, name, public, validity)
+        .add_extension(_A_CA, critical=True)
+        .add_extension(_CA_USAGE, critical=True)
+        .add_extension(identifier, critical=False)
+        .add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(identifier),
+            critical=False,
+        )
+        .sign(key, hashes.SHA256())
+    )
+
+
+class Issuer:
+    """Issues the certificates of enclaves in the name of one identity CA."""
+
+    def __init__(self, certificate: x509.Certificate, key: PrivateKey) -> None:
+        self._certificate = certificate
+        self._key = key
+        self._name = certificate.subject
+        self._validity = validity_of(certificate)
+        self._authority_id = _authority_identifier(certificate)
+
+    def issue(self, subject: x509.Name, public: PublicKey, validity: Window) -> x509.Certificate:
+        """A leaf certificate; its validity is cut to that of the CA."""
+        return (
+            _builder(subject, self._name, public, validity.within(self._validity))
+            .add_extension(_NOT_A_CA, critical=True)
+            .add_extension(_LEAF_USAGE, critical=True)
+            .add_extension(x509.SubjectKeyIdentifier.from_public_key(public), critical=False)
+            .add_extension(self._authority_id, critical=False)
+            .sign(self._key, hashes.SHA256())
+        )
+
+
+def _authority_identifier(certificate: x509.Certificate) -> x509.AuthorityKeyIdentifier:
+    try:
+        extension = certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
+    except x509.ExtensionNotFound:  # a CA made by ros2/sros2 has none
+        public = certificate.public_key()
+        return x509.AuthorityKeyIdentifier.from_issuer_public_key(public)  # type: ignore[arg-type]
+    return x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(extension.value)
+
+
+def _builder(
+    subject: x509.Name, issuer: x509.Name, public: PublicKey, validity: Window
+) -> x509.CertificateBuilder:
+    return x509.CertificateBuilder(
+        issuer_name=issuer,
+        subject_name=subject,
+        public_key=public,
+        serial_number=x509.random_serial_number(),
+        not_valid_before=validity.not_before,
+        not_valid_after=validity.not_after,
+    )
+
+
+def validity_of(certificate: x509.Certificate) -> Window:
+    """The validity of a certificate."""
+    return Window(certificate.not_valid_before_utc, certificate.not_valid_after_utc)
+
+
+def pem(certificate: x509.Certificate) -> bytes:
+    """The certificate as PEM."""
+    return certificate.public_bytes(serialization.Encoding.PEM)
+
+
+def load_certificate(data: bytes, name: str) -> x509.Certificate:
+    """The first certificate of a PEM file; ``name`` stands for it in errors."""
+    try:
+        return x509.load_pem_x509_certificate(data)
+    except (ValueError, UnsupportedAlgorithm) as error:
+        raise PkiError(
+            f"the certificate {name} cannot be read",
+            "It is not a PEM certificate, or it is damaged.",
+            "Restore it from a backup, or issue it anew.",
+        ) from error
+
+
+def same_key(certificate: x509.Certificate, key: PrivateKey) -> bool:
+    """Whether ``key`` is the private key of ``certificate``."""
+    return certificate.public_key() == key.public_key()
+
+
+def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
+    """Whether ``authority`` issued and signed ``certificate`` (names and signature, not time)."""
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (InvalidSignature, ValueError, TypeError):
+        return False
+    return True
+
+
+def subject_text(name: x509.Name) -> str:
+    """A distinguished name as the permissions document writes it (RFC 4514, most general last)."""
+    return name.rfc4514_string()
+
+
+def common_name_of(name: x509.Name) -> str:
+    """The common name of a distinguished name, or ""."""
+    attributes = name.get_attributes_for_oid(NameOID.COMMON_NAME)
+    return str(attributes[0].value) if attributes else ""

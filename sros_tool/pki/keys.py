@@ -1,0 +1,59 @@
+"""Private keys: making, loading, and writing them as PKCS#8 PEM."""
+
+from __future__ import annotations
+
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
+
+from sros_tool.errors import PkiError
+
+PrivateKey = ec.EllipticCurvePrivateKey | rsa.RSAPrivateKey
+PublicKey = ec.EllipticCurvePublicKey | rsa.RSAPublicKey
+
+
+def generate_key() -> ec.EllipticCurvePrivateKey:
+    """A new key on the curve prime256v1, which every DDS vendor accepts (DDS-Security 9.3.1)."""
+    return ec.generate_private_key(ec.SECP256R1())
+
+
+def key_pem(key: PrivateKey) -> bytes:
+    """The key as unencrypted PKCS#8 PEM: no RMW can give a password for an enclave's key."""
+    return key.private_bytes(
+        serialization.Encoding.PEM,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+
+
+def load_key(pem: bytes, name: str) -> PrivateKey:
+    """Read a PEM private key; ``name`` stands for it in errors."""
+    try:
+        key = serialization.load_pem_private_key(pem, None)
+    except TypeError as error:
+        raise PkiError(
+            f"the private key {name} is protected by a passphrase",
+            "It cannot be used without it.",
+            "Decrypt it for this command with `openssl pkey -in KEY -out KEY.plain`.",
+        ) from error
+    except (ValueError, UnsupportedAlgorithm) as error:
+        raise PkiError(
+            f"the private key {name} cannot be read",
+            "It is not a PEM private key, or it is damaged.",
+            "Restore it from a backup.",
+        ) from error
+    if not isinstance(key, (ec.EllipticCurvePrivateKey, rsa.RSAPrivateKey)):
+        raise PkiError(
+            f"the private key {name} is neither an elliptic-curve nor an RSA key",
+            "DDS Security accepts EC prime256v1 and RSA 2048.",
+        )
+    return key
+
+
+def algorithm(key: object) -> str:
+    """The kind of a key in words, such as ``EC secp256r1`` or ``RSA 2048``."""
+    if isinstance(key, (ec.EllipticCurvePrivateKey, ec.EllipticCurvePublicKey)):
+        return f"EC {key.curve.name}"
+    if isinstance(key, (rsa.RSAPrivateKey, rsa.RSAPublicKey)):
+        return f"RSA {key.key_size}"
+    return type(key).__name__.lstrip("_").removesuffix("PublicKey")

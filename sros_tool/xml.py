@@ -1,0 +1,77 @@
+"""The one XML reader and writer of sros: no entities, no network, bounded size."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lxml import etree
+
+from sros_tool.errors import DocumentError
+
+MAX_BYTES = 16 * 1024 * 1024
+"""Largest document that is read, in bytes."""
+
+
+def _parser() -> etree.XMLParser:
+    # A parser keeps the error log of its last document, so each document has one of its own.
+    return etree.XMLParser(
+        resolve_entities=False,
+        no_network=True,
+        load_dtd=False,
+        dtd_validation=False,
+        huge_tree=False,
+        remove_comments=True,
+        remove_pis=True,
+    )
+
+
+def read_bytes(path: Path, what: str) -> bytes:
+    """The bytes of a regular file of bounded size; ``what`` names it in errors."""
+    try:
+        if not path.exists():
+            raise DocumentError(f"the {what} '{path}' does not exist")
+        if not path.is_file():
+            raise DocumentError(f"the {what} '{path}' is not a regular file")
+        with path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise DocumentError(f"the {what} '{path}' cannot be read", f"{error.strerror}.") from error
+    if len(data) > MAX_BYTES:
+        raise DocumentError(
+            f"the {what} '{path}' is too large", f"More than {MAX_BYTES // 1024**2} MiB."
+        )
+    return data
+
+
+def parse(data: bytes, name: str) -> etree._Element:
+    """The root element of an XML document, without comments and processing instructions.
+
+    ``name`` stands for the document in errors.  Raises `DocumentError` for anything that is not
+    well-formed, and for a document type declaration (entities are a way to read other files).
+    """
+    if not data.strip():
+        raise DocumentError(f"{name} is empty", "", "An XML document was expected.")
+    try:
+        root = etree.fromstring(data, _parser())
+    except (etree.XMLSyntaxError, ValueError) as error:
+        raise DocumentError(f"{name} is not well-formed XML", f"{error}.".capitalize()) from error
+    if root is None:
+        raise DocumentError(f"{name} has no element", "", "An XML document was expected.")
+    if root.getroottree().docinfo.doctype:
+        raise DocumentError(
+            f"{name} has a document type declaration",
+            "Entities could pull other files into a signed document, so none is accepted.",
+            "Remove the <!DOCTYPE ...> line.",
+        )
+    return root
+
+
+def text_of(element: etree._Element) -> str:
+    """The character data of an element without child elements, as it stands."""
+    return element.text or ""
+
+
+def serialize(root: etree._Element) -> bytes:
+    """The document of ``root`` in UTF-8, indented, with an XML declaration."""
+    etree.indent(root, space="  ")
+    return etree.tostring(root, xml_declaration=True, encoding="UTF-8") + b"\n"
