@@ -75,3 +75,8 @@ def serialize(root: etree._Element) -> bytes:
     """The document of ``root`` in UTF-8, indented, with an XML declaration."""
     etree.indent(root, space="  ")
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8") + b"\n"
+
+
+def tag_of(element: etree._Element) -> str:
+    """The tag of an element as text."""
+    return str(element.tag)

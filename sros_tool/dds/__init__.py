@@ -1,0 +1,1 @@
+"""The language of DDS Security: domains, governance, permissions, and their XML."""

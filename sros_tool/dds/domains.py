@@ -1,0 +1,140 @@
+"""Sets of DDS domain ids, as governance and permissions documents list them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from lxml import etree
+
+from sros_tool.errors import DocumentError, UsageError
+from sros_tool.xml import tag_of
+
+MAX_DOMAIN = 230
+"""Largest domain id that every vendor accepts: Cyclone DDS 0.10 refuses documents above it."""
+
+_ONE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?\Z", re.ASCII)
+
+
+@dataclass(frozen=True, slots=True)
+class DomainRange:
+    """The domains from ``first`` to ``last``, both included.
+
+    In documents of others one end may be open (None); vendors read that differently, and sros
+    itself never writes it.
+    """
+
+    first: int | None
+    last: int | None
+
+    def __contains__(self, domain: int) -> bool:
+        return (self.first is None or self.first <= domain) and (
+            self.last is None or domain <= self.last
+        )
+
+    def __str__(self) -> str:
+        if self.first == self.last:
+            return str(self.first)
+        return (
+            f"{'' if self.first is None else self.first}-{'' if self.last is None else self.last}"
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class DomainSet:
+    """Domain ids, as ranges in the order of the document."""
+
+    ranges: tuple[DomainRange, ...]
+
+    @classmethod
+    def parse(cls, text: str, source: str = "") -> DomainSet:
+        """Read ``0``, ``0,7`` or ``3-5,9``; sorted, and joined where ranges touch.
+
+        ``source`` says in errors where the text came from.  Raises `UsageError` for anything but
+        whole numbers from 0 to 230.
+        """
+        pairs = []
+        for part in text.split(","):
+            match = _ONE.match(part)
+            first = int(match[1]) if match else -1
+            last = int(match[2]) if match and match[2] else first
+            if not match or first > last or last > MAX_DOMAIN:
+                raise UsageError(
+                    f"{text!r}{source and f' ({source})'} is not a domain id, or a list of them",
+                    f"Domain ids are whole numbers from 0 to {MAX_DOMAIN}; "
+                    "above it, some DDS vendors refuse the documents.",
+                    "Write for example 0 or 0,7 or 10-19.",
+                )
+            pairs.append((first, last))
+        return cls.of(*pairs)
+
+    @classmethod
+    def of(cls, *pairs: tuple[int, int]) -> DomainSet:
+        """The set of these ranges, sorted, and joined where they touch."""
+        joined: list[tuple[int, int]] = []
+        for first, last in sorted(pairs):
+            if joined and first <= joined[-1][1] + 1:
+                joined[-1] = (joined[-1][0], max(last, joined[-1][1]))
+            else:
+                joined.append((first, last))
+        return cls(tuple(DomainRange(first, last) for first, last in joined))
+
+    def __contains__(self, domain: int) -> bool:
+        return any(domain in part for part in self.ranges)
+
+    def __iter__(self) -> Iterator[int]:
+        """Every domain from 0 to 230 that is in the set."""
+        return (domain for domain in range(MAX_DOMAIN + 1) if domain in self)
+
+    def __str__(self) -> str:
+        return ",".join(map(str, self.ranges))
+
+    def only(self) -> int | None:
+        """The domain, if the set has just one, else None."""
+        domains = list(self)
+        return domains[0] if len(domains) == 1 else None
+
+
+def write_domains(parent: etree._Element, domains: DomainSet) -> None:
+    """Append the ``<domains>`` element: ids alone, ranges with both ends."""
+    element = etree.SubElement(parent, "domains")
+    for part in domains.ranges:
+        if part.first == part.last:
+            etree.SubElement(element, "id").text = str(part.first)
+            continue
+        pair = etree.SubElement(element, "id_range")
+        if part.first is not None:
+            etree.SubElement(pair, "min").text = str(part.first)
+        if part.last is not None:
+            etree.SubElement(pair, "max").text = str(part.last)
+
+
+def read_domains(element: etree._Element) -> DomainSet:
+    """Read a ``<domains>`` element as it stands (neither sorted nor joined)."""
+    ranges = []
+    for child in element:
+        if child.tag == "id":
+            domain = _number(child)
+            ranges.append(DomainRange(domain, domain))
+        elif child.tag == "id_range":
+            low, high = child.find("min"), child.find("max")
+            if low is None and high is None:
+                raise DocumentError("an <id_range> has neither <min> nor <max>")
+            ranges.append(
+                DomainRange(
+                    None if low is None else _number(low), None if high is None else _number(high)
+                )
+            )
+        else:
+            raise DocumentError(f"<domains> holds an unknown element <{tag_of(child)}>")
+    if not ranges:
+        raise DocumentError("<domains> names no domain")
+    return DomainSet(tuple(ranges))
+
+
+def _number(element: etree._Element) -> int:
+    text = (element.text or "").strip()
+    if not (text.isascii() and text.isdigit() and len(text) < 10):
+        raise DocumentError(f"<{tag_of(element)}> holds {text!r}, which is no domain id")
+    return int(text)

@@ -1,0 +1,209 @@
+"""The permissions document of DDS Security: grants, rules, and their XML.
+
+Names are those of the specification (DDS-Security 1.1, 9.4.1.3 and the schema
+omg_shared_ca_permissions of 20170901).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lxml import etree
+
+from sros_tool.dds.domains import DomainSet, read_domains, write_domains
+from sros_tool.errors import DocumentError
+from sros_tool.validity import Window, iso, parse_iso
+from sros_tool.xml import parse, serialize, tag_of
+
+SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_permissions.xsd"
+XSI = "http://www.w3.org/2001/XMLSchema-instance"
+MAX_SIGNED_BYTES = 64 * 1024
+"""A signed document above this many bytes breaks the handshake (sros2#228)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Criteria:
+    """Topics that a rule speaks of; no partitions means the default partition."""
+
+    topics: tuple[str, ...]
+    partitions: tuple[str, ...] = ()
+    data_tags: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """An allow or deny rule for some domains."""
+
+    allow: bool
+    domains: DomainSet
+    publish: tuple[Criteria, ...] = ()
+    subscribe: tuple[Criteria, ...] = ()
+    relay: tuple[Criteria, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Grant:
+    """What one subject may do, and when; the moments stand as in the document."""
+
+    name: str
+    subject: str
+    not_before: str
+    not_after: str
+    rules: tuple[Rule, ...]
+    default_allow: bool = False
+
+    @property
+    def validity(self) -> Window:
+        """The window of the grant, read as the standard says (no zone is UTC)."""
+        return Window(parse_iso(self.not_before), parse_iso(self.not_after))
+
+
+@dataclass(frozen=True, slots=True)
+class Permissions:
+    """A permissions document."""
+
+    grants: tuple[Grant, ...]
+
+
+def grant(name: str, subject: str, validity: Window, rules: tuple[Rule, ...]) -> Grant:
+    """A grant of the portable profile: UTC moments, and what no rule names is denied."""
+    return Grant(name, subject, iso(validity.not_before), iso(validity.not_after), rules)
+
+
+# ── writing ────────────────────────────────────────────────────────────────────────────────
+
+
+def render_permissions(permissions: Permissions) -> bytes:
+    """The document as XML, with its elements in the order of the schema."""
+    root = etree.Element("dds", nsmap={"xsi": XSI})
+    root.set(f"{{{XSI}}}noNamespaceSchemaLocation", SCHEMA)
+    parent = etree.SubElement(root, "permissions")
+    for each in permissions.grants:
+        element = etree.SubElement(parent, "grant", name=each.name)
+        etree.SubElement(element, "subject_name").text = each.subject
+        validity = etree.SubElement(element, "validity")
+        etree.SubElement(validity, "not_before").text = each.not_before
+        etree.SubElement(validity, "not_after").text = each.not_after
+        for rule in each.rules:
+            _write_rule(element, rule)
+        etree.SubElement(element, "default").text = "ALLOW" if each.default_allow else "DENY"
+    return serialize(root)
+
+
+def _write_rule(parent: etree._Element, rule: Rule) -> None:
+    element = etree.SubElement(parent, "allow_rule" if rule.allow else "deny_rule")
+    write_domains(element, rule.domains)
+    for tag, all_criteria in (
+        ("publish", rule.publish),
+        ("subscribe", rule.subscribe),
+        ("relay", rule.relay),
+    ):
+        for criteria in all_criteria:
+            child = etree.SubElement(element, tag)
+            _write_list(child, "topics", "topic", criteria.topics)
+            if criteria.partitions:
+                _write_list(child, "partitions", "partition", criteria.partitions)
+            if criteria.data_tags:
+                tags = etree.SubElement(child, "data_tags")
+                for name, value in criteria.data_tags:
+                    one = etree.SubElement(tags, "tag")
+                    etree.SubElement(one, "name").text = name
+                    etree.SubElement(one, "value").text = value
+
+
+def _write_list(parent: etree._Element, tag: str, item: str, texts: tuple[str, ...]) -> None:
+    element = etree.SubElement(parent, tag)
+    for text in texts:
+        etree.SubElement(element, item).text = text
+
+
+# ── reading ────────────────────────────────────────────────────────────────────────────────
+
+
+def parse_permissions(data: bytes, name: str = "the permissions document") -> Permissions:
+    """Read a permissions document; raises `DocumentError` where it is not one."""
+    root = parse(data, name)
+    parent = root.find("permissions")
+    if root.tag != "dds" or parent is None:
+        raise DocumentError(
+            f"{name} is not a permissions document", "<dds><permissions> is missing."
+        )
+    try:
+        return Permissions(tuple(_read_grant(child) for child in parent))
+    except DocumentError as error:
+        raise DocumentError(f"{name} is malformed", f"{error}.", error.remedy) from error
+
+
+def _read_grant(element: etree._Element) -> Grant:
+    if element.tag != "grant":
+        raise DocumentError(f"<permissions> holds an unknown element <{tag_of(element)}>")
+    subject = not_before = not_after = default = None
+    rules = []
+    for child in element:
+        match child.tag:
+            case "subject_name":
+                subject = child.text or ""
+            case "validity":
+                not_before, not_after = child.findtext("not_before"), child.findtext("not_after")
+            case "allow_rule" | "deny_rule":
+                rules.append(_read_rule(child))
+            case "default":
+                default = (child.text or "").strip()
+            case _:
+                raise DocumentError(f"<grant> holds an unknown element <{tag_of(child)}>")
+    if subject is None or not_before is None or not_after is None:
+        raise DocumentError("a <grant> lacks its <subject_name> or its <validity>")
+    if default not in ("ALLOW", "DENY"):
+        raise DocumentError("a <grant> lacks its <default> of ALLOW or DENY")
+    for moment in (not_before, not_after):
+        try:
+            parse_iso(moment)
+        except ValueError as error:
+            raise DocumentError(f"{moment!r} is no XML date and time") from error
+    return Grant(
+        element.get("name", ""), subject, not_before, not_after, tuple(rules), default == "ALLOW"
+    )
+
+
+def _read_rule(element: etree._Element) -> Rule:
+    domains = None
+    criteria: dict[str, list[Criteria]] = {"publish": [], "subscribe": [], "relay": []}
+    for child in element:
+        if child.tag == "domains":
+            domains = read_domains(child)
+        elif child.tag in criteria:
+            criteria[tag_of(child)].append(_read_criteria(child))
+        else:
+            raise DocumentError(f"<{tag_of(element)}> holds an unknown element <{tag_of(child)}>")
+    if domains is None:
+        raise DocumentError(f"<{tag_of(element)}> lacks its <domains>")
+    return Rule(
+        element.tag == "allow_rule",
+        domains,
+        tuple(criteria["publish"]),
+        tuple(criteria["subscribe"]),
+        tuple(criteria["relay"]),
+    )
+
+
+def _read_criteria(element: etree._Element) -> Criteria:
+    topics: tuple[str, ...] = ()
+    partitions: tuple[str, ...] = ()
+    tags: tuple[tuple[str, str], ...] = ()
+    for child in element:
+        match child.tag:
+            case "topics":
+                topics += tuple(each.text or "" for each in child)
+            case "partitions":
+                partitions += tuple(each.text or "" for each in child)
+            case "data_tags":
+                tags += tuple(
+                    (each.findtext("name") or "", each.findtext("value") or "") for each in child
+                )
+            case _:
+                raise DocumentError(
+                    f"<{tag_of(element)}> holds an unknown element <{tag_of(child)}>"
+                )
+    if not topics:
+        raise DocumentError(f"<{tag_of(element)}> names no topic")
+    return Criteria(topics, partitions, tags)

@@ -1,0 +1,157 @@
+"""The identity CA and the permissions CA of a keystore: making them, and loading them to sign."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TypeVar
+
+from cryptography import x509
+
+from sros_tool.errors import KeystoreError, PkiError, SrosError
+from sros_tool.keystore.layout import (
+    IDENTITY,
+    PERMISSIONS,
+    PRIVATE,
+    PUBLIC,
+    ROLES,
+    ca_certificate,
+    ca_key,
+)
+from sros_tool.keystore.template import Template
+from sros_tool.keystore.transaction import Transaction
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import (
+    Issuer,
+    common_name,
+    issue_ca,
+    load_certificate,
+    pem,
+    same_key,
+    subject_text,
+    validity_of,
+)
+from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
+from sros_tool.validity import iso, window
+from sros_tool.xml import read_bytes
+
+Document = TypeVar("Document")
+
+
+@dataclass(frozen=True, slots=True)
+class Authority:
+    """A certificate authority that can sign."""
+
+    certificate: x509.Certificate
+    key: PrivateKey
+
+    def issuer(self) -> Issuer:
+        """What issues the certificates of enclaves in this authority's name."""
+        return Issuer(self.certificate, self.key)
+
+    def sign(
+        self, document: bytes, meant: Document, read: Callable[[bytes], Document], what: str
+    ) -> bytes:
+        """Sign a document and check the result before anybody relies on it.
+
+        The signed message is taken apart again, its signature verified, and what it says (by
+        ``read``) compared with what was ``meant``.  ``what`` names it in errors.
+        """
+        message = smime.sign(document, self.certificate, self.key)
+        signed = smime.parse(message)
+        signed.verify(self.certificate)
+        if read(signed.document) != meant:
+            raise PkiError(
+                f"{what} as signed does not say what was meant",
+                "Nothing was written.",
+                "This is a defect of sros: please report it with the policy.",
+            )
+        return message
+
+
+@dataclass(frozen=True, slots=True)
+class Authorities:
+    """The two authorities of a keystore, which may be one and the same."""
+
+    identity: Authority
+    permissions: Authority
+
+
+def create_authorities(transaction: Transaction, template: Template, now: datetime) -> Authorities:
+    """Make the CA or CAs of a new keystore."""
+    validity = window(now, template.authority_validity)
+    # Every keystore's CA has a name of its own, so that messages and pictures can tell them apart.
+    serial = secrets.token_hex(4)
+
+    def make(file: str, name: str) -> Authority:
+        key = generate_key()
+        certificate = issue_ca(key, common_name(name), validity)
+        transaction.write(f"{PUBLIC}/{file}.cert.pem", pem(certificate))
+        transaction.write(f"{PRIVATE}/{file}.key.pem", key_pem(key), private=True)
+        return Authority(certificate, key)
+
+    if template.separate_authorities:
+        name = template.authority_name
+        return Authorities(
+            make("identity_ca", f"{name} identity CA {serial}"),
+            make("permissions_ca", f"{name} permissions CA {serial}"),
+        )
+    authority = make("ca", template.authority_name)
+    for role in ROLES:
+        transaction.link(ca_certificate(role), "ca.cert.pem")
+        transaction.link(ca_key(role), "ca.key.pem")
+    return Authorities(authority, authority)
+
+
+def load_ca_certificate(root: Path, role: str) -> x509.Certificate:
+    """The certificate of the identity or permissions CA of a keystore."""
+    path = root / ca_certificate(role)
+    return load_certificate(read_bytes(path, f"{role} CA certificate"), f"'{path}'")
+
+
+def load_authorities(root: Path, now: datetime) -> Authorities:
+    """Both authorities of a keystore, with their keys, checked and ready to sign."""
+    identity = _load(root, IDENTITY, now)
+    permissions = _load(root, PERMISSIONS, now)
+    return Authorities(identity, permissions)
+
+
+def _load(root: Path, role: str, now: datetime) -> Authority:
+    if not (root / ca_certificate(role)).exists() and not (root / ca_key(role)).exists():
+        raise KeystoreError(
+            f"keystore '{root}' has no {role} CA",
+            "It may be a copy that was made for a robot, which can run enclaves but not make them.",
+            "Use the keystore that it was exported from.",
+        )
+    certificate = load_ca_certificate(root, role)
+    path = root / ca_key(role)
+    if not path.exists():
+        raise KeystoreError(
+            f"the key of the {role} CA is not in keystore '{root}'",
+            f"'{path}' is missing; perhaps it is kept elsewhere on purpose.",
+            "Put it back for this command. A new CA would lock out every enclave that exists, so "
+            "none is made.",
+        )
+    try:
+        key = load_key(read_bytes(path, f"{role} CA key"), f"'{path}'")
+    except SrosError as error:
+        raise KeystoreError(error.what, error.why, error.remedy) from error
+    if not same_key(certificate, key):
+        raise KeystoreError(
+            f"the key and the certificate of the {role} CA do not belong together",
+            f"'{path}' is not the key of '{root / ca_certificate(role)}', so nothing that it signs "
+            "could be verified.",
+            "Restore the pair from a backup.",
+        )
+    validity = validity_of(certificate)
+    if not validity.contains(now):
+        raise KeystoreError(
+            f"the {role} CA {subject_text(certificate.subject)} is not valid now",
+            f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}, and DDS "
+            "refuses whatever an expired CA has signed.",
+            "Check the clock of this machine; otherwise make a new keystore.",
+        )
+    return Authority(certificate, key)

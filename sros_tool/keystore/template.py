@@ -1,0 +1,219 @@
+"""Keystore templates: named sets of choices, each one readable TOML file.
+
+A keystore keeps a copy of the choices that it was made with (`sros.toml`), so that what is added
+later follows them.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass, fields, replace
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+from sros_tool.errors import DocumentError, SrosError
+from sros_tool.names import expression_problem
+from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
+from sros_tool.resources import templates_dir
+from sros_tool.validity import parse_duration
+from sros_tool.xml import read_bytes
+
+DEFAULT_TEMPLATE = "development"
+EVERYTHING, NODE_BASICS = "everything", "node_basics"
+_DATA_LEVELS = (Level.NONE, Level.SIGN, Level.ENCRYPT)
+_KINDS: dict[str, str] = {"topic": "topics", "service": "services", "action": "actions"}
+
+
+@dataclass(frozen=True, slots=True)
+class Template:
+    """The choices by which a keystore is made.
+
+    ``text`` is the TOML that they were read from.  Durations count from the moment of creation.
+    """
+
+    name: str
+    description: str
+    separate_authorities: bool
+    authority_name: str
+    authority_validity: timedelta
+    certificate_validity: timedelta
+    permissions_validity: timedelta
+    default_permissions: str
+    protection: DomainProtection
+    text: str = ""
+
+
+def template_names() -> tuple[str, ...]:
+    """The names of the templates that ship with sros."""
+    return tuple(sorted(path.stem for path in templates_dir().glob("*.toml")))
+
+
+def load_template(choice: str) -> Template:
+    """The template of that name, or in the file of that path.
+
+    Raises `DocumentError` if there is none, or if it holds anything that is not understood.
+    """
+    if choice in template_names():
+        return read_template(templates_dir() / f"{choice}.toml")
+    path = Path(choice)
+    if "/" not in choice and not path.suffix and not path.exists():
+        raise DocumentError(
+            f"there is no template {choice!r}",
+            f"sros has {', '.join(template_names())}.",
+            "Name one of them, or a TOML file.",
+        )
+    return read_template(path)
+
+
+def read_template(path: Path) -> Template:
+    """Read a template file."""
+    data = read_bytes(path, "template")
+    try:
+        text = data.decode()
+        return parse_template(text, path.stem)
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise DocumentError(
+            f"the template '{path}' is not valid TOML", f"{error}.".capitalize()
+        ) from error
+    except _TemplateError as error:
+        raise DocumentError(f"the template '{path}' is not understood", f"{error}.") from error
+
+
+class _TemplateError(ValueError):
+    pass
+
+
+def parse_template(text: str, name: str) -> Template:
+    """Read the text of a template; unknown keys are errors, for a typo must not pass unseen."""
+    table = _Table(tomllib.loads(text), "")
+    authorities = table.table("authorities")
+    certificates = table.table("certificates")
+    permissions = table.table("permissions")
+    template = Template(
+        name=table.text("name", name),
+        description=table.text("description", ""),
+        separate_authorities=authorities.one_of("layout", ("separate", "single")) == "separate",
+        authority_name=authorities.text("name", "sros"),
+        authority_validity=authorities.duration("validity"),
+        certificate_validity=certificates.duration("validity"),
+        permissions_validity=permissions.duration("validity"),
+        default_permissions=permissions.one_of("default", (EVERYTHING, NODE_BASICS)),
+        protection=_protection(table.table("protection")),
+        text=text,
+    )
+    for part in (authorities, certificates, permissions, table):
+        part.finish()
+    return template
+
+
+def _protection(table: _Table) -> DomainProtection:
+    domain = DomainProtection(
+        rtps=table.level("rtps"),
+        discovery=table.level("discovery"),
+        liveliness=table.level("liveliness"),
+        allow_unauthenticated_participants=table.flag("allow_unauthenticated_participants", False),
+        join_access_control=table.flag("join_access_control", True),
+    )
+    if domain.allow_unauthenticated_participants and domain.rtps is not Level.NONE:
+        raise _TemplateError(
+            'protection.allow_unauthenticated_participants goes with rtps = "NONE" only, since '
+            "Fast DDS refuses to start otherwise"
+        )
+    default = _topic_protection(table.table("default"), TopicProtection())
+    named = []
+    for item, kind in _KINDS.items():
+        for entry in table.tables(item):
+            names = entry.texts("names")
+            for name in names:
+                problem = expression_problem(name)
+                if problem or name.startswith("~"):
+                    raise _TemplateError(
+                        f"{entry.path}.names holds {name!r}, which is not a valid {item} name: "
+                        f"{problem or 'it is private to a node.'}".rstrip(".")
+                    )
+            protection = _topic_protection(entry, default)
+            named += [NamedProtection(kind, name, protection) for name in names]
+    table.finish()
+    return replace(domain, default=default, named=tuple(named))
+
+
+def _topic_protection(table: _Table, default: TopicProtection) -> TopicProtection:
+    values: dict[str, Any] = {}
+    for field in fields(TopicProtection):
+        if field.name in ("data", "metadata"):
+            allowed = _DATA_LEVELS if field.name == "data" else tuple(Level)
+            values[field.name] = table.level(field.name, getattr(default, field.name), allowed)
+        else:
+            values[field.name] = table.flag(field.name, getattr(default, field.name))
+    table.finish()
+    return TopicProtection(**values)
+
+
+class _Table:
+    """A TOML table whose keys are taken one by one; what is left over at the end is an error."""
+
+    def __init__(self, values: object, path: str) -> None:
+        if not isinstance(values, dict):
+            raise _TemplateError(f"{path} is not a table")
+        self._values = dict(values)
+        self.path = path
+
+    def _take(self, key: str, kind: type, default: object = None) -> Any:
+        value = self._values.pop(key, default)
+        if value is None:
+            raise _TemplateError(f"{self._at(key)} is missing")
+        if not isinstance(value, kind):
+            raise _TemplateError(f"{self._at(key)} is {value!r}, not a {kind.__name__}")
+        return value
+
+    def _at(self, key: str) -> str:
+        return f"{self.path}.{key}" if self.path else key
+
+    def table(self, key: str) -> _Table:
+        return _Table(self._values.pop(key, {}), self._at(key))
+
+    def tables(self, key: str) -> list[_Table]:
+        values = self._values.pop(key, [])
+        if not isinstance(values, list):
+            raise _TemplateError(
+                f"{self._at(key)} is not a list of tables; write [[{self._at(key)}]]"
+            )
+        return [_Table(value, self._at(key)) for value in values]
+
+    def text(self, key: str, default: str | None = None) -> str:
+        return str(self._take(key, str, default))
+
+    def texts(self, key: str) -> list[str]:
+        values = self._take(key, list)
+        if not values or not all(isinstance(value, str) for value in values):
+            raise _TemplateError(f"{self._at(key)} is not a list of names")
+        return list(values)
+
+    def flag(self, key: str, default: bool) -> bool:
+        return bool(self._take(key, bool, default))
+
+    def one_of(self, key: str, choices: tuple[str, ...]) -> str:
+        value = self.text(key)
+        if value not in choices:
+            raise _TemplateError(f"{self._at(key)} is {value!r}, not one of {', '.join(choices)}")
+        return value
+
+    def level(
+        self, key: str, default: Level | None = None, allowed: tuple[Level, ...] = tuple(Level)
+    ) -> Level:
+        value = self._take(key, str, default)
+        if value not in allowed:
+            raise _TemplateError(f"{self._at(key)} is {value!r}, not one of {', '.join(allowed)}")
+        return Level(value)
+
+    def duration(self, key: str) -> timedelta:
+        value = self.text(key)
+        try:
+            return parse_duration(value)
+        except SrosError as error:
+            raise _TemplateError(f"{self._at(key)}: {error.what}") from error
+
+    def finish(self) -> None:
+        if self._values:
+            raise _TemplateError(f"{self._at(next(iter(self._values)))} is not a known key")

@@ -1,0 +1,319 @@
+"""All writes to a keystore: staged, flushed to disk once, and put in place as a whole.
+
+New files are written below ``.sros-transaction/new`` of the keystore.  Files that already exist
+change together at a single moment: each is first replaced by a link to
+``.sros-transaction/live/...`` (still its old content), then ``live`` itself, a link, is turned
+from ``old`` to ``new``.  That turn is the commit.  Afterwards the links give way to the plain
+files, and new folders are moved in.  Whatever the moment at which the machine stops, DDS finds
+either all the old files or all the new ones, and the next transaction tidies up.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import fcntl
+import os
+import secrets
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore.layout import folder_mode
+
+STAGE = ".sros-transaction"
+_LOCK_SECONDS = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One file that a transaction creates or replaces; ``path`` is relative to the keystore."""
+
+    action: str
+    path: str
+
+
+class Transaction:
+    """A lock on a keystore and the files that will change in it.
+
+    Use as a context manager; without `commit` nothing changes.  If ``fresh``, the keystore must
+    not exist yet (an empty folder may) and appears at once; otherwise it must exist.  With
+    ``dry_run`` nothing is written, and `changes` tells what would be.
+    """
+
+    def __init__(self, root: Path, *, fresh: bool = False, dry_run: bool = False) -> None:
+        self.root = root
+        self.changes: list[Change] = []
+        self._dry_run = dry_run
+        self._new_root = fresh and not root.exists()
+        self._made_parents: list[Path] = []
+        self._lock = -1
+        self._stage = root / STAGE
+        self._content = self._stage / "new"
+        self._staged: set[str] = set()
+        self._folders: set[str] = set()
+
+    # ── begin and end ──────────────────────────────────────────────────────────────────────
+
+    def __enter__(self) -> Self:
+        if self._dry_run:
+            return self
+        try:
+            self._begin()
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def _begin(self) -> None:
+        if self._new_root:
+            self._remove_stale_siblings()
+            self._make_parents()
+            self._stage = self.root.parent / f".{self.root.name}.sros-{secrets.token_hex(4)}"
+            self._content = self._stage
+            self._stage.mkdir(mode=0o700)
+            self._lock = _lock(self._stage)
+            return
+        self._lock = _lock(self.root)
+        recover(self.root)
+        self._stage.mkdir(mode=0o700)
+        self._content.mkdir(mode=0o700)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if not self._dry_run:
+            self._end()
+
+    def _end(self) -> None:
+        if self._lock >= 0:
+            if self._new_root:
+                shutil.rmtree(self._stage, ignore_errors=True)
+            else:
+                recover(self.root)
+            os.close(self._lock)
+            self._lock = -1
+        for parent in self._made_parents:
+            with contextlib.suppress(OSError):
+                parent.rmdir()
+
+    def _make_parents(self) -> None:
+        missing = []
+        parent = self.root.parent
+        while not parent.exists():
+            missing.append(parent)
+            parent = parent.parent
+        for each in reversed(missing):
+            each.mkdir()
+            self._made_parents.insert(0, each)
+
+    def _remove_stale_siblings(self) -> None:
+        for stale in self.root.parent.glob(f".{self.root.name}.sros-*"):
+            with contextlib.suppress(KeystoreError, OSError):
+                os.close(_lock(stale, wait=0.0))
+                shutil.rmtree(stale, ignore_errors=True)
+
+    # ── what is to change ──────────────────────────────────────────────────────────────────
+
+    def write(self, path: str, data: bytes, *, private: bool = False) -> None:
+        """Stage a file; ``private`` ones are readable by their owner only, from the first byte."""
+        staged = self._prepare(path)
+        if staged is None:
+            return
+        mode = 0o600 if private else 0o644
+        handle = os.open(staged, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        try:
+            os.fchmod(handle, mode)
+            view = memoryview(data)
+            while view:
+                view = view[os.write(handle, view) :]
+        finally:
+            os.close(handle)
+
+    def link(self, path: str, target: str) -> None:
+        """Stage a symbolic link to ``target``, which is relative to the folder of ``path``."""
+        staged = self._prepare(path)
+        if staged is not None:
+            os.symlink(target, staged)
+
+    def _prepare(self, path: str) -> str | None:
+        if path in self._staged:
+            raise KeystoreError(f"{path} would be written twice")
+        self._staged.add(path)
+        folder = path.rpartition("/")[0]
+        self._prepare_folder(folder)
+        existed = not self._new_root and os.path.lexists(self.root / path)
+        self.changes.append(Change("replace" if existed else "create", path))
+        return None if self._dry_run else os.path.join(self._content, path)
+
+    def _prepare_folder(self, path: str) -> None:
+        if path in self._folders:
+            return
+        if path:
+            self._prepare_folder(path.rpartition("/")[0])
+            real = self.root / path
+            if not self._new_root and real.is_symlink():
+                raise KeystoreError(
+                    f"'{real}' is a symbolic link",
+                    "What is written below it would land elsewhere, outside of the keystore.",
+                    "Put a real folder in its place.",
+                )
+            if not self._new_root and real.exists() and not real.is_dir():
+                raise KeystoreError(f"'{real}' is in the way", "It is not a folder.")
+            if not self._dry_run:
+                mode = folder_mode(path)
+                os.mkdir(os.path.join(self._content, path), mode)
+                os.chmod(os.path.join(self._content, path), mode)
+        self._folders.add(path)
+
+    # ── commit ─────────────────────────────────────────────────────────────────────────────
+
+    def commit(self) -> None:
+        """Put everything in place; after this it is on the disk."""
+        if self._dry_run or not self.changes:
+            return
+        _flush_file_system(self._stage)
+        if self._new_root:
+            self._appear()
+        else:
+            self._bridge()
+            _turn(self._stage, "new")
+            recover(self.root)
+
+    def _appear(self) -> None:
+        os.chmod(self._stage, folder_mode(""))
+        try:
+            os.rename(self._stage, self.root)
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                raise KeystoreError(
+                    f"keystore '{self.root}' already exists", "Another process just made it."
+                ) from error
+            raise
+        self._made_parents.clear()
+        _flush_folder(self.root.parent)
+
+    def _bridge(self) -> None:
+        """Let every file that is to change be reached through ``live``, still with old content."""
+        plain = [
+            path for path in self._in_existing_folders() if not (self.root / path).is_symlink()
+        ]
+        if not plain:
+            return
+        old = self._stage / "old"
+        old.mkdir(mode=0o700)
+        _turn(self._stage, "old")
+        spare = self._stage / "spare"
+        for path in plain:
+            target, kept = self.root / path, old / path
+            if target.exists():
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                try:
+                    os.link(target, kept)
+                except OSError:  # a file system, or an owner, that allows no hard links
+                    shutil.copy2(target, kept)
+            os.symlink("../" * path.count("/") + f"{STAGE}/live/{path}", spare)
+            os.replace(spare, target)
+
+    def _in_existing_folders(self) -> Iterator[str]:
+        exists = {path: (self.root / path).is_dir() for path in self._folders}
+        return (path for path in sorted(self._staged) if exists[path.rpartition("/")[0]])
+
+
+def recover(root: Path) -> None:
+    """Complete or undo what an interrupted transaction left behind.  The caller holds the lock."""
+    stage = root / STAGE
+    if not stage.is_dir():
+        return
+    live = stage / "live"
+    committed = live.is_symlink() and os.readlink(live) == "new"
+    if committed:
+        _settle(stage / "new", root)
+        _flush_folder(root)
+    else:
+        for path in _files_below(stage / "old"):
+            if _leads_into_stage(root / path):
+                os.replace(stage / "old" / path, root / path)
+        for path in _files_below(stage / "new"):
+            if _leads_into_stage(root / path):
+                os.unlink(root / path)
+    shutil.rmtree(stage)
+
+
+def _settle(source: Path, target: Path) -> None:
+    """Move everything below ``source`` to its place below ``target``."""
+    with os.scandir(source) as entries:
+        for entry in list(entries):
+            place = target / entry.name
+            if not entry.is_dir(follow_symlinks=False):
+                os.replace(entry.path, place)
+            elif os.path.lexists(place):
+                _settle(Path(entry.path), place)
+            else:
+                os.rename(entry.path, place)
+
+
+def _turn(stage: Path, to: str) -> None:
+    spare = stage / "live.next"
+    os.symlink(to, spare)
+    os.replace(spare, stage / "live")
+
+
+def _files_below(folder: Path) -> Iterator[str]:
+    for parent, _, files in os.walk(folder):
+        for file in files:
+            yield os.path.relpath(os.path.join(parent, file), folder)
+
+
+def _leads_into_stage(path: Path) -> bool:
+    return path.is_symlink() and f"{STAGE}/live/" in os.readlink(path)
+
+
+def _lock(folder: Path, wait: float = _LOCK_SECONDS) -> int:
+    """An exclusive lock on a folder itself, so that no lock file is left behind."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    deadline = time.monotonic() + wait
+    while True:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return handle
+        except BlockingIOError:
+            if time.monotonic() >= deadline:
+                os.close(handle)
+                raise KeystoreError(
+                    f"keystore '{folder}' is busy",
+                    f"Another process has been writing to it for {_LOCK_SECONDS:.0f} seconds.",
+                    "Try again when it is done.",
+                ) from None
+            time.sleep(0.02)
+
+
+def _flush_file_system(folder: Path) -> None:
+    """One flush for all files of a transaction: one for each would cost more than all else."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        libc = ctypes.CDLL(None, use_errno=True)
+        if libc.syncfs(handle) != 0:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number), str(folder))
+    except AttributeError:  # a C library without syncfs
+        os.sync()
+    finally:
+        os.close(handle)
+
+
+def _flush_folder(folder: Path) -> None:
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

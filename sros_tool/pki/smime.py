@@ -1,0 +1,220 @@
+"""Signed documents (``.p7s``): S/MIME multipart/signed with a detached CMS signature.
+
+The form that every DDS vendor reads: CRLF line ends, a first part whose header
+``Content-Type: text/plain`` is part of what is signed, SHA-256, the signer's certificate embedded
+(DDS-Security 1.1, 9.4.1.1; OpenSSL ``smime -sign -text``).
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import re
+import secrets
+from dataclasses import dataclass
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec, padding, rsa
+from cryptography.hazmat.primitives.serialization import Encoding, pkcs7
+
+from sros_tool.errors import PkiError
+from sros_tool.pki import der
+from sros_tool.pki.keys import PrivateKey
+
+_TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"
+_OPTIONS = (pkcs7.PKCS7Options.DetachedSignature, pkcs7.PKCS7Options.Binary)
+_BOUNDARY = re.compile(rb"""(?i)\bboundary=("([^"]{1,200})"|([^\s;"]{1,200}))""")
+_LINE_END = re.compile(rb"\r?\n")
+
+_SIGNED_DATA = "1.2.840.113549.1.7.2"
+_MESSAGE_DIGEST = "1.2.840.113549.1.9.4"
+_DIGESTS: dict[str, type[hashes.HashAlgorithm]] = {
+    "2.16.840.1.101.3.4.2.1": hashes.SHA256,
+    "2.16.840.1.101.3.4.2.2": hashes.SHA384,
+    "2.16.840.1.101.3.4.2.3": hashes.SHA512,
+    "1.3.14.3.2.26": hashes.SHA1,
+}
+
+
+def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
+    """The S/MIME message that carries ``document``, signed by ``key`` of ``certificate``."""
+    content = _TEXT_HEADER + _LINE_END.sub(b"\r\n", document)
+    signature = (
+        pkcs7.PKCS7SignatureBuilder()
+        .set_data(content)
+        .add_signer(certificate, key, hashes.SHA256())
+        .sign(Encoding.DER, _OPTIONS)
+    )
+    boundary = b"----" + secrets.token_hex(16).upper().encode()
+    encoded = base64.encodebytes(signature).replace(b"\n", b"\r\n")
+    return b"".join((
+        b"MIME-Version: 1.0\r\n"
+        b'Content-Type: multipart/signed; protocol="application/x-pkcs7-signature"; '
+        b'micalg="sha-256"; boundary="', boundary, b'"\r\n\r\n'
+        b"This is an S/MIME signed message\r\n\r\n--", boundary, b"\r\n",
+        content,
+        b"\r\n--", boundary, b"\r\n"
+        b'Content-Type: application/x-pkcs7-signature; name="smime.p7s"\r\n'
+        b"Content-Transfer-Encoding: base64\r\n"
+        b'Content-Disposition: attachment; filename="smime.p7s"\r\n\r\n',
+        encoded,
+        b"\r\n--", boundary, b"--\r\n\r\n",
+    ))  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class SignedDocument:
+    """A ``.p7s`` taken apart; nothing of it is trusted before `verify`.
+
+    ``content`` is what was signed, with CRLF line ends and its MIME header; ``document`` the same
+    without the header; ``certificates`` those embedded in the signature.
+    """
+
+    content: bytes
+    document: bytes
+    certificates: tuple[x509.Certificate, ...]
+    digest: str
+    _digest_algorithm: hashes.HashAlgorithm
+    _signed_attributes: bytes
+    _message_digest: bytes
+    _signature: bytes
+    _issuer_and_serial: tuple[bytes, int]
+
+    def signer(self, candidates: tuple[x509.Certificate, ...] = ()) -> x509.Certificate | None:
+        """The certificate that the signature names, among those embedded and ``candidates``."""
+        issuer, serial = self._issuer_and_serial
+        for certificate in (*candidates, *self.certificates):
+            if certificate.serial_number == serial and certificate.issuer.public_bytes() == issuer:
+                return certificate
+        return None
+
+    def verify(self, authority: x509.Certificate) -> None:
+        """Check that ``authority`` itself signed this document; else raise `PkiError`.
+
+        Stricter than Cyclone DDS 0.10, which accepts any signer whose chain ends at the
+        authority (the CVE-2023-24011 class), and just what Fast DDS asks for.
+        """
+        signer = self.signer((authority,))
+        if signer is None or signer != authority:
+            who = f"by {signer.subject.rfc4514_string()}" if signer else "by an unknown certificate"
+            raise PkiError(
+                f"it is signed {who}, not by the permissions CA "
+                f"{authority.subject.rfc4514_string()}"
+            )
+        if not self._intact(signer):
+            raise PkiError(
+                "its signature does not match its content",
+                "The document was changed after it was signed, or its signature is damaged.",
+            )
+
+    def _intact(self, signer: x509.Certificate) -> bool:
+        digest = hashes.Hash(self._digest_algorithm)
+        digest.update(self.content)
+        if self._signed_attributes and digest.finalize() != self._message_digest:
+            return False
+        signed = self._signed_attributes or self.content
+        key = signer.public_key()
+        try:
+            if isinstance(key, ec.EllipticCurvePublicKey):
+                key.verify(self._signature, signed, ec.ECDSA(self._digest_algorithm))
+            elif isinstance(key, rsa.RSAPublicKey):
+                key.verify(self._signature, signed, padding.PKCS1v15(), self._digest_algorithm)
+            else:
+                return False
+        except (InvalidSignature, UnsupportedAlgorithm):
+            return False
+        return True
+
+
+def parse(message: bytes) -> SignedDocument:
+    """Take a ``.p7s`` apart.  Raises `PkiError` if it is no S/MIME signed message."""
+    content, signature = _split(message)
+    header, separator, document = content.partition(b"\r\n\r\n")
+    if not separator or not header.lower().startswith(b"content-type:"):
+        raise PkiError(
+            "its signed part has no MIME header",
+            "DDS vendors only accept documents signed with a text/plain header "
+            "(openssl smime -sign -text).",
+        )
+    try:
+        return _parse_cms(signature, content, document)
+    except (ValueError, IndexError, StopIteration, UnsupportedAlgorithm) as error:
+        raise PkiError("its signature is not a CMS signature that can be read") from error
+
+
+def _split(message: bytes) -> tuple[bytes, bytes]:
+    """The signed part, with CRLF line ends, and the DER of its signature."""
+    head, _, body = message.replace(b"\r\n", b"\n").partition(b"\n\n")
+    boundary = _BOUNDARY.search(head)
+    if b"multipart/signed" not in head.lower() or not boundary:
+        raise PkiError(
+            "it is not an S/MIME signed message",
+            "A signed document begins with MIME headers of the type multipart/signed; "
+            "this may be the unsigned XML.",
+        )
+    mark = b"\n--" + (boundary[2] or boundary[3])
+    parts = (b"\n" + body).split(mark)
+    if len(parts) != 4 or not parts[3].startswith(b"--"):
+        raise PkiError("it does not consist of one signed part and one signature")
+    content = parts[1].removeprefix(b"\n").replace(b"\n", b"\r\n")
+    _, separator, encoded = parts[2].removeprefix(b"\n").partition(b"\n\n")
+    try:
+        signature = base64.b64decode(b"".join(encoded.split()), validate=True)
+    except binascii.Error as error:
+        raise PkiError("its signature is not valid base64") from error
+    if not separator or not signature:
+        raise PkiError("it has no signature")
+    return content, signature
+
+
+def _parse_cms(signature: bytes, content: bytes, document: bytes) -> SignedDocument:
+    """Read ContentInfo / SignedData / SignerInfo (RFC 5652, sections 3, 5.1 and 5.3)."""
+    content_type, wrapped = tuple(der.children(der.read(signature).content))[:2]
+    if der.oid(content_type.content) != _SIGNED_DATA:
+        raise ValueError("not SignedData")
+    fields = list(der.children(der.read(wrapped.content).content))
+    certificates = tuple(
+        x509.load_der_x509_certificate(value.whole)
+        for field in fields[3:]
+        if field.tag == der.CONTEXT_0
+        for value in der.children(field.content)
+        if value.tag == der.SEQUENCE
+    )
+    signers = list(der.children(fields[-1].content))
+    if fields[-1].tag != der.SET or len(signers) != 1:
+        raise ValueError("not exactly one signer")
+    info = list(der.children(signers[0].content))
+    issuer, serial = tuple(der.children(info[1].content))
+    digest_oid = der.oid(der.read(info[2].content).content)
+    algorithm = _DIGESTS.get(digest_oid)
+    if algorithm is None:
+        raise ValueError(f"unknown digest {digest_oid}")
+    attributes, message_digest = b"", b""
+    if info[3].tag == der.CONTEXT_0:
+        # What is signed is the attributes as a SET, not with the tag that they carry inside.
+        attributes = b"\x31" + info[3].whole[1:]
+        message_digest = _message_digest(info[3].content)
+    signature_value = info[5 if attributes else 4]
+    if signature_value.tag != der.OCTET_STRING:
+        raise ValueError("no signature value")
+    return SignedDocument(
+        content=content,
+        document=document,
+        certificates=certificates,
+        digest=str(algorithm.name),
+        _digest_algorithm=algorithm(),
+        _signed_attributes=attributes,
+        _message_digest=message_digest,
+        _signature=signature_value.content,
+        _issuer_and_serial=(issuer.whole, int.from_bytes(serial.content, "big", signed=True)),
+    )
+
+
+def _message_digest(attributes: bytes) -> bytes:
+    for attribute in der.children(attributes):
+        name, values = tuple(der.children(attribute.content))
+        if der.oid(name.content) == _MESSAGE_DIGEST:
+            return der.read(values.content).content
+    raise ValueError("no message digest")

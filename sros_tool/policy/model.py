@@ -1,0 +1,103 @@
+"""The policy language of ROS: who may publish, subscribe, request, reply, call and execute.
+
+Names are those of SROS2 policy XML 0.2.0.  All values can be compared; where a thing came from
+(`Source`) does not count in a comparison.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+VERSION = "0.2.0"
+
+RIGHTS: dict[str, tuple[str, str]] = {
+    "topics": ("publish", "subscribe"),
+    "services": ("request", "reply"),
+    "actions": ("call", "execute"),
+}
+"""The kinds of groups, and the two rights that each kind gives or denies."""
+
+
+class Qualifier(StrEnum):
+    """What a rule says about a right."""
+
+    ALLOW = "ALLOW"
+    DENY = "DENY"
+
+
+ALLOW = Qualifier.ALLOW
+DENY = Qualifier.DENY
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """The file and line (from 1) that something was read from."""
+
+    file: str
+    line: int
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}"
+
+
+_NOWHERE = Source("", 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Names of one kind (topics, services or actions) that share the same rights.
+
+    ``rights`` are pairs of a right and its qualifier, in the order of `RIGHTS`; ``names`` are as
+    written: relative, private or absolute, perhaps with wildcards.
+    """
+
+    kind: str
+    rights: tuple[tuple[str, Qualifier], ...]
+    names: tuple[str, ...]
+    source: Source = field(default=_NOWHERE, compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Profile:
+    """What one node, in its namespace, may do."""
+
+    ns: str
+    node: str
+    groups: tuple[Group, ...]
+    source: Source = field(default=_NOWHERE, compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class Profiles:
+    """A set of profiles with its free ``type`` and its ``metadata`` (XML text, or "")."""
+
+    profiles: tuple[Profile, ...]
+    type: str = ""
+    metadata: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Enclave:
+    """What the processes of one enclave may do."""
+
+    path: str
+    profiles: tuple[Profiles, ...]
+    source: Source = field(default=_NOWHERE, compare=False)
+
+    def all_profiles(self) -> tuple[Profile, ...]:
+        """Every profile of the enclave, in order."""
+        return tuple(profile for block in self.profiles for profile in block.profiles)
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """A policy file after its includes: enclaves with distinct paths."""
+
+    enclaves: tuple[Enclave, ...]
+    version: str = VERSION
+    file: str = field(default="", compare=False)
+
+    def enclave(self, path: str) -> Enclave | None:
+        """The enclave of that path, or None."""
+        return next((each for each in self.enclaves if each.path == path), None)

@@ -1,0 +1,50 @@
+"""What a robot's messages are protected by, said in ROS terms: per topic, service and action."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class Level(StrEnum):
+    """How strongly something is protected; the long forms also prove which writer it came from."""
+
+    NONE = "NONE"
+    SIGN = "SIGN"
+    ENCRYPT = "ENCRYPT"
+    SIGN_WITH_ORIGIN_AUTHENTICATION = "SIGN_WITH_ORIGIN_AUTHENTICATION"
+    ENCRYPT_WITH_ORIGIN_AUTHENTICATION = "ENCRYPT_WITH_ORIGIN_AUTHENTICATION"
+
+
+@dataclass(frozen=True, slots=True)
+class TopicProtection:
+    """The protection of a topic: its payload, its protocol messages, and who is checked."""
+
+    data: Level = Level.ENCRYPT
+    metadata: Level = Level.ENCRYPT
+    read_access_control: bool = True
+    write_access_control: bool = True
+    discovery: bool = True
+    liveliness: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class NamedProtection:
+    """The protection of the topics, services or actions (``kind``) that match a name."""
+
+    kind: str
+    name: str
+    protection: TopicProtection
+
+
+@dataclass(frozen=True, slots=True)
+class DomainProtection:
+    """The protection of a whole domain, and of its names; ``default`` holds for the others."""
+
+    rtps: Level = Level.SIGN
+    discovery: Level = Level.ENCRYPT
+    liveliness: Level = Level.ENCRYPT
+    allow_unauthenticated_participants: bool = False
+    join_access_control: bool = True
+    default: TopicProtection = TopicProtection()
+    named: tuple[NamedProtection, ...] = ()

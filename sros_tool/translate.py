@@ -1,0 +1,210 @@
+"""The translation between the languages of ROS and of DDS Security, both ways.
+
+The mapping of names is that of ros2/sros2, so that a policy gives the same rights with both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.governance import DomainRule, Governance, Protection, TopicRule
+from sros_tool.dds.permissions import Criteria, Permissions, Rule, grant
+from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expand
+from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Qualifier
+from sros_tool.policy.protection import DomainProtection, NamedProtection, TopicProtection
+from sros_tool.validity import Window
+
+# ── ROS → DDS ──────────────────────────────────────────────────────────────────────────────
+
+
+def permissions_for(
+    enclave: Enclave, *, subject: str, validity: Window, domains: DomainSet
+) -> Permissions:
+    """The permissions document of an enclave: one grant, denials before permissions.
+
+    Beside the policy's rights it holds one more: every ROS 2 participant writes and reads
+    ``ros_discovery_info``, without which none starts.
+    """
+    allowed, denied = _Topics(), _Topics()
+    for profile in enclave.all_profiles():
+        ns, node = profile.ns, profile.node
+        for group in profile.groups:
+            for right, qualifier in group.rights:
+                topics = allowed if qualifier is ALLOW else denied
+                for name in group.names:
+                    topics.add(right, expand(name, ns, node))
+    rules = [] if denied.is_empty() else [denied.rule(allow=False, domains=domains)]
+    allowed.publish.add(ROS_DISCOVERY_TOPIC)
+    allowed.subscribe.add(ROS_DISCOVERY_TOPIC)
+    rules.append(allowed.rule(allow=True, domains=domains))
+    return Permissions((grant(enclave.path, subject, validity, tuple(rules)),))
+
+
+class _Topics:
+    """The DDS topics of one rule while it is put together."""
+
+    def __init__(self) -> None:
+        self.publish: set[str] = set()
+        self.subscribe: set[str] = set()
+
+    def add(self, right: str, fqn: str) -> None:
+        if right == "publish":
+            self.publish.add("rt" + fqn)
+        elif right == "subscribe":
+            self.subscribe.add("rt" + fqn)
+        else:
+            names = dds_names(right, fqn)
+            self.publish.update(names.publish)
+            self.subscribe.update(names.subscribe)
+
+    def is_empty(self) -> bool:
+        return not (self.publish or self.subscribe)
+
+    def rule(self, *, allow: bool, domains: DomainSet) -> Rule:
+        return Rule(allow, domains, _criteria(self.publish), _criteria(self.subscribe))
+
+
+def _criteria(topics: set[str]) -> tuple[Criteria, ...]:
+    return (Criteria(tuple(sorted(topics))),) if topics else ()
+
+
+def governance_for(protection: DomainProtection, domains: DomainSet) -> Governance:
+    """The governance document of a keystore: one domain rule, the narrowest topic rules first.
+
+    The first topic rule that matches decides, so a rule stands before every rule that covers it;
+    the last one, for ``*``, holds for whatever no other names.
+    """
+    rules = [
+        _topic_rule(expression, named.protection)
+        for named in protection.named
+        for expression in _expressions(named)
+    ]
+    rules = _narrow_first(rules)
+    rules.append(_topic_rule("*", protection.default))
+    return Governance(
+        (
+            DomainRule(
+                domains=domains,
+                allow_unauthenticated_participants=protection.allow_unauthenticated_participants,
+                enable_join_access_control=protection.join_access_control,
+                discovery_protection_kind=Protection(protection.discovery),
+                liveliness_protection_kind=Protection(protection.liveliness),
+                rtps_protection_kind=Protection(protection.rtps),
+                topic_access_rules=tuple(rules),
+            ),
+        )
+    )
+
+
+def _expressions(named: NamedProtection) -> list[str]:
+    """The DDS topics of a ROS name, whichever side uses it."""
+    expressions: dict[str, None] = {}
+    for right in RIGHTS[named.kind]:
+        names = dds_names(right, expand(named.name, "/", ""))
+        expressions.update(dict.fromkeys(names.publish + names.subscribe))
+    return list(expressions)
+
+
+def _topic_rule(expression: str, protection: TopicProtection) -> TopicRule:
+    return TopicRule(
+        topic_expression=expression,
+        enable_discovery_protection=protection.discovery,
+        enable_liveliness_protection=protection.liveliness,
+        enable_read_access_control=protection.read_access_control,
+        enable_write_access_control=protection.write_access_control,
+        metadata_protection_kind=Protection(protection.metadata),
+        data_protection_kind=Protection(protection.data),
+    )
+
+
+def _narrow_first(rules: list[TopicRule]) -> list[TopicRule]:
+    """``rules`` reordered, as little as possible, so that none is hidden by a wider one."""
+    ordered: list[TopicRule] = []
+    for rule in rules:
+        place = next(
+            (
+                index
+                for index, earlier in enumerate(ordered)
+                if covers(earlier.topic_expression, rule.topic_expression)
+                and not covers(rule.topic_expression, earlier.topic_expression)
+            ),
+            len(ordered),
+        )
+        ordered.insert(place, rule)
+    return ordered
+
+
+def covers(wide: str, narrow: str) -> bool:
+    """Whether every name that matches ``narrow`` also matches ``wide`` (exact for * alone)."""
+    return fnmatchcase(narrow, wide)
+
+
+# ── DDS → ROS ──────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class RosRight:
+    """One right or denial in ROS terms; ``kind`` "dds" is a topic that ROS has no word for."""
+
+    qualifier: Qualifier
+    right: str
+    kind: str
+    name: str
+
+
+def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
+    """What a rule says in ROS terms: actions and services are folded back from their topics.
+
+    Whatever is left over (half a service, a topic without ROS prefix) is told as it is, with
+    ``kind`` "dds".  Partitions and relay criteria are not part of the answer.
+    """
+    qualifier = ALLOW if rule.allow else DENY
+    publish = _all_topics(rule.publish)
+    subscribe = _all_topics(rule.subscribe)
+    rights: list[RosRight] = []
+    for kind, right, found in _candidates(publish, subscribe):
+        names = dds_names(right, found)
+        if all(publish.get(topic) or subscribe.get(topic) for topic in names.publish):
+            continue  # told already, as part of an action
+        if all(topic in publish for topic in names.publish) and all(
+            topic in subscribe for topic in names.subscribe
+        ):
+            rights.append(RosRight(qualifier, right, kind, found))
+            if kind != "topics":
+                for topic in names.publish:
+                    publish[topic] = True
+                for topic in names.subscribe:
+                    subscribe[topic] = True
+    rest = []
+    for right, topics in (("publish", publish), ("subscribe", subscribe)):
+        for topic, told in topics.items():
+            if told:
+                continue
+            if topic.startswith("rt/"):
+                rest.append(RosRight(qualifier, right, "topics", topic[2:]))
+            else:
+                rest.append(RosRight(qualifier, right, "dds", topic))
+    return tuple(rest + rights)
+
+
+def _all_topics(criteria: Iterable[Criteria]) -> dict[str, bool]:
+    """The topics, each with whether it was told as part of a service or action."""
+    return dict.fromkeys((topic for each in criteria for topic in each.topics), False)
+
+
+def _candidates(publish: Iterable[str], subscribe: Iterable[str]) -> Iterable[tuple[str, str, str]]:
+    """Actions, then services, of which a topic that only they have is in the rule.
+
+    Services of an action are not told apart from it unless some of its topics are missing.
+    """
+    goal = "/_action/send_goalRequest"
+    requests_out = [t for t in publish if t.startswith("rq/") and t.endswith("Request")]
+    requests_in = [t for t in subscribe if t.startswith("rq/") and t.endswith("Request")]
+    for kind, cut in (("actions", goal), ("services", "Request")):
+        for right, requests in zip(RIGHTS[kind], (requests_out, requests_in), strict=True):
+            for topic in requests:
+                if topic.endswith(cut):
+                    yield kind, right, topic[2 : -len(cut)]
