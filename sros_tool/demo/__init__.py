@@ -1,0 +1,1 @@
+"""The isolation demo: scenarios, nodes, runner, capture and verdict."""

@@ -1,0 +1,58 @@
+"""Run one ordinary rclpy node: start, report, spin, and end quietly on Ctrl-C or SIGTERM."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from sros_tool.demo.options import NodeOptions
+from sros_tool.runtime.events import EventWriter, Kind, Stage
+
+_LOG_FLUSH_SECONDS = 0.3
+"""Fast DDS logs from a thread of its own: a process that ends at once loses the reason."""
+
+
+def run_ros_node(
+    name: str,
+    options: NodeOptions,
+    arguments: Sequence[str],
+    build: Callable[[Any, EventWriter], None],
+) -> int:
+    """Create the node ``name``, let ``build`` add its endpoints, and spin until told to stop.
+
+    ``arguments`` is the whole command line, from which rclpy takes its ``--ros-args``.  Returns
+    the exit status.
+    """
+    events = EventWriter(options.report)
+    stage = Stage.IMPORT
+    try:
+        import rclpy
+        from rclpy.executors import ExternalShutdownException
+
+        stage = Stage.PARTICIPANT
+        rclpy.init(args=list(arguments))
+        node = rclpy.create_node(name)
+        stage = Stage.ENDPOINT
+        build(node, events)
+        stage = Stage.RUNNING
+        events.report(Kind.READY)
+        try:
+            rclpy.spin(node)
+        except ExternalShutdownException:
+            pass
+        finally:
+            node.destroy_node()
+            rclpy.try_shutdown()
+    except KeyboardInterrupt:
+        pass
+    except Exception as error:  # whatever ends a node must reach its report
+        reason = f"{type(error).__name__}: {error}"
+        time.sleep(_LOG_FLUSH_SECONDS)
+        sys.stdout.flush()
+        events.report(Kind.FAILED, reason, stage=stage)
+        print(f"{name}: failed at stage {stage.value}: {reason}", file=sys.stderr)
+        return 1
+    events.report(Kind.DONE)
+    return 0

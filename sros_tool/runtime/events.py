@@ -1,0 +1,137 @@
+"""What a watched process reports while it runs: one JSON object per line, appended to a file.
+
+Times are seconds of CLOCK_MONOTONIC, which all processes of a machine share.  A line is written
+with one system call, so that a reader never mixes two; a last line without its end is left for
+the next look.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from sros_tool.errors import DocumentError
+
+
+class Kind(StrEnum):
+    """What happened."""
+
+    READY = "ready"
+    REFUSED = "refused"
+    FAILED = "failed"
+    SENT = "sent"
+    HEARD = "heard"
+    SEEN = "seen"
+    DONE = "done"
+
+
+class Stage(StrEnum):
+    """How far a process had come when it was refused or failed."""
+
+    IMPORT = "import"
+    PARTICIPANT = "participant"
+    ENDPOINT = "endpoint"
+    RUNNING = "running"
+
+
+@dataclass(frozen=True)
+class Event:
+    """One report.
+
+    ``text`` is the message sent or heard, or the reason of a refusal or failure; ``count`` is how
+    many messages there were so far; ``publishers`` says how many an observer counts per topic.
+    """
+
+    kind: Kind
+    time: float
+    text: str = ""
+    count: int = 0
+    stage: Stage | None = None
+    publishers: Mapping[str, int] = field(default_factory=dict)
+
+
+class EventWriter:
+    """Appends events to a file, or drops them where there is none."""
+
+    def __init__(self, path: Path | None) -> None:
+        self._file = None
+        if path is not None:
+            flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
+            self._file = os.open(path, flags, 0o644)
+
+    def report(
+        self,
+        kind: Kind,
+        text: str = "",
+        *,
+        count: int = 0,
+        stage: Stage | None = None,
+        publishers: Mapping[str, int] | None = None,
+    ) -> None:
+        """Write one event with the present time."""
+        if self._file is None:
+            return
+        record: dict[str, Any] = {"event": kind.value, "time": round(time.monotonic(), 6)}
+        if text:
+            record["text"] = text
+        if count:
+            record["count"] = count
+        if stage is not None:
+            record["stage"] = stage.value
+        if publishers:
+            record["publishers"] = dict(publishers)
+        os.write(self._file, (json.dumps(record, ensure_ascii=False) + "\n").encode())
+
+    def close(self) -> None:
+        """Close the file."""
+        if self._file is not None:
+            os.close(self._file)
+            self._file = None
+
+
+class EventReader:
+    """Reads what has been appended since the last look; a file not there yet is empty."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._position = 0
+
+    def new_events(self) -> list[Event]:
+        """The whole lines that have come since the last call.  Raises `DocumentError`."""
+        try:
+            with self._path.open("rb") as file:
+                file.seek(self._position)
+                data = file.read()
+        except FileNotFoundError:
+            return []
+        whole = data[: data.rfind(b"\n") + 1]
+        self._position += len(whole)
+        return [_parse(line, self._path) for line in whole.splitlines()]
+
+
+def read_events(path: Path) -> list[Event]:
+    """All events in a file, oldest first.  Raises `DocumentError`."""
+    return EventReader(path).new_events()
+
+
+def _parse(line: bytes, path: Path) -> Event:
+    try:
+        record = json.loads(line)
+        return Event(
+            kind=Kind(record["event"]),
+            time=float(record["time"]),
+            text=str(record.get("text", "")),
+            count=int(record.get("count", 0)),
+            stage=Stage(record["stage"]) if "stage" in record else None,
+            publishers={str(k): int(v) for k, v in record.get("publishers", {}).items()},
+        )
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DocumentError(
+            f"cannot read the report {path}", f"A line is not ours: {error}."
+        ) from error

@@ -1,0 +1,145 @@
+"""Give the calling process a network of its own, so that a demo neither disturbs nor is disturbed.
+
+The network namespace holds nothing but a loopback interface, and vanishes with the last process
+in it.  Root needs CAP_SYS_ADMIN; everybody else a user namespace, which also grants the right to
+capture packets inside (capabilities(7), user_namespaces(7)).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import os
+import signal
+import socket
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+_CLONE_NEWUSER = 0x10000000
+_CLONE_NEWNET = 0x40000000
+_PR_SET_PDEATHSIG = 1
+
+_SIOCADDRT = 0x890B
+_SIOCGIFFLAGS = 0x8913
+_SIOCSIFFLAGS = 0x8914
+_IFF_UP = 0x1
+_IFF_MULTICAST = 0x1000
+_RTF_UP = 0x1
+
+_ALONE = 0
+_TRIAL_SECONDS = 10
+
+
+class _RouteEntry(ctypes.Structure):
+    """``struct rtentry`` of <net/route.h>."""
+
+    _fields_ = [
+        ("pad1", ctypes.c_ulong),
+        ("destination", ctypes.c_char * 16),
+        ("gateway", ctypes.c_char * 16),
+        ("mask", ctypes.c_char * 16),
+        ("flags", ctypes.c_ushort),
+        ("pad2", ctypes.c_short),
+        ("pad3", ctypes.c_ulong),
+        ("pad4", ctypes.c_void_p),
+        ("metric", ctypes.c_short),
+        ("device", ctypes.c_void_p),
+        ("mtu", ctypes.c_ulong),
+        ("window", ctypes.c_ulong),
+        ("round_trip", ctypes.c_ushort),
+    ]
+
+
+@dataclass(frozen=True)
+class Isolation:
+    """Whether a network of its own is to be had, and the reason where it is not."""
+
+    isolated: bool
+    reason: str = ""
+
+
+def try_isolation() -> Isolation:
+    """Try in a child process whether `enter_isolation` would work; the caller stays as it is."""
+    read_end, write_end = os.pipe()
+    child = os.fork()
+    if child == 0:
+        os.close(read_end)
+        signal.alarm(_TRIAL_SECONDS)
+        reason = ""
+        try:
+            enter_isolation()
+        except OSError as error:
+            reason = f"{error.strerror or error}"
+        except BaseException as error:  # a forked child must never return into its caller
+            reason = f"{error}"
+        finally:
+            os.write(write_end, (reason or "yes").encode())
+            os._exit(_ALONE)
+    os.close(write_end)
+    with os.fdopen(read_end, "rb") as answers:
+        answer = answers.read().decode("utf-8", "replace")
+    os.waitpid(child, 0)
+    if answer == "yes":
+        return Isolation(True)
+    return Isolation(False, answer or "the trial process ended without an answer")
+
+
+def enter_isolation() -> None:
+    """Move this process, with one thread only, into a network namespace of its own.
+
+    Raises `OSError` where the kernel does not let it; the process may then be half way (in a user
+    namespace without rights), so ask `try_isolation` first.
+    """
+    user, group = os.getuid(), os.getgid()
+    try:
+        _unshare(_CLONE_NEWNET)
+    except OSError:
+        _unshare(_CLONE_NEWUSER | _CLONE_NEWNET)
+        Path("/proc/self/setgroups").write_text("deny", encoding="ascii")
+        Path("/proc/self/uid_map").write_text(f"{user} {user} 1", encoding="ascii")
+        Path("/proc/self/gid_map").write_text(f"{group} {group} 1", encoding="ascii")
+    _bring_up_loopback()
+
+
+def end_with_parent() -> None:
+    """Ask the kernel to kill this process when the thread that started it ends."""
+    _libc().prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+
+
+def _libc() -> ctypes.CDLL:
+    return ctypes.CDLL(None, use_errno=True)
+
+
+def _unshare(flags: int) -> None:
+    if _libc().unshare(flags) != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, f"unshare: {os.strerror(number)}")
+
+
+def _bring_up_loopback() -> None:
+    """``ip link set lo up multicast on; ip route add 224.0.0.0/4 dev lo``, without iproute2."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker:
+        request = struct.pack("16sH14x", b"lo", 0)
+        answer = fcntl.ioctl(asker, _SIOCGIFFLAGS, request)
+        (flags,) = struct.unpack_from("H", answer, 16)
+        request = struct.pack("16sH14x", b"lo", flags | _IFF_UP | _IFF_MULTICAST)
+        fcntl.ioctl(asker, _SIOCSIFFLAGS, request)
+        _add_multicast_route(asker)
+
+
+def _add_multicast_route(asker: socket.socket) -> None:
+    device = ctypes.create_string_buffer(b"lo")
+    entry = _RouteEntry(
+        destination=_internet_address("224.0.0.0"),
+        gateway=_internet_address("0.0.0.0"),  # noqa: S104 - "no gateway", nothing is bound
+        mask=_internet_address("240.0.0.0"),
+        flags=_RTF_UP,
+        device=ctypes.addressof(device),
+    )
+    fcntl.ioctl(asker, _SIOCADDRT, bytes(entry))
+
+
+def _internet_address(text: str) -> bytes:
+    """``struct sockaddr_in`` with port 0."""
+    return struct.pack("=HH4s8x", socket.AF_INET, 0, socket.inet_aton(text))

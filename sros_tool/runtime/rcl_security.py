@@ -1,0 +1,85 @@
+"""Which enclave a process would load, by exactly the rules of ROS 2's rcl (rcl/src/rcl/security.c).
+
+The rules are unforgiving: anything but ``true`` switches security off, anything but ``Enforce``
+lets a process go on unsecured.  `spelling_warnings` finds the values that someone meant otherwise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from sros_tool.errors import SrosError
+
+ENABLE = "ROS_SECURITY_ENABLE"
+STRATEGY = "ROS_SECURITY_STRATEGY"
+KEYSTORE = "ROS_SECURITY_KEYSTORE"
+ENCLAVE_OVERRIDE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
+DOMAIN = "ROS_DOMAIN_ID"
+
+HIGHEST_DOMAIN = 230
+
+
+@dataclass(frozen=True)
+class SecurityChoice:
+    """What rcl makes of an environment: the enclave's directory, or None for no security."""
+
+    enclave: Path | None
+    note: str
+
+
+def choose_enclave(environment: Mapping[str, str], enclave: str = "/") -> SecurityChoice:
+    """The choice for a process started with ``--ros-args --enclave`` ENCLAVE.
+
+    Raises `SrosError` where rcl would not start the process: Enforce, and no such enclave.
+    """
+    if environment.get(ENABLE) != "true":
+        return SecurityChoice(None, f"security is off: {ENABLE} is not exactly 'true'")
+    enforce = environment.get(STRATEGY) == "Enforce"
+    keystore = environment.get(KEYSTORE, "")
+    name = environment.get(ENCLAVE_OVERRIDE) or enclave
+    if keystore:
+        folder = Path(keystore) / "enclaves" / name.strip("/")
+        if folder.is_dir():
+            return SecurityChoice(folder, f"security directory: {folder}")
+        why = f"The keystore {keystore} has no enclave {name}."
+    else:
+        why = f"{KEYSTORE} is not set."
+    if enforce:
+        raise SrosError("cannot start a secured process", why, f"Set {KEYSTORE} and the enclave.")
+    return SecurityChoice(None, f"running without security, as {STRATEGY} is not 'Enforce'. {why}")
+
+
+def domain_of(environment: Mapping[str, str]) -> int:
+    """The domain that `DOMAIN` names, 0 where it is not set.  Raises `SrosError`."""
+    text = environment.get(DOMAIN, "").strip() or "0"
+    if not (text.isascii() and text.isdigit() and int(text) <= HIGHEST_DOMAIN):
+        raise SrosError(
+            f"cannot use the domain {text!r}",
+            f"{DOMAIN} must be a number from 0 to {HIGHEST_DOMAIN}.",
+        )
+    return int(text)
+
+
+def spelling_warnings(environment: Mapping[str, str]) -> tuple[str, ...]:
+    """What in this environment leaves processes unsecured although security seems wanted."""
+    warnings = []
+    enable = environment.get(ENABLE)
+    if enable is not None and enable not in ("true", "", "false"):
+        warnings.append(
+            f"{ENABLE} is {enable!r}: only exactly 'true' switches security on, so every node"
+            " started here runs unsecured and says nothing about it."
+        )
+    strategy = environment.get(STRATEGY)
+    if enable == "true" and strategy != "Enforce":
+        shown = "not set" if strategy is None else repr(strategy)
+        warnings.append(
+            f"{STRATEGY} is {shown}: unless it is exactly 'Enforce', a node whose enclave or one"
+            " of whose files is missing runs unsecured."
+        )
+    elif strategy is not None and strategy not in ("Enforce", "Permissive", ""):
+        warnings.append(f"{STRATEGY} is {strategy!r}: only exactly 'Enforce' enforces.")
+    if enable == "true" and not environment.get(KEYSTORE):
+        warnings.append(f"{ENABLE} is 'true' but {KEYSTORE} is not set: no enclave is found.")
+    return tuple(warnings)
