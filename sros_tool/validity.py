@@ -68,6 +68,12 @@ def parse_duration(text: str) -> timedelta:
     )
 
 
+def duration_text(duration: timedelta) -> str:
+    """``duration`` as `parse_duration` reads it, in days where they are whole."""
+    seconds = int(duration.total_seconds())
+    return f"{seconds // 86400}d" if seconds % 86400 == 0 else f"{seconds}s"
+
+
 def iso(moment: datetime) -> str:
     """``moment`` as CCYY-MM-DDThh:mm:ssZ, in UTC."""
     return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

@@ -90,6 +90,18 @@ class DomainSet:
     def __str__(self) -> str:
         return ",".join(map(str, self.ranges))
 
+    def closed(self) -> DomainSet:
+        """The set with both ends of every range given, sorted and joined.
+
+        An open range means what Fast DDS and Cyclone make of it: from N on is N alone, up to N
+        begins at 0.
+        """
+        pairs = []
+        for part in self.ranges:
+            first = 0 if part.first is None else part.first
+            pairs.append((first, first if part.last is None else part.last))
+        return DomainSet.of(*pairs)
+
     def only(self) -> int | None:
         """The domain, if the set has just one, else None."""
         domains = list(self)

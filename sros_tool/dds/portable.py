@@ -22,8 +22,8 @@ def document_notes(what: str, permissions: Permissions, signed_bytes: int) -> It
     if signed_bytes >= MAX_SIGNED_BYTES:
         yield Note(
             "portable.document-size",
-            f"{what}: the signed permissions have {signed_bytes} bytes; from {MAX_SIGNED_BYTES} on, "
-            "the DDS handshake breaks and the node hears nobody. Use wildcards, or split the "
+            f"{what}: the signed permissions have {signed_bytes} bytes; from {MAX_SIGNED_BYTES} "
+            "on, the DDS handshake breaks and the node hears nobody. Use wildcards, or split the "
             "enclave.",
         )
     for grant in permissions.grants:

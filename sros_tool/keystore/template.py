@@ -6,6 +6,7 @@ later follows them.
 
 from __future__ import annotations
 
+import json
 import tomllib
 from dataclasses import dataclass, fields, replace
 from datetime import timedelta
@@ -16,7 +17,7 @@ from sros_tool.errors import DocumentError, SrosError
 from sros_tool.names import expression_problem
 from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.resources import templates_dir
-from sros_tool.validity import parse_duration
+from sros_tool.validity import duration_text, parse_duration
 from sros_tool.xml import read_bytes
 
 DEFAULT_TEMPLATE = "development"
@@ -29,7 +30,7 @@ _KINDS: dict[str, str] = {"topic": "topics", "service": "services", "action": "a
 class Template:
     """The choices by which a keystore is made.
 
-    ``text`` is the TOML that they were read from.  Durations count from the moment of creation.
+    Durations count from the moment at which something is created.
     """
 
     name: str
@@ -41,7 +42,6 @@ class Template:
     permissions_validity: timedelta
     default_permissions: str
     protection: DomainProtection
-    text: str = ""
 
 
 def template_names() -> tuple[str, ...]:
@@ -100,11 +100,54 @@ def parse_template(text: str, name: str) -> Template:
         permissions_validity=permissions.duration("validity"),
         default_permissions=permissions.one_of("default", (EVERYTHING, NODE_BASICS)),
         protection=_protection(table.table("protection")),
-        text=text,
     )
     for part in (authorities, certificates, permissions, table):
         part.finish()
     return template
+
+
+def render_template(template: Template) -> str:
+    """The template as TOML text; `parse_template` gives the same value back."""
+    protection = template.protection
+    lines = [
+        f"name = {_toml(template.name)}",
+        f"description = {_toml(template.description)}",
+        "\n[authorities]",
+        f'layout = "{"separate" if template.separate_authorities else "single"}"',
+        f"name = {_toml(template.authority_name)}",
+        f"validity = {_toml(duration_text(template.authority_validity))}",
+        "\n[certificates]",
+        f"validity = {_toml(duration_text(template.certificate_validity))}",
+        "\n[permissions]",
+        f"validity = {_toml(duration_text(template.permissions_validity))}",
+        f"default = {_toml(template.default_permissions)}",
+        "\n[protection]",
+        f"rtps = {_toml(protection.rtps)}",
+        f"discovery = {_toml(protection.discovery)}",
+        f"liveliness = {_toml(protection.liveliness)}",
+        f"allow_unauthenticated_participants = "
+        f"{_toml(protection.allow_unauthenticated_participants)}",
+        f"join_access_control = {_toml(protection.join_access_control)}",
+        "\n[protection.default]",
+        *_topic_lines(protection.default),
+    ]
+    items = {kind: item for item, kind in _KINDS.items()}
+    for named in protection.named:
+        lines += [f"\n[[protection.{items[named.kind]}]]", f"names = [{_toml(named.name)}]"]
+        lines += _topic_lines(named.protection)
+    return "\n".join(lines) + "\n"
+
+
+def _topic_lines(protection: TopicProtection) -> list[str]:
+    return [
+        f"{field.name} = {_toml(getattr(protection, field.name))}"
+        for field in fields(TopicProtection)
+    ]
+
+
+def _toml(value: str | bool) -> str:
+    # A JSON string is a TOML basic string.
+    return json.dumps(value) if isinstance(value, bool) else json.dumps(str(value))
 
 
 def _protection(table: _Table) -> DomainProtection:

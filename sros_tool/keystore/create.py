@@ -1,0 +1,294 @@
+"""The verbs that make a keystore and add to it, each of them one transaction."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.governance import parse_governance, render_governance
+from sros_tool.dds.portable import name_notes
+from sros_tool.errors import KeystoreError, PolicyError, UsageError
+from sros_tool.keystore.authority import (
+    Authorities,
+    Authority,
+    create_authorities,
+    load_authorities,
+)
+from sros_tool.keystore.enclave import Registrar
+from sros_tool.keystore.layout import (
+    ENCLAVES,
+    GOVERNANCE_P7S,
+    GOVERNANCE_XML,
+    PRIVATE,
+    PUBLIC,
+    SETTINGS,
+    enclave_names,
+    is_keystore,
+)
+from sros_tool.keystore.open import check_domain, load_governance, load_settings
+from sros_tool.keystore.template import Template, render_template
+from sros_tool.keystore.transaction import Change, Transaction
+from sros_tool.names import check_enclave_name
+from sros_tool.notes import Note
+from sros_tool.policy.model import Enclave, Policy
+from sros_tool.translate import governance_for
+
+Progress = Callable[[str], None]
+"""Told the name of each enclave when it is done."""
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What a verb did, or with ``dry_run`` would do.
+
+    ``created`` are new enclaves, ``changed`` those whose permissions were replaced, ``completed``
+    those of which a missing file was added, ``kept`` those that were left as they are.
+    """
+
+    root: Path
+    template: Template
+    domains: DomainSet
+    new_keystore: bool = False
+    created: tuple[str, ...] = ()
+    changed: tuple[str, ...] = ()
+    completed: tuple[str, ...] = ()
+    kept: tuple[str, ...] = ()
+    changes: tuple[Change, ...] = ()
+    notes: tuple[Note, ...] = ()
+
+
+def create_keystore(
+    root: Path,
+    *,
+    template: Template,
+    domains: DomainSet | None = None,
+    now: datetime,
+    dry_run: bool = False,
+) -> Result:
+    """Make a new keystore for ``domains`` (default: 0) by the choices of ``template``.
+
+    Raises `KeystoreError` if ``root`` is a keystore, or holds any part of one: a CA is never made
+    anew beside the remains of an older one.
+    """
+    _check_free(root)
+    with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
+        _check_free(root)  # another process may have been faster
+        domains = domains or DomainSet.of((0, 0))
+        _write_keystore(transaction, template, domains, now)
+        transaction.commit()
+    return Result(root, template, domains, True, changes=tuple(transaction.changes))
+
+
+def create_enclaves(
+    root: Path,
+    names: Sequence[str],
+    *,
+    now: datetime,
+    domain: int | None = None,
+    dry_run: bool = False,
+    progress: Progress | None = None,
+) -> Result:
+    """Make enclaves; what they may do is the default of the keystore's template.
+
+    An enclave that exists is left as it is, and completed where a file is missing: neither its
+    key nor its permissions are ever replaced.  ``domain`` is the one that the caller will use
+    (its ROS_DOMAIN_ID); it must be among those of the keystore.
+    """
+    return generate_artifacts(
+        root, enclaves=names, now=now, domain=domain, dry_run=dry_run, progress=progress
+    )
+
+
+def create_permission(
+    root: Path,
+    name: str,
+    policy: Policy,
+    *,
+    now: datetime,
+    domain: int | None = None,
+    dry_run: bool = False,
+) -> Result:
+    """Give an existing enclave the permissions that ``policy`` states for it."""
+    check_enclave_name(name)
+    _check_keystore(root)
+    if name not in set(enclave_names(root)):
+        raise KeystoreError(
+            f"enclave {name} does not exist in keystore '{root}'",
+            "",
+            f"Make it with `sros create_enclave {root} {name}`.",
+        )
+    enclave = policy.enclave(name)
+    if enclave is None:
+        there = ", ".join(each.path for each in policy.enclaves)
+        raise PolicyError(
+            f"unable to find enclave {name} in the policy '{policy.file}'", f"It has {there}."
+        )
+    return _produce(root, {name: enclave}, now, domain, dry_run, None, None, None)
+
+
+def generate_artifacts(
+    root: Path,
+    *,
+    enclaves: Sequence[str] = (),
+    policies: Sequence[Policy] = (),
+    now: datetime,
+    domain: int | None = None,
+    create: Template | None = None,
+    domains: DomainSet | None = None,
+    dry_run: bool = False,
+    progress: Progress | None = None,
+) -> Result:
+    """Make the named enclaves and those of the policies, with their permissions, all or nothing.
+
+    Permissions that a policy states replace those that an enclave had.  Where there is no
+    keystore, one is made by the template ``create``, if that is given.
+    """
+    wanted: dict[str, Enclave | None] = {check_enclave_name(name): None for name in enclaves}
+    for policy in policies:
+        for enclave in policy.enclaves:
+            other = wanted.get(enclave.path)
+            if other is not None and other != enclave:
+                raise PolicyError(
+                    f"the enclave {enclave.path} is given by two policies",
+                    f"It stands at {other.source} and at {enclave.source}, and they differ.",
+                    "Join the two.",
+                )
+            wanted[enclave.path] = enclave
+    if not is_keystore(root) and create is not None:
+        _check_typo(root)
+        _check_free(root)
+    else:
+        _check_keystore(root)
+        create = None
+    return _produce(root, wanted, now, domain, dry_run, progress, create, domains)
+
+
+def list_enclaves(root: Path) -> tuple[str, ...]:
+    """The names of the enclaves of a keystore, sorted; `KeystoreError` if it is none."""
+    _check_keystore(root)
+    return tuple(enclave_names(root))
+
+
+# ── the work ───────────────────────────────────────────────────────────────────────────────
+
+
+def _produce(
+    root: Path,
+    wanted: dict[str, Enclave | None],
+    now: datetime,
+    domain: int | None,
+    dry_run: bool,
+    progress: Progress | None,
+    create: Template | None,
+    domains: DomainSet | None,
+) -> Result:
+    fresh = create is not None
+    with Transaction(root, fresh=fresh, dry_run=dry_run) as transaction:
+        if create is not None:
+            template = create
+            domains = domains or DomainSet.of((0 if domain is None else domain,) * 2)
+            check_domain(domains, domain, root)
+            authorities = _write_keystore(transaction, template, domains, now)
+            existing: tuple[str, ...] = ()
+        else:
+            template = load_settings(root)
+            authorities = load_authorities(root, now)
+            domains = load_governance(root, authorities.permissions.certificate).domains().closed()
+            check_domain(domains, domain, root)
+            existing = tuple(enclave_names(root))
+        registrar = Registrar(transaction, authorities, template, domains, now)
+        for name, enclave in wanted.items():
+            registrar.register(name, enclave)
+            if progress:
+                progress(name)
+        transaction.commit()
+    notes = (*registrar.notes, *name_notes({*existing, *registrar.created}, registrar.created))
+    return Result(
+        root,
+        template,
+        domains,
+        fresh,
+        tuple(registrar.created),
+        tuple(registrar.changed),
+        tuple(registrar.completed),
+        tuple(registrar.kept),
+        tuple(transaction.changes),
+        notes,
+    )
+
+
+def _write_keystore(
+    transaction: Transaction, template: Template, domains: DomainSet, now: datetime
+) -> Authorities:
+    authorities = create_authorities(transaction, template, now)
+    write_governance(transaction, authorities.permissions, template, domains)
+    transaction.write(
+        SETTINGS,
+        b"# The choices by which sros made this keystore; what is added later follows them.\n"
+        + render_template(template).encode(),
+    )
+    return authorities
+
+
+def write_governance(
+    transaction: Transaction, authority: Authority, template: Template, domains: DomainSet
+) -> None:
+    """Stage the governance document of a keystore, signed, and its readable form."""
+    governance = governance_for(template.protection, domains)
+    document = render_governance(governance)
+    transaction.write(GOVERNANCE_XML, document)
+    transaction.write(
+        GOVERNANCE_P7S,
+        authority.sign(document, governance, parse_governance, "the governance document"),
+    )
+
+
+# ── what is checked first ──────────────────────────────────────────────────────────────────
+
+
+def _check_keystore(root: Path) -> None:
+    if not is_keystore(root):
+        raise KeystoreError(
+            f"'{root}' is not a valid keystore",
+            "It does not exist." if not root.exists() else f"It has no {ENCLAVES} folder in use.",
+            f"Make one with `sros create_keystore {root}`.",
+        )
+
+
+def _check_free(root: Path) -> None:
+    if is_keystore(root):
+        raise KeystoreError(
+            f"keystore '{root}' already exists",
+            "",
+            "Nothing was changed. Add to it with `sros create_enclave`, or choose another path.",
+        )
+    if root.exists() and not root.is_dir():
+        raise KeystoreError(f"'{root}' is in the way", "It is not a folder.")
+    remains = [part for part in (PUBLIC, PRIVATE, ENCLAVES) if (root / part).exists()]
+    if remains:
+        raise KeystoreError(
+            f"'{root}' holds parts of a keystore already",
+            f"There are {', '.join(remains)}; a new CA beside them would lock out every enclave "
+            "that trusts the old one.",
+            "Restore what is missing, or choose another path.",
+        )
+
+
+def _check_typo(root: Path) -> None:
+    """Refuse to make a keystore whose name is all but that of one beside it."""
+    try:
+        beside = [p.name for p in root.absolute().parent.iterdir() if p.is_dir()]
+    except OSError:
+        return
+    close = difflib.get_close_matches(root.name, beside, n=3, cutoff=0.5)
+    for name in close:
+        if is_keystore(root.absolute().parent / name):
+            raise UsageError(
+                f"'{root}' does not exist, and '{name}' beside it is a keystore",
+                "This may be a typing error, so no second keystore is made.",
+                f"Name '{root.with_name(name)}', or run `sros create_keystore {root}` first.",
+            )

@@ -1,0 +1,170 @@
+"""Puts enclaves into a keystore: key, certificate, links and signed permissions."""
+
+from __future__ import annotations
+
+import os
+from datetime import datetime
+from pathlib import Path
+
+from cryptography import x509
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.permissions import parse_permissions, render_permissions
+from sros_tool.dds.portable import document_notes
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore.authority import Authorities
+from sros_tool.keystore.defaults import default_enclave
+from sros_tool.keystore.layout import ENCLAVES, IDENTITY, PERMISSIONS, PUBLIC, enclave_folder
+from sros_tool.keystore.template import Template
+from sros_tool.keystore.transaction import Transaction
+from sros_tool.notes import Note
+from sros_tool.pki.certificates import (
+    common_name,
+    issued_by,
+    load_certificate,
+    pem,
+    subject_text,
+    validity_of,
+)
+from sros_tool.pki.keys import generate_key, key_pem, load_key
+from sros_tool.policy.model import Enclave
+from sros_tool.translate import permissions_for
+from sros_tool.validity import iso, window
+from sros_tool.xml import read_bytes
+
+
+class Registrar:
+    """Adds enclaves to one transaction and remembers what became of each."""
+
+    def __init__(
+        self,
+        transaction: Transaction,
+        authorities: Authorities,
+        template: Template,
+        domains: DomainSet,
+        now: datetime,
+    ) -> None:
+        self.created: list[str] = []
+        self.changed: list[str] = []
+        self.completed: list[str] = []
+        self.kept: list[str] = []
+        self.notes: list[Note] = []
+        self._transaction = transaction
+        self._authorities = authorities
+        self._issuer = authorities.identity.issuer()
+        self._template = template
+        self._domains = domains
+        self._now = now
+        self._certificate_validity = window(now, template.certificate_validity)
+        self._permissions_validity = window(now, template.permissions_validity).within(
+            validity_of(authorities.permissions.certificate)
+        )
+
+    def register(self, name: str, policy: Enclave | None) -> None:
+        """Make or complete an enclave; with ``policy``, give it those permissions."""
+        folder = enclave_folder(name)
+        present = self._present(folder)
+        before = len(self._transaction.changes)
+        certificate = self._identity(name, folder, present)
+        self._links(folder, present)
+        if policy is not None or "permissions.p7s" not in present:
+            self._permissions(name, folder, policy, certificate)
+        if "key.pem" not in present:
+            self.created.append(name)
+        elif "permissions.p7s" in present and policy is not None:
+            self.changed.append(name)
+        elif len(self._transaction.changes) > before:
+            self.completed.append(name)
+        else:
+            self.kept.append(name)
+
+    def _present(self, folder: str) -> set[str]:
+        path = self._transaction.root / folder
+        try:
+            names = os.listdir(path)
+        except FileNotFoundError:
+            return set()
+        # A link that leads nowhere is a file that is missing.
+        return {name for name in names if (path / name).exists()}
+
+    def _identity(self, name: str, folder: str, present: set[str]) -> x509.Certificate:
+        if "cert.pem" in present and "key.pem" in present:
+            return self._existing(name, folder)
+        if "cert.pem" in present:
+            raise KeystoreError(
+                f"enclave {name} has a certificate but no key",
+                "Its key.pem is missing, and a new key would make the certificate useless.",
+                f"Restore the key, or remove '{self._transaction.root / folder}/cert.pem' to have "
+                "both made anew.",
+            )
+        if "key.pem" in present:
+            path = self._transaction.root / folder / "key.pem"
+            key = load_key(read_bytes(path, "private key"), f"'{path}'")
+            public = key.public_key()
+        else:
+            new = generate_key()
+            public = new.public_key()
+            self._transaction.write(f"{folder}/key.pem", key_pem(new), private=True)
+        certificate = self._issuer.issue(common_name(name), public, self._certificate_validity)
+        self._transaction.write(f"{folder}/cert.pem", pem(certificate))
+        return certificate
+
+    def _existing(self, name: str, folder: str) -> x509.Certificate:
+        path = self._transaction.root / folder / "cert.pem"
+        certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+        if not issued_by(certificate, self._authorities.identity.certificate):
+            raise KeystoreError(
+                f"the certificate of enclave {name} was not issued by the identity CA of this "
+                "keystore",
+                f"'{path}' names {subject_text(certificate.issuer)} as its issuer, so no node of "
+                "this keystore would talk to it.",
+                "Restore the right certificate, or remove the enclave's folder and make it anew.",
+            )
+        validity = validity_of(certificate)
+        if not validity.contains(self._now):
+            raise KeystoreError(
+                f"the certificate of enclave {name} is not valid now",
+                f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}.",
+                f"Remove '{path}' to have a new one issued for the same key.",
+            )
+        return certificate
+
+    def _links(self, folder: str, present: set[str]) -> None:
+        up = "../" * folder.count("/")
+        for role in (IDENTITY, PERMISSIONS):
+            name = f"{role}_ca.cert.pem"
+            if name not in present:
+                self._transaction.link(f"{folder}/{name}", f"{up}../{PUBLIC}/{name}")
+        if "governance.p7s" not in present and folder != ENCLAVES:
+            self._transaction.link(f"{folder}/governance.p7s", f"{up}governance.p7s")
+
+    def _permissions(
+        self, name: str, folder: str, policy: Enclave | None, certificate: x509.Certificate
+    ) -> None:
+        enclave = policy or default_enclave(self._template.default_permissions, name)
+        if len(enclave.profiles) > 1:
+            self.notes.append(
+                Note(
+                    "policy.several-profiles",
+                    f"{name}: the rights of its {len(enclave.profiles)} <profiles> are joined. "
+                    "ros2/sros2 makes a grant of each, of which DDS reads only the first.",
+                )
+            )
+        permissions = permissions_for(
+            enclave,
+            subject=subject_text(certificate.subject),
+            validity=self._permissions_validity.within(validity_of(certificate)),
+            domains=self._domains,
+        )
+        document = render_permissions(permissions)
+        message = self._authorities.permissions.sign(
+            document, permissions, parse_permissions, f"the permissions of {name}"
+        )
+        self._transaction.write(f"{folder}/permissions.xml", document)
+        self._transaction.write(f"{folder}/permissions.p7s", message)
+        self.notes += document_notes(name, permissions, len(message))
+
+
+def enclave_path(root: Path, name: str) -> Path:
+    """The folder of an enclave of a keystore."""
+    return root / enclave_folder(name)
