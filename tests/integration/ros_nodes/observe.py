@@ -1,0 +1,109 @@
+"""Starts processes of nodes, and prints as JSON what the ROS graph says of each node.
+
+Reads from stdin ``{"domain": N, "processes": {enclave: [node, ...]}}``, nodes as in
+``run_nodes.py``.  Runs in a network of its own where the kernel allows it.  Every node is
+described by its enclave, its endpoints in ROS terms, and the DDS topics that it writes and reads
+(``raw``), both as the graph tells them.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
+
+RUN_NODES = Path(__file__).with_name("run_nodes.py")
+PATIENCE_S = 40.0
+STILL_S = 1.0
+"""The graph counts as complete when it has not changed for this long."""
+
+
+def start(enclave: str, nodes: list[dict[str, Any]]) -> subprocess.Popen[str]:
+    # Simulated time, so that the nodes subscribe to /clock as well.
+    command = [sys.executable, str(RUN_NODES), json.dumps(nodes)]
+    command += ["--ros-args", "--enclave", enclave, "-p", "use_sim_time:=true"]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=end_with_parent)
+
+
+def describe(observer: Any, name: str, ns: str) -> dict[str, Any]:
+    """The endpoints of one node; the names behind actions appear as actions only."""
+    from rclpy.action import graph
+
+    def names(found: list[tuple[str, list[str]]]) -> list[str]:
+        return sorted(each[0] for each in found if "/_action/" not in each[0])
+
+    return {
+        "publish": names(observer.get_publisher_names_and_types_by_node(name, ns)),
+        "subscribe": names(observer.get_subscriber_names_and_types_by_node(name, ns)),
+        "reply": names(observer.get_service_names_and_types_by_node(name, ns)),
+        "request": names(observer.get_client_names_and_types_by_node(name, ns)),
+        "execute": names(graph.get_action_server_names_and_types_by_node(observer, name, ns)),
+        "call": names(graph.get_action_client_names_and_types_by_node(observer, name, ns)),
+        "raw": {
+            "publish": raw(observer.get_publisher_names_and_types_by_node(name, ns, True)),
+            "subscribe": raw(observer.get_subscriber_names_and_types_by_node(name, ns, True)),
+        },
+    }
+
+
+def raw(found: list[tuple[str, list[str]]]) -> list[str]:
+    return sorted(each[0] for each in found)
+
+
+def snapshot(observer: Any) -> list[dict[str, Any]]:
+    found = []
+    for name, ns, enclave in observer.get_node_names_and_namespaces_with_enclaves():
+        if name == observer.get_name():
+            continue
+        try:
+            endpoints = describe(observer, name, ns)
+        except Exception:  # the node was announced, and is not known yet
+            endpoints = {}
+        found.append({"enclave": enclave, "ns": ns, "name": name, **endpoints})
+    return sorted(found, key=lambda each: (each["enclave"], each["ns"], each["name"]))
+
+
+def observe(wanted: int) -> list[dict[str, Any]]:
+    """The graph, once it shows ``wanted`` nodes and has come to rest."""
+    import rclpy
+
+    rclpy.init()
+    observer = rclpy.create_node("sros_test_observer", start_parameter_services=False)
+    deadline = time.monotonic() + PATIENCE_S
+    seen: list[dict[str, Any]] = []
+    since = time.monotonic()
+    while time.monotonic() < deadline:
+        now = snapshot(observer)
+        if now != seen:
+            seen, since = now, time.monotonic()
+        if len(seen) >= wanted and time.monotonic() - since > STILL_S:
+            return seen
+        time.sleep(0.1)
+    raise SystemExit(f"the graph did not come to rest with {wanted} nodes: {seen}")
+
+
+def main() -> None:
+    task = json.load(sys.stdin)
+    if try_isolation().isolated:
+        enter_isolation()
+    os.environ["ROS_DOMAIN_ID"] = str(task["domain"])
+    processes = [start(enclave, nodes) for enclave, nodes in task["processes"].items()]
+    try:
+        for process in processes:
+            if process.stdout is None or process.stdout.readline() != "ready\n":
+                raise SystemExit("a node did not start")
+        print(json.dumps(observe(sum(map(len, task["processes"].values())))))
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+if __name__ == "__main__":
+    main()
