@@ -1,0 +1,110 @@
+"""What the verbs share: the keystore argument, common options, and how results are shown."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from sros_tool.errors import UsageError
+
+if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
+
+    from sros_tool.keystore.transaction import Change
+    from sros_tool.notes import Note
+
+Decorated = TypeVar("Decorated", bound=Callable[..., Any])
+
+KEYSTORE_VARIABLE = "ROS_SECURITY_KEYSTORE"
+
+
+def now() -> datetime:
+    """The present moment: the only place where the command line asks the clock."""
+    return datetime.now(UTC)
+
+
+def json_option(function: Decorated) -> Decorated:
+    """``--json`` for a verb that reads."""
+    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(function)
+
+
+def dry_run_option(function: Decorated) -> Decorated:
+    """``--dry-run`` for a verb that writes."""
+    return click.option(
+        "--dry-run", is_flag=True, help="Say what would change, and change nothing."
+    )(function)
+
+
+def print_json(value: object) -> None:
+    """Print a value as JSON, on stdout."""
+    click.echo(json.dumps(value, indent=2, ensure_ascii=False))
+
+
+def print_notes(notes: Sequence[Note]) -> None:
+    """Print remarks, on stderr."""
+    for note in notes:
+        click.echo(f"note [{note.id}]: {note.text}", err=True)
+
+
+def print_plan(root: Path, changes: Sequence[Change]) -> None:
+    """Print what a dry run would have changed."""
+    for change in changes:
+        click.echo(f"would {change.action} {root / change.path}")
+    if not changes:
+        click.echo("nothing would change")
+
+
+def keystore_from_environment() -> Path:
+    """The keystore that $ROS_SECURITY_KEYSTORE names."""
+    root = os.environ.get(KEYSTORE_VARIABLE)
+    if not root:
+        raise UsageError(
+            "no keystore is named",
+            f"Neither is one given, nor is {KEYSTORE_VARIABLE} set.",
+            "Name the folder of the keystore.",
+        )
+    return Path(root)
+
+
+def split_root(words: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
+    """Take the keystore from the front of the arguments, or else from the environment.
+
+    The first word is the keystore, unless it can only be the name of an enclave: it starts with
+    "/", is no folder, and $ROS_SECURITY_KEYSTORE is set.
+    """
+    first = words[0] if words else ""
+    only_a_name = first.startswith("/") and not Path(first).is_dir()
+    if not first or (only_a_name and os.environ.get(KEYSTORE_VARIABLE)):
+        return keystore_from_environment(), tuple(words)
+    return Path(first), tuple(words[1:])
+
+
+def complete_keystore_and_enclave(
+    ctx: click.Context, _parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem | str]:
+    """Completes folders first, then the enclaves of the keystore that was given."""
+    from click.shell_completion import CompletionItem
+
+    from sros_tool.keystore.layout import enclave_names, is_keystore
+
+    given = ctx.params.get("words") or ()
+    root = Path(given[0]) if given else Path(os.environ.get(KEYSTORE_VARIABLE, ""))
+    if given or (os.environ.get(KEYSTORE_VARIABLE) and incomplete.startswith("/")):
+        names = enclave_names(root) if is_keystore(root) else ()
+        return [name for name in names if name.startswith(incomplete)]
+    return [CompletionItem(incomplete, type="dir")]
+
+
+def complete_template(
+    _ctx: click.Context, _parameter: click.Parameter, incomplete: str
+) -> list[str]:
+    """Completes the names of templates."""
+    from sros_tool.keystore.template import template_names
+
+    return [name for name in template_names() if name.startswith(incomplete)]

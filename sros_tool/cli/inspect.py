@@ -1,0 +1,186 @@
+"""The verb that shows what a keystore, an enclave, a certificate or a document says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+
+from sros_tool.cli.common import json_option, now, print_json
+
+_INDENT = "  "
+
+
+@click.command(
+    "inspect",
+    epilog="""\b
+Example:
+  $ sros inspect keystore/enclaves/talker/permissions.p7s
+  permissions keystore/enclaves/talker/permissions.p7s
+    signed by CN=sros permissions CA 5f0c3a1e, sha256, 2154 bytes: signature verified
+    grant /talker for CN=/talker
+      valid from 2026-11-20T05:59:44Z to 2027-05-20T05:59:44Z
+      ALLOW in domain 0
+        publish topics: /chatter, /parameter_events, /rosout
+        ...""",
+)
+@click.argument("path", type=click.Path(path_type=Path))
+@click.option(
+    "--ca",
+    "authority",
+    type=click.Path(path_type=Path),
+    help="The permissions CA certificate to verify a signed document against.",
+)
+@json_option
+def inspect(path: Path, authority: Path | None, as_json: bool) -> int:
+    """Show what PATH says: a keystore, an enclave's folder, a certificate, a key or a .p7s file.
+
+    The exit status is 1 if an enclave cannot run, or a signature does not verify.
+    """
+    from sros_tool.errors import DocumentError
+    from sros_tool.keystore.describe import describe
+
+    if not path.exists():
+        raise DocumentError(f"'{path}' does not exist")
+    described = describe(path, now=now(), authority=authority)
+    if as_json:
+        print_json(described)
+    else:
+        for line in _TEXT[described["kind"]](described):
+            click.echo(line)
+    bad = described.get("problems") or described.get("signature_verified") is False
+    return 1 if bad and described.get("signed") is not False else 0
+
+
+def _keystore(d: dict[str, Any]) -> Iterator[str]:
+    template = d["template"]
+    yield f"keystore {d['path']}, " + (
+        f"template {template}" if template else "not made by sros, or an export"
+    )
+    for role, authority in d["authorities"].items():
+        if "error" in authority:
+            yield f"  {role} CA: {authority['error']}"
+            continue
+        key = "key here" if authority["key_present"] else "key elsewhere"
+        yield (
+            f"  {role} CA {authority['subject']}, {authority['key']}, {key}, "
+            f"valid until {authority['not_after']}"
+        )
+    if d["governance"]:
+        if "error" in d["governance"]:
+            yield f"  governance: {d['governance']['error']}"
+        else:
+            yield from _indented(_governance(d["governance"]))
+    yield f"  {len(d['enclaves'])} enclaves"
+    for enclave in d["enclaves"]:
+        until = enclave["valid_until"]
+        state = "loadable" if enclave["loadable"] else "NOT LOADABLE"
+        yield f"    {enclave['name']}  {state}, certificate until {until or 'unknown'}"
+        for problem in enclave["problems"]:
+            yield f"      {problem}"
+
+
+def _enclave(d: dict[str, Any]) -> Iterator[str]:
+    yield f"enclave {d['path']}: {'loadable' if d['loadable'] else 'NOT LOADABLE'}"
+    for problem in d["problems"]:
+        yield f"  {problem}"
+    yield f"  subject {d['subject']}, valid until {d['valid_until']}"
+    yield f"  identity CA {d['identity_ca']}, permissions CA {d['permissions_ca']}"
+    yield f"  domains {d['domains']}"
+    for grant in d["permissions"] or ():
+        yield from _indented(_grant(grant))
+
+
+def _certificate(d: dict[str, Any]) -> Iterator[str]:
+    kind = "CA certificate" if d["is_ca"] else "certificate"
+    yield f"{kind} {d['path']}"
+    yield f"  subject {d['subject']}"
+    yield f"  issuer {d['issuer']}"
+    yield f"  serial {d['serial']}"
+    yield f"  {d['key']}, signed with {d['signature']}"
+    valid = "valid now" if d["valid_now"] else "NOT VALID NOW"
+    yield f"  from {d['not_before']} to {d['not_after']}: {valid}"
+    yield f"  SHA-256 {d['sha256']}"
+
+
+def _key(d: dict[str, Any]) -> Iterator[str]:
+    yield f"private key {d['path']}: {d['algorithm']}, mode {d['mode']}"
+    if d["mode"] not in ("0600", "0400"):
+        yield "  others can read it: chmod 600"
+
+
+def _permissions(d: dict[str, Any]) -> Iterator[str]:
+    yield f"permissions {d['path']}"
+    yield from _indented(_signature(d))
+    for grant in d["grants"]:
+        yield from _indented(_grant(grant))
+
+
+def _governance_file(d: dict[str, Any]) -> Iterator[str]:
+    yield f"governance {d['path']}"
+    yield from _indented(_signature(d))
+    yield from _indented(_governance(d))
+
+
+def _signature(d: dict[str, Any]) -> Iterator[str]:
+    if not d["signed"]:
+        yield "not signed"
+        return
+    verified = {True: "signature verified", False: "SIGNATURE NOT VERIFIED", None: "not verified"}
+    yield (
+        f"signed by {d['signer']}, {d['digest']}, {d['bytes']} bytes: "
+        f"{verified[d['signature_verified']]}"
+    )
+    if d["signature_problem"]:
+        yield f"  {d['signature_problem']}"
+
+
+def _grant(grant: dict[str, Any]) -> Iterator[str]:
+    yield f"grant {grant['name']} for {grant['subject']}"
+    expired = "" if grant.get("valid_now", True) else ": NOT VALID NOW"
+    yield f"  valid from {grant['not_before']} to {grant['not_after']}{expired}"
+    for rule in grant["rules"]:
+        where = f" in partitions {', '.join(rule['partitions'])}" if rule["partitions"] else ""
+        yield f"  {rule['qualifier']} in domain {rule['domains']}{where}"
+        for kind, rights in sorted(rule["rights"].items()):
+            for right, names in rights.items():
+                yield f"    {right} {kind}: {', '.join(names)}"
+    yield f"  everything else: {grant['default']}"
+
+
+def _governance(d: dict[str, Any]) -> Iterator[str]:
+    for rule in d["domain_rules"]:
+        yield f"governance of domain {rule['domains']}"
+        yield (
+            f"  rtps {rule['rtps_protection_kind']}, discovery "
+            f"{rule['discovery_protection_kind']}, liveliness "
+            f"{rule['liveliness_protection_kind']}"
+        )
+        joins = "checked" if rule["enable_join_access_control"] else "NOT CHECKED"
+        strangers = "ALLOWED" if rule["allow_unauthenticated_participants"] else "refused"
+        yield f"  permission to join {joins}, unauthenticated participants {strangers}"
+        for topic in rule["topic_rules"]:
+            checks = [
+                word for word in ("read", "write") if not topic[f"enable_{word}_access_control"]
+            ]
+            unchecked = f", {' and '.join(checks)} NOT CHECKED" if checks else ""
+            yield (
+                f"  topics {topic['topic_expression']}: data {topic['data_protection_kind']}, "
+                f"metadata {topic['metadata_protection_kind']}{unchecked}"
+            )
+
+
+def _indented(lines: Iterator[str]) -> Iterator[str]:
+    return (_INDENT + line for line in lines)
+
+
+_TEXT = {
+    "keystore": _keystore,
+    "enclave": _enclave,
+    "certificate": _certificate,
+    "private key": _key,
+    "permissions": _permissions,
+    "governance": _governance_file,
+}

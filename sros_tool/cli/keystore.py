@@ -1,0 +1,418 @@
+"""The verbs that make keystores, add to them, list them, and export from them."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from sros_tool.cli.common import (
+    complete_keystore_and_enclave,
+    complete_template,
+    dry_run_option,
+    json_option,
+    keystore_from_environment,
+    now,
+    print_json,
+    print_notes,
+    print_plan,
+    split_root,
+)
+from sros_tool.errors import UsageError
+
+if TYPE_CHECKING:
+    from sros_tool.dds.domains import DomainSet
+    from sros_tool.keystore import Result
+    from sros_tool.keystore.template import Template
+
+_FOLDER = click.Path(path_type=Path)
+
+
+def _ros_domain() -> int | None:
+    from sros_tool.runtime.environment import domain_from
+
+    return domain_from(os.environ)
+
+
+@click.command(
+    "create_keystore",
+    epilog="""\b
+Example:
+  $ sros create_keystore keystore
+  created keystore 'keystore' for domain 0
+    template development: encrypted and authenticated; every enclave may do everything until it
+    gets a policy
+    identity CA and permissions CA: separate, valid for 3650d; certificates 3650d, permissions 3650d
+  $ sros create_keystore fleet --template production --domain 10-19""",
+)
+@click.argument("root", type=_FOLDER)
+@click.option(
+    "--template",
+    "template_name",
+    default="development",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="The choices to make it by: development, production, sros2, or a TOML file.",
+    shell_complete=complete_template,
+)
+@click.option(
+    "--domain",
+    metavar="IDS",
+    help="The ROS domains it is for, as 0 or 0,7 or 10-19. [default: $ROS_DOMAIN_ID, or 0]",
+)
+@click.option(
+    "--ca-layout",
+    type=click.Choice(["separate", "single"]),
+    help="Two CAs, for identities and permissions, or one for both.",
+)
+@click.option("--ca-validity", metavar="DURATION", help="How long the CAs last, as 5y.")
+@click.option("--validity", metavar="DURATION", help="How long certificates last, as 365d.")
+@click.option("--permissions-validity", metavar="DURATION", help="How long permissions last.")
+@dry_run_option
+def create_keystore(
+    root: Path,
+    template_name: str,
+    domain: str | None,
+    ca_layout: str | None,
+    ca_validity: str | None,
+    validity: str | None,
+    permissions_validity: str | None,
+    dry_run: bool,
+) -> None:
+    """Create a keystore in the folder ROOT, by the choices of a template."""
+    from sros_tool.dds.domains import DomainSet
+    from sros_tool.keystore import create_keystore as create
+
+    ros_domain = _ros_domain() if domain is None else None
+    domains = DomainSet.parse(domain, "--domain") if domain is not None else None
+    if ros_domain is not None:
+        domains = DomainSet.of((ros_domain, ros_domain))
+    template = _choices(template_name, ca_layout, ca_validity, validity, permissions_validity)
+    result = create(root, template=template, domains=domains, now=now(), dry_run=dry_run)
+    if dry_run:
+        print_plan(root, result.changes)
+        return
+    _say_new_keystore(root, template, result.domains)
+    _say_what_is_open(template)
+
+
+def _choices(
+    name: str,
+    ca_layout: str | None,
+    ca_validity: str | None,
+    validity: str | None,
+    permissions_validity: str | None,
+) -> Template:
+    from dataclasses import replace
+
+    from sros_tool.keystore.template import load_template
+    from sros_tool.validity import parse_duration
+
+    template = load_template(name)
+    if ca_layout:
+        template = replace(template, separate_authorities=ca_layout == "separate")
+    if ca_validity:
+        template = replace(template, authority_validity=parse_duration(ca_validity))
+    if validity:
+        duration = parse_duration(validity)
+        template = replace(
+            template,
+            certificate_validity=duration,
+            permissions_validity=min(duration, template.permissions_validity),
+        )
+    if permissions_validity:
+        template = replace(template, permissions_validity=parse_duration(permissions_validity))
+    return template
+
+
+def _say_new_keystore(root: Path, template: Template, domains: DomainSet) -> None:
+    from sros_tool.validity import duration_text
+
+    layout = (
+        "identity CA and permissions CA: separate"
+        if template.separate_authorities
+        else "one CA for identity and permissions"
+    )
+    click.echo(f"created keystore '{root}' for domain {domains}")
+    click.echo(f"  template {template.name}: {template.description}")
+    click.echo(
+        f"  {layout}, valid for {duration_text(template.authority_validity)}; certificates "
+        f"{duration_text(template.certificate_validity)}, permissions "
+        f"{duration_text(template.permissions_validity)}"
+    )
+
+
+def _say_what_is_open(template: Template) -> None:
+    from sros_tool.keystore.template import EVERYTHING
+
+    if template.default_permissions == EVERYTHING:
+        click.echo(
+            "still open: a new enclave may publish, subscribe and call everything; "
+            "`sros create_permission` closes it with a policy, `--template production` from the "
+            "start.",
+            err=True,
+        )
+    if not template.separate_authorities:
+        click.echo(
+            "still open: with one CA for both jobs, Cyclone DDS 0.10 lets an enclave sign its own "
+            "permissions; `--ca-layout separate` closes it.",
+            err=True,
+        )
+
+
+@click.command(
+    "create_enclave",
+    epilog="""\b
+Example:
+  $ sros create_enclave keystore /talker /listener
+  created enclave /talker
+  created enclave /listener""",
+)
+@click.argument(
+    "words",
+    metavar="[ROOT] NAME...",
+    nargs=-1,
+    required=True,
+    shell_complete=complete_keystore_and_enclave,
+)
+@dry_run_option
+def create_enclave(words: tuple[str, ...], dry_run: bool) -> None:
+    """Create the enclaves NAME... in the keystore ROOT.
+
+    An enclave that exists keeps its key and its permissions; a file that it lacks is added.
+    """
+    from sros_tool.keystore import create_enclaves
+
+    root, names = split_root(words)
+    if not names:
+        raise UsageError("no enclave is named", "", "Name one or more, such as /talker.")
+    with _progress(len(names)) as step:
+        result = create_enclaves(
+            root, names, now=now(), domain=_ros_domain(), dry_run=dry_run, progress=step
+        )
+    _show(result, dry_run)
+
+
+@click.command(
+    "create_permission",
+    epilog="""\b
+Example:
+  $ sros create_permission keystore /talker_listener/talker policy.xml
+  replaced the permissions of enclave /talker_listener/talker""",
+)
+@click.argument(
+    "words",
+    metavar="[ROOT] NAME POLICY_FILE",
+    nargs=-1,
+    required=True,
+    shell_complete=complete_keystore_and_enclave,
+)
+@dry_run_option
+def create_permission(words: tuple[str, ...], dry_run: bool) -> None:
+    """Give the enclave NAME the permissions that the policy in POLICY_FILE states for it."""
+    from sros_tool.keystore import create_permission as create
+    from sros_tool.policy import read_policy
+
+    root, rest = split_root(words)
+    if len(rest) != 2:
+        raise UsageError("create_permission takes a keystore, an enclave and a policy file")
+    name, file = rest
+    result = create(
+        root,
+        name,
+        read_policy(Path(file)),
+        now=now(),
+        domain=_ros_domain(),
+        dry_run=dry_run,
+    )
+    _show(result, dry_run)
+
+
+class _SeveralValues(click.Command):
+    """Lets ``-e A B -e C`` mean A, B and C, as ros2/sros2 users write it; every value counts."""
+
+    several = ("-e", "--enclaves", "-p", "--policy-files")
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Repeat the option before each of its values."""
+        spread: list[str] = []
+        option, values = "", 0
+        for word in args:
+            if word.startswith("-") and word != "-":
+                option = word if word in self.several else ""
+                values = 0
+                spread.append(word)
+                continue
+            if option and values:
+                spread.append(option)
+            spread.append(word)
+            values += 1
+        return super().parse_args(ctx, spread)
+
+
+@click.command(
+    "generate_artifacts",
+    cls=_SeveralValues,
+    epilog="""\b
+Example:
+  $ sros generate_artifacts -k keystore -e /spare -p talker_listener.xml mobile_robot.xml
+  created enclave /spare
+  created enclave /talker_listener/talker
+  ...""",
+)
+@click.option("-k", "--keystore-root-path", type=_FOLDER, help="The keystore; made if missing.")
+@click.option("-e", "--enclaves", multiple=True, metavar="NAME...", help="Enclaves to create.")
+@click.option(
+    "-p",
+    "--policy-files",
+    multiple=True,
+    type=_FOLDER,
+    metavar="FILE...",
+    help="Policies whose enclaves to create, with their permissions.",
+)
+@click.option(
+    "--template",
+    "template_name",
+    default="development",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="The choices to make a missing keystore by.",
+    shell_complete=complete_template,
+)
+@dry_run_option
+def generate_artifacts(
+    keystore_root_path: Path | None,
+    enclaves: tuple[str, ...],
+    policy_files: tuple[Path, ...],
+    template_name: str,
+    dry_run: bool,
+) -> None:
+    """Create enclaves, and the permissions that policies state for them, all or nothing.
+
+    Permissions that a policy states replace those that an enclave has.
+    """
+    from sros_tool.keystore import generate_artifacts as generate
+    from sros_tool.keystore.template import load_template
+    from sros_tool.policy import read_policy
+
+    root = keystore_root_path or keystore_from_environment()
+    if not enclaves and not policy_files:
+        raise UsageError(
+            "neither an enclave nor a policy is named", "", "Give -e NAME... or -p FILE... ."
+        )
+    policies = [read_policy(path) for path in policy_files]
+    template = load_template(template_name)
+    total = len(enclaves) + sum(len(policy.enclaves) for policy in policies)
+    with _progress(total) as step:
+        result = generate(
+            root,
+            enclaves=enclaves,
+            policies=policies,
+            now=now(),
+            domain=_ros_domain(),
+            create=template,
+            dry_run=dry_run,
+            progress=step,
+        )
+    if result.new_keystore and not dry_run:
+        click.echo(f"'{root}' is not a valid keystore, creating new keystore", err=True)
+        _say_new_keystore(root, template, result.domains)
+    _show(result, dry_run)
+
+
+@contextmanager
+def _progress(total: int) -> Iterator[Callable[[str], None] | None]:
+    """A progress bar on a terminal, where there is enough to wait for."""
+    if total < 50 or not sys.stderr.isatty():
+        yield None
+        return
+    with click.progressbar(length=total, label="signing", file=sys.stderr) as bar:
+        yield lambda _name: bar.update(1)
+
+
+def _show(result: Result, dry_run: bool) -> None:
+    if dry_run:
+        print_plan(result.root, result.changes)
+    else:
+        for names, text in (
+            (result.created, "created enclave {}"),
+            (result.changed, "replaced the permissions of enclave {}"),
+            (result.completed, "completed enclave {}"),
+        ):
+            for name in names:
+                click.echo(text.format(name))
+    for name in result.kept:
+        click.echo(f"enclave {name} already exists: left as it is", err=True)
+    print_notes(result.notes)
+
+
+@click.command(
+    "list_enclaves",
+    epilog="""\b
+Example:
+  $ sros list_enclaves keystore
+  /listener
+  /talker""",
+)
+@click.argument("root", type=_FOLDER, required=False)
+@json_option
+def list_enclaves(root: Path | None, as_json: bool) -> None:
+    """List the enclaves of the keystore ROOT, sorted."""
+    from sros_tool.errors import KeystoreError
+    from sros_tool.keystore.layout import enclave_names, is_keystore
+
+    root = root or keystore_from_environment()
+    if not is_keystore(root):
+        raise KeystoreError(f"'{root}' is not a valid keystore")
+    names = list(enclave_names(root))
+    if as_json:
+        print_json({"keystore": str(root), "enclaves": names})
+        return
+    for name in names:
+        click.echo(name)
+
+
+@click.command(
+    "distribute_key",
+    epilog="""\b
+Example:
+  $ sros distribute_key keystore /talker talker.tar.gz
+  exported enclave /talker to 'talker.tar.gz'
+  $ tar -xzf talker.tar.gz -C /etc/robot/keystore      # on the robot""",
+)
+@click.argument(
+    "words",
+    metavar="[ROOT] NAME TARGET",
+    nargs=-1,
+    required=True,
+    shell_complete=complete_keystore_and_enclave,
+)
+@click.option("--force", is_flag=True, help="Replace what TARGET holds of another version.")
+@dry_run_option
+def distribute_key(words: tuple[str, ...], force: bool, dry_run: bool) -> None:
+    """Export the enclave NAME to TARGET, a folder or a .tar.gz, for the robot it runs on.
+
+    TARGET is a keystore with this enclave only: real files in place of links, and no CA key.
+    """
+    from sros_tool.keystore.export import distribute
+
+    root, rest = split_root(words)
+    if len(rest) != 2:
+        raise UsageError("distribute_key takes a keystore, an enclave and a target")
+    name, target = rest[0], Path(rest[1])
+    export = distribute(root, [name], target, now=now(), force=force, dry_run=dry_run)
+    if dry_run:
+        print_plan(target if target.is_dir() else target.parent, export.changes)
+        return
+    if not export.changes:
+        click.echo(f"'{target}' already holds enclave {name} as it is", err=True)
+        return
+    for change in export.changes:
+        if change.action == "replace":
+            click.echo(f"replaced {change.path}", err=True)
+    click.echo(f"exported enclave {name} to '{target}'")

@@ -1,0 +1,132 @@
+"""The verbs that give a process the environment of an enclave."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from pathlib import Path
+
+import click
+
+from sros_tool.cli.common import complete_keystore_and_enclave, now, split_root
+from sros_tool.errors import KeystoreError, UsageError
+
+_WORDS = click.argument(
+    "words",
+    metavar="[ROOT] NAME",
+    nargs=-1,
+    required=True,
+    shell_complete=complete_keystore_and_enclave,
+)
+_DOMAIN = click.option(
+    "--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's]"
+)
+
+
+@click.command(
+    "env",
+    epilog="""\b
+Example:
+  $ eval "$(sros env keystore /talker)"
+  $ sros env keystore /talker
+  export ROS_SECURITY_KEYSTORE=/home/robot/keystore
+  export ROS_SECURITY_ENABLE=true
+  export ROS_SECURITY_STRATEGY=Enforce
+  export ROS_SECURITY_ENCLAVE_OVERRIDE=/talker
+  export ROS_DOMAIN_ID=0""",
+)
+@_WORDS
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["sh", "fish", "json", "systemd", "docker"]),
+    default="sh",
+    show_default=True,
+    help="For a shell, a program, a systemd unit, or a Docker env-file.",
+)
+@click.option("--json", "as_json", is_flag=True, help="The same as --format json.")
+@_DOMAIN
+def env(words: tuple[str, ...], form: str, as_json: bool, domain: str | None) -> None:
+    """Print the variables with which a process runs in the enclave NAME, and only there."""
+    from sros_tool.runtime.environment import render_environment
+
+    root, rest = split_root(words)
+    if len(rest) != 1:
+        raise UsageError("env takes a keystore and one enclave")
+    variables = _variables(root, rest[0], domain)
+    click.echo(render_environment(variables, "json" if as_json else form), nl=False)
+
+
+@click.command(
+    "run",
+    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+    epilog="""\b
+Example:
+  $ sros run keystore /talker_listener/talker -- python3 -m sros_tool.demo.talker
+  [INFO] [talker]: Publishing: 'Hello World: 1'""",
+)
+@click.argument(
+    "words",
+    metavar="[ROOT] NAME -- COMMAND...",
+    nargs=-1,
+    required=True,
+    type=click.UNPROCESSED,
+    shell_complete=complete_keystore_and_enclave,
+)
+@_DOMAIN
+def run(words: tuple[str, ...], domain: str | None) -> None:
+    """Run COMMAND in the enclave NAME of the keystore ROOT, or not at all (strategy Enforce).
+
+    The enclave is checked first; what would keep the command from starting is said here, not
+    by an obscure message of the middleware.
+    """
+    root, rest = split_root(words)
+    name, command = (rest[0], [*rest[1:]]) if rest else ("", [])
+    if command[:1] == ["--"]:
+        command = command[1:]
+    if not command:
+        raise UsageError("no command is given", "", "Write `sros run ROOT NAME -- COMMAND...`.")
+    variables = _variables(root, name, domain)
+    program = shutil.which(command[0])
+    if program is None:
+        raise UsageError(f"the command '{command[0]}' is not found")
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os.execve(program, command, {**os.environ, **variables})
+
+
+def _variables(root: Path, name: str, domain_text: str | None) -> dict[str, str]:
+    from sros_tool.keystore.create import list_enclaves
+    from sros_tool.keystore.enclave import enclave_path
+    from sros_tool.keystore.verify import check_enclave
+    from sros_tool.names import check_enclave_name
+    from sros_tool.runtime.environment import (
+        DOMAIN,
+        choose_domain,
+        domain_from,
+        secured_environment,
+    )
+
+    given = {DOMAIN: domain_text} if domain_text is not None else os.environ
+    wanted = domain_from(given)
+    check_enclave_name(name)
+    names = list_enclaves(root)
+    if name not in names:
+        raise KeystoreError(
+            f"enclave {name} does not exist in keystore '{root}'",
+            f"It has {', '.join(names[:5]) or 'none'}{', ...' if len(names) > 5 else ''}.",
+            f"Make it with `sros create_enclave {root} {name}`.",
+        )
+    folder = enclave_path(root, name)
+    state = check_enclave(folder, now=now())
+    domains = state.domains()
+    domain = choose_domain(domains, wanted, root) if domains else 0
+    state = check_enclave(folder, now=now(), domain=domain)
+    if state.problems:
+        raise KeystoreError(
+            f"a process cannot run in enclave {name}",
+            "; ".join(map(str, state.problems)) + ".",
+            f"See `sros inspect {folder}`.",
+        )
+    return secured_environment(root, name, domain)

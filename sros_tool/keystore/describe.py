@@ -1,0 +1,263 @@
+"""Describes keystores, enclaves, certificates and signed documents as plain values for JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+
+from sros_tool.dds.governance import Governance, parse_governance
+from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
+from sros_tool.errors import DocumentError, SrosError
+from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.layout import (
+    GOVERNANCE_P7S,
+    PERMISSIONS,
+    ROLES,
+    SETTINGS,
+    ca_certificate,
+    ca_key,
+    enclave_names,
+    is_keystore,
+)
+from sros_tool.keystore.open import load_settings
+from sros_tool.keystore.verify import EnclaveState, check_enclave
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import load_certificate, subject_text, validity_of
+from sros_tool.pki.keys import algorithm, load_key
+from sros_tool.translate import RosRight, ros_rights
+from sros_tool.validity import iso
+from sros_tool.xml import parse, read_bytes
+
+Description = dict[str, Any]
+
+
+def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Description:
+    """What ``path`` is and says; ``kind`` tells which description follows.
+
+    Kinds: keystore, enclave, certificate, private key, permissions, governance.  ``authority`` is
+    the permissions CA certificate against which a signed document is verified; by default the one
+    that lies with it.  Raises `DocumentError` for what is none of these.
+    """
+    if path.is_dir():
+        if is_keystore(path):
+            return _keystore(path, now)
+        if any((path / name).exists() for name in ("cert.pem", "permissions.p7s")):
+            return {
+                "kind": "enclave",
+                "path": str(path),
+                **describe_enclave(check_enclave(path, now=now)),
+            }
+        raise DocumentError(
+            f"'{path}' is neither a keystore nor an enclave",
+            "It has no enclaves folder, and neither cert.pem nor permissions.p7s.",
+        )
+    data = read_bytes(path, "file")
+    try:
+        return {"path": str(path), **_file(path, data, now, authority)}
+    except SrosError as error:
+        raise DocumentError(f"'{path}' cannot be read: {error.what}", error.why) from error
+
+
+def _file(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
+    if b"-----BEGIN CERTIFICATE-----" in data:
+        certificate = load_certificate(data, "in it")
+        return {"kind": "certificate", **describe_certificate(certificate, now)}
+    if b"PRIVATE KEY-----" in data:
+        mode = path.stat().st_mode & 0o777
+        key = load_key(data, "in it")
+        return {"kind": "private key", "algorithm": algorithm(key), "mode": f"{mode:04o}"}
+    if b"multipart/signed" in data[:1000].lower():
+        return _signed(path, data, now, authority)
+    if data.lstrip()[:1] == b"<":
+        return {**_document(data, now), "signed": False, "signature_verified": False}
+    raise DocumentError(
+        "it is neither a PEM certificate or key, nor a signed document, nor XML",
+    )
+
+
+def _keystore(root: Path, now: datetime) -> Description:
+    template = load_settings(root)
+    authorities: Description = {}
+    for role in ROLES:
+        path = root / ca_certificate(role)
+        if not path.exists():
+            continue
+        try:
+            authorities[role] = {
+                **describe_certificate(
+                    load_certificate(read_bytes(path, "file"), f"'{path}'"), now
+                ),
+                "key_present": (root / ca_key(role)).exists(),
+            }
+        except SrosError as error:
+            authorities[role] = {"error": str(error)}
+    enclaves = [
+        {"name": name, **describe_enclave(check_enclave(enclave_path(root, name), now=now))}
+        for name in enclave_names(root)
+    ]
+    governance = None
+    if (root / GOVERNANCE_P7S).exists():
+        try:
+            governance = describe(root / GOVERNANCE_P7S, now=now)
+        except SrosError as error:
+            governance = {"error": str(error)}
+    problems = [f"{e['name']}: {problem}" for e in enclaves for problem in e["problems"]]
+    problems += [f"{role} CA: {a['error']}" for role, a in authorities.items() if "error" in a]
+    if governance and "error" in governance:
+        problems.append(f"governance: {governance['error']}")
+    return {
+        "kind": "keystore",
+        "path": str(root),
+        "template": template.name if (root / SETTINGS).exists() else None,
+        "authorities": authorities,
+        "governance": governance,
+        "enclaves": enclaves,
+        "problems": problems,
+    }
+
+
+def describe_enclave(state: EnclaveState) -> Description:
+    """The state of an enclave: ``loadable`` says whether a process can run in it now."""
+    domains = state.domains()
+    return {
+        "loadable": not state.problems,
+        "problems": [str(problem) for problem in state.problems],
+        "subject": subject_text(state.certificate.subject) if state.certificate else None,
+        "valid_until": iso(validity_of(state.certificate).not_after) if state.certificate else None,
+        "identity_ca": subject_text(state.identity_ca.subject) if state.identity_ca else None,
+        "permissions_ca": (
+            subject_text(state.permissions_ca.subject) if state.permissions_ca else None
+        ),
+        "domains": str(domains) if domains else None,
+        "permissions": _permissions(state.permissions) if state.permissions else None,
+        "permissions_bytes": state.permissions_bytes,
+    }
+
+
+def describe_certificate(certificate: x509.Certificate, now: datetime) -> Description:
+    """The parts of a certificate that matter to DDS Security."""
+    validity = validity_of(certificate)
+    try:
+        is_ca = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+    except x509.ExtensionNotFound:
+        is_ca = False
+    digest = certificate.signature_hash_algorithm
+    return {
+        "subject": subject_text(certificate.subject),
+        "issuer": subject_text(certificate.issuer),
+        "serial": f"{certificate.serial_number:x}",
+        "is_ca": is_ca,
+        "key": algorithm(certificate.public_key()),
+        "signature": str(digest.name) if digest else "none",
+        "sha256": certificate.fingerprint(hashes.SHA256()).hex(),
+        "not_before": iso(validity.not_before),
+        "not_after": iso(validity.not_after),
+        "valid_now": validity.contains(now),
+    }
+
+
+def _signed(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
+    signed = smime.parse(data)
+    signer = signed.signer()
+    found = authority or _authority_beside(path)
+    reason = "no permissions CA certificate lies with it; name one with --ca"
+    verified: bool | None = None
+    if found:
+        certificate = load_certificate(read_bytes(found, "certificate"), f"'{found}'")
+        try:
+            signed.verify(certificate)
+            verified, reason = True, ""
+        except SrosError as error:
+            verified, reason = False, str(error)
+    return {
+        **_document(signed.document, now),
+        "signed": True,
+        "signer": subject_text(signer.subject) if signer else None,
+        "digest": signed.digest,
+        "bytes": len(data),
+        "signature_verified": verified,
+        "signature_problem": reason,
+    }
+
+
+def _authority_beside(path: Path) -> Path | None:
+    name = f"{PERMISSIONS}_ca.cert.pem"
+    folder = path.absolute().parent
+    return next((p for p in (folder / name, folder.parent / "public" / name) if p.exists()), None)
+
+
+def _document(document: bytes, now: datetime) -> Description:
+    root = parse(document, "its content")
+    if root.find("domain_access_rules") is not None:
+        return {"kind": "governance", **_governance(parse_governance(document, "its content"))}
+    permissions = parse_permissions(document, "its content")
+    return {"kind": "permissions", "grants": _permissions(permissions, now)}
+
+
+def _permissions(permissions: Permissions, now: datetime | None = None) -> list[Description]:
+    return [_grant(grant, now) for grant in permissions.grants]
+
+
+def _grant(grant: Grant, now: datetime | None) -> Description:
+    described: Description = {
+        "name": grant.name,
+        "subject": grant.subject,
+        "not_before": grant.not_before,
+        "not_after": grant.not_after,
+    }
+    if now is not None:
+        described["valid_now"] = grant.validity.contains(now)
+    described["rules"] = [
+        {
+            "qualifier": "ALLOW" if rule.allow else "DENY",
+            "domains": str(rule.domains),
+            "rights": _rights(ros_rights(rule)),
+            "partitions": sorted(
+                {p for c in (*rule.publish, *rule.subscribe) for p in c.partitions}
+            ),
+        }
+        for rule in grant.rules
+    ]
+    described["default"] = "ALLOW" if grant.default_allow else "DENY"
+    return described
+
+
+def _rights(rights: Iterable[RosRight]) -> Description:
+    """ROS names by kind and right, such as ``{"topics": {"publish": ["/chatter"]}}``."""
+    table: Description = {}
+    for right in rights:
+        table.setdefault(right.kind, {}).setdefault(right.right, []).append(right.name)
+    return table
+
+
+def _governance(governance: Governance) -> Description:
+    return {
+        "domain_rules": [
+            {
+                "domains": str(rule.domains),
+                "allow_unauthenticated_participants": rule.allow_unauthenticated_participants,
+                "enable_join_access_control": rule.enable_join_access_control,
+                "discovery_protection_kind": str(rule.discovery_protection_kind),
+                "liveliness_protection_kind": str(rule.liveliness_protection_kind),
+                "rtps_protection_kind": str(rule.rtps_protection_kind),
+                "topic_rules": [
+                    {
+                        "topic_expression": topic.topic_expression,
+                        "data_protection_kind": str(topic.data_protection_kind),
+                        "metadata_protection_kind": str(topic.metadata_protection_kind),
+                        "enable_read_access_control": topic.enable_read_access_control,
+                        "enable_write_access_control": topic.enable_write_access_control,
+                        "enable_discovery_protection": topic.enable_discovery_protection,
+                        "enable_liveliness_protection": topic.enable_liveliness_protection,
+                    }
+                    for topic in rule.topic_access_rules
+                ],
+            }
+            for rule in governance.domain_access_rules
+        ]
+    }
