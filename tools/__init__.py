@@ -1,0 +1,1 @@
+"""What `./dev` does: sets up a checkout with Python's standard library alone, then runs it."""

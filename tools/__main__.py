@@ -1,0 +1,16 @@
+"""Start `./dev`.  Runs under any Python 3.11 or newer, isolated, before anything is installed."""
+
+import sys
+from pathlib import Path
+
+
+def main() -> int:
+    """Run the command named on the command line; return the exit status."""
+    sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+    from tools.commands import main as run
+
+    return run(sys.argv[1:])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,146 @@
+"""Packages of Debian and Ubuntu: installed by root, or only unpacked where nobody is root."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from tools.steps import output_of, root_prefix, say, succeeds
+
+_PATIENT = ["-o", "Acquire::Retries=2", "-o", "DPkg::Lock::Timeout=300"]
+
+
+def available() -> bool:
+    """Whether this system has apt and dpkg at all."""
+    return all(shutil.which(tool) for tool in ("apt-get", "apt-cache", "dpkg", "dpkg-query"))
+
+
+def install(pattern: str, lock: int | None = None) -> bool:
+    """Install, as root, the package whose name matches ``pattern`` wholly.
+
+    The package lists are brought up to date first.  False where nobody is root, where no such
+    package exists, or where apt fails; the log has its words.
+    """
+    prefix = root_prefix()
+    if prefix is None or not available():
+        return False
+    apt_get = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", *_PATIENT]
+    # One unreachable third-party source makes `update` fail while the rest is fine: go on.
+    succeeds([*apt_get, "update"], keep_open=lock)
+    name = find(pattern)
+    if name is None:
+        return False
+    say(f"installing {name} through apt")
+    return succeeds([*apt_get, "install", "-y", "--no-install-recommends", name], keep_open=lock)
+
+
+def provide_openssl(lock: int | None = None) -> None:
+    """Make sure of the `openssl` command, which the tests hold against sros' own cryptography."""
+    if shutil.which("openssl"):
+        return
+    say("no openssl command on this machine, which some tests compare with")
+    if not install("openssl", lock):
+        say("openssl cannot be installed; going on without")
+
+
+def find(pattern: str, options: Sequence[str] = ()) -> str | None:
+    """The first name of an installable package that matches ``pattern`` wholly."""
+    stem = re.match(r"[a-z0-9.+-]*", pattern)
+    names = output_of(["apt-cache", *options, "pkgnames", stem.group() if stem else ""]) or ""
+    for name in sorted(names.split()):
+        if re.fullmatch(pattern, name) and _has_candidate(name, options):
+            return name
+    return None
+
+
+def unpack(pattern: str, folder: Path, lock: int | None = None) -> bool:
+    """Download the package that matches ``pattern`` and unpack it into ``folder``, without root.
+
+    With it come the packages that it depends on and this machine does not have.  Where the
+    system's package lists know no such package or an outdated one, private lists are fetched.
+    """
+    if not available():
+        return False
+    with tempfile.TemporaryDirectory(prefix="sros-apt-") as name:
+        work = Path(name)
+        if _download(pattern, work, [], lock):
+            return _extract(work, folder, lock)
+        private = _private_lists(work)
+        succeeds(["apt-get", *_PATIENT, *private, "update"], keep_open=lock)
+        return _download(pattern, work, private, lock) and _extract(work, folder, lock)
+
+
+def needed(
+    package: str, depends: Callable[[str], str], installed: Callable[[str], bool]
+) -> list[str]:
+    """``package`` and everything that it needs, directly or not, and that is not installed.
+
+    ``depends`` answers as `apt-cache depends --important` does.  Of alternatives an installed
+    one serves; else the first that is a real package is taken.
+    """
+    wanted = [package]
+    for name in wanted:
+        for alternatives in _alternatives(depends(name)):
+            if any(installed(other) for other in alternatives):
+                continue
+            real = [other for other in alternatives if not other.startswith("<")]
+            if real and real[0] not in wanted:
+                wanted.append(real[0])
+    return wanted
+
+
+def _alternatives(answer: str) -> list[list[str]]:
+    groups: list[list[str]] = []
+    open_group = False
+    for line in answer.splitlines():
+        found = re.match(r"^ (\||\s)(?:Pre)?Depends: (\S+)", line)
+        if not found:
+            continue
+        name = found.group(2).removesuffix(":any")
+        if open_group:
+            groups[-1].append(name)
+        else:
+            groups.append([name])
+        open_group = found.group(1) == "|"
+    return groups
+
+
+def _has_candidate(name: str, options: Sequence[str]) -> bool:
+    answer = output_of(["apt-cache", *options, "policy", name]) or ""
+    return bool(re.search(r"^\s+Candidate: (?!\(none\))\S", answer, re.MULTILINE))
+
+
+def _installed(name: str) -> bool:
+    answer = output_of(["dpkg-query", "-W", "-f", "${db:Status-Status}\n", name]) or ""
+    return "installed" in answer.split()
+
+
+def _download(pattern: str, folder: Path, options: Sequence[str], lock: int | None) -> bool:
+    package = find(pattern, options)
+    if package is None:
+        return False
+
+    def depends(name: str) -> str:
+        return output_of(["apt-cache", *options, "depends", "--important", name]) or ""
+
+    names = needed(package, depends, _installed)
+    say(f"downloading {', '.join(names)}")
+    return succeeds(
+        ["apt-get", *_PATIENT, *options, "download", *names], cwd=folder, keep_open=lock
+    )
+
+
+def _extract(source: Path, target: Path, lock: int | None) -> bool:
+    archives = sorted(source.glob("*.deb"))
+    return bool(archives) and all(
+        succeeds(["dpkg", "-x", archive, target], keep_open=lock) for archive in archives
+    )
+
+
+def _private_lists(work: Path) -> list[str]:
+    for part in ("state/lists/partial", "cache/archives/partial"):
+        (work / part).mkdir(parents=True)
+    return ["-o", f"Dir::State={work}/state", "-o", f"Dir::Cache={work}/cache"]

@@ -1,0 +1,210 @@
+"""The virtual environment of the checkout: made, filled, remembered, remade when it is not whole.
+
+A record in it says what a finished setup put there; a mark says that one was interrupted.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import platform
+import shutil
+import tomllib
+from collections.abc import Iterator
+from dataclasses import replace
+
+from tools import apt
+from tools.record import (
+    LIVE_ROS,
+    PYPROJECT,
+    PYTHON,
+    UNFINISHED,
+    Record,
+    current,
+    difference,
+    distributions_now,
+    whole,
+)
+from tools.steps import (
+    CHECKOUT,
+    LOG,
+    VENV,
+    SetupError,
+    log_tail,
+    output_of,
+    root_prefix,
+    say,
+    succeeds,
+)
+
+GROUPS = ("package", "test", "ros", "ros-test")
+"""Everything that can be installed, in the order in which it is."""
+
+ROS_GROUPS = ("ros", "ros-test")
+"""Left out where a sourced ROS 2 brings rclpy, or where no wheel fits."""
+
+_TITLES = {
+    "package": "sros and what it needs",
+    "test": "what the tests need",
+    "ros": "rclpy of ROS 2 Jazzy",
+    "ros-test": "the interfaces for tests of live ROS",
+}
+
+
+def prepare(groups: list[str], record: Record, lock: int) -> Record:
+    """Make the environment if need be and install ``groups``, each one of `GROUPS`.
+
+    Returns what now stands.  Raises `SetupError`, with the end of the log, where it cannot.
+    """
+    now = current()
+    if record.surroundings == now.surroundings and record.base == now.base:
+        now = replace(now, ros_around=record.ros_around)
+    else:
+        now = replace(now, ros_around=_has_rclpy(now))
+    if not _usable(record, now):
+        _make(now, lock)
+        record = Record()
+    elif LOG.exists():
+        LOG.unlink()
+    stands = (
+        record.requirements == now.requirements
+        and record.surroundings == now.surroundings
+        and whole(record)
+    )
+    done = list(record.groups) if stands else []
+    with _unfinished():
+        for group in groups:
+            if group not in done and _install(group, now, lock):
+                done.append(group)
+    return replace(now, groups=done, distributions=distributions_now(), dds=record.dds)
+
+
+def _usable(record: Record, now: Record) -> bool:
+    """Whether the environment on disk can be built upon; refuses one that a person made."""
+    if not VENV.exists():
+        return False
+    if UNFINISHED.exists():
+        say("the last setup was interrupted: making .venv anew")
+        return False
+    if record.checkout:
+        reason = difference(record, now)
+        if reason:
+            say(f"{reason}: making .venv anew")
+        return reason is None
+    answer = output_of([PYTHON, "-I", "-c", "import platform; print(platform.python_version())"])
+    if not (VENV / "pyvenv.cfg").exists() or answer is None:
+        say("the .venv here does not run: making it anew")
+        return False
+    if answer.strip() != now.version or output_of([PYTHON, "-m", "pip", "--version"]) is None:
+        raise SetupError(
+            f"{VENV} was not made by this program, and Python {now.version} cannot build upon it"
+            f" (it runs Python {answer.strip()}). Remove it or give it another name, then run"
+            " this again."
+        )
+    say("using the .venv that is here")
+    return True
+
+
+@contextlib.contextmanager
+def _unfinished() -> Iterator[None]:
+    """Mark the environment while it changes; a kill leaves the mark, an error that pip told not."""
+    UNFINISHED.touch()
+    try:
+        yield
+    except SetupError:
+        UNFINISHED.unlink()
+        raise
+    UNFINISHED.unlink()
+
+
+def _make(now: Record, lock: int) -> None:
+    _make_sure_of_venv(now, lock)
+    if VENV.is_symlink() or VENV.is_file():
+        VENV.unlink()
+    elif VENV.exists():
+        # Without this file it is no environment, so a half removed one is never built upon.
+        (VENV / "pyvenv.cfg").unlink(missing_ok=True)
+        shutil.rmtree(VENV)
+    VENV.mkdir()
+    UNFINISHED.touch()
+    say(f"making .venv with Python {now.version}")
+    command = [now.base, "-I", "-m", "venv", str(VENV)]
+    if now.ros_around:
+        # The rclpy of a sourced ROS needs the system's numpy and yaml.
+        command.append("--system-site-packages")
+    if not succeeds(command, env=_quiet_environment(), keep_open=lock):
+        raise SetupError(f"cannot make a virtual environment in {VENV}. {log_tail()}")
+
+
+def _make_sure_of_venv(now: Record, lock: int) -> None:
+    if _has_venv():
+        return
+    package = f"python{now.version.rpartition('.')[0]}-venv"
+    if now.base.startswith("/usr/bin/") and root_prefix() is not None and apt.available():
+        say(f"this Python has no venv and ensurepip: bringing {package} through apt")
+        apt.install(package.replace(".", r"\."), lock)
+        importlib.invalidate_caches()
+        if _has_venv():
+            return
+    raise SetupError(
+        f"Python {now.version} ({now.base}) comes without venv and ensurepip, which make the"
+        " virtual environment that sros is installed into. On Debian and Ubuntu install them"
+        f" with 'sudo apt-get install {package}' and run this again; or name another Python"
+        " that has them: PYTHON=/path/to/python3 ./dev …"
+    )
+
+
+def _has_venv() -> bool:
+    return all(importlib.util.find_spec(name) for name in ("venv", "ensurepip"))
+
+
+def _install(group: str, now: Record, lock: int) -> bool:
+    """Install one group; whether it is settled.  Raises `SetupError` where nothing runs without."""
+    optional = group in ROS_GROUPS
+    if optional and (now.ros_around or not _rclpy_fits(group, now)):
+        return True
+    say(f"installing {_TITLES[group]}")
+    command = [str(PYTHON), "-m", "pip", "install", "--progress-bar=off", *_requirements(group)]
+    if succeeds(command, env=_quiet_environment(), keep_open=lock):
+        return True
+    if not optional:
+        raise SetupError(f"pip cannot install {_TITLES[group]}. {log_tail()}")
+    say(f"{_TITLES[group]} cannot be installed (see {LOG}); going on without")
+    return False
+
+
+def _requirements(group: str) -> list[str]:
+    """What pip is asked for; naming the extras' contents spares building the package again."""
+    if group == "package":
+        return ["--editable", str(CHECKOUT)]
+    if group == "ros-test":
+        return list(LIVE_ROS)
+    project = tomllib.loads(PYPROJECT.read_text(encoding="utf-8"))["project"]
+    return list(project["optional-dependencies"][group])
+
+
+def _rclpy_fits(group: str, now: Record) -> bool:
+    minor = int(now.version.split(".")[1])
+    system = f"{platform.machine()} with {platform.libc_ver()[0] or 'another libc'}"
+    if system == "x86_64 with glibc" and 10 <= minor <= 13:
+        return True
+    if group == "ros":
+        say(f"no rclpy wheel fits Python {now.version} on {system}; going on without rclpy")
+    return False
+
+
+def _quiet_environment() -> dict[str, str]:
+    env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    env |= {"PIP_DISABLE_PIP_VERSION_CHECK": "1", "PIP_NO_INPUT": "1", "PIP_USER": "0"}
+    # The ROS wheels start every Python of the environment twice unless told that they have.
+    return env | {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
+
+
+def _has_rclpy(now: Record) -> bool:
+    """Whether the interpreter, as this shell has set it up, already has an rclpy that works."""
+    if output_of([now.base, "-c", "import rclpy.node"]) is not None:
+        return True
+    if output_of([now.base, "-c", "import importlib.util as u; assert u.find_spec('rclpy')"]) == "":
+        say(f"the rclpy of the sourced ROS 2 does not work with Python {now.version} ({now.base})")
+    return False

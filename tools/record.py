@@ -1,0 +1,121 @@
+"""What a finished setup left behind: remembered, compared with what is here now."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import sys
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+from tools.steps import CHECKOUT, VENV
+
+PYTHON = VENV / "bin" / "python"
+PYPROJECT = CHECKOUT / "pyproject.toml"
+
+LIVE_ROS = ("ros-std-srvs==5.3.6", "ros-test-msgs==2.0.3")
+"""Interfaces that only the tests of a live ROS graph use; built for the rclpy wheels."""
+
+UNFINISHED = VENV / "sros-setup.unfinished"
+"""Lies there while an installer works; an environment that is found with it is not trusted."""
+
+_RECORD = VENV / "sros-setup.json"
+_SURROUNDINGS = ("PYTHONPATH", "AMENT_PREFIX_PATH", "CONDA_PREFIX")
+
+
+@dataclass(frozen=True)
+class Record:
+    """What a finished setup found and made.
+
+    ``base`` is the interpreter behind the environment, ``ros_around`` whether it has an rclpy of
+    its own (a sourced ROS 2), ``dds`` the folder of the security plugins that were found.
+    """
+
+    checkout: str = ""
+    base: str = ""
+    version: str = ""
+    requirements: str = ""
+    surroundings: str = ""
+    ros_around: bool = False
+    groups: list[str] = field(default_factory=list)
+    distributions: list[str] = field(default_factory=list)
+    dds: str | None = None
+
+
+def read_record() -> Record:
+    """What the last setup left, empty where there is none that can be trusted."""
+    try:
+        found = Record(**json.loads(_RECORD.read_text(encoding="utf-8")))
+    except (OSError, ValueError, TypeError):
+        return Record()
+    return Record() if UNFINISHED.exists() else found
+
+
+def write_record(record: Record) -> None:
+    """Remember a finished setup, whole or not at all."""
+    staged = _RECORD.with_suffix(".new")
+    staged.write_text(json.dumps(asdict(record), indent=1), encoding="utf-8")
+    staged.replace(_RECORD)
+
+
+def current() -> Record:
+    """This checkout, this interpreter and these surroundings, with nothing installed yet."""
+    requirements = PYPROJECT.read_bytes() + repr(LIVE_ROS).encode()
+    around = repr([os.environ.get(name) for name in _SURROUNDINGS]).encode()
+    return Record(
+        checkout=str(CHECKOUT),
+        base=str(base_interpreter()),
+        version=platform.python_version(),
+        requirements=hashlib.sha256(requirements).hexdigest(),
+        surroundings=hashlib.sha256(around).hexdigest(),
+    )
+
+
+def base_interpreter() -> Path:
+    """The Python behind this process, outside of any virtual environment made by links."""
+    real = Path(sys.executable).resolve()
+    if real.is_relative_to(VENV):
+        return Path(getattr(sys, "_base_executable", sys.executable)).resolve()
+    return real
+
+
+def holds(record: Record, now: Record, groups: list[str]) -> bool:
+    """Whether a recorded setup still stands and has all ``groups``."""
+    same = replace(
+        now,
+        ros_around=record.ros_around,
+        groups=record.groups,
+        distributions=record.distributions,
+        dds=record.dds,
+    )
+    return record == same and set(groups) <= set(record.groups) and whole(record)
+
+
+def difference(record: Record, now: Record) -> str | None:
+    """Why an environment must be made anew; None where it can be built upon."""
+    if record.checkout != now.checkout:
+        return f"this checkout was moved here from {record.checkout}"
+    if (record.base, record.version) != (now.base, now.version):
+        return f"Python {record.version} ({record.base}) gave way to {now.version} ({now.base})"
+    if record.ros_around != now.ros_around:
+        return f"a ROS 2 with rclpy is {'now' if now.ros_around else 'no longer'} sourced"
+    if not PYTHON.exists():
+        return "the Python in .venv is gone"
+    return None
+
+
+def whole(record: Record) -> bool:
+    """Whether the environment still has all that the setup left in it."""
+    packages = _site_packages(record.version)
+    return PYTHON.exists() and all((packages / name).exists() for name in record.distributions)
+
+
+def _site_packages(version: str) -> Path:
+    return VENV / "lib" / f"python{version.rpartition('.')[0]}" / "site-packages"
+
+
+def distributions_now() -> list[str]:
+    """The distributions in the environment, by the names of their metadata folders."""
+    return sorted(path.name for path in VENV.glob("lib/python3.*/site-packages/*.dist-info"))

@@ -1,0 +1,125 @@
+"""One step of a setup: say what is done, run an installer quietly, show its end if it fails."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import functools
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+VENV = CHECKOUT / ".venv"
+LOG = VENV / "setup.log"
+
+_PATIENCE = 1800
+"""Seconds after which an installer is taken for hung."""
+
+_TAIL = 15
+"""Lines of an installer's output that are shown when it fails."""
+
+
+class SetupError(Exception):
+    """What is missing, why, and how to get it, in one paragraph for a person."""
+
+
+def say(text: str) -> None:
+    """Tell in one line what is being done, on stderr: stdout belongs to the command's results."""
+    print(f"dev: {text}", file=sys.stderr, flush=True)
+
+
+def succeeds(
+    command: Sequence[str | Path],
+    *,
+    cwd: Path | None = None,
+    env: Mapping[str, str] | None = None,
+    keep_open: int | None = None,
+) -> bool:
+    """Run an installer with its output in the log; whether it ended with 0.
+
+    ``keep_open`` is a file descriptor that it inherits: the lock, so that an installer which
+    outlives a killed setup still keeps the next one waiting.
+    """
+    LOG.parent.mkdir(parents=True, exist_ok=True)
+    with LOG.open("ab") as log:
+        log.write(f"\n$ {' '.join(map(str, command))}\n".encode())
+        log.flush()
+        try:
+            ended = subprocess.run(
+                command,
+                cwd=cwd,
+                env=env,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                timeout=_PATIENCE,
+                pass_fds=() if keep_open is None else (keep_open,),
+                check=False,
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            log.write(f"{error}\n".encode())
+            return False
+        log.write(f"(exit status {ended.returncode})\n".encode())
+        return ended.returncode == 0
+
+
+def output_of(command: Sequence[str | Path], env: Mapping[str, str] | None = None) -> str | None:
+    """What a question to the system answers on stdout; None where it fails or cannot be asked."""
+    try:
+        ended = subprocess.run(
+            command,
+            env=env,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            timeout=60,
+            encoding="utf-8",
+            errors="replace",
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return ended.stdout if ended.returncode == 0 else None
+
+
+def log_tail() -> str:
+    """The last lines of the log, indented, with where to read the rest."""
+    try:
+        lines = LOG.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return ""
+    shown = "\n".join(f"    {line}" for line in lines[-_TAIL:])
+    return f"The end of {LOG}:\n{shown}"
+
+
+@contextlib.contextmanager
+def locked() -> Iterator[int]:
+    """Keep other setups of this checkout out; gives the descriptor that holds the lock.
+
+    The lock is on the checkout's folder itself: it leaves nothing behind, and ends with the
+    last process that has it open.
+    """
+    lock = os.open(CHECKOUT, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            say("another ./dev is setting up this checkout; waiting for it")
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        yield lock
+    finally:
+        os.close(lock)
+
+
+@functools.cache
+def root_prefix() -> list[str] | None:
+    """What to put before a command so that root runs it; None where nobody may without asking."""
+    if os.geteuid() == 0:
+        return []
+    if shutil.which("sudo") and output_of(["sudo", "-n", "true"]) is not None:
+        return ["sudo", "-n"]
+    return None
