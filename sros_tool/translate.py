@@ -167,8 +167,10 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
     rights: list[RosRight] = []
     for kind, right, found in _candidates(publish, subscribe):
         names = dds_names(right, found)
-        if all(publish.get(topic) or subscribe.get(topic) for topic in names.publish):
-            continue  # told already, as part of an action
+        told = [publish.get(topic) for topic in names.publish]
+        told += [subscribe.get(topic) for topic in names.subscribe]
+        if all(told):
+            continue  # as part of an action
         if all(topic in publish for topic in names.publish) and all(
             topic in subscribe for topic in names.subscribe
         ):

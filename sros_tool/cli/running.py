@@ -115,7 +115,8 @@ def _variables(root: Path, name: str, domain_text: str | None) -> dict[str, str]
     if name not in names:
         raise KeystoreError(
             f"enclave {name} does not exist in keystore '{root}'",
-            f"It has {', '.join(names[:5]) or 'none'}{', ...' if len(names) > 5 else ''}.",
+            f"It has {', '.join(names[:5]) or 'none'}"
+            f"{f' and {len(names) - 5} more' if len(names) > 5 else ''}.",
             f"Make it with `sros create_enclave {root} {name}`.",
         )
     folder = enclave_path(root, name)

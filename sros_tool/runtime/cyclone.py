@@ -47,9 +47,9 @@ _ENCLAVE_FILES = {
     "dds.sec.access.permissions": "permissions.p7s",
 }
 _PLUGINS = {
-    "auth": ("libdds_security_auth.so", "authentication"),
-    "access": ("libdds_security_ac.so", "access_control"),
-    "crypto": ("libdds_security_crypto.so", "crypto"),
+    "auth": ("dds_security_auth", "authentication"),
+    "access": ("dds_security_ac", "access_control"),
+    "crypto": ("dds_security_crypto", "crypto"),
 }
 _CRL_PROPERTY = "org.eclipse.cyclonedds.sec.auth.crl"
 
@@ -79,7 +79,7 @@ class Participant:
 
     def __init__(self, domain: int, enclave: Path | None = None) -> None:
         self._library = load_cyclone()
-        properties = {} if enclave is None else security_properties(self._library, enclave)
+        properties = {} if enclave is None else _secured(self._library, enclave)
         with _qos(self._library) as qos:
             for name, value in properties.items():
                 self._library.api.dds_qset_prop(qos, name.encode(), value.encode())
@@ -201,17 +201,12 @@ class Reader:
         return max(0, int(self._library.api.dds_get_matched_publications(self.handle, None, 0)))
 
 
-def security_properties(library: CycloneLibrary, enclave: Path) -> dict[str, str]:
+def security_properties(enclave: Path, plugins: Path | None) -> dict[str, str]:
     """The participant properties that make Cyclone DDS load ``enclave``, as rmw_cyclonedds does.
 
-    Raises `UnavailableError` where the plugins are missing, `DdsError` where a file is.
+    ``plugins`` is the folder of libdds_security_*.so; without one the dynamic loader looks for
+    them.  Raises `DdsError` where the enclave lacks a file.
     """
-    if library.plugins is None:
-        raise UnavailableError(
-            "cannot secure a participant with Cyclone DDS",
-            f"Its security plugins (libdds_security_*.so) do not lie beside {library.path}.",
-            INSTALL_ADVICE,
-        )
     folder = enclave.absolute()
     for name in _ENCLAVE_FILES.values():
         if not (folder / name).is_file():
@@ -223,11 +218,22 @@ def security_properties(library: CycloneLibrary, enclave: Path) -> dict[str, str
     properties = {key: f"file:{folder / name}" for key, name in _ENCLAVE_FILES.items()}
     if (folder / "crl.pem").is_file():
         properties[_CRL_PROPERTY] = f"file:{folder / 'crl.pem'}"
-    for part, (file, function) in _PLUGINS.items():
-        properties[f"dds.sec.{part}.library.path"] = str(library.plugins / file)
+    for part, (library, function) in _PLUGINS.items():
+        file = library if plugins is None else str(plugins / f"lib{library}.so")
+        properties[f"dds.sec.{part}.library.path"] = file
         properties[f"dds.sec.{part}.library.init"] = f"init_{function}"
         properties[f"dds.sec.{part}.library.finalize"] = f"finalize_{function}"
     return properties
+
+
+def _secured(library: CycloneLibrary, enclave: Path) -> dict[str, str]:
+    if library.plugins is None:
+        raise UnavailableError(
+            "cannot secure a participant with Cyclone DDS",
+            f"Its security plugins (libdds_security_*.so) do not lie beside {library.path}.",
+            INSTALL_ADVICE,
+        )
+    return security_properties(enclave, library.plugins)
 
 
 @contextmanager

@@ -189,7 +189,7 @@ def load_cyclone() -> CycloneLibrary:
     Raises `UnavailableError` where there is none, or one whose C interface is another.
     """
     api, path = _load_first()
-    version = _version_of(path)
+    version = version_of(path)
     if not version.startswith(_SUPPORTED):
         raise UnavailableError(
             f"cannot use {path}: it is Cyclone DDS {version}",
@@ -208,7 +208,7 @@ def load_cyclone() -> CycloneLibrary:
 
     sink = _LOG_SINK(keep)
     api.dds_set_log_sink(sink, None)
-    return CycloneLibrary(api, path, version, _plugins_beside(path), log, sink)
+    return CycloneLibrary(api, path, version, plugins_beside(path), log, sink)
 
 
 def _load_first() -> tuple[Any, Path]:
@@ -221,7 +221,8 @@ def _load_first() -> tuple[Any, Path]:
     reasons = []
     for name in SYSTEM_NAMES:
         try:
-            return ctypes.CDLL(name), _path_in_memory()
+            api = ctypes.CDLL(name)
+            return api, next(iter(loaded_libraries("libddsc")))
         except OSError as error:
             reasons.append(str(error))
     raise UnavailableError(
@@ -279,21 +280,21 @@ def _load_all(files: Iterable[Path]) -> None:
         waiting = failed
 
 
-def _path_in_memory() -> Path:
-    """Where the libddsc that this process really loaded lies on disk."""
-    for line in Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace").splitlines():
-        file = line.partition("/")[2]
-        if "/libddsc.so" in f"/{file}":
-            return Path(f"/{file}").resolve()
-    raise UnavailableError("cannot tell which libddsc was loaded")
+def loaded_libraries(prefix: str) -> tuple[Path, ...]:
+    """The real files of the shared libraries in this process whose names start with ``prefix``."""
+    maps = Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace")
+    files = {Path("/" + line.partition("/")[2]) for line in maps.splitlines() if "/" in line}
+    return tuple(sorted(file.resolve() for file in files if file.name.startswith(prefix)))
 
 
-def _version_of(path: Path) -> str:
+def version_of(path: Path) -> str:
+    """The version in the name of a shared library: "0.10.2" of libddsc.so.0.10.2."""
     found = re.search(r"\.so\.(\d+(?:\.\d+)+)$", path.name)
     return found.group(1) if found else "of unknown version"
 
 
-def _plugins_beside(path: Path) -> Path | None:
+def plugins_beside(path: Path) -> Path | None:
+    """The folder of the security plugins that belong to the libddsc at ``path``, or None."""
     folders = [*sorted(path.parent.glob("libddsc0*/")), path.parent]
     for folder in folders:
         if all((folder / f"libdds_security_{name}.so").is_file() for name in _PLUGINS):

@@ -11,14 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sros_tool.errors import SrosError
-
-ENABLE = "ROS_SECURITY_ENABLE"
-STRATEGY = "ROS_SECURITY_STRATEGY"
-KEYSTORE = "ROS_SECURITY_KEYSTORE"
-ENCLAVE_OVERRIDE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
-DOMAIN = "ROS_DOMAIN_ID"
-
-HIGHEST_DOMAIN = 230
+from sros_tool.runtime.environment import ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
 
 
 @dataclass(frozen=True)
@@ -38,7 +31,7 @@ def choose_enclave(environment: Mapping[str, str], enclave: str = "/") -> Securi
         return SecurityChoice(None, f"security is off: {ENABLE} is not exactly 'true'")
     enforce = environment.get(STRATEGY) == "Enforce"
     keystore = environment.get(KEYSTORE, "")
-    name = environment.get(ENCLAVE_OVERRIDE) or enclave
+    name = environment.get(ENCLAVE) or enclave
     if keystore:
         folder = Path(keystore) / "enclaves" / name.strip("/")
         if folder.is_dir():
@@ -52,14 +45,8 @@ def choose_enclave(environment: Mapping[str, str], enclave: str = "/") -> Securi
 
 
 def domain_of(environment: Mapping[str, str]) -> int:
-    """The domain that `DOMAIN` names, 0 where it is not set.  Raises `SrosError`."""
-    text = environment.get(DOMAIN, "").strip() or "0"
-    if not (text.isascii() and text.isdigit() and int(text) <= HIGHEST_DOMAIN):
-        raise SrosError(
-            f"cannot use the domain {text!r}",
-            f"{DOMAIN} must be a number from 0 to {HIGHEST_DOMAIN}.",
-        )
-    return int(text)
+    """The domain that ROS_DOMAIN_ID names, 0 where it is not set.  Raises `SrosError`."""
+    return domain_from(environment) or 0
 
 
 def spelling_warnings(environment: Mapping[str, str]) -> tuple[str, ...]:
