@@ -1,0 +1,255 @@
+"""From what the processes of a row reported to what was observed: a crash is not a refusal.
+
+Silence counts only where both sides were ready, the talker really sent, and the controls held;
+a refusal only where DDS Security said so itself, about this topic.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from sros_tool.demo.scenarios import STATUS_OF, Claim, Relation, Row, Status
+from sros_tool.runtime.events import Event, Kind, Stage
+from sros_tool.runtime.security_log import endpoint_refusal, missing_security, participant_refusal
+
+
+@dataclass(frozen=True)
+class WireCount:
+    """How many packets held a talker's text in the open, and how many of its row were protected."""
+
+    plain: int
+    protected: int
+
+
+@dataclass(frozen=True)
+class PartyRecord:
+    """What one process left behind.
+
+    ``text`` marks the messages of a talker; ``topic`` is its ROS topic; ``output`` is what it
+    printed; ``status`` its exit status (negative for a signal) if it ended before it was stopped.
+    """
+
+    text: str = ""
+    topic: str = ""
+    events: tuple[Event, ...] = ()
+    output: str = ""
+    status: int | None = None
+
+
+@dataclass(frozen=True)
+class RowRecord:
+    """What a row left behind.
+
+    ``window`` is the time (CLOCK_MONOTONIC) that counts; None where not all parties became ready.
+    ``skipped`` is the reason for which the row was not run, or "".
+    """
+
+    row: Row
+    domain: int
+    parties: Mapping[str, PartyRecord] = field(default_factory=dict)
+    window: tuple[float, float] | None = None
+    wire: Mapping[str, WireCount] = field(default_factory=dict)
+    skipped: str = ""
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was observed about one claim, and in a clause why one may believe it."""
+
+    status: Status
+    detail: str
+
+
+@dataclass(frozen=True)
+class RowResult:
+    """A line of the table: ``as_expected`` is also true of a row skipped with its reason."""
+
+    name: str
+    expected: Status
+    observed: Status
+    mechanism: str
+    detail: str
+    domain: int
+    seconds: float = 0.0
+
+    @property
+    def as_expected(self) -> bool:
+        """Whether this row lets the demo succeed."""
+        return self.observed in (self.expected, Status.SKIPPED)
+
+    def as_json(self) -> dict[str, Any]:
+        """The row as `sros demo --json` shows it."""
+        return {
+            "name": self.name,
+            "expected": self.expected.value,
+            "observed": self.observed.value,
+            "as_expected": self.as_expected,
+            "mechanism": self.mechanism,
+            "detail": self.detail,
+            "domain": self.domain,
+            "seconds": round(self.seconds, 1),
+        }
+
+
+def judge_row(record: RowRecord) -> RowResult:
+    """What was observed in a row."""
+    finding = _observe(record)
+    row = record.row
+    seconds = record.window[1] - record.window[0] if record.window else 0.0
+    return RowResult(
+        row.name,
+        row.expected,
+        finding.status,
+        row.mechanism,
+        finding.detail,
+        record.domain,
+        seconds,
+    )
+
+
+def _observe(record: RowRecord) -> Finding:
+    if record.skipped:
+        return Finding(Status.SKIPPED, record.skipped)
+    claims = [(claim, _judge_claim(claim, record)) for claim in record.row.claims]
+    controls = [(claim, _judge_claim(claim, record)) for claim in record.row.controls]
+    wrong = [finding for claim, finding in claims if finding.status is not claim.expected]
+    if wrong:
+        definite = wrong[0].status in STATUS_OF.values()
+        several = len(claims) > 1
+        status = Status.DISTURBED if several and definite else wrong[0].status
+        return Finding(status, wrong[0].detail)
+    for claim, finding in controls:
+        if finding.status is not claim.expected:
+            what = f"{claim.subject} {claim.relation} {claim.talker}".strip()
+            return Finding(
+                Status.UNDECIDED,
+                f"the control failed ({what}: {finding.status}, {finding.detail})",
+            )
+    details = [finding.detail for _, finding in claims]
+    details += [f"control: {finding.detail}" for _, finding in controls]
+    return Finding(record.row.expected, "; ".join(details))
+
+
+def _judge_claim(claim: Claim, record: RowRecord) -> Finding:
+    subject = record.parties[claim.subject]
+    if claim.relation is Relation.IS_REFUSED:
+        return _judge_refusal(claim.subject, subject)
+    for name in filter(None, (claim.subject, claim.talker)):
+        if problem := _trouble(name, record.parties[name]):
+            return problem
+    if claim.relation is Relation.STARTS:
+        return Finding(Status.STARTED, f"{claim.subject} started")
+    if record.window is None:
+        return Finding(Status.UNDECIDED, "not all processes were ready in time")
+    if claim.relation is Relation.READABLE:
+        return _judge_wire(claim, record, subject)
+    talker = record.parties[claim.talker]
+    sent = sum(1 for event in talker.events if event.kind is Kind.SENT and _inside(event, record))
+    if sent == 0:
+        return Finding(Status.UNDECIDED, f"{claim.talker} sent nothing in that time")
+    if claim.relation is Relation.SEES:
+        return _judge_view(claim, record, subject, talker)
+    mark = f"{talker.text}: "
+    heard = [e for e in subject.events if e.kind is Kind.HEARD and e.text.startswith(mark)]
+    status = STATUS_OF[Relation.HEARS, bool(heard)]
+    seconds = record.window[1] - record.window[0]
+    inside = sum(1 for event in heard if _inside(event, record))
+    return Finding(status, f"{claim.subject} heard {inside} of {sent} messages in {seconds:.1f} s")
+
+
+def _judge_refusal(name: str, record: PartyRecord) -> Finding:
+    problem = _trouble(name, record)
+    if problem is None:
+        return Finding(Status.STARTED, f"{name} was let in")
+    return problem
+
+
+def _judge_view(
+    claim: Claim, record: RowRecord, observer: PartyRecord, talker: PartyRecord
+) -> Finding:
+    looks = [e for e in observer.events if e.kind is Kind.SEEN and _inside(e, record)]
+    if not looks:
+        return Finding(Status.UNDECIDED, f"{claim.subject} did not look in that time")
+    most = max(event.publishers.get(talker.topic, 0) for event in looks)
+    return Finding(
+        STATUS_OF[Relation.SEES, most > 0],
+        f"it counts {most} publishers on {talker.topic} in {len(looks)} looks",
+    )
+
+
+def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> Finding:
+    count = record.wire.get(claim.subject)
+    if count is None:
+        return Finding(Status.UNDECIDED, "no packets were captured")
+    if count.plain:
+        return Finding(Status.READABLE, f"{count.plain} packets show the text")
+    sent = sum(1 for event in talker.events if event.kind is Kind.SENT and _inside(event, record))
+    # Silence on the wire proves nothing unless the messages went over the captured wire.
+    if count.protected * 2 < max(2, sent):
+        return Finding(
+            Status.UNDECIDED,
+            f"only {count.protected} encrypted packets were captured for {sent} messages",
+        )
+    return Finding(Status.NOT_READABLE, f"0 packets show the text, {count.protected} are encrypted")
+
+
+def _trouble(name: str, record: PartyRecord) -> Finding | None:
+    """Why a party did not run through the row, or None if it did."""
+    ready = any(event.kind is Kind.READY for event in record.events)
+    for event in record.events:
+        if event.kind is Kind.REFUSED:
+            return _refused(name, event.stage, event.text)
+        if event.kind is Kind.FAILED:
+            return _failure(name, record, event)
+    if record.status is not None:
+        return Finding(Status.CRASHED, f"{name} {_ending(record)}")
+    if not ready:
+        return Finding(Status.NOT_STARTED, f"{name} was not ready in time")
+    return None
+
+
+def _failure(name: str, record: PartyRecord, event: Event) -> Finding:
+    told = f"{record.output}\n{event.text}"
+    reason = " ".join(event.text.split())
+    if lacking := missing_security(told):
+        return Finding(Status.NOT_STARTED, f"{name}: {lacking}")
+    if event.stage is Stage.ENDPOINT:
+        own = [line for line in told.splitlines() if _speaks_of(line, record.topic)]
+        if refusal := endpoint_refusal("\n".join(own)):
+            return _refused(name, Stage.ENDPOINT, refusal)
+    if event.stage is Stage.PARTICIPANT:
+        refusal = participant_refusal(told) or endpoint_refusal(told)
+        if refusal:
+            return _refused(name, Stage.PARTICIPANT, refusal)
+    return Finding(Status.CRASHED, f"{name} failed: {reason}")
+
+
+def _speaks_of(line: str, topic: str) -> bool:
+    return f"rt{topic} " in f"{line} " or "not allowed by security" in line.lower()
+
+
+def _refused(name: str, stage: Stage | None, reason: str) -> Finding:
+    if stage is Stage.ENDPOINT:
+        return Finding(Status.REFUSED, f"{name}: {reason}")
+    return Finding(Status.NOT_STARTED, f"{name} was refused before it came to the topic: {reason}")
+
+
+def _ending(record: PartyRecord) -> str:
+    status = record.status or 0
+    if status < 0:
+        try:
+            return f"was ended by {signal.Signals(-status).name}"
+        except ValueError:
+            return f"was ended by signal {-status}"
+    last = " ".join(record.output.strip().splitlines()[-1:])
+    return f"ended by itself with status {status}. {last}".strip()
+
+
+def _inside(event: Event, record: RowRecord) -> bool:
+    if record.window is None:
+        return False
+    start, end = record.window
+    return start <= event.time <= end

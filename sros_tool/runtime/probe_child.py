@@ -1,0 +1,149 @@
+"""The process in which one DDS is asked whether it enforces security; started by `stacks` only.
+
+It joins in the enclave that the environment names, then asks for endpoints that the enclave's
+permissions allow and for some that they do not, and reports each answer.  Nothing is judged here:
+a crash of this process must not be taken for an answer.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from sros_tool.errors import SrosError
+from sros_tool.runtime.cyclone import Participant, SecurityRefusedError, security_properties
+from sros_tool.runtime.cyclone_library import (
+    loaded_libraries,
+    plugins_beside,
+    version_of,
+)
+from sros_tool.runtime.events import EventWriter, Kind, Stage
+from sros_tool.runtime.netns import enter_isolation, try_isolation
+from sros_tool.runtime.rcl_security import choose_enclave, domain_of
+
+_DDS_LIBRARIES = {
+    "libfastdds.so": "Fast DDS",
+    "libfastrtps.so": "Fast DDS",
+    "libddsc": "Cyclone DDS",
+    "libnddsc.so": "Connext",
+    "libzenohc.so": "Zenoh",
+}
+_LOG_FLUSH_SECONDS = 0.3
+
+Ask = Callable[[str, str], None]
+"""Creates an endpoint of a kind ("writer" or "reader") on a ROS topic ("/chatter")."""
+
+
+def join_rclpy() -> Ask:
+    """A node of rclpy with the RMW that ``RMW_IMPLEMENTATION`` names, or rclpy's default."""
+    import rclpy
+    from std_msgs.msg import String
+
+    rclpy.init()
+    node = rclpy.create_node("talker")
+
+    def ask(kind: str, topic: str) -> None:
+        if kind == "writer":
+            node.create_publisher(String, topic, 10)
+        else:
+            node.create_subscription(String, topic, lambda _message: None, 10)
+
+    return ask
+
+
+def join_cyclone() -> Ask:
+    """A participant of the Cyclone DDS that sros itself speaks with."""
+    participant = Participant(domain_of(os.environ), choose_enclave(os.environ).enclave)
+
+    def ask(kind: str, topic: str) -> None:
+        if kind == "writer":
+            participant.writer(f"rt{topic}")
+        else:
+            participant.reader(f"rt{topic}")
+
+    return ask
+
+
+def join_cyclonedds_package() -> Ask:
+    """A participant of the Python package ``cyclonedds``, with the libddsc that it brings."""
+    core, domain, idl, pub, sub, topics = (
+        importlib.import_module(f"cyclonedds.{name}")
+        for name in ("core", "domain", "idl", "pub", "sub", "topic")
+    )
+    enclave = choose_enclave(os.environ).enclave
+    properties = {} if enclave is None else security_properties(enclave, _package_plugins())
+    qos = core.Qos(*(core.Policy.Property(name, value) for name, value in properties.items()))
+    participant = domain.DomainParticipant(domain_of(os.environ), qos)
+    string = idl.make_idl_struct("String_", "std_msgs.msg.dds_.String_", {"data": str})
+
+    def ask(kind: str, topic: str) -> None:
+        made = topics.Topic(participant, f"rt{topic}", string)
+        (pub.DataWriter if kind == "writer" else sub.DataReader)(participant, made)
+
+    return ask
+
+
+JOINS: dict[str, Callable[[], Ask]] = {
+    "rclpy": join_rclpy,
+    "cyclone": join_cyclone,
+    "cyclonedds": join_cyclonedds_package,
+}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """``KIND REPORT ALLOWED DENIED``: join, then ask for endpoints on the two topics."""
+    kind, report, allowed, denied = sys.argv[1:] if arguments is None else arguments
+    if try_isolation().isolated:
+        enter_isolation()
+    events = EventWriter(Path(report))
+    try:
+        ask = JOINS[kind]()
+    except Exception as error:
+        stage = Stage.IMPORT if isinstance(error, ImportError) else Stage.PARTICIPANT
+        events.report(Kind.SEEN, _dds_in_memory())
+        _report_failure(events, error, stage, "")
+        return 1
+    events.report(Kind.SEEN, _dds_in_memory())
+    events.report(Kind.READY, stage=Stage.PARTICIPANT)
+    for what, topic in (("writer", allowed), ("writer", denied), ("reader", denied)):
+        try:
+            ask(what, topic)
+        except Exception as error:
+            _report_failure(events, error, Stage.ENDPOINT, f"{what} {topic}")
+        else:
+            events.report(Kind.READY, f"{what} {topic}", stage=Stage.ENDPOINT)
+    time.sleep(_LOG_FLUSH_SECONDS)
+    events.report(Kind.DONE)
+    sys.stdout.flush()
+    # What comes after the answers, such as a vendor's clean-up, must not spoil them.
+    os._exit(0)
+
+
+def _report_failure(events: EventWriter, error: Exception, stage: Stage, asked: str) -> None:
+    refused = isinstance(error, SecurityRefusedError)
+    reason = str(error) if isinstance(error, SrosError) else f"{type(error).__name__}: {error}"
+    if stage is not Stage.ENDPOINT:
+        time.sleep(_LOG_FLUSH_SECONDS)
+    text = f"{asked}\n{reason}" if asked else reason
+    events.report(Kind.REFUSED if refused else Kind.FAILED, text, stage=stage)
+
+
+def _dds_in_memory() -> str:
+    """Name, version and file of the DDS that is loaded into this process, one per line; or ""."""
+    for prefix, name in _DDS_LIBRARIES.items():
+        for file in loaded_libraries(prefix):
+            return f"{name}\n{version_of(file)}\n{file}"
+    return ""
+
+
+def _package_plugins() -> Path | None:
+    folders = (plugins_beside(file) for file in loaded_libraries("libddsc"))
+    return next((folder for folder in folders if folder is not None), None)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
