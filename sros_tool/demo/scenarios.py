@@ -140,21 +140,21 @@ _OBSERVER = Party("observer", Role.OBSERVER, Identity.NONE)
 
 ROWS: tuple[Row, ...] = (
     Row(
-        "secured talker → secured listener",
+        "secured talker to secured listener",
         Status.HEARD,
         "each proves its identity by a certificate of the same CA, and has the permission",
         (_SECURED_TALKER, _SECURED_LISTENER),
         (_hears("secured listener", "secured talker"),),
     ),
     Row(
-        "unsecured talker → unsecured listener",
+        "unsecured talker to unsecured listener",
         Status.HEARD,
         "no security on either side: the control of all rows below",
         (_OPEN_TALKER, _OPEN_LISTENER),
         (_hears("unsecured listener", "unsecured talker"),),
     ),
     Row(
-        "secured talker → unsecured listener",
+        "secured talker to unsecured listener",
         Status.NOT_HEARD,
         "a listener that cannot authenticate gets no keys, and is sent nothing",
         (_SECURED_TALKER, _OPEN_LISTENER, _SECURED_LISTENER),
@@ -162,7 +162,7 @@ ROWS: tuple[Row, ...] = (
         (_hears("secured listener", "secured talker"),),
     ),
     Row(
-        "unsecured talker → secured listener",
+        "unsecured talker to secured listener",
         Status.NOT_HEARD,
         "a listener in a closed domain ignores a talker that cannot authenticate",
         (_OPEN_TALKER, _SECURED_LISTENER, _OPEN_LISTENER),
@@ -186,7 +186,7 @@ ROWS: tuple[Row, ...] = (
         (Claim(Relation.STARTS, "secured talker"),),
     ),
     Row(
-        "talker of another keystore → secured listener",
+        "talker of another keystore to secured listener",
         Status.NOT_HEARD,
         "a certificate of another CA proves nothing here: no handshake, no keys",
         (_FOREIGN_TALKER, _SECURED_LISTENER, _FOREIGN_LISTENER),

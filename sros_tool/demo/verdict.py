@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from sros_tool.demo.scenarios import STATUS_OF, Claim, Relation, Row, Status
+from sros_tool.demo.scenarios import STATUS_OF, Claim, Party, Relation, Role, Row, Status
 from sros_tool.runtime.events import Event, Kind, Stage
 from sros_tool.runtime.security_log import endpoint_refusal, missing_security, participant_refusal
 
@@ -113,6 +113,10 @@ def judge_row(record: RowRecord) -> RowResult:
 def _observe(record: RowRecord) -> Finding:
     if record.skipped:
         return Finding(Status.SKIPPED, record.skipped)
+    for party in record.row.parties:
+        lost = _lost_observer(party, record.parties[party.name])
+        if lost:
+            return Finding(Status.SKIPPED, lost)
     claims = [(claim, _judge_claim(claim, record)) for claim in record.row.claims]
     controls = [(claim, _judge_claim(claim, record)) for claim in record.row.controls]
     wrong = [finding for claim, finding in claims if finding.status is not claim.expected]
@@ -131,6 +135,14 @@ def _observe(record: RowRecord) -> Finding:
     details = [finding.detail for _, finding in claims]
     details += [f"control: {finding.detail}" for _, finding in controls]
     return Finding(record.row.expected, "; ".join(details))
+
+
+def _lost_observer(party: Party, record: PartyRecord) -> str:
+    """Why the observer, which is the only one that always needs rclpy, could not be loaded."""
+    if party.role is not Role.OBSERVER:
+        return ""
+    failed = (e.text for e in record.events if e.kind is Kind.FAILED and e.stage is Stage.IMPORT)
+    return next((f"rclpy cannot be loaded here: {text}" for text in failed), "")
 
 
 def _judge_claim(claim: Claim, record: RowRecord) -> Finding:

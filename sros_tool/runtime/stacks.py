@@ -12,7 +12,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ from sros_tool.runtime.events import Kind, read_events
 from sros_tool.runtime.netns import end_with_parent
 from sros_tool.runtime.probing import ProbeRun, Verdict, judge
 
-PROBE_SECONDS = 30.0
+PROBE_SECONDS = 20.0
 
 _RMW_INDEX = "share/ament_index/resource_index/rmw_typesupport"
 _NOT_AN_RMW = "rmw_implementation"
@@ -64,6 +64,7 @@ class Stack:
     enforces: bool | None
     evidence: str
     advice: str = ""
+    rmw: str = ""
 
 
 def survey(probe: ProbeEnclave) -> tuple[Stack, ...]:
@@ -71,12 +72,13 @@ def survey(probe: ProbeEnclave) -> tuple[Stack, ...]:
     return (*rclpy_stacks(probe), cyclone_stack(probe), cyclonedds_package_stack(probe))
 
 
-def rclpy_stacks(probe: ProbeEnclave) -> tuple[Stack, ...]:
-    """One stack per RMW that is installed; rclpy's default first."""
+def rclpy_stacks(probe: ProbeEnclave) -> Iterator[Stack]:
+    """One stack per RMW that is installed, rclpy's choice first; each is tried when asked for."""
     if importlib.util.find_spec("rclpy") is None:
-        return (_without_rclpy(),)
-    names = rmw_implementations(os.environ)
-    return tuple(_probe_rmw(probe, name) for name in names or ("",))
+        yield _without_rclpy()
+        return
+    for name in rmw_implementations(os.environ) or ("",):
+        yield _probe_rmw(probe, name)
 
 
 def rmw_implementations(environment: Mapping[str, str]) -> tuple[str, ...]:
@@ -159,6 +161,7 @@ def _probe_rmw(probe: ProbeEnclave, rmw: str) -> Stack:
         verdict.enforces,
         verdict.evidence,
         "" if verdict.enforces else _ROS_ADVICE,
+        rmw,
     )
 
 

@@ -1,0 +1,94 @@
+"""Choose what the demo's nodes run on: rclpy where its RMW enforces security, else Cyclone DDS."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from sros_tool.demo.scenarios import Role
+from sros_tool.errors import UnavailableError
+from sros_tool.runtime.cyclone_library import INSTALL_ADVICE
+from sros_tool.runtime.stacks import ProbeEnclave, Stack, cyclone_stack, rclpy_stacks
+
+AUTO, RCLPY, CYCLONE = "auto", "rclpy", "cyclone"
+CHOICES = (AUTO, RCLPY, CYCLONE)
+
+_NO_RCLPY = (
+    "Source a ROS 2 installation from packages (its Fast DDS has DDS Security built in), or use"
+    " `--backend cyclone`."
+)
+_ON_THE_WIRE = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
+"""Without it, Fast DDS hands messages to a neighbour through shared memory, past the wire."""
+
+
+@dataclass(frozen=True)
+class Backend:
+    """What the nodes run on; ``why`` says in one line how it was chosen."""
+
+    name: str
+    dds: str
+    why: str
+    rmw: str = ""
+
+    @property
+    def rows_at_once(self) -> int:
+        """How many rows run at the same time: an rclpy node costs some 0.6 s of CPU to start."""
+        return 4 if self.name == RCLPY else 12
+
+    def command(self, role: Role) -> list[str]:
+        """The program of a node, without its options."""
+        if role is Role.OBSERVER:
+            return _module("sros_tool.demo.observer")
+        if self.name == RCLPY:
+            return _module(f"sros_tool.demo.{role.value}")
+        return [*_module("sros_tool.demo.cyclone_node"), role.value]
+
+    def environment(self, role: Role, *, wire: bool) -> Mapping[str, str]:
+        """The variables that a node needs beside those of its security."""
+        if self.name != RCLPY:
+            return {}
+        chosen = {"RMW_IMPLEMENTATION": self.rmw} if self.rmw else {}
+        return {**chosen, **(_ON_THE_WIRE if wire else {})}
+
+
+def choose_backend(wish: str, probe: ProbeEnclave) -> Backend:
+    """Find, by trying, a backend that enforces security.
+
+    ``wish`` is one of `CHOICES`.  Raises `UnavailableError` where there is none.
+    """
+    if wish == CYCLONE:
+        return _cyclone(cyclone_stack(probe), "as asked for")
+    stacks = []
+    for stack in rclpy_stacks(probe):
+        stacks.append(stack)
+        if stack.enforces:
+            why = "as asked for" if wish == RCLPY else f"{stack.name} enforces security here"
+            return Backend(RCLPY, f"{stack.dds} {stack.version}".strip(), why, stack.rmw)
+    reason = _why_not(stacks)
+    if wish == RCLPY:
+        raise UnavailableError(
+            "cannot run the demo with rclpy: no RMW here enforces security", reason, _NO_RCLPY
+        )
+    return _cyclone(cyclone_stack(probe), reason)
+
+
+def _cyclone(stack: Stack, why: str) -> Backend:
+    if not stack.enforces:
+        raise UnavailableError(
+            "cannot run the demo: no DDS here enforces security",
+            f"{stack.name}: {stack.evidence}. {why if why != 'as asked for' else ''}",
+            INSTALL_ADVICE,
+        )
+    return Backend(CYCLONE, f"{stack.dds} {stack.version}".strip(), why)
+
+
+def _why_not(stacks: Sequence[Stack]) -> str:
+    if not any(stack.present for stack in stacks):
+        return "rclpy is not here"
+    seen = "; ".join(f"{stack.rmw or 'its RMW'}: {stack.evidence}" for stack in stacks)
+    return f"rclpy does not enforce security here ({seen})"
+
+
+def _module(name: str) -> list[str]:
+    return [sys.executable, "-m", name]

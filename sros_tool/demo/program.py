@@ -1,0 +1,155 @@
+"""The whole demo: check what was asked, make keystores, choose a backend, run the rows, answer."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
+from sros_tool.demo.backend import AUTO, CYCLONE, Backend, choose_backend
+from sros_tool.demo.isolated import run_isolated
+from sros_tool.demo.keystores import DEFAULT_TOPIC, check_topic, make_keystores
+from sros_tool.demo.runner import Limits, Plan, run_plan
+from sros_tool.demo.scenarios import ROWS, Role, Row
+from sros_tool.demo.verdict import RowResult
+from sros_tool.errors import UsageError
+from sros_tool.keystore.template import Template
+from sros_tool.runtime.netns import Isolation, try_isolation
+from sros_tool.runtime.stacks import rmw_implementations
+
+DEFAULT_DOMAIN = 80
+"""The rows take this domain and those after it: below 102, where Linux hands out no port."""
+
+OWN, HOST = "own", "host"
+NETWORKS = (AUTO, HOST)
+
+_SPEAKS_DDS = ("rmw_fastrtps", "rmw_cyclonedds", "rmw_connext")
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """What was asked for; ``keep`` is the folder to leave everything in, if any."""
+
+    template: Template
+    backend: str = AUTO
+    topic: str = DEFAULT_TOPIC
+    domain: int = DEFAULT_DOMAIN
+    network: str = AUTO
+    keep: Path | None = None
+    rows: tuple[Row, ...] = ROWS
+    limits: Limits = field(default_factory=Limits)
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demo showed."""
+
+    backend: Backend
+    topic: str
+    isolation: Isolation
+    rows: tuple[RowResult, ...]
+
+    @property
+    def as_expected(self) -> bool:
+        """Whether every row is as expected or skipped with a reason."""
+        return all(row.as_expected for row in self.rows)
+
+    def as_json(self) -> dict[str, Any]:
+        """The result as `sros demo --json` shows it."""
+        return {
+            "backend": self.backend.name,
+            "dds": self.backend.dds,
+            "why": self.backend.why,
+            "topic": self.topic,
+            "own_network": self.isolation.isolated,
+            "as_expected": self.as_expected,
+            "rows": [row.as_json() for row in self.rows],
+        }
+
+
+def run_demo(options: DemoOptions, now: datetime, tell: Callable[[str], None]) -> DemoResult:
+    """Run the demo; ``tell`` gets lines about its progress.
+
+    Raises `UsageError` before anything is made, `UnavailableError` where no DDS enforces
+    security, and what making a keystore raises.
+    """
+    topic = check_topic(options.topic)
+    domains = _domains(options)
+    with _folder(options.keep) as folder:
+        spanned = DomainSet.of((domains[0], domains[-1]))
+        keystores = make_keystores(folder, topic, spanned, options.template, now)
+        tell("looking for a DDS that enforces security")
+        backend = choose_backend(options.backend, keystores.probe(topic, domains[0]))
+        tell(f"running {len(options.rows)} rows on {backend.name} ({backend.dds}): {backend.why}")
+        isolation = _isolation(options.network)
+        observer_rmw, no_observer = _observer_rmw(backend)
+        plan = Plan(
+            rows=options.rows,
+            domains=domains,
+            skips={row.name: no_observer for row in options.rows if no_observer and _looks(row)},
+            backend=backend,
+            keystores=keystores,
+            topic=topic,
+            folder=folder / "rows",
+            limits=options.limits,
+            observer_rmw=observer_rmw,
+        )
+        results = run_isolated(lambda told: run_plan(plan, "", told), isolation, tell)
+    return DemoResult(backend, topic, isolation, tuple(results))
+
+
+def _domains(options: DemoOptions) -> tuple[int, ...]:
+    last = MAX_DOMAIN - len(options.rows) + 1
+    if not 0 <= options.domain <= last:
+        raise UsageError(
+            f"the demo cannot start at domain {options.domain}",
+            f"It uses {len(options.rows)} domains in a row, and the highest is {MAX_DOMAIN}.",
+            f"Choose a domain from 0 to {last}.",
+        )
+    return tuple(range(options.domain, options.domain + len(options.rows)))
+
+
+@contextmanager
+def _folder(keep: Path | None) -> Iterator[Path]:
+    if keep is None:
+        with TemporaryDirectory(prefix="sros-demo-") as name:
+            yield Path(name)
+        return
+    if keep.exists() and (not keep.is_dir() or any(keep.iterdir())):
+        raise UsageError(
+            f"cannot keep the demo in '{keep}'",
+            "It exists, and is not an empty folder.",
+            "Name a folder that does not exist yet.",
+        )
+    keep.mkdir(parents=True, exist_ok=True)
+    yield keep.absolute()
+
+
+def _isolation(network: str) -> Isolation:
+    if network == HOST:
+        return Isolation(False, "the network of this machine was asked for")
+    return try_isolation()
+
+
+def _observer_rmw(backend: Backend) -> tuple[str, str]:
+    """The RMW of the observer beside Cyclone nodes, and why there is none, or ""."""
+    if backend.name != CYCLONE:
+        return "", ""
+    if importlib.util.find_spec("rclpy") is None:
+        return "", "rclpy is not installed here"
+    names = rmw_implementations(os.environ)
+    fitting = [name for name in names if name.startswith(_SPEAKS_DDS)]
+    if names and not fitting:
+        return "", f"no RMW here speaks DDS ({', '.join(names)})"
+    return (fitting[0] if fitting else ""), ""
+
+
+def _looks(row: Row) -> bool:
+    return any(party.role is Role.OBSERVER for party in row.parties)

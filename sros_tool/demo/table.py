@@ -1,0 +1,62 @@
+"""Show the result of the demo as text: one line per row, and under it what was seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sros_tool.demo.program import DemoResult
+from sros_tool.demo.scenarios import Status
+from sros_tool.demo.verdict import RowResult
+
+
+def demo_table(result: DemoResult) -> str:
+    """The table, with the backend above it and the verdict below."""
+    network = (
+        "a network namespace of its own"
+        if result.isolation.isolated
+        else f"the network of this machine ({result.isolation.reason})"
+    )
+    rows = result.rows
+    widths = [
+        max(len(text) for text in column)
+        for column in (
+            ["what was tried", *(row.name for row in rows)],
+            ["expected", *(row.expected for row in rows)],
+            ["observed", *(row.observed for row in rows)],
+        )
+    ]
+    lines = [
+        f"{result.backend.dds}, topic {result.topic}, in {network}",
+        f"backend {result.backend.name}: {result.backend.why}",
+        "",
+        _line("", ("what was tried", "expected", "observed"), widths),
+    ]
+    for row in rows:
+        lines += [
+            _line(_mark(row), (row.name, row.expected, row.observed), widths),
+            f"      {row.detail}",
+        ]
+    return "\n".join([*lines, "", _summary(rows)])
+
+
+def _line(mark: str, cells: Sequence[str], widths: Sequence[int]) -> str:
+    padded = (cell.ljust(width) for cell, width in zip(cells, widths, strict=True))
+    return f"{mark:<4}  {'  '.join(padded)}".rstrip()
+
+
+def _mark(row: RowResult) -> str:
+    if row.observed is Status.SKIPPED:
+        return "skip"
+    return "ok" if row.as_expected else "FAIL"
+
+
+def _summary(rows: Sequence[RowResult]) -> str:
+    wrong = sum(1 for row in rows if not row.as_expected)
+    skipped = sum(1 for row in rows if row.observed is Status.SKIPPED)
+    good = len(rows) - wrong - skipped
+    parts = [f"{good} of {len(rows)} rows as expected"]
+    if skipped:
+        parts.append(f"{skipped} skipped")
+    if wrong:
+        parts.append(f"{wrong} not as expected")
+    return ", ".join(parts) + "."
