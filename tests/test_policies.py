@@ -194,6 +194,17 @@ def test_every_node_can_start(enclave: Enclave) -> None:
         assert needed <= rights(profile)
 
 
+@pytest.mark.parametrize("path", DEFAULTS, ids=relative)
+@pytest.mark.parametrize("ns", ["/", "/front_camera", "/hall_2/conveyor"])
+def test_every_node_can_start_by_default(path: Path, ns: str) -> None:
+    """What an enclave without a policy gets is enough for any node in any namespace."""
+    (profile,) = read_policy(path).enclaves[0].all_profiles()
+    allowed = rights(profile)
+    for right, name in EVERY_NODE:
+        wanted = expand(name, ns, "driver")
+        assert [other for way, other in allowed if way == right and fnmatchcase(wanted, other)]
+
+
 @pytest.mark.parametrize("enclave", ENCLAVES.values(), ids=lambda enclave: enclave.path)
 def test_denials_take_away_something_and_mean_one_thing(enclave: Enclave) -> None:
     """Each denial cuts into a permission of the same right, and into nothing that is needed.

@@ -288,6 +288,28 @@ def test_one_name_less_uncovers_exactly_that_endpoint(system: str, path: str) ->
         assert uncovered(lacking, endpoints) == dds_endpoints(right, name), (right, name)
 
 
+def as_private(seen: dict[str, Any]) -> set[tuple[str, str]]:
+    """The endpoints of a node, with ~/ for what is its own."""
+    own = expand("~/", seen["ns"], seen["name"])
+    return {(right, name.replace(own, "~/", 1)) for right, name in ros_endpoints([seen])}
+
+
+@needs_rclpy
+def test_the_common_part_is_what_all_nodes_have_in_common() -> None:
+    nodes = [each for system in SYSTEMS for each in observed(system)]
+    ordinary = [each for each in nodes if not each["name"].startswith("transform_listener")]
+    shared = set.intersection(*(as_private(each) for each in ordinary))
+    helper = enclave_of("mobile_robot", "/mobile_robot/planner").all_profiles()[1]
+    included = {
+        (right, name)
+        for group in helper.groups
+        for right, _ in group.rights
+        for name in group.names
+    }
+    # The last one is what a node of rclcpp has more than a node of rclpy.
+    assert included == shared | {("subscribe", "/parameter_events")}
+
+
 # ── Cyclone DDS and the policy ─────────────────────────────────────────────────────────────
 
 

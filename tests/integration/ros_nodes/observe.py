@@ -13,6 +13,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -56,10 +57,10 @@ def raw(found: list[tuple[str, list[str]]]) -> list[str]:
     return sorted(each[0] for each in found)
 
 
-def snapshot(observer: Any) -> list[dict[str, Any]]:
+def snapshot(observer: Any, enclaves: Collection[str]) -> list[dict[str, Any]]:
     found = []
     for name, ns, enclave in observer.get_node_names_and_namespaces_with_enclaves():
-        if name == observer.get_name():
+        if enclave not in enclaves:  # the observer itself, or a stranger in the domain
             continue
         try:
             endpoints = describe(observer, name, ns)
@@ -69,17 +70,18 @@ def snapshot(observer: Any) -> list[dict[str, Any]]:
     return sorted(found, key=lambda each: (each["enclave"], each["ns"], each["name"]))
 
 
-def observe(wanted: int) -> list[dict[str, Any]]:
-    """The graph, once it shows ``wanted`` nodes and has come to rest."""
+def observe(processes: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
+    """The graph, once it shows the nodes of all ``processes`` and has come to rest."""
     import rclpy
 
     rclpy.init()
     observer = rclpy.create_node("sros_test_observer", start_parameter_services=False)
+    wanted = sum(map(len, processes.values()))
     deadline = time.monotonic() + PATIENCE_S
     seen: list[dict[str, Any]] = []
     since = time.monotonic()
     while time.monotonic() < deadline:
-        now = snapshot(observer)
+        now = snapshot(observer, processes)
         if now != seen:
             seen, since = now, time.monotonic()
         if len(seen) >= wanted and time.monotonic() - since > STILL_S:
@@ -98,7 +100,7 @@ def main() -> None:
         for process in processes:
             if process.stdout is None or process.stdout.readline() != "ready\n":
                 raise SystemExit("a node did not start")
-        print(json.dumps(observe(sum(map(len, task["processes"].values())))))
+        print(json.dumps(observe(task["processes"])))
     finally:
         for process in processes:
             process.kill()
