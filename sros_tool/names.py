@@ -8,7 +8,8 @@ permission translation.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from collections.abc import Callable
+from typing import NamedTuple
 
 from sros_tool.errors import InvalidNameError
 
@@ -18,6 +19,8 @@ MAX_COMMON_NAME = 64
 ROS_DISCOVERY_TOPIC = "ros_discovery_info"
 """The DDS topic by which every ROS 2 participant announces its nodes (rmw_dds_common)."""
 
+# By far the most names need no closer look: relative, private or absolute, without wildcards.
+_PLAIN = re.compile(r"(?:~?/)?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _WILDCARDS = frozenset("*?[")
 # One segment of a name in a policy: the letters of a ROS name, * ? and plain [sets].
@@ -77,6 +80,8 @@ def expression_problem(text: str) -> str:
     Allowed are relative, private (``~``, ``~/x``) and absolute ROS names, with the wildcards
     ``*``, ``?``, ``[abc]``, ``[a-c]`` and ``[!a-c]``, which every DDS vendor reads alike.
     """
+    if _PLAIN.match(text):
+        return ""
     if not text:
         return "It is empty."
     if text != text.strip() or any(c.isspace() for c in text):
@@ -126,16 +131,11 @@ def expand(name: str, ns: str, node: str) -> str:
     return prefix + name
 
 
-@dataclass(frozen=True, slots=True)
-class DdsNames:
+class DdsNames(NamedTuple):
     """The DDS topics behind one right: what its holder writes and what it reads."""
 
     publish: tuple[str, ...]
     subscribe: tuple[str, ...]
-
-
-_ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")
-_ACTION_TOPICS = ("feedback", "status")
 
 
 def dds_names(right: str, fqn: str) -> DdsNames:
@@ -147,6 +147,14 @@ def dds_names(right: str, fqn: str) -> DdsNames:
     return _DDS_NAMES[right](fqn)
 
 
+def _publisher(fqn: str) -> DdsNames:
+    return DdsNames((f"rt{fqn}",), ())
+
+
+def _subscriber(fqn: str) -> DdsNames:
+    return DdsNames((), (f"rt{fqn}",))
+
+
 def _client(fqn: str) -> DdsNames:
     return DdsNames((f"rq{fqn}Request",), (f"rr{fqn}Reply",))
 
@@ -156,22 +164,34 @@ def _server(fqn: str) -> DdsNames:
 
 
 def _action_client(fqn: str) -> DdsNames:
-    return DdsNames(
-        tuple(f"rq{fqn}/_action/{s}Request" for s in _ACTION_SERVICES),
-        tuple(f"rr{fqn}/_action/{s}Reply" for s in _ACTION_SERVICES)
-        + tuple(f"rt{fqn}/_action/{t}" for t in _ACTION_TOPICS),
-    )
+    return DdsNames(_action_requests(fqn), _action_answers(fqn))
 
 
 def _action_server(fqn: str) -> DdsNames:
-    client = _action_client(fqn)
-    replies, topics = client.subscribe[:3], client.subscribe[3:]
-    return DdsNames(replies + topics, client.publish)
+    return DdsNames(_action_answers(fqn), _action_requests(fqn))
 
 
-_DDS_NAMES = {
-    "publish": lambda fqn: DdsNames((f"rt{fqn}",), ()),
-    "subscribe": lambda fqn: DdsNames((), (f"rt{fqn}",)),
+def _action_requests(fqn: str) -> tuple[str, ...]:
+    return (
+        f"rq{fqn}/_action/cancel_goalRequest",
+        f"rq{fqn}/_action/get_resultRequest",
+        f"rq{fqn}/_action/send_goalRequest",
+    )
+
+
+def _action_answers(fqn: str) -> tuple[str, ...]:
+    return (
+        f"rr{fqn}/_action/cancel_goalReply",
+        f"rr{fqn}/_action/get_resultReply",
+        f"rr{fqn}/_action/send_goalReply",
+        f"rt{fqn}/_action/feedback",
+        f"rt{fqn}/_action/status",
+    )
+
+
+_DDS_NAMES: dict[str, Callable[[str], DdsNames]] = {
+    "publish": _publisher,
+    "subscribe": _subscriber,
     "request": _client,
     "reply": _server,
     "call": _action_client,

@@ -167,9 +167,9 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
     rights: list[RosRight] = []
     for kind, right, found in _candidates(publish, subscribe):
         names = dds_names(right, found)
-        told = [publish.get(topic) for topic in names.publish]
-        told += [subscribe.get(topic) for topic in names.subscribe]
-        if all(told):
+        told_already = [publish.get(topic) for topic in names.publish]
+        told_already += [subscribe.get(topic) for topic in names.subscribe]
+        if all(told_already):
             continue  # as part of an action
         if all(topic in publish for topic in names.publish) and all(
             topic in subscribe for topic in names.subscribe

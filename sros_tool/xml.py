@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from pathlib import Path
 
 from lxml import etree
@@ -12,8 +13,8 @@ MAX_BYTES = 16 * 1024 * 1024
 """Largest document that is read, in bytes."""
 
 
+@cache
 def _parser() -> etree.XMLParser:
-    # A parser keeps the error log of its last document, so each document has one of its own.
     return etree.XMLParser(
         resolve_entities=False,
         no_network=True,

@@ -108,18 +108,17 @@ class DomainSet:
         return domains[0] if len(domains) == 1 else None
 
 
-def write_domains(parent: etree._Element, domains: DomainSet) -> None:
-    """Append the ``<domains>`` element: ids alone, ranges with both ends."""
-    element = etree.SubElement(parent, "domains")
+def domain_lines(domains: DomainSet) -> list[str]:
+    """The ``<domains>`` element, a line each: ids alone, ranges with both ends."""
+    lines = ["<domains>"]
     for part in domains.ranges:
         if part.first == part.last:
-            etree.SubElement(element, "id").text = str(part.first)
+            lines.append(f"  <id>{part.first}</id>")
             continue
-        pair = etree.SubElement(element, "id_range")
-        if part.first is not None:
-            etree.SubElement(pair, "min").text = str(part.first)
-        if part.last is not None:
-            etree.SubElement(pair, "max").text = str(part.last)
+        low = "" if part.first is None else f"<min>{part.first}</min>"
+        high = "" if part.last is None else f"<max>{part.last}</max>"
+        lines.append(f"  <id_range>{low}{high}</id_range>")
+    return [*lines, "</domains>"]
 
 
 def read_domains(element: etree._Element) -> DomainSet:

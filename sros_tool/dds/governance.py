@@ -9,13 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
+from xml.sax.saxutils import escape
 
 from lxml import etree
 
-from sros_tool.dds.domains import DomainSet, read_domains, write_domains
+from sros_tool.dds.domains import DomainSet, domain_lines, read_domains
 from sros_tool.dds.permissions import XSI
 from sros_tool.errors import DocumentError
-from sros_tool.xml import parse, serialize, tag_of
+from sros_tool.xml import parse, tag_of
 
 SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_governance.xsd"
 
@@ -92,25 +93,33 @@ _TOPIC_FIELDS: Fields = (
 
 
 def render_governance(governance: Governance) -> bytes:
-    """The document as XML, with its elements in the order of the schema."""
-    root = etree.Element("dds", nsmap={"xsi": XSI})
-    root.set(f"{{{XSI}}}noNamespaceSchemaLocation", SCHEMA)
-    parent = etree.SubElement(root, "domain_access_rules")
+    """The document as XML in UTF-8, with its elements in the order of the schema."""
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        f'<dds xmlns:xsi="{XSI}" xsi:noNamespaceSchemaLocation="{SCHEMA}">',
+        "  <domain_access_rules>",
+    ]
     for rule in governance.domain_access_rules:
-        element = etree.SubElement(parent, "domain_rule")
-        write_domains(element, rule.domains)
-        _write_fields(element, rule, _DOMAIN_FIELDS)
-        topics = etree.SubElement(element, "topic_access_rules")
+        lines.append("    <domain_rule>")
+        lines += [f"      {line}" for line in domain_lines(rule.domains)]
+        lines += [f"      {line}" for line in _field_lines(rule, _DOMAIN_FIELDS)]
+        lines.append("      <topic_access_rules>")
         for topic in rule.topic_access_rules:
-            _write_fields(etree.SubElement(topics, "topic_rule"), topic, _TOPIC_FIELDS)
-    return serialize(root)
+            lines.append("        <topic_rule>")
+            lines += [f"          {line}" for line in _field_lines(topic, _TOPIC_FIELDS)]
+            lines.append("        </topic_rule>")
+        lines += ["      </topic_access_rules>", "    </domain_rule>"]
+    lines += ["  </domain_access_rules>", "</dds>", ""]
+    return "\n".join(lines).encode()
 
 
-def _write_fields(parent: etree._Element, value: object, fields: Fields) -> None:
+def _field_lines(value: object, fields: Fields) -> list[str]:
+    lines = []
     for name, kind in fields:
         content = getattr(value, name)
-        text = ("true" if content else "false") if kind is bool else str(content)
-        etree.SubElement(parent, name).text = text
+        text = ("true" if content else "false") if kind is bool else escape(str(content))
+        lines.append(f"<{name}>{text}</{name}>")
+    return lines
 
 
 def parse_governance(data: bytes, name: str = "the governance document") -> Governance:

@@ -7,13 +7,14 @@ omg_shared_ca_permissions of 20170901).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from xml.sax.saxutils import escape, quoteattr
 
 from lxml import etree
 
-from sros_tool.dds.domains import DomainSet, read_domains, write_domains
+from sros_tool.dds.domains import DomainSet, domain_lines, read_domains
 from sros_tool.errors import DocumentError
 from sros_tool.validity import Window, iso, parse_iso
-from sros_tool.xml import parse, serialize, tag_of
+from sros_tool.xml import parse, tag_of
 
 SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_permissions.xsd"
 XSI = "http://www.w3.org/2001/XMLSchema-instance"
@@ -74,47 +75,58 @@ def grant(name: str, subject: str, validity: Window, rules: tuple[Rule, ...]) ->
 
 
 def render_permissions(permissions: Permissions) -> bytes:
-    """The document as XML, with its elements in the order of the schema."""
-    root = etree.Element("dds", nsmap={"xsi": XSI})
-    root.set(f"{{{XSI}}}noNamespaceSchemaLocation", SCHEMA)
-    parent = etree.SubElement(root, "permissions")
+    """The document as XML in UTF-8, with its elements in the order of the schema."""
+    lines = [
+        '<?xml version="1.0" encoding="UTF-8"?>',
+        f'<dds xmlns:xsi="{XSI}" xsi:noNamespaceSchemaLocation="{SCHEMA}">',
+        "  <permissions>",
+    ]
     for each in permissions.grants:
-        element = etree.SubElement(parent, "grant", name=each.name)
-        etree.SubElement(element, "subject_name").text = each.subject
-        validity = etree.SubElement(element, "validity")
-        etree.SubElement(validity, "not_before").text = each.not_before
-        etree.SubElement(validity, "not_after").text = each.not_after
+        lines += [
+            f"    <grant name={quoteattr(each.name)}>",
+            f"      <subject_name>{escape(each.subject)}</subject_name>",
+            "      <validity>",
+            f"        <not_before>{escape(each.not_before)}</not_before>",
+            f"        <not_after>{escape(each.not_after)}</not_after>",
+            "      </validity>",
+        ]
         for rule in each.rules:
-            _write_rule(element, rule)
-        etree.SubElement(element, "default").text = "ALLOW" if each.default_allow else "DENY"
-    return serialize(root)
+            _write_rule(lines, rule)
+        default = "ALLOW" if each.default_allow else "DENY"
+        lines += [f"      <default>{default}</default>", "    </grant>"]
+    lines += ["  </permissions>", "</dds>", ""]
+    return "\n".join(lines).encode()
 
 
-def _write_rule(parent: etree._Element, rule: Rule) -> None:
-    element = etree.SubElement(parent, "allow_rule" if rule.allow else "deny_rule")
-    write_domains(element, rule.domains)
-    for tag, all_criteria in (
+def _write_rule(lines: list[str], rule: Rule) -> None:
+    tag = "allow_rule" if rule.allow else "deny_rule"
+    lines += [f"      <{tag}>", *(f"        {line}" for line in domain_lines(rule.domains))]
+    for name, all_criteria in (
         ("publish", rule.publish),
         ("subscribe", rule.subscribe),
         ("relay", rule.relay),
     ):
         for criteria in all_criteria:
-            child = etree.SubElement(element, tag)
-            _write_list(child, "topics", "topic", criteria.topics)
+            lines.append(f"        <{name}>")
+            _write_list(lines, "topic", criteria.topics)
             if criteria.partitions:
-                _write_list(child, "partitions", "partition", criteria.partitions)
+                _write_list(lines, "partition", criteria.partitions)
             if criteria.data_tags:
-                tags = etree.SubElement(child, "data_tags")
-                for name, value in criteria.data_tags:
-                    one = etree.SubElement(tags, "tag")
-                    etree.SubElement(one, "name").text = name
-                    etree.SubElement(one, "value").text = value
+                lines.append("          <data_tags>")
+                for key, value in criteria.data_tags:
+                    lines.append(
+                        f"            <tag><name>{escape(key)}</name>"
+                        f"<value>{escape(value)}</value></tag>"
+                    )
+                lines.append("          </data_tags>")
+            lines.append(f"        </{name}>")
+    lines.append(f"      </{tag}>")
 
 
-def _write_list(parent: etree._Element, tag: str, item: str, texts: tuple[str, ...]) -> None:
-    element = etree.SubElement(parent, tag)
-    for text in texts:
-        etree.SubElement(element, item).text = text
+def _write_list(lines: list[str], item: str, texts: tuple[str, ...]) -> None:
+    lines.append(f"          <{item}s>")
+    lines += [f"            <{item}>{escape(text)}</{item}>" for text in texts]
+    lines.append(f"          </{item}s>")
 
 
 # ── reading ────────────────────────────────────────────────────────────────────────────────

@@ -79,13 +79,13 @@ class Registrar:
             self.kept.append(name)
 
     def _present(self, folder: str) -> set[str]:
-        path = self._transaction.root / folder
+        path = os.path.join(self._transaction.root, folder)
         try:
             names = os.listdir(path)
         except FileNotFoundError:
             return set()
         # A link that leads nowhere is a file that is missing.
-        return {name for name in names if (path / name).exists()}
+        return {name for name in names if Path(path, name).exists()}
 
     def _identity(self, name: str, folder: str, present: set[str]) -> x509.Certificate:
         if "cert.pem" in present and "key.pem" in present:

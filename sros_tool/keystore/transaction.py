@@ -17,6 +17,7 @@ import fcntl
 import os
 import secrets
 import shutil
+import stat
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -57,7 +58,7 @@ class Transaction:
         self._stage = root / STAGE
         self._content = self._stage / "new"
         self._staged: set[str] = set()
-        self._folders: set[str] = set()
+        self._folders: dict[str, bool] = {}  # whether the folder is there already
 
     # ── begin and end ──────────────────────────────────────────────────────────────────────
 
@@ -132,7 +133,6 @@ class Transaction:
         mode = 0o600 if private else 0o644
         handle = os.open(staged, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
         try:
-            os.fchmod(handle, mode)
             view = memoryview(data)
             while view:
                 view = view[os.write(handle, view) :]
@@ -149,31 +149,42 @@ class Transaction:
         if path in self._staged:
             raise KeystoreError(f"{path} would be written twice")
         self._staged.add(path)
-        folder = path.rpartition("/")[0]
-        self._prepare_folder(folder)
-        existed = not self._new_root and os.path.lexists(self.root / path)
+        existed = self._prepare_folder(path.rpartition("/")[0]) and os.path.lexists(
+            os.path.join(self.root, path)
+        )
         self.changes.append(Change("replace" if existed else "create", path))
-        return None if self._dry_run else os.path.join(self._content, path)
+        return None if self._dry_run else f"{self._content}/{path}"
 
-    def _prepare_folder(self, path: str) -> None:
+    def _prepare_folder(self, path: str) -> bool:
+        """Stage a folder; tell whether it is in the keystore already."""
         if path in self._folders:
-            return
+            return self._folders[path]
+        exists = not self._new_root
         if path:
-            self._prepare_folder(path.rpartition("/")[0])
-            real = self.root / path
-            if not self._new_root and real.is_symlink():
-                raise KeystoreError(
-                    f"'{real}' is a symbolic link",
-                    "What is written below it would land elsewhere, outside of the keystore.",
-                    "Put a real folder in its place.",
-                )
-            if not self._new_root and real.exists() and not real.is_dir():
-                raise KeystoreError(f"'{real}' is in the way", "It is not a folder.")
+            exists = self._prepare_folder(path.rpartition("/")[0]) and self._is_folder(path)
             if not self._dry_run:
-                mode = folder_mode(path)
-                os.mkdir(os.path.join(self._content, path), mode)
-                os.chmod(os.path.join(self._content, path), mode)
-        self._folders.add(path)
+                staged, mode = f"{self._content}/{path}", folder_mode(path)
+                os.mkdir(staged, mode)
+                if mode != 0o700:
+                    os.chmod(staged, mode)
+        self._folders[path] = exists
+        return exists
+
+    def _is_folder(self, path: str) -> bool:
+        real = os.path.join(self.root, path)
+        try:
+            mode = os.lstat(real).st_mode
+        except FileNotFoundError:
+            return False
+        if stat.S_ISLNK(mode):
+            raise KeystoreError(
+                f"'{real}' is a symbolic link",
+                "What is written below it would land elsewhere, outside of the keystore.",
+                "Put a real folder in its place.",
+            )
+        if not stat.S_ISDIR(mode):
+            raise KeystoreError(f"'{real}' is in the way", "It is not a folder.")
+        return True
 
     # ── commit ─────────────────────────────────────────────────────────────────────────────
 
@@ -225,8 +236,7 @@ class Transaction:
             os.replace(spare, target)
 
     def _in_existing_folders(self) -> Iterator[str]:
-        exists = {path: (self.root / path).is_dir() for path in self._folders}
-        return (path for path in sorted(self._staged) if exists[path.rpartition("/")[0]])
+        return (path for path in sorted(self._staged) if self._folders[path.rpartition("/")[0]])
 
 
 def recover(root: Path) -> None:

@@ -6,17 +6,15 @@ its verification primitives are then given.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from sros_tool.errors import PkiError
 
-INTEGER, OCTET_STRING, OID, SEQUENCE, SET = 0x02, 0x04, 0x06, 0x30, 0x31
+OCTET_STRING, SEQUENCE, SET = 0x04, 0x30, 0x31
 CONTEXT_0 = 0xA0
 
 
-@dataclass(frozen=True, slots=True)
-class Value:
+class Value(NamedTuple):
     """One tag-length-value: its tag, the bytes of its content, and all its bytes."""
 
     tag: int
@@ -24,18 +22,12 @@ class Value:
     whole: bytes
 
 
-def read(data: bytes) -> Value:
-    """The first value in ``data``."""
-    for value in children(data):
-        return value
-    raise PkiError("a DER value is empty")
-
-
-def children(data: bytes) -> Iterator[Value]:
+def children(data: bytes) -> list[Value]:
     """The values that ``data`` (the content of a constructed value) consists of.
 
     Raises `PkiError` where a value is cut short, or of a form that DER does not have.
     """
+    values = []
     position, end = 0, len(data)
     while position < end:
         start = position
@@ -43,29 +35,38 @@ def children(data: bytes) -> Iterator[Value]:
             raise PkiError("a DER value is cut short")
         tag, length = data[position], data[position + 1]
         position += 2
-        if tag & 0x1F == 0x1F or length == 0x80:
-            raise PkiError("a DER value has a form that is not supported")
-        if length > 0x80:
+        if length >= 0x80:
             size = length & 0x7F
-            if size > 4 or position + size > end:
-                raise PkiError("a DER value is cut short")
+            if not 1 <= size <= 4:
+                raise PkiError("a DER value has a form that is not supported")
             length = int.from_bytes(data[position : position + size], "big")
             position += size
+        if tag & 0x1F == 0x1F:
+            raise PkiError("a DER value has a form that is not supported")
         if position + length > end:
             raise PkiError("a DER value is cut short")
-        yield Value(tag, data[position : position + length], data[start : position + length])
+        values.append(
+            Value(tag, data[position : position + length], data[start : position + length])
+        )
         position += length
+    return values
 
 
-def oid(content: bytes) -> str:
-    """An object identifier's content in dotted form."""
-    if not content:
-        raise PkiError("a DER object identifier is empty")
-    numbers, value = [], 0
-    for byte in content:
-        value = value << 7 | byte & 0x7F
-        if not byte & 0x80:
-            numbers.append(value)
-            value = 0
-    first = min(numbers[0] // 40, 2)
-    return ".".join(map(str, (first, numbers[0] - 40 * first, *numbers[1:])))
+def first(data: bytes) -> Value:
+    """The first value in ``data``."""
+    values = children(data)
+    if not values:
+        raise PkiError("a DER value is empty")
+    return values[0]
+
+
+def encode_oid(dotted: str) -> bytes:
+    """The content of an object identifier, from its dotted form."""
+    one, two, *rest = map(int, dotted.split("."))
+    content = bytearray([40 * one + two])
+    for number in rest:
+        part = [number & 0x7F]
+        while number := number >> 7:
+            part.append(number & 0x7F | 0x80)
+        content += bytes(reversed(part))
+    return bytes(content)

@@ -26,21 +26,20 @@ from sros_tool.pki.keys import PrivateKey
 _TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"
 _OPTIONS = (pkcs7.PKCS7Options.DetachedSignature, pkcs7.PKCS7Options.Binary)
 _BOUNDARY = re.compile(rb"""(?i)\bboundary=("([^"]{1,200})"|([^\s;"]{1,200}))""")
-_LINE_END = re.compile(rb"\r?\n")
 
-_SIGNED_DATA = "1.2.840.113549.1.7.2"
-_MESSAGE_DIGEST = "1.2.840.113549.1.9.4"
-_DIGESTS: dict[str, type[hashes.HashAlgorithm]] = {
-    "2.16.840.1.101.3.4.2.1": hashes.SHA256,
-    "2.16.840.1.101.3.4.2.2": hashes.SHA384,
-    "2.16.840.1.101.3.4.2.3": hashes.SHA512,
-    "1.3.14.3.2.26": hashes.SHA1,
+_SIGNED_DATA = der.encode_oid("1.2.840.113549.1.7.2")
+_MESSAGE_DIGEST = der.encode_oid("1.2.840.113549.1.9.4")
+_DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
+    der.encode_oid("2.16.840.1.101.3.4.2.1"): hashes.SHA256(),
+    der.encode_oid("2.16.840.1.101.3.4.2.2"): hashes.SHA384(),
+    der.encode_oid("2.16.840.1.101.3.4.2.3"): hashes.SHA512(),
+    der.encode_oid("1.3.14.3.2.26"): hashes.SHA1(),  # noqa: S303 - read, never written
 }
 
 
 def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
     """The S/MIME message that carries ``document``, signed by ``key`` of ``certificate``."""
-    content = _TEXT_HEADER + _LINE_END.sub(b"\r\n", document)
+    content = _TEXT_HEADER + document.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n")
     signature = (
         pkcs7.PKCS7SignatureBuilder()
         .set_data(content)
@@ -109,10 +108,14 @@ class SignedDocument:
                 "The document was changed after it was signed, or its signature is damaged.",
             )
 
-    def _intact(self, signer: x509.Certificate) -> bool:
+    def carries_digest(self) -> bool:
+        """Whether what was signed is this content, by the digest among the signed attributes."""
         digest = hashes.Hash(self._digest_algorithm)
         digest.update(self.content)
-        if self._signed_attributes and digest.finalize() != self._message_digest:
+        return digest.finalize() == self._message_digest
+
+    def _intact(self, signer: x509.Certificate) -> bool:
+        if self._signed_attributes and not self.carries_digest():
             return False
         signed = self._signed_attributes or self.content
         key = signer.public_key()
@@ -140,7 +143,7 @@ def parse(message: bytes) -> SignedDocument:
         )
     try:
         return _parse_cms(signature, content, document)
-    except (ValueError, IndexError, StopIteration, UnsupportedAlgorithm) as error:
+    except (ValueError, IndexError, UnsupportedAlgorithm) as error:
         raise PkiError("its signature is not a CMS signature that can be read") from error
 
 
@@ -171,10 +174,10 @@ def _split(message: bytes) -> tuple[bytes, bytes]:
 
 def _parse_cms(signature: bytes, content: bytes, document: bytes) -> SignedDocument:
     """Read ContentInfo / SignedData / SignerInfo (RFC 5652, sections 3, 5.1 and 5.3)."""
-    content_type, wrapped = tuple(der.children(der.read(signature).content))[:2]
-    if der.oid(content_type.content) != _SIGNED_DATA:
+    content_type, wrapped = der.children(der.first(signature).content)[:2]
+    if content_type.content != _SIGNED_DATA:
         raise ValueError("not SignedData")
-    fields = list(der.children(der.read(wrapped.content).content))
+    fields = der.children(der.first(wrapped.content).content)
     certificates = tuple(
         x509.load_der_x509_certificate(value.whole)
         for field in fields[3:]
@@ -182,15 +185,14 @@ def _parse_cms(signature: bytes, content: bytes, document: bytes) -> SignedDocum
         for value in der.children(field.content)
         if value.tag == der.SEQUENCE
     )
-    signers = list(der.children(fields[-1].content))
+    signers = der.children(fields[-1].content)
     if fields[-1].tag != der.SET or len(signers) != 1:
         raise ValueError("not exactly one signer")
-    info = list(der.children(signers[0].content))
-    issuer, serial = tuple(der.children(info[1].content))
-    digest_oid = der.oid(der.read(info[2].content).content)
-    algorithm = _DIGESTS.get(digest_oid)
+    info = der.children(signers[0].content)
+    issuer, serial = der.children(info[1].content)
+    algorithm = _DIGESTS.get(der.first(info[2].content).content)
     if algorithm is None:
-        raise ValueError(f"unknown digest {digest_oid}")
+        raise ValueError("unknown digest")
     attributes, message_digest = b"", b""
     if info[3].tag == der.CONTEXT_0:
         # What is signed is the attributes as a SET, not with the tag that they carry inside.
@@ -203,8 +205,8 @@ def _parse_cms(signature: bytes, content: bytes, document: bytes) -> SignedDocum
         content=content,
         document=document,
         certificates=certificates,
-        digest=str(algorithm.name),
-        _digest_algorithm=algorithm(),
+        digest=algorithm.name,
+        _digest_algorithm=algorithm,
         _signed_attributes=attributes,
         _message_digest=message_digest,
         _signature=signature_value.content,
@@ -214,7 +216,7 @@ def _parse_cms(signature: bytes, content: bytes, document: bytes) -> SignedDocum
 
 def _message_digest(attributes: bytes) -> bytes:
     for attribute in der.children(attributes):
-        name, values = tuple(der.children(attribute.content))
-        if der.oid(name.content) == _MESSAGE_DIGEST:
-            return der.read(values.content).content
+        name, values = der.children(attribute.content)
+        if name.content == _MESSAGE_DIGEST:
+            return der.first(values.content).content
     raise ValueError("no message digest")

@@ -1,0 +1,1 @@
+"""Measures sros side by side with the floor of each task, in the same run."""

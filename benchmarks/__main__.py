@@ -1,0 +1,179 @@
+"""``python -m benchmarks``: a table on stdout, and with ``--json FILE`` the same as JSON."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from benchmarks.floor import make_enclaves, sizes_of
+from benchmarks.inputs import enclaves_policy, topics_policy
+
+ENCLAVES = 1000
+RULES = 14
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure: seconds (or as ``unit`` says), its floor, and the limit that it should keep."""
+
+    name: str
+    value: float
+    floor: float | None
+    limit: str
+    kept: bool
+    unit: str = "s"
+
+
+def main() -> int:
+    """Run every benchmark; exit 1 if a limit is not kept."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--rounds", type=int, default=5)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        rows = [*_artifacts(Path(name), options.rounds), *_topics(Path(name), options.rounds)]
+        rows += _starts(Path(name))
+        rows += _memory(Path(name))
+    print(f"Python {platform.python_version()}, {os.cpu_count()} cores, medians")
+    print(f"{'task':58} {'sros':>9} {'floor':>9} {'ratio':>6}  limit")
+    for row in rows:
+        floor = f"{row.floor:9.3f}" if row.floor is not None else " " * 9
+        ratio = f"{row.value / row.floor:6.2f}" if row.floor else " " * 6
+        kept = "" if row.kept else "  NOT KEPT"
+        print(f"{row.name:58} {row.value:9.3f} {floor} {ratio}  {row.limit}{kept}")
+    if options.json:
+        options.json.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n")
+    return 0 if all(row.kept for row in rows) else 1
+
+
+def _timed(action: Callable[[int], object], rounds: int) -> float:
+    times = []
+    for index in range(rounds):
+        begin = time.perf_counter()
+        action(index)
+        times.append(time.perf_counter() - begin)
+    return statistics.median(times)
+
+
+def _artifacts(folder: Path, rounds: int) -> list[Row]:
+    from sros_tool.keystore import create_keystore, generate_artifacts
+    from sros_tool.keystore.template import load_template
+    from sros_tool.policy import read_policy
+
+    now = datetime.now(UTC)
+    policy = folder / "enclaves.xml"
+    policy.write_text(enclaves_policy(ENCLAVES, RULES))
+    template = load_template("development")
+
+    def make(root: Path) -> None:
+        generate_artifacts(root, policies=[read_policy(policy)], now=now)
+
+    for index in range(rounds):
+        create_keystore(folder / f"ks{index}", template=template, now=now)
+    made = _timed(lambda index: make(folder / f"ks{index}"), rounds)
+    again = _timed(lambda index: make(folder / f"ks{index}"), rounds)
+    files = sizes_of(folder / "ks0/enclaves/robot0/part")
+    for index in range(rounds):
+        (folder / f"floor{index}").mkdir()
+    floor = _timed(lambda i: make_enclaves(folder / f"floor{i}", files, ENCLAVES), rounds)
+    limit = "2 x floor and 1.5 s"
+    return [
+        Row(
+            f"policy of {ENCLAVES} enclaves, {RULES} rules each -> all artifacts",
+            made, floor, limit, made <= 2 * floor and made < 1.5,
+        ),
+        Row("the same again: permissions replaced, keys kept", again, floor, "-", True),
+    ]  # fmt: skip
+
+
+def _topics(folder: Path, rounds: int) -> list[Row]:
+    from sros_tool.keystore import create_enclaves, create_keystore, create_permission
+    from sros_tool.keystore.template import load_template
+    from sros_tool.policy import read_policy
+
+    now = datetime.now(UTC)
+    root = folder / "topics"
+    create_keystore(root, template=load_template("development"), now=now)
+    create_enclaves(root, ["/big"], now=now)
+    rows: list[Row] = []
+    for count in (2000, 20000):
+        file = folder / f"topics{count}.xml"
+        file.write_text(topics_policy(count))
+        taken = _timed(
+            lambda _, file=file: create_permission(root, "/big", read_policy(file), now=now),  # type: ignore[misc]
+            rounds,
+        )
+        limit = "0.5 s" if count == 20000 else "-"
+        rows.append(Row(f"one policy group of {count} topics", taken, None, limit, taken < 0.5))
+    growth = rows[1].value / rows[0].value
+    rows.append(Row("... 10 times the topics take", growth, None, "linear", growth < 13, "x"))
+    return rows
+
+
+def _starts(folder: Path) -> list[Row]:
+    program = str(Path(sys.executable).with_name("sros"))
+    root = str(folder / "ks0")
+
+    def run(*command: str) -> float:
+        return _timed(lambda _: subprocess.run(command, check=True, stdout=subprocess.DEVNULL), 15)
+
+    floor = run(sys.executable, "-c", "pass")
+    rows = []
+    for words in (("--help",), ("list_enclaves", str(folder / "topics"))):
+        taken = run(program, *words)
+        rows.append(
+            Row(
+                f"sros {words[0]}",
+                taken,
+                floor,
+                "60 ms above python -c pass",
+                taken - floor <= 0.060,
+            )  # fmt: skip
+        )
+    taken = run(program, "list_enclaves", root)
+    rows.append(Row(f"sros list_enclaves, {ENCLAVES} enclaves", taken, floor, "-", True))
+    return rows
+
+
+_PEAK = """
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from sros_tool.keystore import create_keystore, generate_artifacts
+from sros_tool.keystore.template import load_template
+root, count = Path(sys.argv[1]), int(sys.argv[2])
+now = datetime.now(UTC)
+create_keystore(root, template=load_template("development"), now=now)
+generate_artifacts(root, enclaves=[f"/robot{i}/part" for i in range(count)], now=now)
+# Not ru_maxrss, which starts with the size of the parent.
+print(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1])
+"""
+
+
+def _memory(folder: Path) -> list[Row]:
+    peaks = []
+    for count in (100, 4000):
+        command = [sys.executable, "-c", _PEAK, str(folder / f"memory{count}"), str(count)]
+        peaks.append(int(subprocess.run(command, check=True, capture_output=True).stdout) / 1024)
+    growth = (peaks[1] - peaks[0]) / 3900 * 1024
+    return [
+        Row(
+            "peak memory, 4000 enclaves (floor: 100 enclaves)", peaks[1], peaks[0], "-", True, "MB"
+        ),
+        Row("... for each further enclave, in kB", growth, None, "8 kB", growth < 8, "kB"),
+    ]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

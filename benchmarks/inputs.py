@@ -1,0 +1,44 @@
+"""Policies of any size, for measuring."""
+
+from __future__ import annotations
+
+_GROUPS = (
+    ('topics publish="ALLOW"', "topic"),
+    ('topics subscribe="ALLOW"', "topic"),
+    ('services reply="ALLOW"', "service"),
+    ('services request="ALLOW"', "service"),
+    ('actions call="ALLOW"', "action"),
+)
+
+
+def enclaves_policy(enclaves: int, rules: int) -> str:
+    """A policy of so many enclaves, each with one profile of so many names in five groups."""
+    parts = []
+    for index in range(enclaves):
+        groups = []
+        for number, (opening, item) in enumerate(_GROUPS):
+            names = "".join(
+                f"<{item}>{item}_{rule}</{item}>"
+                for rule in range(rules)
+                if rule % len(_GROUPS) == number
+            )
+            groups.append(f"<{opening}>{names}</{opening.split()[0]}>")
+        parts.append(
+            f'<enclave path="/robot{index}/part"><profiles>'
+            f'<profile ns="/robot{index}" node="part">{"".join(groups)}</profile>'
+            "</profiles></enclave>"
+        )
+    return _policy("".join(parts))
+
+
+def topics_policy(topics: int) -> str:
+    """A policy of one enclave that publishes so many topics."""
+    names = "".join(f"<topic>/fleet/topic_{index}</topic>" for index in range(topics))
+    return _policy(
+        '<enclave path="/big"><profiles><profile ns="/" node="big">'
+        f'<topics publish="ALLOW">{names}</topics></profile></profiles></enclave>'
+    )
+
+
+def _policy(enclaves: str) -> str:
+    return f'<policy version="0.2.0"><enclaves>{enclaves}</enclaves></policy>'
