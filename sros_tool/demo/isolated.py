@@ -66,6 +66,7 @@ def _main(
         os._exit(1)
     signal.signal(signal.SIGTERM, _interrupt)
     signal.signal(signal.SIGINT, _interrupt)
+    signal.signal(signal.SIGHUP, _interrupt)
     try:
         if isolation.isolated:
             enter_isolation()

@@ -13,6 +13,7 @@ from sros_tool.demo.capture import udp_ports
 from sros_tool.demo.verdict import PartyRecord
 from sros_tool.runtime.events import Event, EventReader, Kind
 from sros_tool.runtime.netns import end_with_parent
+from sros_tool.runtime.security_log import plain_text
 
 _LEFT_OUT_PREFIXES = ("ROS_SECURITY_",)
 _LEFT_OUT = frozenset(
@@ -136,11 +137,12 @@ class PartyProcess:
 
     def record(self) -> PartyRecord:
         """What the process left behind; call it after `end`."""
-        self._events += self._reader.new_events()
+        # Being ended is no failure, whatever a node makes of it.
+        late = [event for event in self._reader.new_events() if event.kind is not Kind.FAILED]
         return PartyRecord(
             text=self.text,
             topic=self._topic,
-            events=tuple(self._events),
-            output=self._log.read_text(encoding="utf-8", errors="replace"),
+            events=(*self._events, *late),
+            output=plain_text(self._log.read_text(encoding="utf-8", errors="replace")),
             status=self._own_status,
         )

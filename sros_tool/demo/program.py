@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
+import shutil
+import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from types import FrameType
 from typing import Any
 
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
@@ -82,7 +87,7 @@ def run_demo(options: DemoOptions, now: datetime, tell: Callable[[str], None]) -
     """
     topic = check_topic(options.topic)
     domains = _domains(options)
-    with _folder(options.keep) as folder:
+    with _ended_by_signals(), _folder(options.keep) as folder:
         spanned = DomainSet.of((domains[0], domains[-1]))
         keystores = make_keystores(folder, topic, spanned, options.template, now)
         tell("looking for a DDS that enforces security")
@@ -101,8 +106,12 @@ def run_demo(options: DemoOptions, now: datetime, tell: Callable[[str], None]) -
             limits=options.limits,
             observer_rmw=observer_rmw,
         )
-        results = run_isolated(lambda told: run_plan(plan, "", told), isolation, tell)
-    return DemoResult(backend, topic, isolation, tuple(results))
+        rows = run_isolated(lambda told: run_plan(plan, "", told), isolation, tell)
+        result = DemoResult(backend, topic, isolation, tuple(rows))
+        if options.keep is not None:
+            text = json.dumps(result.as_json(), indent=2) + "\n"
+            (folder / "result.json").write_text(text, encoding="utf-8")
+    return result
 
 
 def _domains(options: DemoOptions) -> tuple[int, ...]:
@@ -122,14 +131,42 @@ def _folder(keep: Path | None) -> Iterator[Path]:
         with TemporaryDirectory(prefix="sros-demo-") as name:
             yield Path(name)
         return
-    if keep.exists() and (not keep.is_dir() or any(keep.iterdir())):
+    try:
+        if keep.exists() and (not keep.is_dir() or any(keep.iterdir())):
+            raise UsageError(
+                f"cannot keep the demo in '{keep}'",
+                "It exists, and is not an empty folder.",
+                "Name a folder that does not exist yet.",
+            )
+        keep.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
         raise UsageError(
-            f"cannot keep the demo in '{keep}'",
-            "It exists, and is not an empty folder.",
-            "Name a folder that does not exist yet.",
-        )
-    keep.mkdir(parents=True, exist_ok=True)
-    yield keep.absolute()
+            f"cannot keep the demo in '{keep}'", f"{error.strerror}.", "Name another folder."
+        ) from error
+    try:
+        yield keep.absolute()
+    except BaseException:
+        # What did not come to a result is not worth keeping, and it holds private keys.
+        shutil.rmtree(keep, ignore_errors=True)
+        raise
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """Clean up on SIGTERM and SIGHUP as on Ctrl-C: the folder holds private keys."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def end(number: int, _frame: FrameType | None) -> None:
+        raise SystemExit(128 + number)
+
+    before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def _isolation(network: str) -> Isolation:

@@ -42,6 +42,10 @@ def run_ros_node(
             rclpy.spin(node)
         except ExternalShutdownException:
             pass
+        except Exception:
+            # A signal may end the context in the middle of a callback; that is no failure.
+            if rclpy.ok():
+                raise
         finally:
             node.destroy_node()
             rclpy.try_shutdown()

@@ -169,7 +169,8 @@ def _judge_claim(claim: Claim, record: RowRecord) -> Finding:
     status = STATUS_OF[Relation.HEARS, bool(heard)]
     seconds = record.window[1] - record.window[0]
     inside = sum(1 for event in heard if _inside(event, record))
-    return Finding(status, f"{claim.subject} heard {inside} of {sent} messages in {seconds:.1f} s")
+    heard_of = f"{inside} of {sent} messages of the {claim.talker}"
+    return Finding(status, f"{claim.subject} heard {heard_of} in {seconds:.1f} s")
 
 
 def _judge_refusal(name: str, record: PartyRecord) -> Finding:

@@ -26,8 +26,8 @@ SYSTEM_NAMES = ("libddsc.so.0debian", "libddsc.so.0t64", "libddsc.so.0")
 """The shared object names of Debian 12, of Debian 13, and of an installation from source or ROS."""
 
 INSTALL_ADVICE = (
-    "Install Cyclone DDS with `apt-get install libddsc0debian` (Debian 12, Ubuntu 24.04) or"
-    " `apt-get install libddsc0t64` (Debian 13), or name a folder with its unpacked packages"
+    "Install Cyclone DDS with `apt-get install libddsc0debian` (Debian 12; newer releases call it"
+    " libddsc0t64), or unpack the package and those that it depends on into a folder and name that"
     f" in {FOLDER_VARIABLE}."
 )
 
@@ -288,9 +288,18 @@ def loaded_libraries(prefix: str) -> tuple[Path, ...]:
 
 
 def version_of(path: Path) -> str:
-    """The version in the name of a shared library: "0.10.2" of libddsc.so.0.10.2."""
-    found = re.search(r"\.so\.(\d+(?:\.\d+)+)$", path.name)
+    """The version in the name of a shared library: "0.10.2" of libddsc.so.0.10.2.
+
+    Wheels hold copies in place of links, so that the loaded one may have the shortest name.
+    """
+    copies = [copy for copy in path.parent.glob(f"{path.name}.*") if _same_size(copy, path)]
+    name = max([path.name, *(copy.name for copy in copies)], key=len)
+    found = re.search(r"\.so\.(\d+(?:\.\d+)+)$", name)
     return found.group(1) if found else "of unknown version"
+
+
+def _same_size(one: Path, other: Path) -> bool:
+    return one.stat().st_size == other.stat().st_size
 
 
 def plugins_beside(path: Path) -> Path | None:

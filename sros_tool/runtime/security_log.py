@@ -59,8 +59,13 @@ def missing_security(text: str) -> str:
     return _first_line_with(_NOT_BUILT_IN, text)
 
 
+def plain_text(output: str) -> str:
+    """What a process printed, without colours."""
+    return _COLOUR.sub("", output)
+
+
 def _first_line_with(marks: tuple[str, ...], text: str) -> str:
-    for line in _COLOUR.sub("", text).splitlines():
+    for line in plain_text(text).splitlines():
         lowered = line.lower()
         if any(mark in lowered for mark in marks):
             return " ".join(line.split())

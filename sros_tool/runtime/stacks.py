@@ -22,12 +22,13 @@ from sros_tool.runtime.cyclone_library import INSTALL_ADVICE
 from sros_tool.runtime.events import Kind, read_events
 from sros_tool.runtime.netns import end_with_parent
 from sros_tool.runtime.probing import ProbeRun, Verdict, judge
+from sros_tool.runtime.security_log import plain_text
 
 PROBE_SECONDS = 20.0
 
 _RMW_INDEX = "share/ament_index/resource_index/rmw_typesupport"
 _NOT_AN_RMW = "rmw_implementation"
-_ROS_ADVICE = (
+ROS_ADVICE = (
     "The ROS 2 packages of Ubuntu (ros-jazzy-ros-base) have DDS Security built in; the wheels on"
     " PyPI do not."
 )
@@ -106,7 +107,7 @@ def cyclone_stack(probe: ProbeEnclave) -> Stack:
     dds, version, where = _identity(run)
     absent = not version and any("cannot find Cyclone DDS" in event.text for event in run.events)
     if absent:
-        verdict = Verdict(None, "not here")
+        verdict = Verdict(None, verdict.evidence.removeprefix("could not be tried: "))
     return Stack(
         "Cyclone DDS (libddsc)",
         "cyclone",
@@ -160,7 +161,7 @@ def _probe_rmw(probe: ProbeEnclave, rmw: str) -> Stack:
         True,
         verdict.enforces,
         verdict.evidence,
-        "" if verdict.enforces else _ROS_ADVICE,
+        "" if verdict.enforces else ROS_ADVICE,
         rmw,
     )
 
@@ -175,7 +176,7 @@ def _without_rclpy() -> Stack:
 
 
 def _absent(name: str, kind: str, dds: str) -> Stack:
-    return Stack(name, kind, dds, "", "", False, None, "not here")
+    return Stack(name, kind, dds, "", "", False, None, "")
 
 
 def _run_probe(kind: str, probe: ProbeEnclave, extra: Mapping[str, str]) -> ProbeRun:
@@ -199,9 +200,8 @@ def _run_probe(kind: str, probe: ProbeEnclave, extra: Mapping[str, str]) -> Prob
                 preexec_fn=end_with_parent,
             )
             status = _wait(process)
-        return ProbeRun(
-            tuple(read_events(report)), log.read_text(encoding="utf-8", errors="replace"), status
-        )
+        printed = plain_text(log.read_text(encoding="utf-8", errors="replace"))
+        return ProbeRun(tuple(read_events(report)), printed, status)
 
 
 def _wait(process: subprocess.Popen[bytes]) -> int | None:

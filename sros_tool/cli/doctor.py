@@ -1,0 +1,43 @@
+"""The verb `doctor`: which DDS stacks are here, and which of them enforce security."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import click
+
+from sros_tool.cli.common import json_option, now, print_json
+
+
+@click.command(
+    "doctor",
+    epilog="""\b
+Example:
+  $ sros doctor
+  rclpy with rmw_fastrtps_cpp  does not enforce   Fast DDS 2.14.5
+      a secured participant fails: RCLError: error creating node: This Fast DDS version
+      doesn't have the security libraries
+  Cyclone DDS (libddsc)        enforces security  Cyclone DDS 0.10.2
+      in an enclave made by sros it created the allowed writer on /chatter, and refused
+      writer and reader on /sros_not_allowed: ... Not Allowed By Security
+  DDS Security can be enforced here.
+
+Exit status: 0 if something here enforces security, 1 if nothing does.""",
+)
+@json_option
+def doctor(as_json: bool) -> None:
+    """Find the DDS stacks and RMWs of this machine that enforce security.
+
+    Each is tried, in a process of its own and in an enclave made for the purpose; a name or a
+    version says nothing about how it was built. Also warns of misspelt ROS_SECURITY_* values.
+    """
+    from sros_tool.demo.doctor import diagnosis_text, examine
+
+    diagnosis = examine(os.environ, now())
+    if as_json:
+        print_json(diagnosis.as_json())
+    else:
+        click.echo(diagnosis_text(diagnosis))
+    if not diagnosis.enforces:
+        sys.exit(1)

@@ -1,0 +1,86 @@
+"""Examine this machine: which DDS stacks are here, which enforce security, what is misspelt."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.demo.keystores import DEFAULT_TOPIC, make_keystores
+from sros_tool.keystore.template import load_template
+from sros_tool.runtime.cyclone_library import INSTALL_ADVICE
+from sros_tool.runtime.rcl_security import spelling_warnings
+from sros_tool.runtime.stacks import ROS_ADVICE, Stack, survey
+
+_PROBE_DOMAIN = 80
+_TEMPLATE = "production"
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found; ``warnings`` are about the environment variables."""
+
+    stacks: tuple[Stack, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def enforces(self) -> bool:
+        """Whether at least one stack here enforces security."""
+        return any(stack.enforces for stack in self.stacks)
+
+    @property
+    def advice(self) -> str:
+        """What to install where nothing enforces, else ""."""
+        return "" if self.enforces else f"{INSTALL_ADVICE} {ROS_ADVICE}"
+
+    def as_json(self) -> dict[str, Any]:
+        """The diagnosis as `sros doctor --json` shows it."""
+        return {
+            "enforces": self.enforces,
+            "stacks": [vars(stack) for stack in self.stacks],
+            "warnings": list(self.warnings),
+            "advice": self.advice,
+        }
+
+
+def examine(environment: Mapping[str, str], now: datetime) -> Diagnosis:
+    """Try every stack in an enclave made for the purpose, and leave nothing behind."""
+    with TemporaryDirectory(prefix="sros-doctor-") as folder:
+        domains = DomainSet.of((_PROBE_DOMAIN, _PROBE_DOMAIN))
+        template = load_template(_TEMPLATE)
+        keystores = make_keystores(Path(folder), DEFAULT_TOPIC, domains, template, now)
+        stacks = survey(keystores.probe(DEFAULT_TOPIC, _PROBE_DOMAIN))
+    return Diagnosis(stacks, spelling_warnings(environment))
+
+
+def diagnosis_text(diagnosis: Diagnosis) -> str:
+    """The diagnosis for people: one line per stack, under it what was seen and what to do."""
+    width = max(len(stack.name) for stack in diagnosis.stacks)
+    lines: list[str] = []
+    for stack in diagnosis.stacks:
+        identity = f"{stack.dds} {stack.version}".strip() if stack.present else ""
+        lines.append(f"{stack.name:<{width}}  {_answer(stack):<19}  {identity}".rstrip())
+        lines += _indented([stack.evidence, stack.where, stack.advice])
+    lines += ["", *(f"warning: {warning}" for warning in diagnosis.warnings)]
+    lines.append(
+        "DDS Security can be enforced here."
+        if diagnosis.enforces
+        else f"Nothing here enforces DDS Security. {diagnosis.advice}"
+    )
+    return "\n".join(lines)
+
+
+def _answer(stack: Stack) -> str:
+    if not stack.present:
+        return "not here"
+    if stack.enforces is None:
+        return "could not be tried"
+    return "enforces security" if stack.enforces else "does not enforce"
+
+
+def _indented(texts: Sequence[str]) -> list[str]:
+    return [f"    {text}" for text in texts if text]
