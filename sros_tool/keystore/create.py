@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -18,7 +18,7 @@ from sros_tool.keystore.authority import (
     create_authorities,
     load_authorities,
 )
-from sros_tool.keystore.enclave import Registrar
+from sros_tool.keystore.enclave import Fate, Progress, Registrar
 from sros_tool.keystore.layout import (
     ENCLAVES,
     GOVERNANCE_P7S,
@@ -36,9 +36,6 @@ from sros_tool.names import check_enclave_name
 from sros_tool.notes import Note
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.translate import governance_for
-
-Progress = Callable[[str], None]
-"""Told the name of each enclave when it is done."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,23 +198,22 @@ def _produce(
             check_domain(domains, domain, root)
             existing = tuple(enclave_names(root))
         registrar = Registrar(transaction, authorities, template, domains, now)
-        for name, enclave in wanted.items():
-            registrar.register(name, enclave)
-            if progress:
-                progress(name)
+        outcomes = registrar.register_all(list(wanted.items()), progress)
         transaction.commit()
-    notes = (*registrar.notes, *name_notes({*existing, *registrar.created}, registrar.created))
+    fates = {name: fate for outcome in outcomes for name, fate in outcome.fates}
+    of = {fate: tuple(name for name in fates if fates[name] is fate) for fate in Fate}
+    notes = tuple(note for outcome in outcomes for note in outcome.notes)
     return Result(
         root,
         template,
         domains,
         fresh,
-        tuple(registrar.created),
-        tuple(registrar.changed),
-        tuple(registrar.completed),
-        tuple(registrar.kept),
+        of[Fate.CREATED],
+        of[Fate.CHANGED],
+        of[Fate.COMPLETED],
+        of[Fate.KEPT],
         tuple(transaction.changes),
-        notes,
+        (*notes, *name_notes({*existing, *of[Fate.CREATED]}, of[Fate.CREATED])),
     )
 
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from datetime import datetime
+from enum import Enum
 from pathlib import Path
 
 from cryptography import x509
@@ -15,8 +18,9 @@ from sros_tool.errors import KeystoreError
 from sros_tool.keystore.authority import Authorities
 from sros_tool.keystore.defaults import default_enclave
 from sros_tool.keystore.layout import ENCLAVES, IDENTITY, PERMISSIONS, PUBLIC, enclave_folder
+from sros_tool.keystore.parallel import in_shares
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.transaction import Transaction
+from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.notes import Note
 from sros_tool.pki.certificates import (
     common_name,
@@ -33,8 +37,30 @@ from sros_tool.validity import iso, window
 from sros_tool.xml import read_bytes
 
 
+class Fate(Enum):
+    """What became of an enclave."""
+
+    CREATED = "created"
+    CHANGED = "changed"
+    COMPLETED = "completed"
+    KEPT = "kept"
+
+
+Progress = Callable[[str], None]
+"""Told the name of each enclave when it is done."""
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What became of each enclave of a share, the remarks on it, and the files it staged."""
+
+    fates: list[tuple[str, Fate]]
+    notes: list[Note]
+    changes: list[Change]
+
+
 class Registrar:
-    """Adds enclaves to one transaction and remembers what became of each."""
+    """Adds enclaves to one transaction."""
 
     def __init__(
         self,
@@ -44,11 +70,6 @@ class Registrar:
         domains: DomainSet,
         now: datetime,
     ) -> None:
-        self.created: list[str] = []
-        self.changed: list[str] = []
-        self.completed: list[str] = []
-        self.kept: list[str] = []
-        self.notes: list[Note] = []
         self._transaction = transaction
         self._authorities = authorities
         self._issuer = authorities.identity.issuer()
@@ -59,9 +80,34 @@ class Registrar:
         self._permissions_validity = window(now, template.permissions_validity).within(
             validity_of(authorities.permissions.certificate)
         )
+        self._notes: list[Note] = []
 
-    def register(self, name: str, policy: Enclave | None) -> None:
-        """Make or complete an enclave; with ``policy``, give it those permissions."""
+    def register_all(
+        self, wanted: Sequence[tuple[str, Enclave | None]], progress: Progress | None
+    ) -> list[Outcome]:
+        """Make or complete each enclave; with a policy, give it those permissions."""
+        outcomes = []
+        own = os.getpid()
+
+        def work(share: Sequence[tuple[str, Enclave | None]]) -> Outcome:
+            before = len(self._transaction.changes)
+            fates = []
+            for name, enclave in share:
+                fates.append((name, self._register(name, enclave)))
+                if progress and os.getpid() == own:
+                    progress(name)
+            return Outcome(fates, self._notes, self._transaction.changes[before:])
+
+        for index, (share, outcome) in enumerate(in_shares(wanted, work)):
+            if index:  # the first share was done here, the others by other processes
+                self._transaction.absorb(outcome.changes)
+                for name, _ in share:
+                    if progress:
+                        progress(name)
+            outcomes.append(outcome)
+        return outcomes
+
+    def _register(self, name: str, policy: Enclave | None) -> Fate:
         folder = enclave_folder(name)
         present = self._present(folder)
         before = len(self._transaction.changes)
@@ -70,13 +116,10 @@ class Registrar:
         if policy is not None or "permissions.p7s" not in present:
             self._permissions(name, folder, policy, certificate)
         if "key.pem" not in present:
-            self.created.append(name)
-        elif "permissions.p7s" in present and policy is not None:
-            self.changed.append(name)
-        elif len(self._transaction.changes) > before:
-            self.completed.append(name)
-        else:
-            self.kept.append(name)
+            return Fate.CREATED
+        if "permissions.p7s" in present and policy is not None:
+            return Fate.CHANGED
+        return Fate.COMPLETED if len(self._transaction.changes) > before else Fate.KEPT
 
     def _present(self, folder: str) -> set[str]:
         path = os.path.join(self._transaction.root, folder)
@@ -143,7 +186,7 @@ class Registrar:
     ) -> None:
         enclave = policy or default_enclave(self._template.default_permissions, name)
         if len(enclave.profiles) > 1:
-            self.notes.append(
+            self._notes.append(
                 Note(
                     "policy.several-profiles",
                     f"{name}: the rights of its {len(enclave.profiles)} <profiles> are joined. "
@@ -162,7 +205,7 @@ class Registrar:
         )
         self._transaction.write(f"{folder}/permissions.xml", document)
         self._transaction.write(f"{folder}/permissions.p7s", message)
-        self.notes += document_notes(name, permissions, len(message))
+        self._notes += document_notes(name, permissions, len(message))
 
 
 def enclave_path(root: Path, name: str) -> Path:

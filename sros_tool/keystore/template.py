@@ -22,6 +22,7 @@ from sros_tool.xml import read_bytes
 
 DEFAULT_TEMPLATE = "development"
 EVERYTHING, NODE_BASICS = "everything", "node_basics"
+_LONGEST_AUTHORITY_NAME = 40  # the role and a number follow it in a common name
 _DATA_LEVELS = (Level.NONE, Level.SIGN, Level.ENCRYPT)
 _KINDS: dict[str, str] = {"topic": "topics", "service": "services", "action": "actions"}
 
@@ -94,7 +95,7 @@ def parse_template(text: str, name: str) -> Template:
         name=table.text("name", name),
         description=table.text("description", ""),
         separate_authorities=authorities.one_of("layout", ("separate", "single")) == "separate",
-        authority_name=authorities.text("name", "sros"),
+        authority_name=_authority_name(authorities),
         authority_validity=authorities.duration("validity"),
         certificate_validity=certificates.duration("validity"),
         permissions_validity=permissions.duration("validity"),
@@ -138,6 +139,15 @@ def render_template(template: Template) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _authority_name(table: _Table) -> str:
+    name = table.text("name", "sros")
+    if not 0 < len(name) <= _LONGEST_AUTHORITY_NAME or not name.isprintable():
+        raise _TemplateError(
+            f"{table.path}.name is {name!r}, not 1 to {_LONGEST_AUTHORITY_NAME} printable characters"
+        )
+    return name
+
+
 def _topic_lines(protection: TopicProtection) -> list[str]:
     return [
         f"{field.name} = {_toml(getattr(protection, field.name))}"
@@ -146,8 +156,10 @@ def _topic_lines(protection: TopicProtection) -> list[str]:
 
 
 def _toml(value: str | bool) -> str:
-    # A JSON string is a TOML basic string.
-    return json.dumps(value) if isinstance(value, bool) else json.dumps(str(value))
+    if isinstance(value, bool):
+        return json.dumps(value)
+    # A JSON string is a TOML basic string, but for a character that TOML wants escaped.
+    return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _protection(table: _Table) -> DomainProtection:

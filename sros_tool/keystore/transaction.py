@@ -19,7 +19,7 @@ import secrets
 import shutil
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -164,7 +164,8 @@ class Transaction:
             exists = self._prepare_folder(path.rpartition("/")[0]) and self._is_folder(path)
             if not self._dry_run:
                 staged, mode = f"{self._content}/{path}", folder_mode(path)
-                os.mkdir(staged, mode)
+                with contextlib.suppress(FileExistsError):  # by a process with another share
+                    os.mkdir(staged, mode)
                 if mode != 0o700:
                     os.chmod(staged, mode)
         self._folders[path] = exists
@@ -185,6 +186,13 @@ class Transaction:
         if not stat.S_ISDIR(mode):
             raise KeystoreError(f"'{real}' is in the way", "It is not a folder.")
         return True
+
+    def absorb(self, changes: Sequence[Change]) -> None:
+        """Take over what a forked process staged for this transaction."""
+        for change in changes:
+            self._staged.add(change.path)
+            self._prepare_folder(change.path.rpartition("/")[0])
+        self.changes += changes
 
     # ── commit ─────────────────────────────────────────────────────────────────────────────
 
