@@ -34,16 +34,16 @@ class Needs:
 
     groups: tuple[str, ...] = ("package",)
     dds: bool = False
-    openssl: bool = False
+    for_tests: bool = False
 
 
 NEEDS = {
     "demo": Needs(("package", "ros"), dds=True),
-    "test": Needs(GROUPS, dds=True, openssl=True),
+    "test": Needs(GROUPS, dds=True, for_tests=True),
     "lint": Needs(("package", "test")),
     "bench": Needs(),
     "sros": Needs(),
-    "setup": Needs(GROUPS, dds=True, openssl=True),
+    "setup": Needs(GROUPS, dds=True, for_tests=True),
 }
 
 
@@ -80,25 +80,33 @@ def set_up(needs: Needs, *, afresh: bool = False) -> None:
         record = read_record()
         groups = list(needs.groups)
         if afresh:
-            record = replace(record, groups=[], dds=None)
+            record = replace(record, groups=[], dds=None, rmw=None)
         if not holds(record, current(), groups):
             record = prepare(groups, record, lock)
             write_record(record)
-        if needs.openssl:
+        if needs.for_tests:
             apt.provide_openssl(lock)
-        if _lacks_dds(needs, record):
-            plugins = dds.provide(PYTHON, lock)
-            if plugins and not dds.chosen_by_user():
-                write_record(replace(record, dds=plugins))
+        if needs.dds and not dds.chosen_by_user():
+            with_dds = _with_dds(needs, record, lock)
+            if with_dds != record:
+                write_record(with_dds)
 
 
-def _lacks_dds(needs: Needs, record: Record) -> bool:
-    if not needs.dds or dds.chosen_by_user():
-        return False
-    # A sourced ROS 2 brings its own DDS; only tests ask for Cyclone DDS besides.
-    if record.ros_around and not needs.openssl:
-        return False
-    return record.dds is None or not Path(record.dds).is_dir()
+def _with_dds(needs: Needs, record: Record, lock: int) -> Record:
+    """See to a DDS that enforces security, and note where it is, so as not to ask again."""
+    if record.ros_around and not needs.for_tests:
+        # The demo prefers the DDS of a sourced ROS 2; the tests ask for Cyclone DDS besides.
+        if not _stands(record.rmw):
+            record = replace(record, rmw=dds.enforced_by_ros(PYTHON))
+        if record.rmw:
+            return record
+    if not _stands(record.dds):
+        record = replace(record, dds=dds.provide(PYTHON, lock))
+    return record
+
+
+def _stands(path: str | None) -> bool:
+    return path is not None and Path(path).exists()
 
 
 def _run(command: str, arguments: list[str]) -> int:
@@ -107,7 +115,7 @@ def _run(command: str, arguments: list[str]) -> int:
     env["VIRTUAL_ENV"] = str(VENV)
     env["PATH"] = f"{folder}{os.pathsep}{env.get('PATH', os.defpath)}"
     if command == "setup":
-        say(f"everything is in place in {VENV}")
+        say(f"the setup in {VENV} is done")
         return 0
     if command in ("test", "lint"):
         return checks.run(arguments, env, with_tests=command == "test")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import tempfile
@@ -18,22 +19,31 @@ PACKAGE = r"libddsc0\w*"
 
 _VARIABLE = "SROS_CYCLONEDDS_DIR"
 
-_ASK = (
-    "from sros_tool.runtime.cyclone_library import load_cyclone;print(load_cyclone().plugins or '')"
-)
+_ASK = """
+from sros_tool.errors import UnavailableError
+from sros_tool.runtime.cyclone_library import load_cyclone
+try:
+    print(load_cyclone().plugins or "")
+except UnavailableError:
+    print()
+"""
 
 
 def provide(python: Path, lock: int | None) -> str | None:
-    """Make sure of a DDS with security plugins; the folder of its plugins, None without one.
+    """Make sure of Cyclone DDS with security plugins; their folder, None without them.
 
     Nothing here fails: without a DDS the commands still run, and explain what they miss.
     """
     plugins = plugins_found_by(python)
-    if plugins is None and UNPACKED.exists():
+    if plugins is None:
+        # An sros that is being worked on and does not start is no reason to install anything.
+        say("sros cannot be asked whether a DDS is here; going on")
+        return None
+    if not plugins and UNPACKED.exists():
         # Of another machine, or damaged: the package would prefer it to what apt may bring.
         shutil.rmtree(UNPACKED)
         plugins = plugins_found_by(python)
-    if plugins is not None:
+    if plugins:
         return plugins
 
     missing = "no DDS that enforces security on this machine"
@@ -46,13 +56,23 @@ def provide(python: Path, lock: int | None) -> str | None:
         apt.install(PACKAGE, lock)
         plugins = plugins_found_by(python)
         tried.append("apt-get install")
-    if plugins is None:
-        say(f"{missing}: unpacking Cyclone DDS under {UNPACKED.name}/, without root")
+    if not plugins:
+        say(f"{missing}: unpacking Cyclone DDS under {UNPACKED.name}/")
         plugins = _unpack(python, lock)
         tried.append("apt-get download")
-    if plugins is None:
+    if not plugins:
         say(f"no DDS that enforces security came by {' or '.join(tried)} (see {LOG}); going on")
-    return plugins
+    return plugins or None
+
+
+def enforced_by_ros(python: Path) -> str | None:
+    """The DDS library of the sourced ROS 2, if sros found by trying that it enforces security."""
+    try:
+        answer = json.loads(output_of([python, "-m", "sros_tool", "doctor", "--json"]) or "{}")
+        enforcing = [stack for stack in answer["stacks"] if stack["enforces"]]
+        return next((str(stack["where"]) for stack in enforcing if stack["kind"] == "rmw"), None)
+    except (ValueError, KeyError, TypeError):
+        return None
 
 
 def chosen_by_user() -> bool:
@@ -61,21 +81,22 @@ def chosen_by_user() -> bool:
 
 
 def plugins_found_by(python: Path, folder: Path | None = None) -> str | None:
-    """Where the package, asked in a process of its own, finds the security plugins.
+    """Where the package finds the security plugins; empty if nowhere, None if it does not start.
 
     ``folder`` makes it look there and nowhere else.
     """
     env = dict(os.environ)
     if folder is not None:
         env[_VARIABLE] = str(folder)
-    return (output_of([python, "-c", _ASK], env) or "").strip() or None
+    answer = output_of([python, "-c", _ASK], env)
+    return None if answer is None else answer.strip()
 
 
 def _unpack(python: Path, lock: int | None) -> str | None:
     with tempfile.TemporaryDirectory(prefix="dds-", dir=VENV) as staging:
         whole = Path(staging, "whole")
         whole.mkdir()
-        if not apt.unpack(PACKAGE, whole, lock) or plugins_found_by(python, whole) is None:
+        if not apt.unpack(PACKAGE, whole, lock) or not plugins_found_by(python, whole):
             return None
         whole.rename(UNPACKED)
     return plugins_found_by(python)

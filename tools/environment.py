@@ -72,12 +72,20 @@ def prepare(groups: list[str], record: Record, lock: int) -> Record:
         and record.surroundings == now.surroundings
         and whole(record)
     )
-    done = list(record.groups) if stands else []
+    if not stands:
+        record = Record()
+    done = list(record.groups)
     with _unfinished():
         for group in groups:
             if group not in done and _install(group, now, lock):
                 done.append(group)
-    return replace(now, groups=done, distributions=distributions_now(), dds=record.dds)
+    return replace(
+        now,
+        groups=done,
+        distributions=distributions_now(),
+        dds=record.dds,
+        rmw=record.rmw,
+    )
 
 
 def _usable(record: Record, now: Record) -> bool:
@@ -150,8 +158,8 @@ def _make_sure_of_venv(now: Record, lock: int) -> None:
     raise SetupError(
         f"Python {now.version} ({now.base}) comes without venv and ensurepip, which make the"
         " virtual environment that sros is installed into. On Debian and Ubuntu install them"
-        f" with 'sudo apt-get install {package}' and run this again; or name another Python"
-        " that has them: PYTHON=/path/to/python3 ./dev …"
+        f" with 'sudo apt-get update && sudo apt-get install {package}' and run this again; or name"
+        " another Python that has them: PYTHON=/path/to/python3 ./dev …"
     )
 
 

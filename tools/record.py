@@ -30,7 +30,8 @@ class Record:
     """What a finished setup found and made.
 
     ``base`` is the interpreter behind the environment, ``ros_around`` whether it has an rclpy of
-    its own (a sourced ROS 2), ``dds`` the folder of the security plugins that were found.
+    its own (a sourced ROS 2).  ``dds`` is the folder of Cyclone's security plugins, ``rmw`` the
+    DDS library of that ROS 2 if it enforces security.
     """
 
     checkout: str = ""
@@ -42,6 +43,7 @@ class Record:
     groups: list[str] = field(default_factory=list)
     distributions: list[str] = field(default_factory=list)
     dds: str | None = None
+    rmw: str | None = None
 
 
 def read_record() -> Record:
@@ -89,6 +91,7 @@ def holds(record: Record, now: Record, groups: list[str]) -> bool:
         groups=record.groups,
         distributions=record.distributions,
         dds=record.dds,
+        rmw=record.rmw,
     )
     return record == same and set(groups) <= set(record.groups) and whole(record)
 

@@ -1,0 +1,252 @@
+"""The commands that set up a checkout: what they trust, what they ask for, what they say."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tools import apt, checks, dds, environment, record, steps
+from tools.record import Record
+from tools.steps import SetupError
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+
+APT_DEPENDS = {
+    "libddsc0debian": "libddsc0debian\n  Depends: libc6\n  Depends: libiceoryx-binding-c2\n",
+    "libiceoryx-binding-c2": "libiceoryx-binding-c2\n |Depends: libc6\n  Depends: <libc6-other>\n"
+    "  PreDepends: libiceoryx-posh2:any\n",
+    "libiceoryx-posh2": "libiceoryx-posh2\n  Depends: libddsc0debian\n  Depends: <virtual>\n"
+    " |Depends: <virtual>\n |Depends: real-one\n  Depends: other\n",
+}
+
+
+def start(folder: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["/bin/sh", str(folder / "dev"), *arguments],
+        env={"PATH": "/usr/bin:/bin", **variables},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def fake_python(path: Path, version: str) -> Path:
+    """An interpreter that refuses to be new enough and tells its version."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f'#!/bin/sh\ncase "$*" in *exit*) exit 1;; *) echo Python {version};; esac\n')
+    path.chmod(0o755)
+    return path
+
+
+def changed(found: Record, change: dict[str, Any]) -> Record:
+    return replace(found, **change)
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A copy of the program alone, in a folder whose name has a space."""
+    folder = tmp_path / "a robot"
+    folder.mkdir()
+    shutil.copy(CHECKOUT / "dev", folder)
+    shutil.copytree(CHECKOUT / "tools", folder / "tools")
+    shutil.copy(CHECKOUT / "pyproject.toml", folder)
+    return folder
+
+
+@pytest.fixture
+def venv(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty stand-in for the environment, with a Python that does not run."""
+    folder = tmp_path / ".venv"
+    (folder / "bin").mkdir(parents=True)
+    (folder / "bin" / "python").touch()
+    for module in (record, environment, steps):
+        monkeypatch.setattr(module, "VENV", folder)
+    for module in (record, environment):
+        monkeypatch.setattr(module, "PYTHON", folder / "bin" / "python")
+        monkeypatch.setattr(module, "UNFINISHED", folder / "sros-setup.unfinished")
+    monkeypatch.setattr(record, "_RECORD", folder / "sros-setup.json")
+    monkeypatch.setattr(steps, "LOG", folder / "setup.log")
+    return folder
+
+
+def test_a_python_that_is_too_old_is_named_with_what_to_do(checkout: Path) -> None:
+    old = fake_python(checkout / "old" / "python3", "3.9.18")
+    answer = start(checkout, "demo", PYTHON=str(old))
+    assert answer.returncode == 1
+    assert "PYTHON names" in answer.stderr
+    assert "Python 3.9.18" in answer.stderr
+    assert not (checkout / ".venv").exists()
+
+
+def test_without_a_fitting_python_the_way_to_one_is_told(checkout: Path) -> None:
+    stubs = checkout / "stubs"
+    fake_python(stubs / "python3", "3.10.12")
+    (stubs / "dirname").symlink_to(shutil.which("dirname") or "/usr/bin/dirname")
+    answer = start(checkout, "test", PATH=str(stubs))
+    assert answer.returncode == 1
+    assert "python3: Python 3.10.12" in answer.stderr
+    assert "apt-get install python3 python3-venv" in answer.stderr
+    assert answer.stdout == ""
+    assert len(answer.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status"), [((), 2), (("nonsense",), 2), (("--help",), 0), (("help",), 0)]
+)
+def test_usage_is_told_and_nothing_is_set_up(
+    checkout: Path, arguments: tuple[str, ...], status: int
+) -> None:
+    answer = start(checkout, *arguments, PYTHON=sys.executable)
+    assert answer.returncode == status
+    assert "Usage: ./dev COMMAND" in (answer.stderr if status else answer.stdout)
+    assert not (checkout / ".venv").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(checkout: Path) -> None:
+    (checkout / "pyproject.toml").unlink()
+    answer = start(checkout, "demo", PYTHON=sys.executable)
+    assert answer.returncode == 1
+    assert answer.stderr.startswith("dev: cannot go on: ")
+    assert "pyproject.toml" in answer.stderr
+    assert "Traceback" not in answer.stderr
+
+
+def test_missing_venv_names_the_package(venv: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(environment, "_has_venv", lambda: False)
+    monkeypatch.setattr(environment, "root_prefix", lambda: None)
+    now = Record(checkout="/here", base="/usr/bin/python3.12", version="3.12.3")
+    with pytest.raises(SetupError, match=r"sudo apt-get install python3\.12-venv'"):
+        environment._make_sure_of_venv(now, 0)
+
+
+def test_a_record_is_trusted_only_when_the_setup_ended(venv: Path) -> None:
+    done = Record(checkout="/here", groups=["package"], dds="/usr/lib/plugins")
+    record.write_record(done)
+    assert record.read_record() == done
+    (venv / "sros-setup.unfinished").touch()
+    assert record.read_record() == Record()
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"unknown": 1}', "null"])
+def test_a_damaged_record_counts_as_none(venv: Path, content: str) -> None:
+    (venv / "sros-setup.json").write_text(content)
+    assert record.read_record() == Record()
+
+
+def test_a_setup_holds_until_anything_it_rests_on_changes(venv: Path) -> None:
+    now = record.current()
+    distribution = f"lib/python{now.version.rpartition('.')[0]}/site-packages/click.dist-info"
+    (venv / distribution).mkdir(parents=True)
+    done = replace(now, groups=["package", "ros"], distributions=["click.dist-info"], dds="/lib")
+    assert record.holds(done, now, ["package"])
+    assert not record.holds(done, now, ["package", "test"])
+    for name in ("checkout", "base", "version", "requirements", "surroundings"):
+        assert not record.holds(changed(done, {name: "other"}), now, ["package"]), name
+    (venv / distribution).rmdir()
+    assert not record.holds(done, now, ["package"])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"checkout": "/old"}, "moved here from /old"),
+        ({"version": "3.11.0"}, "Python 3.11.0"),
+        ({"base": "/gone/python3"}, "/gone/python3"),
+        ({"ros_around": True}, "no longer sourced"),
+        ({"requirements": "other"}, None),
+        ({"distributions": ["gone"]}, None),
+    ],
+)
+def test_only_what_cannot_be_built_upon_is_made_anew(
+    venv: Path, change: dict[str, Any], said: str | None
+) -> None:
+    now = record.current()
+    reason = record.difference(changed(now, change), now)
+    assert reason is None if said is None else said in (reason or "")
+
+
+def test_an_environment_that_a_person_made_is_not_removed(
+    venv: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (venv / "pyvenv.cfg").touch()
+    monkeypatch.setattr(environment, "output_of", lambda command: "3.99.0\n")
+    with pytest.raises(SetupError, match="was not made by this program"):
+        environment._usable(Record(), record.current())
+    assert (venv / "pyvenv.cfg").exists()
+
+
+def test_needed_packages_are_those_that_are_not_here() -> None:
+    here = {"libc6"}
+    needed = apt.needed("libddsc0debian", lambda name: APT_DEPENDS.get(name, ""), here.__contains__)
+    assert needed == ["libddsc0debian", "libiceoryx-binding-c2", "libiceoryx-posh2", "real-one"]
+    everything = here | set(APT_DEPENDS)
+    alone = apt.needed("libddsc0debian", APT_DEPENDS.__getitem__, everything.__contains__)
+    assert alone == ["libddsc0debian"]
+
+
+def test_the_package_answers_where_its_security_plugins_are() -> None:
+    """An answer of None would mean that the question no longer fits the package."""
+    assert dds.plugins_found_by(Path(sys.executable)) is not None
+
+
+def test_an_empty_folder_has_no_plugins(tmp_path: Path) -> None:
+    assert dds.plugins_found_by(Path(sys.executable), tmp_path) == ""
+
+
+def test_a_package_that_does_not_start_installs_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(apt, "install", lambda *_: pytest.fail("nothing is to be installed"))
+    monkeypatch.setattr(apt, "unpack", lambda *_: pytest.fail("nothing is to be unpacked"))
+    assert dds.provide(fake_python(tmp_path / "python", "3.11.0").with_name("gone"), None) is None
+
+
+def test_a_second_setup_waits_for_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(steps, "CHECKOUT", tmp_path)
+    order: list[str] = []
+
+    def second() -> None:
+        with steps.locked():
+            order.append("second")
+
+    with steps.locked():
+        thread = threading.Thread(target=second)
+        thread.start()
+        while "waiting for it" not in capsys.readouterr().err:
+            thread.join(0.01)
+        order.append("first")
+    thread.join(10)
+    assert order == ["first", "second"]
+    assert os.listdir(tmp_path) == []
+
+
+def test_an_installer_keeps_the_lock_of_a_killed_setup(
+    venv: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(steps, "CHECKOUT", venv.parent)
+    ask = "import os, sys; os.fstat(int(sys.argv[1]))"
+    with steps.locked() as lock:
+        assert steps.succeeds([sys.executable, "-c", ask, str(lock)], keep_open=lock)
+        assert not steps.succeeds([sys.executable, "-c", ask, str(lock)])
+
+
+def test_counts_come_from_the_reports_of_pytest(tmp_path: Path) -> None:
+    report = tmp_path / "report.xml"
+    report.write_text(
+        '<testsuites><testsuite name="pytest" errors="1" failures="2" skipped="3" tests="10"/>'
+        "</testsuites>"
+    )
+    assert checks.count(report) == {"passed": 4, "failed": 3, "skipped": 3}
+    assert checks.count(tmp_path / "none.xml") == {}
