@@ -67,16 +67,14 @@ def choose_backend(wish: str, probe: ProbeEnclave) -> Backend:
             return Backend(RCLPY, f"{stack.dds} {stack.version}".strip(), why, stack.rmw)
     reason = _why_not(stacks)
     if wish == RCLPY:
-        raise UnavailableError(
-            "cannot run the demo with rclpy: no RMW here enforces security", reason, _NO_RCLPY
-        )
+        raise UnavailableError("no RMW under rclpy enforces security here", reason, _NO_RCLPY)
     return _cyclone(cyclone_stack(probe), reason)
 
 
 def _cyclone(stack: Stack, why: str) -> Backend:
     if not stack.enforces:
         raise UnavailableError(
-            "cannot run the demo: no DDS here enforces security",
+            "no DDS here enforces security",
             f"{stack.name}: {stack.evidence}. {why if why != 'as asked for' else ''}",
             INSTALL_ADVICE,
         )

@@ -6,6 +6,7 @@ namespace of his own (`sros_tool.runtime.netns`).
 
 from __future__ import annotations
 
+import os
 import socket
 from collections import Counter
 from collections.abc import Sequence
@@ -22,17 +23,40 @@ _PROTECTED_SUBMESSAGES = range(0x30, 0x35)
 """SEC_BODY, SEC_PREFIX, SEC_POSTFIX, SRTPS_PREFIX, SRTPS_POSTFIX (DDS-Security 1.1 §7.3.6)."""
 
 
-class Capture:
-    """Listens on every interface and counts; nothing is stored.
+class PacketCounter:
+    """Counts IPv4 packets in which one of ``marks`` is readable, and those that are protected.
 
-    ``marks`` are the texts to look for.  Raises `PermissionError` where it is not permitted.
+    ``plain`` counts by mark, ``protected`` by UDP port, for both ports of a packet.
     """
 
     def __init__(self, marks: Sequence[str]) -> None:
         self._marks = {mark: mark.encode() for mark in marks}
         self.plain: Counter[str] = Counter()
         self.protected: Counter[int] = Counter()
-        self.packets = 0
+
+    def count(self, packet: bytes) -> None:
+        """Count one packet; whatever is not UDP is passed over."""
+        start = (packet[0] & 0x0F) * 4 if packet else 0
+        if len(packet) < max(20, start) + 8 or packet[9] != _UDP:
+            return
+        source = int.from_bytes(packet[start : start + 2], "big")
+        target = int.from_bytes(packet[start + 2 : start + 4], "big")
+        payload = packet[start + 8 :]
+        for mark, raw in self._marks.items():
+            if raw in payload:
+                self.plain[mark] += 1
+        if _is_protected(payload):
+            self.protected.update({source, target})
+
+
+class Capture(PacketCounter):
+    """Listens on every interface and counts; nothing is stored.
+
+    Raises `PermissionError` where it is not permitted.
+    """
+
+    def __init__(self, marks: Sequence[str]) -> None:
+        super().__init__(marks)
         self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(_ETH_P_IP))
         self._socket.setblocking(False)
         try:
@@ -53,21 +77,6 @@ class Capture:
                 return
             if address[2] != _PACKET_OUTGOING:
                 self.count(packet)
-
-    def count(self, packet: bytes) -> None:
-        """Count one IPv4 packet."""
-        self.packets += 1
-        start = (packet[0] & 0x0F) * 4
-        if len(packet) < start + 8 or packet[9] != _UDP:
-            return
-        source = int.from_bytes(packet[start : start + 2], "big")
-        target = int.from_bytes(packet[start + 2 : start + 4], "big")
-        payload = packet[start + 8 :]
-        for mark, raw in self._marks.items():
-            if raw in payload:
-                self.plain[mark] += 1
-        if _is_protected(payload):
-            self.protected.update({source, target})
 
     def close(self) -> None:
         """Stop listening."""
@@ -95,13 +104,18 @@ def udp_ports(process: int) -> frozenset[int]:
     """The UDP ports that a process has bound, by its open descriptors; empty if it has ended."""
     folder = Path(f"/proc/{process}")
     try:
-        inodes = {
-            str(link.readlink())[len("socket:[") : -1]
-            for link in (folder / "fd").iterdir()
-            if str(link.readlink()).startswith("socket:[")
-        }
+        links = list((folder / "fd").iterdir())
         lines = (folder / "net" / "udp").read_text(encoding="ascii").splitlines()[1:]
     except OSError:
         return frozenset()
+    inodes = {_socket_inode(link) for link in links}
     rows = [line.split() for line in lines]
     return frozenset(int(row[1].partition(":")[2], 16) for row in rows if row[9] in inodes)
+
+
+def _socket_inode(link: Path) -> str:
+    try:
+        target = os.readlink(link)
+    except OSError:
+        return ""  # closed meanwhile
+    return target.removeprefix("socket:[").removesuffix("]") if target[:8] == "socket:[" else ""

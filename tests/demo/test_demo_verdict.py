@@ -1,0 +1,263 @@
+"""The verdict: what counts as heard, as silence, and as a refusal; and that a crash is neither."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import pytest
+
+from sros_tool.demo.scenarios import ROWS, Row, Status
+from sros_tool.demo.verdict import PartyRecord, RowRecord, RowResult, WireCount, judge_row
+from sros_tool.runtime.events import Event, Kind, Stage
+
+WINDOW = (100.0, 105.0)
+FAST_DDS_DENIAL = (
+    "2026-01-01 12:00:00.000 [SECURITY Error] rt/chatter topic not found in allow rule."
+    " -> Function check_create_datareader\n"
+)
+READY = Event(Kind.READY, 99.0)
+
+
+def row(name: str) -> Row:
+    return next(each for each in ROWS if each.name == name)
+
+
+def talker(text: str, times: Iterable[float] = (101.0, 102.0), topic: str = "/c") -> PartyRecord:
+    sent = [Event(Kind.SENT, at, f"{text}: {n}", n) for n, at in enumerate(times, 1)]
+    return PartyRecord(text=text, topic=topic, events=(READY, *sent))
+
+
+def listener(*heard: str) -> PartyRecord:
+    events = [Event(Kind.HEARD, 101.5, f"{text}: 1", n) for n, text in enumerate(heard, 1)]
+    return PartyRecord(events=(READY, *events))
+
+
+def judge(name: str, **parties: PartyRecord) -> RowResult:
+    records = {party.replace("_", " "): record for party, record in parties.items()}
+    return judge_row(RowRecord(row(name), 100, records, WINDOW))
+
+
+POSITIVE = "secured talker to secured listener"
+NEGATIVE = "secured talker to unsecured listener"
+DENIED = "secured listener without permission"
+
+
+def test_heard() -> None:
+    result = judge(POSITIVE, secured_talker=talker("T"), secured_listener=listener("T"))
+    assert (result.observed, result.as_expected) == (Status.HEARD, True)
+    assert "1 of 2 messages" in result.detail
+
+
+def test_silence_is_a_failure_where_sound_is_expected() -> None:
+    result = judge(POSITIVE, secured_talker=talker("T"), secured_listener=listener())
+    assert (result.observed, result.as_expected) == (Status.NOT_HEARD, False)
+
+
+def test_words_of_another_talker_do_not_count() -> None:
+    result = judge(POSITIVE, secured_talker=talker("T-1"), secured_listener=listener("T-11"))
+    assert result.observed is Status.NOT_HEARD
+
+
+def test_silence_counts_beside_a_control_that_heard() -> None:
+    parties = {"secured_talker": talker("T"), "unsecured_listener": listener()}
+    good = judge(NEGATIVE, **parties, secured_listener=listener("T"))
+    assert (good.observed, good.as_expected) == (Status.NOT_HEARD, True)
+    deaf_control = judge(NEGATIVE, **parties, secured_listener=listener())
+    assert (deaf_control.observed, deaf_control.as_expected) == (Status.UNDECIDED, False)
+
+
+def test_one_leaked_message_is_a_failure_even_before_the_window() -> None:
+    leak = PartyRecord(events=(READY, Event(Kind.HEARD, 99.5, "T: 0", 1)))
+    result = judge(
+        NEGATIVE,
+        secured_talker=talker("T"),
+        unsecured_listener=leak,
+        secured_listener=listener("T"),
+    )
+    assert (result.observed, result.as_expected) == (Status.HEARD, False)
+
+
+def test_silence_of_a_talker_that_sent_nothing_is_undecided() -> None:
+    result = judge(
+        NEGATIVE,
+        secured_talker=talker("T", times=(90.0,)),
+        unsecured_listener=listener(),
+        secured_listener=listener("T"),
+    )
+    assert (result.observed, result.as_expected) == (Status.UNDECIDED, False)
+
+
+CRASHES = {
+    "killed": (PartyRecord(events=(READY,), status=-11), Status.CRASHED, "SIGSEGV"),
+    "ended by itself": (PartyRecord(events=(READY,), status=0), Status.CRASHED, "status 0"),
+    "died before it was ready": (
+        PartyRecord(output="Traceback\nImportError: no std_msgs", status=1),
+        Status.CRASHED,
+        "ImportError",
+    ),
+    "an exception": (
+        PartyRecord(events=(Event(Kind.FAILED, 99, "ValueError: x", stage=Stage.ENDPOINT),)),
+        Status.CRASHED,
+        "ValueError: x",
+    ),
+    "never ready": (PartyRecord(), Status.NOT_STARTED, "not ready"),
+    "no security built in": (
+        PartyRecord(
+            events=(
+                Event(
+                    Kind.FAILED,
+                    99,
+                    "This Fast DDS version doesn't have the security libraries",
+                    stage=Stage.PARTICIPANT,
+                ),
+            )
+        ),
+        Status.NOT_STARTED,
+        "security libraries",
+    ),
+    "refused already as a participant": (
+        PartyRecord(events=(Event(Kind.REFUSED, 99, "bad file", stage=Stage.PARTICIPANT),)),
+        Status.NOT_STARTED,
+        "before it came to the topic",
+    ),
+    "the log of another topic": (
+        PartyRecord(
+            topic="/chatter",
+            output="[SECURITY Error] rt/rosout topic not found in allow rule.\n",
+            events=(Event(Kind.FAILED, 99, "RCLError: x", stage=Stage.ENDPOINT),),
+        ),
+        Status.CRASHED,
+        "RCLError",
+    ),
+    "a denial in the log, then a crash": (
+        PartyRecord(topic="/chatter", output=FAST_DDS_DENIAL, status=-6),
+        Status.CRASHED,
+        "SIGABRT",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CRASHES)
+def test_a_crash_is_not_a_refusal(case: str) -> None:
+    record, observed, told = CRASHES[case]
+    result = judge(DENIED, listener_without_permission=record, secured_listener=listener())
+    assert (result.observed, result.as_expected) == (observed, False)
+    assert told in result.detail
+
+
+@pytest.mark.parametrize("case", CRASHES)
+def test_a_crash_is_not_silence(case: str) -> None:
+    record, observed, _ = CRASHES[case]
+    result = judge(
+        NEGATIVE,
+        secured_talker=talker("T"),
+        unsecured_listener=record,
+        secured_listener=listener("T"),
+    )
+    assert (result.observed, result.as_expected) == (observed, False)
+
+
+REFUSALS = {
+    "Cyclone says so": PartyRecord(
+        topic="/chatter",
+        events=(Event(Kind.REFUSED, 99, "Not Allowed By Security", stage=Stage.ENDPOINT),),
+    ),
+    "rclpy raises, Fast DDS says so on stdout": PartyRecord(
+        topic="/chatter",
+        output=FAST_DDS_DENIAL,
+        events=(Event(Kind.FAILED, 99, "RCLError: invalid allocator", stage=Stage.ENDPOINT),),
+        status=1,
+    ),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+def test_a_refusal_by_security(case: str) -> None:
+    parties = {"listener_without_permission": REFUSALS[case]}
+    result = judge(DENIED, **parties, secured_listener=listener())
+    assert (result.observed, result.as_expected) == (Status.REFUSED, True)
+    without_twin = judge(DENIED, **parties, secured_listener=PartyRecord())
+    assert (without_twin.observed, without_twin.as_expected) == (Status.UNDECIDED, False)
+
+
+def test_a_listener_that_is_let_in_is_a_failure() -> None:
+    result = judge(DENIED, listener_without_permission=listener(), secured_listener=listener())
+    assert (result.observed, result.as_expected) == (Status.STARTED, False)
+
+
+def test_a_refused_listener_is_not_silence() -> None:
+    result = judge(
+        NEGATIVE,
+        secured_talker=talker("T"),
+        unsecured_listener=REFUSALS["Cyclone says so"],
+        secured_listener=listener("T"),
+    )
+    assert (result.observed, result.as_expected) == (Status.REFUSED, False)
+
+
+@pytest.mark.parametrize(
+    ("secured", "unsecured", "observed"),
+    [
+        (["S"], ["U"], Status.UNDISTURBED),
+        (["S", "U"], ["U"], Status.DISTURBED),
+        (["S"], ["U", "S"], Status.DISTURBED),
+        ([], ["U"], Status.DISTURBED),
+    ],
+)
+def test_side_by_side(secured: list[str], unsecured: list[str], observed: Status) -> None:
+    result = judge(
+        "both pairs side by side on one topic",
+        secured_talker=talker("S"),
+        unsecured_talker=talker("U"),
+        secured_listener=listener(*secured),
+        unsecured_listener=listener(*unsecured),
+    )
+    assert result.observed is observed
+
+
+@pytest.mark.parametrize(
+    ("of_secured", "of_open", "observed"),
+    [(0, 1, Status.NOT_VISIBLE), (1, 1, Status.VISIBLE), (0, 0, Status.UNDECIDED)],
+)
+def test_view(of_secured: int, of_open: int, observed: Status) -> None:
+    looks = {"/c": of_secured, "/c_open": of_open}
+    result = judge(
+        "secured talker in an unsecured node's view",
+        secured_talker=talker("S"),
+        unsecured_talker_aside=talker("U", topic="/c_open"),
+        observer=PartyRecord(events=(READY, Event(Kind.SEEN, 103, publishers=looks))),
+    )
+    assert result.observed is observed
+
+
+def test_an_observer_without_rclpy_is_skipped_with_the_reason() -> None:
+    failed = Event(Kind.FAILED, 99, "ModuleNotFoundError: rclpy", stage=Stage.IMPORT)
+    result = judge(
+        "secured talker in an unsecured node's view",
+        secured_talker=talker("S"),
+        unsecured_talker_aside=talker("U"),
+        observer=PartyRecord(events=(failed,), status=1),
+    )
+    assert (result.observed, result.as_expected) == (Status.SKIPPED, True)
+    assert "ModuleNotFoundError" in result.detail
+
+
+@pytest.mark.parametrize(
+    ("plain", "protected", "observed"),
+    [
+        (0, 100, Status.NOT_READABLE),
+        (1, 100, Status.READABLE),
+        (0, 0, Status.UNDECIDED),
+    ],
+)
+def test_wire(plain: int, protected: int, observed: Status) -> None:
+    parties = {"secured talker": talker("T"), "secured listener": listener("T")}
+    wire = {"secured talker": WireCount(plain, protected)}
+    record = RowRecord(row("secured payload on the wire"), 100, parties, WINDOW, wire)
+    assert judge_row(record).observed is observed
+
+
+def test_a_skipped_row_is_shown_with_its_reason() -> None:
+    result = judge_row(RowRecord(row(POSITIVE), 100, skipped="not permitted"))
+    assert (result.observed, result.detail) == (Status.SKIPPED, "not permitted")
+    assert set(result.as_json()) >= {"name", "expected", "observed", "as_expected", "mechanism"}
