@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import signal
 import sys
@@ -12,18 +13,32 @@ def main(arguments: list[str] | None = None) -> None:
     """Run ``sros`` and exit: 0 yes or done; 1 no, denied, or failed; 2 wrong usage."""
     # Turns a polite request to end into an exception, so that nothing half-made is left behind.
     signal.signal(signal.SIGTERM, _terminate)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")  # a path need not be valid UTF-8
     from sros_tool.cli.program import program
     from sros_tool.cli.report import report_error
 
     try:
         status = program.main(arguments, prog_name="sros", standalone_mode=False)
-        sys.stdout.flush()
+        if sys.stdout:  # None where it was closed
+            sys.stdout.flush()
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _give_up_stdout()
         sys.exit(1)
     except BaseException as error:
-        sys.exit(report_error(error))
+        status = report_error(error)
+        try:
+            if sys.stdout:
+                sys.stdout.flush()
+        except OSError:
+            _give_up_stdout()
+        sys.exit(status)
     sys.exit(status if isinstance(status, int) else 0)
+
+
+def _give_up_stdout() -> None:
+    """Keep the interpreter from failing again, at its end, with what could not be printed."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _terminate(number: int, _frame: FrameType | None) -> None:

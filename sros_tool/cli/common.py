@@ -24,6 +24,22 @@ Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 KEYSTORE_VARIABLE = "ROS_SECURITY_KEYSTORE"
 
 
+class NamedPath(click.Path):
+    """A path that has to be named: "" is an unset variable of a script, and not this folder."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The path; refuses the empty one."""
+        if value == "":
+            self.fail("the path is empty.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
+PATH = NamedPath()
+
+
 def now() -> datetime:
     """The present moment: the only place where the command line asks the clock."""
     return datetime.now(UTC)

@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from sros_tool.cli.common import json_option, now, print_json
+from sros_tool.cli.common import PATH, json_option, now, print_json
 
 _INDENT = "  "
 
@@ -26,11 +26,11 @@ Example:
         publish topics: /chatter, /parameter_events, /rosout
         ...""",
 )
-@click.argument("path", type=click.Path(path_type=Path))
+@click.argument("path", type=PATH)
 @click.option(
     "--ca",
     "authority",
-    type=click.Path(path_type=Path),
+    type=PATH,
     help="The permissions CA certificate to verify a signed document against.",
 )
 @json_option

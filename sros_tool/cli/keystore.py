@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from sros_tool.cli.common import (
+    PATH,
     complete_keystore_and_enclave,
     complete_template,
     dry_run_option,
@@ -29,8 +30,6 @@ if TYPE_CHECKING:
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore import Result
     from sros_tool.keystore.template import Template
-
-_FOLDER = click.Path(path_type=Path)
 
 
 def _ros_domain() -> int | None:
@@ -50,7 +49,7 @@ Example:
     identity CA and permissions CA: separate, valid for 3650d; certificates 3650d, permissions 3650d
   $ sros create_keystore fleet --template production --domain 10-19""",
 )
-@click.argument("root", type=_FOLDER)
+@click.argument("root", type=PATH)
 @click.option(
     "--template",
     "template_name",
@@ -225,7 +224,7 @@ def create_permission(words: tuple[str, ...], dry_run: bool) -> None:
     result = create(
         root,
         name,
-        read_policy(Path(file)),
+        read_policy(PATH.convert(file, None, None)),
         now=now(),
         domain=_ros_domain(),
         dry_run=dry_run,
@@ -265,13 +264,13 @@ Example:
   created enclave /talker_listener/talker
   ...""",
 )
-@click.option("-k", "--keystore-root-path", type=_FOLDER, help="The keystore; made if missing.")
+@click.option("-k", "--keystore-root-path", type=PATH, help="The keystore; made if missing.")
 @click.option("-e", "--enclaves", multiple=True, metavar="NAME...", help="Enclaves to create.")
 @click.option(
     "-p",
     "--policy-files",
     multiple=True,
-    type=_FOLDER,
+    type=PATH,
     metavar="FILE...",
     help="Policies whose enclaves to create, with their permissions.",
 )
@@ -359,7 +358,7 @@ Example:
   /listener
   /talker""",
 )
-@click.argument("root", type=_FOLDER, required=False)
+@click.argument("root", type=PATH, required=False)
 @json_option
 def list_enclaves(root: Path | None, as_json: bool) -> None:
     """List the enclaves of the keystore ROOT, sorted."""
@@ -404,7 +403,7 @@ def distribute_key(words: tuple[str, ...], force: bool, dry_run: bool) -> None:
     root, rest = split_root(words)
     if len(rest) != 2:
         raise UsageError("distribute_key takes a keystore, an enclave and a target")
-    name, target = rest[0], Path(rest[1])
+    name, target = rest[0], PATH.convert(rest[1], None, None)
     export = distribute(root, [name], target, now=now(), force=force, dry_run=dry_run)
     if dry_run:
         print_plan(target if target.is_dir() else target.parent, export.changes)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from sros_tool.cli.common import dry_run_option, json_option, print_json
+from sros_tool.cli.common import PATH, dry_run_option, json_option, print_json
 from sros_tool.errors import UsageError
 
 
@@ -24,7 +24,7 @@ Example:
 @click.option(
     "--copy",
     "target",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="DIR",
     help="Copy them to the new folder DIR, to start your own from.",
 )

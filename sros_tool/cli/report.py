@@ -72,8 +72,10 @@ def _verb() -> str | None:
 
 
 def _os_problem(error: OSError) -> str:
-    path = f" '{os.fsdecode(error.filename)}'" if error.filename is not None else ""
-    return f"the operating system refuses{path}: {error.strerror or error}. Nothing was changed."
+    if error.filename is None:  # perhaps what was done can only not be printed
+        return f"the operating system refuses: {error.strerror or error}."
+    path = os.fsdecode(error.filename)
+    return f"the operating system refuses '{path}': {error.strerror or error}. Nothing was changed."
 
 
 def _defect(error: BaseException) -> int:

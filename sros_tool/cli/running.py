@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import sys
 from pathlib import Path
 
@@ -93,6 +94,8 @@ def run(words: tuple[str, ...], domain: str | None) -> None:
         raise UsageError(f"the command '{command[0]}' is not found")
     sys.stdout.flush()
     sys.stderr.flush()
+    for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # by Python, and a command would inherit it
+        signal.signal(ignored, signal.SIG_DFL)
     os.execve(program, command, {**os.environ, **variables})
 
 
@@ -108,8 +111,9 @@ def _variables(root: Path, name: str, domain_text: str | None) -> dict[str, str]
         secured_environment,
     )
 
-    given = {DOMAIN: domain_text} if domain_text is not None else os.environ
-    wanted = domain_from(given)
+    if domain_text == "":
+        raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
+    wanted = domain_from(os.environ if domain_text is None else {DOMAIN: domain_text})
     check_enclave_name(name)
     names = list_enclaves(root)
     if name not in names:
