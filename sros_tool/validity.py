@@ -19,9 +19,9 @@ Fast DDS 2.14.5 reads the dates of permissions in the host's local time, so a do
 valid at least 14 hours before its creation in UTC to work in every time zone.
 """
 
-_DURATION = re.compile(r"(\d{1,6})([smhdwy])\Z")
+_DURATION = re.compile(r"(\d{1,10})([smhdwy])\Z", re.ASCII)
 _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400, "w": 604800, "y": 365 * 86400}
-_LONGEST = timedelta(days=100 * 365)
+_LONGEST = 100 * _SECONDS["y"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +57,9 @@ def parse_duration(text: str) -> timedelta:
     """Read ``90d``, ``72h``, ``10y`` …: a whole number and one of s m h d w y (365 days)."""
     match = _DURATION.match(text.strip())
     if match:
-        duration = timedelta(seconds=int(match[1]) * _SECONDS[match[2]])
-        if timedelta(0) < duration <= _LONGEST:
-            return duration
+        seconds = int(match[1]) * _SECONDS[match[2]]
+        if 0 < seconds <= _LONGEST:
+            return timedelta(seconds=seconds)
     raise UsageError(
         f"{text!r} is not a duration",
         "",
@@ -87,4 +87,7 @@ def parse_iso(text: str) -> datetime:
     moment = datetime.fromisoformat(text.strip())
     if moment.tzinfo is None:
         moment = moment.replace(tzinfo=UTC)
-    return moment.astimezone(UTC)
+    try:
+        return moment.astimezone(UTC)
+    except OverflowError as error:  # an offset at the very end of the calendar
+        raise ValueError(f"{text!r} lies outside of the calendar") from error

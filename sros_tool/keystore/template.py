@@ -143,7 +143,8 @@ def _authority_name(table: _Table) -> str:
     name = table.text("name", "sros")
     if not 0 < len(name) <= _LONGEST_AUTHORITY_NAME or not name.isprintable():
         raise _TemplateError(
-            f"{table.path}.name is {name!r}, not 1 to {_LONGEST_AUTHORITY_NAME} printable characters"
+            f"{table.path}.name is {name!r}, not a text of 1 to {_LONGEST_AUTHORITY_NAME} "
+            "printable characters"
         )
     return name
 

@@ -33,6 +33,9 @@ _LEAF_USAGE = x509.KeyUsage(
     encipher_only=False,
     decipher_only=False,
 )
+UNREADABLE = (ValueError, UnsupportedAlgorithm, x509.DuplicateExtension, x509.InvalidVersion)
+"""What `cryptography` raises for a certificate that is damaged or of an unknown kind."""
+
 _NOT_A_CA = x509.BasicConstraints(ca=False, path_length=None)
 _A_CA = x509.BasicConstraints(ca=True, path_length=1)
 
@@ -118,15 +121,30 @@ def pem(certificate: x509.Certificate) -> bytes:
 
 
 def load_certificate(data: bytes, name: str) -> x509.Certificate:
-    """The first certificate of a PEM file; ``name`` stands for it in errors."""
+    """The first certificate of a PEM file, read in full; ``name`` stands for it in errors."""
     try:
-        return x509.load_pem_x509_certificate(data)
-    except (ValueError, UnsupportedAlgorithm) as error:
+        return read_in_full(x509.load_pem_x509_certificate(data))
+    except UNREADABLE as error:
         raise PkiError(
             f"the certificate {name} cannot be read",
-            "It is not a PEM certificate, or it is damaged.",
+            "It is not a PEM certificate, it is damaged, or its key is of an unknown kind.",
             "Restore it from a backup, or issue it anew.",
         ) from error
+
+
+def read_in_full(certificate: x509.Certificate) -> x509.Certificate:
+    """``certificate``, after every part of it that sros asks for was read once.
+
+    `cryptography` reads a certificate's parts when they are asked for, so damage would otherwise
+    come to light anywhere.  Raises one of `UNREADABLE`.
+    """
+    for name in (certificate.subject, certificate.issuer):
+        name.rfc4514_string()
+    certificate.public_key()
+    _ = certificate.extensions, certificate.signature_hash_algorithm, certificate.serial_number
+    if certificate.not_valid_after_utc <= certificate.not_valid_before_utc:
+        raise ValueError("its validity ends before it begins")
+    return certificate
 
 
 def same_key(certificate: x509.Certificate, key: PrivateKey) -> bool:

@@ -12,6 +12,7 @@ import binascii
 import re
 import secrets
 from dataclasses import dataclass
+from functools import lru_cache
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -21,10 +22,12 @@ from cryptography.hazmat.primitives.serialization import Encoding, pkcs7
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
+from sros_tool.pki.certificates import UNREADABLE, read_in_full
 from sros_tool.pki.keys import PrivateKey
 
 _TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"
 _OPTIONS = (pkcs7.PKCS7Options.DetachedSignature, pkcs7.PKCS7Options.Binary)
+_TEXT = re.compile(rb"(?i)content-type:[ \t]*text/plain\b")
 _BOUNDARY = re.compile(rb"""(?i)\bboundary=("([^"]{1,200})"|([^\s;"]{1,200}))""")
 
 _SIGNED_DATA = der.encode_oid("1.2.840.113549.1.7.2")
@@ -135,15 +138,15 @@ def parse(message: bytes) -> SignedDocument:
     """Take a ``.p7s`` apart.  Raises `PkiError` if it is no S/MIME signed message."""
     content, signature = _split(message)
     header, separator, document = content.partition(b"\r\n\r\n")
-    if not separator or not header.lower().startswith(b"content-type:"):
+    if not separator or not _TEXT.match(header):
         raise PkiError(
-            "its signed part has no MIME header",
+            "its signed part has no MIME header of text/plain",
             "DDS vendors only accept documents signed with a text/plain header "
             "(openssl smime -sign -text).",
         )
     try:
         return _parse_cms(signature, content, document)
-    except (ValueError, IndexError, UnsupportedAlgorithm) as error:
+    except (IndexError, *UNREADABLE) as error:
         raise PkiError("its signature is not a CMS signature that can be read") from error
 
 
@@ -172,6 +175,12 @@ def _split(message: bytes) -> tuple[bytes, bytes]:
     return content, signature
 
 
+@lru_cache(maxsize=16)
+def _certificate(data: bytes) -> x509.Certificate:
+    # All documents of a keystore embed the same certificate.
+    return read_in_full(x509.load_der_x509_certificate(data))
+
+
 def _parse_cms(signature: bytes, content: bytes, document: bytes) -> SignedDocument:
     """Read ContentInfo / SignedData / SignerInfo (RFC 5652, sections 3, 5.1 and 5.3)."""
     content_type, wrapped = der.children(der.first(signature).content)[:2]
@@ -179,7 +188,7 @@ def _parse_cms(signature: bytes, content: bytes, document: bytes) -> SignedDocum
         raise ValueError("not SignedData")
     fields = der.children(der.first(wrapped.content).content)
     certificates = tuple(
-        x509.load_der_x509_certificate(value.whole)
+        _certificate(value.whole)
         for field in fields[3:]
         if field.tag == der.CONTEXT_0
         for value in der.children(field.content)
