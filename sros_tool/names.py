@@ -110,7 +110,7 @@ def check_namespace(ns: str) -> str:
     text = ns if ns == "/" else ns.removesuffix("/")
     if not text:
         return "/"
-    problem = "" if text == "/" else expression_problem(text)
+    problem = "" if ns == "/" else expression_problem(text)
     if not problem and not text.startswith("/"):
         problem = "A namespace starts with '/'."
     if problem:

@@ -72,9 +72,10 @@ def text_of(element: etree._Element) -> str:
     return element.text or ""
 
 
-def serialize(root: etree._Element) -> bytes:
-    """The document of ``root`` in UTF-8, indented, with an XML declaration."""
-    etree.indent(root, space="  ")
+def serialize(root: etree._Element, *, indent: bool = True) -> bytes:
+    """The document of ``root`` in UTF-8, indented unless it is already, with a declaration."""
+    if indent:
+        etree.indent(root, space="  ")
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8") + b"\n"
 
 

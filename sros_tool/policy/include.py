@@ -6,6 +6,7 @@ another document (a moved node of lxml can crash the interpreter).
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -99,7 +100,8 @@ class Includer:
             return place.file
         path = Path(unquote(href))
         try:
-            file = (place.file.parent / path).resolve()
+            # Unlike Path.resolve, realpath does not fail at links that lead in a circle.
+            file = Path(os.path.realpath(place.file.parent / path))
         except (OSError, ValueError) as error:
             raise PolicyError(f"{where}: the include of {href!r} names no file") from error
         if "://" in href or href.startswith("file:") or not file.is_relative_to(self.root):

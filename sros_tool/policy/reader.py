@@ -6,6 +6,8 @@ can never match anything is an error, for it is a right or a denial that somebod
 
 from __future__ import annotations
 
+import os
+import re
 from pathlib import Path
 
 from lxml import etree
@@ -27,6 +29,7 @@ from sros_tool.policy.model import (
 from sros_tool.xml import tag_of
 
 _XML_ATTRIBUTES = ("{http://www.w3.org/XML/1998/namespace}",)
+_VERSION = re.compile(r"0\.2\.[0-9]+\Z")
 _QUALIFIERS = {qualifier.value: qualifier for qualifier in Qualifier}
 
 
@@ -42,7 +45,7 @@ def read_policy(path: Path) -> Policy:
 class _Reader:
     def __init__(self, path: Path) -> None:
         self._shown = path
-        self._file = path.resolve()
+        self._file = Path(os.path.realpath(path))
         self._includer = Includer(self._file.parent)
 
     def policy(self) -> Policy:
@@ -59,7 +62,7 @@ class _Reader:
             )
         self._attributes(root, place, required=("version",))
         version = root.get("version", "")
-        if not version.startswith("0.2."):
+        if not _VERSION.match(version):
             raise PolicyError(
                 f"{where}: the policy has version {version!r}",
                 f"sros reads version {VERSION} of the SROS2 policy format.",

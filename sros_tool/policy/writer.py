@@ -12,6 +12,7 @@ def write_policy(policy: Policy) -> bytes:
     """The policy as XML in UTF-8; `read_policy` gives the same value back."""
     root = etree.Element("policy", version=policy.version)
     enclaves = etree.SubElement(root, "enclaves")
+    metadata: list[tuple[etree._Element, str]] = []
     for enclave in policy.enclaves:
         element = etree.SubElement(enclaves, "enclave", path=enclave.path)
         for block in enclave.profiles:
@@ -21,8 +22,13 @@ def write_policy(policy: Policy) -> bytes:
             for profile in block.profiles:
                 _write_profile(profiles, profile)
             if block.metadata:
-                profiles.append(parse(block.metadata.encode(), "metadata"))
-    return serialize(root)
+                metadata.append((profiles, block.metadata))
+    etree.indent(root, space="  ")
+    for profiles, text in metadata:  # after the indentation, which would change what it holds
+        last, element = profiles[-1], parse(text.encode(), "metadata")
+        last.tail, element.tail = profiles.text, last.tail
+        profiles.append(element)
+    return serialize(root, indent=False)
 
 
 def _write_profile(parent: etree._Element, profile: Profile) -> None:

@@ -6,6 +6,7 @@ Source: rcl 9.x ``security.c``, ``rcl/src/rcl/domain_id.c``.
 from __future__ import annotations
 
 import json
+import re
 import shlex
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,6 +20,8 @@ STRATEGY = "ROS_SECURITY_STRATEGY"
 ENCLAVE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
 DOMAIN = "ROS_DOMAIN_ID"
 
+_DOMAIN = re.compile(r"(?:0|[1-9]\d*)\Z", re.ASCII)
+
 
 def domain_from(environment: Mapping[str, str]) -> int | None:
     """ROS_DOMAIN_ID as a number, or None where it is unset or empty.
@@ -28,11 +31,12 @@ def domain_from(environment: Mapping[str, str]) -> int | None:
     text = environment.get(DOMAIN, "")
     if not text:
         return None
-    domain = DomainSet.parse(text, DOMAIN).only() if text.isdigit() else None
+    # rcl reads a leading zero as octal (strtoul with base 0): 010 would be domain 8 to a node.
+    domain = DomainSet.parse(text, DOMAIN).only() if _DOMAIN.match(text) else None
     if domain is None:
         raise UsageError(
             f"{DOMAIN} is {text!r}, which is not a domain id",
-            "A domain id is one whole number from 0 to 230.",
+            "A domain id is one whole number from 0 to 230, without leading zeros.",
             "Correct the variable, or unset it.",
         )
     return domain
