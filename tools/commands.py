@@ -128,4 +128,4 @@ def _run(command: str, arguments: list[str]) -> int:
 
 def _become(program: list[str], env: dict[str, str]) -> NoReturn:
     """Let the program take this process over: its signals and exit status are its own."""
-    os.execve(program[0], program, env)  # noqa: S606 - no shell is wanted
+    os.execve(program[0], program, env)
