@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -31,7 +32,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.open import check_domain, load_governance, load_settings
 from sros_tool.keystore.template import Template, render_template
-from sros_tool.keystore.transaction import Change, Transaction
+from sros_tool.keystore.transaction import Change, Transaction, tidy
 from sros_tool.names import check_enclave_name
 from sros_tool.notes import Note
 from sros_tool.policy.model import Enclave, Policy
@@ -71,6 +72,8 @@ def create_keystore(
     Raises `KeystoreError` if ``root`` is a keystore, or holds any part of one: a CA is never made
     anew beside the remains of an older one.
     """
+    if not dry_run:
+        tidy(root)
     _check_free(root)
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
         _check_free(root)  # another process may have been faster
@@ -111,6 +114,8 @@ def create_permission(
 ) -> Result:
     """Give an existing enclave the permissions that ``policy`` states for it."""
     check_enclave_name(name)
+    if not dry_run:
+        tidy(root)
     _check_keystore(root)
     if name not in set(enclave_names(root)):
         raise KeystoreError(
@@ -155,6 +160,8 @@ def generate_artifacts(
                     "Join the two.",
                 )
             wanted[enclave.path] = enclave
+    if not dry_run:
+        tidy(root)
     if not is_keystore(root) and create is not None:
         _check_typo(root)
         _check_free(root)
@@ -186,6 +193,7 @@ def _produce(
     fresh = create is not None
     with Transaction(root, fresh=fresh, dry_run=dry_run) as transaction:
         if create is not None:
+            _check_free(root)  # another process may have been faster
             template = create
             domains = domains or DomainSet.of((0 if domain is None else domain,) * 2)
             check_domain(domains, domain, root)
@@ -262,7 +270,7 @@ def _check_free(root: Path) -> None:
             "",
             "Nothing was changed. Add to it with `sros create_enclave`, or choose another path.",
         )
-    if root.exists() and not root.is_dir():
+    if os.path.lexists(root) and not root.is_dir():
         raise KeystoreError(f"'{root}' is in the way", "It is not a folder.")
     remains = [part for part in (PUBLIC, PRIVATE, ENCLAVES) if (root / part).exists()]
     if remains:

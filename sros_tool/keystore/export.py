@@ -23,7 +23,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     folder_mode,
 )
-from sros_tool.keystore.transaction import Change, Transaction
+from sros_tool.keystore.transaction import Change, Transaction, tidy
 from sros_tool.keystore.verify import check_enclave
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import load_certificate
@@ -88,6 +88,11 @@ def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes
     return dict(sorted(files.items()))
 
 
+def _real(path: Path) -> Path:
+    # Unlike Path.resolve, realpath does not fail at links that lead in a circle.
+    return Path(os.path.realpath(path))
+
+
 def _mode(path: str) -> int:
     return 0o600 if path.endswith("/key.pem") else 0o644
 
@@ -95,9 +100,11 @@ def _mode(path: str) -> int:
 def _write_folder(
     root: Path, target: Path, files: dict[str, bytes], force: bool, dry_run: bool
 ) -> tuple[Change, ...]:
-    if target.resolve() == root.resolve():
-        raise KeystoreError(f"'{target}' is the keystore itself", "", "Choose another folder.")
-    if target.exists() and not target.is_dir():
+    if _real(target).is_relative_to(_real(root)):
+        raise KeystoreError(
+            f"'{target}' is the keystore itself or lies in it", "", "Choose another folder."
+        )
+    if os.path.lexists(target) and not target.is_dir():
         raise KeystoreError(f"'{target}' is in the way", "It is not a folder.")
     if (target / PRIVATE).exists():
         raise KeystoreError(
@@ -105,6 +112,8 @@ def _write_folder(
             "It is a keystore of its own, not an export.",
             "Choose another folder.",
         )
+    if not dry_run:
+        tidy(target)
     _check_same_authority(target, files)
     different = {
         path: data

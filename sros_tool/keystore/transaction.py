@@ -14,6 +14,7 @@ import contextlib
 import ctypes
 import errno
 import fcntl
+import glob
 import os
 import secrets
 import shutil
@@ -26,7 +27,7 @@ from types import TracebackType
 from typing import Self
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.layout import folder_mode
+from sros_tool.keystore.layout import ENCLAVES, folder_mode
 
 STAGE = ".sros-transaction"
 _LOCK_SECONDS = 60.0
@@ -76,10 +77,7 @@ class Transaction:
         if self._new_root:
             self._remove_stale_siblings()
             self._make_parents()
-            self._stage = self.root.parent / f".{self.root.name}.sros-{secrets.token_hex(4)}"
-            self._content = self._stage
-            self._stage.mkdir(mode=0o700)
-            self._lock = _lock(self._stage)
+            self._make_sibling()
             return
         self._lock = _lock(self.root)
         recover(self.root)
@@ -114,14 +112,29 @@ class Transaction:
             missing.append(parent)
             parent = parent.parent
         for each in reversed(missing):
-            each.mkdir()
-            self._made_parents.insert(0, each)
+            with contextlib.suppress(FileExistsError):  # another process was faster
+                each.mkdir()
+                self._made_parents.insert(0, each)
+
+    def _make_sibling(self) -> None:
+        while self._lock < 0:
+            self._stage = self.root.parent / f".{self.root.name}.sros-{secrets.token_hex(4)}"
+            self._content = self._stage
+            self._stage.mkdir(mode=0o700)
+            # Until it is locked, another process may take it for a stale one and remove it.
+            with contextlib.suppress(FileNotFoundError):
+                lock = _lock(self._stage)
+                if self._stage.exists():
+                    self._lock = lock
+                else:
+                    os.close(lock)
 
     def _remove_stale_siblings(self) -> None:
-        for stale in self.root.parent.glob(f".{self.root.name}.sros-*"):
+        for stale in self.root.parent.glob(f".{glob.escape(self.root.name)}.sros-*"):
             with contextlib.suppress(KeystoreError, OSError):
-                os.close(_lock(stale, wait=0.0))
+                lock = _lock(stale, wait=0.0)
                 shutil.rmtree(stale, ignore_errors=True)
+                os.close(lock)
 
     # ── what is to change ──────────────────────────────────────────────────────────────────
 
@@ -136,6 +149,9 @@ class Transaction:
             view = memoryview(data)
             while view:
                 view = view[os.write(handle, view) :]
+        except OSError as error:
+            error.filename = str(self.root / path)
+            raise
         finally:
             os.close(handle)
 
@@ -231,7 +247,7 @@ class Transaction:
         old = self._stage / "old"
         old.mkdir(mode=0o700)
         _turn(self._stage, "old")
-        spare = self._stage / "spare"
+        copied = False
         for path in plain:
             target, kept = self.root / path, old / path
             if target.exists():
@@ -240,15 +256,30 @@ class Transaction:
                     os.link(target, kept)
                 except OSError:  # a file system, or an owner, that allows no hard links
                     shutil.copy2(target, kept)
+                    copied = True
+        if copied:
+            _flush_file_system(old)
+        spare = self._stage / "spare"
+        for path in plain:
             os.symlink("../" * path.count("/") + f"{STAGE}/live/{path}", spare)
-            os.replace(spare, target)
+            os.replace(spare, self.root / path)
 
     def _in_existing_folders(self) -> Iterator[str]:
         return (path for path in sorted(self._staged) if self._folders[path.rpartition("/")[0]])
 
 
+def tidy(root: Path) -> None:
+    """Complete or undo what an interrupted transaction left behind, if there is anything."""
+    if (root / STAGE).is_dir():
+        lock = _lock(root)
+        try:
+            recover(root)
+        finally:
+            os.close(lock)
+
+
 def recover(root: Path) -> None:
-    """Complete or undo what an interrupted transaction left behind.  The caller holds the lock."""
+    """As `tidy`, for a caller that holds the lock."""
     stage = root / STAGE
     if not stage.is_dir():
         return
@@ -264,13 +295,18 @@ def recover(root: Path) -> None:
         for path in _files_below(stage / "new"):
             if _leads_into_stage(root / path):
                 os.unlink(root / path)
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(live)  # first, for without it what is left of the stage is only to be removed
     shutil.rmtree(stage)
 
 
 def _settle(source: Path, target: Path) -> None:
-    """Move everything below ``source`` to its place below ``target``."""
+    """Move everything below ``source`` to its place below ``target``.
+
+    The enclaves come last: without them, a new keystore that is not complete yet is none.
+    """
     with os.scandir(source) as entries:
-        for entry in list(entries):
+        for entry in sorted(entries, key=lambda each: each.name == ENCLAVES):
             place = target / entry.name
             if not entry.is_dir(follow_symlinks=False):
                 os.replace(entry.path, place)
