@@ -23,9 +23,9 @@ class SrosError(Exception):
         self.remedy = remedy
 
     def __str__(self) -> str:
-        parts = [self.what.rstrip("."), self.why.strip().rstrip("."), self.remedy.strip()]
-        text = ". ".join(part for part in parts if part)
-        return " ".join(text.split())
+        sentences = [each.strip().rstrip(".") for each in (self.what, self.why, self.remedy)]
+        text = ". ".join(each for each in sentences if each)
+        return " ".join(text.split()) + ("." if self.why or self.remedy else "")
 
 
 class UsageError(SrosError):

@@ -13,6 +13,7 @@ import click
 from sros_tool.cli.common import complete_keystore_and_enclave, now, split_root
 from sros_tool.errors import KeystoreError, UsageError
 
+_COMMAND = "sros.command"
 _WORDS = click.argument(
     "words",
     metavar="[ROOT] NAME",
@@ -59,9 +60,23 @@ def env(words: tuple[str, ...], form: str, as_json: bool, domain: str | None) ->
     click.echo(render_environment(variables, "json" if as_json else form), nl=False)
 
 
+class _WithCommand(click.Command):
+    """Leaves alone what follows ``--``, or, without it, what follows the first two arguments."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Part the command to run from the arguments of sros."""
+        own, command = args, []
+        if "--" in args:
+            own, command = args[: args.index("--")], args[args.index("--") + 1 :]
+        else:
+            ctx.allow_interspersed_args = False
+        ctx.meta[_COMMAND] = command
+        return super().parse_args(ctx, own)
+
+
 @click.command(
     "run",
-    context_settings={"ignore_unknown_options": True, "allow_interspersed_args": False},
+    cls=_WithCommand,
     epilog="""\b
 Example:
   $ sros run keystore /talker_listener/talker -- python3 -m sros_tool.demo.talker
@@ -76,16 +91,15 @@ Example:
     shell_complete=complete_keystore_and_enclave,
 )
 @_DOMAIN
-def run(words: tuple[str, ...], domain: str | None) -> None:
+@click.pass_context
+def run(ctx: click.Context, words: tuple[str, ...], domain: str | None) -> None:
     """Run COMMAND in the enclave NAME of the keystore ROOT, or not at all (strategy Enforce).
 
     The enclave is checked first; what would keep the command from starting is said here, not
     by an obscure message of the middleware.
     """
     root, rest = split_root(words)
-    name, command = (rest[0], [*rest[1:]]) if rest else ("", [])
-    if command[:1] == ["--"]:
-        command = command[1:]
+    name, command = rest[0] if rest else "", [*rest[1:], *ctx.meta[_COMMAND]]
     if not command:
         raise UsageError("no command is given", "", "Write `sros run ROOT NAME -- COMMAND...`.")
     variables = _variables(root, name, domain)
