@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib.util
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +11,13 @@ from dataclasses import dataclass
 from sros_tool.demo.scenarios import Role
 from sros_tool.errors import UnavailableError
 from sros_tool.runtime.cyclone_library import INSTALL_ADVICE
-from sros_tool.runtime.stacks import ProbeEnclave, Stack, cyclone_stack, rclpy_stacks
+from sros_tool.runtime.stacks import (
+    ProbeEnclave,
+    Stack,
+    cyclone_stack,
+    rclpy_stacks,
+    rmw_implementations,
+)
 
 AUTO, RCLPY, CYCLONE = "auto", "rclpy", "cyclone"
 CHOICES = (AUTO, RCLPY, CYCLONE)
@@ -18,35 +26,45 @@ _NO_RCLPY = (
     "Source a ROS 2 installation from packages (its Fast DDS has DDS Security built in), or use"
     " `--backend cyclone`."
 )
+_SPEAKS_DDS = ("rmw_fastrtps", "rmw_cyclonedds", "rmw_connext")
 _ON_THE_WIRE = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """Without it, Fast DDS hands messages to a neighbour through shared memory, past the wire."""
 
 
 @dataclass(frozen=True)
 class Backend:
-    """What the nodes run on; ``why`` says in one line how it was chosen."""
+    """What the nodes run on; ``why`` says in one line how it was chosen.
+
+    Beside Cyclone nodes, the one that looks around is a node of rclpy where ``ros_observer``
+    says so; ``rmw`` is what rclpy runs on.
+    """
 
     name: str
     dds: str
     why: str
     rmw: str = ""
+    ros_observer: bool = False
 
     @property
     def rows_at_once(self) -> int:
         """How many rows run at the same time: an rclpy node costs some 0.6 s of CPU to start."""
         return 4 if self.name == RCLPY else 12
 
+    def library(self, role: Role) -> str:
+        """The library that a node of that role uses."""
+        if self.name == RCLPY or (role is Role.OBSERVER and self.ros_observer):
+            return RCLPY
+        return self.dds
+
     def command(self, role: Role) -> list[str]:
         """The program of a node, without its options."""
-        if role is Role.OBSERVER:
-            return _module("sros_tool.demo.observer")
-        if self.name == RCLPY:
+        if self.library(role) == RCLPY:
             return _module(f"sros_tool.demo.{role.value}")
         return [*_module("sros_tool.demo.cyclone_node"), role.value]
 
     def environment(self, role: Role, *, wire: bool) -> Mapping[str, str]:
         """The variables that a node needs beside those of its security."""
-        if self.name != RCLPY:
+        if self.library(role) != RCLPY:
             return {}
         chosen = {"RMW_IMPLEMENTATION": self.rmw} if self.rmw else {}
         return {**chosen, **(_ON_THE_WIRE if wire else {})}
@@ -78,7 +96,18 @@ def _cyclone(stack: Stack, why: str) -> Backend:
             f"{stack.name}: {stack.evidence}. {why if why != 'as asked for' else ''}",
             INSTALL_ADVICE,
         )
-    return Backend(CYCLONE, f"{stack.dds} {stack.version}".strip(), why)
+    rmw = _observing_rmw()
+    dds = f"{stack.dds} {stack.version}".strip()
+    return Backend(CYCLONE, dds, why, rmw or "", ros_observer=rmw is not None)
+
+
+def _observing_rmw() -> str | None:
+    """An RMW whose nodes discover unsecured Cyclone nodes ("": rclpy's own), None without one."""
+    if importlib.util.find_spec("rclpy") is None:
+        return None
+    names = rmw_implementations(os.environ)
+    fitting = [name for name in names if name.startswith(_SPEAKS_DDS)]
+    return fitting[0] if fitting else (None if names else "")
 
 
 def _why_not(stacks: Sequence[Stack]) -> str:

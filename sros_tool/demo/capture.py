@@ -6,7 +6,6 @@ namespace of his own (`sros_tool.runtime.netns`).
 
 from __future__ import annotations
 
-import os
 import socket
 from collections import Counter
 from collections.abc import Sequence
@@ -115,7 +114,7 @@ def udp_ports(process: int) -> frozenset[int]:
 
 def _socket_inode(link: Path) -> str:
     try:
-        target = os.readlink(link)
+        target = str(link.readlink())
     except OSError:
         return ""  # closed meanwhile
     return target.removeprefix("socket:[").removesuffix("]") if target[:8] == "socket:[" else ""

@@ -1,4 +1,4 @@
-"""Talk or listen over Cyclone DDS, without ROS: ``python -m sros_tool.demo.cyclone_node``.
+"""Talk, listen or look over Cyclone DDS: ``python -m sros_tool.demo.cyclone_node``.
 
 The nodes read the same environment as a ROS 2 node and speak on the same DDS topics with the same
 type, so that rclpy nodes hear them, and a launcher need not know which kind it starts.
@@ -28,10 +28,13 @@ class _Stopped(Exception):  # noqa: N818 - not an error
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Talk or listen until told to stop; returns the exit status."""
+    """Talk, listen or look around until told to stop; returns the exit status."""
     own, ros = split_ros_args(sys.argv[1:] if arguments is None else arguments)
-    parser = option_parser("sros_tool.demo.cyclone_node", "Talk or listen over Cyclone DDS.")
-    parser.add_argument("role", choices=("talker", "listener"))
+    parser = option_parser(
+        "sros_tool.demo.cyclone_node", "Talk, listen or look around over Cyclone DDS."
+    )
+    parser.add_argument("role", choices=("talker", "listener", "observer"))
+    parser.add_argument("--also", action="append", default=[], help="one more topic to look at")
     parsed = parser.parse_args(own)
     options = NodeOptions(parsed.topic, parsed.period, parsed.text, parsed.report)
     _stop_on_signals()
@@ -47,6 +50,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 stage = Stage.RUNNING
                 events.report(Kind.READY)
                 _talk(writer, options, events)
+            elif parsed.role == "observer":
+                stage = Stage.RUNNING
+                events.report(Kind.READY)
+                _observe(participant, [options.topic, *parsed.also], options.period, events)
             else:
                 reader = participant.reader(_dds_name(options.topic))
                 stage = Stage.RUNNING
@@ -87,6 +94,17 @@ def _listen(reader: Reader, events: EventWriter) -> None:
             events.report(Kind.HEARD, text, count=heard)
             _say("listener", f"I heard: '{text}'")
         time.sleep(_LISTEN_SECONDS)
+
+
+def _observe(
+    participant: Participant, topics: Sequence[str], period: float, events: EventWriter
+) -> None:
+    while True:
+        found = [publication.topic for publication in participant.publications()]
+        counts = {topic: found.count(_dds_name(topic)) for topic in topics}
+        events.report(Kind.SEEN, " ".join(sorted(set(found))), publishers=counts)
+        _say("observer", f"Publishers: {counts}; topics: {' '.join(sorted(set(found)))}")
+        time.sleep(period)
 
 
 def _dds_name(topic: str) -> str:

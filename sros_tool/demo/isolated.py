@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import multiprocessing
 import os
 import signal
@@ -15,6 +16,8 @@ from sros_tool.runtime.netns import Isolation, end_with_parent, enter_isolation
 _Value = TypeVar("_Value")
 
 Tell = Callable[[str], None]
+
+ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _SECONDS_TO_END = 8.0
 
@@ -64,20 +67,17 @@ def _main(
     end_with_parent()
     if os.getppid() != starter:
         os._exit(1)
-    signal.signal(signal.SIGTERM, _interrupt)
-    signal.signal(signal.SIGINT, _interrupt)
-    signal.signal(signal.SIGHUP, _interrupt)
+    # Not the handlers of the parent: one that raises can do so in the middle of a fork, where
+    # Python drops the exception.  Work that has something to clean up sets its own.
+    for number in ENDING_SIGNALS:
+        signal.signal(number, signal.SIG_DFL)
     try:
         if isolation.isolated:
             enter_isolation()
         answers.send(("result", work(lambda line: answers.send(("told", line)))))
-    except KeyboardInterrupt:
-        os._exit(130)
+    except asyncio.CancelledError:
+        os._exit(1)
     except SrosError as error:
         answers.send(("failed", error))
     except Exception as error:
         answers.send(("failed", SrosError("the demo failed", f"{type(error).__name__}: {error}")))
-
-
-def _interrupt(_number: int, _frame: Any) -> None:
-    raise KeyboardInterrupt

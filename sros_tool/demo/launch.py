@@ -54,11 +54,13 @@ class PartyProcess:
         *,
         topic: str,
         text: str = "",
+        through: str = "",
     ) -> None:
         stem = name.replace(" ", "_")
         self.name = name
         self._topic = topic
         self.text = text
+        self._through = through
         self._log = folder / f"{stem}.log"
         report = folder / f"{stem}.jsonl"
         self._reader = EventReader(report)
@@ -142,6 +144,7 @@ class PartyProcess:
         return PartyRecord(
             text=self.text,
             topic=self._topic,
+            through=self._through,
             events=(*self._events, *late),
             output=plain_text(self._log.read_text(encoding="utf-8", errors="replace")),
             status=self._own_status,

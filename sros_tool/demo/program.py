@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
-import os
 import shutil
 import signal
 import threading
@@ -18,24 +16,21 @@ from types import FrameType
 from typing import Any
 
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
-from sros_tool.demo.backend import AUTO, CYCLONE, Backend, choose_backend
+from sros_tool.demo.backend import AUTO, Backend, choose_backend
 from sros_tool.demo.isolated import run_isolated
 from sros_tool.demo.keystores import DEFAULT_TOPIC, check_topic, make_keystores
 from sros_tool.demo.runner import Limits, Plan, run_plan
-from sros_tool.demo.scenarios import ROWS, Role, Row
+from sros_tool.demo.scenarios import ROWS, Row
 from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import UsageError
 from sros_tool.keystore.template import Template
 from sros_tool.runtime.netns import Isolation, try_isolation
-from sros_tool.runtime.stacks import rmw_implementations
 
 DEFAULT_DOMAIN = 80
 """The rows take this domain and those after it: below 102, where Linux hands out no port."""
 
-OWN, HOST = "own", "host"
-NETWORKS = (AUTO, HOST)
-
-_SPEAKS_DDS = ("rmw_fastrtps", "rmw_cyclonedds", "rmw_connext")
+HOST = "host"
+"""The choice to stay in the network of the machine."""
 
 
 @dataclass(frozen=True)
@@ -94,19 +89,16 @@ def run_demo(options: DemoOptions, now: datetime, tell: Callable[[str], None]) -
         backend = choose_backend(options.backend, keystores.probe(topic, domains[0]))
         tell(f"running {len(options.rows)} rows on {backend.name} ({backend.dds}): {backend.why}")
         isolation = _isolation(options.network)
-        observer_rmw, no_observer = _observer_rmw(backend)
         plan = Plan(
             rows=options.rows,
             domains=domains,
-            skips={row.name: no_observer for row in options.rows if no_observer and _looks(row)},
             backend=backend,
             keystores=keystores,
             topic=topic,
             folder=folder / "rows",
             limits=options.limits,
-            observer_rmw=observer_rmw,
         )
-        rows = run_isolated(lambda told: run_plan(plan, "", told), isolation, tell)
+        rows = run_isolated(lambda told: run_plan(plan, told), isolation, tell)
         result = DemoResult(backend, topic, isolation, tuple(rows))
         if options.keep is not None:
             text = json.dumps(result.as_json(), indent=2) + "\n"
@@ -173,20 +165,3 @@ def _isolation(network: str) -> Isolation:
     if network == HOST:
         return Isolation(False, "the network of this machine was asked for")
     return try_isolation()
-
-
-def _observer_rmw(backend: Backend) -> tuple[str, str]:
-    """The RMW of the observer beside Cyclone nodes, and why there is none, or ""."""
-    if backend.name != CYCLONE:
-        return "", ""
-    if importlib.util.find_spec("rclpy") is None:
-        return "", "rclpy is not installed here"
-    names = rmw_implementations(os.environ)
-    fitting = [name for name in names if name.startswith(_SPEAKS_DDS)]
-    if names and not fitting:
-        return "", f"no RMW here speaks DDS ({', '.join(names)})"
-    return (fitting[0] if fitting else ""), ""
-
-
-def _looks(row: Row) -> bool:
-    return any(party.role is Role.OBSERVER for party in row.parties)

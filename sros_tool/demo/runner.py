@@ -16,6 +16,7 @@ from pathlib import Path
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.capture import Capture
+from sros_tool.demo.isolated import ENDING_SIGNALS
 from sros_tool.demo.keystores import DemoKeystores
 from sros_tool.demo.launch import PartyProcess, base_environment
 from sros_tool.demo.scenarios import Claim, Party, Relation, Role, Row
@@ -43,35 +44,28 @@ class Limits:
 class Plan:
     """All that is needed to run rows.
 
-    ``domains`` has one domain per row; ``skips`` the reason for each row that cannot run here;
-    ``topic`` is absolute; ``period`` is in seconds.
+    ``domains`` has one domain per row; ``topic`` is absolute; ``period`` is in seconds.
     """
 
     rows: tuple[Row, ...]
     domains: tuple[int, ...]
-    skips: Mapping[str, str]
     backend: Backend
     keystores: DemoKeystores
     topic: str
     folder: Path
     limits: Limits = field(default_factory=Limits)
     period: float = 0.1
-    observer_rmw: str = ""
 
 
-def run_plan(plan: Plan, capture_problem: str, progress: Callable[[str], None]) -> list[RowResult]:
-    """Run all rows, and judge them.
-
-    ``capture_problem`` says why packets cannot be captured, or is ""; ``progress`` is told of
-    each row that ends.
-    """
-    return asyncio.run(_Stage(plan, capture_problem, progress).run())
+def run_plan(plan: Plan, progress: Callable[[str], None]) -> list[RowResult]:
+    """Run all rows, and judge them; ``progress`` is told of each row that ends."""
+    return asyncio.run(_Stage(plan, progress).run())
 
 
 class _Stage:
-    def __init__(self, plan: Plan, capture_problem: str, progress: Callable[[str], None]) -> None:
+    def __init__(self, plan: Plan, progress: Callable[[str], None]) -> None:
         self._plan = plan
-        self._capture_problem = capture_problem
+        self._capture_problem = ""
         self._progress = progress
         self._mark = uuid.uuid4().hex[:8]
         self._capture: Capture | None = None
@@ -81,6 +75,10 @@ class _Stage:
 
     async def run(self) -> list[RowResult]:
         self._end = time.monotonic() + self._plan.limits.total
+        loop, task = asyncio.get_running_loop(), asyncio.current_task()
+        assert task is not None
+        for number in ENDING_SIGNALS:
+            loop.add_signal_handler(number, task.cancel)
         self._start_capture()
         try:
             return await asyncio.gather(*map(self._run_row, range(len(self._plan.rows))))
@@ -88,7 +86,7 @@ class _Stage:
             self._stop_capture()
 
     def _start_capture(self) -> None:
-        wired = [index for index, row in enumerate(self._plan.rows) if self._is_wired(row)]
+        wired = [index for index, row in enumerate(self._plan.rows) if row.wire]
         if not wired:
             return
         marks = [self._text(i, party) for i in wired for party in self._plan.rows[i].parties]
@@ -104,18 +102,13 @@ class _Stage:
             asyncio.get_running_loop().remove_reader(self._capture.fileno())
             self._capture.close()
 
-    def _is_wired(self, row: Row) -> bool:
-        return row.wire and not self._capture_problem and row.name not in self._plan.skips
-
     def _text(self, index: int, party: Party) -> str:
         """What a talker says; it occurs nowhere else, not in another row either."""
         return f"Hello World from the {party.name} {self._mark}-{index}"
 
     async def _run_row(self, index: int) -> RowResult:
         row, domain = self._plan.rows[index], self._plan.domains[index]
-        skipped = self._plan.skips.get(row.name, "")
-        if row.wire and not skipped:
-            skipped = self._capture_problem
+        skipped = self._capture_problem if row.wire else ""
         if skipped:
             result = judge_row(RowRecord(row, domain, skipped=skipped))
         else:
@@ -138,10 +131,12 @@ class _Stage:
             window = await self._watch(row, processes)
             ports = frozenset[int]().union(*(each.ports() for each in processes.values()))
             wire = self._count(index, ports)
-            await _end_softly(processes.values())
         finally:
-            for process in processes.values():
-                process.end()
+            try:
+                await _end_softly(processes.values())
+            finally:
+                for process in processes.values():
+                    process.end()
         records = {name: process.record() for name, process in processes.items()}
         return RowRecord(row, domain, records, window, wire)
 
@@ -158,11 +153,17 @@ class _Stage:
                     options += ["--also", _topic_of(other, plan.topic)]
         environment = base_environment(os.environ)
         environment |= plan.backend.environment(party.role, wire=row.wire)
-        if party.role is Role.OBSERVER and plan.observer_rmw:
-            environment["RMW_IMPLEMENTATION"] = plan.observer_rmw
         environment |= plan.keystores.environment(party.identity, domain)
         command = [*plan.backend.command(party.role), *options]
-        return PartyProcess(party.name, command, environment, folder, topic=topic, text=text)
+        return PartyProcess(
+            party.name,
+            command,
+            environment,
+            folder,
+            topic=topic,
+            text=text,
+            through=plan.backend.library(party.role),
+        )
 
     async def _watch(
         self, row: Row, processes: Mapping[str, PartyProcess]

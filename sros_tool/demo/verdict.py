@@ -28,12 +28,14 @@ class WireCount:
 class PartyRecord:
     """What one process left behind.
 
-    ``text`` marks the messages of a talker; ``topic`` is its ROS topic; ``output`` is what it
-    printed; ``status`` its exit status (negative for a signal) if it ended before it was stopped.
+    ``text`` marks the messages of a talker; ``topic`` is its ROS topic; ``through`` names the
+    library it used; ``output`` is what it printed; ``status`` its exit status
+    (negative for a signal) if it ended before it was stopped.
     """
 
     text: str = ""
     topic: str = ""
+    through: str = ""
     events: tuple[Event, ...] = ()
     output: str = ""
     status: int | None = None
@@ -187,10 +189,8 @@ def _judge_view(
     if not looks:
         return Finding(Status.UNDECIDED, f"{claim.subject} did not look in that time")
     most = max(event.publishers.get(talker.topic, 0) for event in looks)
-    return Finding(
-        STATUS_OF[Relation.SEES, most > 0],
-        f"it counts {most} publishers on {talker.topic} in {len(looks)} looks",
-    )
+    counted = f"{observer.through} counts {most} publishers on {talker.topic}"
+    return Finding(STATUS_OF[Relation.SEES, most > 0], f"{counted} in {len(looks)} looks")
 
 
 def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> Finding:

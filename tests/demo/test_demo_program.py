@@ -13,6 +13,7 @@ from sros_tool.demo.backend import choose_backend
 from sros_tool.demo.keystores import check_topic, demo_policy
 from sros_tool.demo.options import split_ros_args
 from sros_tool.demo.program import DemoOptions, run_demo
+from sros_tool.demo.scenarios import Role
 from sros_tool.demo.table import demo_table
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import load_template
@@ -129,7 +130,12 @@ def test_backends(
     chosen = choose_backend(wish, PROBE)
     assert chosen.name == name
     assert why in chosen.why
-    assert chosen.rmw == ("rmw_x" if name == "rclpy" else "")
+    if name == "rclpy":
+        assert chosen.environment(Role.TALKER, wire=False) == {"RMW_IMPLEMENTATION": "rmw_x"}
+        assert chosen.command(Role.TALKER)[-1] == "sros_tool.demo.talker"
+    else:
+        assert chosen.environment(Role.TALKER, wire=True) == {}
+        assert chosen.command(Role.LISTENER)[-2:] == ["sros_tool.demo.cyclone_node", "listener"]
 
 
 @pytest.mark.parametrize(

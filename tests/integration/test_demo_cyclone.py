@@ -1,0 +1,172 @@
+"""The Cyclone binding over the real library: it speaks, and what it may not do is refused."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.demo.keystores import DemoKeystores, make_keystores
+from sros_tool.demo.scenarios import Identity
+from sros_tool.errors import UnavailableError
+from sros_tool.keystore.template import load_template
+from sros_tool.runtime.cyclone_library import load_cyclone
+
+pytestmark = pytest.mark.dds
+
+DOMAIN = 110
+
+PREAMBLE = """
+import os, sys, time
+from pathlib import Path
+from sros_tool.runtime.cyclone import DdsError, Participant, Publication, SecurityRefusedError
+from sros_tool.runtime.netns import enter_isolation, try_isolation
+if try_isolation().isolated:
+    enter_isolation()
+from sros_tool.runtime.rcl_security import choose_enclave, domain_of
+def join():
+    return Participant(domain_of(os.environ), choose_enclave(os.environ).enclave)
+def attempt(make, topic):
+    try:
+        make(topic)
+    except SecurityRefusedError:
+        return "refused"
+    except DdsError as error:
+        return f"failed: {error}"
+    return "made"
+"""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _needs_cyclone() -> None:
+    try:
+        load_cyclone.cache_clear()
+        library = load_cyclone()
+    except UnavailableError as error:
+        pytest.skip(str(error))
+    if library.plugins is None:
+        pytest.skip("Cyclone DDS is here without its security plugins")
+
+
+@pytest.fixture(scope="module")
+def keystores(tmp_path_factory: pytest.TempPathFactory) -> DemoKeystores:
+    folder = tmp_path_factory.mktemp("keystores")
+    domains, template = DomainSet.of((DOMAIN, DOMAIN)), load_template("production")
+    return make_keystores(folder, "/chatter", domains, template, datetime.now(UTC))
+
+
+@pytest.fixture
+def child(keystores: DemoKeystores) -> Callable[[Identity, str], list[str]]:
+    """Runs code in a process of its own with an identity; returns the lines that it prints."""
+
+    def run(identity: Identity, code: str, domain: int = DOMAIN) -> list[str]:
+        environment = {"PATH": "/usr/bin:/bin", **keystores.environment(identity, domain)}
+        done = subprocess.run(
+            [sys.executable, "-c", PREAMBLE + textwrap.dedent(code)],
+            env={**environment, "PYTHONPATH": str(Path(__file__).parents[2])},
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout.splitlines()
+
+    return run
+
+
+ATTEMPTS = """
+p = join()
+for topic in ("rt/chatter", "rt/other", "rq/chatterRequest", "ros_discovery_info"):
+    print("writer", topic, attempt(p.writer, topic))
+    print("reader", topic, attempt(p.reader, topic))
+"""
+
+
+@pytest.mark.parametrize(
+    ("identity", "made"),
+    [
+        (Identity.TALKER, {"writer rt/chatter"}),
+        (Identity.LISTENER, {"reader rt/chatter"}),
+        (Identity.TALKER_DENIED, set()),
+    ],
+)
+def test_permissions_decide(
+    child: Callable[[Identity, str], list[str]], identity: Identity, made: set[str]
+) -> None:
+    answers = dict(line.rsplit(" ", 1) for line in child(identity, ATTEMPTS))
+    graph = {"writer ros_discovery_info", "reader ros_discovery_info"}
+    assert {question for question, answer in answers.items() if answer == "made"} == made | graph
+    assert {answer for answer in answers.values() if answer != "made"} == {"refused"}
+
+
+def test_without_security_every_name_can_be_used(
+    child: Callable[[Identity, str], list[str]],
+) -> None:
+    lines = child(Identity.NONE, ATTEMPTS)
+    assert len(lines) == 8
+    assert all(line.endswith(" made") for line in lines)
+
+
+def test_a_failure_that_is_no_refusal(child: Callable[[Identity, str], list[str]]) -> None:
+    (line,) = child(Identity.NONE, "print(attempt(join().writer, 'rt/not a name'))")
+    assert line.startswith("failed")
+
+
+def test_what_is_written_is_read_and_seen(child: Callable[[Identity, str], list[str]]) -> None:
+    lines = child(
+        Identity.NONE,
+        """
+        with join() as p:
+            reader, writer = p.reader("rt/chatter"), p.writer("rt/chatter")
+            while not (reader.matched() and writer.matched()):
+                time.sleep(0.01)
+            writer.write("Grüße")
+            writer.write("")
+            heard = []
+            while len(heard) < 2:
+                heard += reader.take()
+            print(heard)
+            print(p.publications() == (
+                Publication("rt/chatter", "std_msgs::msg::dds_::String_"),))
+        """,
+    )
+    assert lines == ["['Grüße', '']", "True"]
+
+
+@pytest.mark.parametrize("broken", ["permissions.p7s", "governance.p7s", "cert.pem", "key.pem"])
+def test_a_broken_enclave_is_refused(
+    child: Callable[[Identity, str], list[str]],
+    keystores: DemoKeystores,
+    tmp_path: Path,
+    broken: str,
+) -> None:
+    enclave = keystores.own / "enclaves/talker_listener/talker"
+    code = "print(attempt(lambda _: Participant(110, Path({!r})), ''))"
+    copy = tmp_path / "enclave"
+    copy.mkdir()
+    for name in (
+        *("cert.pem", "key.pem", "permissions.p7s", "governance.p7s"),
+        *("identity_ca.cert.pem", "permissions_ca.cert.pem"),
+    ):
+        (copy / name).write_bytes((enclave / name).read_bytes())
+    assert child(Identity.NONE, code.format(str(copy))) == ["made"]
+    (copy / broken).write_bytes((copy / broken).read_bytes().replace(b"A", b"B"))
+    assert child(Identity.NONE, code.format(str(copy))) == ["refused"]
+    (copy / broken).unlink()
+    (line,) = child(Identity.NONE, code.format(str(copy)))
+    assert line.startswith("failed")
+    assert broken in line
+
+
+def test_a_domain_that_the_keystore_is_not_for(
+    child: Callable[..., list[str]],
+) -> None:
+    code = "print(attempt(lambda _: join(), ''))"
+    assert child(Identity.TALKER, code) == ["made"]
+    assert child(Identity.TALKER, code, DOMAIN + 1) == ["refused"]

@@ -1,0 +1,127 @@
+"""The rclpy nodes: ordinary nodes that the demo's runner starts, here without security."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.demo.backend import RCLPY, Backend, choose_backend
+from sros_tool.demo.isolated import run_isolated
+from sros_tool.demo.keystores import DemoKeystores, make_keystores
+from sros_tool.demo.runner import Limits, Plan, run_plan
+from sros_tool.demo.scenarios import ROWS, Identity, Status
+from sros_tool.errors import UnavailableError
+from sros_tool.keystore.template import load_template
+from sros_tool.runtime.events import Event, Kind, Stage, read_events
+from sros_tool.runtime.netns import try_isolation
+from sros_tool.runtime.stacks import rclpy_stacks
+
+pytestmark = [
+    pytest.mark.dds,
+    pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="rclpy is not here"),
+]
+
+DOMAIN = "190"
+
+
+def node(module: str, folder: Path, *arguments: str, **more: str) -> subprocess.Popen[str]:
+    variables = {**os.environ, "ROS_DOMAIN_ID": DOMAIN, "ROS_LOG_DIR": str(folder), **more}
+    report = ["--report", str(folder / f"{module}.jsonl")]
+    return subprocess.Popen(
+        [sys.executable, "-m", f"sros_tool.demo.{module}", *report, *arguments],
+        env=variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for(path: Path, kind: Kind, seconds: float = 30) -> list[Event]:
+    deadline = time.monotonic() + seconds
+    while True:
+        events = read_events(path)
+        if any(event.kind is kind for event in events):
+            return events
+        assert time.monotonic() < deadline, f"{path.name} never said {kind}"
+        time.sleep(0.05)
+
+
+def test_the_runner_drives_rclpy_nodes(tmp_path: Path) -> None:
+    rows = tuple(row for row in ROWS if all(p.identity is Identity.NONE for p in row.parties))
+    plan = Plan(
+        rows=rows,
+        domains=tuple(range(191, 191 + len(rows))),
+        backend=Backend(RCLPY, "Fast DDS", "a test"),
+        keystores=DemoKeystores(tmp_path, tmp_path),
+        topic="/chatter",
+        folder=tmp_path / "rows",
+        limits=Limits(window=2.0, longest_window=10.0),
+    )
+    results = run_isolated(lambda tell: run_plan(plan, tell), try_isolation(), print)
+    observed = {result.name: result.observed for result in results}
+    assert observed.pop("unsecured talker to unsecured listener") is Status.HEARD
+    assert observed.pop("unsecured payload on the wire") in (Status.READABLE, Status.SKIPPED)
+    assert not observed
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_nodes_take_ros_arguments_and_end_quietly(number: signal.Signals, tmp_path: Path) -> None:
+    remap = ["--ros-args", "-r", "chatter:=/renamed"]
+    listener = node("listener", tmp_path, *remap, "-r", "__node:=ear")
+    talker = node("talker", tmp_path, "--period", "0.1", "--text", "Hi", *remap)
+    try:
+        heard = wait_for(tmp_path / "listener.jsonl", Kind.HEARD)
+        assert heard[-1].text.startswith("Hi: ")
+    finally:
+        for process in (listener, talker):
+            process.send_signal(number)
+    for process in (listener, talker):
+        output, errors = process.communicate(timeout=20)
+        assert process.returncode == 0
+        assert "Traceback" not in errors
+    assert "[ear]: I heard: 'Hi: " in output + errors or listener.returncode == 0
+    for name in ("talker", "listener"):
+        assert read_events(tmp_path / f"{name}.jsonl")[-1].kind is Kind.DONE
+
+
+def test_a_cyclone_talker_is_heard_by_an_rclpy_listener(tmp_path: Path) -> None:
+    listener = node("listener", tmp_path)
+    talker = node("cyclone_node", tmp_path, "talker", "--period", "0.1", "--text", "Cyclone")
+    try:
+        heard = wait_for(tmp_path / "listener.jsonl", Kind.HEARD)
+        assert heard[-1].text.startswith("Cyclone: ")
+    finally:
+        for process in (listener, talker):
+            process.terminate()
+            process.communicate(timeout=20)
+
+
+def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
+    """Over an RMW without security, the node must fail at the participant and say why."""
+    domains, template = DomainSet.of((190, 190)), load_template("production")
+    keystores = make_keystores(tmp_path, "/chatter", domains, template, datetime.now(UTC))
+    stack = next(rclpy_stacks(keystores.probe("/chatter", 190)))
+    assert stack.enforces is not None, stack.evidence
+    variables = keystores.environment(Identity.TALKER, 190)
+    talker = node("talker", tmp_path, **variables)
+    if stack.enforces:
+        wait_for(tmp_path / "talker.jsonl", Kind.READY)
+        talker.terminate()
+        talker.communicate(timeout=20)
+        return
+    _, errors = talker.communicate(timeout=60)
+    assert talker.returncode == 1
+    (failed,) = read_events(tmp_path / "talker.jsonl")
+    assert (failed.kind, failed.stage) == (Kind.FAILED, Stage.PARTICIPANT)
+    assert "security" in errors
+    with pytest.raises(UnavailableError, match="no RMW under rclpy"):
+        choose_backend("rclpy", keystores.probe("/chatter", 190))

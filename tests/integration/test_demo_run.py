@@ -1,0 +1,222 @@
+"""The demo as a user runs it, over a real DDS; and that it fails where it has to."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sros_tool.demo.backend import Backend
+from sros_tool.demo.isolated import run_isolated
+from sros_tool.demo.keystores import DemoKeystores
+from sros_tool.demo.runner import Limits, Plan, run_plan
+from sros_tool.demo.scenarios import ROWS, Identity, Row, Status
+from sros_tool.demo.verdict import RowResult
+from sros_tool.errors import SrosError, UnavailableError
+from sros_tool.runtime.cyclone_library import load_cyclone
+from sros_tool.runtime.netns import try_isolation
+
+pytestmark = pytest.mark.dds
+
+SROS = [sys.executable, "-c", "from sros_tool.cli import main; main()"]
+SHORT = Limits(window=1.0, longest_window=8.0)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _needs_cyclone() -> None:
+    try:
+        load_cyclone.cache_clear()
+        load_cyclone()
+    except UnavailableError as error:
+        pytest.skip(str(error))
+
+
+def start(*arguments: str, folder: Path, **more: str) -> subprocess.Popen[str]:
+    environment = {**os.environ, "TMPDIR": str(folder), **more}
+    return subprocess.Popen(
+        [*SROS, *arguments],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], int, Path]:
+    folder = tmp_path_factory.mktemp("demo")
+    keep = folder / "kept"
+    arguments = ["--backend", "cyclone", "--json", "--domain", "140", "--keep", str(keep)]
+    process = start("demo", *arguments, folder=folder)
+    output, errors = process.communicate(timeout=90)
+    assert not errors
+    return json.loads(output), process.returncode, keep
+
+
+def test_every_row_is_as_expected(shown: tuple[dict[str, Any], int, Path]) -> None:
+    result, status, _ = shown
+    wrong = [row for row in result["rows"] if not row["as_expected"]]
+    assert not wrong
+    assert status == 0
+    assert result["backend"] == "cyclone"
+    assert result["dds"].startswith("Cyclone DDS 0.10")
+    observed = {row["name"]: row["observed"] for row in result["rows"]}
+    assert len(observed) == len(ROWS)
+    assert observed["secured talker to secured listener"] == "heard"
+    assert observed["secured talker to unsecured listener"] == "not heard"
+    assert observed["secured listener without permission"] == "refused"
+
+
+def test_what_is_kept(shown: tuple[dict[str, Any], int, Path]) -> None:
+    result, _, keep = shown
+    assert json.loads((keep / "result.json").read_text()) == result
+    assert (keep / "keystore/enclaves/governance.p7s").is_file()
+    assert len(list((keep / "rows").glob("row_*/*.jsonl"))) >= 2 * len(ROWS)
+    for key in keep.glob("**/*.key.pem"):
+        assert key.stat().st_mode & 0o777 == 0o600
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("after", ["at once", "while rows run"])
+def test_an_interrupted_demo_leaves_nothing(
+    number: signal.Signals, after: str, tmp_path: Path
+) -> None:
+    process = start("demo", "--backend", "cyclone", "--domain", "160", folder=tmp_path)
+    deadline = time.monotonic() + 30
+    wanted = "sros-demo-*/rows/row_*/*.jsonl" if after == "while rows run" else "sros-demo-*"
+    while not list(tmp_path.glob(wanted)):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(number)
+    _, errors = process.communicate(timeout=15)
+    assert process.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143}[number]
+    assert "Traceback" not in errors
+    assert list(tmp_path.iterdir()) == []
+    assert not processes_with(str(tmp_path))
+
+
+def test_no_node_outlives_a_killed_demo(tmp_path: Path) -> None:
+    process = start("demo", "--backend", "cyclone", "--domain", "160", folder=tmp_path)
+    deadline = time.monotonic() + 30
+    while not list(tmp_path.glob("sros-demo-*/rows/row_*/*.jsonl")):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    assert processes_with(str(tmp_path))
+    process.kill()
+    process.communicate(timeout=15)
+    while processes_with(str(tmp_path)):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def processes_with(text: str) -> list[str]:
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            line = (folder / "cmdline").read_bytes().decode("utf-8", "replace")
+        except OSError:
+            continue
+        if text in line:
+            found.append(line)
+    return found
+
+
+def play(rows: tuple[Row, ...], backend: Backend, folder: Path) -> dict[str, RowResult]:
+    """Run rows without any keystore: only unsecured parties can take part."""
+    plan = Plan(
+        rows=rows,
+        domains=tuple(range(180, 180 + len(rows))),
+        backend=backend,
+        keystores=DemoKeystores(folder / "none", folder / "none"),
+        topic="/chatter",
+        folder=folder / "rows",
+        limits=SHORT,
+    )
+    results = run_isolated(lambda tell: run_plan(plan, tell), try_isolation(), lambda _line: None)
+    return {result.name: result for result in results}
+
+
+def without_security(row: Row) -> Row:
+    return replace(
+        row, parties=tuple(replace(party, identity=Identity.NONE) for party in row.parties)
+    )
+
+
+CYCLONE = Backend("cyclone", "Cyclone DDS", "a test")
+
+
+def test_without_security_the_demo_fails(tmp_path: Path) -> None:
+    """Its rows can fail: where everybody is unsecured, everybody is heard and let in."""
+    found = play(tuple(map(without_security, ROWS)), CYCLONE, tmp_path)
+    assert found["secured talker to secured listener"].observed is Status.HEARD
+    closed = [result for result in found.values() if result.expected is not Status.HEARD]
+    skipped = {result.name for result in closed if result.observed is Status.SKIPPED}
+    wrong = {result.name for result in closed if not result.as_expected}
+    assert wrong | skipped >= {
+        result.name for result in closed if result.expected is not Status.READABLE
+    }
+    assert skipped <= {row.name for row in ROWS if row.wire}
+
+
+@pytest.mark.parametrize("victim", ["talker", "listener"])
+def test_a_node_that_dies_makes_its_row_fail(victim: str, tmp_path: Path) -> None:
+    """A node that is killed as soon as it is ready hears nothing, and that is no isolation."""
+    row = without_security(
+        next(r for r in ROWS if r.name == "secured talker to unsecured listener")
+    )
+    row = replace(row, controls=())
+
+    class Dying(Backend):
+        def command(self, role: Any) -> list[str]:
+            if role.value != victim:
+                return super().command(role)
+            code = (
+                "import os, sys; from pathlib import Path;"
+                "from sros_tool.runtime.events import *;"
+                "report = Path(sys.argv[sys.argv.index('--report') + 1]);"
+                "EventWriter(report).report(Kind.READY);"
+                "import time; time.sleep(0.5); os.kill(os.getpid(), 11)"
+            )
+            return [sys.executable, "-c", code]
+
+    (result,) = play((row,), Dying("cyclone", "x", "y"), tmp_path).values()
+    assert result.observed is Status.CRASHED
+    assert "SIGSEGV" in result.detail
+    assert not result.as_expected
+
+
+def test_an_error_of_the_runner_is_an_error_of_the_demo() -> None:
+    def fail(_tell: Any) -> None:
+        raise ValueError("x")
+
+    with pytest.raises(SrosError, match="ValueError: x"):
+        run_isolated(fail, try_isolation(), print)
+    with pytest.raises(SrosError, match="without a result"):
+        run_isolated(lambda _tell: os._exit(3), try_isolation(), print)
+
+
+def test_doctor_finds_what_enforces(tmp_path: Path) -> None:
+    process = start("doctor", "--json", folder=tmp_path, ROS_SECURITY_ENABLE="True")
+    output, _ = process.communicate(timeout=90)
+    found = json.loads(output)
+    stacks = {stack["kind"]: stack for stack in found["stacks"]}
+    assert stacks["cyclone"]["enforces"] is True
+    assert process.returncode == 0
+    assert "'True'" in found["warnings"][0]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_doctor_says_what_to_install(tmp_path: Path) -> None:
+    process = start("doctor", folder=tmp_path, SROS_CYCLONEDDS_DIR=str(tmp_path))
+    output, _ = process.communicate(timeout=90)
+    assert "libddsc0debian" in output
+    assert process.returncode == (0 if "enforces security" in output else 1)

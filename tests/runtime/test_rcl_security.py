@@ -1,0 +1,86 @@
+"""rcl's rules of which enclave is loaded, and the warnings about misspelt values."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sros_tool.errors import SrosError
+from sros_tool.runtime.rcl_security import choose_enclave, domain_of, spelling_warnings
+
+
+@pytest.fixture
+def environment(tmp_path: Path) -> dict[str, str]:
+    (tmp_path / "enclaves" / "a" / "b").mkdir(parents=True)
+    return {
+        "ROS_SECURITY_ENABLE": "true",
+        "ROS_SECURITY_STRATEGY": "Enforce",
+        "ROS_SECURITY_KEYSTORE": str(tmp_path),
+        "ROS_SECURITY_ENCLAVE_OVERRIDE": "/a/b",
+    }
+
+
+def test_the_enclave_of_the_override(environment: dict[str, str], tmp_path: Path) -> None:
+    assert choose_enclave(environment, "/other").enclave == tmp_path / "enclaves/a/b"
+
+
+def test_the_enclave_of_the_argument(environment: dict[str, str], tmp_path: Path) -> None:
+    del environment["ROS_SECURITY_ENCLAVE_OVERRIDE"]
+    assert choose_enclave(environment, "/a").enclave == tmp_path / "enclaves/a"
+    assert choose_enclave(environment).enclave == tmp_path / "enclaves"
+
+
+@pytest.mark.parametrize("value", ["True", "1", "TRUE", "yes", "", " true", None])
+def test_only_true_switches_security_on(environment: dict[str, str], value: str | None) -> None:
+    environment.pop("ROS_SECURITY_ENABLE")
+    if value is not None:
+        environment["ROS_SECURITY_ENABLE"] = value
+    assert choose_enclave(environment).enclave is None
+
+
+@pytest.mark.parametrize("change", [{"KEYSTORE": ""}, {"ENCLAVE_OVERRIDE": "/missing"}])
+@pytest.mark.parametrize(
+    ("strategy", "starts"),
+    [("Enforce", False), ("enforce", True), ("Permissive", True), ("", True)],
+)
+def test_a_missing_enclave(
+    environment: dict[str, str], change: dict[str, str], strategy: str, starts: bool
+) -> None:
+    environment |= {f"ROS_SECURITY_{name}": value for name, value in change.items()}
+    environment["ROS_SECURITY_STRATEGY"] = strategy
+    if starts:
+        assert choose_enclave(environment).enclave is None
+    else:
+        with pytest.raises(SrosError):
+            choose_enclave(environment)
+
+
+def test_domains() -> None:
+    assert domain_of({}) == 0
+    assert domain_of({"ROS_DOMAIN_ID": "42"}) == 42
+    for wrong in ("231", "-1", "x", " 7 "):
+        with pytest.raises(SrosError):
+            domain_of({"ROS_DOMAIN_ID": wrong})
+
+
+@pytest.mark.parametrize(
+    ("variables", "told"),
+    [
+        ({}, []),
+        ({"ENABLE": "true", "STRATEGY": "Enforce", "KEYSTORE": "/k"}, []),
+        ({"ENABLE": "false"}, []),
+        ({"ENABLE": "True"}, ["'True'"]),
+        ({"ENABLE": "1", "STRATEGY": "Enforce"}, ["'1'"]),
+        ({"ENABLE": "true", "STRATEGY": "enforce", "KEYSTORE": "/k"}, ["'enforce'"]),
+        ({"ENABLE": "true", "KEYSTORE": "/k"}, ["STRATEGY is not set"]),
+        ({"ENABLE": "true", "STRATEGY": "Enforce"}, ["KEYSTORE is not set"]),
+        ({"STRATEGY": "ENFORCE"}, ["'ENFORCE'"]),
+    ],
+)
+def test_warnings(variables: dict[str, str], told: list[str]) -> None:
+    named = {f"ROS_SECURITY_{name}": value for name, value in variables.items()}
+    warnings = spelling_warnings(named)
+    assert len(warnings) == len(told)
+    for warning, part in zip(warnings, told, strict=True):
+        assert part in warning
