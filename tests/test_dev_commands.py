@@ -185,6 +185,16 @@ def test_an_environment_that_a_person_made_is_not_removed(
     assert (venv / "pyvenv.cfg").exists()
 
 
+def test_without_a_fitting_wheel_the_setup_goes_on_without_rclpy(
+    venv: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(environment, "succeeds", lambda *_, **__: pytest.fail("pip was asked"))
+    assert environment._install("ros", Record(version="3.14.0"), 0)
+    assert capsys.readouterr().err.startswith("dev: no rclpy wheel fits Python 3.14.0 on ")
+    assert environment._install("ros", Record(version="3.12.3", ros_around=True), 0)
+    assert capsys.readouterr().err == ""
+
+
 def test_needed_packages_are_those_that_are_not_here() -> None:
     here = {"libc6"}
     needed = apt.needed("libddsc0debian", lambda name: APT_DEPENDS.get(name, ""), here.__contains__)
