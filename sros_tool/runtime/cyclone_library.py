@@ -33,6 +33,7 @@ INSTALL_ADVICE = (
 
 _SUPPORTED = "0.10."
 _PLUGINS = ("auth", "ac", "crypto")
+_NEEDED_FIRST = ("_platform", "_hoofs", "_posh", "_binding_c")
 _KEPT_LOG_LINES = 200
 
 
@@ -265,9 +266,10 @@ def _library_files(folder: Path) -> list[Path]:
 def _load_all(files: Iterable[Path]) -> None:
     """Load libraries that need each other, in whatever order works; ignore what never loads.
 
-    With them in memory under their own names, libddsc finds them without LD_LIBRARY_PATH.
+    With them in memory under their own names, libddsc finds them without LD_LIBRARY_PATH.  Those
+    that others need come first, or the loader might take the system's copy beside ours.
     """
-    waiting = sorted(files)
+    waiting = sorted(files, key=_load_order)
     while waiting:
         failed = []
         for file in waiting:
@@ -278,6 +280,11 @@ def _load_all(files: Iterable[Path]) -> None:
         if len(failed) == len(waiting):
             return
         waiting = failed
+
+
+def _load_order(file: Path) -> tuple[int, str]:
+    places = [place for place, part in enumerate(_NEEDED_FIRST) if part in file.name]
+    return (places[0] if places else len(_NEEDED_FIRST), file.name)
 
 
 def loaded_libraries(prefix: str) -> tuple[Path, ...]:

@@ -170,3 +170,37 @@ def test_a_domain_that_the_keystore_is_not_for(
     code = "print(attempt(lambda _: join(), ''))"
     assert child(Identity.TALKER, code) == ["made"]
     assert child(Identity.TALKER, code, DOMAIN + 1) == ["refused"]
+
+
+def test_unpacked_packages_are_used_alone(tmp_path: Path) -> None:
+    """A folder as `dpkg -x` leaves it: nothing of the system's copy is loaded beside it."""
+    library = load_cyclone()
+    folder = tmp_path / "usr/lib/some-arch"
+    folder.mkdir(parents=True)
+    assert library.plugins is not None
+    for file in (library.path, *library.path.parent.glob("libiceoryx_*.so.?")):
+        (folder / file.name).write_bytes(file.read_bytes())
+    plugins = folder / library.plugins.name if library.plugins != library.path.parent else folder
+    plugins.mkdir(exist_ok=True)
+    for file in library.plugins.glob("libdds_security_*.so"):
+        (plugins / file.name).write_bytes(file.read_bytes())
+    code = (
+        "from sros_tool.runtime.cyclone_library import load_cyclone, loaded_libraries\n"
+        "library = load_cyclone()\n"
+        "print(library.plugins)\n"
+        "print(*loaded_libraries('libddsc'), *loaded_libraries('libiceoryx'), sep='\\n')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={
+            "SROS_CYCLONEDDS_DIR": str(tmp_path),
+            "PYTHONPATH": str(Path(__file__).parents[2]),
+        },
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    lines = done.stdout.splitlines()
+    assert lines[0] == str(plugins)
+    assert lines[1:]
+    assert all(line.startswith(str(folder)) for line in lines[1:])

@@ -220,3 +220,34 @@ def test_doctor_says_what_to_install(tmp_path: Path) -> None:
     output, _ = process.communicate(timeout=90)
     assert "libddsc0debian" in output
     assert process.returncode == (0 if "enforces security" in output else 1)
+
+
+FAST_DDS_NODE = """
+import sys
+from pathlib import Path
+from sros_tool.runtime.events import EventWriter, Kind, Stage
+argument = dict(zip(sys.argv, sys.argv[1:]))
+events = EventWriter(Path(argument["--report"]))
+if "without_permission" in argument["--report"]:
+    print("\\x1b[37;1m2026-01-01 12:00:00.000 [\\x1b[31;1mSECURITY Error\\x1b[37;1m] "
+          f"\\x1b[0mrt{argument['--topic']} topic not found in allow rule. -> Function check")
+    events.report(Kind.FAILED, "RCLError: invalid allocator", stage=Stage.ENDPOINT)
+    sys.exit(1)
+events.report(Kind.READY)
+import time; time.sleep(60)
+"""
+
+
+def test_a_denial_as_rclpy_over_fast_dds_shows_it(tmp_path: Path) -> None:
+    """The exception misleads; what Fast DDS prints on stdout, in colour, is what counts."""
+
+    class FastDds(Backend):
+        def command(self, role: Any) -> list[str]:
+            return [sys.executable, "-c", FAST_DDS_NODE]
+
+    rows = tuple(without_security(row) for row in ROWS if row.expected is Status.REFUSED)
+    results = play(rows, FastDds("rclpy", "Fast DDS", "a test"), tmp_path)
+    assert len(results) == 2
+    for result in results.values():
+        assert (result.observed, result.as_expected) == (Status.REFUSED, True)
+        assert "topic not found in allow rule" in result.detail
