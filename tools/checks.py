@@ -39,6 +39,9 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
         env = {**env, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": _PLUGINS}
     results = {name: _python(words, env, name) for name, words in LINTERS.items()}
     counts: Counter[str] = Counter()
+    if with_tests and not arguments:
+        # The table is shown, not judged: how fast a shared machine is proves nothing.
+        results["benchmarks"] = _python(["-m", "benchmarks", "--rounds", "1"], env, "benchmarks")
     if with_tests and arguments:
         results["pytest"] = _python(["-m", "pytest", *arguments], env, "pytest")
     elif with_tests:

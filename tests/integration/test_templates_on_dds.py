@@ -137,6 +137,8 @@ def test_protection_by_name_is_what_is_on_the_wire(tmp_path: Path) -> None:
     answer = converse(*parties)
     for name in topics:
         assert len(answer["nodes"][f"{name} heard"]["heard"]) > 10, answer
+    if answer["readable"] is None:
+        pytest.skip("packets may not be captured here")
     assert answer["readable"].get("say-stream", 0) > 10, answer
     assert answer["readable"].get("say-secret", 0) == 0, answer
     assert answer["readable"].get("say-command", 0) == 0, answer
