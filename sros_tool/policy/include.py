@@ -45,10 +45,12 @@ class Includer:
     def load(self, file: Path) -> etree._Element:
         """The root element of a document (its real path)."""
         if file not in self._documents:
-            self._documents[file] = parse(
-                read_bytes(file, "policy file"), f"the policy file '{file}'"
-            )
+            self.hold(file, read_bytes(file, "policy file"))
         return self._documents[file]
+
+    def hold(self, file: Path, content: bytes) -> None:
+        """Take ``content`` for what the file (its real path) holds, wherever it is included."""
+        self._documents[file] = parse(content, f"the policy file '{file}'")
 
     def children(
         self, parent: etree._Element, place: Place

@@ -33,25 +33,28 @@ _VERSION = re.compile(r"0\.2\.[0-9]+\Z")
 _QUALIFIERS = {qualifier.value: qualifier for qualifier in Qualifier}
 
 
-def read_policy(path: Path) -> Policy:
+def read_policy(path: Path, content: bytes | None = None) -> Policy:
     """Read a policy file and its includes, which must lie in its folder or below.
 
+    With ``content``, read that in place of what the file holds; the file need not exist.
     Raises `PolicyError` (or another `DocumentError`) with file and line for anything that the
     format does not have, for names that ROS does not have, and for an enclave given twice.
     """
-    return _Reader(path).policy()
+    return _Reader(path, content).policy()
 
 
 class _Reader:
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, content: bytes | None) -> None:
         self._shown = path
         self._file = Path(os.path.realpath(path))
         self._includer = Includer(self._file.parent)
+        if content is not None:
+            self._includer.hold(self._file, content)
+        elif not self._file.exists():
+            raise PolicyError(f"the policy file '{path}' does not exist")
 
     def policy(self) -> Policy:
-        root = self._includer.load(self._file) if self._file.exists() else None
-        if root is None:
-            raise PolicyError(f"the policy file '{self._shown}' does not exist")
+        root = self._includer.load(self._file)
         place = Place(self._file)
         where = self._where(root, place)
         if root.tag != "policy":

@@ -1,0 +1,174 @@
+"""What a policy comes down to: a set of rights and denials on absolute names.
+
+Two documents mean the same if their rights in normal form are equal.  An action is nothing but
+three services and two topics (ROS 2 design "Actions"): `unfolded` says it in those, `folded` puts
+them together again.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+from sros_tool.names import expand, is_expression
+from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Profile, Qualifier
+from sros_tool.policy.patterns import covers, overlap
+
+KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
+"""The kind of group in which a right stands, such as topics for publish."""
+
+RIGHT_ORDER = {right: number for number, right in enumerate(KIND_OF)}
+"""The order in which rights are told: publish, subscribe, request, reply, call, execute."""
+
+_GOAL = "/_action/send_goal"
+_SERVICES = ("/_action/cancel_goal", "/_action/get_result", _GOAL)
+_TOPICS = ("/_action/feedback", "/_action/status")
+_PARTS = {
+    "call": tuple([("request", s) for s in _SERVICES] + [("subscribe", t) for t in _TOPICS]),
+    "execute": tuple([("reply", s) for s in _SERVICES] + [("publish", t) for t in _TOPICS]),
+}
+_WHOLE = {"request": "call", "reply": "execute"}
+
+
+class Right(NamedTuple):
+    """One right or denial of an enclave; ``name`` is absolute, perhaps with wildcards.
+
+    A name without a leading "/" is a DDS topic that ROS has no word for; only permissions that
+    sros did not make hold such.
+    """
+
+    enclave: str
+    qualifier: Qualifier
+    right: str
+    name: str
+
+    @property
+    def kind(self) -> str:
+        """Topics, services or actions; dds for a topic that ROS has no word for."""
+        return KIND_OF[self.right] if self.name.startswith("/") else "dds"
+
+    def __str__(self) -> str:
+        """As ``/talker ALLOW publish topic /chatter``."""
+        return f"{self.enclave} {self.qualifier.value} {self.told()}"
+
+    def told(self) -> str:
+        """As ``publish topic /chatter``."""
+        item = "DDS topic" if self.kind == "dds" else self.kind.removesuffix("s")
+        return f"{self.right} {item} {self.name}"
+
+
+def order(right: Right) -> tuple[str, int, str, str]:
+    """Sorts rights as people look for them: by enclave, then kind and right, then name."""
+    return right.enclave, RIGHT_ORDER[right.right], right.name, right.qualifier
+
+
+def policy_rights(policy: Policy) -> frozenset[Right]:
+    """The rights that a policy states, as written but for their names, which become absolute."""
+    return frozenset(
+        right
+        for enclave in policy.enclaves
+        for profile in enclave.all_profiles()
+        for right in profile_rights(enclave.path, profile)
+    )
+
+
+def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
+    """The rights that one profile of an enclave states."""
+    ns, node = profile.ns, profile.node
+    for group in profile.groups:
+        for name in group.names:
+            fqn = expand(name, ns, node)
+            for right, qualifier in group.rights:
+                yield Right(enclave, qualifier, right, fqn)
+
+
+# ── actions and their parts ────────────────────────────────────────────────────────────────
+
+
+def parts(right: Right) -> tuple[Right, ...]:
+    """The topics and services that a right stands for: itself, or the five parts of an action."""
+    found = _PARTS.get(right.right)
+    if found is None:
+        return (right,)
+    return tuple(
+        Right(right.enclave, right.qualifier, part, right.name + end) for part, end in found
+    )
+
+
+def unfolded(rights: Iterable[Right]) -> frozenset[Right]:
+    """The same rights with every action as its parts."""
+    return frozenset(part for right in rights for part in parts(right))
+
+
+def folded(rights: Iterable[Right]) -> frozenset[Right]:
+    """The normal form: all parts of an action are told as the action, and not a second time."""
+    remaining = set(unfolded(rights))
+    actions = [
+        Right(each.enclave, each.qualifier, _WHOLE[each.right], each.name.removesuffix(_GOAL))
+        for each in remaining
+        if each.right in _WHOLE and each.name.endswith(_GOAL) and each.name.startswith("/")
+    ]
+    whole = [each for each in actions if each.name and remaining.issuperset(parts(each))]
+    for each in whole:
+        remaining.difference_update(parts(each))
+    return frozenset(remaining.union(whole))
+
+
+# ── asking ─────────────────────────────────────────────────────────────────────────────────
+
+
+class Rules:
+    """A set of rights that can be asked; exact names are looked up, only wildcards are matched."""
+
+    def __init__(self, rights: Iterable[Right]) -> None:
+        self._said = unfolded(rights)
+        self._names: dict[_Place, list[str]] = defaultdict(list)
+        self._wild: dict[_Place, list[str]] = defaultdict(list)
+        for enclave, qualifier, right, name in sorted(self._said):
+            place = (enclave, qualifier, right)
+            self._names[place].append(name)
+            if is_expression(name):
+                self._wild[place].append(name)
+
+    def cover(self, right: Right) -> bool:
+        """Whether all that ``right`` says (an ALLOW, or a DENY) is said here too."""
+        return all(self._covering(part) for part in parts(right))
+
+    def covering(self, right: Right) -> tuple[Right, ...]:
+        """The rights by which `cover` is true, without repetition; empty where it is not."""
+        found = [self._covering(part) for part in parts(right)]
+        return tuple(dict.fromkeys(each for each in found if each)) if all(found) else ()
+
+    def meeting(self, right: Right) -> tuple[Right, ...]:
+        """The rights here that share a name with ``right``."""
+        found: dict[Right, None] = {}
+        for part in parts(right):
+            place = part[:3]
+            if is_expression(part.name):
+                candidates = self._names.get(place, ())
+            else:
+                candidates = self._wild.get(place, ())
+                if part in self._said:
+                    found[part] = None
+            for name in candidates:
+                if overlap(name, part.name):
+                    found[Right(*place, name)] = None
+        return tuple(found)
+
+    def allow(self, enclave: str, right: str, name: str) -> bool:
+        """Whether ``name`` may be used so: something allows it, and nothing denies any of it."""
+        wanted = Right(enclave, ALLOW, right, name)
+        return self.cover(wanted) and not self.meeting(wanted._replace(qualifier=DENY))
+
+    def _covering(self, part: Right) -> Right | None:
+        if part in self._said:
+            return part
+        place = part[:3]
+        for wide in self._wild.get(place, ()):
+            if covers(wide, part.name):
+                return Right(*place, wide)
+        return None
+
+
+_Place = tuple[str, Qualifier, str]
