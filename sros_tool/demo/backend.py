@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from sros_tool.demo.scenarios import Role
 from sros_tool.errors import UnavailableError
 from sros_tool.runtime.cyclone_library import INSTALL_ADVICE
+from sros_tool.runtime.security_log import CYCLONE_EXPLAINS
 from sros_tool.runtime.stacks import (
     ProbeEnclave,
     Stack,
@@ -62,12 +63,20 @@ class Backend:
             return _module(f"sros_tool.demo.{role.value}")
         return [*_module("sros_tool.demo.cyclone_node"), role.value]
 
-    def environment(self, role: Role, *, wire: bool) -> Mapping[str, str]:
-        """The variables that a node needs beside those of its security."""
-        if self.library(role) != RCLPY:
-            return {}
-        chosen = {"RMW_IMPLEMENTATION": self.rmw} if self.rmw else {}
-        return {**chosen, **(_ON_THE_WIRE if wire else {})}
+    def environment(
+        self, role: Role, *, wire: bool = False, denied: bool = False
+    ) -> Mapping[str, str]:
+        """The variables that a node needs beside those of its security.
+
+        ``wire`` keeps its messages off shared memory; ``denied`` makes it say why.
+        """
+        on_ros = self.library(role) == RCLPY
+        variables = {"RMW_IMPLEMENTATION": self.rmw} if on_ros and self.rmw else {}
+        if on_ros and wire:
+            variables |= _ON_THE_WIRE
+        if denied and (not on_ros or self.rmw.startswith("rmw_cyclonedds")):
+            variables |= CYCLONE_EXPLAINS
+        return variables
 
 
 def choose_backend(wish: str, probe: ProbeEnclave) -> Backend:

@@ -69,6 +69,7 @@ class DemoResult:
             "why": self.backend.why,
             "topic": self.topic,
             "own_network": self.isolation.isolated,
+            "network_reason": self.isolation.reason,
             "as_expected": self.as_expected,
             "rows": [row.as_json() for row in self.rows],
         }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 from sros_tool.demo.options import NodeOptions
@@ -13,50 +14,62 @@ from sros_tool.runtime.events import EventWriter, Kind, Stage
 _LOG_FLUSH_SECONDS = 0.3
 """Fast DDS logs from a thread of its own: a process that ends at once loses the reason."""
 
+Build = Callable[[Any, EventWriter], None]
+"""Adds a node's publishers, subscriptions and timers."""
 
-def run_ros_node(
-    name: str,
-    options: NodeOptions,
-    arguments: Sequence[str],
-    build: Callable[[Any, EventWriter], None],
-) -> int:
+
+def run_ros_node(name: str, options: NodeOptions, arguments: Sequence[str], build: Build) -> int:
     """Create the node ``name``, let ``build`` add its endpoints, and spin until told to stop.
 
     ``arguments`` is the whole command line, from which rclpy takes its ``--ros-args``.  Returns
     the exit status.
     """
     events = EventWriter(options.report)
-    stage = Stage.IMPORT
     try:
         import rclpy
-        from rclpy.executors import ExternalShutdownException
-
-        stage = Stage.PARTICIPANT
+    except ImportError as error:
+        return _fail(name, error, Stage.IMPORT, events)
+    stage, node = Stage.PARTICIPANT, None
+    try:
         rclpy.init(args=list(arguments))
         node = rclpy.create_node(name)
         stage = Stage.ENDPOINT
         build(node, events)
         stage = Stage.RUNNING
         events.report(Kind.READY)
-        try:
-            rclpy.spin(node)
-        except ExternalShutdownException:
-            pass
-        except Exception:
-            # A signal may end the context in the middle of a callback; that is no failure.
-            if rclpy.ok():
-                raise
-        finally:
-            node.destroy_node()
-            rclpy.try_shutdown()
+        _spin(node)
     except KeyboardInterrupt:
         pass
-    except Exception as error:  # whatever ends a node must reach its report
-        reason = f"{type(error).__name__}: {error}"
-        time.sleep(_LOG_FLUSH_SECONDS)
-        sys.stdout.flush()
-        events.report(Kind.FAILED, reason, stage=stage)
-        print(f"{name}: failed at stage {stage.value}: {reason}", file=sys.stderr)
-        return 1
+    except Exception as error:
+        return _fail(name, error, stage, events)
+    finally:
+        # Leaves the domain, and nothing in shared memory; what is half made may well complain.
+        with suppress(Exception):
+            if node is not None:
+                node.destroy_node()
+            rclpy.try_shutdown()
     events.report(Kind.DONE)
     return 0
+
+
+def _spin(node: Any) -> None:
+    import rclpy
+    from rclpy.executors import ExternalShutdownException
+
+    try:
+        rclpy.spin(node)
+    except ExternalShutdownException:
+        pass
+    except Exception:
+        # A signal may end the context in the middle of a callback; that is no failure.
+        if rclpy.ok():
+            raise
+
+
+def _fail(name: str, error: Exception, stage: Stage, events: EventWriter) -> int:
+    reason = f"{type(error).__name__}: {error}"
+    time.sleep(_LOG_FLUSH_SECONDS)
+    sys.stdout.flush()
+    events.report(Kind.FAILED, reason, stage=stage)
+    print(f"{name}: failed at stage {stage.value}: {reason}", file=sys.stderr)
+    return 1

@@ -152,7 +152,11 @@ class _Stage:
                 if other.role is Role.TALKER and other.aside:
                     options += ["--also", _topic_of(other, plan.topic)]
         environment = base_environment(os.environ)
-        environment |= plan.backend.environment(party.role, wire=row.wire)
+        denied = any(
+            claim.relation is Relation.IS_REFUSED and claim.subject == party.name
+            for claim in row.claims
+        )
+        environment |= plan.backend.environment(party.role, wire=row.wire, denied=denied)
         environment |= plan.keystores.environment(party.identity, domain)
         command = [*plan.backend.command(party.role), *options]
         return PartyProcess(

@@ -161,8 +161,8 @@ def _judge_claim(claim: Claim, record: RowRecord) -> Finding:
     if claim.relation is Relation.READABLE:
         return _judge_wire(claim, record, subject)
     talker = record.parties[claim.talker]
-    sent = sum(1 for event in talker.events if event.kind is Kind.SENT and _inside(event, record))
-    if sent == 0:
+    sent = {e.text for e in talker.events if e.kind is Kind.SENT and _inside(e, record)}
+    if not sent:
         return Finding(Status.UNDECIDED, f"{claim.talker} sent nothing in that time")
     if claim.relation is Relation.SEES:
         return _judge_view(claim, record, subject, talker)
@@ -170,8 +170,8 @@ def _judge_claim(claim: Claim, record: RowRecord) -> Finding:
     heard = [e for e in subject.events if e.kind is Kind.HEARD and e.text.startswith(mark)]
     status = STATUS_OF[Relation.HEARS, bool(heard)]
     seconds = record.window[1] - record.window[0]
-    inside = sum(1 for event in heard if _inside(event, record))
-    heard_of = f"{inside} of {sent} messages of the {claim.talker}"
+    arrived = len(sent & {event.text for event in heard})
+    heard_of = f"{arrived} of {len(sent)} messages of the {claim.talker}"
     return Finding(status, f"{claim.subject} heard {heard_of} in {seconds:.1f} s")
 
 
@@ -214,7 +214,7 @@ def _trouble(name: str, record: PartyRecord) -> Finding | None:
     ready = any(event.kind is Kind.READY for event in record.events)
     for event in record.events:
         if event.kind is Kind.REFUSED:
-            return _refused(name, event.stage, event.text)
+            return _refused(name, event.stage, _own_denial(record, "") or event.text)
         if event.kind is Kind.FAILED:
             return _failure(name, record, event)
     if record.status is not None:
@@ -229,15 +229,19 @@ def _failure(name: str, record: PartyRecord, event: Event) -> Finding:
     reason = " ".join(event.text.split())
     if lacking := missing_security(told):
         return Finding(Status.NOT_STARTED, f"{name}: {lacking}")
-    if event.stage is Stage.ENDPOINT:
-        own = [line for line in told.splitlines() if _speaks_of(line, record.topic)]
-        if refusal := endpoint_refusal("\n".join(own)):
-            return _refused(name, Stage.ENDPOINT, refusal)
+    if event.stage is Stage.ENDPOINT and (refusal := _own_denial(record, event.text)):
+        return _refused(name, Stage.ENDPOINT, refusal)
     if event.stage is Stage.PARTICIPANT:
         refusal = participant_refusal(told) or endpoint_refusal(told)
         if refusal:
             return _refused(name, Stage.PARTICIPANT, refusal)
     return Finding(Status.CRASHED, f"{name} failed: {reason}")
+
+
+def _own_denial(record: PartyRecord, told: str) -> str:
+    """The line in which DDS Security denies this very topic, or ""."""
+    lines = f"{record.output}\n{told}".splitlines()
+    return endpoint_refusal("\n".join(line for line in lines if _speaks_of(line, record.topic)))
 
 
 def _speaks_of(line: str, topic: str) -> bool:

@@ -70,9 +70,9 @@ def try_isolation() -> Isolation:
         try:
             enter_isolation()
         except OSError as error:
-            reason = f"{error.strerror or error}"
+            reason = f"no network namespace of its own: {error.strerror or error}"
         except BaseException as error:  # a forked child must never return into its caller
-            reason = f"{error}"
+            reason = f"no network namespace of its own: {error}"
         finally:
             os.write(write_end, (reason or "yes").encode())
             os._exit(_ALONE)

@@ -37,8 +37,11 @@ _LOG_FLUSH_SECONDS = 0.3
 Ask = Callable[[str, str], None]
 """Creates an endpoint of a kind ("writer" or "reader") on a ROS topic ("/chatter")."""
 
+Close = Callable[[], None]
+"""Leaves the domain, so that nothing stays behind."""
 
-def join_rclpy() -> Ask:
+
+def join_rclpy() -> tuple[Ask, Close]:
     """A node of rclpy with the RMW that ``RMW_IMPLEMENTATION`` names, or rclpy's default."""
     import rclpy
     from std_msgs.msg import String
@@ -52,10 +55,14 @@ def join_rclpy() -> Ask:
         else:
             node.create_subscription(String, topic, lambda _message: None, 10)
 
-    return ask
+    def close() -> None:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+    return ask, close
 
 
-def join_cyclone() -> Ask:
+def join_cyclone() -> tuple[Ask, Close]:
     """A participant of the Cyclone DDS that sros itself speaks with."""
     participant = Participant(domain_of(os.environ), choose_enclave(os.environ).enclave)
 
@@ -65,10 +72,10 @@ def join_cyclone() -> Ask:
         else:
             participant.reader(f"rt{topic}")
 
-    return ask
+    return ask, participant.close
 
 
-def join_cyclonedds_package() -> Ask:
+def join_cyclonedds_package() -> tuple[Ask, Close]:
     """A participant of the Python package ``cyclonedds``, with the libddsc that it brings."""
     core, domain, idl, pub, sub, topics = (
         importlib.import_module(f"cyclonedds.{name}")
@@ -84,10 +91,10 @@ def join_cyclonedds_package() -> Ask:
         made = topics.Topic(participant, f"rt{topic}", string)
         (pub.DataWriter if kind == "writer" else sub.DataReader)(participant, made)
 
-    return ask
+    return ask, lambda: None
 
 
-JOINS: dict[str, Callable[[], Ask]] = {
+JOINS: dict[str, Callable[[], tuple[Ask, Close]]] = {
     "rclpy": join_rclpy,
     "cyclone": join_cyclone,
     "cyclonedds": join_cyclonedds_package,
@@ -101,7 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         enter_isolation()
     events = EventWriter(Path(report))
     try:
-        ask = JOINS[kind]()
+        ask, close = JOINS[kind]()
     except Exception as error:
         stage = Stage.IMPORT if isinstance(error, ImportError) else Stage.PARTICIPANT
         events.report(Kind.SEEN, _dds_in_memory())
@@ -118,9 +125,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             events.report(Kind.READY, f"{what} {topic}", stage=Stage.ENDPOINT)
     time.sleep(_LOG_FLUSH_SECONDS)
     events.report(Kind.DONE)
-    sys.stdout.flush()
-    # What comes after the answers, such as a vendor's clean-up, must not spoil them.
-    os._exit(0)
+    close()
+    return 0
 
 
 def _report_failure(events: EventWriter, error: Exception, stage: Stage, asked: str) -> None:

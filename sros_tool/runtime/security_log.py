@@ -11,6 +11,14 @@ import re
 
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
+_TRACE_HEAD = re.compile(r"^\d+\.\d+ \[\d*\]\s+\S+: ")
+
+CYCLONE_EXPLAINS = {
+    "CYCLONEDDS_URI": "<CycloneDDS><Domain><Tracing><Category>fatal,error,warning,trace</Category>"
+    "<OutputFile>stderr</OutputFile></Tracing></Domain></CycloneDDS>"
+}
+"""Makes Cyclone DDS say why it denies a topic, which it tells only its trace."""
+
 _ENDPOINT_REFUSALS = (
     "topic not found in allow rule",
     "topic denied by deny rule",
@@ -68,5 +76,5 @@ def _first_line_with(marks: tuple[str, ...], text: str) -> str:
     for line in plain_text(text).splitlines():
         lowered = line.lower()
         if any(mark in lowered for mark in marks):
-            return " ".join(line.split())
+            return " ".join(_TRACE_HEAD.sub("", line).split())
     return ""

@@ -22,7 +22,7 @@ from sros_tool.runtime.cyclone_library import INSTALL_ADVICE
 from sros_tool.runtime.events import Kind, read_events
 from sros_tool.runtime.netns import end_with_parent
 from sros_tool.runtime.probing import ProbeRun, Verdict, judge
-from sros_tool.runtime.security_log import plain_text
+from sros_tool.runtime.security_log import CYCLONE_EXPLAINS, plain_text
 
 PROBE_SECONDS = 20.0
 
@@ -149,7 +149,10 @@ def cyclonedds_package_stack(probe: ProbeEnclave) -> Stack:
 
 
 def _probe_rmw(probe: ProbeEnclave, rmw: str) -> Stack:
-    run = _run_probe("rclpy", probe, {"RMW_IMPLEMENTATION": rmw} if rmw else {})
+    variables = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}  # leaves nothing in shared memory
+    variables |= {"RMW_IMPLEMENTATION": rmw} if rmw else {}
+    variables |= CYCLONE_EXPLAINS if rmw.startswith("rmw_cyclonedds") else {}
+    run = _run_probe("rclpy", probe, variables)
     verdict = judge(run, probe.allowed, probe.denied)
     dds, version, where = _identity(run)
     return Stack(

@@ -74,6 +74,8 @@ def test_every_row_is_as_expected(shown: tuple[dict[str, Any], int, Path]) -> No
     assert observed["secured talker to secured listener"] == "heard"
     assert observed["secured talker to unsecured listener"] == "not heard"
     assert observed["secured listener without permission"] == "refused"
+    details = {row["name"]: row["detail"] for row in result["rows"]}
+    assert "rt/chatter denied by default rule" in details["secured talker without permission"]
 
 
 def test_what_is_kept(shown: tuple[dict[str, Any], int, Path]) -> None:

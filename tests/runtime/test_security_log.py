@@ -12,6 +12,7 @@ ENDPOINT = [
     "[SECURITY Error] rt/chatter topic denied by deny rule. -> Function check_rule",
     "[SECURITY Error] Not found topic access rule for topic ros_discovery_info",
     "cannot create topic rt/chatter. Not Allowed By Security",
+    "1795242829.9 [121] python: Local topic permission denied: rt/x denied by default rule(145)",
 ]
 PARTICIPANT = [
     "[SECURITY Error]  -> Function validate_local_identity",
