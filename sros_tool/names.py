@@ -111,7 +111,7 @@ def check_namespace(ns: str) -> str:
     if not text:
         return "/"
     problem = "" if ns == "/" else expression_problem(text)
-    if not problem and not text.startswith("/"):
+    if not problem and text[0] not in "/*":
         problem = "A namespace starts with '/'."
     if problem:
         raise InvalidNameError(f"{ns!r} is not a valid namespace", problem, "")

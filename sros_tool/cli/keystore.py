@@ -74,7 +74,7 @@ Example:
 @click.option("--permissions-validity", metavar="DURATION", help="How long permissions last.")
 @dry_run_option
 def create_keystore(
-    root: Path,
+    root: Path | None,
     template_name: str,
     domain: str | None,
     ca_layout: str | None,
@@ -87,6 +87,7 @@ def create_keystore(
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore import create_keystore as create
 
+    root = root or keystore_from_environment()
     ros_domain = _ros_domain() if domain is None else None
     domains = DomainSet.parse(domain, "--domain") if domain is not None else None
     if ros_domain is not None:
