@@ -23,6 +23,7 @@ from sros_tool.runtime.stacks import (
 AUTO, RCLPY, CYCLONE = "auto", "rclpy", "cyclone"
 CHOICES = (AUTO, RCLPY, CYCLONE)
 
+_ASKED = "as asked for"
 _NO_RCLPY = (
     "Source a ROS 2 installation from packages (its Fast DDS has DDS Security built in), or use"
     " `--backend cyclone`."
@@ -85,12 +86,12 @@ def choose_backend(wish: str, probe: ProbeEnclave) -> Backend:
     ``wish`` is one of `CHOICES`.  Raises `UnavailableError` where there is none.
     """
     if wish == CYCLONE:
-        return _cyclone(cyclone_stack(probe), "as asked for")
+        return _cyclone(cyclone_stack(probe), _ASKED)
     stacks = []
     for stack in rclpy_stacks(probe):
         stacks.append(stack)
         if stack.enforces:
-            why = "as asked for" if wish == RCLPY else f"{stack.name} enforces security here"
+            why = _ASKED if wish == RCLPY else f"{stack.name} enforces security here"
             return Backend(RCLPY, f"{stack.dds} {stack.version}".strip(), why, stack.rmw)
     reason = _why_not(stacks)
     if wish == RCLPY:
@@ -102,7 +103,7 @@ def _cyclone(stack: Stack, why: str) -> Backend:
     if not stack.enforces:
         raise UnavailableError(
             "no DDS here enforces security",
-            f"{stack.name}: {stack.evidence}. {why if why != 'as asked for' else ''}",
+            f"{stack.name}: {stack.evidence}. {'' if why == _ASKED else why}",
             INSTALL_ADVICE,
         )
     rmw = _observing_rmw()

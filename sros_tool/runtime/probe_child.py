@@ -131,7 +131,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _report_failure(events: EventWriter, error: Exception, stage: Stage, asked: str) -> None:
     refused = isinstance(error, SecurityRefusedError)
-    reason = str(error) if isinstance(error, SrosError) else f"{type(error).__name__}: {error}"
+    reason = f"{type(error).__name__}: {error}"
+    if isinstance(error, SrosError):
+        # Not the remedy: what to do depends on all that was found.
+        reason = str(SrosError(error.what, error.why)).rstrip(".")
     if stage is not Stage.ENDPOINT:
         time.sleep(_LOG_FLUSH_SECONDS)
     text = f"{asked}\n{reason}" if asked else reason
