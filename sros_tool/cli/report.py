@@ -20,6 +20,7 @@ _PHRASES = {
     "env": "print the environment",
     "run": "run the command",
     "demo": "run the demo",
+    "doctor": "examine this machine",
 }
 
 
