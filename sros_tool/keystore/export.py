@@ -23,7 +23,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     folder_mode,
 )
-from sros_tool.keystore.transaction import Change, Transaction, tidy
+from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.keystore.verify import check_enclave
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import load_certificate
@@ -112,8 +112,6 @@ def _write_folder(
             "It is a keystore of its own, not an export.",
             "Choose another folder.",
         )
-    if not dry_run:
-        tidy(target)
     _check_same_authority(target, files)
     different = {
         path: data

@@ -94,11 +94,11 @@ class Transaction:
             self._end()
 
     def _end(self) -> None:
+        if self._stage != self.root / STAGE:
+            shutil.rmtree(self._stage, ignore_errors=True)
+        elif self._lock >= 0:
+            recover(self.root)
         if self._lock >= 0:
-            if self._new_root:
-                shutil.rmtree(self._stage, ignore_errors=True)
-            else:
-                recover(self.root)
             os.close(self._lock)
             self._lock = -1
         for parent in self._made_parents:
@@ -222,7 +222,8 @@ class Transaction:
         else:
             self._bridge()
             _turn(self._stage, "new")
-            recover(self.root)
+            with contextlib.suppress(OSError):  # it is done; the end tries to tidy up once more
+                recover(self.root)
 
     def _appear(self) -> None:
         os.chmod(self._stage, folder_mode(""))
@@ -235,7 +236,8 @@ class Transaction:
                 ) from error
             raise
         self._made_parents.clear()
-        _flush_folder(self.root.parent)
+        with contextlib.suppress(OSError):  # it is there; the system writes it down in time anyway
+            _flush_folder(self.root.parent)
 
     def _bridge(self) -> None:
         """Let every file that is to change be reached through ``live``, still with old content."""

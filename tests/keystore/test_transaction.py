@@ -1,0 +1,595 @@
+"""A transaction is whole or did not happen, at whatever step the process is stopped."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NoReturn
+
+import pytest
+from harness import check_whole, policy_text, publish, remains, snapshot, topics_of
+
+from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.keystore import (
+    create,
+    create_enclaves,
+    create_keystore,
+    create_permission,
+    generate_artifacts,
+    transaction,
+)
+from sros_tool.keystore.export import distribute
+from sros_tool.keystore.layout import REQUIRED_FILES, enclave_folder, is_keystore
+from sros_tool.keystore.template import load_template
+from sros_tool.keystore.transaction import STAGE, Transaction
+from sros_tool.policy import Policy, read_policy
+
+NOW = datetime.now(UTC)
+TEMPLATE = load_template("development")
+DISCOVERY = "ros_discovery_info"
+
+# Every way in which the keystore's code changes a file system, and waits for it.
+PRIMITIVES = (
+    "chmod",
+    "fsync",
+    "link",
+    "mkdir",
+    "open",
+    "rename",
+    "replace",
+    "rmdir",
+    "symlink",
+    "unlink",
+    "write",
+)
+DIED, REFUSED = 99, 98
+
+
+class Steps:
+    """Counts the steps of a process, and does something else in place of one of them."""
+
+    def __init__(self, at: int, instead: Callable[[str, tuple[Any, ...]], object]) -> None:
+        self.count = 0
+        self._at = at
+        self._instead = instead
+
+    def install(self) -> None:
+        for name in PRIMITIVES:
+            setattr(os, name, self._counting(name, getattr(os, name)))
+        flush = transaction._flush_file_system
+        setattr(transaction, "_flush_file_system", self._counting("flush", lambda _: None))  # noqa: B010
+        assert callable(flush)
+
+    def _counting(self, name: str, real: Callable[..., Any]) -> Callable[..., Any]:
+        def primitive(*arguments: Any, **options: Any) -> Any:
+            self.count += 1
+            if self.count == self._at:
+                self._instead(name, (real, *arguments))
+            return real(*arguments, **options)
+
+        return primitive
+
+
+def die(name: str, call: tuple[Any, ...]) -> NoReturn:
+    """Stop at once; of a file that is being written, half is there."""
+    if name == "write":
+        real, handle, data = call
+        real(handle, bytes(data)[: len(data) // 2])
+    os._exit(DIED)
+
+
+def run_out_of_space(name: str, call: tuple[Any, ...]) -> NoReturn:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), name)
+
+
+def in_child(
+    verb: Callable[[], object],
+    at: int = 0,
+    instead: Callable[[str, tuple[Any, ...]], object] = die,
+) -> tuple[int, int]:
+    """Run a verb in a forked process; its exit status, and how many steps it took."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        steps = Steps(at, instead)
+        status = 1
+        try:
+            write = os.write
+            steps.install()
+            try:
+                verb()
+                status = 0
+            except (SrosError, OSError):
+                status = REFUSED
+            write(writer, str(steps.count).encode())
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(status)
+    os.close(writer)
+    with os.fdopen(reader) as pipe:
+        said = pipe.read()
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status), int(said or 0)
+
+
+# ── scenarios ──────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A verb on a folder ``w`` with a keystore; the topics of its enclaves before and after."""
+
+    verb: Callable[[Path], object]
+    before: dict[str, str]
+    after: dict[str, str]
+    prepare: Callable[[Path], object] = lambda _: None
+    keystore: str = "ks"
+
+
+def policy(folder: Path) -> Policy:
+    path = folder / "policy.xml"
+    path.write_text(
+        policy_text({name: publish(topic) for name, topic in NEW.items() if name != "/spare"})
+    )
+    return read_policy(path)
+
+
+OLD = {"/a": "old_a", "/b": "old_b"}
+NEW = {"/a": "new_a", "/b": "new_b", "/c": "new_c", "/c/d": "new_d", "/a/inner": "new_e"}
+
+
+def no_root(w: Path) -> None:
+    shutil.rmtree(w / "ks")
+
+
+def empty_root(w: Path) -> None:
+    no_root(w)
+    (w / "ks").mkdir()
+
+
+def lost_permissions(w: Path) -> None:
+    for name in ("permissions.p7s", "permissions.xml", "governance.p7s"):
+        (w / "ks/enclaves/b" / name).unlink()
+
+
+def export(w: Path) -> None:
+    distribute(w / "ks", ["/a"], w / "out", now=NOW)
+    create_permission(w / "ks", "/a", policy(w), now=NOW)
+
+
+SCENARIOS = {
+    "generate_artifacts": Scenario(
+        lambda w: generate_artifacts(w / "ks", policies=[policy(w)], now=NOW), OLD, NEW
+    ),
+    "create_permission": Scenario(
+        lambda w: create_permission(w / "ks", "/a", policy(w), now=NOW),
+        OLD,
+        {**OLD, "/a": "new_a"},
+    ),
+    "create_enclave": Scenario(
+        lambda w: create_enclaves(w / "ks", ["/c", "/c/d"], now=NOW),
+        OLD,
+        {**OLD, "/c": "*", "/c/d": "*"},
+    ),
+    "completion": Scenario(
+        lambda w: create_enclaves(w / "ks", ["/b"], now=NOW),
+        {"/a": "old_a"},
+        {"/a": "old_a", "/b": "*"},
+        lost_permissions,
+    ),
+    "create_keystore": Scenario(
+        lambda w: create_keystore(w / "ks", template=TEMPLATE, now=NOW), {}, {}, no_root
+    ),
+    "create_keystore, parents missing": Scenario(
+        lambda w: create_keystore(w / "x/y/ks", template=TEMPLATE, now=NOW),
+        {},
+        {},
+        no_root,
+        "x/y/ks",
+    ),
+    "create_keystore, empty root": Scenario(
+        lambda w: create_keystore(w / "ks", template=TEMPLATE, now=NOW), {}, {}, empty_root
+    ),
+    "generate_artifacts, no root": Scenario(
+        lambda w: generate_artifacts(w / "ks", policies=[policy(w)], now=NOW, create=TEMPLATE),
+        {},
+        NEW,
+        no_root,
+    ),
+    "generate_artifacts, empty root": Scenario(
+        lambda w: generate_artifacts(w / "ks", policies=[policy(w)], now=NOW, create=TEMPLATE),
+        {},
+        NEW,
+        empty_root,
+    ),
+    "distribute_key": Scenario(
+        lambda w: distribute(w / "ks", ["/a"], w / "out", now=NOW, force=True),
+        {"/a": "old_a"},
+        {"/a": "new_a"},
+        export,
+        "out",
+    ),
+}
+
+
+def seen(keystore: Path) -> dict[str, str]:
+    """The enclaves whose files are all there, with the one topic that tells their policy."""
+    found = {}
+    for name in ("/a", "/a/inner", "/b", "/c", "/c/d"):
+        folder = keystore / enclave_folder(name)
+        if all((folder / file).exists() for file in REQUIRED_FILES):
+            topics = topics_of(folder) - {DISCOVERY}
+            found[name] = "*" if "rt/*" in topics else ",".join(sorted(topics)).removeprefix("rt/")
+    return found
+
+
+def dangling(keystore: Path) -> list[Path]:
+    """Links that lead nowhere, beside those that are still in a stage."""
+    return [
+        Path(parent, name)
+        for parent, folders, files in os.walk(keystore)
+        for name in (*folders, *files)
+        if STAGE not in parent and not Path(parent, name).exists()
+    ]
+
+
+def check_moment(scenario: Scenario, w: Path, prepared: Path) -> None:
+    """What must hold at any moment: every enclave is as before or as after, and so are all."""
+    keystore = w / scenario.keystore
+    for path in dangling(keystore):  # only what was not there before, and is not there yet
+        assert STAGE in os.readlink(path), path
+        assert not (prepared / path.relative_to(w)).exists(), path
+    folders = [keystore / enclave_folder(name) for name in scenario.before]
+    if scenario.keystore != "out":
+        check_whole(keystore)
+    assert all((folder / "key.pem").exists() for folder in folders)
+    visible = seen(keystore)
+    existing = {name: topic for name, topic in visible.items() if name in scenario.before}
+    wanted = {name: scenario.after[name] for name in scenario.before}
+    assert existing in (scenario.before, wanted), existing
+    new = {name: topic for name, topic in visible.items() if name not in scenario.before}
+    assert new.items() <= scenario.after.items(), new
+    if new:
+        assert existing == wanted, "new enclaves appeared before the existing ones changed"
+
+
+def check_done(scenario: Scenario, w: Path) -> None:
+    """What must hold after the verb was run to its end."""
+    assert not remains(w), remains(w)
+    keystore = w / scenario.keystore
+    assert is_keystore(keystore)
+    assert seen(keystore) == scenario.after
+    assert not dangling(keystore)
+    if scenario.keystore != "out":
+        check_whole(keystore)
+
+
+def again(scenario: Scenario, w: Path) -> None:
+    """Run the verb again, which may find that it is done already."""
+    try:
+        scenario.verb(w)
+    except KeystoreError as error:
+        assert "already exists" in str(error), error
+        assert not scenario.before
+
+
+class Stage:
+    """Makes the folder of a scenario afresh, as often as it is needed."""
+
+    def __init__(self, scenario: Scenario, made_keystore: Path, folder: Path) -> None:
+        self.prepared = folder / "prepared"
+        self.prepared.mkdir()
+        shutil.copytree(made_keystore, self.prepared / "ks", symlinks=True)
+        policy(self.prepared)
+        scenario.prepare(self.prepared)
+        self._work = folder / "work"
+
+    def fresh(self) -> Path:
+        if self._work.exists():
+            shutil.rmtree(self._work)
+        return Path(shutil.copytree(self.prepared, self._work, symlinks=True))
+
+
+@pytest.fixture
+def stage(name: str, made_keystore: Path, tmp_path: Path) -> Stage:
+    return Stage(SCENARIOS[name], made_keystore, tmp_path)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_death_at_every_step(name: str, stage: Stage) -> None:
+    scenario = SCENARIOS[name]
+    w = stage.fresh()
+    status, steps = in_child(lambda: scenario.verb(w))
+    assert status == 0
+    check_done(scenario, w)
+    assert steps > 15
+    outcomes = set()
+    for step in range(1, steps + 1):
+        w = stage.fresh()
+        assert in_child(lambda w=w: scenario.verb(w), step) == (DIED, 0), step  # type: ignore[misc]
+        check_moment(scenario, w, stage.prepared)
+        outcomes.add(str(seen(w / scenario.keystore)))
+        again(scenario, w)
+        check_done(scenario, w)
+    assert len(outcomes) > (scenario.before != scenario.after)
+
+
+@pytest.mark.parametrize("name", ["generate_artifacts", "generate_artifacts, empty root"])
+def test_death_while_recovering_from_death(name: str, stage: Stage) -> None:
+    scenario = SCENARIOS[name]
+    _, steps = in_child(lambda: scenario.verb(stage.fresh()))
+    for first in range(steps - 60, steps, 17):
+        w = stage.fresh()
+        in_child(lambda w=w: scenario.verb(w), first)  # type: ignore[misc]
+        stopped = w.with_name("stopped")
+        w.rename(stopped)
+        for second in range(1, 36, 3):
+            shutil.copytree(stopped, w, symlinks=True)
+            in_child(lambda w=w: again(scenario, w), second)  # type: ignore[misc]
+            check_moment(scenario, w, stage.prepared)
+            again(scenario, w)
+            check_done(scenario, w)
+            shutil.rmtree(w)
+        shutil.rmtree(stopped)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_no_space_at_every_step(name: str, stage: Stage) -> None:
+    """An error leaves everything as it was, byte by byte; or else the verb succeeds."""
+    scenario = SCENARIOS[name]
+    before = snapshot(stage.prepared)
+    w = stage.fresh()
+    _, steps = in_child(lambda: scenario.verb(w))
+    refused = 0
+    for step in range(1, steps + 1):
+        w = stage.fresh()
+        status, _ = in_child(lambda w=w: scenario.verb(w), step, run_out_of_space)  # type: ignore[misc]
+        assert status in (0, REFUSED), step
+        if status == 0:
+            check_done(scenario, w)
+        else:
+            refused += 1
+            assert snapshot(w) == before, step
+    assert refused > 10
+
+
+@pytest.mark.parametrize("name", ["create_permission", "completion"])
+def test_without_hard_links(name: str, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refuse)
+    test_death_at_every_step(name, stage)
+
+
+# ── several at once ────────────────────────────────────────────────────────────────────────
+
+
+def fork(verb: Callable[[], object]) -> int:
+    child = os.fork()
+    if child:
+        return child
+    try:
+        verb()
+        os._exit(0)
+    except SrosError:
+        os._exit(REFUSED)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(1)
+
+
+def join(children: list[int]) -> list[int]:
+    return [os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
+
+
+def test_concurrent_additions_all_count(keystore: Path) -> None:
+    names = [f"/n{index}" for index in range(6)]
+    add = [lambda name=name: create_enclaves(keystore, [name], now=NOW) for name in names]
+    assert join([fork(each) for each in add]) == [0] * 6
+    check_whole(keystore)
+    assert not remains(keystore.parent)
+    assert all((keystore / enclave_folder(name) / "permissions.p7s").is_file() for name in names)
+
+
+@pytest.mark.parametrize("root", ["missing", "empty", "deep/er"])
+def test_only_one_of_many_makes_the_keystore(root: str, tmp_path: Path) -> None:
+    """generate_artifacts, too, makes no second CA in a keystore that another one just made."""
+    target = tmp_path / root
+    if root == "empty":
+        target.mkdir()
+    verbs = [
+        lambda: create_keystore(target, template=TEMPLATE, now=NOW),
+        lambda: generate_artifacts(target, enclaves=["/a"], now=NOW, create=TEMPLATE),
+    ]
+    barrier, go = os.pipe()
+
+    def wait_and(verb: Callable[[], object]) -> None:
+        os.close(go)
+        os.read(barrier, 1)
+        verb()
+
+    children = [fork(lambda verb=verbs[i % 2]: wait_and(verb)) for i in range(8)]  # type: ignore[misc]
+    os.close(go)
+    os.close(barrier)
+    statuses = join(children)
+    assert set(statuses) <= {0, REFUSED}
+    assert statuses[::2].count(0) <= 1
+    assert 0 in statuses
+    check_whole(target)
+    assert not remains(tmp_path)
+
+
+def test_no_second_ca_where_another_process_was_faster(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In an empty folder that exists, the keystore of the other one is not written over."""
+    root = tmp_path / "ks"
+    root.mkdir()
+    after: dict[str, tuple[int, bytes]] = {}
+
+    def be_slow(*arguments: Any, **options: Any) -> Transaction:
+        monkeypatch.setattr(create, "Transaction", Transaction)
+        create_keystore(root, template=TEMPLATE, now=NOW)
+        after.update(snapshot(tmp_path))
+        return Transaction(*arguments, **options)
+
+    monkeypatch.setattr(create, "Transaction", be_slow)
+    with pytest.raises(KeystoreError, match="already exists"):
+        generate_artifacts(root, enclaves=["/a"], now=NOW, create=TEMPLATE)
+    assert after
+    assert snapshot(tmp_path) == after
+
+
+def test_a_transaction_waits_for_another(keystore: Path) -> None:
+    ready, go = os.pipe()  # forked before, for a fork would share the lock
+
+    def follow() -> None:
+        os.read(ready, 1)
+        create_enclaves(keystore, ["/late"], now=NOW)
+
+    child = fork(follow)
+    with Transaction(keystore) as held:
+        held.write("enclaves/x.txt", b"x")
+        os.write(go, b".")
+        time.sleep(0.1)
+        assert os.waitpid(child, os.WNOHANG) == (0, 0)
+        held.commit()
+    assert join([child]) == [0]
+    assert (keystore / "enclaves/x.txt").read_bytes() == b"x"
+    assert (keystore / "enclaves/late/key.pem").exists()
+
+
+def test_a_busy_keystore_is_told(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transaction, "_LOCK_SECONDS", 0.05)
+    monkeypatch.setattr(transaction._lock, "__defaults__", (0.05,))
+    with Transaction(keystore):
+        before = snapshot(keystore)
+        with pytest.raises(KeystoreError, match="is busy"), Transaction(keystore):
+            pass
+        assert snapshot(keystore) == before
+    assert not remains(keystore)
+
+
+def test_stale_stages_beside_a_keystore_are_removed_and_those_in_use_are_not(
+    tmp_path: Path,
+) -> None:
+    stale, other = tmp_path / ".k[s]*.sros-12345678", tmp_path / ".ks.sros-12345678"
+    for folder in (stale, other):
+        (folder / "private").mkdir(parents=True)
+        (folder / "private/ca.key.pem").write_text("secret")
+    used = tmp_path / ".k[s]*.sros-87654321"
+    used.mkdir()
+    lock = transaction._lock(used)
+    create_keystore(tmp_path / "k[s]*", template=TEMPLATE, now=NOW)
+    os.close(lock)
+    assert not stale.exists()
+    assert used.exists()
+    assert other.exists(), "the name of a keystore is not a pattern"
+
+
+@pytest.mark.parametrize("opened", [False, True])
+def test_a_stage_that_was_removed_before_it_was_locked_is_made_anew(
+    opened: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock = transaction._lock
+    removed: list[Path] = []
+
+    def lose_the_first(folder: Path, wait: float = 60.0) -> int:
+        handle = lock(folder, wait) if opened else -1
+        if not removed:
+            removed.append(folder)
+            folder.rmdir()
+        return handle if opened else lock(folder, wait)
+
+    monkeypatch.setattr(transaction, "_lock", lose_the_first)
+    create_keystore(tmp_path / "ks", template=TEMPLATE, now=NOW)
+    assert removed
+    check_whole(tmp_path / "ks")
+    assert not remains(tmp_path)
+
+
+# ── what is written ────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("umask", [0o000, 0o022, 0o077])
+def test_keys_are_private_from_the_first_byte(
+    umask: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = tmp_path / "ks"
+    modes: dict[str, int] = {}
+    write = os.write
+
+    def note_mode(handle: int, data: bytes) -> int:
+        if b"PRIVATE KEY" in bytes(data):
+            path = os.readlink(f"/proc/self/fd/{handle}")
+            modes[path] = os.fstat(handle).st_mode & 0o777
+            folders = Path(path).relative_to(tmp_path).parents
+            assert any((tmp_path / each).stat().st_mode & 0o077 == 0 for each in folders)
+        return write(handle, data)
+
+    before = os.umask(umask)
+    try:
+        monkeypatch.setattr(os, "write", note_mode)
+        create_keystore(root, template=TEMPLATE, now=NOW)
+        create_enclaves(root, ["/a", "/b/c"], now=NOW)
+    finally:
+        os.umask(before)
+    assert len(modes) == 4
+    assert set(modes.values()) == {0o600}
+    for folder in (root / "private", root / "enclaves", root / "enclaves/a", root / "enclaves/b"):
+        assert folder.stat().st_mode & 0o777 == 0o700
+    assert root.stat().st_mode & 0o777 == 0o755
+    check_whole(root)
+
+
+def test_an_error_after_staging_leaves_nothing(keystore: Path) -> None:
+    before = snapshot(keystore.parent)
+    with pytest.raises(RuntimeError), Transaction(keystore) as changing:
+        changing.write("enclaves/a/key.pem", b"new", private=True)
+        changing.write("enclaves/new/key.pem", b"new", private=True)
+        raise RuntimeError
+    assert snapshot(keystore.parent) == before
+
+
+def test_a_dry_run_tells_the_changes_and_makes_none(keystore: Path) -> None:
+    before = snapshot(keystore.parent)
+    with Transaction(keystore, dry_run=True) as changing:
+        changing.write("enclaves/a/key.pem", b"new", private=True)
+        changing.write("enclaves/new/key.pem", b"new", private=True)
+        changing.commit()
+    assert [(change.action, change.path) for change in changing.changes] == [
+        ("replace", "enclaves/a/key.pem"),
+        ("create", "enclaves/new/key.pem"),
+    ]
+    assert snapshot(keystore.parent) == before
+
+
+def test_nothing_is_written_through_a_link(keystore: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (keystore / "enclaves/link").symlink_to(outside)
+    with pytest.raises(KeystoreError, match="symbolic link"):
+        create_enclaves(keystore, ["/link", "/link/below"], now=NOW)
+    assert not list(outside.iterdir())
+    assert not remains(keystore)
+
+
+def test_a_file_that_is_a_link_is_replaced_and_not_followed(keystore: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "elsewhere.p7s"
+    (keystore / "enclaves/a/permissions.p7s").rename(outside)
+    (keystore / "enclaves/a/permissions.p7s").symlink_to(outside)
+    before = outside.read_bytes()
+    create_permission(keystore, "/a", policy(tmp_path), now=NOW)
+    assert outside.read_bytes() == before
+    assert seen(keystore)["/a"] == "new_a"
+    check_whole(keystore)
