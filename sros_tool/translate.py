@@ -11,10 +11,11 @@ from fnmatch import fnmatchcase
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, Protection, TopicRule
-from sros_tool.dds.permissions import Criteria, Permissions, Rule, grant
+from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, grant
 from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expand
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Qualifier
 from sros_tool.policy.protection import DomainProtection, NamedProtection, TopicProtection
+from sros_tool.policy.rights import Right
 from sros_tool.validity import Window
 
 # ── ROS → DDS ──────────────────────────────────────────────────────────────────────────────
@@ -190,6 +191,20 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
             else:
                 rest.append(RosRight(qualifier, right, "dds", topic))
     return tuple(rest + rights)
+
+
+def grant_rights(enclave: str, grant: Grant) -> frozenset[Right]:
+    """The rights of a grant, those of an ``enclave``, without what every participant has.
+
+    Domains, partitions, relay criteria and the default of the grant are not part of the answer,
+    nor is the order of its rules.
+    """
+    return frozenset(
+        Right(enclave, each.qualifier, each.right, each.name)
+        for rule in grant.rules
+        for each in ros_rights(rule)
+        if each.name != ROS_DISCOVERY_TOPIC
+    )
 
 
 def _all_topics(criteria: Iterable[Criteria]) -> dict[str, bool]:

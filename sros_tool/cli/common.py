@@ -101,6 +101,31 @@ def split_root(words: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
     return Path(first), tuple(words[1:])
 
 
+class SeveralValues(click.Command):
+    """Lets ``-e A B -e C`` mean A, B and C, as ros2/sros2 users write it; every value counts.
+
+    ``several`` are the options that take values so.
+    """
+
+    several: tuple[str, ...] = ()
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Repeat the option before each of its values."""
+        spread: list[str] = []
+        option, values = "", 0
+        for word in args:
+            if word.startswith("-") and word != "-":
+                option = word if word in self.several else ""
+                values = 0
+                spread.append(word)
+                continue
+            if option and values:
+                spread.append(option)
+            spread.append(word)
+            values += 1
+        return super().parse_args(ctx, spread)
+
+
 def complete_keystore_and_enclave(
     ctx: click.Context, _parameter: click.Parameter, incomplete: str
 ) -> list[CompletionItem | str]:

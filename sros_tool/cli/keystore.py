@@ -13,6 +13,7 @@ import click
 
 from sros_tool.cli.common import (
     PATH,
+    SeveralValues,
     complete_keystore_and_enclave,
     complete_template,
     dry_run_option,
@@ -233,31 +234,13 @@ def create_permission(words: tuple[str, ...], dry_run: bool) -> None:
     _show(result, dry_run)
 
 
-class _SeveralValues(click.Command):
-    """Lets ``-e A B -e C`` mean A, B and C, as ros2/sros2 users write it; every value counts."""
-
+class _SeveralEnclavesAndPolicies(SeveralValues):
     several = ("-e", "--enclaves", "-p", "--policy-files")
-
-    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Repeat the option before each of its values."""
-        spread: list[str] = []
-        option, values = "", 0
-        for word in args:
-            if word.startswith("-") and word != "-":
-                option = word if word in self.several else ""
-                values = 0
-                spread.append(word)
-                continue
-            if option and values:
-                spread.append(option)
-            spread.append(word)
-            values += 1
-        return super().parse_args(ctx, spread)
 
 
 @click.command(
     "generate_artifacts",
-    cls=_SeveralValues,
+    cls=_SeveralEnclavesAndPolicies,
     epilog="""\b
 Example:
   $ sros generate_artifacts -k keystore -e /spare -p talker_listener.xml mobile_robot.xml

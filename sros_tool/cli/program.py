@@ -32,6 +32,10 @@ FAMILIES: dict[str, dict[str, Verb]] = {
         "inspect": Verb("inspect", "Show what a keystore, certificate or document says."),
     },
     "Policy": {
+        "generate_policy": Verb("generate_policy", "Learn a policy from the running robot."),
+        "merge_policy": Verb("policy", "Add the rights of policies to a policy file."),
+        "diff_policy": Verb("policy", "Compare the rights of policies, permissions, keystores."),
+        "minimize_policy": Verb("minimize", "Narrow a policy to what was observed."),
         "policies": Verb("policies", "List or copy the policies that ship with sros."),
     },
     "Running": {

@@ -18,11 +18,9 @@ from sros_tool.names import check_namespace
 from sros_tool.policy.merge import Contradiction, Entry, Place, plan_merge
 from sros_tool.policy.model import RIGHTS, Policy, Qualifier
 from sros_tool.policy.reader import read_policy
-from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.policy.rights import Right, Said, policy_rights
 from sros_tool.policy.text import Element, Text
 from sros_tool.xml import read_bytes
-
-Rights = tuple[tuple[str, Qualifier], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,7 +100,7 @@ def _item(kind: str, name: str) -> _New:
     return _New(kind.removesuffix("s"), name)
 
 
-def _group(kind: str, rights: Rights, names: Iterable[str]) -> _New:
+def _group(kind: str, rights: Said, names: Iterable[str]) -> _New:
     attributes = "".join(f' {right}="{qualifier.value}"' for right, qualifier in rights)
     return _New(kind + attributes, children=[_item(kind, name) for name in names])
 
@@ -170,7 +168,7 @@ class _Editor:
             self._append(enclave, _New("profiles", children=new))
 
     def _add_to_profiles(self, profiles: list[Element], entries: Sequence[Entry]) -> None:
-        groups: dict[tuple[str, Rights], Element] = {}
+        groups: dict[tuple[str, Said], Element] = {}
         for profile in profiles:
             for child in profile.children:
                 if child.tag in RIGHTS:
@@ -199,9 +197,9 @@ class _Editor:
 
     def _append(self, parent: Element, new: _New) -> None:
         """Write an element behind the last one of ``parent`` that is not its metadata."""
-        children = [child for child in parent.children if child.tag != "metadata"]
-        if children:
-            self._put_after(children[-1], new)
+        last = next((each for each in reversed(parent.children) if each.tag != "metadata"), None)
+        if last:
+            self._put_after(last, new)
         else:
             self._put_into_empty(parent, new)
 
@@ -243,7 +241,7 @@ class _Editor:
         return f"{before}<{new.start}>{children}{before}</{tag}>"
 
 
-def _rights_of(group: Element) -> Rights:
+def _rights_of(group: Element) -> Said:
     return tuple(
         (right, Qualifier(group.get(right))) for right in RIGHTS[group.tag] if group.get(right)
     )

@@ -12,7 +12,16 @@ from dataclasses import dataclass
 from sros_tool.names import expand
 from sros_tool.notes import Note
 from sros_tool.policy.model import ALLOW, DENY, Policy, Qualifier
-from sros_tool.policy.rights import RIGHT_ORDER, Right, Rules, folded, order, policy_rights
+from sros_tool.policy.rights import (
+    RIGHT_ORDER,
+    Right,
+    Rules,
+    Said,
+    folded,
+    order,
+    policy_rights,
+    sayable,
+)
 
 _MANY = 3
 
@@ -36,7 +45,7 @@ class Entry:
 
     kind: str
     name: str
-    rights: tuple[tuple[str, Qualifier], ...]
+    rights: Said
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,27 +134,15 @@ class _Name:
 
 def _entries(found: dict[tuple[str, str], _Name]) -> Iterable[Entry]:
     for (kind, _), name in found.items():
-        # A right can be both allowed and denied, which no single group can say.
-        for qualifiers in _compatible(name.rights):
+        for qualifiers in sayable(name.rights):
             yield Entry(kind, name.written, qualifiers)
-
-
-def _compatible(
-    rights: Iterable[tuple[str, Qualifier]],
-) -> Iterable[tuple[tuple[str, Qualifier], ...]]:
-    ordered = sorted(rights, key=lambda each: (RIGHT_ORDER[each[0]], each[1]))
-    if len({right for right, _ in ordered}) == len(ordered):
-        yield tuple(ordered)
-        return
-    for wanted in (ALLOW, DENY):
-        yield tuple((right, qualifier) for right, qualifier in ordered if qualifier is wanted)
 
 
 def _place_order(place: Place) -> tuple[str, str, str]:
     return place.enclave, place.ns, place.node
 
 
-def _entry_order(entry: Entry) -> tuple[int, tuple[tuple[str, Qualifier], ...], str]:
+def _entry_order(entry: Entry) -> tuple[int, Said, str]:
     return RIGHT_ORDER[entry.rights[0][0]], entry.rights, entry.name
 
 

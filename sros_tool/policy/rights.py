@@ -63,6 +63,20 @@ def order(right: Right) -> tuple[str, int, str, str]:
     return right.enclave, RIGHT_ORDER[right.right], right.name, right.qualifier
 
 
+Said = tuple[tuple[str, Qualifier], ...]
+"""What a group says of its names: rights with their qualifiers, in the order of `RIGHTS`."""
+
+
+def sayable(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[Said]:
+    """What groups are to say for ``rights`` on a name: two where one is allowed and denied."""
+    ordered = sorted(rights, key=lambda each: (RIGHT_ORDER[each[0]], each[1]))
+    if len({right for right, _ in ordered}) == len(ordered):
+        yield tuple(ordered)
+        return
+    for qualifier in Qualifier:
+        yield tuple(each for each in ordered if each[1] is qualifier)
+
+
 def policy_rights(policy: Policy) -> frozenset[Right]:
     """The rights that a policy states, as written but for their names, which become absolute."""
     return frozenset(

@@ -1,0 +1,49 @@
+"""Measures how large the signed permissions of an enclave become, by signing them for nobody."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.permissions import render_permissions
+from sros_tool.names import dds_names
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import common_name, issue_ca, subject_text
+from sros_tool.pki.keys import generate_key
+from sros_tool.policy.model import Enclave
+from sros_tool.policy.rights import Right
+from sros_tool.translate import permissions_for
+from sros_tool.validity import window
+
+_LINE = len("            <topic></topic>\r\n")
+
+
+class Scale:
+    """Signs with a key of its own that is thrown away.
+
+    A keystore's own CA may have a longer or shorter name, and a signature varies by some bytes: the
+    sizes are right to within 100 bytes.
+    """
+
+    def __init__(self) -> None:
+        self._key = generate_key()
+        self._validity = window(datetime(2026, 1, 1, tzinfo=UTC), timedelta(days=365))
+        self._certificate = issue_ca(
+            self._key, common_name("sros permissions CA 00000000"), self._validity
+        )
+
+    def signed_bytes(self, enclave: Enclave) -> int:
+        """The size in bytes of ``permissions.p7s`` for an enclave of a policy."""
+        permissions = permissions_for(
+            enclave,
+            subject=subject_text(common_name(enclave.path)),
+            validity=self._validity,
+            domains=DomainSet.of((0, 0)),
+        )
+        return len(smime.sign(render_permissions(permissions), self._certificate, self._key))
+
+
+def right_bytes(right: Right) -> int:
+    """The bytes that one right takes in a signed document: a line for each of its DDS topics."""
+    names = dds_names(right.right, right.name)
+    return sum(_LINE + len(name) for name in (*names.publish, *names.subscribe))

@@ -1,0 +1,288 @@
+"""Narrows a policy to what was observed, and measures how much wider it was.
+
+Over-privilege of an enclave is the number of pairs (right, name) that it is allowed, divided by
+the number of those that were observed.  A pair is one of publish, subscribe, request, reply, call,
+execute with one exact name; a wildcard counts as the known names that it matches, which are the
+exact names of that kind (topics, services or actions) in the policy and in the observations of all
+enclaves.  Pairs that a DENY takes away do not count.  What was observed and is not allowed does
+not count either: it cannot have worked.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+from sros_tool.errors import PolicyError
+from sros_tool.names import expand, is_expression
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy
+from sros_tool.policy.narrow import narrowed_enclave
+from sros_tool.policy.patterns import covers, literal_prefix, matches
+from sros_tool.policy.rights import (
+    KIND_OF,
+    Right,
+    Rules,
+    folded,
+    order,
+    parts,
+    policy_rights,
+    unfolded,
+)
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Wide:
+    """A wildcard, the observed rights that rest on it, and what can stand in its place.
+
+    ``replacement`` leaves out what other rules of the enclave allow by its exact name.
+    """
+
+    rule: Right
+    used: tuple[Right, ...]
+    replacement: tuple[Right, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class EnclaveUse:
+    """What an enclave is allowed against what it was observed to do.
+
+    ``unused`` rules were never observed and go; ``common`` ones were never observed and stay, as
+    they belong to what every node needs; ``refused`` was observed, and the policy does not allow
+    it.  An enclave that was not ``seen`` at all stays as it is.
+    """
+
+    enclave: str
+    seen: bool
+    unused: tuple[Right, ...]
+    common: tuple[Right, ...]
+    wide: tuple[Wide, ...]
+    refused: tuple[Right, ...]
+    allowed_pairs: int
+    observed_pairs: int
+    remaining_pairs: int
+
+    @property
+    def ratio(self) -> float | None:
+        """Allowed over observed pairs, 1.0 for the least policy; None if nothing was observed."""
+        return self.allowed_pairs / self.observed_pairs if self.observed_pairs else None
+
+
+@dataclass(frozen=True, slots=True)
+class Minimized:
+    """The narrowed policy, without includes, and the use of each enclave."""
+
+    policy: Policy
+    uses: tuple[EnclaveUse, ...]
+
+
+def minimize(policy: Policy, observed: Iterable[Right], common: Sequence[Group] = ()) -> Minimized:
+    """Narrow ``policy`` to the ALLOW rights of ``observed``.
+
+    A DENY always stays.  ``common`` is what every node needs, said for a node: where the policy
+    allows it to a node with a profile, it stays, observed or not.
+    """
+    seen = folded(right for right in observed if right.qualifier is ALLOW)
+    by_enclave: dict[str, set[Right]] = defaultdict(set)
+    for right in seen:
+        by_enclave[right.enclave].add(right)
+    names = KnownNames((policy_rights(policy), seen))
+    enclaves, uses = [], []
+    for enclave in policy.enclaves:
+        enclave, use = _Narrowing(
+            enclave, frozenset(by_enclave.get(enclave.path, ())), common, names
+        ).result()
+        enclaves.append(enclave)
+        uses.append(use)
+    return Minimized(Policy(tuple(enclaves), policy.version, policy.file), tuple(uses))
+
+
+class KnownNames:
+    """All exact names that policies and observations hold, by kind, sorted."""
+
+    def __init__(self, all_rights: Iterable[Iterable[Right]]) -> None:
+        found: dict[str, set[str]] = defaultdict(set)
+        for rights in all_rights:
+            for right in folded(rights):
+                if not is_expression(right.name):
+                    found[right.kind].add(right.name)
+        self._names = {kind: sorted(names) for kind, names in found.items()}
+
+    def of(self, kind: str) -> Sequence[str]:
+        """The known names of topics, services or actions."""
+        return self._names.get(kind, ())
+
+    def matched(self, kind: str, expression: str) -> Iterator[str]:
+        """The known names that a wildcard matches."""
+        names, prefix = self.of(kind), literal_prefix(expression)
+        for name in names[bisect_left(names, prefix) :]:
+            if not name.startswith(prefix):
+                return
+            if matches(expression, name):
+                yield name
+
+
+class _Narrowing:
+    """One enclave."""
+
+    def __init__(
+        self,
+        enclave: Enclave,
+        observed: frozenset[Right],
+        common: Sequence[Group],
+        names: KnownNames,
+    ) -> None:
+        self._enclave = enclave
+        self._names = names
+        stated = policy_rights(Policy((enclave,)))
+        self._stated = sorted((r for r in stated if r.qualifier is ALLOW), key=order)
+        self._denied = [right for right in stated if right.qualifier is DENY]
+        self._rules = Rules(stated)
+        self._observed = sorted(observed, key=order)
+        seen = unfolded(observed)
+        self._in_use = frozenset(part for part in seen if self._is_usable(part))
+        self._refused = folded(seen - self._in_use)
+        self._use = Rules(self._in_use)
+        self._common = {
+            right
+            for right in _for_nodes(enclave, common)
+            if right in stated or (not is_expression(right.name) and self._is_allowed(right))
+        }
+
+    def _is_allowed(self, part: Right) -> bool:
+        return self._rules.cover(part) and not self._rules.cover(part._replace(qualifier=DENY))
+
+    def _is_usable(self, part: Right) -> bool:
+        """Whether it, or for a wildcard some of what it means, is allowed."""
+        if self._is_allowed(part):
+            return True
+        return is_expression(part.name) and bool(self._rules.meeting(part))
+
+    def _is_observed(self, rule: Right) -> bool:
+        return bool(self._use.meeting(rule))
+
+    def result(self) -> tuple[Enclave, EnclaveUse]:
+        if not self._observed:
+            return self._enclave, self._told({*self._stated}, ())
+        kept = {right for right in self._stated if self._stays(right)}
+        wide = self._narrowed(kept)
+        self._prove([*kept, *(right for each in wide for right in each.replacement)])
+        replacements = {each.rule: each.replacement for each in wide}
+        return narrowed_enclave(self._enclave, kept, replacements), self._told(kept, wide)
+
+    def _told(self, kept: set[Right], wide: Sequence[Wide]) -> EnclaveUse:
+        seen = bool(self._observed)
+        unused = [right for right in self._stated if not self._is_observed(right)]
+        rewritten = {each.rule for each in wide}
+        remaining = [*kept, *(right for each in wide for right in each.replacement)]
+        in_use = self._pairs(self._in_use)
+        return EnclaveUse(
+            enclave=self._enclave.path,
+            seen=seen,
+            unused=tuple(r for r in unused if not seen or (r not in kept and r not in rewritten)),
+            common=tuple(r for r in unused if seen and r in kept),
+            wide=tuple(wide),
+            refused=tuple(sorted(self._refused, key=order)),
+            allowed_pairs=len(self._pairs(self._stated) | in_use),
+            observed_pairs=len(in_use),
+            remaining_pairs=len(self._pairs(remaining) | in_use),
+        )
+
+    # ── what stays, and what takes the place of wildcards ──────────────────────────────────
+
+    def _stays(self, rule: Right) -> bool:
+        """Whether a rule stays as it is: a name in use, or a wildcard that was used as such."""
+        if rule in self._common:
+            return True
+        if not is_expression(rule.name):
+            return self._is_observed(rule)
+        return any(
+            is_expression(seen.name)
+            and (seen.name == part.name or not covers(part.name, seen.name))
+            for part in parts(rule)
+            for seen in self._use.meeting(part)
+        )
+
+    def _narrowed(self, kept: set[Right]) -> tuple[Wide, ...]:
+        """The wildcards that were used, or mean common rights, with what no other rule allows."""
+        wide = [rule for rule in self._stated if is_expression(rule.name) and rule not in kept]
+        owners: dict[Right, list[Right]] = defaultdict(list)
+        for rule in wide:
+            for part in parts(rule):
+                owners[part].append(rule)
+        rules = Rules(wide)
+
+        def homes(right: Right) -> list[Right]:
+            met = [rule for part in rules.meeting(right) for rule in owners[part]]
+            return sorted(dict.fromkeys(met), key=lambda rule: rule.right != right.right)
+
+        used: dict[Right, list[Right]] = defaultdict(list)
+        for right in folded(self._in_use):
+            for rule in homes(right):
+                used[rule].append(right)
+        others = Rules(kept)
+        needed = unfolded((*self._in_use, *self._common))
+        replacement: dict[Right, list[Right]] = defaultdict(list)
+        for right in folded(p for p in needed if self._is_allowed(p) and not others.cover(p)):
+            replacement[homes(right)[0]].append(right)
+        return tuple(
+            Wide(
+                rule,
+                tuple(sorted(used[rule], key=order)),
+                tuple(sorted(replacement[rule], key=order)),
+            )
+            for rule in wide
+            if rule in used or rule in replacement
+        )
+
+    def _prove(self, remaining: Sequence[Right]) -> None:
+        """Nothing more than before, and nothing observed lost."""
+        after = Rules(remaining)
+        more = [right for right in remaining if not self._rules.cover(right)]
+        lost = [p for p in self._in_use if self._is_allowed(p) and not after.cover(p)]
+        if more or lost:
+            raise PolicyError(
+                f"the enclave {self._enclave.path} cannot be narrowed",
+                f"{(more or lost)[0]} would be {'added' if more else 'lost'}.",
+                "This is a defect of sros: please report it with the policy.",
+            )
+
+    # ── counting ───────────────────────────────────────────────────────────────────────────
+
+    def _pairs(self, rights: Iterable[Right]) -> set[Pair]:
+        """The pairs of a right and a known name that ``rights`` allow and nothing denies."""
+        rights = folded(rights)
+        found: set[Pair] = set()
+        wild: set[str] = set()
+        for right in rights:
+            if is_expression(right.name):
+                wild.add(right.right)
+                matched = self._names.matched(right.kind, right.name)
+                found.update((right.right, name) for name in matched)
+            else:
+                found.add((right.right, right.name))
+        path = self._enclave.path
+        for action, needs in (("call", "request"), ("execute", "reply")):
+            if needs in wild:  # wildcards of services and topics can mean actions
+                rules = Rules(rights)
+                found.update(
+                    (action, name)
+                    for name in self._names.of(KIND_OF[action])
+                    if rules.cover(Right(path, ALLOW, action, name))
+                )
+        if not self._denied:
+            return found
+        return {pair for pair in found if not self._rules.meeting(Right(path, DENY, *pair))}
+
+
+def _for_nodes(enclave: Enclave, common: Sequence[Group]) -> Iterator[Right]:
+    """What every node needs, for each node that the enclave has a profile for."""
+    for profile in enclave.all_profiles():
+        for group in common:
+            for name in group.names:
+                fqn = expand(name, profile.ns, profile.node)
+                for right, _ in group.rights:
+                    yield Right(enclave.path, ALLOW, right, fqn)
