@@ -1,0 +1,283 @@
+"""The verb that learns a policy from the running robot, or from what its logs say was denied."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from sros_tool.cli.common import (
+    PATH,
+    dry_run_option,
+    json_option,
+    print_json,
+    print_notes,
+)
+from sros_tool.cli.observing import FOREVER, observe, observer_environment, why_empty
+from sros_tool.errors import UsageError
+
+if TYPE_CHECKING:
+    from sros_tool.graph.learn import Learned
+    from sros_tool.graph.observation import Observation
+    from sros_tool.graph.write import Draft
+    from sros_tool.policy.model import Policy
+
+NO_NODES = "No nodes detected in the ROS graph. No policy file was generated."
+"""What ros2/sros2 says; scripts look for it."""
+
+_DURATION = re.compile(r"\d+[smhdwy]\Z", re.ASCII)
+
+
+class _Words(click.Command):
+    """Lets ``--watch`` go without its duration, and ``--from-log`` take several files."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        words: list[str] = []
+        in_logs = False
+        for index, word in enumerate(args):
+            follows = args[index + 1] if index + 1 < len(args) else ""
+            if in_logs and (word == "-" or not word.startswith("-")):
+                words += ["--from-log", word]
+                continue
+            in_logs = word == "--from-log"
+            if in_logs and follows and (follows == "-" or not follows.startswith("-")):
+                continue  # it is repeated before each file
+            words.append(word)
+            if word == "--watch" and not _DURATION.match(follows):
+                words.append(FOREVER)
+        return super().parse_args(ctx, words)
+
+
+@click.command(
+    "generate_policy",
+    cls=_Words,
+    epilog="""\b
+Example:
+  $ sros generate_policy robot.xml
+  wrote 'robot.xml': 2 enclaves, 2 nodes, 24 rights
+  copied common/node/logging.xml, common/node/types.xml, common/rclpy_node.xml beside it
+  $ sros generate_policy robot.xml --watch 10m     while the robot does all that it is to do
+  new: /teleop in enclave /teleop
+  new: /teleop publish /cmd_vel
+  ...
+  $ sros generate_policy robot.xml --from-log talker.log
+  added 1 right to 'robot.xml'
+    /talker ALLOW publish topic /chatter
+
+On a secured robot, observe in an enclave of its own: policies/observer.xml (see `sros policies`)
+says the little that it needs; make it with `sros generate_artifacts -k ROOT -p observer.xml`, and
+observe with --keystore ROOT --enclave /sros_observer.""",
+)
+@click.argument("file", type=PATH, required=False)
+@click.option(
+    "--watch",
+    metavar="[DURATION]",
+    help="Keep everything seen within DURATION, as 10m, or until Ctrl-C.",
+)
+@click.option("--spin-time", type=click.FloatRange(0.1, 86400), metavar="S", help="Look S seconds.")
+@click.option("--flat", is_flag=True, help="One file, without includes of common parts.")
+@click.option("--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or 0]")
+@click.option(
+    "--enclave", metavar="NAME", help="Observe in this enclave; for --from-log, the node's."
+)
+@click.option(
+    "--keystore", type=PATH, metavar="ROOT", help="Its keystore. [default: $ROS_SECURITY_KEYSTORE]"
+)
+@click.option(
+    "--from-log",
+    "logs",
+    multiple=True,
+    type=PATH,
+    metavar="LOG...",
+    help="Propose what was denied in these logs of Fast DDS or Cyclone DDS (- is stdin) instead.",
+)
+@click.option("--node", metavar="/NS/NAME", help="The node whose profile --from-log adds to.")
+@click.option("-s", "--use-sim-time", is_flag=True, help="Accepted; observing needs no clock.")
+@click.option("--no-daemon", is_flag=True, help="Accepted; sros never uses the ROS daemon.")
+@dry_run_option
+@json_option
+def generate_policy(
+    file: Path | None,
+    watch: str | None,
+    spin_time: float | None,
+    flat: bool,
+    domain: str | None,
+    enclave: str | None,
+    keystore: Path | None,
+    logs: tuple[Path, ...],
+    node: str | None,
+    use_sim_time: bool,
+    no_daemon: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> int:
+    """Write to FILE the least policy under which the robot does what it is seen to do.
+
+    Looks at the running nodes until their graph has come to rest. An existing FILE keeps all that
+    it says; what is new is added to it. Read the result before you enforce it.
+    """
+    present = _present_policy(file)
+    if logs:
+        return _from_logs(file, logs, enclave, node, present, dry_run, as_json)
+    if file is None:
+        raise UsageError("no file is named", "", "Name the policy FILE to write.")
+    if node is not None:
+        raise UsageError("--node is for --from-log only")
+    from sros_tool.graph.common import common_parts
+    from sros_tool.graph.learn import learn
+    from sros_tool.graph.write import draft, write
+    from sros_tool.resources import policies_dir
+
+    common = common_parts(file.parent, policies_dir())
+    environment = observer_environment(enclave, keystore, domain)
+    snapshot, rmw = observe(environment, watch, spin_time, common, secured=enclave is not None)
+    learned = learn(snapshot.observation, None if flat else common)
+    if not learned.profiles:
+        click.echo(NO_NODES, err=True)
+        print_notes(learned.notes)
+        click.echo(why_empty(environment, snapshot.seconds, rmw, enclave), err=True)
+        return 1
+    plan = draft(file, learned, None if flat else common)
+    if not dry_run:
+        write(plan)
+    _show(plan, learned, snapshot.observation, dry_run, as_json)
+    if not snapshot.settled:
+        click.echo(
+            f"the graph kept changing for {snapshot.seconds:.0f} s; --watch keeps what comes and "
+            "goes.",
+            err=True,
+        )
+    return 0
+
+
+def _present_policy(file: Path | None) -> Policy | None:
+    """The policy to be added to, read first: not after ten minutes is it to be found broken."""
+    from sros_tool.policy import read_policy
+
+    if file is None:
+        return None
+    if os.path.lexists(file):
+        return read_policy(file)
+    if not file.parent.is_dir():
+        raise UsageError(f"the folder '{file.parent}' does not exist", "", "Make it first.")
+    return None
+
+
+# ── logs ───────────────────────────────────────────────────────────────────────────────────
+
+
+def _from_logs(
+    file: Path | None,
+    logs: Sequence[Path],
+    enclave: str | None,
+    node: str | None,
+    present: Policy | None,
+    dry_run: bool,
+    as_json: bool,
+) -> int:
+    from sros_tool.graph.denials import propose, read_denials
+    from sros_tool.graph.document import render
+    from sros_tool.graph.observation import Observation
+    from sros_tool.graph.proposal import as_learned
+    from sros_tool.graph.write import draft, write
+    from sros_tool.runtime.security_log import plain_text
+
+    denials = [each for log in logs for each in read_denials(plain_text(_log_text(log)))]
+    learned = as_learned(propose(denials), enclave or "", _place(node), present)
+    if not learned.profiles:
+        print_notes(learned.notes)
+        click.echo(
+            "Nothing is to be proposed." if denials else "The logs tell of no denial.", err=True
+        )
+        return 1
+    if file is None:
+        print_notes(learned.notes)
+        click.echo(render(learned.profiles).decode(), nl=False)
+        return 0
+    plan = draft(file, learned, None)
+    if not dry_run:
+        write(plan)
+    _show(plan, learned, Observation(), dry_run, as_json)
+    return 0
+
+
+def _log_text(log: Path) -> str:
+    if str(log) == "-":
+        return sys.stdin.buffer.read().decode("utf-8", "replace")
+    if not log.exists():
+        raise UsageError(
+            f"the log '{log}' does not exist", "", "The policy FILE stands before --from-log."
+        )
+    return log.read_bytes().decode("utf-8", "replace")
+
+
+def _place(node: str | None) -> tuple[str, str] | None:
+    from sros_tool.names import check_namespace, expression_problem
+
+    if node is None:
+        return None
+    ns, _, name = node.rpartition("/")
+    if problem := expression_problem(name):
+        raise UsageError(f"--node {node!r} is not a node", problem, "Write it as /namespace/name.")
+    return check_namespace(ns), name
+
+
+# ── showing ────────────────────────────────────────────────────────────────────────────────
+
+
+def _show(
+    plan: Draft, learned: Learned, observation: Observation, dry_run: bool, as_json: bool
+) -> None:
+    from sros_tool.graph.observation import to_json
+    from sros_tool.policy.merge import merge_notes
+
+    notes = (*merge_notes(plan.contradictions), *learned.notes)
+    if as_json:
+        print_json(
+            {
+                "file": str(plan.path),
+                "created": plan.before is None,
+                "changed": plan.changes,
+                "dry_run": dry_run,
+                **to_json(observation),
+                "added": [_right_json(each) for each in plan.added],
+                "copied": sorted(plan.copies),
+                "notes": [{"id": each.id, "text": each.text} for each in notes],
+            }
+        )
+        return
+    would = "would have " if dry_run else ""
+    if plan.before is None:
+        enclaves = {each.enclave for each in learned.profiles}
+        click.echo(
+            f"{would}{'written' if dry_run else 'wrote'} '{plan.path}': "
+            f"{_count(len(enclaves), 'enclave')}, {_count(len(learned.profiles), 'node')}, "
+            f"{_count(len(plan.added), 'right')}"
+        )
+    elif plan.added:
+        click.echo(f"{would}added {_count(len(plan.added), 'right')} to '{plan.path}'")
+        for each in plan.added:
+            click.echo(f"  {each}")
+    else:
+        click.echo(f"nothing to add: '{plan.path}' says all that was seen")
+    if plan.copies:
+        click.echo(f"{would}copied {', '.join(sorted(plan.copies))} beside it")
+    print_notes(notes)
+
+
+def _right_json(right: Any) -> dict[str, str]:
+    return {
+        "enclave": right.enclave,
+        "kind": right.kind,
+        "right": right.right,
+        "name": right.name,
+    }
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"

@@ -1,0 +1,158 @@
+"""Reads what was denied from the logs of secured nodes, and proposes the rules that were missing.
+
+The texts are those of Fast DDS 2.1 to 2.14 (Permissions.cpp, SecurityManager.cpp) and of Cyclone
+DDS 0.10 (access_control.c, q_omg_security.c); each was seen in a real log.  Fast DDS names the
+topic, and near it whether it was a writer or a reader.  Cyclone DDS first asks whether a topic may
+be used at all; that denial has no direction.  It says nothing where the governance protects the
+discovery of the topic.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+from sros_tool.graph.fold import Right
+from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
+from sros_tool.names import expression_problem, is_expression
+
+_FAST = re.compile(r"(?P<topic>[^\s(]+) topic (?P<how>not found in allow|denied by deny) rule")
+_CYCLONE = re.compile(
+    r"(?P<who>Local topic permission denied|Writer is not permitted|Reader is not permitted): "
+    r"(?P<topic>\S+) (?P<how>denied by default rule|found in deny_rule)"
+)
+_ENCLAVE = re.compile(r"Found security directory: \S*?/enclaves(?P<enclave>/\S*)?(?:\s|\Z)")
+_WRITER = re.compile(
+    r"local writer|check_create_datawriter|datawriter_sec|associated Writer|DATA_WRITER"
+    r"|create(?:_p| p|P)ublisher|register_local_writer"
+)
+_READER = re.compile(
+    r"local reader|check_create_datareader|datareader_sec|associated Reader|DATA_READER"
+    r"|create(?:_s| s|S)ubscri|register_local_reader"
+)
+_REMOTE = re.compile(r"check_remote_data|remote (?:writer|reader)")
+_NEAR_LINES = 3
+"""How many lines after a denial still speak of it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Denial:
+    """One refusal: a raw DDS topic, "publish", "subscribe" or "" where the log does not tell.
+
+    ``by_rule`` says that a rule denies it, so that allowing it would not help; ``remote`` that it
+    is about the permissions of a peer.  ``enclave`` is "" where the log does not name it.
+    """
+
+    topic: str
+    direction: str
+    enclave: str = ""
+    by_rule: bool = False
+    remote: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """The rights by enclave ("" for those that the log does not name) that denials ask for.
+
+    ``unclear`` are denials without a direction, ``by_rule`` those by a deny rule, ``remote`` those
+    of peers, ``foreign`` those of topics without a ROS name: all of them are left to a person.
+    """
+
+    rights: dict[str, frozenset[Right]]
+    unclear: tuple[Denial, ...] = ()
+    by_rule: tuple[Denial, ...] = ()
+    remote: tuple[Denial, ...] = ()
+    foreign: tuple[Denial, ...] = ()
+
+
+def read_denials(text: str) -> tuple[Denial, ...]:
+    """Every refusal in a log without colours, once, in the order of the log."""
+    lines = text.splitlines()
+    found: dict[Denial, None] = {}
+    enclave = ""
+    for number, line in enumerate(lines):
+        if said := _ENCLAVE.search(line):
+            enclave = said["enclave"] or "/"
+        if match := _FAST.search(line):
+            remote, direction = _near(lines, number, match["topic"])
+            by_rule = match["how"].startswith("denied")
+            found[Denial(match["topic"], direction, enclave, by_rule, remote)] = None
+        elif match := _CYCLONE.search(line):
+            direction = {"W": PUBLISH, "R": SUBSCRIBE}.get(match["who"][0], "")
+            by_rule = match["how"].startswith("found")
+            found[Denial(match["topic"], direction, enclave, by_rule)] = None
+    known = {replace(each, direction="") for each in found if each.direction}
+    return tuple(each for each in found if each.direction or each not in known)
+
+
+def _near(lines: list[str], number: int, topic: str) -> tuple[bool, str]:
+    """Whether a denial is about a peer, and its direction, by its line and those that follow."""
+    for line in lines[number : number + 1 + _NEAR_LINES]:
+        other = _FAST.search(line)
+        if other and other["topic"] != topic:
+            break
+        writer, reader = _WRITER.search(line), _READER.search(line)
+        if _REMOTE.search(line):
+            return True, PUBLISH if "riter" in line else SUBSCRIBE
+        if bool(writer) != bool(reader):
+            return False, PUBLISH if writer else SUBSCRIBE
+    return False, ""
+
+
+def propose(denials: Iterable[Denial]) -> Proposal:
+    """The rights that would have let pass what was denied, as far as the log tells.
+
+    A node stops at its first refusal, so one denied half of a service asks for the service, and
+    one denied service of an action for the action.
+    """
+    rights: dict[str, set[Right]] = {}
+    rest: dict[str, list[Denial]] = {"unclear": [], "by_rule": [], "remote": [], "foreign": []}
+    for each in denials:
+        kind = (
+            "remote" if each.remote
+            else "by_rule" if each.by_rule
+            else "foreign" if not _is_ros(each.topic)
+            else "unclear" if not each.direction
+            else ""
+        )  # fmt: skip
+        if kind:
+            rest[kind].append(each)
+        else:
+            rights.setdefault(each.enclave, set()).add(_right(each))
+    return Proposal(
+        {enclave: _without_parts(found) for enclave, found in rights.items()},
+        **{kind: tuple(found) for kind, found in rest.items()},
+    )
+
+
+_SERVICE = re.compile(r"r(?P<side>[qr])(?P<name>/.+?)(?P<end>Request|Reply)\Z")
+_ACTION = re.compile(r"(?P<name>/.+)/_action/(?:send_goal|cancel_goal|get_result)\Z")
+
+
+def _is_ros(topic: str) -> bool:
+    if is_expression(topic) or expression_problem(topic[2:]):
+        return False  # a topic that is named like a wildcard must not become one
+    return topic.startswith("rt/") or _SERVICE.match(topic) is not None
+
+
+def _right(denial: Denial) -> Right:
+    service = _SERVICE.match(denial.topic)
+    if service is None:
+        return Right(denial.direction, denial.topic[2:])
+    client = (service["side"] == "q") == (denial.direction == PUBLISH)
+    if action := _ACTION.match(service["name"]):
+        return Right("call" if client else "execute", action["name"])
+    return Right("request" if client else "reply", service["name"])
+
+
+def _without_parts(rights: set[Right]) -> frozenset[Right]:
+    """The rights without the topics that an action among them stands for."""
+    parts = {
+        Right(way, f"{each.name}/_action/{topic}")
+        for each in rights
+        for way in ({"call": SUBSCRIBE, "execute": PUBLISH}.get(each.right),)
+        if way
+        for topic in ("feedback", "status")
+    }
+    return frozenset(rights - parts)

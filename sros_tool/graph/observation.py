@@ -1,0 +1,131 @@
+"""What was seen of a ROS graph: nodes with their DDS endpoints, and the union of several looks.
+
+Topics stand here by their raw DDS names (``rt/chatter``, ``rq/addRequest``), for only those tell
+everything apart; `sros_tool.graph.fold` says them in ROS terms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+PUBLISH, SUBSCRIBE = "publish", "subscribe"
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Endpoint:
+    """A DDS topic (its raw name), and whether it is written (publish) or read (subscribe)."""
+
+    topic: str
+    direction: str
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class ObservedNode:
+    """A node of one process.
+
+    ``enclaves`` is the enclave of that process; several, sorted, where the graph does not tell
+    which of them it is.  ``participant`` is the first 12 bytes of its endpoints' identifiers, in
+    hex (RTPS 2.3, 8.2.4.1): the same for all nodes of a process, and of no other process.
+    """
+
+    enclaves: tuple[str, ...]
+    ns: str
+    name: str
+    participant: str
+    endpoints: frozenset[Endpoint]
+
+    @property
+    def fqn(self) -> str:
+        """The node's name with its namespace."""
+        return f"{self.ns.rstrip('/')}/{self.name}"
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """The nodes of a graph, sorted, and what belongs to none of them.
+
+    ``silent`` are nodes (enclave, namespace, name) that were announced and had no endpoint.
+    ``strays`` are endpoints of a participant that no node claims: of programs without ROS, or of
+    a node that was only half discovered.
+    """
+
+    nodes: tuple[ObservedNode, ...] = ()
+    silent: frozenset[tuple[str, str, str]] = frozenset()
+    strays: frozenset[tuple[str, Endpoint]] = frozenset()
+
+    @property
+    def endpoint_count(self) -> int:
+        """How many endpoints all nodes have together."""
+        return sum(len(node.endpoints) for node in self.nodes)
+
+    def union(self, other: Observation) -> Observation:
+        """Everything that either of the two has seen.
+
+        What one look left open, another may tell: a process stays in one enclave, so only the
+        enclaves that both looks allow remain for it.
+        """
+        enclaves: dict[str, tuple[str, ...]] = {}
+        endpoints: dict[tuple[str, str, str], frozenset[Endpoint]] = {}
+        for node in (*self.nodes, *other.nodes):
+            before = enclaves.get(node.participant, node.enclaves)
+            both = tuple(each for each in before if each in node.enclaves)
+            enclaves[node.participant] = both or tuple(sorted({*before, *node.enclaves}))
+            key = (node.participant, node.ns, node.name)
+            endpoints[key] = endpoints.get(key, frozenset()) | node.endpoints
+        nodes = sorted(
+            ObservedNode(enclaves[participant], ns, name, participant, found)
+            for (participant, ns, name), found in endpoints.items()
+        )
+        heard = {(enclave, n.ns, n.name) for n in nodes for enclave in n.enclaves}
+        claimed = {(n.participant, endpoint) for n in nodes for endpoint in n.endpoints}
+        return Observation(
+            tuple(nodes),
+            frozenset((self.silent | other.silent) - heard),
+            frozenset((self.strays | other.strays) - claimed),
+        )
+
+
+def make_observation(
+    nodes: Iterable[ObservedNode],
+    silent: Iterable[tuple[str, str, str]] = (),
+    strays: Iterable[tuple[str, Endpoint]] = (),
+) -> Observation:
+    """An observation of these nodes, sorted."""
+    return Observation(tuple(sorted(nodes)), frozenset(silent), frozenset(strays))
+
+
+def to_json(observation: Observation) -> dict[str, Any]:
+    """The nodes as JSON; `from_json` gives them back."""
+    return {
+        "nodes": [
+            {
+                "enclaves": list(node.enclaves),
+                "namespace": node.ns,
+                "name": node.name,
+                "participant": node.participant,
+                PUBLISH: _topics(node, PUBLISH),
+                SUBSCRIBE: _topics(node, SUBSCRIBE),
+            }
+            for node in observation.nodes
+        ]
+    }
+
+
+def from_json(value: Mapping[str, Any]) -> Observation:
+    """The observation that `to_json` has written."""
+    return make_observation(
+        ObservedNode(
+            tuple(node["enclaves"]),
+            node["namespace"],
+            node["name"],
+            node["participant"],
+            frozenset(Endpoint(t, way) for way in (PUBLISH, SUBSCRIBE) for t in node[way]),
+        )
+        for node in value["nodes"]
+    )
+
+
+def _topics(node: ObservedNode, direction: str) -> list[str]:
+    return sorted(each.topic for each in node.endpoints if each.direction == direction)

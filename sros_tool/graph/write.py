@@ -1,0 +1,140 @@
+"""Writes a learned policy: as a new file or into an existing one, whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from sros_tool.errors import DocumentError, PolicyError
+from sros_tool.graph.common import CommonParts
+from sros_tool.graph.document import render, with_includes
+from sros_tool.graph.learn import Learned
+from sros_tool.policy.edit import merge_into
+from sros_tool.policy.merge import Contradiction
+from sros_tool.policy.reader import read_policy
+from sros_tool.policy.rights import Right, order, policy_rights
+from sros_tool.xml import read_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """What would be written, and where: the policy ``path``, and ``copies`` beside it.
+
+    ``before`` is the present content of the policy, or None; ``copies`` are paths relative to the
+    folder of the policy.  The rights of ``document`` lie between ``least`` and ``most``.
+    """
+
+    path: Path
+    before: bytes | None
+    document: bytes
+    copies: Mapping[str, bytes]
+    added: tuple[Right, ...]
+    contradictions: tuple[Contradiction, ...]
+    least: frozenset[Right]
+    most: frozenset[Right]
+
+    @property
+    def changes(self) -> bool:
+        """Whether anything would change."""
+        return self.document != self.before
+
+
+def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
+    """What ``learned`` makes of the policy file at ``path``; nothing is written.
+
+    ``common`` are the parts with which it was learned (None: one file without includes).  Raises
+    `PolicyError` (or another `DocumentError`) where the file is no policy, or nothing can be
+    added to it.
+    """
+    additions = learned.policy()
+    rights = policy_rights(additions)
+    if not os.path.lexists(path):
+        copies = common.to_copy(learned.includes) if common else {}
+        added = tuple(sorted(rights, key=order))
+        return Draft(path, None, render(learned.profiles), copies, added, (), rights, rights)
+    before = read_bytes(path, "policy file")
+    merged = merge_into(path, additions)
+    document, included = merged.document, tuple[str, ...]()
+    if common and document != before:
+        document, included = with_includes(path, before, document, learned.profiles)
+    least = policy_rights(read_policy(path, merged.document))
+    return Draft(
+        path,
+        before,
+        document,
+        common.to_copy(included) if common else {},
+        merged.added,
+        merged.contradictions,
+        least,
+        least | rights,
+    )
+
+
+def write(plan: Draft) -> None:
+    """Put a draft in place; what fails leaves every file as it was.
+
+    Raises `PolicyError` if the result, read again, would not say what it should.
+    """
+    if not plan.changes:
+        return
+    target = Path(os.path.realpath(plan.path))  # a link stays a link
+    mode = None if plan.before is None else target.stat().st_mode & 0o7777
+    copied: list[Path] = []
+    try:
+        for path, data in plan.copies.items():
+            copied += _put_new(plan.path.parent / path, data)
+        _check(plan)
+        _replace(target, plan.document, mode)
+    except BaseException:
+        for made in reversed(copied):
+            with contextlib.suppress(OSError):
+                made.rmdir() if made.is_dir() else made.unlink()
+        raise
+
+
+def _check(plan: Draft) -> None:
+    try:
+        found = policy_rights(read_policy(plan.path, plan.document))
+        if plan.least <= found <= plan.most:
+            return
+        why = f"It would differ in {min(found ^ plan.least, key=order)}."
+    except DocumentError as error:
+        why = f"{error}"
+    raise PolicyError(
+        f"what was learned cannot be written to '{plan.path}'", why, "Try --flat, without includes."
+    )
+
+
+def _put_new(path: Path, data: bytes) -> list[Path]:
+    """Create a file with the folders that it lacks; returns all of them, the folders first."""
+    made = [each for each in reversed(path.parents) if not each.exists()]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _replace(path, data, None)
+    return [*made, path]
+
+
+def _replace(target: Path, data: bytes, mode: int | None) -> None:
+    """Let ``target`` hold ``data``: at once, and on disk before that; a new file if no ``mode``."""
+    stage = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
+    handle = os.open(stage, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666 if mode is None else 0o600)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            if mode is not None:
+                os.fchmod(file.fileno(), mode)
+            file.flush()
+            os.fsync(file.fileno())
+        stage.replace(target)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            stage.unlink()
+        raise
+    folder = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
