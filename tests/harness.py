@@ -38,7 +38,7 @@ class Ended:
 
 
 def sros(
-    *arguments: str | Path, env: Mapping[str, str | None] | None = None, cwd: Path | None = None
+    *arguments: object, env: Mapping[str, str | None] | None = None, cwd: Path | None = None
 ) -> Ended:
     """Run the program in this process; a value None in ``env`` unsets the variable."""
     words = [str(argument) for argument in arguments]
@@ -65,7 +65,7 @@ def sros(
         os.chdir(before[1])
         sys.argv = before[2]
         signal.signal(signal.SIGTERM, before[3])
-    said = [stream.buffer.getvalue().decode(errors="replace") for stream in (out, err)]  # type: ignore[attr-defined]
+    said = [stream.buffer.getvalue().decode(errors="replace") for stream in (out, err)]
     return Ended(status, *said)
 
 
@@ -154,3 +154,8 @@ def publish(*names: str) -> str:
     """A group of topics to publish, as XML."""
     topics = "".join(f"<topic>{name}</topic>" for name in names)
     return f'<topics publish="ALLOW">{topics}</topics>'
+
+
+def with_includes(policy: str) -> str:
+    """A policy's text in which the prefix xi is that of includes."""
+    return policy.replace("<policy", '<policy xmlns:xi="http://www.w3.org/2001/XInclude"', 1)
