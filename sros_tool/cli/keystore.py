@@ -117,16 +117,16 @@ def _choices(
     template = load_template(name)
     if ca_layout:
         template = replace(template, separate_authorities=ca_layout == "separate")
-    if ca_validity:
+    if ca_validity is not None:
         template = replace(template, authority_validity=parse_duration(ca_validity))
-    if validity:
+    if validity is not None:
         duration = parse_duration(validity)
         template = replace(
             template,
             certificate_validity=duration,
             permissions_validity=min(duration, template.permissions_validity),
         )
-    if permissions_validity:
+    if permissions_validity is not None:
         template = replace(template, permissions_validity=parse_duration(permissions_validity))
     return template
 
