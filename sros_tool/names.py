@@ -27,6 +27,7 @@ _WILDCARDS = frozenset("*?[")
 _EXPRESSION = re.compile(
     r"(?:~(?=/|\Z))?(?:[A-Za-z0-9_/*?]|\[!?[A-Za-z0-9_/]+(?:-[A-Za-z0-9_]+)*\])*\Z"
 )
+_RANGE = re.compile(r"(.)-(.)")
 
 
 def check_enclave_name(name: str) -> str:
@@ -92,6 +93,8 @@ def expression_problem(text: str) -> str:
         return "DDS vendors disagree about [^...] and [:class:]; [!...] and plain sets work alike."
     if not _EXPRESSION.match(text):
         return "It contains a character that no ROS name has."
+    if any(first > last for first, last in _RANGE.findall(text)):
+        return "It contains a range of characters that runs backwards."
     if "//" in text:
         return "It contains '//'."
     if text.endswith("/"):
