@@ -1,0 +1,139 @@
+"""A merge adds what was asked, in the direction in which it was asked, and denies no less."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import pytest
+from drawn_policies import PATHS, effective, meant, policies
+from hypothesis import given, settings
+
+from sros_tool.policy import ALLOW, DENY, Group, Policy, read_policy, write_policy
+from sros_tool.policy.edit import merge_all, merge_into
+from sros_tool.policy.merge import merge_notes, plan_merge
+from sros_tool.policy.model import Enclave, Profile, Profiles
+from sros_tool.policy.rights import Right, policy_rights
+
+
+def one(*groups: Group, node: str = "n") -> Policy:
+    return Policy((Enclave("/a", (Profiles((Profile("/", node, groups),)),)),))
+
+
+def group(kind: str, names: str, **rights: str) -> Group:
+    found = tuple((right, DENY if word == "DENY" else ALLOW) for right, word in rights.items())
+    return Group(kind, found, tuple(names.split()))
+
+
+def merged(first: Policy, second: Policy) -> Policy:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "a.xml")
+        path.write_bytes(write_policy(first))
+        result = merge_into(path, second)
+        path.write_bytes(result.document)
+        again = merge_into(path, second)
+        assert not again.added
+        assert again.document == result.document
+        after = read_policy(path)
+        assert policy_rights(after) == policy_rights(first) | set(result.added)
+        assert set(result.added) <= policy_rights(second)
+        return after
+
+
+@settings(max_examples=60)
+@given(policies(), policies())
+def test_merging_is_the_union_whichever_comes_first(first: Policy, second: Policy) -> None:
+    forward, backward = merged(first, second), merged(second, first)
+    for path in PATHS:
+        allowed = meant(first, path, allow=True) | meant(second, path, allow=True)
+        denied = meant(first, path, allow=False) | meant(second, path, allow=False)
+        assert effective(forward, path) == allowed - denied
+        assert effective(backward, path) == allowed - denied
+
+
+@given(policies())
+def test_merging_with_itself_adds_nothing(policy: Policy) -> None:
+    plan = plan_merge(policy, policy)
+    assert plan.entries == {}
+    assert plan.added == ()
+
+
+TOPICS = group("topics", "/x /cam/*", publish="ALLOW")
+
+CASES = {
+    "exact": (one(TOPICS), one(group("topics", "x", publish="ALLOW")), []),
+    "other node": (one(TOPICS), one(group("topics", "/x", publish="ALLOW"), node="m"), []),
+    "wildcard": (one(TOPICS), one(group("topics", "/cam/a", publish="ALLOW")), []),
+    "direction": (
+        one(TOPICS),
+        one(group("topics", "/x", publish="ALLOW", subscribe="ALLOW")),
+        ["subscribe topic /x"],
+    ),
+    "wider": (one(TOPICS), one(group("topics", "/*", publish="ALLOW")), ["publish topic /*"]),
+    "action by its parts": (
+        one(
+            group("services", "/f/*", request="ALLOW"),
+            group("topics", "/f/*", subscribe="ALLOW"),
+        ),
+        one(group("actions", "/f", call="ALLOW", execute="ALLOW")),
+        ["execute action /f"],
+    ),
+    "part of an action": (
+        one(group("actions", "/f", call="ALLOW")),
+        one(group("topics", "/f/_action/status", publish="ALLOW", subscribe="ALLOW")),
+        ["publish topic /f/_action/status"],
+    ),
+}
+
+
+@pytest.mark.parametrize(("before", "asked", "added"), CASES.values(), ids=CASES)
+def test_what_is_there_is_not_added(before: Policy, asked: Policy, added: list[str]) -> None:
+    assert [right.told() for right in plan_merge(before, asked).added] == added
+
+
+DENIED = group("topics", "/cam/*", subscribe="DENY")
+ALLOWED = group("topics", "/cam/a", subscribe="ALLOW")
+ALL = group("topics", "/*", subscribe="ALLOW")
+
+CONTRADICTIONS = {
+    "still denied": (one(DENIED), one(ALLOWED), [], "merge.still-denied"),
+    "denied in part": (one(DENIED), one(ALL), ["ALLOW /*"], "merge.still-denied"),
+    "both mean the exception": (one(DENIED), one(ALL, DENIED), ["ALLOW /*"], ""),
+    "newly denied": (one(ALLOWED), one(DENIED), ["DENY /cam/*"], "merge.newly-denied"),
+    "denied by both": (one(DENIED), one(DENIED), [], ""),
+    "nothing to do with it": (one(DENIED), one(group("topics", "/x", subscribe="DENY")),
+                              ["DENY /x"], ""),
+    "other direction": (one(DENIED), one(group("topics", "/cam/a", publish="ALLOW")),
+                        ["ALLOW /cam/a"], ""),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("before", "asked", "added", "note"), CONTRADICTIONS.values(), ids=CONTRADICTIONS
+)
+def test_a_denial_stays_and_is_told(
+    before: Policy, asked: Policy, added: list[str], note: str
+) -> None:
+    plan = plan_merge(before, asked)
+    assert [f"{right.qualifier} {right.name}" for right in plan.added] == added
+    assert [each.id for each in merge_notes(plan.contradictions)] == ([note] if note else [])
+
+
+def test_a_denial_is_told_once_for_all_that_it_meets() -> None:
+    names = " ".join(f"/cam/{number}" for number in range(9))
+    plan = plan_merge(one(DENIED), one(group("topics", names, subscribe="ALLOW")))
+    (note,) = merge_notes(plan.contradictions)
+    assert "and 6 more" in note.text
+
+
+def test_a_denied_action_is_told_as_one() -> None:
+    action = group("actions", "/f", call="DENY")
+    plan = plan_merge(one(action), one(group("actions", "/f", call="ALLOW")))
+    assert [each.denied for each in plan.contradictions] == [Right("/a", DENY, "call", "/f")]
+
+
+def test_several_policies_one_after_the_other(tmp_path: Path) -> None:
+    path = tmp_path / "a.xml"
+    path.write_bytes(write_policy(one(TOPICS)))
+    more = [one(group("topics", name, publish="ALLOW")) for name in ("/y", "/z", "/y")]
+    assert [right.name for right in merge_all(path, more).added] == ["/y", "/z"]

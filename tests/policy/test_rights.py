@@ -1,0 +1,106 @@
+"""Rights are compared as sets of absolute names; wildcards mean what DDS takes them for."""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+from itertools import product
+
+import pytest
+from drawn_policies import PATHS, effective, grant_of, policies
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sros_tool.policy import ALLOW, DENY, Policy
+from sros_tool.policy.patterns import covers, overlap
+from sros_tool.policy.rights import Right, Rules, folded, parts, policy_rights, unfolded
+from sros_tool.translate import grant_rights
+
+WORDS = [
+    "/" + "".join(letters)
+    for size in range(1, 5)
+    for letters in product("ab/", repeat=size)
+]  # fmt: skip
+expressions = st.lists(
+    st.sampled_from(["a", "b", "/", "*", "?", "[ab]", "[!a]", "[a-b]"]), min_size=1, max_size=5
+).map(lambda pieces: "/" + "".join(pieces))
+
+
+@pytest.mark.parametrize(
+    ("wide", "narrow", "is_covered"),
+    [
+        ("/*", "/a", True),
+        ("/*", "/a/b", True),
+        ("/a", "/a", True),
+        ("/a", "/*", False),
+        ("/*", "/a*", True),
+        ("/a*", "/*", False),
+        ("/?", "/*", False),
+        ("/*", "/?", True),
+        ("/?", "/[ab]", True),
+        ("/[ab]", "/?", False),
+        ("/[a-c]", "/[ab]", True),
+        ("/*a*", "/[ab]", False),
+        ("/????", "/[ab]", False),
+        ("/a*b*", "/a?xb*", True),
+        ("/*", "rq/xRequest", False),
+    ],
+)
+def test_covers(wide: str, narrow: str, is_covered: bool) -> None:
+    assert covers(wide, narrow) is is_covered
+
+
+@given(expressions, expressions)
+def test_covering_and_overlapping_are_true_of_every_name(one: str, other: str) -> None:
+    first = {word for word in WORDS if fnmatchcase(word, one)}
+    second = {word for word in WORDS if fnmatchcase(word, other)}
+    if covers(one, other):
+        assert second <= first
+    if first & second:
+        assert overlap(one, other)
+    assert overlap(one, other) == overlap(other, one)
+
+
+@given(policies())
+def test_permissions_tell_the_same_rights_as_their_policy(policy: Policy) -> None:
+    for path in PATHS:
+        own = {right for right in policy_rights(policy) if right.enclave == path}
+        assert folded(grant_rights(path, grant_of(policy, path))) == folded(own)
+
+
+@given(policies())
+def test_folding_changes_no_right(policy: Policy) -> None:
+    rights = policy_rights(policy)
+    assert unfolded(folded(rights)) == unfolded(rights)
+    assert folded(folded(rights)) == folded(rights)
+
+
+@given(policies())
+def test_rules_answer_as_dds_does(policy: Policy) -> None:
+    rules = Rules(policy_rights(policy))
+    for path in PATHS:
+        for direction, topic in effective(policy, path):
+            if topic.startswith("rt/"):
+                assert rules.allow(path, direction, topic[2:])
+
+
+def test_an_action_is_told_once() -> None:
+    action = Right("/a", ALLOW, "call", "/fib")
+    status = Right("/a", ALLOW, "subscribe", "/fib/_action/status")
+    assert folded([action, status]) == {action}
+    assert folded(parts(action)) == {action}
+    assert folded(parts(action)[1:]) == frozenset(parts(action)[1:])
+
+
+def test_a_denied_action_is_denied_by_its_parts() -> None:
+    rules = Rules(
+        [Right("/a", ALLOW, "call", "/*"), Right("/a", DENY, "request", "/fib/_action/send_goal")]
+    )
+    assert not rules.allow("/a", "call", "/fib")
+    assert rules.allow("/a", "call", "/other")
+    assert not rules.allow("/b", "call", "/other")
+
+
+def test_a_right_reads_as_people_say_it() -> None:
+    assert str(Right("/a", ALLOW, "publish", "/x")) == "/a ALLOW publish topic /x"
+    assert str(Right("/a", DENY, "call", "/x")) == "/a DENY call action /x"
+    assert str(Right("/a", ALLOW, "publish", "raw")) == "/a ALLOW publish DDS topic raw"
