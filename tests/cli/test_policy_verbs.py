@@ -1,0 +1,325 @@
+"""merge_policy, diff_policy and minimize_policy, as somebody at a terminal meets them."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from harness import policy_text, publish, snapshot, sros
+
+from benchmarks.inputs import enclaves_policy, topics_policy
+from sros_tool.atomic import replace_file
+from sros_tool.policy import read_policy
+from sros_tool.policy.rights import policy_rights
+from sros_tool.resources import policies_dir
+
+DENY = '<topics publish="DENY"><topic>cmd_vel</topic></topics>'
+A = '<?xml version="1.0"?>\n<!-- mine -->\n' + policy_text({"/a": publish("x", "/cam/*") + DENY})
+B = policy_text({"/a": publish("x", "y", "/cam/a", "cmd_vel"), "/b": publish("z")})
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "a.xml").write_text(A)
+    (tmp_path / "b.xml").write_text(B)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+# ── merge_policy ───────────────────────────────────────────────────────────────────────────
+
+ADDED = ["/a ALLOW publish topic /y", "/b ALLOW publish topic /z"]
+STILL = (
+    "note [merge.still-denied]: /a DENY publish topic /cmd_vel stays, and counts before what was "
+    "asked for: publish topic /cmd_vel."
+)
+
+
+def test_merge_to_stdout(folder: Path) -> None:
+    before = snapshot(folder)
+    ended = sros("merge_policy", "a.xml", "b.xml").ok()
+    assert "<!-- mine -->" in ended.out
+    assert ended.err.splitlines() == ["added 2 rights", *(f"  {right}" for right in ADDED), STILL]
+    assert snapshot(folder) == before
+    rights = policy_rights(read_policy(Path("result.xml"), ended.out.encode()))
+    assert rights == policy_rights(read_policy(Path("a.xml"))) | {
+        right for right in policy_rights(read_policy(Path("b.xml"))) if str(right) in ADDED
+    }
+
+
+def test_merge_in_place_keeps_mode_and_link(folder: Path) -> None:
+    file = folder / "a.xml"
+    file.chmod(0o640)
+    (folder / "link.xml").symlink_to("a.xml")
+    assert "replaced 'link.xml'" in sros("merge_policy", "link.xml", "b.xml", "--in-place").ok().err
+    assert file.stat().st_mode & 0o777 == 0o640
+    assert (folder / "link.xml").is_symlink()
+    before, inode = file.read_bytes(), file.stat().st_ino
+    ended = sros("merge_policy", "a.xml", "b.xml", "--in-place").ok()
+    assert ended.err.splitlines() == ["no right was missing", STILL]
+    assert (file.read_bytes(), file.stat().st_ino) == (before, inode)
+
+
+def test_merge_into_another_file(folder: Path) -> None:
+    sros("merge_policy", "a.xml", "b.xml", "-o", "c.xml").ok()
+    assert sros("diff_policy", "a.xml", "c.xml").out.splitlines() == [f"+ {r}" for r in ADDED]
+    ended = sros("merge_policy", "a.xml", "b.xml", "-o", "c.xml")
+    assert (ended.status, "already exists" in ended.err) == (2, True)
+    assert (
+        "replaced 'c.xml'" in sros("merge_policy", "a.xml", "b.xml", "-o", "c.xml", "--force").err
+    )
+
+
+def test_merge_of_several(folder: Path) -> None:
+    (folder / "c.xml").write_text(policy_text({"/a": publish("w"), "/b": publish("z")}))
+    ended = sros("merge_policy", "a.xml", "b.xml", "c.xml", "--json").ok()
+    value = json.loads(ended.out)
+    assert [right["name"] for right in value["added"]] == ["/y", "/z", "/w"]
+    assert value["contradictions"][0]["denied"] == {
+        "enclave": "/a",
+        "qualifier": "DENY",
+        "kind": "topics",
+        "right": "publish",
+        "name": "/cmd_vel",
+    }
+    assert value["output"] is None
+    assert policy_rights(read_policy(Path("r.xml"), value["document"].encode()))
+
+
+def test_a_dry_run_writes_nothing(folder: Path) -> None:
+    before = snapshot(folder)
+    ended = sros("merge_policy", "a.xml", "b.xml", "--in-place", "--dry-run").ok()
+    assert ended.out.splitlines() == [*(f"would add {r}" for r in ADDED), "would replace a.xml"]
+    assert snapshot(folder) == before
+
+
+@pytest.mark.parametrize("content", ["", "<policy", "<policy version='0.2.0'/>", "<profile/>"])
+@pytest.mark.parametrize("bad", ["a.xml", "b.xml"])
+def test_a_failing_merge_leaves_everything(folder: Path, bad: str, content: str) -> None:
+    (folder / bad).write_text(content)
+    before = snapshot(folder)
+    ended = sros("merge_policy", "a.xml", "b.xml", "--in-place")
+    assert ended.status == 1
+    assert ended.err.startswith("Unable to merge policies: ")
+    assert snapshot(folder) == before
+
+
+@pytest.fixture
+def failing_step(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    name = request.param
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path if name == "replace" else os, name, fail)
+    yield
+    monkeypatch.undo()
+
+
+@pytest.mark.parametrize("failing_step", ["open", "fsync", "fchmod", "replace"], indirect=True)
+def test_a_write_that_fails_leaves_the_file(folder: Path, failing_step: None) -> None:
+    # One of the steps of writing fails, as it does on a full disk or in a closed folder.
+    before = snapshot(folder)
+    with pytest.raises(OSError, match="No space"):
+        replace_file(folder / "a.xml", b"new")
+    assert snapshot(folder) == before
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_folder_that_cannot_be_written(folder: Path) -> None:
+    before = snapshot(folder)
+    folder.chmod(0o555)
+    try:
+        ended = sros("merge_policy", "a.xml", "b.xml", "--in-place")
+    finally:
+        folder.chmod(0o755)
+    assert (ended.status, "refuses" in ended.err) == (1, True)
+    assert snapshot(folder) == before
+
+
+def test_includes_are_not_led_elsewhere(folder: Path) -> None:
+    shutil.copytree(policies_dir(), folder / "robot")
+    ended = sros("merge_policy", "robot/talker_listener.xml", "b.xml", "-o", "c.xml")
+    assert (ended.status, "Its includes are relative" in ended.err) == (1, True)
+    assert not (folder / "c.xml").exists()
+    sros("merge_policy", "robot/talker_listener.xml", "b.xml", "-o", "robot/c.xml").ok()
+
+
+def test_two_targets_are_one_too_many(folder: Path) -> None:
+    assert sros("merge_policy", "a.xml", "b.xml", "--in-place", "-o", "c.xml").status == 2
+
+
+# ── diff_policy ────────────────────────────────────────────────────────────────────────────
+
+
+def test_diff_tells_in_ros_terms(folder: Path) -> None:
+    ended = sros("diff_policy", "a.xml", "b.xml")
+    assert ended.status == 1
+    assert ended.out.splitlines() == [
+        "- /a ALLOW publish topic /cam/*",
+        "+ /a ALLOW publish topic /cam/a  (A has it by publish topic /cam/*)",
+        "+ /a ALLOW publish topic /cmd_vel",
+        "- /a DENY publish topic /cmd_vel",
+        "+ /a ALLOW publish topic /y",
+        "+ /b ALLOW publish topic /z",
+    ]
+    assert ended.err == "6 rights differ\n"
+
+
+def test_diff_of_the_same(folder: Path) -> None:
+    ended = sros("diff_policy", "a.xml", "a.xml")
+    assert (ended.status, ended.out) == (0, "")
+    assert json.loads(sros("diff_policy", "a.xml", "a.xml", "--json").out)["equal"] is True
+
+
+def test_diff_with_a_keystore_and_its_parts(keystore: Path) -> None:
+    same = keystore.parent / "same.xml"
+    same.write_text(policy_text({"/a": publish("old_a"), "/b": publish("old_b")}))
+    enclave = keystore / "enclaves" / "a"
+    for other in (keystore, enclave, enclave / "permissions.p7s", enclave / "permissions.xml"):
+        assert sros("diff_policy", same, other).status == 0
+        assert sros("diff_policy", other, same).status == 0
+    same.write_text(policy_text({"/a": publish("new_a"), "/b": publish("new_b")}))
+    assert len(sros("diff_policy", same, keystore).out.splitlines()) == 4
+    for other in (enclave, enclave / "permissions.p7s"):
+        ended = sros("diff_policy", same, other)
+        assert ended.out.splitlines() == [
+            "+ /a ALLOW publish topic /old_a" if line == 1 else "- /a ALLOW publish topic /new_a"
+            for line in (0, 1)
+        ]
+        assert "of /a" in ended.err
+
+
+def test_diff_of_two_enclaves_compares_both(keystore: Path) -> None:
+    a, b = (keystore / "enclaves" / name / "permissions.p7s" for name in "ab")
+    assert len(sros("diff_policy", a, b).out.splitlines()) == 2
+
+
+def test_equal_but_refused_by_dds_is_not_equal(keystore: Path) -> None:
+    file = keystore / "enclaves" / "a" / "permissions.p7s"
+    file.write_bytes(file.read_bytes().replace(b"old_a", b"new_a"))
+    ended = sros("diff_policy", file, file)
+    assert (ended.status, "DOES NOT VERIFY" in ended.err) == (1, True)
+
+
+def test_diff_json(keystore: Path) -> None:
+    policy = keystore.parent / "p.xml"
+    policy.write_text(policy_text({"/a": publish("*")}))
+    ended = sros("diff_policy", policy, keystore / "enclaves" / "a" / "permissions.xml", "--json")
+    value = json.loads(ended.out)
+    assert (ended.status, value["equal"], value["a"]["kind"]) == (1, False, "policy")
+    assert value["b"]["enclaves"] == ["/a"]
+    assert [note["id"] for note in value["b"]["notes"]] == ["rights.unsigned"]
+    assert value["differences"][1] == {
+        "only": "b",
+        "enclave": "/a",
+        "qualifier": "ALLOW",
+        "kind": "topics",
+        "right": "publish",
+        "name": "/old_a",
+        "covered_by": [
+            {
+                "enclave": "/a",
+                "qualifier": "ALLOW",
+                "kind": "topics",
+                "right": "publish",
+                "name": "/*",
+            }
+        ],
+    }
+
+
+@pytest.mark.parametrize("arguments", [(), ("a.xml",), ("a.xml", "b.xml", "b.xml")])
+def test_wrong_usage(folder: Path, arguments: tuple[str, ...]) -> None:
+    assert sros("diff_policy", *arguments).status == 2
+
+
+def test_diff_with_what_is_no_policy(folder: Path) -> None:
+    (folder / "c.xml").write_text("<nothing/>")
+    ended = sros("diff_policy", "a.xml", "c.xml")
+    assert (ended.status, ended.err.startswith("Unable to compare: ")) == (1, True)
+
+
+# ── minimize_policy ────────────────────────────────────────────────────────────────────────
+
+
+def test_minimize_tells_and_writes(folder: Path) -> None:
+    ended = sros("minimize_policy", "a.xml", "--observed", "b.xml", "-o", "n.xml").ok()
+    assert ended.out.splitlines()[:5] == [
+        "/a: allowed 2, observed 2: 1.0x",
+        "  wider than its use",
+        "    publish topic /cam/*  becomes  publish topic /cam/a",
+        "  observed, and not allowed",
+        "    publish topic /cmd_vel",
+    ]
+    assert "minimize.enclave-not-in-policy" in ended.err
+    assert sros("diff_policy", "a.xml", "n.xml").out.splitlines() == [
+        "- /a ALLOW publish topic /cam/*",
+        "+ /a ALLOW publish topic /cam/a  (A has it by publish topic /cam/*)",
+    ]
+
+
+def test_minimize_with_permissions_and_several_observations(keystore: Path) -> None:
+    policy = keystore.parent / "p.xml"
+    policy.write_text(policy_text({"/a": publish("*"), "/b": publish("old_b", "more"), "/c": DENY}))
+    observed = [keystore / "enclaves" / name / "permissions.p7s" for name in "ab"]
+    ended = sros("minimize_policy", policy, "--observed", *observed, "--json").ok()
+    value = json.loads(ended.out)
+    by_name = {each["enclave"]: each for each in value["enclaves"]}
+    assert by_name["/a"]["ratio"] == 4.0  # old_a, old_b, more and cmd_vel are known
+    assert [right["name"] for right in by_name["/b"]["never_observed"]] == ["/more"]
+    assert by_name["/c"]["observed_at_all"] is False
+    assert by_name["/a"]["bytes"]["limit"] == 65536
+
+
+def test_what_every_node_needs_stays_unless_strict(folder: Path) -> None:
+    shutil.copytree(policies_dir(), folder / "robot")
+    (folder / "seen.xml").write_text(policy_text({"/talker_listener/talker": publish("chatter")}))
+    policy = "robot/talker_listener.xml"
+    for more, kept in (((), True), (("--strict",), False)):
+        sros("minimize_policy", policy, "--observed", "seen.xml", "-o", "n.xml", "--force", *more)
+        narrowed = read_policy(folder / "n.xml").enclave("/talker_listener/talker")
+        assert narrowed is not None
+        names = {n for p in narrowed.all_profiles() for g in p.groups for n in g.names}
+        assert ("/rosout" in names) is kept
+        assert "chatter" in names
+
+
+def test_a_document_that_is_too_large_gets_proposals(folder: Path) -> None:
+    (folder / "big.xml").write_text(topics_policy(2000))
+    ended = sros("minimize_policy", "big.xml", "--observed", "big.xml").ok()
+    assert "TOO LARGE" in ended.out
+    assert "publish topic /fleet/topic_*  in place of 2000 names" in ended.out
+    assert "add no name known here" in ended.out
+
+
+def test_minimize_dry_run(folder: Path) -> None:
+    before = snapshot(folder)
+    ended = sros("minimize_policy", "a.xml", "--observed", "b.xml", "-o", "n.xml", "--dry-run")
+    assert ended.ok().out.splitlines()[-1] == "would write n.xml"
+    assert snapshot(folder) == before
+
+
+def test_minimize_without_observation_is_wrong_usage(folder: Path) -> None:
+    assert sros("minimize_policy", "a.xml").status == 2
+
+
+# ── speed ──────────────────────────────────────────────────────────────────────────────────
+
+
+def test_large_policies_take_about_a_second(folder: Path) -> None:
+    for name, before, after in (
+        ("enclaves", enclaves_policy(1000, 20), enclaves_policy(1000, 24)),
+        ("topics", topics_policy(20000), topics_policy(20400)),
+    ):
+        (folder / f"{name}.xml").write_text(before)
+        (folder / "after.xml").write_text(after)
+        for verb in ("diff_policy", "merge_policy"):
+            start = time.process_time()
+            sros(verb, f"{name}.xml", "after.xml")
+            assert time.process_time() - start < 5, verb  # far more would be quadratic
