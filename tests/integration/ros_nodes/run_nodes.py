@@ -1,10 +1,10 @@
 """Runs plain rclpy nodes in one process: ``run_nodes.py JSON --ros-args ...``.
 
 JSON is a list of nodes, each with ``name``, ``ns`` and the names that it uses by right (publish,
-subscribe, reply, request, execute, call); ``managed`` makes it a lifecycle node, ``bare`` one
-without parameter services.  What the messages are does not matter here, so every topic carries
-the same type, and so does every service and every action.  Prints ``ready`` and runs until it is
-ended.
+subscribe, reply, request, execute, call), and the nodes whose parameters it reads (ask);
+``managed`` makes it a lifecycle node, ``bare`` one without parameter services.  What the messages
+are does not matter here, so every topic carries the same type, and so does every service and every
+action.  Prints ``ready`` and runs until it is ended.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from rclpy.action import ActionClient, ActionServer
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
+from rclpy.parameter_client import AsyncParameterClient
 from std_msgs.msg import String
 from test_msgs.action import Fibonacci
 from test_msgs.srv import BasicTypes
@@ -36,6 +37,7 @@ def make_node(spec: dict[str, Any]) -> Any:
         node.create_service(BasicTypes, name, lambda request, response: response)
     for name in spec.get("request", ()):
         node.create_client(BasicTypes, name)
+    node.asked = [AsyncParameterClient(node, name) for name in spec.get("ask", ())]
     node.actions = [ActionClient(node, Fibonacci, name) for name in spec.get("call", ())] + [
         ActionServer(node, Fibonacci, name, lambda goal: Fibonacci.Result())
         for name in spec.get("execute", ())

@@ -1,0 +1,639 @@
+"""A policy learned from real nodes is the expected one, covers just what was seen, and holds.
+
+The nodes are those of rclpy in processes of their own (unsecured, for its wheels have no DDS
+Security); what is learned from them is then enforced by Cyclone DDS.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.keystore import generate_artifacts
+from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.template import load_template
+from sros_tool.names import ROS_DISCOVERY_TOPIC
+from sros_tool.policy import Enclave, Group, Policy, read_policy
+from sros_tool.policy.rights import policy_rights
+from sros_tool.resources import policies_dir
+from sros_tool.translate import permissions_for
+from sros_tool.validity import Window
+
+pytestmark = [
+    pytest.mark.dds,
+    pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="rclpy is not installed"),
+]
+
+SCRIPTS = Path(__file__).with_name("ros_nodes")
+DOMAIN = 211
+NO_NODES = "No nodes detected in the ROS graph. No policy file was generated."
+
+Endpoint = tuple[str, str]
+
+
+def node(name: str, ns: str = "/", **rights: list[str] | bool) -> dict[str, Any]:
+    return {"name": name, "ns": ns, **rights}
+
+
+def process(enclave: str, *nodes: dict[str, Any], **more: Any) -> dict[str, Any]:
+    return {"enclave": enclave, "nodes": list(nodes), **more}
+
+
+SIMULATED = ["-p", "use_sim_time:=true"]
+ROBOT = [
+    process("/talker", node("talker", publish=["chatter", "/tf"], ask=["/hall/listener"])),
+    process("/listener", node("listener", "/hall", subscribe=["/chatter", "~/status"])),
+    process("/adder", node("server", "/hall", reply=["add", "~/reset"])),
+    process("/caller", node("client", request=["/hall/add"], subscribe=["fib/_action/status"])),
+    process("/fibonacci", node("fibonacci", execute=["fib"])),
+    process("/planner", node("planner", "/hall", call=["/fib"], execute=["plan"])),
+    process(
+        "/composed",
+        node("left", "/hall", publish=["out"]),
+        node("right", "/cellar", managed=True, subscribe=["in"]),
+        arguments=SIMULATED,
+    ),
+    # Of the same name: in two enclaves, and in two processes of one enclave.
+    process("/first", node("twin", publish=["one"])),
+    process("/second", node("twin", publish=["two"])),
+    process("/crew", node("worker", publish=["a"], subscribe=["job"])),
+    process("/crew", node("worker", publish=["b"], subscribe=["job"])),
+    process("/tools", node("_ros2cli_daemon_0_abc", bare=True)),
+]
+
+EXPECTED = """\
+<?xml version="1.0" encoding="UTF-8"?>
+<!-- What the robot was seen to do, or what it was denied, by sros generate_policy. Read it before
+     you enforce it: what was not seen is not allowed, and what was seen need not be meant. -->
+<policy version="0.2.0" xmlns:xi="http://www.w3.org/2001/XInclude">
+  <enclaves>
+    <enclave path="/adder">
+      <profiles>
+        <profile ns="/hall" node="server">
+          <xi:include href="common/rclpy_node.xml" xpointer="xpointer(/profile/*)"/>
+          <services reply="ALLOW">
+            <service>add</service>
+            <service>~/reset</service>
+          </services>
+        </profile>
+      </profiles>
+    </enclave>
+    <enclave path="/caller">
+      <profiles>
+        <profile ns="/" node="client">
+          <xi:include href="common/rclpy_node.xml" xpointer="xpointer(/profile/*)"/>
+          <topics subscribe="ALLOW">
+            <topic>fib/_action/status</topic>
+          </topics>
+          <services request="ALLOW">
+            <service>/hall/add</service>
+          </services>
+        </profile>
+      </profiles>
+    </enclave>
+    <enclave path="/composed">
+      <profiles>
+        <profile ns="/cellar" node="right">
+          <xi:include href="common/rclpy_node.xml" xpointer="xpointer(/profile/*)"/>
+          <xi:include href="common/node/time.xml" xpointer="xpointer(/profile/*)"/>
+          <topics publish="ALLOW">
+            <topic>~/transition_event</topic>
+          </topics>
+          <topics subscribe="ALLOW">
+            <topic>in</topic>
+          </topics>
+          <services reply="ALLOW">
+            <service>~/change_state</service>
+            <service>~/get_available_states</service>
+            <service>~/get_available_transitions</service>
+            <service>~/get_state</service>
+            <service>~/get_transition_graph</service>
+          </services>
+        </profile>
+        <profile ns="/hall" node="left">
+          <xi:include href="common/rclpy_node.xml" xpointer="xpointer(/profile/*)"/>
+          <xi:include href="common/node/time.xml" xpointer="xpointer(/profile/*)"/>
+          <topics publish="ALLOW">
+            <topic>out</topic>
+          </topics>
+        </profile>
+      </profiles>
+    </enclave>
+    <enclave path="/crew">
+      <profiles>
+        <profile ns="/" node="worker">
+          <xi:include href="common/rclpy_node.xml" xpointer="xpointer(/profile/*)"/>
+          <topics publish="ALLOW">
+            <topic>a</topic>
+            <topic>b</topic>
+          </topics>
+          <topics subscribe="ALLOW">
+            <topic>job</topic>
+          </topics>
+        </profile>
+      </profiles>
+    </enclave>
+    <enclave path="/fibonacci">
+      <profiles>
+        <profile ns="/" node="fibonacci">
+          <xi:include href="common/rclpy_node.xml" xpointer="xpointer(/profile/*)"/>
+          <actions execute="ALLOW">
+            <action>fib</action>
+          </actions>
+        </profile>
+      </profiles>
+    </enclave>
+    <enclave path="/first">
+      <profiles>
+        <profile ns="/" node="twin">
+          <xi:include href="common/rclpy_node.xml" xpointer="xpointer(/profile/*)"/>
+          <topics publish="ALLOW">
+            <topic>one</topic>
+          </topics>
+        </profile>
+      </profiles>
+    </enclave>
+    <enclave path="/listener">
+      <profiles>
+        <profile ns="/hall" node="listener">
+          <xi:include href="common/rclpy_node.xml" xpointer="xpointer(/profile/*)"/>
+          <topics subscribe="ALLOW">
+            <topic>/chatter</topic>
+            <topic>~/status</topic>
+          </topics>
+        </profile>
+      </profiles>
+    </enclave>
+    <enclave path="/planner">
+      <profiles>
+        <profile ns="/hall" node="planner">
+          <xi:include href="common/rclpy_node.xml" xpointer="xpointer(/profile/*)"/>
+          <actions call="ALLOW">
+            <action>/fib</action>
+          </actions>
+          <actions execute="ALLOW">
+            <action>plan</action>
+          </actions>
+        </profile>
+      </profiles>
+    </enclave>
+    <enclave path="/second">
+      <profiles>
+        <profile ns="/" node="twin">
+          <xi:include href="common/rclpy_node.xml" xpointer="xpointer(/profile/*)"/>
+          <topics publish="ALLOW">
+            <topic>two</topic>
+          </topics>
+        </profile>
+      </profiles>
+    </enclave>
+    <enclave path="/talker">
+      <profiles>
+        <profile ns="/" node="talker">
+          <xi:include href="common/rclpy_node.xml" xpointer="xpointer(/profile/*)"/>
+          <topics publish="ALLOW">
+            <topic>/tf</topic>
+            <topic>chatter</topic>
+          </topics>
+          <services request="ALLOW">
+            <service>/hall/listener/describe_parameters</service>
+            <service>/hall/listener/get_parameter_types</service>
+            <service>/hall/listener/get_parameters</service>
+            <service>/hall/listener/list_parameters</service>
+            <service>/hall/listener/set_parameters</service>
+            <service>/hall/listener/set_parameters_atomically</service>
+          </services>
+        </profile>
+      </profiles>
+    </enclave>
+  </enclaves>
+</policy>
+"""
+
+OLDER = """\
+<?xml version="1.0"?>
+<!-- Written by hand. -->
+<policy version="0.2.0">
+  <enclaves>
+    <enclave path="/talker">
+      <profiles type="mine">
+        <profile ns="/" node="talker">
+          <topics publish="ALLOW" subscribe="ALLOW"><topic>/both</topic></topics>
+          <topics publish="DENY"><topic>/tf</topic></topics> <!-- never -->
+        </profile>
+        <metadata><owner>me</owner></metadata>
+      </profiles>
+    </enclave>
+  </enclaves>
+</policy>
+"""
+
+ELSEWHERE = """\
+<policy version="0.2.0" xmlns:xi="http://www.w3.org/2001/XInclude">
+  <enclaves><xi:include href="older.xml" xpointer="xpointer(/policy/enclaves/enclave)"/></enclaves>
+</policy>
+"""
+
+
+# ── running ────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True)
+class Ended:
+    status: int
+    out: str
+    err: str
+    seconds: float
+
+
+def live(
+    domain: int, folder: Path, processes: list[dict[str, Any]], *commands: str | dict[str, Any]
+) -> list[Ended]:
+    """Run commands beside the nodes, one after the other."""
+    task = {
+        "domain": domain,
+        "folder": str(folder),
+        "processes": processes,
+        "commands": [
+            {"words": each.split()} if isinstance(each, str) else each for each in commands
+        ],
+    }
+    done = subprocess.run(
+        [sys.executable, str(SCRIPTS / "robot.py")],
+        input=json.dumps(task),
+        capture_output=True,
+        text=True,
+        timeout=180,
+    )
+    assert done.returncode == 0, done.stderr
+    return [Ended(**each) for each in json.loads(done.stdout.splitlines()[-1])]
+
+
+@dataclass(frozen=True)
+class Learned:
+    folder: Path
+    ended: dict[str, Ended]
+    observed: dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> Learned:
+    """Everything that is asked of one robot, as it starts only once."""
+    folder = tmp_path_factory.mktemp("robot")
+    (folder / "older.xml").write_text(OLDER)
+    (folder / "elsewhere.xml").write_text(ELSEWHERE)
+    commands = [
+        "generate_policy robot.xml",
+        "generate_policy robot.xml --spin-time 5 --no-daemon --use-sim-time",
+        "generate_policy flat.xml --flat --json",
+        "generate_policy elsewhere.xml",
+        "generate_policy older.xml",
+        "generate_policy older.xml",
+        "generate_policy never.xml --dry-run",
+    ]
+    ended = live(DOMAIN, folder, ROBOT, *commands)
+    names = ("first", "second", "flat", "elsewhere", "older", "older_again", "dry")
+    by_name = dict(zip(names, ended, strict=True))
+    return Learned(folder, by_name, json.loads(by_name["flat"].out))
+
+
+def observed_endpoints(learned: Learned) -> dict[str, set[Endpoint]]:
+    found: dict[str, set[Endpoint]] = {}
+    for each in learned.observed["nodes"]:
+        if each["name"].startswith("_ros2cli"):
+            continue
+        (enclave,) = each["enclaves"]
+        for way in ("publish", "subscribe"):
+            found.setdefault(enclave, set()).update((way, topic) for topic in each[way])
+    return found
+
+
+def allowed_endpoints(enclave: Enclave) -> set[Endpoint]:
+    """Every topic of the permissions that sros makes from a policy."""
+    moment = datetime(2024, 1, 1, tzinfo=UTC)
+    permissions = permissions_for(
+        enclave,
+        subject=f"CN={enclave.path}",
+        validity=Window(moment, moment + timedelta(days=1)),
+        domains=DomainSet.parse("0"),
+    )
+    (only,) = permissions.grants
+    assert all(rule.allow for rule in only.rules)
+    return {
+        (way, topic)
+        for rule in only.rules
+        for way, found in (("publish", rule.publish), ("subscribe", rule.subscribe))
+        for each in found
+        for topic in each.topics
+    } - {("publish", ROS_DISCOVERY_TOPIC), ("subscribe", ROS_DISCOVERY_TOPIC)}
+
+
+# ── what is learned ────────────────────────────────────────────────────────────────────────
+
+
+def test_the_policy_is_the_expected_one(learned: Learned) -> None:
+    ended = learned.ended["first"]
+    assert ended.status == 0, ended.err
+    assert (learned.folder / "robot.xml").read_text() == EXPECTED
+    assert "wrote 'robot.xml': 10 enclaves, 11 nodes" in ended.out
+    assert "copied common/node/logging.xml, " in ended.out
+    for part in ("rclpy_node.xml", "node/time.xml", "node/types.xml"):
+        copied = (learned.folder / "common" / part).read_bytes()
+        assert copied == (policies_dir() / "common" / part).read_bytes()
+    assert not (learned.folder / "common" / "node.xml").exists(), "only what is needed"
+
+
+def test_what_is_left_out_is_said(learned: Learned) -> None:
+    err = learned.ended["first"].err
+    assert "note [graph.tool]" in err
+    assert "/_ros2cli_daemon_0_abc" in err
+    assert "note [graph.partial-action]" in err
+    assert "/client subscribe /fib/_action/status" in err
+    assert "_sros_observer" not in err
+    assert "ambiguous" not in err
+
+
+def test_a_second_run_changes_nothing(learned: Learned) -> None:
+    ended = learned.ended["second"]
+    assert ended.status == 0, ended.err
+    assert ended.out == "nothing to add: 'robot.xml' says all that was seen\n"
+    assert (learned.folder / "robot.xml").read_text() == EXPECTED
+
+
+def test_flat_is_the_same_in_one_file(learned: Learned, tmp_path: Path) -> None:
+    assert b"include" not in (learned.folder / "flat.xml").read_bytes()
+    alone = shutil.copy(learned.folder / "flat.xml", tmp_path)
+    assert policy_rights(read_policy(Path(alone))) == policy_rights(
+        read_policy(learned.folder / "robot.xml")
+    )
+
+
+def test_processes_are_told_apart(learned: Learned) -> None:
+    nodes = [each for each in learned.observed["nodes"] if each["name"] in ("twin", "worker")]
+    assert len({each["participant"] for each in nodes}) == 4
+    assert all(len(each["enclaves"]) == 1 for each in nodes)
+
+
+@pytest.mark.parametrize("file", ["robot.xml", "flat.xml"])
+def test_permissions_cover_what_was_observed_and_nothing_else(learned: Learned, file: str) -> None:
+    policy = read_policy(learned.folder / file)
+    allowed = {each.path: allowed_endpoints(each) for each in policy.enclaves}
+    observed = observed_endpoints(learned)
+    assert len(observed["/planner"]) == 32
+    assert allowed == observed
+
+
+def test_it_stays_inside_the_portable_profile(learned: Learned, tmp_path: Path) -> None:
+    result = generate_artifacts(
+        tmp_path / "keystore",
+        policies=[read_policy(learned.folder / "robot.xml")],
+        now=datetime.now(UTC),
+        create=load_template("production"),
+    )
+    assert result.notes == ()
+
+
+def test_a_dry_run_writes_nothing(learned: Learned) -> None:
+    assert "would have written 'never.xml'" in learned.ended["dry"].out
+    assert not (learned.folder / "never.xml").exists()
+
+
+# ── merging ────────────────────────────────────────────────────────────────────────────────
+
+
+def test_merging_keeps_what_was_there_and_adds_one_direction(learned: Learned) -> None:
+    ended = learned.ended["older"]
+    assert ended.status == 0, ended.err
+    text = (learned.folder / "older.xml").read_text()
+    declared = 'version="0.2.0" xmlns:xi="http://www.w3.org/2001/XInclude"'
+    for line in OLDER.replace('version="0.2.0"', declared).splitlines():
+        assert line in text
+    assert "note [merge.still-denied]" in ended.err and "/tf" in ended.err
+    rights = {(each.qualifier, each.right, each.name) for each in policy_rights(
+        read_policy(learned.folder / "older.xml")
+    ) if each.enclave == "/talker"}  # fmt: skip
+    assert ("ALLOW", "publish", "/chatter") in rights
+    assert ("ALLOW", "subscribe", "/chatter") not in rights
+    assert ("DENY", "publish", "/tf") in rights and ("ALLOW", "publish", "/tf") not in rights
+
+
+def test_what_is_new_in_an_old_file_comes_with_its_includes(learned: Learned) -> None:
+    text = (learned.folder / "older.xml").read_text()
+    assert text.count('<xi:include href="common/rclpy_node.xml"') == 10
+    assert text.count("http://www.w3.org/2001/XInclude") == 1
+
+
+def test_merging_again_adds_nothing(learned: Learned) -> None:
+    assert learned.ended["older_again"].status == 0
+    assert "nothing to add" in learned.ended["older_again"].out
+
+
+def test_a_merge_that_fails_leaves_the_file_as_it_was(learned: Learned) -> None:
+    ended = learned.ended["elsewhere"]
+    assert ended.status == 1
+    assert ended.err.startswith("Unable to generate policy: nothing can be added to the enclave")
+    assert (learned.folder / "elsewhere.xml").read_text() == ELSEWHERE
+    assert sorted(each.name for each in learned.folder.iterdir()) == [
+        "common", "elsewhere.xml", "flat.xml", "older.xml", "robot.xml",
+    ]  # fmt: skip
+
+
+# ── enforced ───────────────────────────────────────────────────────────────────────────────
+
+
+def keystore_of(policy: Policy, root: Path) -> Path:
+    generate_artifacts(
+        root,
+        policies=[policy],
+        now=datetime.now(UTC),
+        create=load_template("production"),
+        domains=DomainSet.of((DOMAIN + 3, DOMAIN + 3)),
+    )
+    return root
+
+
+def refused(keystore: Path, enclave: str, endpoints: Iterable[Endpoint]) -> set[Endpoint]:
+    questions = sorted(endpoints)
+    done = subprocess.run(
+        [
+            *(sys.executable, str(SCRIPTS / "ask_cyclone.py")),
+            *(str(enclave_path(keystore, enclave)), str(DOMAIN + 3)),
+        ],
+        input=json.dumps(questions),
+        capture_output=True,
+        text=True,
+        timeout=90,
+    )
+    assert done.returncode == 0, done.stderr
+    answers = json.loads(done.stdout.splitlines()[-1])
+    return {tuple(q) for q, said in zip(questions, answers, strict=True) if said == "refused"}
+
+
+def heard(keystore: Path, topic: str, talker: str, listener: str) -> dict[str, Any]:
+    parties = [
+        {
+            "role": role,
+            "name": role,
+            "keystore": str(keystore),
+            "enclave": enclave,
+            "topic": topic,
+            "text": "Hello",
+        }
+        for role, enclave in (("talker", talker), ("listener", listener))
+    ]
+    done = subprocess.run(
+        [sys.executable, str(SCRIPTS.with_name("converse.py")), str(DOMAIN + 3)],
+        input=json.dumps(parties),
+        capture_output=True,
+        text=True,
+        timeout=90,
+    )
+    assert done.returncode == 0, done.stderr
+    return {each["name"]: each for each in json.loads(done.stdout)["nodes"]}
+
+
+def without(policy: Policy, path: str, name: str) -> Policy:
+    """The policy without one name of one enclave."""
+
+    def poorer(groups: tuple[Group, ...]) -> tuple[Group, ...]:
+        left = (replace(g, names=tuple(n for n in g.names if n != name)) for g in groups)
+        return tuple(group for group in left if group.names)
+
+    return replace(
+        policy,
+        enclaves=tuple(
+            each
+            if each.path != path
+            else replace(
+                each,
+                profiles=tuple(
+                    replace(
+                        block,
+                        profiles=tuple(replace(p, groups=poorer(p.groups)) for p in block.profiles),
+                    )
+                    for block in each.profiles
+                ),
+            )
+            for each in policy.enclaves
+        ),
+    )
+
+
+def test_a_learned_pair_works_on_cyclone_and_one_topic_less_fails(
+    learned: Learned, tmp_path: Path
+) -> None:
+    policy = read_policy(learned.folder / "robot.xml")
+    whole = keystore_of(policy, tmp_path / "whole")
+    poorer = keystore_of(without(policy, "/talker", "chatter"), tmp_path / "poorer")
+    seen = observed_endpoints(learned)
+
+    parties = heard(whole, "/chatter", "/talker", "/listener")
+    assert len(parties["listener"]["heard"]) > 5
+    parties = heard(poorer, "/chatter", "/talker", "/listener")
+    assert parties["listener"]["heard"] == []
+    assert "refused" in parties["talker"]["kinds"]
+    assert refused(poorer, "/talker", seen["/talker"]) == {("publish", "rt/chatter")}
+
+
+@pytest.mark.parametrize("path", ["/talker", "/planner", "/fibonacci", "/crew", "/composed"])
+def test_cyclone_allows_what_was_learned_and_nothing_else(
+    learned: Learned, tmp_path: Path, path: str
+) -> None:
+    keystore = keystore_of(read_policy(learned.folder / "robot.xml"), tmp_path / "keystore")
+    seen = observed_endpoints(learned)
+    others = set.union(*seen.values()) - seen[path]
+    assert refused(keystore, path, seen[path] | others) == others
+
+
+# ── over time ──────────────────────────────────────────────────────────────────────────────
+
+PASSER_BY = process("/passer_by", node("passer_by", publish=["hello"]), after=2.5, lives=2.0)
+STEADY = process("/steady", node("steady", publish=["beat"]))
+
+
+def rights_of(path: Path) -> set[tuple[str, str, str]]:
+    return {(each.enclave, each.right, each.name) for each in policy_rights(read_policy(path))}
+
+
+def test_a_watch_keeps_who_came_and_went(tmp_path: Path) -> None:
+    watched, _ = live(
+        DOMAIN + 1,
+        tmp_path,
+        [STEADY, PASSER_BY],
+        "generate_policy watched.xml --watch 9s",
+        "generate_policy after.xml",
+    )
+    assert watched.status == 0, watched.err
+    assert ("/passer_by", "publish", "/hello") in rights_of(tmp_path / "watched.xml")
+    assert ("/steady", "publish", "/beat") in rights_of(tmp_path / "watched.xml")
+    assert {each[0] for each in rights_of(tmp_path / "after.xml")} == {"/steady"}
+    news = [line for line in watched.err.splitlines() if line.startswith("new: ")]
+    assert news == [
+        "new: /steady (/steady)",
+        "new: /steady (/steady) publish /beat",
+        "new: /passer_by (/passer_by)",
+        "new: /passer_by (/passer_by) publish /hello",
+    ]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM], ids=lambda each: each.name)
+def test_a_signal_ends_a_watch_and_the_policy_is_written(
+    tmp_path: Path, number: signal.Signals
+) -> None:
+    words = ["generate_policy", "--watch", "endless.xml"]
+    (ended,) = live(
+        DOMAIN + 2, tmp_path, [STEADY], {"words": words, "signal": int(number), "at": 5}
+    )
+    assert ended.status == 0, ended.err
+    assert ended.seconds < 8
+    assert ("/steady", "publish", "/beat") in rights_of(tmp_path / "endless.xml")
+
+
+def test_ctrl_c_in_a_snapshot_writes_nothing(tmp_path: Path) -> None:
+    words = ["generate_policy", "none.xml", "--spin-time", "30"]
+    (ended,) = live(DOMAIN + 2, tmp_path, [], {"words": words, "signal": signal.SIGINT, "at": 3})
+    assert (ended.status, ended.err.strip()) == (130, "sros: interrupted")
+    assert list(tmp_path.iterdir()) == []
+
+
+# ── nothing to see ─────────────────────────────────────────────────────────────────────────
+
+
+def test_no_nodes(tmp_path: Path) -> None:
+    (ended,) = live(DOMAIN + 4, tmp_path, [], "generate_policy empty.xml --spin-time 1")
+    assert ended.status == 1
+    assert ended.out == ""
+    message, why = ended.err.splitlines()
+    assert message == NO_NODES
+    assert f"domain {DOMAIN + 4}" in why and "--enclave" in why
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_dds_without_security_is_named(tmp_path: Path) -> None:
+    """The wheels of rclpy have none: an enclave cannot be observed in, and that is the answer."""
+    keystore = keystore_of(read_policy(policies_dir() / "observer.xml"), tmp_path / "ks")
+    command = f"generate_policy p.xml --keystore {keystore} --enclave /sros_observer --domain 214"
+    (ended,) = live(DOMAIN + 3, tmp_path, [], command)
+    assert ended.status == 1
+    assert ended.err.count("\n") == 1
+    assert "built without DDS Security" in ended.err
+
+
+def test_the_observer_may_join_and_nothing_else(tmp_path: Path) -> None:
+    keystore = keystore_of(read_policy(policies_dir() / "observer.xml"), tmp_path / "keystore")
+    may = {("publish", "rt/parameter_events"), ("publish", "ros_discovery_info")}
+    may.add(("subscribe", "ros_discovery_info"))
+    more = {("subscribe", "rt/chatter"), ("publish", "rt/rosout"), ("subscribe", "rt/rosout")}
+    assert refused(keystore, "/sros_observer", may | more) == more
