@@ -37,13 +37,14 @@ def install(pattern: str, lock: int | None = None) -> bool:
     return succeeds([*apt_get, "install", "-y", "--no-install-recommends", name], keep_open=lock)
 
 
-def provide_openssl(lock: int | None = None) -> None:
-    """Make sure of the `openssl` command, which the tests hold against sros' own cryptography."""
-    if shutil.which("openssl"):
-        return
-    say("no openssl command on this machine, which some tests compare with")
-    if not install("openssl", lock):
-        say("openssl cannot be installed; going on without")
+def provide_for_tests(lock: int | None = None) -> None:
+    """Make sure of what the tests hold sros against: OpenSSL, and a token in software."""
+    for command, package in (("openssl", "openssl"), ("softhsm2-util", "softhsm2")):
+        if shutil.which(command):
+            continue
+        say(f"no {command} command on this machine, which some tests compare with")
+        if not install(package, lock):
+            say(f"{package} cannot be installed; going on without")
 
 
 def find(pattern: str, options: Sequence[str] = ()) -> str | None:

@@ -85,7 +85,7 @@ def set_up(needs: Needs, *, afresh: bool = False) -> None:
             record = prepare(groups, record, lock)
             write_record(record)
         if needs.for_tests:
-            apt.provide_openssl(lock)
+            apt.provide_for_tests(lock)
         if needs.dds and not dds.chosen_by_user():
             with_dds = _with_dds(needs, record, lock)
             if with_dds != record:

@@ -25,6 +25,7 @@ from sros_tool.cli.common import (
     print_plan,
     split_root,
 )
+from sros_tool.cli.secrets import keyring
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
@@ -73,6 +74,15 @@ Example:
 @click.option("--ca-validity", metavar="DURATION", help="How long the CAs last, as 5y.")
 @click.option("--validity", metavar="DURATION", help="How long certificates last, as 365d.")
 @click.option("--permissions-validity", metavar="DURATION", help="How long permissions last.")
+@click.option(
+    "--identity-key",
+    metavar="URI",
+    help="Where the key of the identity CA is, or is to be made: file:PATH or pkcs11:...",
+)
+@click.option("--permissions-key", metavar="URI", help="The same for the permissions CA.")
+@click.option(
+    "--encrypt-ca-keys", is_flag=True, help="Protect new CA keys in files by a passphrase."
+)
 @dry_run_option
 def create_keystore(
     root: Path | None,
@@ -82,9 +92,16 @@ def create_keystore(
     ca_validity: str | None,
     validity: str | None,
     permissions_validity: str | None,
+    identity_key: str | None,
+    permissions_key: str | None,
+    encrypt_ca_keys: bool,
     dry_run: bool,
 ) -> None:
-    """Create a keystore in the folder ROOT, by the choices of a template."""
+    """Create a keystore in the folder ROOT, by the choices of a template.
+
+    Passphrases of CA keys come from a prompt, from $SROS_CA_PASSPHRASE or from the file
+    $SROS_CA_PASSPHRASE_FILE; the PIN of a token from a prompt or $SROS_PKCS11_PIN.
+    """
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore import create_keystore as create
 
@@ -94,7 +111,14 @@ def create_keystore(
     if ros_domain is not None:
         domains = DomainSet.of((ros_domain, ros_domain))
     template = _choices(template_name, ca_layout, ca_validity, validity, permissions_validity)
-    result = create(root, template=template, domains=domains, now=now(), dry_run=dry_run)
+    result = create(
+        root,
+        template=template,
+        domains=domains,
+        now=now(),
+        keyring=keyring(identity_key, permissions_key, encrypt=encrypt_ca_keys),
+        dry_run=dry_run,
+    )
     if dry_run:
         print_plan(root, result.changes)
         return
@@ -194,7 +218,13 @@ def create_enclave(words: tuple[str, ...], dry_run: bool) -> None:
         raise UsageError("no enclave is named", "", "Name one or more, such as /talker.")
     with _progress(len(names)) as step:
         result = create_enclaves(
-            root, names, now=now(), domain=_ros_domain(), dry_run=dry_run, progress=step
+            root,
+            names,
+            now=now(),
+            domain=_ros_domain(),
+            keyring=keyring(),
+            dry_run=dry_run,
+            progress=step,
         )
     _show(result, dry_run)
 
@@ -229,6 +259,7 @@ def create_permission(words: tuple[str, ...], dry_run: bool) -> None:
         read_policy(PATH.convert(file, None, None)),
         now=now(),
         domain=_ros_domain(),
+        keyring=keyring(),
         dry_run=dry_run,
     )
     _show(result, dry_run)
@@ -299,6 +330,7 @@ def generate_artifacts(
             now=now(),
             domain=_ros_domain(),
             create=template,
+            keyring=keyring(),
             dry_run=dry_run,
             progress=step,
         )

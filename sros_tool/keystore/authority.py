@@ -11,7 +11,8 @@ from typing import TypeVar
 
 from cryptography import x509
 
-from sros_tool.errors import KeystoreError, PkiError, SrosError
+from sros_tool.errors import KeystoreError, PkiError
+from sros_tool.keystore.keyring import Keyring, check_places
 from sros_tool.keystore.layout import (
     IDENTITY,
     PERMISSIONS,
@@ -34,7 +35,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
-from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
+from sros_tool.pki.keys import PrivateKey
 from sros_tool.validity import iso, window
 from sros_tool.xml import read_bytes
 
@@ -79,29 +80,33 @@ class Authorities:
     permissions: Authority
 
 
-def create_authorities(transaction: Transaction, template: Template, now: datetime) -> Authorities:
+def create_authorities(
+    transaction: Transaction, template: Template, keyring: Keyring, now: datetime
+) -> Authorities:
     """Make the CA or CAs of a new keystore."""
+    check_places(keyring, template)
     validity = window(now, template.authority_validity)
     # Every keystore's CA has a name of its own, so that messages and pictures can tell them apart.
     serial = secrets.token_hex(4)
 
-    def make(file: str, name: str) -> Authority:
-        key = generate_key()
+    def make(file: str, role: str, name: str) -> Authority:
+        key = keyring.make(transaction, f"{PRIVATE}/{file}.key.pem", role, template)
         certificate = issue_ca(key, common_name(name), validity)
         transaction.write(f"{PUBLIC}/{file}.cert.pem", pem(certificate))
-        transaction.write(f"{PRIVATE}/{file}.key.pem", key_pem(key), private=True)
         return Authority(certificate, key)
 
     if template.separate_authorities:
         name = template.authority_name
         return Authorities(
-            make("identity_ca", f"{name} identity CA {serial}"),
-            make("permissions_ca", f"{name} permissions CA {serial}"),
+            make("identity_ca", IDENTITY, f"{name} identity CA {serial}"),
+            make("permissions_ca", PERMISSIONS, f"{name} permissions CA {serial}"),
         )
-    authority = make("ca", template.authority_name)
+    authority = make("ca", IDENTITY, template.authority_name)
+    in_keystore = not (keyring.places.get(IDENTITY) or template.identity_key)
     for role in ROLES:
         transaction.link(ca_certificate(role), "ca.cert.pem")
-        transaction.link(ca_key(role), "ca.key.pem")
+        if in_keystore:
+            transaction.link(ca_key(role), "ca.key.pem")
     return Authorities(authority, authority)
 
 
@@ -111,14 +116,16 @@ def load_ca_certificate(root: Path, role: str) -> x509.Certificate:
     return load_certificate(read_bytes(path, f"{role} CA certificate"), f"'{path}'")
 
 
-def load_authorities(root: Path, now: datetime) -> Authorities:
+def load_authorities(
+    root: Path, template: Template, keyring: Keyring, now: datetime
+) -> Authorities:
     """Both authorities of a keystore, with their keys, checked and ready to sign."""
-    identity = _load(root, IDENTITY, now)
-    permissions = _load(root, PERMISSIONS, now)
+    identity = _load(root, IDENTITY, template, keyring, now)
+    permissions = _load(root, PERMISSIONS, template, keyring, now)
     return Authorities(identity, permissions)
 
 
-def _load(root: Path, role: str, now: datetime) -> Authority:
+def _load(root: Path, role: str, template: Template, keyring: Keyring, now: datetime) -> Authority:
     if not (root / ca_certificate(role)).exists() and not (root / ca_key(role)).exists():
         raise KeystoreError(
             f"keystore '{root}' has no {role} CA",
@@ -126,23 +133,12 @@ def _load(root: Path, role: str, now: datetime) -> Authority:
             "Use the keystore that it was exported from.",
         )
     certificate = load_ca_certificate(root, role)
-    path = root / ca_key(role)
-    if not path.exists():
-        raise KeystoreError(
-            f"the key of the {role} CA is not in keystore '{root}'",
-            f"'{path}' is missing; perhaps it is kept elsewhere on purpose.",
-            "Put it back for this command. A new CA would lock out every enclave that exists, so "
-            "none is made.",
-        )
-    try:
-        key = load_key(read_bytes(path, f"{role} CA key"), f"'{path}'")
-    except SrosError as error:
-        raise KeystoreError(error.what, error.why, error.remedy) from error
+    key = keyring.open(root, role, template)
     if not same_key(certificate, key):
         raise KeystoreError(
             f"the key and the certificate of the {role} CA do not belong together",
-            f"'{path}' is not the key of '{root / ca_certificate(role)}', so nothing that it signs "
-            "could be verified.",
+            f"'{keyring.place(role, template)}' is not the key of "
+            f"'{root / ca_certificate(role)}', so nothing that it signs could be verified.",
             "Restore the pair from a backup.",
         )
     validity = validity_of(certificate)

@@ -20,6 +20,7 @@ from sros_tool.keystore.authority import (
     load_authorities,
 )
 from sros_tool.keystore.enclave import Fate, Progress, Registrar
+from sros_tool.keystore.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
     ENCLAVES,
     GOVERNANCE_P7S,
@@ -65,6 +66,7 @@ def create_keystore(
     template: Template,
     domains: DomainSet | None = None,
     now: datetime,
+    keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
 ) -> Result:
     """Make a new keystore for ``domains`` (default: 0) by the choices of ``template``.
@@ -78,7 +80,7 @@ def create_keystore(
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
         _check_free(root)  # another process may have been faster
         domains = domains or DomainSet.of((0, 0))
-        _write_keystore(transaction, template, domains, now)
+        _write_keystore(transaction, template, domains, keyring, now)
         transaction.commit()
     return Result(root, template, domains, True, changes=tuple(transaction.changes))
 
@@ -89,6 +91,7 @@ def create_enclaves(
     *,
     now: datetime,
     domain: int | None = None,
+    keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> Result:
@@ -99,7 +102,13 @@ def create_enclaves(
     (its ROS_DOMAIN_ID); it must be among those of the keystore.
     """
     return generate_artifacts(
-        root, enclaves=names, now=now, domain=domain, dry_run=dry_run, progress=progress
+        root,
+        enclaves=names,
+        now=now,
+        domain=domain,
+        keyring=keyring,
+        dry_run=dry_run,
+        progress=progress,
     )
 
 
@@ -110,6 +119,7 @@ def create_permission(
     *,
     now: datetime,
     domain: int | None = None,
+    keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
 ) -> Result:
     """Give an existing enclave the permissions that ``policy`` states for it."""
@@ -129,7 +139,7 @@ def create_permission(
         raise PolicyError(
             f"unable to find enclave {name} in the policy '{policy.file}'", f"It has {there}."
         )
-    return _produce(root, {name: enclave}, now, domain, dry_run, None, None, None)
+    return _produce(root, {name: enclave}, now, domain, keyring, dry_run)
 
 
 def generate_artifacts(
@@ -141,6 +151,7 @@ def generate_artifacts(
     domain: int | None = None,
     create: Template | None = None,
     domains: DomainSet | None = None,
+    keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> Result:
@@ -168,7 +179,7 @@ def generate_artifacts(
     else:
         _check_keystore(root)
         create = None
-    return _produce(root, wanted, now, domain, dry_run, progress, create, domains)
+    return _produce(root, wanted, now, domain, keyring, dry_run, progress, create, domains)
 
 
 def list_enclaves(root: Path) -> tuple[str, ...]:
@@ -185,10 +196,11 @@ def _produce(
     wanted: dict[str, Enclave | None],
     now: datetime,
     domain: int | None,
+    keyring: Keyring,
     dry_run: bool,
-    progress: Progress | None,
-    create: Template | None,
-    domains: DomainSet | None,
+    progress: Progress | None = None,
+    create: Template | None = None,
+    domains: DomainSet | None = None,
 ) -> Result:
     fresh = create is not None
     with Transaction(root, fresh=fresh, dry_run=dry_run) as transaction:
@@ -197,11 +209,11 @@ def _produce(
             template = create
             domains = domains or DomainSet.of((0 if domain is None else domain,) * 2)
             check_domain(domains, domain, root)
-            authorities = _write_keystore(transaction, template, domains, now)
+            authorities = _write_keystore(transaction, template, domains, keyring, now)
             existing: tuple[str, ...] = ()
         else:
             template = load_settings(root)
-            authorities = load_authorities(root, now)
+            authorities = load_authorities(root, template, keyring, now)
             domains = load_governance(root, authorities.permissions.certificate).domains().closed()
             check_domain(domains, domain, root)
             existing = tuple(enclave_names(root))
@@ -226,14 +238,18 @@ def _produce(
 
 
 def _write_keystore(
-    transaction: Transaction, template: Template, domains: DomainSet, now: datetime
+    transaction: Transaction,
+    template: Template,
+    domains: DomainSet,
+    keyring: Keyring,
+    now: datetime,
 ) -> Authorities:
-    authorities = create_authorities(transaction, template, now)
+    authorities = create_authorities(transaction, template, keyring, now)
     write_governance(transaction, authorities.permissions, template, domains)
     transaction.write(
         SETTINGS,
         b"# The choices by which sros made this keystore; what is added later follows them.\n"
-        + render_template(template).encode(),
+        + render_template(keyring.remembered(template)).encode(),
     )
     return authorities
 

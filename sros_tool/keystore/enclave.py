@@ -31,6 +31,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.keys import generate_key, key_pem, load_key
+from sros_tool.pki.token import TokenKey
 from sros_tool.policy.model import Enclave
 from sros_tool.translate import permissions_for
 from sros_tool.validity import iso, window
@@ -98,7 +99,11 @@ class Registrar:
                     progress(name)
             return Outcome(fates, self._notes, self._transaction.changes[before:])
 
-        for index, (share, outcome) in enumerate(in_shares(wanted, work)):
+        # A session with a token does not survive a fork.
+        keys = (self._authorities.identity.key, self._authorities.permissions.key)
+        alone = any(isinstance(key, TokenKey) for key in keys)
+        shares = [(wanted, work(wanted))] if alone else in_shares(wanted, work)
+        for index, (share, outcome) in enumerate(shares):
             if index:  # the first share was done here, the others by other processes
                 self._transaction.absorb(outcome.changes)
                 for name, _ in share:

@@ -31,7 +31,8 @@ _KINDS: dict[str, str] = {"topic": "topics", "service": "services", "action": "a
 class Template:
     """The choices by which a keystore is made.
 
-    Durations count from the moment at which something is created.
+    Durations count from the moment at which something is created.  ``identity_key`` and
+    ``permissions_key`` name the keys of the CAs by URI, where they are not in the keystore.
     """
 
     name: str
@@ -43,6 +44,8 @@ class Template:
     permissions_validity: timedelta
     default_permissions: str
     protection: DomainProtection
+    identity_key: str = ""
+    permissions_key: str = ""
 
 
 def template_names() -> tuple[str, ...]:
@@ -101,6 +104,8 @@ def parse_template(text: str, name: str) -> Template:
         permissions_validity=permissions.duration("validity"),
         default_permissions=permissions.one_of("default", (EVERYTHING, NODE_BASICS)),
         protection=_protection(table.table("protection")),
+        identity_key=authorities.text("identity_key", ""),
+        permissions_key=authorities.text("permissions_key", ""),
     )
     for part in (authorities, certificates, permissions, table):
         part.finish()
@@ -117,6 +122,11 @@ def render_template(template: Template) -> str:
         f'layout = "{"separate" if template.separate_authorities else "single"}"',
         f"name = {_toml(template.authority_name)}",
         f"validity = {_toml(duration_text(template.authority_validity))}",
+        *(
+            f"{name} = {_toml(place)}"
+            for name in ("identity_key", "permissions_key")
+            if (place := getattr(template, name))
+        ),
         "\n[certificates]",
         f"validity = {_toml(duration_text(template.certificate_validity))}",
         "\n[permissions]",

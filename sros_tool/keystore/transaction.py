@@ -20,7 +20,7 @@ import secrets
 import shutil
 import stat
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -52,7 +52,7 @@ class Transaction:
     def __init__(self, root: Path, *, fresh: bool = False, dry_run: bool = False) -> None:
         self.root = root
         self.changes: list[Change] = []
-        self._dry_run = dry_run
+        self.dry_run = dry_run
         self._new_root = fresh and not root.exists()
         self._made_parents: list[Path] = []
         self._lock = -1
@@ -60,11 +60,16 @@ class Transaction:
         self._content = self._stage / "new"
         self._staged: set[str] = set()
         self._folders: dict[str, bool] = {}  # whether the folder is there already
+        self._undo: list[Callable[[], None]] = []
+
+    def on_failure(self, undo: Callable[[], None]) -> None:
+        """Have ``undo`` called at the end, unless everything was put in place."""
+        self._undo.append(undo)
 
     # ── begin and end ──────────────────────────────────────────────────────────────────────
 
     def __enter__(self) -> Self:
-        if self._dry_run:
+        if self.dry_run:
             return self
         try:
             self._begin()
@@ -90,8 +95,10 @@ class Transaction:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if not self._dry_run:
+        if not self.dry_run:
             self._end()
+        for undo in self._undo:
+            undo()
 
     def _end(self) -> None:
         if self._stage != self.root / STAGE:
@@ -169,7 +176,7 @@ class Transaction:
             os.path.join(self.root, path)
         )
         self.changes.append(Change("replace" if existed else "create", path))
-        return None if self._dry_run else f"{self._content}/{path}"
+        return None if self.dry_run else f"{self._content}/{path}"
 
     def _prepare_folder(self, path: str) -> bool:
         """Stage a folder; tell whether it is in the keystore already."""
@@ -178,7 +185,7 @@ class Transaction:
         exists = not self._new_root
         if path:
             exists = self._prepare_folder(path.rpartition("/")[0]) and self._is_folder(path)
-            if not self._dry_run:
+            if not self.dry_run:
                 staged, mode = f"{self._content}/{path}", folder_mode(path)
                 with contextlib.suppress(FileExistsError):  # by a process with another share
                     os.mkdir(staged, mode)
@@ -214,7 +221,7 @@ class Transaction:
 
     def commit(self) -> None:
         """Put everything in place; after this it is on the disk."""
-        if self._dry_run or not self.changes:
+        if self.dry_run or not self.changes:
             return
         _flush_file_system(self._stage)
         if self._new_root:
@@ -222,6 +229,7 @@ class Transaction:
         else:
             self._bridge()
             _turn(self._stage, "new")
+            self._undo.clear()
             with contextlib.suppress(OSError):  # it is done; the end tries to tidy up once more
                 recover(self.root)
 
@@ -236,6 +244,7 @@ class Transaction:
                 ) from error
             raise
         self._made_parents.clear()
+        self._undo.clear()
         with contextlib.suppress(OSError):  # it is there; the system writes it down in time anyway
             _flush_folder(self.root.parent)
 

@@ -74,7 +74,7 @@ class Issuer:
         self._key = key
         self._name = certificate.subject
         self._validity = validity_of(certificate)
-        self._authority_id = _authority_identifier(certificate)
+        self._authority_id = authority_identifier(certificate)
 
     def issue(self, subject: x509.Name, public: PublicKey, validity: Window) -> x509.Certificate:
         """A leaf certificate; its validity is cut to that of the CA."""
@@ -88,7 +88,8 @@ class Issuer:
         )
 
 
-def _authority_identifier(certificate: x509.Certificate) -> x509.AuthorityKeyIdentifier:
+def authority_identifier(certificate: x509.Certificate) -> x509.AuthorityKeyIdentifier:
+    """The identifier by which what ``certificate`` signs refers to its key."""
     try:
         extension = certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
     except x509.ExtensionNotFound:  # a CA made by ros2/sros2 has none

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
+from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 
 from sros_tool.errors import PkiError
 
@@ -17,25 +20,34 @@ def generate_key() -> ec.EllipticCurvePrivateKey:
     return ec.generate_private_key(ec.SECP256R1())
 
 
-def key_pem(key: PrivateKey) -> bytes:
-    """The key as unencrypted PKCS#8 PEM: no RMW can give a password for an enclave's key."""
+def key_pem(key: PrivateKey, passphrase: str | None = None) -> bytes:
+    """The key as PKCS#8 PEM, encrypted where a passphrase is given.
+
+    The keys of enclaves never are: no RMW can give a password.
+    """
+    protection: serialization.KeySerializationEncryption = serialization.NoEncryption()
+    if passphrase:
+        protection = serialization.BestAvailableEncryption(passphrase.encode())
     return key.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, protection
     )
 
 
-def load_key(pem: bytes, name: str) -> PrivateKey:
-    """Read a PEM private key; ``name`` stands for it in errors."""
+def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None) -> PrivateKey:
+    """Read a PEM private key; ``name`` stands for it in errors.
+
+    ``passphrase`` is asked where the key is encrypted; without it such a key is refused.
+    """
     try:
         key = serialization.load_pem_private_key(pem, None)
     except TypeError as error:
-        raise PkiError(
-            f"the private key {name} is protected by a passphrase",
-            "It cannot be used without it.",
-            "Decrypt it for this command with `openssl pkey -in KEY -out KEY.plain`.",
-        ) from error
+        if passphrase is None:
+            raise PkiError(
+                f"the private key {name} is protected by a passphrase",
+                "It cannot be used without it.",
+                "Decrypt it for this command with `openssl pkey -in KEY -out KEY.plain`.",
+            ) from error
+        key = _decrypted(pem, name, passphrase())
     except (ValueError, UnsupportedAlgorithm) as error:
         raise PkiError(
             f"the private key {name} cannot be read",
@@ -48,6 +60,15 @@ def load_key(pem: bytes, name: str) -> PrivateKey:
             "DDS Security accepts EC prime256v1 and RSA 2048.",
         )
     return key
+
+
+def _decrypted(pem: bytes, name: str, passphrase: str) -> PrivateKeyTypes:
+    try:
+        return serialization.load_pem_private_key(pem, passphrase.encode())
+    except (ValueError, TypeError) as error:
+        raise PkiError(
+            f"the private key {name} cannot be decrypted", "The passphrase is wrong."
+        ) from error
 
 
 def algorithm(key: object) -> str:

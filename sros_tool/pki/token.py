@@ -1,0 +1,230 @@
+"""Keys on PKCS#11 tokens, named by URI (RFC 7512): they sign there and never leave it."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+from urllib.parse import parse_qsl, unquote
+
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, encode_dss_signature
+from cryptography.hazmat.primitives.serialization import load_der_public_key
+
+from sros_tool.errors import PkiError, UnavailableError, UsageError
+
+SCHEME = "pkcs11:"
+MODULE_VARIABLE = "PKCS11_MODULE_PATH"
+Secrets = Callable[[str], str]
+"""Answers with the secret for what it is told; never asked more than once for one thing."""
+
+
+@dataclass(frozen=True, slots=True)
+class TokenUri:
+    """The parts of a ``pkcs11:`` URI that sros understands."""
+
+    token: str
+    object: str
+    module: str
+    pin_source: str = ""
+
+
+def parse_uri(uri: str) -> TokenUri:
+    """Read ``pkcs11:token=NAME;object=LABEL?module-path=FILE``.
+
+    Without ``module-path``, $PKCS11_MODULE_PATH names the module.  A ``pin-value`` is refused: a
+    secret does not belong into a file of settings or a command line.
+    """
+    path, _, query = uri.removeprefix(SCHEME).partition("?")
+    parts = dict(part.partition("=")[::2] for part in path.split(";") if part)
+    options = dict(parse_qsl(query))
+    if "pin-value" in options:
+        raise UsageError(
+            "a PKCS#11 URI with pin-value is not accepted",
+            "The PIN would be written into the keystore's settings.",
+            "Leave it out; SROS_PKCS11_PIN or pin-source=FILE says it.",
+        )
+    module = options.get("module-path", os.environ.get(MODULE_VARIABLE, ""))
+    token, label = unquote(parts.get("token", "")), unquote(parts.get("object", ""))
+    if not uri.startswith(SCHEME) or not token or not label or not module:
+        raise UsageError(
+            f"{uri!r} does not name a key on a token",
+            "It needs a token, an object and a module.",
+            f"Write pkcs11:token=NAME;object=LABEL?module-path=FILE, or set {MODULE_VARIABLE}.",
+        )
+    return TokenUri(token, label, module, options.get("pin-source", "").removeprefix("file:"))
+
+
+class TokenKey(ec.EllipticCurvePrivateKey):
+    """A private key on the curve prime256v1 that lies on a token.
+
+    `cryptography` signs certificates, documents and revocation lists with it as with any other.
+    """
+
+    def __init__(self, private: Any, public: ec.EllipticCurvePublicKey) -> None:
+        self._private = private
+        self._public = public
+
+    def public_key(self) -> ec.EllipticCurvePublicKey:
+        """The public half."""
+        return self._public
+
+    @property
+    def curve(self) -> ec.EllipticCurve:
+        """The curve."""
+        return self._public.curve
+
+    @property
+    def key_size(self) -> int:
+        """Its size in bits."""
+        return self._public.key_size
+
+    def sign(self, data: Any, signature_algorithm: ec.EllipticCurveSignatureAlgorithm) -> bytes:
+        """Sign on the token (CKM_ECDSA over a digest that is made here); DER-encoded."""
+        import pkcs11
+
+        algorithm = signature_algorithm.algorithm
+        if isinstance(algorithm, Prehashed):
+            digest = bytes(data)
+        else:
+            hasher = hashes.Hash(algorithm)
+            hasher.update(data)
+            digest = hasher.finalize()
+        raw = self._private.sign(digest, mechanism=pkcs11.Mechanism.ECDSA)
+        half = len(raw) // 2
+        return encode_dss_signature(
+            int.from_bytes(raw[:half], "big"), int.from_bytes(raw[half:], "big")
+        )
+
+    def exchange(self, algorithm: ec.ECDH, peer_public_key: ec.EllipticCurvePublicKey) -> bytes:
+        """Not for a key that signs."""
+        raise PkiError("a key on a token does not agree on secrets")
+
+    def private_numbers(self) -> ec.EllipticCurvePrivateNumbers:
+        """Never leave the token."""
+        raise PkiError("a key on a token cannot be read")
+
+    def private_bytes(self, *_args: Any, **_options: Any) -> bytes:
+        """Never leave the token."""
+        raise PkiError("a key on a token cannot be read")
+
+    def __copy__(self) -> TokenKey:
+        return self
+
+    def __deepcopy__(self, _memo: Any) -> TokenKey:
+        return self
+
+
+def holds_token_key(uri: str, secrets: Secrets) -> bool:
+    """Whether the token has the key that ``uri`` names."""
+    _need_package()
+    import pkcs11
+
+    parsed = parse_uri(uri)
+    try:
+        session = _session(parsed, secrets, write=False)
+        return any(True for _ in session.get_objects({pkcs11.Attribute.LABEL: parsed.object}))
+    except (pkcs11.PKCS11Error, RuntimeError, OSError) as error:
+        raise _unusable(parsed, error) from error
+
+
+def open_token_key(uri: str, secrets: Secrets) -> TokenKey:
+    """The key that ``uri`` names; `PkiError` if the token has none."""
+    return _open(uri, secrets, create=False)
+
+
+def create_token_key(uri: str, secrets: Secrets) -> TokenKey:
+    """A new key pair on the token; `PkiError` if there is one of that name already."""
+    return _open(uri, secrets, create=True)
+
+
+def _open(uri: str, secrets: Secrets, *, create: bool) -> TokenKey:
+    parsed = parse_uri(uri)
+    _need_package()
+    import pkcs11
+    from pkcs11.util.ec import encode_ec_public_key
+
+    try:
+        session = _session(parsed, secrets, write=create)
+        if create:
+            _create(session, parsed)
+        private = session.get_key(pkcs11.ObjectClass.PRIVATE_KEY, label=parsed.object)
+        public = session.get_key(pkcs11.ObjectClass.PUBLIC_KEY, label=parsed.object)
+        assert isinstance(public, pkcs11.PublicKey)
+        loaded = load_der_public_key(encode_ec_public_key(public))
+    except pkcs11.NoSuchKey as error:
+        raise PkiError(f"the token {parsed.token!r} has no key {parsed.object!r}") from error
+    except (pkcs11.PKCS11Error, RuntimeError, OSError) as error:
+        raise _unusable(parsed, error) from error
+    if not isinstance(loaded, ec.EllipticCurvePublicKey) or loaded.curve.name != "secp256r1":
+        raise PkiError(
+            f"the key {parsed.object!r} on the token is not on the curve prime256v1",
+            "Other kinds are not accepted by every DDS vendor.",
+        )
+    return TokenKey(private, loaded)
+
+
+def _need_package() -> None:
+    """Raise `UnavailableError` where the Python package for tokens is not installed."""
+    if importlib.util.find_spec("pkcs11") is None:
+        raise UnavailableError(
+            "keys on PKCS#11 tokens need the Python package python-pkcs11",
+            "",
+            "Install it with `pip install 'sros_tool[pkcs11]'`.",
+        )
+
+
+def _unusable(parsed: TokenUri, error: Exception) -> PkiError:
+    return PkiError(
+        f"the token {parsed.token!r} cannot be used",
+        f"{type(error).__name__}{f': {error}' if str(error) else ''} ({parsed.module}).",
+        "Check that the token is there, the module is right, and so is the PIN.",
+    )
+
+
+# A process logs into a token once, whichever of its keys are used.
+_sessions: dict[tuple[str, str], tuple[Any, bool]] = {}
+
+
+def _session(parsed: TokenUri, secrets: Secrets, *, write: bool) -> Any:
+    import pkcs11
+
+    place = (parsed.module, parsed.token)
+    session, writable = _sessions.get(place, (None, False))
+    if session is None or (write and not writable):
+        pin = _pin(parsed, secrets)
+        if session is not None:
+            session.close()
+        token = pkcs11.lib(parsed.module).get_token(token_label=parsed.token)
+        session = token.open(rw=write, user_pin=pin)
+        _sessions[place] = (session, write)
+    return session
+
+
+def _create(session: Any, parsed: TokenUri) -> None:
+    import pkcs11
+    from pkcs11.util.ec import encode_named_curve_parameters
+
+    search = {pkcs11.Attribute.LABEL: parsed.object}
+    if any(True for _ in session.get_objects(search)):
+        raise PkiError(
+            f"the token {parsed.token!r} already has a key {parsed.object!r}",
+            "",
+            "Choose another object name.",
+        )
+    parameters = session.create_domain_parameters(
+        pkcs11.KeyType.EC,
+        {pkcs11.Attribute.EC_PARAMS: encode_named_curve_parameters("secp256r1")},
+        local=True,
+    )
+    parameters.generate_keypair(label=parsed.object, store=True)
+
+
+def _pin(parsed: TokenUri, secrets: Secrets) -> str:
+    if parsed.pin_source:
+        with open(parsed.pin_source, encoding="utf-8") as file:
+            return file.readline().rstrip("\n")
+    return secrets(f"the PIN of the token {parsed.token}")

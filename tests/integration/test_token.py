@@ -1,0 +1,109 @@
+"""CA keys on a PKCS#11 token (SoftHSM), which never touch the disk of the keystore."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+MODULES = ("/usr/lib/softhsm/libsofthsm2.so", "/usr/lib/x86_64-linux-gnu/softhsm/libsofthsm2.so")
+MODULE = next((path for path in MODULES if Path(path).exists()), "")
+
+pytestmark = pytest.mark.skipif(
+    not (shutil.which("softhsm2-util") and MODULE), reason="softhsm2 is not installed"
+)
+
+
+@pytest.fixture
+def token(tmp_path: Path) -> dict[str, str]:
+    """The environment in which a token named robot is there, with the PIN 1234."""
+    (tmp_path / "tokens").mkdir()
+    configuration = tmp_path / "softhsm2.conf"
+    configuration.write_text(
+        f"directories.tokendir = {tmp_path / 'tokens'}\nobjectstore.backend = file\n"
+    )
+    environment = {**os.environ, "SOFTHSM2_CONF": str(configuration), "SROS_PKCS11_PIN": "1234"}
+    subprocess.run(
+        "softhsm2-util --init-token --free --label robot --pin 1234 --so-pin 5678".split(),
+        env=environment,
+        check=True,
+        capture_output=True,
+    )
+    return environment
+
+
+def sros(environment: dict[str, str], *words: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "sros_tool", *map(str, words)]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, stdin=-3)
+
+
+def uri(name: str) -> str:
+    return f"pkcs11:token=robot;object={name}?module-path={MODULE}"
+
+
+def make(environment: dict[str, str], root: Path) -> None:
+    keys = ["--identity-key", uri("identity"), "--permissions-key", uri("permissions")]
+    done = sros(environment, "create_keystore", root, "--template", "production", *keys)
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_keys_stay_on_the_token_and_openssl_agrees(
+    token: dict[str, str], tmp_path: Path
+) -> None:
+    root = tmp_path / "ks"
+    make(token, root)
+    names = [f"/robot/part_{index}" for index in range(210)]  # enough for several processes
+    done = sros(token, "create_enclave", root, *names)
+    assert done.returncode == 0, done.stderr
+    keys = [p for p in root.rglob("*") if p.is_file() and b"PRIVATE KEY" in p.read_bytes()]
+    assert sorted({key.name for key in keys}) == ["key.pem"]  # those of the enclaves alone
+    folder = root / "enclaves/robot/part_7"
+    identity, permissions = (root / f"public/{r}_ca.cert.pem" for r in ("identity", "permissions"))
+    for command in (
+        ["verify", "-x509_strict", "-CAfile", identity, folder / "cert.pem"],
+        ["smime", "-verify", "-text", "-in", folder / "permissions.p7s", "-CAfile", permissions],
+        ["smime", "-verify", "-text", "-in", folder / "governance.p7s", "-CAfile", permissions],
+    ):
+        checked = subprocess.run(["openssl", *map(str, command)], capture_output=True, text=True)
+        assert checked.returncode == 0, checked.stderr
+
+
+def test_what_is_wrong_with_a_token_is_said(token: dict[str, str], tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    make(token, root)
+    wrong_pin = sros(token | {"SROS_PKCS11_PIN": "9999"}, "create_enclave", root, "/a")
+    assert (wrong_pin.returncode, "PinIncorrect" in wrong_pin.stderr) == (1, True)
+    no_pin = sros(token | {"SROS_PKCS11_PIN": ""}, "create_enclave", root, "/a")
+    assert (no_pin.returncode, "SROS_PKCS11_PIN" in no_pin.stderr) == (1, True)
+    no_token = sros(token | {"SROS_IDENTITY_KEY": uri("nobody")}, "create_enclave", root, "/a")
+    assert (no_token.returncode, "has no key 'nobody'" in no_token.stderr) == (1, True)
+    leak = sros(
+        token, "create_keystore", tmp_path / "x", "--identity-key", uri("i") + "&pin-value=1"
+    )
+    assert (leak.returncode, "pin-value" in leak.stderr) == (2, True)
+    for ended in (wrong_pin, no_pin, no_token, leak):
+        assert ended.stderr.count("\n") == 1, ended.stderr
+    assert sros(token, "list_enclaves", root).stdout == ""
+    assert sros(token, "create_enclave", root, "/a").returncode == 0
+
+
+def test_everything_but_signing_works_without_the_token(
+    token: dict[str, str], tmp_path: Path
+) -> None:
+    root = tmp_path / "ks"
+    make(token, root)
+    assert sros(token, "create_enclave", root, "/a").returncode == 0
+    without = {**token, "SOFTHSM2_CONF": os.devnull}
+    for words in (
+        ("list_enclaves", root),
+        ("inspect", root),
+        ("env", root, "/a"),
+        ("run", root, "/a", "--", "true"),
+        ("distribute_key", root, "/a", tmp_path / "out"),
+    ):
+        ended = sros(without, *words)
+        assert ended.returncode == 0, (words, ended.stderr)

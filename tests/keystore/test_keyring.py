@@ -1,0 +1,122 @@
+"""The keys of the authorities: encrypted, away from the keystore, and found again."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore import create_enclaves, create_keystore, list_enclaves
+from sros_tool.keystore.keyring import Keyring
+from sros_tool.keystore.open import load_settings
+from sros_tool.keystore.template import load_template
+from tests.harness import sros
+
+NOW = datetime.now(UTC)
+
+
+def answers(secret: str) -> Keyring:
+    return Keyring(lambda _what: secret, encrypt=True)
+
+
+def test_an_encrypted_key_signs_with_its_passphrase_only(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    create_keystore(root, template=load_template("production"), now=NOW, keyring=answers("right"))
+    for key in root.glob("private/*.pem"):
+        assert key.read_bytes().startswith(b"-----BEGIN ENCRYPTED PRIVATE KEY-----")
+        assert key.stat().st_mode & 0o777 == 0o600
+    with pytest.raises(KeystoreError, match="passphrase is wrong"):
+        create_enclaves(root, ["/a"], now=NOW, keyring=answers("wrong"))
+    with pytest.raises(KeystoreError, match="passphrase of the identity CA key is needed"):
+        create_enclaves(root, ["/a"], now=NOW)
+    assert list_enclaves(root) == ()
+    create_enclaves(root, ["/a"], now=NOW, keyring=answers("right"))
+    assert list_enclaves(root) == ("/a",)
+
+
+def test_a_passphrase_is_asked_for_once_a_key(tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def handler(what: str) -> str:
+        asked.append(what)
+        return "secret"
+
+    root = tmp_path / "ks"
+    keyring = Keyring(handler, encrypt=True)
+    create_keystore(root, template=load_template("production"), now=NOW, keyring=keyring)
+    asked.clear()
+    create_enclaves(root, [f"/e{i}" for i in range(250)], now=NOW, keyring=keyring)
+    assert sorted(asked) == [
+        "the passphrase of the identity CA key",
+        "the passphrase of the permissions CA key",
+    ]
+
+
+def test_keys_away_from_the_keystore(tmp_path: Path) -> None:
+    root, away = tmp_path / "ks", tmp_path / "stick"
+    away.mkdir()
+    places = {role: f"file:{away / role}.pem" for role in ("identity", "permissions")}
+    template = load_template("production")
+    create_keystore(root, template=template, now=NOW, keyring=Keyring(places=places))
+    assert not (root / "private").exists()
+    assert {key.stat().st_mode & 0o777 for key in away.iterdir()} == {0o600}
+    assert load_settings(root).identity_key == places["identity"]
+    create_enclaves(root, ["/a"], now=NOW)  # the settings tell where the keys are
+    away.rename(tmp_path / "drawer")
+    with pytest.raises(KeystoreError, match="SROS_IDENTITY_KEY"):
+        create_enclaves(root, ["/b"], now=NOW)
+    moved = {role: f"file:{tmp_path / 'drawer' / role}.pem" for role in places}
+    create_enclaves(root, ["/b"], now=NOW, keyring=Keyring(places=moved))
+    assert list_enclaves(root) == ("/a", "/b")
+
+
+def test_a_key_of_another_authority_is_refused(tmp_path: Path) -> None:
+    for name in ("one", "two"):
+        create_keystore(tmp_path / name, template=load_template("production"), now=NOW)
+    other = {"identity": f"file:{tmp_path / 'two/private/identity_ca.key.pem'}"}
+    with pytest.raises(KeystoreError, match="do not belong together"):
+        create_enclaves(tmp_path / "one", ["/a"], now=NOW, keyring=Keyring(places=other))
+
+
+def test_a_failed_keystore_leaves_no_key_outside(tmp_path: Path) -> None:
+    places = {
+        "identity": f"file:{tmp_path / 'identity.pem'}",
+        "permissions": f"file:{tmp_path / 'missing' / 'permissions.pem'}",
+    }
+    with pytest.raises(OSError, match="missing"):
+        create_keystore(
+            tmp_path / "ks",
+            template=load_template("production"),
+            now=NOW,
+            keyring=Keyring(places=places),
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_one_authority_has_one_place(tmp_path: Path) -> None:
+    template = load_template("sros2")
+    with pytest.raises(KeystoreError, match="one place"):
+        create_keystore(
+            tmp_path / "ks",
+            template=template,
+            now=NOW,
+            keyring=Keyring(places={"identity": f"file:{tmp_path / 'ca.pem'}"}),
+        )
+    places = dict.fromkeys(("identity", "permissions"), f"file:{tmp_path / 'ca.pem'}")
+    create_keystore(tmp_path / "ks", template=template, now=NOW, keyring=Keyring(places=places))
+    create_enclaves(tmp_path / "ks", ["/a"], now=NOW)
+
+
+def test_the_program_takes_secrets_from_the_environment_or_a_file(tmp_path: Path) -> None:
+    root, file = tmp_path / "ks", tmp_path / "passphrase"
+    file.write_text("secret\nsecond line\n")
+    none = {"SROS_CA_PASSPHRASE": None, "SROS_CA_PASSPHRASE_FILE": None}
+    by_value = none | {"SROS_CA_PASSPHRASE": "secret"}
+    sros("create_keystore", root, "--encrypt-ca-keys", env=by_value).ok()
+    refused = sros("create_enclave", root, "/a", env=none)
+    assert refused.status == 1
+    assert "SROS_CA_PASSPHRASE" in refused.err
+    by_file = none | {"SROS_CA_PASSPHRASE_FILE": str(file)}
+    sros("create_enclave", root, "/a", env=by_file).ok()
