@@ -28,7 +28,17 @@ def token(tmp_path: Path) -> dict[str, str]:
     )
     environment = {**os.environ, "SOFTHSM2_CONF": str(configuration), "SROS_PKCS11_PIN": "1234"}
     subprocess.run(
-        "softhsm2-util --init-token --free --label robot --pin 1234 --so-pin 5678".split(),
+        [
+            "softhsm2-util",
+            "--init-token",
+            "--free",
+            "--label",
+            "robot",
+            "--pin",
+            "1234",
+            "--so-pin",
+            "5678",
+        ],
         env=environment,
         check=True,
         capture_output=True,
