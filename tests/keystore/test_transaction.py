@@ -593,3 +593,35 @@ def test_a_file_that_is_a_link_is_replaced_and_not_followed(keystore: Path, tmp_
     assert outside.read_bytes() == before
     assert seen(keystore)["/a"] == "new_a"
     check_whole(keystore)
+
+
+@pytest.mark.parametrize("verb", ["create_keystore", "create_permission", "without hard links"])
+def test_content_is_on_the_disk_before_its_name(
+    verb: str, keystore: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A power failure may lose what was not flushed, also where a kill does not."""
+    calls: list[str] = []
+
+    def note(module: object, name: str) -> None:
+        real = getattr(module, name)
+
+        def noting(*arguments: Any, **options: Any) -> Any:
+            calls.append(f"{name} {arguments[0]}")
+            return real(*arguments, **options)
+
+        monkeypatch.setattr(module, name, noting)
+
+    if verb == "without hard links":
+        monkeypatch.setattr(os, "link", lambda *_, **__: run_out_of_space("link", ()))
+    note(transaction, "_flush_file_system")
+    for name in ("rename", "replace"):
+        note(os, name)
+    if verb == "create_keystore":
+        create_keystore(tmp_path / "new", template=TEMPLATE, now=NOW)
+    else:
+        create_permission(keystore, "/a", policy(tmp_path), now=NOW)
+    moved = [call.split()[0] for call in calls]
+    assert moved[0] == "_flush_file_system"
+    assert "rename" in moved or "replace" in moved
+    if verb == "without hard links":
+        assert [call for call in calls if call.startswith("_flush") and call.endswith("/old")]
