@@ -110,6 +110,7 @@ def minimize_policy(
     document = write_policy(result.policy)
     if output and read_policy(output, document) != result.policy:
         raise PolicyError("the narrowed policy does not read as it was meant")
+    saved = save(output, document) if output and not dry_run else ""
     if as_json:
         value = _json(policy, result, measured, output if not dry_run else None)
         print_json({**value, "notes": notes_json(notes)})
@@ -120,8 +121,8 @@ def minimize_policy(
     print_notes(notes)
     if output and dry_run:
         click.echo(f"would {'replace' if output.exists() else 'write'} {output}", err=as_json)
-    elif output:
-        save(output, document)
+    if saved:
+        click.echo(saved, err=True)
 
 
 def _common() -> Sequence[Group]:

@@ -56,13 +56,13 @@ def check_output(output: Path, *, force: bool) -> None:
         raise UsageError(f"'{output}' already exists", "", "Name another file, or add --force.")
 
 
-def save(output: Path, document: bytes) -> None:
-    """Write a document as a whole, and say so."""
+def save(output: Path, document: bytes) -> str:
+    """Write a document as a whole, and return what to say about it."""
     from sros_tool.atomic import replace_file
 
     verb = "replaced" if output.exists() else "wrote"
     replace_file(output, document)
-    click.echo(f"{verb} '{output}'", err=True)
+    return f"{verb} '{output}'"
 
 
 # ── merge_policy ───────────────────────────────────────────────────────────────────────────
@@ -115,9 +115,12 @@ def merge_policy(
     merged = merge_all(policy, [read_policy(path) for path in others])
     if output:
         _check_includes(policy, output, merged.document)
-    notes = merge_notes(merged.contradictions)
+    saved = ""
+    if target and not dry_run and (merged.added or output):
+        saved = save(target, merged.document)
     if as_json:
-        _print_merged_json(policy, merged, target, dry_run)
+        show = target is None and not dry_run
+        _print_merged_json(policy, merged, target if saved else None, show=show)
     elif dry_run:
         for right in merged.added:
             click.echo(f"would add {right}")
@@ -129,9 +132,9 @@ def merge_policy(
         click.echo(merged.document, nl=False)
     if not dry_run and not as_json:
         _say_added(merged)
-    print_notes(notes)
-    if target and not dry_run and (merged.added or output):
-        save(target, merged.document)
+    print_notes(merge_notes(merged.contradictions))
+    if saved:
+        click.echo(saved, err=True)
 
 
 def _say_added(merged: Merged) -> None:
@@ -144,7 +147,9 @@ def _say_added(merged: Merged) -> None:
         click.echo(f"  {right}", err=True)
 
 
-def _print_merged_json(policy: Path, merged: Merged, target: Path | None, dry_run: bool) -> None:
+def _print_merged_json(policy: Path, merged: Merged, written: Path | None, *, show: bool) -> None:
+    from sros_tool.policy.text import Text
+
     value: dict[str, Any] = {
         "policy": str(policy),
         "added": [right_json(right) for right in merged.added],
@@ -156,10 +161,10 @@ def _print_merged_json(policy: Path, merged: Merged, target: Path | None, dry_ru
             }
             for each in merged.contradictions
         ],
-        "output": str(target) if target and not dry_run else None,
+        "output": str(written) if written else None,
     }
-    if target is None and not dry_run:
-        value["document"] = merged.document.decode("utf-8", "replace")
+    if show:
+        value["document"] = Text(merged.document, str(policy)).text
     print_json(value)
 
 

@@ -1,5 +1,6 @@
-"""The text of a policy file with the place of each element, so that it can be changed by hand's
-breadth: what is not concerned stays byte for byte, comments and line ends included.
+"""The text of a policy file with the place of each element, to change it as a person would.
+
+What is not concerned stays byte for byte, comments and line ends included.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ class Text:
         return PolicyError(
             f"{self._name} cannot be added to in place",
             why,
-            "Save it as UTF-8, or read it with sros and write a new file.",
+            "Save it as UTF-8.",
         )
 
     def _elements(self, root: etree._Element) -> Element:
