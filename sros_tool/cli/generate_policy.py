@@ -7,7 +7,7 @@ import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -19,6 +19,7 @@ from sros_tool.cli.common import (
     print_notes,
 )
 from sros_tool.cli.observing import FOREVER, observe, observer_environment, why_empty
+from sros_tool.cli.policy import notes_json, right_json
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
@@ -245,9 +246,9 @@ def _show(
                 "changed": plan.changes,
                 "dry_run": dry_run,
                 **to_json(observation),
-                "added": [_right_json(each) for each in plan.added],
+                "added": [right_json(each) for each in plan.added],
                 "copied": sorted(plan.copies),
-                "notes": [{"id": each.id, "text": each.text} for each in notes],
+                "notes": notes_json(notes),
             }
         )
         return
@@ -268,15 +269,6 @@ def _show(
     if plan.copies:
         click.echo(f"{would}copied {', '.join(sorted(plan.copies))} beside it")
     print_notes(notes)
-
-
-def _right_json(right: Any) -> dict[str, str]:
-    return {
-        "enclave": right.enclave,
-        "kind": right.kind,
-        "right": right.right,
-        "name": right.name,
-    }
 
 
 def _count(number: int, thing: str) -> str:

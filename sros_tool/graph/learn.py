@@ -87,6 +87,8 @@ def learn(observation: Observation, common: CommonParts | None = None) -> Learne
         remarks.add("root-enclave", str(len(seen)))
     profiles = []
     for place, found in sorted(seen.items()):
+        if not found:
+            continue
         _, ns, name = place
         rights = frozenset(found)
         includes, rest = common.choose(rights, ns, name) if common else ((), rights)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import os
-import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from sros_tool.atomic import replace_file
 from sros_tool.errors import DocumentError, PolicyError
 from sros_tool.graph.common import CommonParts
 from sros_tool.graph.document import render, with_includes
@@ -81,14 +81,12 @@ def write(plan: Draft) -> None:
     """
     if not plan.changes:
         return
-    target = Path(os.path.realpath(plan.path))  # a link stays a link
-    mode = None if plan.before is None else target.stat().st_mode & 0o7777
     copied: list[Path] = []
     try:
         for path, data in plan.copies.items():
             copied += _put_new(plan.path.parent / path, data)
         _check(plan)
-        _replace(target, plan.document, mode)
+        replace_file(plan.path, plan.document)
     except BaseException:
         for made in reversed(copied):
             with contextlib.suppress(OSError):
@@ -113,28 +111,5 @@ def _put_new(path: Path, data: bytes) -> list[Path]:
     """Create a file with the folders that it lacks; returns all of them, the folders first."""
     made = [each for each in reversed(path.parents) if not each.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
-    _replace(path, data, None)
+    replace_file(path, data)
     return [*made, path]
-
-
-def _replace(target: Path, data: bytes, mode: int | None) -> None:
-    """Let ``target`` hold ``data``: at once, and on disk before that; a new file if no ``mode``."""
-    stage = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
-    handle = os.open(stage, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666 if mode is None else 0o600)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            if mode is not None:
-                os.fchmod(file.fileno(), mode)
-            file.flush()
-            os.fsync(file.fileno())
-        stage.replace(target)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            stage.unlink()
-        raise
-    folder = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)

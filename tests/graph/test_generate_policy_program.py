@@ -1,0 +1,116 @@
+"""``sros generate_policy`` without a graph: its words, its logs, and what it does without rclpy."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from harness import sros
+
+from sros_tool.policy import read_policy
+from sros_tool.policy.rights import policy_rights
+
+LOG = Path(__file__).with_name("logs") / "fastdds_2.9.1.log"
+CYCLONE = LOG.with_name("cyclone_0.10.2.log")
+
+
+@pytest.fixture
+def no_rclpy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+
+
+@pytest.mark.usefixtures("no_rclpy")
+def test_without_rclpy_one_paragraph_says_what_to_install(tmp_path: Path) -> None:
+    ended = sros("generate_policy", tmp_path / "robot.xml")
+    assert (ended.status, ended.out) == (1, "")
+    assert ended.err.count("\n") == 1
+    assert ended.err.startswith("Unable to generate policy: rclpy is not installed")
+    assert "pip install 'sros_tool[ros]'" in ended.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_every_module_of_the_graph_can_be_imported_without_rclpy() -> None:
+    code = (
+        "import sys, pkgutil, importlib, sros_tool.graph as graph\n"
+        "sys.modules['rclpy'] = None\n"
+        "for each in pkgutil.iter_modules(graph.__path__):\n"
+        "    importlib.import_module(f'sros_tool.graph.{each.name}')\n"
+        "import sros_tool.cli.generate_policy\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+@pytest.mark.usefixtures("no_rclpy")
+def test_a_policy_that_is_broken_is_found_before_anything_else(tmp_path: Path) -> None:
+    path = tmp_path / "robot.xml"
+    path.write_text("<policy>")
+    ended = sros("generate_policy", path, "--watch", "10m")
+    assert ended.status == 1
+    assert "not well-formed" in ended.err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "no file is named"),
+        (("nowhere/robot.xml",), "the folder 'nowhere' does not exist"),
+        (("robot.xml", "--node", "/n"), "--node is for --from-log only"),
+        (("robot.xml", "--keystore", "ks"), "--keystore is given without --enclave"),
+        (("robot.xml", "--enclave", "/a"), "no keystore is named"),
+        (("robot.xml", "--domain", "x"), "not a domain id"),
+        (("robot.xml", "--watch", "5 minutes"), "5 minutes"),
+        (("robot.xml", "--from-log", "gone.log"), "the log 'gone.log' does not exist"),
+    ],
+)
+def test_wrong_usage(tmp_path: Path, words: tuple[str, ...], said: str) -> None:
+    ended = sros("generate_policy", *words, cwd=tmp_path)
+    assert ended.status == 2
+    assert said in ended.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_rules_that_logs_ask_for_go_to_stdout() -> None:
+    ended = sros("generate_policy", "--enclave", "/robot", "--node", "/hall/arm", "--from-log", LOG)
+    assert ended.status == 0
+    assert '<profile ns="/hall" node="arm">' in ended.out
+    assert "<service>/add</service>" in ended.out
+    assert "note [log.denied-by-rule]" in ended.err
+
+
+def test_or_into_a_file(tmp_path: Path) -> None:
+    words = ("--enclave", "/robot", "--from-log", LOG, CYCLONE)
+    path = tmp_path / "robot.xml"
+    first = sros("generate_policy", path, *words).ok()
+    assert "wrote" in first.out
+    assert {f"{each.right} {each.name}" for each in policy_rights(read_policy(path))} == {
+        "publish /nope",
+        "subscribe /chatter",
+        "request /add",
+        "call /fibonacci",
+    }
+    before = path.read_bytes()
+    second = sros("generate_policy", path, *words, "--json").ok()
+    assert json.loads(second.out)["changed"] is False
+    assert path.read_bytes() == before
+
+
+def test_a_dry_run_of_a_log_writes_nothing(tmp_path: Path) -> None:
+    words = ("--enclave", "/robot", "--from-log", LOG, "--dry-run")
+    ended = sros("generate_policy", tmp_path / "robot.xml", *words).ok()
+    assert "would have written" in ended.out
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_log_without_denials(tmp_path: Path) -> None:
+    (tmp_path / "quiet.log").write_text("[INFO] [talker]: Publishing: 'Hello World: 1'\n")
+    ended = sros("generate_policy", "--from-log", tmp_path / "quiet.log")
+    assert (ended.status, ended.err) == (1, "The logs tell of no denial.\n")
+
+
+def test_the_enclave_has_to_be_known() -> None:
+    ended = sros("generate_policy", "--from-log", LOG)
+    assert ended.status == 2
+    assert "Name it with --enclave." in ended.err

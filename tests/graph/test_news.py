@@ -1,0 +1,20 @@
+"""A watch tells every new thing once, and nothing that every node has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from graphs import graph, node
+
+from sros_tool.graph.common import common_parts
+from sros_tool.graph.news import News
+from sros_tool.resources import policies_dir
+
+
+def test_each_new_thing_is_one_line(tmp_path: Path) -> None:
+    news = News(common_parts(tmp_path, policies_dir()))
+    first = graph(node("/talker", "publish chatter", like="python"))
+    second = graph(node("/talker", "publish chatter", "call /fib", like="c++"))
+    assert news.lines(first) == ["new: /talker (/robot)", "new: /talker (/robot) publish /chatter"]
+    assert news.lines(first) == []
+    assert news.lines(second) == ["new: /talker (/robot) call /fib"]

@@ -1,0 +1,69 @@
+"""Looks at a graph add up, and processes stay apart."""
+
+from __future__ import annotations
+
+from graphs import graph, node
+
+from sros_tool.graph.observation import (
+    Endpoint,
+    Observation,
+    from_json,
+    make_observation,
+    to_json,
+)
+
+
+def test_the_union_keeps_nodes_and_endpoints_that_were_gone() -> None:
+    before = graph(node("/a", "publish x"), node("/b", "publish y", participant="p2"))
+    after = graph(node("/a", "subscribe z"))
+    (a, b) = before.union(after).nodes
+    assert a.endpoints == {Endpoint("rt/x", "publish"), Endpoint("rt/z", "subscribe")}
+    assert b.name == "b"
+
+
+def test_the_union_does_not_depend_on_the_order() -> None:
+    looks = [
+        graph(node("/a", "publish x")),
+        graph(node("/a", "call fib"), node("/n/b", "reply s")),
+        graph(node("/a", "publish x", participant="p2", enclave="/other")),
+    ]
+    forward, backward = Observation(), Observation()
+    for each in looks:
+        forward = forward.union(each)
+    for each in reversed(looks):
+        backward = backward.union(each)
+    assert forward == backward
+    assert forward.union(forward) == forward
+
+
+def test_nodes_of_one_name_in_two_processes_stay_two() -> None:
+    both = graph(node("/a", "publish x")).union(graph(node("/a", "publish y", participant="p2")))
+    assert [each.endpoints for each in both.nodes] == [
+        {Endpoint("rt/x", "publish")},
+        {Endpoint("rt/y", "publish")},
+    ]
+
+
+def test_a_second_look_can_tell_the_enclave() -> None:
+    unclear = graph(node("/a", "publish x", enclave=("/one", "/two")))
+    clear = graph(node("/a", "publish x", enclave="/two"))
+    assert [each.enclaves for each in unclear.union(clear).nodes] == [("/two",)]
+    assert [each.enclaves for each in clear.union(unclear).nodes] == [("/two",)]
+
+
+def test_an_endpoint_that_found_its_node_is_no_stray() -> None:
+    stray = make_observation((), strays=[("p1", Endpoint("rt/x", "publish"))])
+    both = stray.union(graph(node("/a", "publish x")))
+    assert both.strays == frozenset()
+    assert stray.union(graph(node("/b", "publish x", participant="p2"))).strays
+
+
+def test_a_node_that_spoke_later_is_not_silent() -> None:
+    silent = make_observation((), silent=[("/robot", "/", "a")])
+    assert silent.union(graph(node("/a", "publish x"))).silent == frozenset()
+    assert silent.union(graph(node("/b", "publish x"))).silent
+
+
+def test_json_gives_the_same_back() -> None:
+    seen = graph(node("/a", "publish x", "call fib"), node("/n/b", "reply s", participant="p2"))
+    assert from_json(to_json(seen)) == seen

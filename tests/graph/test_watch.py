@@ -1,0 +1,110 @@
+"""When a graph is complete, and what a watch keeps and tells, by a clock of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from graphs import graph, node
+
+from sros_tool.graph.observation import Observation
+from sros_tool.graph.watch import Settling, look_for, settle, watch
+
+ONE = graph(node("/a", "publish x"))
+TWO = graph(node("/a", "publish x"), node("/b", "publish y", participant="p2"))
+SETTLING = Settling(least=2.0, still=1.0, most=10.0)
+
+
+@dataclass
+class Script:
+    """A graph that changes at the given moments, and the clock by which it does."""
+
+    changes: Sequence[tuple[float, Observation]]
+    now: float = 100.0
+    begin: float = 100.0
+    _told: int = field(default=0)
+
+    def clock(self) -> float:
+        return self.now
+
+    def next(self, seconds: float) -> Observation | None:
+        if self._told < len(self.changes):
+            at, seen = self.changes[self._told]
+            if self.begin + at <= self.now + seconds:
+                self.now = max(self.now, self.begin + at)
+                self._told += 1
+                return seen
+        self.now += seconds
+        return None
+
+
+def test_a_still_graph_takes_the_least_time() -> None:
+    script = Script([(0.1, ONE)])
+    snapshot = settle(script, SETTLING, script.clock)
+    assert snapshot.observation == ONE
+    assert snapshot.settled
+    assert 2.0 <= snapshot.seconds < 2.3
+
+
+def test_a_late_change_is_waited_for() -> None:
+    script = Script([(0.1, ONE), (1.9, TWO)])
+    snapshot = settle(script, SETTLING, script.clock)
+    assert snapshot.observation == TWO
+    assert 2.9 <= snapshot.seconds < 3.3
+
+
+def test_the_snapshot_is_the_graph_as_it_is_now() -> None:
+    script = Script([(0.1, TWO), (0.5, ONE)])
+    assert settle(script, SETTLING, script.clock).observation == ONE
+
+
+def test_a_graph_that_never_rests_ends_at_last() -> None:
+    script = Script([(each / 2, (ONE, TWO)[each % 2]) for each in range(1, 100)])
+    snapshot = settle(script, SETTLING, script.clock)
+    assert not snapshot.settled
+    assert 10.0 <= snapshot.seconds < 10.6
+
+
+def test_a_given_time_is_kept() -> None:
+    script = Script([(0.1, ONE), (4.0, TWO)])
+    assert look_for(script, 3.0, script.clock).observation == ONE
+    assert abs(script.now - 103.0) < 0.01
+
+
+def test_a_watch_keeps_what_was_gone_and_tells_it_once() -> None:
+    passing = graph(node("/p", "publish z", participant="p9"))
+    script = Script([(0.1, ONE), (3.0, ONE.union(passing)), (5.0, ONE), (7.0, TWO)])
+    told: list[Observation] = []
+    snapshot = watch(script, 10.0, script.clock, stop=lambda: False, tell=told.append)
+    assert snapshot.observation == TWO.union(passing)
+    assert told == [ONE, ONE.union(passing), TWO.union(passing)]
+
+
+def test_what_is_half_discovered_is_not_told_for_a_moment() -> None:
+    half = graph(node("/a"))
+    script = Script([(0.1, half), (0.3, ONE)])
+    told: list[Observation] = []
+    watch(script, 3.0, script.clock, stop=lambda: False, tell=told.append)
+    assert told == [ONE]
+
+
+def test_a_restless_graph_is_told_nevertheless() -> None:
+    grown = Observation()
+    changes = []
+    for each in range(1, 40):
+        grown = grown.union(graph(node("/a", f"publish t{each}")))
+        changes.append((each * 0.3, grown))
+    script = Script(changes)
+    told: list[Observation] = []
+    watch(script, 12.0, script.clock, stop=lambda: False, tell=told.append)
+    assert len(told) >= 4
+
+
+def test_a_watch_ends_when_it_is_told_to() -> None:
+    script = Script([(0.1, ONE)])
+    told: list[Observation] = []
+    stop = lambda: script.now > 101.0  # noqa: E731
+    snapshot = watch(script, None, script.clock, stop=stop, tell=told.append)
+    assert snapshot.observation == ONE
+    assert snapshot.seconds < 1.5
+    assert told == [ONE]
