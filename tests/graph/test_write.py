@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 from graphs import graph, node
 
+from sros_tool.atomic import replace_file
 from sros_tool.errors import DocumentError, PolicyError
-from sros_tool.graph import write as write_module
 from sros_tool.graph.common import common_parts
+from sros_tool.graph.document import render
 from sros_tool.graph.learn import Learned, learn
 from sros_tool.graph.observation import Observation
 from sros_tool.graph.write import draft, write
@@ -125,14 +126,13 @@ def test_what_fails_at_the_last_step_leaves_nothing(
     if exists:
         save(path, ROBOT, flat=True)
     before = path.read_bytes() if exists else b""
-    real = write_module.replace_file
 
     def full_disk(target: Path, data: bytes) -> None:
         if target == path:
             raise OSError(28, "No space left on device", str(target))
-        real(target, data)
+        replace_file(target, data)
 
-    monkeypatch.setattr(write_module, "replace_file", full_disk)
+    monkeypatch.setattr("sros_tool.graph.write.replace_file", full_disk)
     with pytest.raises(OSError, match="No space"):
         save(path, MORE)
     assert {each.name for each in tmp_path.iterdir()} == ({"robot.xml"} if exists else set())
@@ -144,8 +144,9 @@ def test_a_result_that_says_something_else_is_not_written(
 ) -> None:
     """Whatever goes wrong between a value and its text, the file is not replaced by it."""
     path = tmp_path / "robot.xml"
-    real = write_module.render
-    monkeypatch.setattr(write_module, "render", lambda found: real(found).replace(b"chatter", b"*"))
+    monkeypatch.setattr(
+        "sros_tool.graph.write.render", lambda found: render(found).replace(b"chatter", b"*")
+    )
     with pytest.raises(PolicyError, match="cannot be written"):
         save(path, ROBOT)
     assert list(tmp_path.iterdir()) == []
@@ -153,7 +154,7 @@ def test_a_result_that_says_something_else_is_not_written(
 
 def test_folders_that_were_there_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "common").mkdir()
-    monkeypatch.setattr(write_module, "render", lambda _: b"<policy")
+    monkeypatch.setattr("sros_tool.graph.write.render", lambda _: b"<policy")
     with pytest.raises(PolicyError):
         save(tmp_path / "robot.xml", ROBOT)
     assert [each.name for each in tmp_path.iterdir()] == ["common"]

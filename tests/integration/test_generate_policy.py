@@ -478,7 +478,7 @@ def refused(keystore: Path, enclave: str, endpoints: Iterable[Endpoint]) -> set[
     )
     assert done.returncode == 0, done.stderr
     answers = json.loads(done.stdout.splitlines()[-1])
-    return {tuple(q) for q, said in zip(questions, answers, strict=True) if said == "refused"}
+    return {asked for asked, said in zip(questions, answers, strict=True) if said == "refused"}
 
 
 def heard(keystore: Path, topic: str, talker: str, listener: str) -> dict[str, Any]:
