@@ -216,7 +216,7 @@ def create_enclave(words: tuple[str, ...], dry_run: bool) -> None:
     root, names = split_root(words)
     if not names:
         raise UsageError("no enclave is named", "", "Name one or more, such as /talker.")
-    with _progress(len(names)) as step:
+    with progress_bar(len(names)) as step:
         result = create_enclaves(
             root,
             names,
@@ -322,7 +322,7 @@ def generate_artifacts(
     policies = [read_policy(path) for path in policy_files]
     template = load_template(template_name)
     total = len(enclaves) + sum(len(policy.enclaves) for policy in policies)
-    with _progress(total) as step:
+    with progress_bar(total) as step:
         result = generate(
             root,
             enclaves=enclaves,
@@ -341,7 +341,7 @@ def generate_artifacts(
 
 
 @contextmanager
-def _progress(total: int) -> Iterator[Callable[[str], None] | None]:
+def progress_bar(total: int) -> Iterator[Callable[[str], None] | None]:
     """A progress bar on a terminal, where there is enough to wait for."""
     if total < 50 or not sys.stderr.isatty():
         yield None

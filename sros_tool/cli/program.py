@@ -31,6 +31,12 @@ FAMILIES: dict[str, dict[str, Verb]] = {
         ),
         "inspect": Verb("inspect", "Show what a keystore, certificate or document says."),
     },
+    "Life of keys": {
+        "renew": Verb("life", "Renew certificates and permissions of enclaves."),
+        "revoke": Verb("life", "Revoke enclaves."),
+        "crl": Verb("life", "Show the revocation list, or sign it anew."),
+        "check": Verb("life", "Say which enclaves need to be renewed."),
+    },
     "Policy": {
         "generate_policy": Verb("generate_policy", "Learn a policy from the running robot."),
         "merge_policy": Verb("policy", "Add the rights of policies to a policy file."),

@@ -120,12 +120,15 @@ def load_authorities(
     root: Path, template: Template, keyring: Keyring, now: datetime
 ) -> Authorities:
     """Both authorities of a keystore, with their keys, checked and ready to sign."""
-    identity = _load(root, IDENTITY, template, keyring, now)
-    permissions = _load(root, PERMISSIONS, template, keyring, now)
+    identity = load_authority(root, IDENTITY, template, keyring, now)
+    permissions = load_authority(root, PERMISSIONS, template, keyring, now)
     return Authorities(identity, permissions)
 
 
-def _load(root: Path, role: str, template: Template, keyring: Keyring, now: datetime) -> Authority:
+def load_authority(
+    root: Path, role: str, template: Template, keyring: Keyring, now: datetime
+) -> Authority:
+    """The identity or permissions CA of a keystore, with its key, checked and ready to sign."""
     if not (root / ca_certificate(role)).exists() and not (root / ca_key(role)).exists():
         raise KeystoreError(
             f"keystore '{root}' has no {role} CA",

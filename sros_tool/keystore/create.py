@@ -31,6 +31,7 @@ from sros_tool.keystore.layout import (
     enclave_names,
     is_keystore,
 )
+from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
 from sros_tool.keystore.open import check_domain, load_governance, load_settings
 from sros_tool.keystore.template import Template, render_template
 from sros_tool.keystore.transaction import Change, Transaction, tidy
@@ -80,7 +81,8 @@ def create_keystore(
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
         _check_free(root)  # another process may have been faster
         domains = domains or DomainSet.of((0, 0))
-        _write_keystore(transaction, template, domains, keyring, now)
+        _, entries = _write_keystore(transaction, template, domains, keyring, now)
+        append(transaction, entries)
         transaction.commit()
     return Result(root, template, domains, True, changes=tuple(transaction.changes))
 
@@ -209,7 +211,7 @@ def _produce(
             template = create
             domains = domains or DomainSet.of((0 if domain is None else domain,) * 2)
             check_domain(domains, domain, root)
-            authorities = _write_keystore(transaction, template, domains, keyring, now)
+            authorities, entries = _write_keystore(transaction, template, domains, keyring, now)
             existing: tuple[str, ...] = ()
         else:
             template = load_settings(root)
@@ -217,8 +219,10 @@ def _produce(
             domains = load_governance(root, authorities.permissions.certificate).domains().closed()
             check_domain(domains, domain, root)
             existing = tuple(enclave_names(root))
+            entries = []
         registrar = Registrar(transaction, authorities, template, domains, now)
         outcomes = registrar.register_all(list(wanted.items()), progress)
+        append(transaction, [*entries, *(e for outcome in outcomes for e in outcome.entries)])
         transaction.commit()
     fates = {name: fate for outcome in outcomes for name, fate in outcome.fates}
     of = {fate: tuple(name for name in fates if fates[name] is fate) for fate in Fate}
@@ -243,28 +247,30 @@ def _write_keystore(
     domains: DomainSet,
     keyring: Keyring,
     now: datetime,
-) -> Authorities:
+) -> tuple[Authorities, list[Entry]]:
     authorities = create_authorities(transaction, template, keyring, now)
-    write_governance(transaction, authorities.permissions, template, domains)
+    distinct = dict.fromkeys((authorities.identity, authorities.permissions))
+    entries = [certificate_entry(now, "ca", each.certificate) for each in distinct]
+    message = write_governance(transaction, authorities.permissions, template, domains)
+    entries.append(document_entry(now, "governance", message))
     transaction.write(
         SETTINGS,
         b"# The choices by which sros made this keystore; what is added later follows them.\n"
         + render_template(keyring.remembered(template)).encode(),
     )
-    return authorities
+    return authorities, entries
 
 
 def write_governance(
     transaction: Transaction, authority: Authority, template: Template, domains: DomainSet
-) -> None:
-    """Stage the governance document of a keystore, signed, and its readable form."""
+) -> bytes:
+    """Stage the governance document of a keystore, with its readable form; the signed one."""
     governance = governance_for(template.protection, domains)
     document = render_governance(governance)
+    message = authority.sign(document, governance, parse_governance, "the governance document")
     transaction.write(GOVERNANCE_XML, document)
-    transaction.write(
-        GOVERNANCE_P7S,
-        authority.sign(document, governance, parse_governance, "the governance document"),
-    )
+    transaction.write(GOVERNANCE_P7S, message)
+    return message
 
 
 # ── what is checked first ──────────────────────────────────────────────────────────────────

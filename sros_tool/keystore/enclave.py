@@ -17,13 +17,14 @@ from sros_tool.dds.portable import document_notes
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.authority import Authorities
 from sros_tool.keystore.defaults import default_enclave
-from sros_tool.keystore.layout import ENCLAVES, IDENTITY, PERMISSIONS, PUBLIC, enclave_folder
+from sros_tool.keystore.layout import CRL, ENCLAVES, IDENTITY, PERMISSIONS, PUBLIC, enclave_folder
+from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
 from sros_tool.keystore.parallel import in_shares
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.notes import Note
 from sros_tool.pki.certificates import (
-    common_name,
+    enclave_subject,
     issued_by,
     load_certificate,
     pem,
@@ -53,11 +54,12 @@ Progress = Callable[[str], None]
 
 @dataclass(slots=True)
 class Outcome:
-    """What became of each enclave of a share, the remarks on it, and the files it staged."""
+    """What became of each enclave of a share, with remarks, staged files and ledger entries."""
 
     fates: list[tuple[str, Fate]]
     notes: list[Note]
     changes: list[Change]
+    entries: list[Entry]
 
 
 class Registrar:
@@ -82,6 +84,8 @@ class Registrar:
             validity_of(authorities.permissions.certificate)
         )
         self._notes: list[Note] = []
+        self._entries: list[Entry] = []
+        self._has_crl = (transaction.root / CRL).exists()
 
     def register_all(
         self, wanted: Sequence[tuple[str, Enclave | None]], progress: Progress | None
@@ -97,7 +101,8 @@ class Registrar:
                 fates.append((name, self._register(name, enclave)))
                 if progress and os.getpid() == own:
                     progress(name)
-            return Outcome(fates, self._notes, self._transaction.changes[before:])
+            changes = self._transaction.changes[before:]
+            return Outcome(fates, self._notes, changes, self._entries)
 
         # A session with a token does not survive a fork.
         keys = (self._authorities.identity.key, self._authorities.permissions.key)
@@ -153,8 +158,10 @@ class Registrar:
             new = generate_key()
             public = new.public_key()
             self._transaction.write(f"{folder}/key.pem", key_pem(new), private=True)
-        certificate = self._issuer.issue(common_name(name), public, self._certificate_validity)
+        subject = enclave_subject(name, unique=self._template.unique_subject)
+        certificate = self._issuer.issue(subject, public, self._certificate_validity)
         self._transaction.write(f"{folder}/cert.pem", pem(certificate))
+        self._entries.append(certificate_entry(self._now, "certificate", certificate, name))
         return certificate
 
     def _existing(self, name: str, folder: str) -> x509.Certificate:
@@ -185,6 +192,8 @@ class Registrar:
                 self._transaction.link(f"{folder}/{name}", f"{up}../{PUBLIC}/{name}")
         if "governance.p7s" not in present and folder != ENCLAVES:
             self._transaction.link(f"{folder}/governance.p7s", f"{up}governance.p7s")
+        if self._has_crl and "crl.pem" not in present:
+            self._transaction.link(f"{folder}/crl.pem", f"{up}../{CRL}")
 
     def _permissions(
         self, name: str, folder: str, policy: Enclave | None, certificate: x509.Certificate
@@ -198,11 +207,10 @@ class Registrar:
                     "ros2/sros2 makes a grant of each, of which DDS reads only the first.",
                 )
             )
+        subject = subject_text(certificate.subject)
+        validity = self._permissions_validity.within(validity_of(certificate))
         permissions = permissions_for(
-            enclave,
-            subject=subject_text(certificate.subject),
-            validity=self._permissions_validity.within(validity_of(certificate)),
-            domains=self._domains,
+            enclave, subject=subject, validity=validity, domains=self._domains
         )
         document = render_permissions(permissions)
         message = self._authorities.permissions.sign(
@@ -210,6 +218,17 @@ class Registrar:
         )
         self._transaction.write(f"{folder}/permissions.xml", document)
         self._transaction.write(f"{folder}/permissions.p7s", message)
+        self._entries.append(
+            document_entry(
+                self._now,
+                "permissions",
+                message,
+                enclave=name,
+                subject=subject,
+                validity=validity,
+                policy=enclave.digest,
+            )
+        )
         self._notes += document_notes(name, permissions, len(message))
 
 

@@ -16,6 +16,11 @@ SETTINGS = "sros.toml"
 IDENTITY, PERMISSIONS = "identity", "permissions"
 ROLES = (IDENTITY, PERMISSIONS)
 
+CRL = f"{PUBLIC}/identity_ca.crl.pem"
+"""The revocation list of the identity CA, once something was revoked."""
+REVOKED = "revoked"
+"""Where the files of revoked enclaves go."""
+
 GOVERNANCE_XML = f"{ENCLAVES}/governance.xml"
 GOVERNANCE_P7S = f"{ENCLAVES}/governance.p7s"
 

@@ -32,7 +32,8 @@ class Template:
     """The choices by which a keystore is made.
 
     Durations count from the moment at which something is created.  ``identity_key`` and
-    ``permissions_key`` name the keys of the CAs by URI, where they are not in the keystore.
+    ``permissions_key`` name the keys of the CAs by URI, where they are not in the keystore.  With
+    ``unique_subject``, the subject of a certificate has a part that no other has.
     """
 
     name: str
@@ -46,6 +47,8 @@ class Template:
     protection: DomainProtection
     identity_key: str = ""
     permissions_key: str = ""
+    unique_subject: bool = False
+    revocation_validity: timedelta = timedelta(days=3650)
 
 
 def template_names() -> tuple[str, ...]:
@@ -94,6 +97,7 @@ def parse_template(text: str, name: str) -> Template:
     authorities = table.table("authorities")
     certificates = table.table("certificates")
     permissions = table.table("permissions")
+    revocation = table.table("revocation")
     template = Template(
         name=table.text("name", name),
         description=table.text("description", ""),
@@ -106,8 +110,10 @@ def parse_template(text: str, name: str) -> Template:
         protection=_protection(table.table("protection")),
         identity_key=authorities.text("identity_key", ""),
         permissions_key=authorities.text("permissions_key", ""),
+        unique_subject=certificates.flag("unique_subject", False),
+        revocation_validity=revocation.duration("validity", "10y"),
     )
-    for part in (authorities, certificates, permissions, table):
+    for part in (authorities, certificates, permissions, revocation, table):
         part.finish()
     return template
 
@@ -129,9 +135,12 @@ def render_template(template: Template) -> str:
         ),
         "\n[certificates]",
         f"validity = {_toml(duration_text(template.certificate_validity))}",
+        f"unique_subject = {_toml(template.unique_subject)}",
         "\n[permissions]",
         f"validity = {_toml(duration_text(template.permissions_validity))}",
         f"default = {_toml(template.default_permissions)}",
+        "\n[revocation]",
+        f"validity = {_toml(duration_text(template.revocation_validity))}",
         "\n[protection]",
         f"rtps = {_toml(protection.rtps)}",
         f"discovery = {_toml(protection.discovery)}",
@@ -273,8 +282,8 @@ class _Table:
             raise _TemplateError(f"{self._at(key)} is {value!r}, not one of {', '.join(allowed)}")
         return Level(value)
 
-    def duration(self, key: str) -> timedelta:
-        value = self.text(key)
+    def duration(self, key: str, default: str | None = None) -> timedelta:
+        value = self.text(key, default)
         try:
             return parse_duration(value)
         except SrosError as error:

@@ -30,6 +30,7 @@ from sros_tool.errors import KeystoreError
 from sros_tool.keystore.layout import ENCLAVES, folder_mode
 
 STAGE = ".sros-transaction"
+_REMOVED = "removed"
 _LOCK_SECONDS = 60.0
 
 
@@ -61,6 +62,7 @@ class Transaction:
         self._staged: set[str] = set()
         self._folders: dict[str, bool] = {}  # whether the folder is there already
         self._undo: list[Callable[[], None]] = []
+        self._removed: list[str] = []
 
     def on_failure(self, undo: Callable[[], None]) -> None:
         """Have ``undo`` called at the end, unless everything was put in place."""
@@ -168,6 +170,16 @@ class Transaction:
         if staged is not None:
             os.symlink(target, staged)
 
+    def remove(self, path: str) -> None:
+        """Have a file or link go, together with the changes of the transaction.
+
+        Folders of which nothing is left go too.
+        """
+        if not self._is_folder(path.rpartition("/")[0]) or not os.path.lexists(self.root / path):
+            raise KeystoreError(f"'{self.root / path}' does not exist")
+        self._removed.append(path)
+        self.changes.append(Change("remove", path))
+
     def _prepare(self, path: str) -> str | None:
         if path in self._staged:
             raise KeystoreError(f"{path} would be written twice")
@@ -223,6 +235,8 @@ class Transaction:
         """Put everything in place; after this it is on the disk."""
         if self.dry_run or not self.changes:
             return
+        if self._removed:
+            (self._stage / _REMOVED).write_text("\0".join(self._removed), encoding="utf-8")
         _flush_file_system(self._stage)
         if self._new_root:
             self._appear()
@@ -276,7 +290,8 @@ class Transaction:
             os.replace(spare, self.root / path)
 
     def _in_existing_folders(self) -> Iterator[str]:
-        return (path for path in sorted(self._staged) if self._folders[path.rpartition("/")[0]])
+        staged = (path for path in self._staged if self._folders[path.rpartition("/")[0]])
+        return iter(sorted([*staged, *self._removed]))
 
 
 def tidy(root: Path) -> None:
@@ -298,6 +313,7 @@ def recover(root: Path) -> None:
     committed = live.is_symlink() and os.readlink(live) == "new"
     if committed:
         _settle(stage / "new", root)
+        _remove(stage / _REMOVED, root)
         _flush_folder(root)
     else:
         for path in _files_below(stage / "old"):
@@ -325,6 +341,20 @@ def _settle(source: Path, target: Path) -> None:
                 _settle(Path(entry.path), place)
             else:
                 os.rename(entry.path, place)
+
+
+def _remove(names: Path, root: Path) -> None:
+    """Remove what a file lists, and the folders that are empty then."""
+    if not names.exists():
+        return
+    for name in names.read_text(encoding="utf-8").split("\0"):
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(root / name)
+        folder = name.rpartition("/")[0]
+        with contextlib.suppress(OSError):  # it is not empty
+            while "/" in folder:
+                os.rmdir(root / folder)
+                folder = folder.rpartition("/")[0]
 
 
 def _turn(stage: Path, to: str) -> None:

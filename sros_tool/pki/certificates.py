@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import secrets
+
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
@@ -43,6 +45,20 @@ _A_CA = x509.BasicConstraints(ca=True, path_length=1)
 def common_name(text: str) -> x509.Name:
     """The distinguished name ``CN=text``, all that a portable subject consists of."""
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
+
+
+def enclave_subject(name: str, *, unique: bool) -> x509.Name:
+    """The subject of an enclave's certificate: its name, and perhaps a part that no other has.
+
+    With the part, permissions made for another subject never fit: not those of an enclave whose
+    name contains this one's (Cyclone DDS compares parts), and not those of an earlier certificate.
+    RFC 4514 text of this order of parts, CN first, is what Fast DDS 2.9.1 and Cyclone DDS 0.10.2
+    both compare with.
+    """
+    if not unique:
+        return common_name(name)
+    part = x509.NameAttribute(NameOID.ORGANIZATIONAL_UNIT_NAME, secrets.token_hex(8))
+    return x509.Name([part, x509.NameAttribute(NameOID.COMMON_NAME, name)])
 
 
 def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certificate:

@@ -6,6 +6,7 @@ another document (a moved node of lxml can crash the interpreter).
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 from collections.abc import Iterator
@@ -41,6 +42,11 @@ class Includer:
     root: Path
     _documents: dict[Path, etree._Element] = field(default_factory=dict)
     _count: int = 0
+    _digests: list[bytes] = field(default_factory=list)
+
+    def digest(self) -> str:
+        """The SHA-256, hexadecimal, of all documents read so far, whatever their order."""
+        return hashlib.sha256(b"".join(sorted(self._digests))).hexdigest()
 
     def load(self, file: Path) -> etree._Element:
         """The root element of a document (its real path)."""
@@ -51,6 +57,7 @@ class Includer:
     def hold(self, file: Path, content: bytes) -> None:
         """Take ``content`` for what the file (its real path) holds, wherever it is included."""
         self._documents[file] = parse(content, f"the policy file '{file}'")
+        self._digests.append(hashlib.sha256(content).digest())
 
     def children(
         self, parent: etree._Element, place: Place

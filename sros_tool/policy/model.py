@@ -79,11 +79,15 @@ class Profiles:
 
 @dataclass(frozen=True, slots=True)
 class Enclave:
-    """What the processes of one enclave may do."""
+    """What the processes of one enclave may do.
+
+    ``digest`` is the SHA-256 of the policy file that it was read from, with its includes.
+    """
 
     path: str
     profiles: tuple[Profiles, ...]
     source: Source = field(default=_NOWHERE, compare=False)
+    digest: str = field(default="", compare=False)
 
     def all_profiles(self) -> tuple[Profile, ...]:
         """Every profile of the enclave, in order."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
 from lxml import etree
@@ -89,7 +90,9 @@ class _Reader:
             enclaves[enclave.path] = enclave
         if not enclaves:
             raise PolicyError(f"{where}: the policy has no enclave")
-        return Policy(tuple(enclaves.values()), version, str(self._shown))
+        digest = self._includer.digest()
+        read = tuple(replace(enclave, digest=digest) for enclave in enclaves.values())
+        return Policy(read, version, str(self._shown))
 
     def _enclave(self, element: etree._Element, place: Place) -> Enclave:
         self._attributes(element, place, required=("path",))

@@ -1,0 +1,240 @@
+"""The verbs for the life of keys: renewing, revoking, and knowing when it is time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from sros_tool.cli.common import (
+    PATH,
+    complete_keystore_and_enclave,
+    dry_run_option,
+    json_option,
+    keystore_from_environment,
+    now,
+    print_json,
+    print_plan,
+    split_root,
+)
+from sros_tool.cli.keystore import progress_bar
+from sros_tool.cli.secrets import keyring
+from sros_tool.errors import UsageError
+
+_MANY = 5
+
+
+@click.command(
+    "renew",
+    epilog="""\b
+Example:
+  $ sros renew keystore /talker
+  renewed enclave /talker
+  $ sros renew keystore --all-expiring 30d""",
+)
+@click.argument(
+    "words",
+    metavar="[ROOT] [NAME...]",
+    nargs=-1,
+    shell_complete=complete_keystore_and_enclave,
+)
+@click.option(
+    "--all-expiring",
+    metavar="DURATION|PERCENT",
+    help="Renew also all that end within 30d, or of whose life 66% is over.",
+)
+@click.option("--new-key", is_flag=True, help="Make new keys, too.")
+@dry_run_option
+def renew(words: tuple[str, ...], all_expiring: str | None, new_key: bool, dry_run: bool) -> None:
+    """Issue new certificates for the enclaves NAME..., and sign their permissions anew.
+
+    The rights stay as they are.  Processes that run go on with what they have loaded; restart
+    them before it ends.
+    """
+    from sros_tool.keystore.renew import parse_threshold
+    from sros_tool.keystore.renew import renew as work
+
+    root, names = split_root(words)
+    if not names and all_expiring is None:
+        raise UsageError("no enclave is named", "", "Name one or more, or give --all-expiring 30d.")
+    threshold = parse_threshold(all_expiring) if all_expiring is not None else None
+    with progress_bar(len(names) or 50) as step:
+        result = work(
+            root,
+            names,
+            now=now(),
+            expiring=threshold,
+            new_key=new_key,
+            keyring=keyring(),
+            dry_run=dry_run,
+            progress=step,
+        )
+    if dry_run:
+        print_plan(root, result.changes)
+        return
+    for name in result.renewed:
+        click.echo(f"renewed enclave {name}")
+    if not result.renewed:
+        click.echo("no enclave needs to be renewed", err=True)
+
+
+@click.command(
+    "revoke",
+    epilog="""\b
+Example:
+  $ sros revoke keystore /talker --reason key_compromise
+  revoked enclave /talker
+  restart the processes of 2 enclaves for it to take effect: /listener, /monitor""",
+)
+@click.argument(
+    "words",
+    metavar="[ROOT] NAME...",
+    nargs=-1,
+    required=True,
+    shell_complete=complete_keystore_and_enclave,
+)
+@click.option(
+    "--reason",
+    default="unspecified",
+    show_default=True,
+    help="Why, in a word of RFC 5280, such as key_compromise, superseded, cessation_of_operation.",
+)
+@dry_run_option
+def revoke(words: tuple[str, ...], reason: str, dry_run: bool) -> None:
+    """Revoke the enclaves NAME...: nobody who reads the new crl.pem talks to them any more.
+
+    Their files move to the folder "revoked" of the keystore.  Exported enclaves need their
+    crl.pem exported again.
+    """
+    from sros_tool.keystore.revoke import revoke as work
+
+    root, names = split_root(words)
+    if not names:
+        raise UsageError("no enclave is named", "", "Name one or more, such as /talker.")
+    words_of_rfc = reason.replace("-", "_").split("_")
+    told = words_of_rfc[0] + "".join(word.capitalize() for word in words_of_rfc[1:])
+    result = work(root, names, now=now(), reason=told, keyring=keyring(), dry_run=dry_run)
+    if dry_run:
+        print_plan(root, result.changes)
+    else:
+        for name in result.revoked:
+            click.echo(f"revoked enclave {name}")
+    _say_restart(result.restart)
+
+
+@click.command(
+    "crl",
+    epilog="""\b
+Example:
+  $ sros crl keystore
+  revocation list 3, until 2036-11-18T06:05:29Z
+    69aa94992b4cf7d761cf3c3e06f16849896e24a3  2026-11-21T07:00:00Z  keyCompromise
+  $ sros crl keystore --refresh""",
+)
+@click.argument("root", type=PATH, required=False)
+@click.option("--refresh", is_flag=True, help="Sign it anew, so that it holds for longer.")
+@json_option
+@dry_run_option
+def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
+    """Show the revocation list of the keystore ROOT, or sign it anew.
+
+    An expired list makes DDS refuse everybody, so the exit status is 1 when it ends within 30
+    days.
+    """
+    from datetime import timedelta
+
+    from sros_tool.keystore.create import list_enclaves
+    from sros_tool.keystore.revoke import read_crl, refresh_crl
+    from sros_tool.validity import iso
+
+    root = root or keystore_from_environment()
+    list_enclaves(root)
+    if refresh:
+        result = refresh_crl(root, now=now(), keyring=keyring(), dry_run=dry_run)
+        if dry_run:
+            print_plan(root, result.changes)
+            return 0
+        _say_restart(result.restart)
+    found = read_crl(root)
+    if found is None:
+        print_json(None) if as_json else click.echo("nothing was ever revoked", err=True)
+        return 0
+    soon = found.next_update - now() < timedelta(days=30)
+    if as_json:
+        print_json(
+            {
+                "number": found.number,
+                "this_update": iso(found.this_update),
+                "next_update": iso(found.next_update),
+                "ends_soon": soon,
+                "revoked": [
+                    {"serial": f"{each.serial:x}", "date": iso(each.date), "reason": each.reason}
+                    for each in found.revoked
+                ],
+            }
+        )
+    else:
+        click.echo(f"revocation list {found.number}, until {iso(found.next_update)}")
+        for each in found.revoked:
+            click.echo(f"  {each.serial:x}  {iso(each.date)}  {each.reason}")
+    if soon:
+        click.echo(
+            f"it ends soon, and DDS then refuses everybody: run `sros crl {root} --refresh`.",
+            err=True,
+        )
+    return 1 if soon else 0
+
+
+@click.command(
+    "check",
+    epilog="""\b
+Example:
+  $ sros check keystore keystore --needs-renewal 66%
+  /talker  permissions until 2027-05-20T05:59:44Z
+  $ sros check keystore keystore --needs-renewal 30d || sros renew keystore --all-expiring 30d""",
+)
+@click.argument("what", type=click.Choice(["keystore"]))
+@click.argument("root", type=PATH, required=False)
+@click.option(
+    "--needs-renewal",
+    default="66%",
+    show_default=True,
+    metavar="DURATION|PERCENT",
+    help="What ends within 30d, or of whose life 66% is over.",
+)
+@json_option
+def check(what: str, root: Path | None, needs_renewal: str, as_json: bool) -> int:
+    """List the enclaves of a keystore that need to be renewed.
+
+    The exit status is 0 if there are none, and 1 if there are.
+    """
+    from sros_tool.keystore.renew import describe_lifetime, lifetimes, parse_threshold
+    from sros_tool.validity import iso
+
+    root = root or keystore_from_environment()
+    threshold, moment = parse_threshold(needs_renewal), now()
+    due = [each for each in lifetimes(root) if each.due(threshold, moment)]
+    if as_json:
+        print_json(
+            [
+                {
+                    "enclave": each.name,
+                    "certificate_until": iso(each.certificate.not_after),
+                    "permissions_until": iso(each.permissions.not_after),
+                }
+                for each in due
+            ]
+        )
+    else:
+        for each in due:
+            click.echo(describe_lifetime(each, moment))
+    return 1 if due else 0
+
+
+def _say_restart(names: tuple[str, ...]) -> None:
+    if not names:
+        return
+    shown = ", ".join(names[:_MANY]) + (", ..." if len(names) > _MANY else "")
+    click.echo(
+        f"restart the processes of {len(names)} enclaves for it to take effect: {shown}", err=True
+    )

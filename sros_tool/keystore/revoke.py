@@ -1,0 +1,181 @@
+"""Revokes enclaves: the list, its way to everybody else, and the files out of the way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from sros_tool.errors import KeystoreError, UsageError
+from sros_tool.keystore.authority import Authority, load_authority
+from sros_tool.keystore.create import list_enclaves
+from sros_tool.keystore.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.layout import (
+    CRL,
+    IDENTITY,
+    OPTIONAL_FILES,
+    REQUIRED_FILES,
+    REVOKED,
+    enclave_folder,
+)
+from sros_tool.keystore.ledger import Entry, append, document_entry
+from sros_tool.keystore.open import load_settings
+from sros_tool.keystore.template import Template
+from sros_tool.keystore.transaction import Change, Transaction, tidy
+from sros_tool.names import check_enclave_name
+from sros_tool.pki.certificates import issued_by, load_certificate, subject_text, validity_of
+from sros_tool.pki.crl import REASONS, RevocationList, Revoked, load_crl, sign_crl
+from sros_tool.validity import BACKDATE, Window, iso
+from sros_tool.xml import read_bytes
+
+_FILES = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml")
+_PRIVATE = "key.pem"
+
+
+@dataclass(frozen=True, slots=True)
+class Revocation:
+    """What was revoked, and until when the list holds.
+
+    ``restart`` are the enclaves whose processes go on trusting the revoked ones until they are
+    started again.
+    """
+
+    root: Path
+    revoked: tuple[str, ...]
+    restart: tuple[str, ...]
+    next_update: datetime
+    changes: tuple[Change, ...]
+
+
+def revoke(
+    root: Path,
+    names: Sequence[str],
+    *,
+    now: datetime,
+    reason: str = "unspecified",
+    keyring: Keyring = IN_KEYSTORE,
+    dry_run: bool = False,
+) -> Revocation:
+    """Revoke the certificates of enclaves and move their files to ``revoked`` in the keystore.
+
+    Every other enclave gets ``crl.pem``, a link to the one list.  ``reason`` is one of `REASONS`.
+    """
+    if reason not in REASONS:
+        raise UsageError(f"{reason!r} is not a reason", f"Reasons are {', '.join(REASONS)}.")
+    if not dry_run:
+        tidy(root)
+    existing = list_enclaves(root)
+    for name in names:
+        check_enclave_name(name)
+        if name not in existing:
+            raise KeystoreError(f"enclave {name} does not exist in keystore '{root}'")
+    with Transaction(root, dry_run=dry_run) as transaction:
+        template = load_settings(root)
+        authority = load_authority(root, IDENTITY, template, keyring, now)
+        old = read_crl(root)
+        revoked = list(old.revoked) if old else []
+        entries: list[Entry] = []
+        for name in dict.fromkeys(names):
+            serial, subject = _move_away(transaction, authority, name)
+            if not (old and old.names(serial)):
+                revoked.append(Revoked(serial, now.replace(microsecond=0), reason))
+            entries.append(
+                Entry(iso(now), "revocation", name, subject, f"{serial:x}", reason=reason)
+            )
+        next_update = _sign(transaction, authority, template, revoked, old, now, entries)
+        remaining = tuple(name for name in existing if name not in names)
+        _link_everywhere(transaction, remaining)
+        append(transaction, entries)
+        transaction.commit()
+    return Revocation(
+        root, tuple(dict.fromkeys(names)), remaining, next_update, tuple(transaction.changes)
+    )
+
+
+def refresh_crl(
+    root: Path, *, now: datetime, keyring: Keyring = IN_KEYSTORE, dry_run: bool = False
+) -> Revocation:
+    """Sign the revocation list anew, so that it holds for longer; what it revokes is kept."""
+    if not dry_run:
+        tidy(root)
+    existing = list_enclaves(root)
+    with Transaction(root, dry_run=dry_run) as transaction:
+        template = load_settings(root)
+        authority = load_authority(root, IDENTITY, template, keyring, now)
+        old = read_crl(root)
+        entries: list[Entry] = []
+        revoked = list(old.revoked) if old else []
+        next_update = _sign(transaction, authority, template, revoked, old, now, entries)
+        _link_everywhere(transaction, existing)
+        append(transaction, entries)
+        transaction.commit()
+    return Revocation(root, (), existing, next_update, tuple(transaction.changes))
+
+
+def read_crl(root: Path) -> RevocationList | None:
+    """The revocation list of a keystore, or None if nothing was ever revoked."""
+    path = root / CRL
+    if not path.exists():
+        return None
+    return load_crl(read_bytes(path, "revocation list"), f"'{path}'")
+
+
+def _move_away(transaction: Transaction, authority: Authority, name: str) -> tuple[int, str]:
+    """Have the files of an enclave moved; the serial number and subject of its certificate."""
+    folder = enclave_folder(name)
+    path = transaction.root / folder / "cert.pem"
+    certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+    if not issued_by(certificate, authority.certificate):
+        raise KeystoreError(
+            f"the certificate of enclave {name} was not issued by the identity CA of this keystore",
+            "Only its own CA can revoke it.",
+        )
+    serial = certificate.serial_number
+    target = f"{REVOKED}/{serial:x}"
+    for file in _FILES:
+        source = transaction.root / folder / file
+        if name == "/" and file == "governance.p7s":
+            continue  # of the enclave / this is the keystore's own
+        if not source.is_symlink() and not source.exists():
+            continue
+        if not source.is_symlink():
+            data = read_bytes(source, "file")
+            transaction.write(f"{target}/{file}", data, private=file == _PRIVATE)
+        transaction.remove(f"{folder}/{file}")
+    return serial, subject_text(certificate.subject)
+
+
+def _sign(
+    transaction: Transaction,
+    authority: Authority,
+    template: Template,
+    revoked: list[Revoked],
+    old: RevocationList | None,
+    now: datetime,
+    entries: list[Entry],
+) -> datetime:
+    """Stage the list; it ends with its CA at the latest.  An expired one locks everybody out."""
+    moment = now.replace(microsecond=0)
+    end = min(moment + template.revocation_validity, validity_of(authority.certificate).not_after)
+    begin = max(moment - BACKDATE, validity_of(authority.certificate).not_before)
+    document = sign_crl(
+        authority.certificate,
+        authority.key,
+        revoked,
+        number=old.number + 1 if old else 1,
+        this_update=begin,
+        next_update=end,
+    )
+    transaction.write(CRL, document)
+    entries.append(document_entry(now, "crl", document, validity=Window(begin, end)))
+    return end
+
+
+def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
+    for name in names:
+        folder = enclave_folder(name)
+        path = transaction.root / folder / "crl.pem"
+        if not path.is_symlink() and not path.exists():
+            up = "../" * folder.count("/")
+            transaction.link(f"{folder}/crl.pem", f"{up}../{CRL}")

@@ -1,0 +1,107 @@
+"""Certificate revocation lists (RFC 5280, section 5) of an identity CA."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from datetime import datetime
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+
+from sros_tool.errors import PkiError
+from sros_tool.pki.certificates import authority_identifier
+from sros_tool.pki.keys import PrivateKey
+
+REASONS = tuple(
+    flag.value
+    for flag in x509.ReasonFlags
+    # Not reasons of a whole certificate: remove_from_crl belongs to delta lists.
+    if flag not in (x509.ReasonFlags.remove_from_crl,)
+)
+"""The reasons that a revocation can have, in the words of RFC 5280."""
+
+
+@dataclass(frozen=True, slots=True)
+class Revoked:
+    """One revoked certificate; ``reason`` is one of `REASONS`."""
+
+    serial: int
+    date: datetime
+    reason: str = "unspecified"
+
+
+@dataclass(frozen=True, slots=True)
+class RevocationList:
+    """A revocation list as it was read."""
+
+    number: int
+    this_update: datetime
+    next_update: datetime
+    revoked: tuple[Revoked, ...]
+    list: x509.CertificateRevocationList
+
+    def names(self, serial: int) -> bool:
+        """Whether the certificate of that serial number is revoked."""
+        return any(each.serial == serial for each in self.revoked)
+
+
+def sign_crl(
+    issuer: x509.Certificate,
+    key: PrivateKey,
+    revoked: Iterable[Revoked],
+    *,
+    number: int,
+    this_update: datetime,
+    next_update: datetime,
+) -> bytes:
+    """A revocation list as PEM, signed by ``key`` of ``issuer``."""
+    builder = (
+        x509.CertificateRevocationListBuilder()
+        .issuer_name(issuer.subject)
+        .last_update(this_update)
+        .next_update(next_update)
+        .add_extension(x509.CRLNumber(number), critical=False)
+        .add_extension(authority_identifier(issuer), critical=False)
+    )
+    for each in revoked:
+        entry = (
+            x509.RevokedCertificateBuilder().serial_number(each.serial).revocation_date(each.date)
+        )
+        if each.reason != "unspecified":  # RFC 5280 5.3.1: then the reason is left out
+            entry = entry.add_extension(
+                x509.CRLReason(x509.ReasonFlags(each.reason)), critical=False
+            )
+        builder = builder.add_revoked_certificate(entry.build())
+    return builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
+
+
+def load_crl(pem: bytes, name: str) -> RevocationList:
+    """Read a PEM revocation list; ``name`` stands for it in errors."""
+    try:
+        crl = x509.load_pem_x509_crl(pem)
+        revoked = tuple(_revoked(entry) for entry in crl)
+        next_update = crl.next_update_utc
+        if next_update is None:
+            raise ValueError("no next update")
+        return RevocationList(_number(crl), crl.last_update_utc, next_update, revoked, crl)
+    except ValueError as error:
+        raise PkiError(
+            f"the revocation list {name} cannot be read",
+            "It is not a PEM revocation list, or it is damaged; DDS then refuses everybody.",
+        ) from error
+
+
+def _number(crl: x509.CertificateRevocationList) -> int:
+    try:
+        return crl.extensions.get_extension_for_class(x509.CRLNumber).value.crl_number
+    except x509.ExtensionNotFound:
+        return 0
+
+
+def _revoked(entry: x509.RevokedCertificate) -> Revoked:
+    try:
+        reason = entry.extensions.get_extension_for_class(x509.CRLReason).value.reason.value
+    except x509.ExtensionNotFound:
+        reason = "unspecified"
+    return Revoked(entry.serial_number, entry.revocation_date_utc, reason)
