@@ -60,15 +60,16 @@ class _Words(click.Command):
     epilog="""\b
 Example:
   $ sros generate_policy robot.xml
-  wrote 'robot.xml': 2 enclaves, 2 nodes, 24 rights
+  wrote 'robot.xml': 2 enclaves, 2 nodes, 20 rights
   copied common/node/logging.xml, common/node/types.xml, common/rclpy_node.xml beside it
-  $ sros generate_policy robot.xml --watch 10m     while the robot does all that it is to do
-  new: /teleop in enclave /teleop
-  new: /teleop publish /cmd_vel
+  $ sros generate_policy robot.xml --watch 10m
+  watching for 600 s, or until Ctrl-C; then the policy is written
+  new: /talker (/talker_listener/talker)
+  new: /talker (/talker_listener/talker) publish /chatter
   ...
-  $ sros generate_policy robot.xml --from-log talker.log
+  $ sros generate_policy robot.xml --enclave /talker_listener/talker --from-log talker.log
   added 1 right to 'robot.xml'
-    /talker ALLOW publish topic /chatter
+    /talker_listener/talker ALLOW publish topic /nope
 
 On a secured robot, observe in an enclave of its own: policies/observer.xml (see `sros policies`)
 says the little that it needs; make it with `sros generate_artifacts -k ROOT -p observer.xml`, and
@@ -119,8 +120,9 @@ def generate_policy(
 ) -> int:
     """Write to FILE the least policy under which the robot does what it is seen to do.
 
-    Looks at the running nodes until their graph has come to rest. An existing FILE keeps all that
-    it says; what is new is added to it. Read the result before you enforce it.
+    Looks at the running nodes until nothing has changed for a while, some four seconds. An
+    existing FILE keeps all that it says; what is new is added to it. Read the result before you
+    enforce it: on a robot that is not secured yet, anybody may have added to what is seen.
     """
     present = _present_policy(file)
     if logs:

@@ -85,8 +85,8 @@ def _watch(graph: RosGraph, seconds: float | None, common: CommonParts) -> Snaps
             click.echo(line, err=True)
 
     with _until_signalled() as stopped:
-        span = f"for {seconds:.0f} s" if seconds else ""
-        click.echo(f"watching {span or FOREVER}; Ctrl-C ends it and writes the policy", err=True)
+        until = f"for {seconds:.0f} s, or {FOREVER}" if seconds else FOREVER
+        click.echo(f"watching {until}; then the policy is written", err=True)
         return watch(graph, seconds, time.monotonic, stop=stopped, tell=tell)
 
 

@@ -3,8 +3,8 @@
 The texts are those of Fast DDS 2.1 to 2.14 (Permissions.cpp, SecurityManager.cpp) and of Cyclone
 DDS 0.10 (access_control.c, q_omg_security.c); each was seen in a real log.  Fast DDS names the
 topic, and near it whether it was a writer or a reader.  Cyclone DDS first asks whether a topic may
-be used at all; that denial has no direction.  It says nothing where the governance protects the
-discovery of the topic.
+be used at all; that denial has no direction but by what rcl says next.  It says nothing where the
+governance protects the discovery of the topic.
 """
 
 from __future__ import annotations
@@ -19,18 +19,20 @@ from sros_tool.names import expression_problem, is_expression
 
 _FAST = re.compile(r"(?P<topic>[^\s(]+) topic (?P<how>not found in allow|denied by deny) rule")
 _CYCLONE = re.compile(
-    r"(?P<who>Local topic permission denied|Writer is not permitted|Reader is not permitted): "
+    r"(?:Local topic permission denied|Writer is not permitted|Reader is not permitted): "
     r"(?P<topic>\S+) (?P<how>denied by default rule|found in deny_rule)"
 )
 _ENCLAVE = re.compile(r"Found security directory: \S*?/enclaves(?P<enclave>/\S*)?(?:\s|\Z)")
 _WRITER = re.compile(
-    r"local writer|check_create_datawriter|datawriter_sec|associated Writer|DATA_WRITER"
-    r"|create(?:_p| p|P)ublisher|register_local_writer"
+    r"Writer is not|local writer|check_create_datawriter|datawriter_sec"
+    r"|associated Writer|DATA_WRITER|create(?:_p| p|P)ublisher|register_local_writer"
 )
 _READER = re.compile(
-    r"local reader|check_create_datareader|datareader_sec|associated Reader|DATA_READER"
-    r"|create(?:_s| s|S)ubscri|register_local_reader"
+    r"Reader is not|local reader|check_create_datareader|datareader_sec"
+    r"|associated Reader|DATA_READER|create(?:_s| s|S)ubscri|register_local_reader"
 )
+_CLIENT = re.compile(r"create(?:_c| c|C)lient")
+_SERVER = re.compile(r"create(?:_s| s|S)ervice")
 _REMOTE = re.compile(r"check_remote_data|remote (?:writer|reader)")
 _NEAR_LINES = 3
 """How many lines after a denial still speak of it."""
@@ -74,28 +76,33 @@ def read_denials(text: str) -> tuple[Denial, ...]:
     for number, line in enumerate(lines):
         if said := _ENCLAVE.search(line):
             enclave = said["enclave"] or "/"
-        if match := _FAST.search(line):
-            remote, direction = _near(lines, number, match["topic"])
-            by_rule = match["how"].startswith("denied")
-            found[Denial(match["topic"], direction, enclave, by_rule, remote)] = None
-        elif match := _CYCLONE.search(line):
-            direction = {"W": PUBLISH, "R": SUBSCRIBE}.get(match["who"][0], "")
-            by_rule = match["how"].startswith("found")
-            found[Denial(match["topic"], direction, enclave, by_rule)] = None
+        if match := _denied(line):
+            topic = match["topic"]
+            remote, direction = _near(lines, number, topic)
+            by_rule = "deny" in match["how"]
+            found[Denial(topic, direction, enclave, by_rule, remote)] = None
     known = {replace(each, direction="") for each in found if each.direction}
     return tuple(each for each in found if each.direction or each not in known)
+
+
+def _denied(line: str) -> re.Match[str] | None:
+    return _FAST.search(line) or _CYCLONE.search(line)
 
 
 def _near(lines: list[str], number: int, topic: str) -> tuple[bool, str]:
     """Whether a denial is about a peer, and its direction, by its line and those that follow."""
     for line in lines[number : number + 1 + _NEAR_LINES]:
-        other = _FAST.search(line)
+        other = _denied(line)
         if other and other["topic"] != topic:
             break
-        writer, reader = _WRITER.search(line), _READER.search(line)
         if _REMOTE.search(line):
             return True, PUBLISH if "riter" in line else SUBSCRIBE
-        if bool(writer) != bool(reader):
+        writer, reader = bool(_WRITER.search(line)), bool(_READER.search(line))
+        if topic.startswith(("rq/", "rr/")) and not (writer or reader):
+            # A client writes requests and reads replies, a server does the opposite.
+            client, server = bool(_CLIENT.search(line)), bool(_SERVER.search(line))
+            writer, reader = (client, server) if topic[1] == "q" else (server, client)
+        if writer != reader:
             return False, PUBLISH if writer else SUBSCRIBE
     return False, ""
 

@@ -59,6 +59,23 @@ def test_the_direction_is_that_of_the_lines_nearby(lines: str, direction: str) -
     assert read_denials(lines)[0] == Denial("rt/x", direction)
 
 
+@pytest.mark.parametrize(
+    ("topic", "said", "direction"),
+    [
+        ("rq/addRequest", "failed to create client: failed to create topic", "publish"),
+        ("rr/addReply", "failed to create client: failed to create topic", "subscribe"),
+        ("rq/addRequest", "could not create service: failed to create topic", "subscribe"),
+        ("rr/addReply", "could not create service: failed to create topic", "publish"),
+        ("rt/x", "could not create publisher: failed to create topic", "publish"),
+        ("rt/x", "could not create subscription: failed to create topic", "subscribe"),
+        ("rt/x", "failed to create client: failed to create topic", ""),
+    ],
+)
+def test_rcl_tells_what_cyclone_does_not(topic: str, said: str, direction: str) -> None:
+    text = f"Local topic permission denied: {topic} denied by default rule(code: 145)\n{said}"
+    assert read_denials(text) == (Denial(topic, direction),)
+
+
 def test_a_denial_of_a_peer_is_no_reason_to_widen_ones_own() -> None:
     text = "rt/x topic not found in allow rule. -> Function check_remote_datawriter"
     (denial,) = read_denials(text)

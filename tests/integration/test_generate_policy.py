@@ -557,6 +557,71 @@ def test_cyclone_allows_what_was_learned_and_nothing_else(
     assert refused(keystore, path, seen[path] | others) == others
 
 
+_REFUSALS = """
+import json, sys
+from pathlib import Path
+from sros_tool.runtime.cyclone import Participant, SecurityRefusedError
+from sros_tool.runtime.netns import enter_isolation, try_isolation
+if try_isolation().isolated:
+    enter_isolation()
+with Participant(int(sys.argv[2]), Path(sys.argv[1])) as participant:
+    for direction, topic in json.load(sys.stdin):
+        try:
+            participant.writer(topic) if direction == "publish" else participant.reader(topic)
+        except SecurityRefusedError as error:
+            print(error)
+"""
+
+
+def test_what_cyclone_denied_is_proposed_and_then_allowed(tmp_path: Path) -> None:
+    """Both nodes hold the wrong direction of their topic; their log sets it right."""
+    path, enclave = tmp_path / "robot.xml", "/robot"
+    path.write_text(
+        f'<policy version="0.2.0"><enclaves><enclave path="{enclave}"><profiles>'
+        '<profile ns="/" node="arm"><topics publish="ALLOW"><topic>state</topic></topics>'
+        '<topics subscribe="ALLOW"><topic>goal</topic></topics></profile>'
+        "</profiles></enclave></enclaves></policy>"
+    )
+    wrong = {("subscribe", "rt/state"), ("publish", "rt/goal")}
+    never = {("publish", "rt/never")}
+    # Cyclone DDS says nothing of topics whose discovery is protected.
+    template = load_template("production")
+    default = replace(template.protection.default, discovery=False)
+    template = replace(template, protection=replace(template.protection, default=default))
+
+    def keystore(name: str) -> Path:
+        root, domains = tmp_path / name, DomainSet.of((DOMAIN + 3, DOMAIN + 3))
+        generate_artifacts(
+            root,
+            policies=[read_policy(path)],
+            now=datetime.now(UTC),
+            create=template,
+            domains=domains,
+        )
+        return root
+
+    before = keystore("before")
+    assert refused(before, enclave, wrong | never) == wrong | never
+    folder = str(enclave_path(before, enclave))
+    done = subprocess.run(
+        [sys.executable, "-c", _REFUSALS, folder, str(DOMAIN + 3)],
+        input=json.dumps(sorted(wrong | never)),
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    (tmp_path / "arm.log").write_text(done.stdout)
+    words = ["generate_policy", "robot.xml", "--enclave", enclave, "--from-log", "arm.log"]
+    ended = subprocess.run(
+        [sys.executable, "-m", "sros_tool", *words], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert "note [log.unclear]" in ended.stderr and "rt/never" in ended.stderr
+    assert "added 2 rights" in ended.stdout
+    assert refused(keystore("after"), enclave, wrong | never) == never
+
+
 # ── over time ──────────────────────────────────────────────────────────────────────────────
 
 PASSER_BY = process("/passer_by", node("passer_by", publish=["hello"]), after=2.5, lives=2.0)
