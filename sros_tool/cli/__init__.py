@@ -6,6 +6,7 @@ import io
 import os
 import signal
 import sys
+import warnings
 from types import FrameType
 
 
@@ -15,6 +16,8 @@ def main(arguments: list[str] | None = None) -> None:
     signal.signal(signal.SIGTERM, _terminate)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="surrogateescape")  # a path need not be valid UTF-8
+    if not sys.warnoptions:
+        warnings.simplefilter("ignore")  # remarks of libraries are not for users
     from sros_tool.cli.program import program
     from sros_tool.cli.report import report_error
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from sros_tool.errors import PkiError
 
-OCTET_STRING, SEQUENCE, SET = 0x04, 0x30, 0x31
+INTEGER, OCTET_STRING, OID, SEQUENCE, SET = 0x02, 0x04, 0x06, 0x30, 0x31
 CONTEXT_0 = 0xA0
 
 

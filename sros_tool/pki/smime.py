@@ -28,9 +28,16 @@ from sros_tool.pki.keys import PrivateKey
 _TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"
 _OPTIONS = (pkcs7.PKCS7Options.DetachedSignature, pkcs7.PKCS7Options.Binary)
 _TEXT = re.compile(rb"(?i)content-type:[ \t]*text/plain\b")
-_BOUNDARY = re.compile(rb"""(?i)\bboundary=("([^"]{1,200})"|([^\s;"]{1,200}))""")
+_MULTIPART = re.compile(
+    rb"(?im)^content-type:[ \t]*multipart/signed"
+    rb"""((?:;[ \t]*(?:\n[ \t]+)?[\w-]+=(?:"[^"\x00-\x1f]+"|[^\s;"]+))+)$"""
+)
+_BOUNDARY = re.compile(rb"""(?i);\s*boundary=("([^"]{1,200})"|([^\s;"]{1,200}))""")
+_PKCS7 = re.compile(rb"(?im)^content-type:[ \t]*application/(?:x-)?pkcs7-signature(?:;|$)")
 
+_VERSION = b"\x02\x01\x01"
 _SIGNED_DATA = der.encode_oid("1.2.840.113549.1.7.2")
+_DATA = der.encode_oid("1.2.840.113549.1.7.1")
 _MESSAGE_DIGEST = der.encode_oid("1.2.840.113549.1.9.4")
 _DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
     der.encode_oid("2.16.840.1.101.3.4.2.1"): hashes.SHA256(),
@@ -84,10 +91,10 @@ class SignedDocument:
     _signature: bytes
     _issuer_and_serial: tuple[bytes, int]
 
-    def signer(self, candidates: tuple[x509.Certificate, ...] = ()) -> x509.Certificate | None:
-        """The certificate that the signature names, among those embedded and ``candidates``."""
+    def signer(self) -> x509.Certificate | None:
+        """The certificate that the signature names, if it is embedded."""
         issuer, serial = self._issuer_and_serial
-        for certificate in (*candidates, *self.certificates):
+        for certificate in self.certificates:
             if certificate.serial_number == serial and certificate.issuer.public_bytes() == issuer:
                 return certificate
         return None
@@ -98,9 +105,13 @@ class SignedDocument:
         Stricter than Cyclone DDS 0.10, which accepts any signer whose chain ends at the
         authority (the CVE-2023-24011 class), and just what Fast DDS asks for.
         """
-        signer = self.signer((authority,))
+        signer = self.signer()
         if signer is None or signer != authority:
-            who = f"by {signer.subject.rfc4514_string()}" if signer else "by an unknown certificate"
+            who = (
+                f"by {signer.subject.rfc4514_string()}"
+                if signer
+                else "by a certificate that it lacks"
+            )
             raise PkiError(
                 f"it is signed {who}, not by the permissions CA "
                 f"{authority.subject.rfc4514_string()}"
@@ -153,8 +164,9 @@ def parse(message: bytes) -> SignedDocument:
 def _split(message: bytes) -> tuple[bytes, bytes]:
     """The signed part, with CRLF line ends, and the DER of its signature."""
     head, _, body = message.replace(b"\r\n", b"\n").partition(b"\n\n")
-    boundary = _BOUNDARY.search(head)
-    if b"multipart/signed" not in head.lower() or not boundary:
+    multipart = _MULTIPART.search(head)
+    boundary = _BOUNDARY.search(multipart[1]) if multipart else None
+    if not boundary:
         raise PkiError(
             "it is not an S/MIME signed message",
             "A signed document begins with MIME headers of the type multipart/signed; "
@@ -165,12 +177,12 @@ def _split(message: bytes) -> tuple[bytes, bytes]:
     if len(parts) != 4 or not parts[3].startswith(b"--"):
         raise PkiError("it does not consist of one signed part and one signature")
     content = parts[1].removeprefix(b"\n").replace(b"\n", b"\r\n")
-    _, separator, encoded = parts[2].removeprefix(b"\n").partition(b"\n\n")
+    header, _, encoded = parts[2].removeprefix(b"\n").partition(b"\n\n")
     try:
         signature = base64.b64decode(b"".join(encoded.split()), validate=True)
     except binascii.Error as error:
         raise PkiError("its signature is not valid base64") from error
-    if not separator or not signature:
+    if not _PKCS7.search(header) or not signature:
         raise PkiError("it has no signature")
     return content, signature
 
@@ -181,12 +193,25 @@ def _certificate(data: bytes) -> x509.Certificate:
     return read_in_full(x509.load_der_x509_certificate(data))
 
 
+def _parts(value: der.Value, *tags: int) -> list[der.Value]:
+    """What a value consists of; the first of its parts must have ``tags``."""
+    parts = der.children(value.content)
+    if [part.tag for part in parts[: len(tags)]] != list(tags):
+        raise ValueError("not of the structure of a signature")
+    return parts
+
+
 def _parse_cms(signature: bytes, content: bytes, document: bytes) -> SignedDocument:
     """Read ContentInfo / SignedData / SignerInfo (RFC 5652, sections 3, 5.1 and 5.3)."""
-    content_type, wrapped = der.children(der.first(signature).content)[:2]
-    if content_type.content != _SIGNED_DATA:
+    message = der.first(signature)
+    content_type, wrapped = _parts(message, der.OID, der.CONTEXT_0)[:2]
+    (signed_data,) = _parts(wrapped, der.SEQUENCE)
+    if message.tag != der.SEQUENCE or content_type.content != _SIGNED_DATA:
         raise ValueError("not SignedData")
-    fields = der.children(der.first(wrapped.content).content)
+    fields = _parts(signed_data, der.INTEGER, der.SET, der.SEQUENCE)
+    version, digests, encapsulated = fields[:3]
+    if version.whole != _VERSION or _parts(encapsulated, der.OID)[0].content != _DATA:
+        raise ValueError("not a detached signature of data")
     certificates = tuple(
         _certificate(value.whole)
         for field in fields[3:]
@@ -194,21 +219,27 @@ def _parse_cms(signature: bytes, content: bytes, document: bytes) -> SignedDocum
         for value in der.children(field.content)
         if value.tag == der.SEQUENCE
     )
-    signers = der.children(fields[-1].content)
-    if fields[-1].tag != der.SET or len(signers) != 1:
-        raise ValueError("not exactly one signer")
-    info = der.children(signers[0].content)
-    issuer, serial = der.children(info[1].content)
-    algorithm = _DIGESTS.get(der.first(info[2].content).content)
-    if algorithm is None:
-        raise ValueError("unknown digest")
+    (signer,) = _parts(fields[-1], der.SEQUENCE)
+    info = _parts(signer, der.INTEGER, der.SEQUENCE, der.SEQUENCE)
+    issuer, serial = _parts(info[1], der.SEQUENCE, der.INTEGER)
+    digest = _parts(info[2], der.OID)[0].content
+    algorithm = _DIGESTS.get(digest)
+    (listed,) = _parts(digests, der.SEQUENCE)
+    if _parts(listed, der.OID)[0].content != digest or info[0].whole != _VERSION:
+        raise ValueError("another digest or version than announced")
+    if algorithm is None or fields[-1].tag != der.SET:
+        raise ValueError("unknown digest, or no signers")
     attributes, message_digest = b"", b""
     if info[3].tag == der.CONTEXT_0:
         # What is signed is the attributes as a SET, not with the tag that they carry inside.
         attributes = b"\x31" + info[3].whole[1:]
         message_digest = _message_digest(info[3].content)
-    signature_value = info[5 if attributes else 4]
-    if signature_value.tag != der.OCTET_STRING:
+    signature_algorithm, signature_value = info[4:6] if attributes else info[3:5]
+    if (
+        signature_value.tag != der.OCTET_STRING
+        or signature_algorithm.tag != der.SEQUENCE
+        or not _parts(signature_algorithm, der.OID)
+    ):
         raise ValueError("no signature value")
     return SignedDocument(
         content=content,
