@@ -702,3 +702,93 @@ def test_the_observer_may_join_and_nothing_else(tmp_path: Path) -> None:
     may.add(("subscribe", "ros_discovery_info"))
     more = {("subscribe", "rt/chatter"), ("publish", "rt/rosout"), ("subscribe", "rt/rosout")}
     assert refused(keystore, "/sros_observer", may | more) == more
+
+
+_OBSERVED_OBSERVER = """
+import json, os, time
+from sros_tool.runtime.netns import enter_isolation, try_isolation
+if try_isolation().isolated:
+    enter_isolation()
+os.environ["ROS_DOMAIN_ID"] = "216"
+from sros_tool.graph.source import RosGraph
+with RosGraph():
+    import rclpy
+    rclpy.init(args=[])
+    asker = rclpy.create_node("asker")
+    found = set()
+    end = time.monotonic() + 8
+    while time.monotonic() < end:
+        time.sleep(0.2)
+        for topic, _ in asker.get_topic_names_and_types(no_demangle=True):
+            for way, infos in (
+                ("publish", asker.get_publishers_info_by_topic(topic, no_mangle=True)),
+                ("subscribe", asker.get_subscriptions_info_by_topic(topic, no_mangle=True)),
+            ):
+                if any(each.node_name == "_sros_observer" for each in infos):
+                    found.add((way, topic))
+                    end = min(end, time.monotonic() + 2)
+print(json.dumps(sorted(found)))
+"""
+
+
+def test_the_observer_has_no_more_than_its_policy_says() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _OBSERVED_OBSERVER],
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    (enclave,) = read_policy(policies_dir() / "observer.xml").enclaves
+    assert {tuple(each) for each in json.loads(done.stdout)} == allowed_endpoints(enclave)
+
+
+_TALK_AND_LOOK = """
+import json, subprocess, sys, time
+from pathlib import Path
+from sros_tool.runtime.cyclone import Participant
+from sros_tool.runtime.netns import enter_isolation, try_isolation
+if sys.argv[3:]:
+    with Participant(int(sys.argv[2]), Path(sys.argv[1])) as talker:
+        talker.writer("rt/chatter")
+        sys.stdin.read()
+    sys.exit()
+if try_isolation().isolated:
+    enter_isolation()
+folders, domain = sys.argv[1].split(":"), sys.argv[2]
+talk = [sys.executable, "-c", sys.stdin.read(), folders[0], domain, "talk"]
+with (
+    Participant(int(domain), Path(folders[1])) as observer,
+    subprocess.Popen(talk, stdin=subprocess.PIPE) as process,
+):
+    end = time.monotonic() + 15
+    while time.monotonic() < end and not observer.publications():
+        time.sleep(0.2)
+    print(json.dumps([each.topic for each in observer.publications()]))
+    process.stdin.close()
+"""
+
+
+def test_a_secured_observer_sees_what_it_may_not_read(tmp_path: Path) -> None:
+    """On Cyclone DDS: the discovery is encrypted, and the observer is let in."""
+    root, domain = tmp_path / "keystore", DOMAIN + 3
+    names = ("talker_listener.xml", "observer.xml")
+    generate_artifacts(
+        root,
+        policies=[read_policy(policies_dir() / name) for name in names],
+        now=datetime.now(UTC),
+        create=load_template("production"),
+        domains=DomainSet.of((domain, domain)),
+    )
+    enclaves = ("/talker_listener/talker", "/sros_observer")
+    folders = ":".join(str(enclave_path(root, each)) for each in enclaves)
+    done = subprocess.run(
+        [sys.executable, "-c", _TALK_AND_LOOK, folders, str(domain)],
+        input=_TALK_AND_LOOK,
+        stdout=subprocess.PIPE,
+        text=True,
+        timeout=60,
+        check=True,
+    )
+    assert json.loads(done.stdout) == ["rt/chatter"]
+    assert refused(root, "/sros_observer", {("subscribe", "rt/chatter")})
