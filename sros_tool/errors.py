@@ -23,7 +23,7 @@ class SrosError(Exception):
         self.remedy = remedy
 
     def __str__(self) -> str:
-        sentences = [each.strip().rstrip(".") for each in (self.what, self.why, self.remedy)]
+        sentences = [each.strip().removesuffix(".") for each in (self.what, self.why, self.remedy)]
         text = ". ".join(each for each in sentences if each)
         return " ".join(text.split()) + ("." if self.why or self.remedy else "")
 

@@ -47,10 +47,66 @@ class Window:
         return Window(max(self.not_before, outer.not_before), min(self.not_after, outer.not_after))
 
 
-def window(now: datetime, duration: timedelta) -> Window:
-    """The window of something made ``now`` that is to last for ``duration`` (back-dated)."""
+@dataclass(frozen=True, slots=True)
+class Lifespan:
+    """A validity with a fixed start, a fixed end, or both; ``length`` counts from the start.
+
+    Without ``start`` it begins when something is made.  Exactly one of the others is given.
+    """
+
+    start: datetime | None = None
+    end: datetime | None = None
+    length: timedelta | None = None
+
+
+Span = timedelta | Lifespan
+"""How long something is to be valid: so long from its creation on, or a `Lifespan`."""
+
+
+def window(now: datetime, span: Span) -> Window:
+    """The window of something made ``now``; back-dated unless its start is fixed."""
     moment = now.astimezone(UTC).replace(microsecond=0)
-    return Window(moment - BACKDATE, moment + duration)
+    if isinstance(span, timedelta):
+        return Window(moment - BACKDATE, moment + span)
+    begin = span.start or moment
+    end = span.end or begin + (span.length or timedelta(0))
+    if end <= moment:
+        raise UsageError(f"the validity ended at {iso(end)} already")
+    return Window(span.start or moment - BACKDATE, end)
+
+
+def parse_span(text: str) -> Span:
+    """Read a duration (``90d``), an end (``2027-06-01``), or both ends of an interval.
+
+    Intervals are written as in ISO 8601, ``2026-12-01/2027-06-01`` or ``2026-12-01/90d``; dates
+    without a zone are in UTC.
+    """
+    first, slash, last = text.strip().partition("/")
+    start = _moment(first, text) if slash else None
+    rest = last if slash else first
+    if _DURATION.match(rest):
+        length = parse_duration(rest)
+        return Lifespan(start=start, length=length) if start else length
+    return Lifespan(start=start, end=_moment(rest, text))
+
+
+def _moment(text: str, whole: str) -> datetime:
+    try:
+        return parse_iso(text).replace(microsecond=0)
+    except (ValueError, OverflowError) as error:
+        raise UsageError(
+            f"{whole!r} is neither a duration nor a date",
+            "",
+            "Write for example 90d, 72h, 2027-06-01 or 2026-12-01/90d.",
+        ) from error
+
+
+def span_text(span: Span) -> str:
+    """``span`` as `parse_span` reads it."""
+    if isinstance(span, timedelta):
+        return duration_text(span)
+    end = iso(span.end) if span.end else duration_text(span.length or timedelta(0))
+    return f"{iso(span.start)}/{end}" if span.start else end
 
 
 def parse_duration(text: str) -> timedelta:

@@ -71,9 +71,19 @@ Example:
     type=click.Choice(["separate", "single"]),
     help="Two CAs, for identities and permissions, or one for both.",
 )
-@click.option("--ca-validity", metavar="DURATION", help="How long the CAs last, as 5y.")
-@click.option("--validity", metavar="DURATION", help="How long certificates last, as 365d.")
-@click.option("--permissions-validity", metavar="DURATION", help="How long permissions last.")
+@click.option(
+    "--ca-validity",
+    metavar="SPAN",
+    help="How long the CAs last: 5y, until 2031-01-01, or from 2026-12-01/5y.",
+)
+@click.option("--validity", metavar="SPAN", help="The same for certificates.")
+@click.option("--permissions-validity", metavar="SPAN", help="The same for permissions.")
+@click.option(
+    "--identity-ca",
+    type=PATH,
+    help="The certificate of an existing identity CA, with its chain; needs --identity-key.",
+)
+@click.option("--permissions-ca", type=PATH, help="The same for the permissions CA.")
 @click.option(
     "--identity-key",
     metavar="URI",
@@ -92,6 +102,8 @@ def create_keystore(
     ca_validity: str | None,
     validity: str | None,
     permissions_validity: str | None,
+    identity_ca: Path | None,
+    permissions_ca: Path | None,
     identity_key: str | None,
     permissions_key: str | None,
     encrypt_ca_keys: bool,
@@ -117,8 +129,10 @@ def create_keystore(
         domains=domains,
         now=now(),
         keyring=keyring(identity_key, permissions_key, encrypt=encrypt_ca_keys),
+        imported=_imported({"identity": identity_ca, "permissions": permissions_ca}),
         dry_run=dry_run,
     )
+    print_notes(result.notes)
     if dry_run:
         print_plan(root, result.changes)
         return
@@ -134,29 +148,38 @@ def _choices(
     permissions_validity: str | None,
 ) -> Template:
     from dataclasses import replace
+    from datetime import timedelta
 
     from sros_tool.keystore.template import load_template
-    from sros_tool.validity import parse_duration
+    from sros_tool.validity import parse_span
 
     template = load_template(name)
     if ca_layout:
         template = replace(template, separate_authorities=ca_layout == "separate")
-    if ca_validity is not None:
-        template = replace(template, authority_validity=parse_duration(ca_validity))
-    if validity is not None:
-        duration = parse_duration(validity)
-        template = replace(
-            template,
-            certificate_validity=duration,
-            permissions_validity=min(duration, template.permissions_validity),
-        )
-    if permissions_validity is not None:
-        template = replace(template, permissions_validity=parse_duration(permissions_validity))
+    if ca_validity:
+        template = replace(template, authority_validity=parse_span(ca_validity))
+    if validity:
+        span, permissions = parse_span(validity), template.permissions_validity
+        template = replace(template, certificate_validity=span)
+        if not isinstance(span, timedelta):
+            template = replace(template, permissions_validity=span)
+        elif isinstance(permissions, timedelta):
+            template = replace(template, permissions_validity=min(span, permissions))
+    if permissions_validity:
+        template = replace(template, permissions_validity=parse_span(permissions_validity))
     return template
 
 
+def _imported(files: dict[str, Path | None]) -> dict[str, bytes]:
+    from sros_tool.xml import read_bytes
+
+    return {
+        role: read_bytes(path, "CA certificate") for role, path in files.items() if path is not None
+    }
+
+
 def _say_new_keystore(root: Path, template: Template, domains: DomainSet) -> None:
-    from sros_tool.validity import duration_text
+    from sros_tool.validity import span_text
 
     layout = (
         "identity CA and permissions CA: separate"
@@ -166,9 +189,9 @@ def _say_new_keystore(root: Path, template: Template, domains: DomainSet) -> Non
     click.echo(f"created keystore '{root}' for domain {domains}")
     click.echo(f"  template {template.name}: {template.description}")
     click.echo(
-        f"  {layout}, valid for {duration_text(template.authority_validity)}; certificates "
-        f"{duration_text(template.certificate_validity)}, permissions "
-        f"{duration_text(template.permissions_validity)}"
+        f"  {layout}, valid for {span_text(template.authority_validity)}; certificates "
+        f"{span_text(template.certificate_validity)}, permissions "
+        f"{span_text(template.permissions_validity)}"
     )
 
 

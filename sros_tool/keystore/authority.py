@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -12,7 +12,8 @@ from typing import TypeVar
 from cryptography import x509
 
 from sros_tool.errors import KeystoreError, PkiError
-from sros_tool.keystore.keyring import Keyring, check_places
+from sros_tool.keystore.imported import check_imported
+from sros_tool.keystore.keyring import Keyring, check_keys_of, check_places
 from sros_tool.keystore.layout import (
     IDENTITY,
     PERMISSIONS,
@@ -24,6 +25,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Transaction
+from sros_tool.notes import Note
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     Issuer,
@@ -78,21 +80,34 @@ class Authorities:
 
     identity: Authority
     permissions: Authority
+    notes: tuple[Note, ...] = ()
 
 
 def create_authorities(
-    transaction: Transaction, template: Template, keyring: Keyring, now: datetime
+    transaction: Transaction,
+    template: Template,
+    keyring: Keyring,
+    now: datetime,
+    imported: Mapping[str, bytes],
 ) -> Authorities:
-    """Make the CA or CAs of a new keystore."""
+    """Make the CA or CAs of a new keystore; those whose certificate is ``imported`` exist."""
     check_places(keyring, template)
+    check_keys_of(imported, keyring, template)
     validity = window(now, template.authority_validity)
     # Every keystore's CA has a name of its own, so that messages and pictures can tell them apart.
     serial = secrets.token_hex(4)
+    notes: list[Note] = []
 
     def make(file: str, role: str, name: str) -> Authority:
         key = keyring.make(transaction, f"{PRIVATE}/{file}.key.pem", role, template)
-        certificate = issue_ca(key, common_name(name), validity)
-        transaction.write(f"{PUBLIC}/{file}.cert.pem", pem(certificate))
+        if role in imported:
+            found = check_imported(role, imported[role], key, now)
+            certificate, bundle = found.certificate, found.bundle
+            notes.extend(found.notes)
+        else:
+            certificate = issue_ca(key, common_name(name), validity)
+            bundle = pem(certificate)
+        transaction.write(f"{PUBLIC}/{file}.cert.pem", bundle)
         return Authority(certificate, key)
 
     if template.separate_authorities:
@@ -100,6 +115,7 @@ def create_authorities(
         return Authorities(
             make("identity_ca", IDENTITY, f"{name} identity CA {serial}"),
             make("permissions_ca", PERMISSIONS, f"{name} permissions CA {serial}"),
+            tuple(notes),
         )
     authority = make("ca", IDENTITY, template.authority_name)
     in_keystore = not (keyring.places.get(IDENTITY) or template.identity_key)
@@ -107,7 +123,7 @@ def create_authorities(
         transaction.link(ca_certificate(role), "ca.cert.pem")
         if in_keystore:
             transaction.link(ca_key(role), "ca.key.pem")
-    return Authorities(authority, authority)
+    return Authorities(authority, authority, tuple(notes))
 
 
 def load_ca_certificate(root: Path, role: str) -> x509.Certificate:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from types import MappingProxyType
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import parse_governance, render_governance
@@ -39,6 +40,9 @@ from sros_tool.names import check_enclave_name
 from sros_tool.notes import Note
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.translate import governance_for
+from sros_tool.validity import window
+
+_NOTHING: Mapping[str, bytes] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,12 +72,14 @@ def create_keystore(
     domains: DomainSet | None = None,
     now: datetime,
     keyring: Keyring = IN_KEYSTORE,
+    imported: Mapping[str, bytes] = _NOTHING,
     dry_run: bool = False,
 ) -> Result:
     """Make a new keystore for ``domains`` (default: 0) by the choices of ``template``.
 
     Raises `KeystoreError` if ``root`` is a keystore, or holds any part of one: a CA is never made
-    anew beside the remains of an older one.
+    anew beside the remains of an older one.  ``imported`` are PEM certificates of existing CAs by
+    role ("identity", "permissions"), whose keys the ``keyring`` has.
     """
     if not dry_run:
         tidy(root)
@@ -81,10 +87,19 @@ def create_keystore(
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
         _check_free(root)  # another process may have been faster
         domains = domains or DomainSet.of((0, 0))
-        _, entries = _write_keystore(transaction, template, domains, keyring, now)
+        authorities, entries = _write_keystore(
+            transaction, template, domains, keyring, now, imported
+        )
         append(transaction, entries)
         transaction.commit()
-    return Result(root, template, domains, True, changes=tuple(transaction.changes))
+    return Result(
+        root,
+        template,
+        domains,
+        True,
+        changes=tuple(transaction.changes),
+        notes=authorities.notes,
+    )
 
 
 def create_enclaves(
@@ -247,8 +262,11 @@ def _write_keystore(
     domains: DomainSet,
     keyring: Keyring,
     now: datetime,
+    imported: Mapping[str, bytes] = _NOTHING,
 ) -> tuple[Authorities, list[Entry]]:
-    authorities = create_authorities(transaction, template, keyring, now)
+    for span in (template.certificate_validity, template.permissions_validity):
+        window(now, span)  # what could not issue anything is no keystore
+    authorities = create_authorities(transaction, template, keyring, now, imported)
     distinct = dict.fromkeys((authorities.identity, authorities.permissions))
     entries = [certificate_entry(now, "ca", each.certificate) for each in distinct]
     message = write_governance(transaction, authorities.permissions, template, domains)

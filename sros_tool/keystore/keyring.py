@@ -7,12 +7,12 @@ The library never asks a person: a secrets handler does, which the caller brings
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from sros_tool.errors import KeystoreError, PkiError
+from sros_tool.errors import KeystoreError, PkiError, UsageError
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Transaction
@@ -117,6 +117,23 @@ def check_places(keyring: Keyring, template: Template) -> None:
             "Two different places are named.",
             "Name the same place for both, or use --ca-layout separate.",
         )
+
+
+def check_keys_of(roles: Iterable[str], keyring: Keyring, template: Template) -> None:
+    """Raise `UsageError` where the certificate of a CA is given, but not where its key is."""
+    for role in roles:
+        if keyring.place(role, template) == ca_key(role):
+            raise UsageError(
+                f"the certificate of the {role} CA is given without its key",
+                "A keystore signs with it.",
+                f"Add --{role}-key file:PATH or --{role}-key pkcs11:...",
+            )
+        if not template.separate_authorities and role != IDENTITY:
+            raise UsageError(
+                "with one CA for both jobs, its certificate is that of the identity CA",
+                "",
+                "Give --identity-ca alone, or --ca-layout separate.",
+            )
 
 
 def _path(place: str, root: Path) -> Path:

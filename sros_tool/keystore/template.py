@@ -17,7 +17,7 @@ from sros_tool.errors import DocumentError, SrosError
 from sros_tool.names import expression_problem
 from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.resources import templates_dir
-from sros_tool.validity import duration_text, parse_duration
+from sros_tool.validity import Span, duration_text, parse_duration, parse_span, span_text
 from sros_tool.xml import read_bytes
 
 DEFAULT_TEMPLATE = "development"
@@ -40,9 +40,9 @@ class Template:
     description: str
     separate_authorities: bool
     authority_name: str
-    authority_validity: timedelta
-    certificate_validity: timedelta
-    permissions_validity: timedelta
+    authority_validity: Span
+    certificate_validity: Span
+    permissions_validity: Span
     default_permissions: str
     protection: DomainProtection
     identity_key: str = ""
@@ -103,9 +103,9 @@ def parse_template(text: str, name: str) -> Template:
         description=table.text("description", ""),
         separate_authorities=authorities.one_of("layout", ("separate", "single")) == "separate",
         authority_name=_authority_name(authorities),
-        authority_validity=authorities.duration("validity"),
-        certificate_validity=certificates.duration("validity"),
-        permissions_validity=permissions.duration("validity"),
+        authority_validity=authorities.span("validity"),
+        certificate_validity=certificates.span("validity"),
+        permissions_validity=permissions.span("validity"),
         default_permissions=permissions.one_of("default", (EVERYTHING, NODE_BASICS)),
         protection=_protection(table.table("protection")),
         identity_key=authorities.text("identity_key", ""),
@@ -127,17 +127,17 @@ def render_template(template: Template) -> str:
         "\n[authorities]",
         f'layout = "{"separate" if template.separate_authorities else "single"}"',
         f"name = {_toml(template.authority_name)}",
-        f"validity = {_toml(duration_text(template.authority_validity))}",
+        f"validity = {_toml(span_text(template.authority_validity))}",
         *(
             f"{name} = {_toml(place)}"
             for name in ("identity_key", "permissions_key")
             if (place := getattr(template, name))
         ),
         "\n[certificates]",
-        f"validity = {_toml(duration_text(template.certificate_validity))}",
+        f"validity = {_toml(span_text(template.certificate_validity))}",
         f"unique_subject = {_toml(template.unique_subject)}",
         "\n[permissions]",
-        f"validity = {_toml(duration_text(template.permissions_validity))}",
+        f"validity = {_toml(span_text(template.permissions_validity))}",
         f"default = {_toml(template.default_permissions)}",
         "\n[revocation]",
         f"validity = {_toml(duration_text(template.revocation_validity))}",
@@ -281,6 +281,13 @@ class _Table:
         if value not in allowed:
             raise _TemplateError(f"{self._at(key)} is {value!r}, not one of {', '.join(allowed)}")
         return Level(value)
+
+    def span(self, key: str) -> Span:
+        value = self.text(key)
+        try:
+            return parse_span(value)
+        except SrosError as error:
+            raise _TemplateError(f"{self._at(key)}: {error.what}") from error
 
     def duration(self, key: str, default: str | None = None) -> timedelta:
         value = self.text(key, default)

@@ -1,0 +1,159 @@
+"""Keystores upon authorities that were made elsewhere, and spans of validity with dates."""
+
+from __future__ import annotations
+
+import subprocess
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from sros_tool.errors import UsageError
+from sros_tool.validity import Lifespan, Span, Window, parse_span, span_text, window
+from tests.harness import sros
+
+CA = "basicConstraints=critical,CA:TRUE"
+USAGE = "keyUsage=critical,keyCertSign,cRLSign,digitalSignature"
+NOW = datetime(2026, 6, 1, 12, tzinfo=UTC)
+
+
+def openssl(folder: Path, *words: str) -> None:
+    subprocess.run(["openssl", *words], cwd=folder, check=True, capture_output=True)
+
+
+@pytest.fixture(scope="module")
+def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A root, an intermediate below it, the chain of both, and CAs that vendors differ about."""
+    folder = tmp_path_factory.mktemp("pki")
+    curve = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
+    root = ("-x509", "-days", "900", "-addext", CA, "-addext", USAGE)
+    for name, kind, extra in (
+        ("root", curve, ()),
+        ("permissions", curve, ()),
+        ("sha384", curve, ("-sha384",)),
+        ("rsa3072", ("-newkey", "rsa:3072", "-nodes"), ()),
+    ):
+        out = ("-keyout", f"{name}.key", "-out", f"{name}.pem", "-subj", f"/CN=corp {name}")
+        openssl(folder, "req", *kind, *root, *extra, *out)
+    out = ("-keyout", "leaf.key", "-out", "leaf.pem", "-subj", "/CN=leaf")
+    openssl(folder, "req", "-x509", *curve, *out, "-addext", "basicConstraints=CA:FALSE")
+    openssl(folder, "req", *curve, "-keyout", "sub.key", "-out", "sub.csr", "-subj", "/CN=sub")
+    (folder / "ext").write_text(
+        f"{CA}\n{USAGE}\nsubjectKeyIdentifier=hash\nauthorityKeyIdentifier=keyid\n"
+    )
+    issued = ("-CA", "root.pem", "-CAkey", "root.key", "-CAcreateserial", "-days", "500")
+    openssl(folder, "x509", "-req", "-in", "sub.csr", *issued, "-extfile", "ext", "-out", "sub.pem")
+    chain = (folder / "root.pem").read_bytes() + (folder / "sub.pem").read_bytes()
+    (folder / "chain.pem").write_bytes(chain)
+    return folder
+
+
+def test_both_authorities_can_be_imported(pki: Path, tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros(
+        "create_keystore", root, "--template", "production",
+        "--identity-ca", pki / "root.pem", "--identity-key", pki / "root.key",
+        "--permissions-ca", pki / "permissions.pem", "--permissions-key", pki / "permissions.key",
+    ).ok()  # fmt: skip
+    assert not (root / "private").exists()
+    sros("create_enclave", root, "/a").ok()
+    folder = root / "enclaves/a"
+    openssl(folder, "verify", "-x509_strict", "-CAfile", str(pki / "root.pem"), "cert.pem")
+    verify = ("smime", "-verify", "-text", "-CAfile", str(pki / "permissions.pem"))
+    openssl(folder, *verify, "-in", "permissions.p7s")
+    assert sros("inspect", root).status == 0
+
+
+def test_an_intermediate_comes_with_its_chain(pki: Path, tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    made = sros(
+        "create_keystore", root, "--identity-ca", pki / "chain.pem", "--identity-key",
+        pki / "sub.key",
+    ).ok()  # fmt: skip
+    assert "portable.intermediate" in made.err
+    sros("create_enclave", root, "/a").ok()
+    openssl(
+        tmp_path, "verify", "-x509_strict", "-CAfile", str(pki / "chain.pem"),
+        str(root / "enclaves/a/cert.pem"),
+    )  # fmt: skip
+    assert sros("inspect", root / "enclaves/a").status == 0
+
+
+@pytest.mark.parametrize(
+    ("certificate", "key", "status", "words"),
+    [
+        ("root.pem", None, 2, "without its key"),
+        ("root.pem", "sub.key", 1, "does not fit its key"),
+        ("sub.pem", "sub.key", 1, "has no root"),
+        ("leaf.pem", "leaf.key", 1, "cannot be the identity CA"),
+        ("root.key", "root.key", 1, "cannot be read"),
+        ("nothing.pem", "root.key", 1, "does not exist"),
+        ("root.pem", "nothing/x.key", 1, "nothing"),
+    ],
+)
+def test_what_cannot_be_imported(
+    certificate: str, key: str | None, status: int, words: str, pki: Path, tmp_path: Path
+) -> None:
+    before = sorted(pki.iterdir())
+    more = ["--identity-key", pki / key] if key else []
+    ended = sros("create_keystore", tmp_path / "ks", "--identity-ca", pki / certificate, *more)
+    assert ended.status == status, ended
+    assert words in ended.err
+    assert list(tmp_path.iterdir()) == []
+    assert sorted(pki.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("name", "note"), [("sha384", "portable.signature-hash"), ("rsa3072", "portable.key-algorithm")]
+)
+def test_what_vendors_differ_about_is_said(name: str, note: str, pki: Path, tmp_path: Path) -> None:
+    place = ("--identity-ca", pki / f"{name}.pem", "--identity-key", pki / f"{name}.key")
+    assert note in sros("create_keystore", tmp_path / "ks", *place).ok().err
+    plain = ("--identity-ca", pki / "root.pem", "--identity-key", pki / "root.key")
+    assert "note [" not in sros("create_keystore", tmp_path / "plain", *plain).ok().err
+
+
+@pytest.mark.parametrize(
+    ("text", "span", "begin", "end"),
+    [
+        ("90d", timedelta(days=90), NOW - timedelta(days=1), NOW + timedelta(days=90)),
+        ("72h", timedelta(hours=72), NOW - timedelta(days=1), NOW + timedelta(days=3)),
+        (
+            "2026-07-01",
+            Lifespan(end=datetime(2026, 7, 1, tzinfo=UTC)),
+            NOW - timedelta(days=1),
+            datetime(2026, 7, 1, tzinfo=UTC),
+        ),
+        (
+            "2026-05-01/90d",
+            Lifespan(start=datetime(2026, 5, 1, tzinfo=UTC), length=timedelta(days=90)),
+            datetime(2026, 5, 1, tzinfo=UTC),
+            datetime(2026, 7, 30, tzinfo=UTC),
+        ),
+        (
+            "2026-07-01T06:00:00+02:00/2026-08-01",
+            Lifespan(
+                start=datetime(2026, 7, 1, 4, tzinfo=UTC), end=datetime(2026, 8, 1, tzinfo=UTC)
+            ),
+            datetime(2026, 7, 1, 4, tzinfo=UTC),
+            datetime(2026, 8, 1, tzinfo=UTC),
+        ),
+    ],
+)
+def test_spans(text: str, span: Span, begin: datetime, end: datetime) -> None:
+    assert parse_span(text) == span
+    assert parse_span(span_text(span)) == span
+    assert window(NOW, span) == Window(begin, end)
+
+
+@pytest.mark.parametrize("text", ["", "x", "90", "0d", "2026-13-01", "/90d", "90d/90d", "a/b/c"])
+def test_what_is_no_span(text: str) -> None:
+    with pytest.raises(UsageError):
+        parse_span(text)
+
+
+def test_a_span_that_is_over_makes_no_keystore(tmp_path: Path) -> None:
+    ended = sros("create_keystore", tmp_path / "ks", "--validity", "2020-01-01")
+    assert ended.status == 2
+    assert "ended at 2020-01-01" in ended.err
+    assert list(tmp_path.iterdir()) == []
