@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
@@ -42,7 +43,7 @@ def sros(
 ) -> Ended:
     """Run the program in this process; a value None in ``env`` unsets the variable."""
     words = [str(argument) for argument in arguments]
-    before = dict(os.environ), Path.cwd(), sys.argv, signal.getsignal(signal.SIGTERM)
+    before = dict(os.environ), Path.cwd(), sys.argv, signal.getsignal(signal.SIGTERM), os.execve
     out = io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True)
     err = io.TextIOWrapper(io.BytesIO(), "utf-8", "backslashreplace", write_through=True)
     try:
@@ -54,6 +55,7 @@ def sros(
         if cwd:
             os.chdir(cwd)
         sys.argv = ["sros", *words]
+        os.execve = _refuse_to_execute  # type: ignore[assignment]
         with redirect_stdout(out), redirect_stderr(err):
             try:
                 main(words)
@@ -65,8 +67,14 @@ def sros(
         os.chdir(before[1])
         sys.argv = before[2]
         signal.signal(signal.SIGTERM, before[3])
+        os.execve = before[4]
     said = [stream.buffer.getvalue().decode(errors="replace") for stream in (out, err)]
     return Ended(status, *said)
+
+
+def _refuse_to_execute(*_: object) -> NoReturn:
+    # It would end the tests, and with the status of the command.
+    raise AssertionError("a command was executed")
 
 
 def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:

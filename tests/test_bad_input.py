@@ -777,7 +777,6 @@ MISUSE: dict[str, tuple[str, str]] = {
     "run nothing after --": ("run ks /a --", "no command"),
     "run what is not there": ("run ks /a -- no-such-command", "not found"),
     "run a folder": ("run ks /a -- ./ks", "not found"),
-    "run a file that is none": ("run ks /a -- ./noise", "refuses"),
     "run a missing enclave": ("run ks /c -- touch ran", "does not exist"),
     "run in another domain": ("run --domain 7 ks /a -- touch ran", "for domain 0"),
     "inspect nothing": ("inspect nothing", "does not exist"),
@@ -794,8 +793,6 @@ def test_misuse(case: str, keystore: Path, tmp_path: Path) -> None:
     line, why = MISUSE[case]
     (tmp_path / "p.xml").write_text(GOOD)
     (tmp_path / "p.txt").write_text("hello")
-    (tmp_path / "noise").write_bytes(os.urandom(64))
-    (tmp_path / "noise").chmod(0o755)
     before = snapshot(tmp_path)
     check_refused(sros(*shlex.split(line), cwd=tmp_path), why)
     check_unchanged(tmp_path, before)
@@ -814,6 +811,13 @@ def program(
         command, env=environment, capture_output=True, text=True, preexec_fn=preexec
     )
     return Ended(ended.returncode, ended.stdout, ended.stderr)
+
+
+def test_run_of_a_file_that_is_no_program(keystore: Path, tmp_path: Path) -> None:
+    noise = tmp_path / "noise"
+    noise.write_bytes(bytes(range(256)))
+    noise.chmod(0o755)
+    check_refused(program("run", keystore, "/a", "--", noise), os.strerror(errno.ENOEXEC))
 
 
 @pytest.mark.parametrize(

@@ -156,16 +156,16 @@ def _choices(
     template = load_template(name)
     if ca_layout:
         template = replace(template, separate_authorities=ca_layout == "separate")
-    if ca_validity:
+    if ca_validity is not None:
         template = replace(template, authority_validity=parse_span(ca_validity))
-    if validity:
+    if validity is not None:
         span, permissions = parse_span(validity), template.permissions_validity
         template = replace(template, certificate_validity=span)
         if not isinstance(span, timedelta):
             template = replace(template, permissions_validity=span)
         elif isinstance(permissions, timedelta):
             template = replace(template, permissions_validity=min(span, permissions))
-    if permissions_validity:
+    if permissions_validity is not None:
         template = replace(template, permissions_validity=parse_span(permissions_validity))
     return template
 
@@ -437,7 +437,7 @@ def distribute_key(words: tuple[str, ...], force: bool, dry_run: bool) -> None:
 
     TARGET is a keystore with this enclave only: real files in place of links, and no CA key.
     """
-    from sros_tool.keystore.export import distribute
+    from sros_tool.keystore.export import ARCHIVE_SUFFIXES, distribute
 
     root, rest = split_root(words)
     if len(rest) != 2:
@@ -445,7 +445,8 @@ def distribute_key(words: tuple[str, ...], force: bool, dry_run: bool) -> None:
     name, target = rest[0], PATH.convert(rest[1], None, None)
     export = distribute(root, [name], target, now=now(), force=force, dry_run=dry_run)
     if dry_run:
-        print_plan(target if target.is_dir() else target.parent, export.changes)
+        archive = target.name.endswith(ARCHIVE_SUFFIXES)
+        print_plan(target.parent if archive else target, export.changes)
         return
     if not export.changes:
         click.echo(f"'{target}' already holds enclave {name} as it is", err=True)

@@ -1,0 +1,534 @@
+"""The verbs as a person or a script uses them: what they do, print and return."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import stat
+import subprocess
+import sys
+import tarfile
+import time
+from pathlib import Path
+
+import pytest
+from harness import check_whole, policy_text, publish, remains, snapshot, sros, topics_of
+
+from sros_tool.cli.program import FAMILIES
+from sros_tool.keystore.layout import PRIVATE, REQUIRED_FILES
+from sros_tool.resources import policies_dir
+
+VERBS = [name for family in FAMILIES.values() for name in family]
+PROGRAM = [sys.executable, "-m", "sros_tool"]
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes that are started elsewhere find the package, too."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
+
+
+# ── help ───────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_helps_with_an_example(verb: str) -> None:
+    said = sros(verb, "--help").ok().out
+    assert f"Usage: sros {verb}" in said
+    assert f"$ sros {verb}" in said
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_hyphens_are_underscores(verb: str) -> None:
+    assert sros(verb.replace("_", "-"), "-h").ok().out == sros(verb, "-h").out
+
+
+@pytest.mark.parametrize(
+    ("alias", "verb"),
+    [
+        ("create_key", "create_enclave"),
+        ("list_keys", "list_enclaves"),
+        ("list-keys", "list_enclaves"),
+        ("export_enclave", "distribute_key"),
+    ],
+)
+def test_aliases(alias: str, verb: str) -> None:
+    assert sros(alias, "-h").ok().out == sros(verb, "-h").out
+
+
+def test_help_and_version() -> None:
+    said = sros("--help").ok().out
+    assert all(verb in said for verb in VERBS)
+    assert sros("--version").ok().out.startswith("sros ")
+    assert sros().status == 2
+
+
+# ── what scripts of ros2/sros2 rely on ─────────────────────────────────────────────────────
+
+
+def test_messages_and_statuses_of_ros2(keystore: Path, tmp_path: Path) -> None:
+    ended = sros("create_keystore", keystore)
+    assert ended.status == 1
+    assert ended.err.startswith(f"Unable to create keystore: keystore '{keystore}' already exists")
+    ended = sros("list_enclaves", tmp_path / "none")
+    assert ended.status == 1
+    assert ended.err.startswith(
+        f"Unable to list enclaves: '{tmp_path / 'none'}' is not a valid keystore"
+    )
+    assert sros("list_enclaves", keystore).ok().out == "/a\n/b\n"
+
+
+def test_the_layout_is_that_of_ros2(keystore: Path) -> None:
+    for name in REQUIRED_FILES:
+        assert (keystore / "enclaves/a" / name).is_file()
+    assert os.readlink(keystore / "enclaves/a/governance.p7s") == "../governance.p7s"
+    link = os.readlink(keystore / "enclaves/a/identity_ca.cert.pem")
+    assert link == "../../public/identity_ca.cert.pem"
+
+
+def test_a_keystore_that_ros2_made(tmp_path: Path) -> None:
+    """One CA without key identifiers, no sros.toml, and files that are open to all."""
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", "sros2").ok()
+    (root / "sros.toml").unlink()
+    for path in root.rglob("*"):
+        if not path.is_symlink():
+            path.chmod(0o755 if path.is_dir() else 0o644)
+    sros("create_enclave", root, "/talker").ok()
+    sros("env", root, "/talker").ok()
+    assert "rt/*" in topics_of(root / "enclaves/talker")
+    assert json.loads(sros("inspect", root, "--json").ok().out)["template"] is None
+
+
+# ── roots ──────────────────────────────────────────────────────────────────────────────────
+
+ROOTS = {
+    "relative": "ks2",
+    "with a slash at the end": "ks2/",
+    "with dots": "./x/../ks2",
+    "deep": "one/two/three",
+    "spaces and quotes": 'it\'s a "key" store $HOME `x`;&',
+    "line break": "key\nstore",
+    "not ASCII": "schlüssel-\u202eerots",
+    "not UTF-8": os.fsdecode(b"ks-\xff\xfe"),
+    "a hyphen in front": "./-ks",
+    "a pattern": "k[s]*?",
+    "a percent sign": "100%d",
+    "a comma": "a,b|c=d",
+    "long": "x" * 200,
+}
+
+
+@pytest.mark.parametrize("name", ROOTS)
+def test_root_with_any_name(name: str, tmp_path: Path) -> None:
+    (tmp_path / "x").mkdir()
+    root = ROOTS[name]
+    sros("create_keystore", root, cwd=tmp_path).ok()
+    sros("create_enclave", root, "/robot/arm", cwd=tmp_path).ok()
+    sros("generate_artifacts", "-k", root, "-e", "/robot", cwd=tmp_path).ok()
+    assert sros("list_enclaves", root, cwd=tmp_path).ok().out.split() == ["/robot", "/robot/arm"]
+    sros("inspect", root, cwd=tmp_path).ok()
+    sros("distribute_key", root, "/robot", "out", cwd=tmp_path).ok()
+    check_whole(tmp_path / root)
+    assert not remains(tmp_path)
+    # What the shell is told is what the file system knows.
+    script = 'eval "$("$@")"; test -f "$ROS_SECURITY_KEYSTORE/enclaves/robot/arm/key.pem"'
+    command = ["sh", "-c", script, "sh", *PROGRAM, "env", root, "/robot/arm"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+
+
+def test_root_is_the_working_folder_and_was_not_empty(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    sros("create_keystore", ".", cwd=tmp_path).ok()
+    sros("create_enclave", ".", "/a", cwd=tmp_path).ok()
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+    check_whole(tmp_path)
+    assert not remains(tmp_path)
+
+
+def test_root_from_the_environment(tmp_path: Path) -> None:
+    env = {"ROS_SECURITY_KEYSTORE": str(tmp_path / "ks")}
+    (tmp_path / "p.xml").write_text(policy_text({"/a": publish("x")}))
+    sros("generate_artifacts", "-e", "/a", env=env).ok()
+    sros("create_enclave", "/b", "/c", env=env).ok()
+    sros("create_permission", "/b", tmp_path / "p.xml", env=env)
+    sros("create_permission", "/a", tmp_path / "p.xml", env=env).ok()
+    assert sros("list_enclaves", env=env).ok().out.split() == ["/a", "/b", "/c"]
+    assert str(tmp_path / "ks") in sros("env", "/a", env=env).ok().out
+    sros("distribute_key", "/a", tmp_path / "out", env=env).ok()
+
+
+@pytest.mark.parametrize("umask", [0o000, 0o077])
+def test_modes_under_any_umask(umask: int, tmp_path: Path) -> None:
+    before = os.umask(umask)
+    try:
+        sros("create_keystore", tmp_path / "ks").ok()
+        sros("create_enclave", tmp_path / "ks", "/a").ok()
+        sros("distribute_key", tmp_path / "ks", "/a", tmp_path / "out.tar.gz").ok()
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "out.tar.gz").stat().st_mode) == 0o600
+    for path in (tmp_path / "ks").rglob("*"):
+        if not path.is_symlink():
+            mode = stat.S_IMODE(path.stat().st_mode)
+            assert not mode & 0o022, path
+            secret = path.name.endswith("key.pem") or path.name in ("private", "enclaves", "a")
+            assert not (secret and mode & 0o077), path
+
+
+# ── dry runs ───────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "create_keystore new",
+        "create_keystore deep/new --template production",
+        "create_enclave ks /c /d",
+        "create_permission ks /a p.xml",
+        "generate_artifacts -k ks -e /c -p p.xml",
+        "generate_artifacts -k something -e /c -p p.xml",
+        "distribute_key ks /a out",
+        "distribute_key ks /a out.tar.gz",
+        "policies --copy mine",
+    ],
+)
+def test_a_dry_run_tells_what_the_verb_then_does(line: str, keystore: Path, tmp_path: Path) -> None:
+    (tmp_path / "p.xml").write_text(policy_text({"/a": publish("new"), "/e": publish("new")}))
+    before = snapshot(tmp_path)
+    said = sros(*line.split(), "--dry-run", cwd=tmp_path).ok().out
+    assert snapshot(tmp_path) == before
+    sros(*line.split(), cwd=tmp_path).ok()
+    after = snapshot(tmp_path)
+    assert not remains(tmp_path)
+    if "policies" in line:
+        assert "mine" in said
+        return
+    folders = {path for path, (mode, _) in after.items() if stat.S_ISDIR(mode)}
+    words = [each.split(" ", 2) for each in said.splitlines()]
+    told = {path: action for _, action, path in words}
+    assert told == {
+        path: "replace" if path in before else "create"
+        for path in after.keys() - folders
+        if before.get(path) != after[path]
+    }
+
+
+# ── single verbs ───────────────────────────────────────────────────────────────────────────
+
+
+def test_create_keystore_names_its_choice_and_what_is_open(tmp_path: Path) -> None:
+    ended = sros("create_keystore", tmp_path / "1").ok()
+    assert "template development" in ended.out
+    assert "create_permission" in ended.err
+    ended = sros("create_keystore", tmp_path / "2", "--template", "production").ok()
+    assert ended.err == ""
+    ended = sros("create_keystore", tmp_path / "3", "--template", "sros2").ok()
+    assert "--ca-layout separate" in ended.err
+
+
+def test_create_keystore_by_options(tmp_path: Path) -> None:
+    words = ["--domain", "3,1,10-12", "--ca-layout", "single", "--ca-validity", "2y"]
+    words += ["--validity", "90d", "--permissions-validity", "300h"]
+    sros("create_keystore", tmp_path / "ks", *words).ok()
+    sros("create_enclave", tmp_path / "ks", "/a").ok()
+    described = json.loads(sros("inspect", tmp_path / "ks", "--json").ok().out)
+    (enclave,) = described["enclaves"]
+    assert enclave["domains"] == "1,3,10-12"
+    assert enclave["loadable"] is True
+    assert (
+        described["authorities"]["identity"]["subject"]
+        == (described["authorities"]["permissions"]["subject"])
+    )
+    assert (tmp_path / "ks/private/identity_ca.key.pem").is_symlink()
+
+
+def test_create_permission_replaces_and_says_so(keystore: Path, tmp_path: Path) -> None:
+    (tmp_path / "p.xml").write_text(policy_text({"/a": publish("new"), "/b": publish("new")}))
+    key = (keystore / "enclaves/a/key.pem").read_bytes()
+    ended = sros("create_permission", keystore, "/a", tmp_path / "p.xml").ok()
+    assert ended.out == "replaced the permissions of enclave /a\n"
+    assert topics_of(keystore / "enclaves/a") == {"rt/new", "ros_discovery_info"}
+    assert "rt/new" not in topics_of(keystore / "enclaves/b")
+    assert (keystore / "enclaves/a/key.pem").read_bytes() == key
+
+
+def test_generate_artifacts_tells_each_enclave(keystore: Path, tmp_path: Path) -> None:
+    (tmp_path / "p.xml").write_text(policy_text({"/a": publish("new"), "/c": publish("new")}))
+    (keystore / "enclaves/b/governance.p7s").unlink()
+    ended = sros("generate_artifacts", "-k", keystore, "-e", "/b", "/d", "-p", tmp_path / "p.xml")
+    assert set(ended.ok().out.splitlines()) == {
+        "replaced the permissions of enclave /a",
+        "completed enclave /b",
+        "created enclave /c",
+        "created enclave /d",
+    }
+    assert (keystore / "enclaves/b/governance.p7s").exists()
+
+
+def test_a_lost_certificate_is_issued_for_the_same_key(keystore: Path) -> None:
+    folder = keystore / "enclaves/a"
+    (folder / "cert.pem").unlink()
+    before = (folder / "permissions.p7s").read_bytes()
+    sros("create_enclave", keystore, "/a").ok()
+    assert (folder / "permissions.p7s").read_bytes() == before
+    check_whole(keystore)
+    sros("env", keystore, "/a").ok()
+
+
+def test_list_enclaves_as_json(keystore: Path) -> None:
+    listed = json.loads(sros("list_enclaves", keystore, "--json").ok().out)
+    assert listed == {"keystore": str(keystore), "enclaves": ["/a", "/b"]}
+
+
+def test_exports_repeat_byte_by_byte(keystore: Path, tmp_path: Path) -> None:
+    for name in ("1", "2"):
+        sros("distribute_key", keystore, "/a", tmp_path / name).ok()
+        sros("distribute_key", keystore, "/a", tmp_path / f"{name}.tar.gz").ok()
+        time.sleep(0.01)
+    assert snapshot(tmp_path / "1") == snapshot(tmp_path / "2")
+    assert (tmp_path / "1.tar.gz").read_bytes() == (tmp_path / "2.tar.gz").read_bytes()
+    exported = snapshot(tmp_path / "1")
+    assert not [path for path, (mode, _) in exported.items() if stat.S_ISLNK(mode)]
+    assert not [path for path in exported if PRIVATE in path or "/b" in path]
+    shutil.rmtree(keystore)
+    with tarfile.open(tmp_path / "1.tar.gz") as archive:
+        archive.extractall(tmp_path / "robot", filter="data")
+    assert snapshot(tmp_path / "robot").keys() == exported.keys()
+    for place in ("robot", "1"):
+        sros("env", tmp_path / place, "/a").ok()
+    key = tmp_path / "robot/enclaves/a/key.pem"
+    assert stat.S_IMODE(key.stat().st_mode) == 0o600
+
+
+def test_an_export_grows_and_is_replaced_on_request_only(keystore: Path, tmp_path: Path) -> None:
+    target = tmp_path / "out"
+    sros("distribute_key", keystore, "/a", target).ok()
+    sros("distribute_key", keystore, "/b", target).ok()
+    assert sros("list_enclaves", target).ok().out.split() == ["/a", "/b"]
+    assert "as it is" in sros("distribute_key", keystore, "/a", target).ok().err
+    (tmp_path / "p.xml").write_text(policy_text({"/a": publish("new")}))
+    sros("create_permission", keystore, "/a", tmp_path / "p.xml").ok()
+    before = snapshot(target)
+    assert sros("distribute_key", keystore, "/a", target).status == 1
+    assert snapshot(target) == before
+    assert "replaced" in sros("distribute_key", keystore, "/a", target, "--force").ok().err
+    assert "rt/new" in topics_of(target / "enclaves/a")
+    assert not remains(tmp_path)
+
+
+INSPECTED = {
+    "": "keystore",
+    "enclaves/a": "enclave",
+    "enclaves/a/cert.pem": "certificate",
+    "enclaves/a/key.pem": "private key",
+    "enclaves/a/permissions.p7s": "permissions",
+    "enclaves/a/permissions.xml": "permissions",
+    "enclaves/governance.p7s": "governance",
+    "enclaves/governance.xml": "governance",
+    "public/identity_ca.cert.pem": "certificate",
+}
+
+
+@pytest.mark.parametrize("path", INSPECTED)
+def test_inspect(path: str, keystore: Path) -> None:
+    described = json.loads(sros("inspect", keystore / path, "--json").ok().out)
+    assert described["kind"] == INSPECTED[path]
+    said = sros("inspect", keystore / path).ok().out
+    assert "BEGIN" not in said, "keys are not shown"
+    if path.endswith(".p7s"):
+        assert described["signature_verified"] is True
+    if path.endswith("a/permissions.p7s"):
+        (grant,) = described["grants"]
+        assert grant["rules"][0]["rights"]["topics"] == {"publish": ["/old_a"]}
+        assert "publish topics: /old_a" in said
+
+
+def test_inspect_shows_trouble(keystore: Path, tmp_path: Path) -> None:
+    document = keystore / "enclaves/a/permissions.p7s"
+    document.write_bytes(document.read_bytes().replace(b"old_a", b"new_a"))
+    for path in (document, keystore / "enclaves/a", keystore):
+        ended = sros("inspect", path)
+        assert ended.status == 1
+        assert "does not match" in ended.out
+    other = keystore / "public/identity_ca.cert.pem"
+    assert sros("inspect", keystore / "enclaves/b/permissions.p7s", "--ca", other).status == 1
+    shutil.copy(keystore / "enclaves/b/permissions.p7s", tmp_path)
+    assert "not verified" in sros("inspect", tmp_path / "permissions.p7s").ok().out
+
+
+@pytest.mark.parametrize(
+    "date", ["9999-12-31T23:59:59-14:00", "0001-01-01T00:00:00+14:00", "2020-02-30T00:00:00", ""]
+)
+def test_inspect_of_a_date_at_the_end_of_time(date: str, keystore: Path, tmp_path: Path) -> None:
+    document = (keystore / "enclaves/a/permissions.xml").read_text()
+    start, end = document.index("<not_after>"), document.index("</not_after>")
+    (tmp_path / "p.xml").write_text(document[:start] + f"<not_after>{date}" + document[end:])
+    ended = sros("inspect", tmp_path / "p.xml")
+    assert ended.status == 1
+    assert "defect" not in ended.err
+
+
+def test_policies_are_listed_and_copied(tmp_path: Path) -> None:
+    listed = sros("policies").ok().out
+    assert "/talker_listener/talker" in listed
+    as_json = json.loads(sros("policies", "--json").ok().out)
+    assert len(as_json) == len(listed.splitlines())
+    sros("policies", "--copy", tmp_path / "mine").ok()
+    assert snapshot(tmp_path / "mine") == snapshot(policies_dir())
+    sros("generate_artifacts", "-k", tmp_path / "ks", "-p", tmp_path / "mine/fibonacci.xml").ok()
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_completion(shell: str) -> None:
+    assert "_SROS_COMPLETE" in sros("completion", shell).ok().out
+
+
+def test_completion_of_enclaves(keystore: Path) -> None:
+    environment = {
+        **os.environ,
+        "_SROS_COMPLETE": "bash_complete",
+        "COMP_WORDS": f"sros env {keystore} /",
+        "COMP_CWORD": "3",
+    }
+    script = "from sros_tool.cli import main; main()"
+    ended = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True
+    )
+    assert ended.stdout.split() == ["plain,/a", "plain,/b"], ended
+
+
+# ── env and run ────────────────────────────────────────────────────────────────────────────
+
+
+def variables(keystore: Path, domain: int = 0) -> dict[str, str]:
+    return {
+        "ROS_SECURITY_KEYSTORE": str(keystore),
+        "ROS_SECURITY_ENABLE": "true",
+        "ROS_SECURITY_STRATEGY": "Enforce",
+        "ROS_SECURITY_ENCLAVE_OVERRIDE": "/a",
+        "ROS_DOMAIN_ID": str(domain),
+    }
+
+
+def test_env_in_every_form(keystore: Path) -> None:
+    wanted = variables(keystore)
+    assert json.loads(sros("env", keystore, "/a", "--json").ok().out) == wanted
+    assert json.loads(sros("env", keystore, "/a", "--format", "json").ok().out) == wanted
+    docker = sros("env", keystore, "/a", "--format", "docker").ok().out
+    assert dict(line.split("=", 1) for line in docker.splitlines()) == wanted
+    for form, start in (("sh", "export "), ("fish", "set -gx "), ("systemd", "Environment=")):
+        said = sros("env", keystore, "/a", "--format", form).ok().out
+        assert len(said.splitlines()) == len(wanted)
+        assert all(line.startswith(start) for line in said.splitlines())
+
+
+def test_env_of_a_path_that_a_form_cannot_hold(tmp_path: Path) -> None:
+    root = tmp_path / "a\nb"
+    sros("create_keystore", root).ok()
+    sros("create_enclave", root, "/a").ok()
+    for form in ("docker", "systemd"):
+        assert sros("env", root, "/a", "--format", form).status == 2
+    assert json.loads(sros("env", root, "/a", "--json").ok().out) == variables(root)
+
+
+@pytest.mark.parametrize(
+    ("domains", "option", "environment", "chosen"),
+    [
+        ("0,7", None, None, "0"),
+        ("0,7", "7", None, "7"),
+        ("0,7", None, "7", "7"),
+        ("0,7", "0", "7", "0"),
+        ("0,7", None, "", "0"),
+        ("5-9", None, None, "5"),
+        ("5-9", None, "6", "6"),
+        ("230", None, None, "230"),
+    ],
+)
+def test_the_domain_of_a_process(
+    domains: str, option: str | None, environment: str | None, chosen: str, tmp_path: Path
+) -> None:
+    sros("create_keystore", tmp_path / "ks", "--domain", domains).ok()
+    sros("create_enclave", tmp_path / "ks", "/a").ok()
+    words = ["--domain", option] if option else []
+    env = {"ROS_DOMAIN_ID": environment}
+    said = sros("env", tmp_path / "ks", "/a", *words, "--json", env=env).ok().out
+    assert json.loads(said)["ROS_DOMAIN_ID"] == chosen
+
+
+SHOW = """
+import json, os, signal
+ignored = [s for s in signal.Signals if signal.getsignal(s) == signal.SIG_IGN]
+print(json.dumps([dict(os.environ), os.getcwd(), [i.name for i in ignored]]))
+"""
+
+
+def test_run_executes_in_exactly_that_environment(keystore: Path, tmp_path: Path) -> None:
+    command = [*PROGRAM, "run", "ks", "/a", "--", "env", "-i", "sh", "-c", "true"]
+    subprocess.run(command, cwd=tmp_path, check=True)
+    wrong = {"ROS_SECURITY_ENABLE": "false", "ROS_SECURITY_KEYSTORE": "/nowhere", "MINE": "1"}
+    environment = {**os.environ, **wrong}
+    command = [*PROGRAM, "run", "ks", "/a", "--", sys.executable, "-c", SHOW]
+    said = subprocess.run(
+        command, cwd=tmp_path, env=environment, check=True, capture_output=True
+    ).stdout
+    seen, folder, ignored = json.loads(said)
+    wanted = {**environment, **variables(keystore)}
+    for each in (seen, wanted):
+        each.pop("LC_CTYPE", None)  # Python sets it for itself where no locale is chosen
+    assert seen == wanted
+    assert folder == str(tmp_path)
+    # Those that the new Python itself ignores; a command without Python sees none.
+    assert set(ignored) <= {"SIGPIPE", "SIGXFSZ"}
+    command = [*PROGRAM, "run", "ks", "/a", "--", "grep", "SigIgn", "/proc/self/status"]
+    said = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True).stdout
+    assert int(said.split()[1], 16) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "out", "status"),
+    [
+        (["--", "sh", "-c", "exit 7"], "", 7),
+        (["--", "sh", "-c", "echo $1", "sh", "--"], "--\n", 0),
+        (["echo", "x"], "x\n", 0),
+        (["--", "echo", "--domain", "9"], "--domain 9\n", 0),
+        (["--", "printf", "%s", "--help"], "--help", 0),
+        (["--", "echo", "--", "-x"], "-- -x\n", 0),
+        (["--", "sh", "-c", "kill -TERM $$"], "", -signal.SIGTERM),
+        (["--", "./here"], "here\n", 0),
+    ],
+)
+def test_run_hands_everything_on(
+    words: list[str], out: str, status: int, keystore: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "here").write_text("#!/bin/sh\necho here\n")
+    (tmp_path / "here").chmod(0o755)
+    command = [*PROGRAM, "run", str(keystore), "/a", *words]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert (ended.stdout, ended.returncode) == (out, status), ended.stderr
+
+
+def test_a_reader_that_goes_away_is_no_trouble(keystore: Path) -> None:
+    script = '"$@" | head -c 1'
+    command = ["sh", "-c", script, "sh", *PROGRAM, "run", str(keystore), "/a", "--", "yes"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=30)
+    assert (ended.stdout, ended.stderr) == ("y", "")
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_polite_end_leaves_nothing(number: signal.Signals, keystore: Path) -> None:
+    before = snapshot(keystore.parent)
+    names = [f"/n{index}" for index in range(400)]
+    process = subprocess.Popen(
+        [*PROGRAM, "create_enclave", str(keystore), *names], stderr=subprocess.PIPE, text=True
+    )
+    deadline = time.monotonic() + 20
+    while not remains(keystore) and time.monotonic() < deadline:
+        time.sleep(0.002)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=20)
+    assert process.returncode == (143 if number == signal.SIGTERM else 130), said
+    assert "Traceback" not in said
+    assert snapshot(keystore.parent) == before
