@@ -131,6 +131,8 @@ def generate_policy(
         raise UsageError("no file is named", "", "Name the policy FILE to write.")
     if node is not None:
         raise UsageError("--node is for --from-log only")
+    if watch is not None and spin_time is not None:
+        raise UsageError("--watch and --spin-time are two ways to look", "", "Choose one.")
     from sros_tool.graph.common import common_parts
     from sros_tool.graph.learn import learn
     from sros_tool.graph.write import draft, write

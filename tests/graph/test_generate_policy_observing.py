@@ -1,0 +1,167 @@
+"""``sros generate_policy`` beside a graph that is made up: what it says, and how it fails."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from harness import Ended, sros
+
+FAKE = Path(__file__).with_name("fake_rclpy.py")
+NO_NODES = "No nodes detected in the ROS graph. No policy file was generated."
+
+Program = Callable[..., Ended]
+
+
+@pytest.fixture
+def program(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> Program:
+    """Runs ``sros generate_policy`` in ``tmp_path`` beside the graph that it is given."""
+    place = tmp_path_factory.mktemp("fake")
+    for module in ("__init__", "parameter", "signals"):
+        (place / "rclpy").mkdir(exist_ok=True)
+        shutil.copy(FAKE, place / "rclpy" / f"{module}.py")
+    monkeypatch.syspath_prepend(str(place))
+
+    def run(graph: dict[str, Any], *words: str, **environment: str) -> Ended:
+        env = {"PYTHONPATH": str(place), "FAKE_GRAPH": json.dumps(graph), **environment}
+        return sros("generate_policy", *words, env=env, cwd=tmp_path)
+
+    return run
+
+
+def graph(*nodes: tuple[str, str, str, str, list[str]], rmw: str = "rmw_fake") -> dict[str, Any]:
+    return {"nodes": nodes, "rmw": rmw}
+
+
+TALKER = ("/talker", "/", "talker", "01", ["publish rt/chatter"])
+TWINS = (
+    ("/one", "/", "twin", "01", ["publish rt/x"]),
+    ("/two", "/", "twin", "02", ["publish rt/y"]),
+)
+SHORT = ("robot.xml", "--spin-time", "0.6")
+
+
+def test_what_is_seen_is_written_and_nothing_else_on_stdout(program: Program) -> None:
+    ended = program(graph(TALKER), *SHORT)
+    assert ended == Ended(0, "wrote 'robot.xml': 1 enclave, 1 node, 1 right\n", "")
+
+
+def test_json_has_a_stable_shape(program: Program) -> None:
+    ended = program(graph(TALKER), *SHORT, "--json").ok()
+    assert json.loads(ended.out) == {
+        "file": "robot.xml",
+        "created": True,
+        "changed": True,
+        "dry_run": False,
+        "nodes": [
+            {
+                "enclaves": ["/talker"],
+                "namespace": "/",
+                "name": "talker",
+                "participant": "01" + "00" * 11,
+                "publish": ["rt/chatter"],
+                "subscribe": [],
+            }
+        ],
+        "added": [
+            {
+                "enclave": "/talker",
+                "qualifier": "ALLOW",
+                "kind": "topics",
+                "right": "publish",
+                "name": "/chatter",
+            }
+        ],
+        "copied": [],
+        "notes": [],
+    }
+
+
+def test_twins_are_told_apart_where_the_middleware_keeps_an_order(
+    program: Program, tmp_path: Path
+) -> None:
+    ended = program(graph(*TWINS, rmw="rmw_cyclonedds_cpp"), *SHORT).ok()
+    assert ended.err == ""
+    assert (tmp_path / "robot.xml").read_text().count("<topic>") == 2
+
+
+def test_twins_get_the_union_and_a_note_where_it_does_not(program: Program, tmp_path: Path) -> None:
+    ended = program(graph(*TWINS), *SHORT).ok()
+    assert ended.err.startswith("note [graph.ambiguous]: ")
+    assert "/twin in /one or /two" in ended.err
+    assert (tmp_path / "robot.xml").read_text().count("<topic>") == 4
+
+
+@pytest.mark.parametrize(
+    ("environment", "why"),
+    [
+        ({}, "Nodes may be in another domain (ROS_DOMAIN_ID, --domain)"),
+        ({"ROS_SECURITY_KEYSTORE": "/ks"}, "ROS_SECURITY_KEYSTORE is set, so the robot may be"),
+        ({"ROS_DOMAIN_ID": "7"}, "Looked at domain 7 for 1 s with rmw_fake."),
+    ],
+)
+def test_an_empty_graph_is_explained(
+    program: Program, tmp_path: Path, environment: dict[str, str], why: str
+) -> None:
+    ended = program(graph(), *SHORT, **environment)
+    assert (ended.status, ended.out) == (1, "")
+    assert ended.err.splitlines()[0] == NO_NODES
+    assert why in ended.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_tools_alone_are_an_empty_graph(program: Program) -> None:
+    ended = program(graph(("/", "/", "_ros2cli_12", "01", ["publish rt/x"])), *SHORT)
+    assert ended.status == 1
+    assert ended.err.splitlines()[0] == NO_NODES
+    assert "note [graph.tool]" in ended.err
+
+
+@pytest.mark.parametrize(
+    ("stage", "says", "what"),
+    [
+        ("import", "", "rclpy cannot be imported. RuntimeError: invalid allocator"),
+        ("init", "", "rclpy cannot start. RuntimeError"),
+        ("node", "", "rclpy cannot start a node to observe the graph with. RuntimeError"),
+        ("crash", "boom", "the process that observes the ROS graph failed. It ended with status"),
+        (
+            "node",
+            "\x1b[31mrt/parameter_events topic not found in allow rule.\x1b[m",
+            "the enclave / does not permit an observer. DDS says: rt/parameter_events topic not",
+        ),
+        ("node", "PKCS7 data verification failed", "DDS refuses the enclave /. It says: PKCS7"),
+        ("node", "Please compile Fast DDS using the -DSECURITY=ON", "was built without DDS Sec"),
+    ],
+)
+def test_a_failure_is_one_paragraph(
+    program: Program, tmp_path: Path, stage: str, says: str, what: str
+) -> None:
+    ended = program({"fails": stage, "says": says}, *SHORT)
+    assert (ended.status, ended.out) == (1, "")
+    assert ended.err.count("\n") == 1
+    assert ended.err.startswith("Unable to generate policy: ")
+    assert what in ended.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_watch_tells_what_is_new(program: Program) -> None:
+    ended = program(graph(TALKER), "robot.xml", "--watch", "1s").ok()
+    assert ended.err.splitlines() == [
+        "watching for 1 s, or until Ctrl-C; then the policy is written",
+        "new: /talker (/talker)",
+        "new: /talker (/talker) publish /chatter",
+    ]
+
+
+def test_the_words_of_a_watch(program: Program, tmp_path: Path) -> None:
+    """A duration belongs to --watch, and a file that follows it does not."""
+    program(graph(TALKER), "--watch", "1s", "robot.xml").ok()
+    assert (tmp_path / "robot.xml").exists()
+    ended = program(graph(TALKER), "robot.xml", "--watch", "1s", "--spin-time", "2")
+    assert ended.status == 2
