@@ -10,7 +10,7 @@ governance protects the discovery of the topic.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 from sros_tool.graph.fold import Right
@@ -34,6 +34,11 @@ _READER = re.compile(
 _CLIENT = re.compile(r"create(?:_c| c|C)lient")
 _SERVER = re.compile(r"create(?:_s| s|S)ervice")
 _REMOTE = re.compile(r"check_remote_data|remote (?:writer|reader)")
+_LABEL = re.compile(
+    r"\[[\w.-]+-\d+\] "  # ros2 launch: [talker-1]
+    r"|(?:\S+ +){3,4}[\w.@-]+\[\d+\]: "  # journald: Nov 21 06:00:00 robot talker[12]:
+    r"|[\w.-]+ +\| "  # Docker Compose: talker-1  |
+)
 _NEAR_LINES = 3
 """How many lines after a denial still speak of it."""
 
@@ -69,9 +74,22 @@ class Proposal:
 
 
 def read_denials(text: str) -> tuple[Denial, ...]:
-    """Every refusal in a log without colours, once, in the order of the log."""
-    lines = text.splitlines()
-    found: dict[Denial, None] = {}
+    """Every refusal in a log without colours, once, in the order of the log.
+
+    Processes that write into one log are told apart by what ros2 launch, journald or Docker
+    Compose puts before their lines; an enclave that one of them names is not that of another.
+    """
+    processes: dict[str, list[str]] = {}
+    for line in text.splitlines():
+        label = _LABEL.match(line)
+        processes.setdefault(label[0].strip() if label else "", []).append(line)
+    found = {each: None for lines in processes.values() for each in _denials_of(lines)}
+    known = {replace(each, direction="") for each in found if each.direction}
+    return tuple(each for each in found if each.direction or each not in known)
+
+
+def _denials_of(lines: list[str]) -> Iterator[Denial]:
+    """The refusals of one process."""
     enclave = ""
     for number, line in enumerate(lines):
         if said := _ENCLAVE.search(line):
@@ -80,9 +98,7 @@ def read_denials(text: str) -> tuple[Denial, ...]:
             topic = match["topic"]
             remote, direction = _near(lines, number, topic)
             by_rule = "deny" in match["how"]
-            found[Denial(topic, direction, enclave, by_rule, remote)] = None
-    known = {replace(each, direction="") for each in found if each.direction}
-    return tuple(each for each in found if each.direction or each not in known)
+            yield Denial(topic, direction, enclave, by_rule, remote)
 
 
 def _denied(line: str) -> re.Match[str] | None:

@@ -15,6 +15,13 @@ ANY_NODE = ("/", "*")
 """The namespace and node of a profile that is not about a particular node."""
 
 
+_SEVERAL = Note(
+    "log.several-enclaves",
+    "the log names several enclaves, and each denial counts for the one that its process named "
+    "last; check that processes without a label of their own did not write at the same time",
+)
+
+
 def as_learned(
     proposal: Proposal, enclave: str, node: tuple[str, str] | None, policy: Policy | None
 ) -> Learned:
@@ -75,7 +82,8 @@ def _notes(proposal: Proposal) -> tuple[Note, ...]:
             "not proposed, as a policy has no words for these topics: {}",
         ),
     }
-    return tuple(
+    several = len(proposal.rights) > 1
+    return (_SEVERAL,) * several + tuple(
         Note(name, text.format(", ".join(dict.fromkeys(map(_shown, denials)))))
         for name, (denials, text) in texts.items()
         if denials

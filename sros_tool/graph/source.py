@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -142,6 +143,8 @@ class RosGraph:
                     return None
                 data = os.read(self._report, 1 << 20)
                 if not data:
+                    with contextlib.suppress(subprocess.TimeoutExpired):
+                        self._process.wait(_END_SECONDS)
                     raise self._failed(None)
                 self._rest += data
         line, _, self._rest = self._rest.partition(b"\n")

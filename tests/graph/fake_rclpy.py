@@ -1,4 +1,6 @@
-"""Stands in for rclpy and the modules of it that are used: a graph that $FAKE_GRAPH describes, or a failure that it names.
+"""Stands in for rclpy and those of its modules that are used.
+
+$FAKE_GRAPH describes the graph, or names a failure.
 
 JSON: ``{"nodes": [[enclave, namespace, name, participant, ["publish topic", ...]]...]}``, or
 ``{"fails": "import" | "init" | "node" | "crash", "says": TEXT}``.

@@ -98,6 +98,37 @@ def test_the_enclave_that_rcl_names() -> None:
 
 
 @pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("[talker-1] ", "[listener-2] "),
+        ("Nov 21 06:00:00 robot talker[12]: ", "Nov 21 06:00:00 robot listener[13]: "),
+        (
+            "2026-11-21T06:00:00+0000 host robot talker[1]: ",
+            "2026-11-21T06:00:00+0000 host robot l[2]: ",
+        ),
+        ("talker-1    | ", "listener-1  | "),
+    ],
+)
+def test_processes_that_write_at_the_same_time(one: str, other: str) -> None:
+    text = (
+        f"{one}[INFO] [1.2] [rcl]: Found security directory: /ks/enclaves/talker\n"
+        f"{other}[INFO] [1.2] [rcl]: Found security directory: /ks/enclaves/listener\n"
+        f"{one}2026-11-21 06:00:00.1 [SECURITY Error] rt/x topic not found in allow rule.\n"
+        f"{other}2026-11-21 06:00:00.1 [SECURITY Error] rt/x topic not found in allow rule.\n"
+        f"{other}failed to create subscription: denied\n"
+        f"{one}could not create publisher: denied\n"
+    )
+    proposal = propose(read_denials(text))
+    assert proposal.rights == {
+        "/talker": {Right("publish", "/x")},
+        "/listener": {Right("subscribe", "/x")},
+    }
+    assert [note.id for note in as_learned(proposal, "", None, None).notes] == [
+        "log.several-enclaves"
+    ]
+
+
+@pytest.mark.parametrize(
     ("topic", "direction", "right"),
     [
         ("rt/x", "publish", Right("publish", "/x")),
