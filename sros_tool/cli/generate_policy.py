@@ -190,6 +190,7 @@ def _from_logs(
     from sros_tool.graph.observation import Observation
     from sros_tool.graph.proposal import as_learned
     from sros_tool.graph.write import draft, write
+    from sros_tool.policy.rights import order, policy_rights
     from sros_tool.runtime.security_log import plain_text
 
     denials = [each for log in logs for each in read_denials(plain_text(_log_text(log)))]
@@ -200,6 +201,12 @@ def _from_logs(
             "Nothing is to be proposed." if denials else "The logs tell of no denial.", err=True
         )
         return 1
+    if file is None and as_json:
+        rights = sorted(policy_rights(learned.policy()), key=order)
+        print_json(
+            {"added": [right_json(each) for each in rights], "notes": notes_json(learned.notes)}
+        )
+        return 0
     if file is None:
         print_notes(learned.notes)
         click.echo(render(learned.profiles).decode(), nl=False)

@@ -80,6 +80,17 @@ def test_the_rules_that_logs_ask_for_go_to_stdout() -> None:
     assert "note [log.denied-by-rule]" in ended.err
 
 
+def test_or_as_json() -> None:
+    ended = sros("generate_policy", "--enclave", "/robot", "--from-log", CYCLONE, "--json").ok()
+    value = json.loads(ended.out)
+    assert [(each["right"], each["name"]) for each in value["added"]] == [
+        ("publish", "/nope"),
+        ("subscribe", "/chatter"),
+    ]
+    assert [each["id"] for each in value["notes"]] == ["log.unclear", "log.denied-by-rule"]
+    assert ended.err == ""
+
+
 def test_or_into_a_file(tmp_path: Path) -> None:
     words = ("--enclave", "/robot", "--from-log", LOG, CYCLONE)
     path = tmp_path / "robot.xml"
