@@ -24,7 +24,10 @@ Example:
       valid from 2026-11-20T05:59:44Z to 2027-05-20T05:59:44Z
       ALLOW in domain 0
         publish topics: /chatter, /parameter_events, /rosout
-        ...""",
+        ...
+  $ sros inspect keystore --history
+  2026-11-20T05:59:44Z  certificate  current     /talker  until 2027-11-20T05:59:44Z  4f1c9a
+  ...""",
 )
 @click.argument("path", type=PATH)
 @click.option(
@@ -33,17 +36,25 @@ Example:
     type=PATH,
     help="The permissions CA certificate to verify a signed document against.",
 )
+@click.option(
+    "--history",
+    is_flag=True,
+    help="Show everything that the keystore PATH ever issued, and what became of it.",
+)
 @json_option
-def inspect(path: Path, authority: Path | None, as_json: bool) -> int:
+def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) -> int:
     """Show what PATH says: a keystore, an enclave's folder, a certificate, a key or a .p7s file.
 
-    The exit status is 1 if an enclave cannot run, or a signature does not verify.
+    The exit status is 1 if an enclave cannot run, a signature does not verify, or the ledger of
+    the keystore does not know a certificate or signed document in it.
     """
     from sros_tool.errors import DocumentError
     from sros_tool.keystore.describe import describe
 
     if not path.exists():
         raise DocumentError(f"'{path}' does not exist")
+    if history:
+        return _show_history(path, as_json)
     described = describe(path, now=now(), authority=authority)
     if as_json:
         print_json(described)
@@ -52,6 +63,36 @@ def inspect(path: Path, authority: Path | None, as_json: bool) -> int:
             click.echo(line)
     bad = described.get("problems") or described.get("signature_verified") is False
     return 1 if bad and described.get("signed") is not False else 0
+
+
+def _show_history(root: Path, as_json: bool) -> int:
+    from dataclasses import asdict
+
+    from sros_tool.keystore.history import history
+
+    found = history(root, now=now())
+    if as_json:
+        print_json(
+            {
+                "kind": "history",
+                "path": str(root),
+                "entries": [
+                    {**asdict(item.entry), "status": item.status, "path": item.path}
+                    for item in found.items
+                ],
+                "unexplained": list(found.unexplained),
+            }
+        )
+    else:
+        for item in found.items:
+            entry = item.entry
+            until = f"until {entry.not_after}" if entry.not_after else ""
+            words = (entry.enclave or entry.subject, until, entry.serial, entry.reason)
+            line = "  ".join(word for word in words if word)
+            click.echo(f"{entry.time}  {entry.what:11}  {item.status:10}  {line}".rstrip())
+        for name in found.unexplained:
+            click.echo(f"NOT IN THE LEDGER  {name}")
+    return 1 if found.unexplained else 0
 
 
 def _keystore(d: dict[str, Any]) -> Iterator[str]:

@@ -14,7 +14,7 @@ from cryptography import x509
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import parse_permissions, render_permissions
 from sros_tool.dds.portable import document_notes
-from sros_tool.errors import KeystoreError
+from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.authority import Authorities
 from sros_tool.keystore.defaults import default_enclave
 from sros_tool.keystore.layout import CRL, ENCLAVES, IDENTITY, PERMISSIONS, PUBLIC, enclave_folder
@@ -23,7 +23,9 @@ from sros_tool.keystore.parallel import in_shares
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.notes import Note
+from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
+    common_name_of,
     enclave_subject,
     issued_by,
     load_certificate,
@@ -159,10 +161,27 @@ class Registrar:
             public = new.public_key()
             self._transaction.write(f"{folder}/key.pem", key_pem(new), private=True)
         subject = enclave_subject(name, unique=self._template.unique_subject)
+        if "permissions.p7s" in present:
+            subject = self._subject_of_permissions(folder, subject)
         certificate = self._issuer.issue(subject, public, self._certificate_validity)
         self._transaction.write(f"{folder}/cert.pem", pem(certificate))
         self._entries.append(certificate_entry(self._now, "certificate", certificate, name))
         return certificate
+
+    def _subject_of_permissions(self, folder: str, otherwise: x509.Name) -> x509.Name:
+        """The subject of this name that the permissions of an enclave are signed for."""
+        path = self._transaction.root / folder / "permissions.p7s"
+        try:
+            signed = smime.parse(read_bytes(path, "permissions document"))
+            signed.verify(self._authorities.permissions.certificate)
+            subjects = [
+                x509.Name.from_rfc4514_string(grant.subject)
+                for grant in parse_permissions(signed.document, f"'{path}'").grants
+            ]
+        except (SrosError, ValueError):
+            return otherwise  # they cannot be used with any certificate
+        own = common_name_of(otherwise)
+        return next((each for each in subjects if common_name_of(each) == own), otherwise)
 
     def _existing(self, name: str, folder: str) -> x509.Certificate:
         path = self._transaction.root / folder / "cert.pem"
@@ -180,7 +199,7 @@ class Registrar:
             raise KeystoreError(
                 f"the certificate of enclave {name} is not valid now",
                 f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}.",
-                f"Remove '{path}' to have a new one issued for the same key.",
+                f"Renew it with `sros renew {self._transaction.root} {name}`.",
             )
         return certificate
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import re
 from collections.abc import Callable, Sequence
@@ -17,7 +18,13 @@ from sros_tool.keystore.authority import Authorities, load_authorities
 from sros_tool.keystore.create import list_enclaves
 from sros_tool.keystore.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import enclave_folder
-from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
+from sros_tool.keystore.ledger import (
+    Entry,
+    append,
+    certificate_entry,
+    document_entry,
+    read_ledger,
+)
 from sros_tool.keystore.open import load_settings
 from sros_tool.keystore.parallel import in_shares
 from sros_tool.keystore.template import Template
@@ -34,7 +41,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.pki.token import TokenKey
-from sros_tool.validity import Window, iso, parse_duration, window
+from sros_tool.validity import BACKDATE, Window, iso, parse_duration, window
 from sros_tool.xml import read_bytes
 
 Progress = Callable[[str], None]
@@ -58,7 +65,7 @@ class Lifetime:
             return self.ends() - now <= threshold.remaining
         assert threshold.elapsed is not None
         return any(
-            (now - each.not_before) / (each.not_after - each.not_before) >= threshold.elapsed
+            _elapsed(each, now) >= threshold.elapsed
             for each in (self.certificate, self.permissions)
         )
 
@@ -69,6 +76,14 @@ class Threshold:
 
     remaining: timedelta | None = None
     elapsed: float | None = None
+
+
+def _elapsed(validity: Window, now: datetime) -> float:
+    """How much of a life is over, from 0 to 1; the time by which it was back-dated is no life."""
+    begin = validity.not_before
+    if validity.not_after - begin > BACKDATE:
+        begin += BACKDATE
+    return (now - begin) / (validity.not_after - begin)
 
 
 def parse_threshold(text: str) -> Threshold:
@@ -150,6 +165,7 @@ class _Renewer:
         self._template = template
         self._now = now
         self._new_key = new_key
+        self._policies = {each.sha256: each.policy for each in read_ledger(transaction.root)}
         self._certificate_validity = window(now, template.certificate_validity)
         self._permissions_validity = window(now, template.permissions_validity).within(
             validity_of(authorities.permissions.certificate)
@@ -218,7 +234,13 @@ class _Renewer:
         return [
             certificate_entry(self._now, "certificate", certificate, name),
             document_entry(
-                self._now, "permissions", message, enclave=name, subject=text, validity=validity
+                self._now,
+                "permissions",
+                message,
+                enclave=name,
+                subject=text,
+                validity=validity,
+                policy=self._policies.get(state.digest, ""),
             ),
         ]
 
@@ -227,6 +249,7 @@ class _Renewer:
 class _State:
     certificate: x509.Certificate
     signed: smime.SignedDocument
+    digest: str
     grant: Grant
     lifetime: Lifetime
 
@@ -237,7 +260,8 @@ def _read(root: Path, name: str) -> _State:
         path = folder / "cert.pem"
         certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
         path = folder / "permissions.p7s"
-        signed = smime.parse(read_bytes(path, "permissions document"))
+        message = read_bytes(path, "permissions document")
+        signed = smime.parse(message)
         permissions = parse_permissions(signed.document, f"'{path}'")
     except SrosError as error:
         raise KeystoreError(
@@ -255,7 +279,8 @@ def _read(root: Path, name: str) -> _State:
         )
     # The first grant that fits is the one that DDS reads.
     lifetime = Lifetime(name, validity_of(certificate), matching[0].validity)
-    return _State(certificate, signed, matching[0], lifetime)
+    digest = hashlib.sha256(message).hexdigest()
+    return _State(certificate, signed, digest, matching[0], lifetime)
 
 
 def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:

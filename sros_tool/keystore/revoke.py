@@ -19,7 +19,7 @@ from sros_tool.keystore.layout import (
     REVOKED,
     enclave_folder,
 )
-from sros_tool.keystore.ledger import Entry, append, document_entry
+from sros_tool.keystore.ledger import Entry, append, document_entry, read_ledger
 from sros_tool.keystore.open import load_settings
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Change, Transaction, tidy
@@ -59,30 +59,34 @@ def revoke(
 ) -> Revocation:
     """Revoke the certificates of enclaves and move their files to ``revoked`` in the keystore.
 
+    Every certificate of an enclave is revoked that the ledger knows and that has not ended: an
+    earlier one would serve whoever has a copy of it, with the key, just as well.
     Every other enclave gets ``crl.pem``, a link to the one list.  ``reason`` is one of `REASONS`.
     """
     if reason not in REASONS:
         raise UsageError(f"{reason!r} is not a reason", f"Reasons are {', '.join(REASONS)}.")
     if not dry_run:
         tidy(root)
-    existing = list_enclaves(root)
-    for name in names:
-        check_enclave_name(name)
-        if name not in existing:
-            raise KeystoreError(f"enclave {name} does not exist in keystore '{root}'")
+    _check_names(root, names)
     with Transaction(root, dry_run=dry_run) as transaction:
+        existing = _check_names(root, names)  # another process may have been faster
         template = load_settings(root)
         authority = load_authority(root, IDENTITY, template, keyring, now)
         old = read_crl(root)
         revoked = list(old.revoked) if old else []
+        listed = {each.serial for each in revoked}
+        issued = read_ledger(root)
         entries: list[Entry] = []
         for name in dict.fromkeys(names):
-            serial, subject = _move_away(transaction, authority, name)
-            if not (old and old.names(serial)):
-                revoked.append(Revoked(serial, now.replace(microsecond=0), reason))
-            entries.append(
-                Entry(iso(now), "revocation", name, subject, f"{serial:x}", reason=reason)
-            )
+            subjects = _still_valid(issued, name, now)
+            subjects.update([_move_away(transaction, authority, name)])
+            for serial, subject in subjects.items():
+                if serial not in listed:
+                    listed.add(serial)
+                    revoked.append(Revoked(serial, now.replace(microsecond=0), reason))
+                    entries.append(
+                        Entry(iso(now), "revocation", name, subject, f"{serial:x}", reason=reason)
+                    )
         next_update = _sign(transaction, authority, template, revoked, old, now, entries)
         remaining = tuple(name for name in existing if name not in names)
         _link_everywhere(transaction, remaining)
@@ -99,8 +103,9 @@ def refresh_crl(
     """Sign the revocation list anew, so that it holds for longer; what it revokes is kept."""
     if not dry_run:
         tidy(root)
-    existing = list_enclaves(root)
+    list_enclaves(root)
     with Transaction(root, dry_run=dry_run) as transaction:
+        existing = list_enclaves(root)
         template = load_settings(root)
         authority = load_authority(root, IDENTITY, template, keyring, now)
         old = read_crl(root)
@@ -119,6 +124,25 @@ def read_crl(root: Path) -> RevocationList | None:
     if not path.exists():
         return None
     return load_crl(read_bytes(path, "revocation list"), f"'{path}'")
+
+
+def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
+    """All enclaves of the keystore, after those that are named were found among them."""
+    existing = list_enclaves(root)
+    for name in names:
+        check_enclave_name(name)
+        if name not in existing:
+            raise KeystoreError(f"enclave {name} does not exist in keystore '{root}'")
+    return existing
+
+
+def _still_valid(issued: Sequence[Entry], name: str, now: datetime) -> dict[int, str]:
+    """Serial numbers and subjects of what was issued to an enclave and has not ended."""
+    return {
+        int(each.serial, 16): each.subject
+        for each in issued
+        if each.what == "certificate" and each.enclave == name and each.not_after >= iso(now)
+    }
 
 
 def _move_away(transaction: Transaction, authority: Authority, name: str) -> tuple[int, str]:
@@ -176,6 +200,7 @@ def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
     for name in names:
         folder = enclave_folder(name)
         path = transaction.root / folder / "crl.pem"
-        if not path.is_symlink() and not path.exists():
-            up = "../" * folder.count("/")
-            transaction.link(f"{folder}/crl.pem", f"{up}../{CRL}")
+        target = "../" * folder.count("/") + f"../{CRL}"
+        # A copy, as some ways of copying a keystore make of a link, would grow stale.
+        if not path.is_symlink() or str(path.readlink()) != target:
+            transaction.link(f"{folder}/crl.pem", target)

@@ -312,6 +312,7 @@ def recover(root: Path) -> None:
     live = stage / "live"
     committed = live.is_symlink() and os.readlink(live) == "new"
     if committed:
+        _settle_links(stage / "new", root)
         _settle(stage / "new", root)
         _remove(stage / _REMOVED, root)
         _flush_folder(root)
@@ -325,6 +326,20 @@ def recover(root: Path) -> None:
     with contextlib.suppress(FileNotFoundError):
         os.unlink(live)  # first, for without it what is left of the stage is only to be removed
     shutil.rmtree(stage)
+
+
+def _settle_links(source: Path, target: Path) -> None:
+    """Move the links that belong into folders which are there.
+
+    They come first, for a link that is still reached through ``live`` leads to nothing as soon as
+    the file that it names has left the stage.
+    """
+    with os.scandir(source) as entries:
+        for entry in entries:
+            if entry.is_symlink():
+                os.replace(entry.path, target / entry.name)
+            elif entry.is_dir() and (target / entry.name).is_dir():
+                _settle_links(Path(entry.path), target / entry.name)
 
 
 def _settle(source: Path, target: Path) -> None:
@@ -353,7 +368,8 @@ def _remove(names: Path, root: Path) -> None:
         folder = name.rpartition("/")[0]
         with contextlib.suppress(OSError):  # it is not empty
             while "/" in folder:
-                os.rmdir(root / folder)
+                with contextlib.suppress(FileNotFoundError):  # by whoever was stopped here
+                    os.rmdir(root / folder)
                 folder = folder.rpartition("/")[0]
 
 

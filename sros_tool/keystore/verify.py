@@ -27,6 +27,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
+from sros_tool.pki.crl import signed_by
 from sros_tool.pki.keys import load_key
 from sros_tool.validity import Window, iso
 from sros_tool.xml import read_bytes
@@ -169,8 +170,13 @@ class _Check:
         except (SrosError, ValueError):
             self._fault("crl.pem", "it is not a revocation list, and DDS then refuses everybody")
             return
-        if ca and crl.issuer != ca.subject:
+        if ca and not signed_by(crl, ca):
             self._fault("crl.pem", "it is not of the identity CA, and DDS then refuses everybody")
+        if crl.last_update_utc > self._now:
+            self._fault(
+                "crl.pem",
+                f"it is not valid before {iso(crl.last_update_utc)}: everybody is refused",
+            )
         if crl.next_update_utc and crl.next_update_utc < self._now:
             self._fault(
                 "crl.pem", f"it expired at {iso(crl.next_update_utc)}: everybody is refused"

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 
 from sros_tool.errors import PkiError
@@ -90,6 +91,15 @@ def load_crl(pem: bytes, name: str) -> RevocationList:
             f"the revocation list {name} cannot be read",
             "It is not a PEM revocation list, or it is damaged; DDS then refuses everybody.",
         ) from error
+
+
+def signed_by(crl: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:
+    """Whether ``authority`` issued and signed a list."""
+    try:
+        public = authority.public_key()
+        return crl.issuer == authority.subject and crl.is_signature_valid(public)  # type: ignore[arg-type]
+    except (TypeError, ValueError, UnsupportedAlgorithm):
+        return False
 
 
 def _number(crl: x509.CertificateRevocationList) -> int:
