@@ -7,10 +7,10 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from harness import sros
 
 from sros_tool.errors import UsageError
 from sros_tool.validity import Lifespan, Span, Window, parse_span, span_text, window
-from tests.harness import sros
 
 CA = "basicConstraints=critical,CA:TRUE"
 USAGE = "keyUsage=critical,keyCertSign,cRLSign,digitalSignature"
