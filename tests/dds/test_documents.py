@@ -1,0 +1,150 @@
+"""Governance and permissions documents: what is written reads back, whatever the texts in it."""
+
+from __future__ import annotations
+
+import re
+import string
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lxml import etree
+
+from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
+from sros_tool.dds.governance import (
+    DATA_PROTECTIONS,
+    DomainRule,
+    Governance,
+    Protection,
+    TopicRule,
+    parse_governance,
+    render_governance,
+)
+from sros_tool.dds.permissions import (
+    Criteria,
+    Grant,
+    Permissions,
+    Rule,
+    parse_permissions,
+    render_permissions,
+)
+from sros_tool.errors import DocumentError
+
+domains = st.lists(st.integers(0, MAX_DOMAIN), min_size=1, max_size=4).map(
+    lambda ids: DomainSet.of(*((each, each) for each in ids))
+)
+# Everything that XML sets apart, and letters of other alphabets.
+texts = st.text(
+    alphabet=string.ascii_letters + "/_*?[]!-&<>\"' =,{}%é中😀", min_size=1, max_size=12
+)
+lists = st.lists(texts, min_size=1, max_size=3).map(tuple)
+none_or_some = st.lists(texts, max_size=2).map(tuple)
+criteria = st.lists(st.builds(Criteria, lists, none_or_some), max_size=2).map(tuple)
+tagged = st.builds(
+    Criteria, lists, none_or_some, st.lists(st.tuples(texts, texts), max_size=2).map(tuple)
+)
+relayed = st.lists(tagged, max_size=1).map(tuple)
+rules = st.lists(st.builds(Rule, st.booleans(), domains, criteria, criteria, relayed), max_size=3)
+dates = st.sampled_from(
+    ["2024-01-01T00:00:00Z", "2034-01-01T00:00:00", "2034-01-01T00:00:00+09:00"]
+)
+grants = st.builds(Grant, texts, texts, dates, dates, rules.map(tuple), st.booleans())
+permissions = st.lists(grants, min_size=1, max_size=2).map(lambda each: Permissions(tuple(each)))
+
+kinds = st.sampled_from(Protection)
+topic_rules = st.builds(
+    TopicRule,
+    texts.filter(lambda text: text == text.strip()),
+    *[st.booleans()] * 4,
+    kinds,
+    st.sampled_from(DATA_PROTECTIONS),
+)
+domain_rules = st.builds(
+    DomainRule,
+    domains,
+    st.booleans(),
+    st.booleans(),
+    kinds,
+    kinds,
+    kinds,
+    st.lists(topic_rules, min_size=1, max_size=4).map(tuple),
+)
+governances = st.lists(domain_rules, min_size=1, max_size=2).map(
+    lambda each: Governance(tuple(each))
+)
+
+
+def schema(name: str) -> etree.XMLSchema:
+    path = Path(__file__).parents[1] / "schemas" / f"{name}.xsd"
+    return etree.XMLSchema(etree.parse(path, etree.XMLParser(no_network=True)))
+
+
+PERMISSIONS, GOVERNANCE = schema("dds_permissions"), schema("dds_governance")
+
+
+@settings(deadline=None)
+@given(permissions)
+def test_permissions_read_back(meant: Permissions) -> None:
+    document = render_permissions(meant)
+    assert parse_permissions(document) == meant
+    assert parse_permissions(document.replace(b"\n", b"\r\n")) == meant
+    if all(grant.rules for grant in meant.grants):
+        PERMISSIONS.assertValid(etree.fromstring(document))
+
+
+@settings(deadline=None)
+@given(governances)
+def test_governance_reads_back(meant: Governance) -> None:
+    document = render_governance(meant)
+    assert parse_governance(document) == meant
+    assert parse_governance(document.replace(b"\n", b"\r\n")) == meant
+    GOVERNANCE.assertValid(etree.fromstring(document))
+
+
+GRANT = Grant(
+    "/a",
+    "CN=/a",
+    "2024-01-01T00:00:00Z",
+    "2034-01-01T00:00:00Z",
+    (Rule(True, DomainSet.of((0, 0)), (Criteria(("rt/x",)),)),),
+)
+GOOD = render_permissions(Permissions((GRANT,))).decode()
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (r"(</?)dds\b", r"\1sdd"),
+        (r"(</?)permissions\b", r"\1governance"),
+        (r"(</?)grant\b", r"\1grunt"),
+        (r"(</?)allow_rule\b", r"\1allow"),
+        (r"(</?)publish\b", r"\1write"),
+        (r"(</?)topics\b", r"\1topic_list"),
+        (r"(</?)domains\b", r"\1domain"),
+        (r"<subject_name>.*", ""),
+        (r"<not_after>.*", ""),
+        (r"2034-01-01T00:00:00Z", "tomorrow"),
+        (r"2034-01-01T00:00:00Z", "9999-12-31T23:59:59-14:00"),
+        (r"<default>.*", ""),
+        (r"DENY", "deny"),
+        (r"<topic>.*", ""),
+        (r"<id>.*", ""),
+        (r"</dds>", ""),
+        (r"<dds", "<!DOCTYPE dds><dds"),
+    ],
+)
+def test_permissions_that_are_none(old: str, new: str) -> None:
+    assert parse_permissions(GOOD.encode()) == Permissions((GRANT,))
+    broken = re.sub(old, new, GOOD)
+    assert broken != GOOD
+    with pytest.raises(DocumentError):
+        parse_permissions(broken.encode())
+
+
+@settings(deadline=None)
+@given(st.binary(max_size=80) | texts.map(str.encode))
+def test_any_bytes_are_a_document_or_an_error(data: bytes) -> None:
+    for parse in (parse_permissions, parse_governance):
+        with pytest.raises(DocumentError):
+            parse(data)

@@ -1,0 +1,124 @@
+"""Damaged keys, certificates and documents are errors that are told, wherever the damage is."""
+
+from __future__ import annotations
+
+import base64
+import random
+import re
+import shutil
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sros_tool.errors import PkiError, SrosError
+from sros_tool.keystore import create_enclaves
+from sros_tool.keystore.describe import describe
+from sros_tool.keystore.verify import check_enclave
+from sros_tool.pki import der
+
+FILES = (
+    "public/identity_ca.cert.pem",
+    "public/permissions_ca.cert.pem",
+    "private/identity_ca.key.pem",
+    "enclaves/a/cert.pem",
+    "enclaves/a/key.pem",
+    "enclaves/a/permissions.p7s",
+    "enclaves/governance.p7s",
+    "sros.toml",
+)
+_BASE64 = re.compile(rb"(?:-----BEGIN [A-Z ]+-----\n|smime\.p7s\"\r\n\r\n)([A-Za-z0-9+/=\s]+)")
+
+
+def damage(data: bytearray, dice: random.Random) -> None:
+    for _ in range(dice.choice((1, 1, 1, 2, 4))):
+        place = dice.randrange(len(data))
+        how = dice.randrange(3)
+        if how == 0:
+            data[place] = dice.randrange(256)
+        elif how == 1:
+            del data[place : place + dice.randrange(1, 4)]
+        else:
+            data[place:place] = dice.randbytes(dice.randrange(1, 4))
+
+
+def damaged(data: bytes, dice: random.Random) -> bytes:
+    """The file with some bytes changed, half of the time inside of what base64 carries."""
+    found = list(_BASE64.finditer(data))
+    if not found or dice.random() < 0.3:
+        changed = bytearray(data)
+        damage(changed, dice)
+        return bytes(changed)
+    inside = bytearray(base64.b64decode(found[-1][1]))
+    damage(inside, dice)
+    return data[: found[-1].start(1)] + base64.encodebytes(inside) + data[found[-1].end(1) :]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("name", FILES)
+def test_damage(name: str, keystore: Path) -> None:
+    dice = random.Random(name)
+    path, now = keystore / name, datetime.now(UTC)
+    whole = path.read_bytes()
+    looks: dict[str, Callable[[], object]] = {
+        "describe the file": lambda: describe(path, now=now),
+        "describe the keystore": lambda: describe(keystore, now=now),
+        "check": lambda: check_enclave(keystore / "enclaves/a", now=now, domain=0),
+        "add": lambda: create_enclaves(keystore, ["/a", "/new"], now=now, dry_run=True),
+    }
+    if name == "sros.toml":
+        del looks["describe the file"]
+    told = 0
+    for number in range(150):
+        path.write_bytes(damaged(whole, dice))
+        for what, look in looks.items():
+            try:
+                look()
+            except SrosError:
+                told += 1
+            except Exception as error:
+                shutil.copy(path, keystore.parent / "culprit")
+                raise AssertionError(f"{what}, damage {number}: {error!r}") from error
+    assert told > 20
+    path.write_bytes(whole)
+    for look in looks.values():
+        look()
+
+
+@given(st.binary(max_size=40))
+def test_any_bytes_are_der_or_an_error(data: bytes) -> None:
+    try:
+        values = der.children(data)
+    except PkiError:
+        return
+    assert b"".join(value.whole for value in values) == data
+    assert all(value.whole.endswith(value.content) for value in values)
+    if values:
+        assert der.first(data) == values[0]
+    else:
+        with pytest.raises(PkiError):
+            der.first(data)
+
+
+@pytest.mark.parametrize(
+    "data",
+    ["30", "3001", "3080", "3085000000000100", "1f0100", "bf0100", "30820001", "3003020100ff"],
+)
+def test_der_that_is_cut_short_or_of_another_form(data: str) -> None:
+    with pytest.raises(PkiError):
+        der.children(bytes.fromhex(data))
+
+
+@pytest.mark.parametrize(
+    ("dotted", "content"),
+    [
+        ("1.2.840.113549.1.7.2", "2a864886f70d010702"),
+        ("2.16.840.1.101", "6086480165"),
+        ("2.5.4", "5504"),
+    ],
+)
+def test_object_identifiers(dotted: str, content: str) -> None:
+    assert der.encode_oid(dotted).hex() == content

@@ -1,0 +1,158 @@
+"""Policies as XML: what is written reads back, and lies where the includes say."""
+
+from __future__ import annotations
+
+import string
+import tempfile
+from pathlib import Path
+
+import pytest
+from harness import with_includes
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lxml import etree
+
+from sros_tool.errors import PolicyError
+from sros_tool.policy import (
+    RIGHTS,
+    Enclave,
+    Group,
+    Policy,
+    Profile,
+    Profiles,
+    Qualifier,
+    read_policy,
+    write_policy,
+)
+
+names = st.sampled_from(("x", "/x/y", "~/z", "~", "*", "a?", "[!a-c]d", "/a/*/b"))
+
+
+def groups() -> st.SearchStrategy[Group]:
+    def of(kind: str) -> st.SearchStrategy[Group]:
+        either = st.none() | st.sampled_from(Qualifier)
+        rights = st.tuples(either, either).map(
+            lambda pair: tuple(
+                (right, said) for right, said in zip(RIGHTS[kind], pair, strict=True) if said
+            )
+        )
+        some = st.lists(names, min_size=1, max_size=3).map(tuple)
+        return st.builds(Group, st.just(kind), rights.filter(bool), some)
+
+    return st.sampled_from(sorted(RIGHTS)).flatmap(of)
+
+
+texts = st.text(alphabet=string.ascii_letters + "&<>\"' \té中😀", max_size=8)
+metadata = st.just("") | texts.map(lambda text: _metadata(text))
+
+
+def _metadata(text: str) -> str:
+    element = etree.Element("metadata")
+    etree.SubElement(element, "note", by=text).text = text or None
+    etree.SubElement(element, "empty").tail = text or None
+    return etree.tostring(element, encoding="unicode")
+
+
+blocks = st.builds(
+    Profiles,
+    st.lists(
+        st.builds(
+            Profile,
+            st.sampled_from(("/", "/ns", "/ns/*")),
+            st.sampled_from(("n", "node_2", "*")),
+            st.lists(groups(), max_size=3).map(tuple),
+        ),
+        min_size=1,
+        max_size=3,
+    ).map(tuple),
+    texts,
+    metadata,
+)
+policies = st.lists(
+    st.builds(
+        Enclave,
+        st.sampled_from(("/", "/a", "/a/b", "/c")),
+        st.lists(blocks, min_size=1, max_size=2).map(tuple),
+    ),
+    min_size=1,
+    max_size=3,
+    unique_by=lambda each: each.path,
+).map(lambda enclaves: Policy(tuple(enclaves)))
+
+SCHEMA = etree.XMLSchema(
+    etree.parse(Path(__file__).parents[1] / "schemas/policy.xsd", etree.XMLParser(no_network=True))
+)
+
+
+@settings(deadline=None)
+@given(policies)
+def test_a_policy_reads_back(policy: Policy) -> None:
+    document = write_policy(policy)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "policy.xml")
+        path.write_bytes(document)
+        again = read_policy(path)
+    assert again == policy
+    assert write_policy(again) == document
+    SCHEMA.assertValid(etree.fromstring(document))
+
+
+POLICY = """<policy version="0.2.0">
+  <enclaves>
+    <xi:include href="enclaves/one.xml" xpointer="xpointer(/enclaves/*)"/>
+    <enclave path="/two"><profiles>
+      <xi:include href="enclaves/profile.xml"/>
+    </profiles></enclave>
+  </enclaves>
+</policy>"""
+ONE = """<enclaves xmlns:xi="http://www.w3.org/2001/XInclude">
+  <enclave path="/one"><profiles><xi:include href="profile.xml" xpointer="xpointer(/profile)"/>
+  </profiles></enclave>
+</enclaves>"""
+PROFILE = """<profile ns="/" node="n" xmlns:xi="http://www.w3.org/2003/XInclude">
+  <xi:include href="../groups.xml" xpointer="xpointer(/profile/topics[@publish])"/>
+</profile>"""
+GROUPS = """<profile>
+  <topics publish="ALLOW"><topic>out</topic></topics>
+  <topics subscribe="ALLOW"><topic>in</topic></topics>
+</profile>"""
+
+
+def test_includes_are_read_where_they_lie(tmp_path: Path) -> None:
+    (tmp_path / "enclaves").mkdir()
+    (tmp_path / "policy.xml").write_text(with_includes(POLICY))
+    (tmp_path / "enclaves/one.xml").write_text(ONE)
+    (tmp_path / "enclaves/profile.xml").write_text(PROFILE)
+    (tmp_path / "groups.xml").write_text(GROUPS)
+    policy = read_policy(tmp_path / "policy.xml")
+    assert [each.path for each in policy.enclaves] == ["/one", "/two"]
+    one, two = (each.all_profiles() for each in policy.enclaves)
+    assert one == two
+    assert one[0].groups[0].names == ("out",)
+    assert one[0].groups[0].source.file == str(tmp_path / "groups.xml")
+    assert one[0].groups[0].source.line == 2
+    (tmp_path / "groups.xml").write_text(GROUPS.replace("out", "o ut"))
+    with pytest.raises(PolicyError, match=r"groups\.xml:2: 'o ut'"):
+        read_policy(tmp_path / "policy.xml")
+
+
+def test_a_linked_policy_includes_from_where_it_really_is(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "real/groups.xml").write_text(GROUPS)
+    text = """<policy version="0.2.0"><enclaves><enclave path="/a"><profiles>
+    <profile ns="/" node="n"><xi:include href="groups.xml" xpointer="xpointer(/profile/*)"/>
+    </profile></profiles></enclave></enclaves></policy>"""
+    (tmp_path / "real/policy.xml").write_text(with_includes(text))
+    (tmp_path / "link.xml").symlink_to("real/policy.xml")
+    assert len(read_policy(tmp_path / "link.xml").enclaves[0].all_profiles()[0].groups) == 2
+
+
+@pytest.mark.parametrize("comment", ["<!-- c -->", "<?pi x?>"])
+def test_comments_count_for_nothing(comment: str, tmp_path: Path) -> None:
+    text = f"""{comment}<policy version="0.2.0">{comment}<enclaves><enclave path="/a"><profiles>
+    <profile ns="/" node="n"><topics publish="ALLOW">{comment}<topic>ch{comment}atter</topic>
+    </topics></profile></profiles></enclave></enclaves></policy>{comment}"""
+    (tmp_path / "p.xml").write_text(text)
+    assert read_policy(tmp_path / "p.xml").enclaves[0].all_profiles()[0].groups[0].names == (
+        "chatter",
+    )

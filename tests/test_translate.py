@@ -1,0 +1,201 @@
+"""From a policy to what DDS enforces, and back: nothing is added, and nothing is lost."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from itertools import combinations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.governance import TopicRule
+from sros_tool.dds.permissions import Criteria, Permissions, Rule
+from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expand
+from sros_tool.policy import ALLOW, DENY, RIGHTS, Enclave, Group, Profile, Profiles, Qualifier
+from sros_tool.policy.protection import (
+    DomainProtection,
+    Level,
+    NamedProtection,
+    TopicProtection,
+)
+from sros_tool.translate import covers, governance_for, permissions_for, ros_rights
+from sros_tool.validity import window
+
+DOMAINS = DomainSet.parse("0,7")
+VALIDITY = window(datetime(2026, 1, 1, tzinfo=UTC), timedelta(days=1))
+NAMES = (
+    "x",
+    "/x",
+    "~/x",
+    "~",
+    "*",
+    "/*",
+    "a/b",
+    "/a/*",
+    "x?",
+    "[ab]",
+    "fib",
+    "/fib/_action/status",
+)
+
+
+def groups() -> st.SearchStrategy[Group]:
+    def of(kind: str) -> st.SearchStrategy[Group]:
+        either = st.none() | st.sampled_from(Qualifier)
+        rights = st.tuples(either, either).map(
+            lambda pair: tuple(
+                (right, said) for right, said in zip(RIGHTS[kind], pair, strict=True) if said
+            )
+        )
+        names = st.lists(st.sampled_from(NAMES), min_size=1, max_size=3).map(tuple)
+        return st.builds(Group, st.just(kind), rights.filter(bool), names)
+
+    return st.sampled_from(sorted(RIGHTS)).flatmap(of)
+
+
+profiles = st.builds(
+    Profile,
+    st.sampled_from(("/", "/ns", "/ns/deep")),
+    st.sampled_from(("n", "m", "*")),
+    st.lists(groups(), max_size=3).map(tuple),
+)
+blocks = st.builds(Profiles, st.lists(profiles, min_size=1, max_size=2).map(tuple))
+enclaves = st.builds(Enclave, st.just("/e"), st.lists(blocks, min_size=1, max_size=2).map(tuple))
+
+
+def topics(rules: list[Rule], direction: str) -> set[str]:
+    found: list[Criteria] = [each for rule in rules for each in getattr(rule, direction)]
+    return {topic for each in found for topic in each.topics}
+
+
+def expected(enclave: Enclave, qualifier: Qualifier) -> tuple[set[str], set[str]]:
+    publish, subscribe = set[str](), set[str]()
+    for profile in enclave.all_profiles():
+        for group in profile.groups:
+            for right, said in group.rights:
+                for name in group.names if said is qualifier else ():
+                    names = dds_names(right, expand(name, profile.ns, profile.node))
+                    publish.update(names.publish)
+                    subscribe.update(names.subscribe)
+    return publish, subscribe
+
+
+def made(enclave: Enclave) -> Permissions:
+    return permissions_for(enclave, subject="CN=/e", validity=VALIDITY, domains=DOMAINS)
+
+
+@given(enclaves)
+def test_permissions_say_what_the_policy_says_and_discovery(enclave: Enclave) -> None:
+    (grant,) = made(enclave).grants
+    for qualifier in (ALLOW, DENY):
+        rules = [rule for rule in grant.rules if rule.allow is (qualifier is ALLOW)]
+        publish, subscribe = expected(enclave, qualifier)
+        own = {ROS_DISCOVERY_TOPIC} if qualifier is ALLOW else set()
+        assert topics(rules, "publish") == publish | own
+        assert topics(rules, "subscribe") == subscribe | own
+
+
+@given(enclaves)
+def test_permissions_stay_in_the_portable_profile(enclave: Enclave) -> None:
+    (grant,) = made(enclave).grants
+    assert [rule.allow for rule in grant.rules] in ([True], [False, True]), "denials come first"
+    assert grant.default_allow is False
+    assert all(rule.domains == DOMAINS for rule in grant.rules)
+    for rule in grant.rules:
+        for each in (*rule.publish, *rule.subscribe):
+            assert each.topics
+            assert not each.partitions
+            assert list(each.topics) == sorted(set(each.topics))
+        assert len(rule.publish) <= 1, "Cyclone DDS reads the last list of topics only"
+        assert len(rule.subscribe) <= 1
+
+
+@given(enclaves)
+def test_the_rights_of_a_rule_are_its_topics(enclave: Enclave) -> None:
+    """Folded back into services and actions, a rule still names each of its topics, and no more."""
+    for rule in made(enclave).grants[0].rules:
+        told = {"publish": set[str](), "subscribe": set[str]()}
+        for each in ros_rights(rule):
+            assert each.qualifier is (ALLOW if rule.allow else DENY)
+            if each.kind == "dds":
+                told[each.right].add(each.name)
+                continue
+            names = dds_names(each.right, each.name)
+            told["publish"].update(names.publish)
+            told["subscribe"].update(names.subscribe)
+        assert told["publish"] == topics([rule], "publish")
+        assert told["subscribe"] == topics([rule], "subscribe")
+
+
+def test_services_and_actions_are_told_as_such() -> None:
+    said = (("call", ALLOW), ("execute", ALLOW))
+    enclave = Enclave(
+        "/e",
+        (
+            Profiles(
+                (
+                    Profile("/", "n", (Group("actions", said, ("fib",)),)),
+                    Profile("/", "n", (Group("services", (("request", ALLOW),), ("add",)),)),
+                )
+            ),
+        ),
+    )
+    rights = {
+        (each.kind, each.right, each.name) for each in ros_rights(made(enclave).grants[0].rules[0])
+    }
+    assert rights - {
+        ("dds", "publish", ROS_DISCOVERY_TOPIC),
+        ("dds", "subscribe", ROS_DISCOVERY_TOPIC),
+    } == {
+        ("actions", "call", "/fib"),
+        ("actions", "execute", "/fib"),
+        ("services", "request", "/add"),
+    }
+
+
+# ── governance ─────────────────────────────────────────────────────────────────────────────
+
+topic_protections = st.builds(
+    TopicProtection,
+    st.sampled_from((Level.NONE, Level.SIGN, Level.ENCRYPT)),
+    st.sampled_from(Level),
+    *[st.booleans()] * 4,
+)
+WIDER = ("/cmd_vel", "/cmd_*", "/camera/*", "/camera/image", "/*", "*", "/camera/ima?e", "/fib")
+named = st.builds(
+    NamedProtection, st.sampled_from(sorted(RIGHTS)), st.sampled_from(WIDER), topic_protections
+)
+protections = st.builds(
+    DomainProtection,
+    default=topic_protections,
+    named=st.lists(named, max_size=6, unique_by=lambda each: (each.kind, each.name)).map(tuple),
+)
+
+
+def decided(rules: tuple[TopicRule, ...], topic: str) -> TopicRule:
+    """The rule that DDS takes: the first that matches (fnmatch, * crosses /)."""
+    return next(rule for rule in rules if covers(rule.topic_expression, topic))
+
+
+@settings(deadline=None)
+@given(protections)
+def test_no_topic_rule_is_hidden_by_a_wider_one(protection: DomainProtection) -> None:
+    (rule,) = governance_for(protection, DOMAINS).domain_access_rules
+    rules = rule.topic_access_rules
+    assert rules[-1].topic_expression == "*", "a topic without a rule cannot be created"
+    for earlier, later in combinations(rules, 2):
+        wide, narrow = earlier.topic_expression, later.topic_expression
+        assert not covers(wide, narrow) or covers(narrow, wide)
+    unmatched = decided(rules, "nothing/of/ros")
+    assert str(unmatched.data_protection_kind) == str(protection.default.data)
+    for each in protection.named:
+        if "*" in each.name or "?" in each.name:
+            continue
+        for right in RIGHTS[each.kind]:
+            names = dds_names(right, each.name)
+            for topic in (*names.publish, *names.subscribe):
+                found = decided(rules, topic)
+                assert found.topic_expression == topic
+                assert str(found.metadata_protection_kind) == str(each.protection.metadata)
+                assert found.enable_read_access_control == each.protection.read_access_control
