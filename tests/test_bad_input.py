@@ -958,6 +958,8 @@ def test_a_result_that_cannot_be_printed_is_not_told_as_nothing_changed(tmp_path
     ended = subprocess.run(["sh", "-c", command, tmp_path / "ks"], capture_output=True, text=True)
     assert ended.returncode == 1
     assert "Nothing was changed" not in ended.stderr
+    assert os.strerror(errno.ENOSPC) in ended.stderr
+    assert ended.stderr.count("\n") == 1
     assert (tmp_path / "ks/enclaves").is_dir()
 
 
