@@ -224,9 +224,9 @@ def diff_policy(a: Path, b: Path, as_json: bool) -> int:
         for line in _difference_lines(difference):
             click.echo(line)
         count = len(difference.only_first) + len(difference.only_second)
-        within = f" of {', '.join(sorted(scope))}" if scope else ""
-        text = f"{count} right{'s' if count > 1 else ''} differ{'' if count > 1 else 's'}"
-        click.echo(text + within if count else f"the rights{within} are the same", err=True)
+        of = f" of {', '.join(sorted(scope))}" if scope else ""
+        differ = f"1 right{of} differs" if count == 1 else f"{count} rights{of} differ"
+        click.echo(differ if count else f"the rights{of} are the same", err=True)
     print_notes((*first.notes, *second.notes))
     return 0 if not difference and first.sound and second.sound else 1
 

@@ -3,9 +3,9 @@
 Over-privilege of an enclave is the number of pairs (right, name) that it is allowed, divided by
 the number of those that were observed.  A pair is one of publish, subscribe, request, reply, call,
 execute with one exact name; a wildcard counts as the known names that it matches, which are the
-exact names of that kind (topics, services or actions) in the policy and in the observations of all
-enclaves.  Pairs that a DENY takes away do not count.  What was observed and is not allowed does
-not count either: it cannot have worked.
+exact names of that kind (topics, services or actions) in the policy, in the observations of all
+enclaves, and among what every node needs.  Pairs that a DENY takes away do not count.  What was
+observed and is not allowed does not count either: it cannot have worked.
 """
 
 from __future__ import annotations
@@ -89,7 +89,8 @@ def minimize(policy: Policy, observed: Iterable[Right], common: Sequence[Group] 
     by_enclave: dict[str, set[Right]] = defaultdict(set)
     for right in seen:
         by_enclave[right.enclave].add(right)
-    names = KnownNames((policy_rights(policy), seen))
+    needed = (right for enclave in policy.enclaves for right in _for_nodes(enclave, common))
+    names = KnownNames((policy_rights(policy), seen, needed))
     enclaves, uses = [], []
     for enclave in policy.enclaves:
         enclave, use = _Narrowing(

@@ -288,7 +288,8 @@ def test_minimize_with_permissions_and_several_observations(keystore: Path) -> N
     ended = sros("minimize_policy", policy, "--observed", *observed, "--json").ok()
     value = json.loads(ended.out)
     by_name = {each["enclave"]: each for each in value["enclaves"]}
-    assert by_name["/a"]["ratio"] == 4.0  # old_a, old_b, more and cmd_vel are known
+    # Known are old_a, old_b, more and cmd_vel, and of every node rosout, parameter_events, clock.
+    assert by_name["/a"]["ratio"] == 7.0
     assert [right["name"] for right in by_name["/b"]["never_observed"]] == ["/more"]
     assert by_name["/c"]["observed_at_all"] is False
     assert by_name["/a"]["bytes"]["limit"] == 65536

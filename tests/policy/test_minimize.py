@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from drawn_policies import effective, exact_names, listed, meant, policies
+from drawn_policies import effective, exact_names, listed, meant, patient, policies
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -46,7 +46,7 @@ def use(given_policy: Policy, *rights: str, common: tuple[Group, ...] = ()) -> E
     return minimize(given_policy, seen(*rights), common).uses[0]
 
 
-@settings(max_examples=100)
+@settings(patient, max_examples=100)
 @given(
     policies(),
     st.one_of(policies(qualifier=st.just(ALLOW)), policies(exact_names, st.just(ALLOW))),
@@ -159,6 +159,11 @@ def test_the_ratio_counts_known_names() -> None:
     found = use(given_policy, "publish /x", "subscribe /x")
     assert (found.allowed_pairs, found.observed_pairs, found.remaining_pairs) == (5, 2, 2)
     assert found.ratio == 2.5
+
+
+def test_what_every_node_needs_is_known() -> None:
+    found = use(policy(group("topics", "/*", "publish")), "publish /x", common=COMMON)
+    assert (found.allowed_pairs, found.observed_pairs, found.remaining_pairs) == (2, 1, 2)
 
 
 def test_wildcards_of_services_and_topics_count_known_actions() -> None:
