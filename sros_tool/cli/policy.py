@@ -192,7 +192,7 @@ def _check_includes(policy: Path, output: Path, document: bytes) -> None:
     epilog="""\b
 Example:
   $ sros diff_policy robot.xml keystore
-  - /talker ALLOW subscribe topic /tf
+  - /talker ALLOW publish topic /status
   - /talker ALLOW request service /*
   + /talker ALLOW request service /add_two_ints  (A has it by request service /*)
   3 rights differ
