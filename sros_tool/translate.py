@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, Protection, TopicRule
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, grant
 from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expand
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Qualifier
+from sros_tool.policy.patterns import covers
 from sros_tool.policy.protection import DomainProtection, NamedProtection, TopicProtection
 from sros_tool.policy.rights import Right
 from sros_tool.validity import Window
@@ -136,11 +136,6 @@ def _narrow_first(rules: list[TopicRule]) -> list[TopicRule]:
         )
         ordered.insert(place, rule)
     return ordered
-
-
-def covers(wide: str, narrow: str) -> bool:
-    """Whether every name that matches ``narrow`` also matches ``wide`` (exact for * alone)."""
-    return fnmatchcase(narrow, wide)
 
 
 # ── DDS → ROS ──────────────────────────────────────────────────────────────────────────────

@@ -13,13 +13,14 @@ from sros_tool.dds.governance import TopicRule
 from sros_tool.dds.permissions import Criteria, Permissions, Rule
 from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expand
 from sros_tool.policy import ALLOW, DENY, RIGHTS, Enclave, Group, Profile, Profiles, Qualifier
+from sros_tool.policy.patterns import covers
 from sros_tool.policy.protection import (
     DomainProtection,
     Level,
     NamedProtection,
     TopicProtection,
 )
-from sros_tool.translate import covers, governance_for, permissions_for, ros_rights
+from sros_tool.translate import governance_for, permissions_for, ros_rights
 from sros_tool.validity import window
 
 DOMAINS = DomainSet.parse("0,7")
