@@ -34,6 +34,7 @@ FAMILIES: dict[str, dict[str, Verb]] = {
     "Life of keys": {
         "renew": Verb("life", "Renew certificates and permissions of enclaves."),
         "revoke": Verb("life", "Revoke enclaves."),
+        "rotate_ca": Verb("rotate", "Replace the CAs, stage by stage."),
         "crl": Verb("life", "Show the revocation list, or sign it anew."),
         "check": Verb("life", "Say which enclaves need to be renewed."),
     },

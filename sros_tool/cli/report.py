@@ -17,6 +17,7 @@ _PHRASES = {
     "generate_artifacts": "generate artifacts",
     "list_enclaves": "list enclaves",
     "distribute_key": "distribute key",
+    "rotate_ca": "rotate the CA",
     "generate_policy": "generate policy",
     "merge_policy": "merge policies",
     "diff_policy": "compare",

@@ -1,0 +1,286 @@
+"""How far a rotation of CAs has come: its one small file, and who is on which CA.
+
+A CA file holds the issuing CA first, for Cyclone DDS 0.10.2 reads nothing else of it (ran); Fast
+DDS 2.9.1 trusts all that it holds (ran).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from enum import StrEnum
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.keystore.create import list_enclaves
+from sros_tool.keystore.layout import (
+    CRL,
+    IDENTITY,
+    PERMISSIONS,
+    PUBLIC,
+    ROLES,
+    ca_certificate,
+    enclave_folder,
+)
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import (
+    UNREADABLE,
+    issued_by,
+    load_certificate,
+    read_in_full,
+    subject_text,
+    validity_of,
+)
+from sros_tool.validity import Window
+from sros_tool.xml import read_bytes
+
+ROTATION = "rotation.json"
+"""Which CAs are being replaced; there while a rotation is under way."""
+_CRL_MARK = b"-----BEGIN X509 CRL-----"
+
+
+class Stage(StrEnum):
+    """The stages of a rotation, in their order; NONE is before the first and after the last."""
+
+    NONE = "none"
+    DISTRIBUTE = "distribute"
+    """The new CA stands beside the old one, which still issues."""
+    REISSUE = "reissue"
+    """Everything is of the new CA; the old one is still trusted."""
+    RETIRE = "retire"
+    """The old CA is trusted no longer, which ends the rotation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Replacement:
+    """A CA and the one that takes its place.
+
+    ``file`` is the stem of its files ("identity_ca", "permissions_ca", or "ca" for both jobs);
+    ``old`` and ``new`` are SHA-256 of the certificates; ``key`` is where the new key is, by URI or
+    path in the keystore.
+    """
+
+    file: str
+    old: str
+    new: str
+    key: str
+
+
+@dataclass(frozen=True, slots=True)
+class Rotation:
+    """The stage that was reached, and the CAs that it is about."""
+
+    stage: Stage = Stage.NONE
+    replacements: tuple[Replacement, ...] = ()
+
+    def following(self) -> Stage:
+        """The next stage."""
+        order = list(Stage)
+        return order[order.index(self.stage) + 1]
+
+
+@dataclass(frozen=True, slots=True)
+class AuthorityState:
+    """A CA that is trusted: ``standing`` is issuing, next or old; ``enclaves`` are on it."""
+
+    file: str
+    roles: tuple[str, ...]
+    standing: str
+    subject: str
+    serial: str
+    validity: Window
+    enclaves: int
+
+
+@dataclass(frozen=True, slots=True)
+class RotationStatus:
+    """The stage of a keystore, its CAs, how many enclaves it has, and what vendors make of it."""
+
+    root: Path
+    rotation: Rotation
+    authorities: tuple[AuthorityState, ...]
+    enclaves: int
+    remarks: tuple[str, ...]
+
+
+def digest(certificate: x509.Certificate) -> str:
+    """The SHA-256 of a certificate, in hexadecimal."""
+    return certificate.fingerprint(hashes.SHA256()).hex()
+
+
+def authority_files(root: Path) -> dict[str, tuple[str, ...]]:
+    """The stem of each CA file, with the roles for which it serves."""
+    found: dict[str, tuple[str, ...]] = {}
+    for role in ROLES:
+        path = root / ca_certificate(role)
+        real = Path(os.path.realpath(path))
+        if not real.is_file() or real.parent != Path(os.path.realpath(root / PUBLIC)):
+            raise KeystoreError(
+                f"keystore '{root}' has no {role} CA of its own",
+                f"'{path}' is missing, or leads out of the keystore.",
+                "Use the keystore that it was exported from.",
+            )
+        stem = real.name.removesuffix(".cert.pem")
+        found[stem] = (*found.get(stem, ()), role)
+    return found
+
+
+def certificates_of(root: Path, file: str) -> tuple[x509.Certificate, ...]:
+    """All certificates of a CA file, the issuing one first."""
+    path = root / PUBLIC / f"{file}.cert.pem"
+    try:
+        found = x509.load_pem_x509_certificates(read_bytes(path, "CA certificate"))
+        return tuple(read_in_full(each) for each in found)
+    except UNREADABLE as error:
+        raise KeystoreError(
+            f"the CA certificate '{path}' cannot be read", "It is not PEM, or it is damaged."
+        ) from error
+
+
+def carries_crl(root: Path, file: str) -> bool:
+    """Whether a CA file carries a revocation list, too: Fast DDS 2.9.1 reads it (ran)."""
+    return _CRL_MARK in read_bytes(root / PUBLIC / f"{file}.cert.pem", "CA certificate")
+
+
+def read_rotation(root: Path) -> Rotation:
+    """The rotation that is under way, if one is; `KeystoreError` where it does not fit the CAs."""
+    path = root / ROTATION
+    if not path.exists():
+        return Rotation()
+    try:
+        told = json.loads(path.read_bytes())
+        replacements = tuple(Replacement(**each) for each in told["replacements"])
+        rotation = Rotation(Stage(told["stage"]), replacements)
+        for each in replacements:
+            issuing = each.old if rotation.stage is Stage.DISTRIBUTE else each.new
+            there = [digest(found) for found in certificates_of(root, each.file)]
+            if there[0] != issuing or not {each.old, each.new} <= set(there):
+                raise ValueError
+    except (ValueError, TypeError, KeyError, IndexError) as error:
+        raise KeystoreError(
+            f"the rotation of keystore '{root}' cannot be continued",
+            f"'{path}' does not fit the CA certificates, or is damaged.",
+            "Restore the folders 'public' and 'private' and this file from one backup.",
+        ) from error
+    return rotation
+
+
+def render_rotation(rotation: Rotation) -> bytes:
+    """The file of a rotation."""
+    told = {
+        "stage": rotation.stage.value,
+        "replacements": [asdict(each) for each in rotation.replacements],
+    }
+    return json.dumps(told, indent=2).encode() + b"\n"
+
+
+def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
+    """Where the keystore stands: each CA that is trusted, its end, and the enclaves on it."""
+    names = list_enclaves(root)
+    rotation = read_rotation(root)
+    by_file = {each.file: each for each in rotation.replacements}
+    states = []
+    for file, roles in authority_files(root).items():
+        found = certificates_of(root, file)
+        counts = _count(root, names, roles[0], found)
+        for index, certificate in enumerate(found):
+            replaced = by_file.get(file)
+            standing = "issuing" if index == 0 else "old"
+            if replaced and index and digest(certificate) == replaced.new:
+                standing = "next"
+            states.append(
+                AuthorityState(
+                    file,
+                    roles,
+                    standing,
+                    subject_text(certificate.subject),
+                    f"{certificate.serial_number:x}",
+                    validity_of(certificate),
+                    counts[index],
+                )
+            )
+    remarks = tuple(_remarks(root, rotation))
+    return RotationStatus(root, rotation, tuple(states), len(names), remarks)
+
+
+def _count(
+    root: Path, names: Sequence[str], role: str, authorities: tuple[x509.Certificate, ...]
+) -> Counter[int]:
+    """How many enclaves are on each CA, by certificate or else by signature."""
+    counts: Counter[int] = Counter()
+    for name in names:
+        folder = root / enclave_folder(name)
+        try:
+            if role == IDENTITY:
+                path = folder / "cert.pem"
+                own = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+                fits = [issued_by(own, each) for each in authorities]
+            else:
+                signed = smime.parse(read_bytes(folder / "permissions.p7s", "permissions"))
+                signer = signed.signer()
+                fits = [signer == each for each in authorities]
+        except SrosError:  # `sros inspect` says what is wrong with it
+            continue
+        if True in fits:
+            counts[fits.index(True)] += 1
+    return counts
+
+
+# ── what the vendors make of it ────────────────────────────────────────────────────────────
+
+
+def _remarks(root: Path, rotation: Rotation) -> list[str]:
+    """What to restart at this stage, and how, by vendor."""
+    files = [each.file for each in rotation.replacements]
+    if rotation.stage is Stage.NONE:
+        return []
+    if rotation.stage is Stage.DISTRIBUTE:
+        return [
+            "All vendors: restart the processes one by one, when it suits; those restarted and "
+            "those not yet restarted talk with each other. Go on when all have been restarted."
+        ]
+    hindrance = fast_dds_hindrance(root, files)
+    remarks = [
+        f"Fast DDS: {hindrance} Restart all processes together."
+        if hindrance
+        else "Fast DDS: restart the processes one by one, when it suits; those restarted and those "
+        "not yet restarted talk with each other. Go on when all have been restarted.",
+        "Cyclone DDS: it trusts one CA at a time, so restart all processes together; one that is "
+        "restarted does not talk with one that is not.",
+    ]
+    if (root / CRL).exists() and any(file != "permissions_ca" for file in files):
+        remarks.append(
+            "Until the old CA is retired, earlier certificates of enclaves that are revoked from "
+            "now on are still accepted: retire it first."
+        )
+    return remarks
+
+
+def fast_dds_hindrance(root: Path, files: Sequence[str]) -> str:
+    """Why Fast DDS cannot trust the old and the new CA at once, as a sentence, or "".
+
+    Fast DDS 2.9.1 (ran): two CAs of one name are told apart by their key identifiers, and
+    permissions CAs need to have one name and one algorithm on both sides.
+    """
+    for file in files:
+        if file == "identity_ca":
+            continue
+        for certificate in certificates_of(root, file):
+            if not isinstance(certificate.public_key(), ec.EllipticCurvePublicKey):
+                return "the old permissions CA has a key of another kind than the new one."
+            try:
+                certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
+            except x509.ExtensionNotFound:
+                return (
+                    f"the old {'CA' if file == 'ca' else f'{PERMISSIONS} CA'} has no key "
+                    "identifier (ros2/sros2 made it), so it cannot be told from the new one."
+                )
+    return ""

@@ -1,0 +1,358 @@
+"""Stages what a rotation changes: new CAs beside the old, in their place, and the old ones away."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+
+from cryptography import x509
+
+from sros_tool.errors import KeystoreError, UsageError
+from sros_tool.keystore.authority import Authority
+from sros_tool.keystore.keyring import Keyring, check_places
+from sros_tool.keystore.layout import (
+    CRL,
+    IDENTITY,
+    PERMISSIONS,
+    PRIVATE,
+    PUBLIC,
+    ROLES,
+    SETTINGS,
+    ca_key,
+    enclave_folder,
+)
+from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
+from sros_tool.keystore.open import load_settings
+from sros_tool.keystore.reissue import Progress, Turn, reissue
+from sros_tool.keystore.revoke import read_crl
+from sros_tool.keystore.rotation import (
+    ROTATION,
+    Replacement,
+    Rotation,
+    Stage,
+    authority_files,
+    carries_crl,
+    certificates_of,
+    digest,
+    render_rotation,
+)
+from sros_tool.keystore.template import Template, render_template
+from sros_tool.keystore.transaction import Transaction
+from sros_tool.pki.certificates import common_name, issue_ca, pem, same_key, validity_of
+from sros_tool.pki.crl import sign_crl
+from sros_tool.validity import BACKDATE, Span, Window, window
+from sros_tool.xml import read_bytes
+
+RETIRED = "retired"
+"""Where certificates and keys of CAs go that are used no longer."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Succession:
+    """One CA file in turn: the certificates of the old CA (with its chain), and the new CA."""
+
+    file: str
+    roles: tuple[str, ...]
+    old: tuple[x509.Certificate, ...]
+    new: Authority
+    key: str
+
+    def turn(self) -> Turn:
+        return Turn(self.old[0], self.new)
+
+
+class Rotator:
+    """Does one stage in one transaction.
+
+    ``replacements`` are the CAs that it is about, and ``kept_elsewhere`` the places of old keys
+    that do not lie in the keystore and are left there.
+    """
+
+    def __init__(
+        self,
+        transaction: Transaction,
+        rotation: Rotation,
+        keyring: Keyring,
+        new_keys: Keyring,
+        now: datetime,
+        *,
+        delete_old_key: bool,
+    ) -> None:
+        self._transaction = transaction
+        self._root = transaction.root
+        self._rotation = rotation
+        self._keyring = keyring
+        self._new_keys = new_keys
+        self._now = now
+        self._delete = delete_old_key
+        self._template = load_settings(self._root)
+        self._entries: list[Entry] = []
+        self.replacements = list(rotation.replacements)
+        self.kept_elsewhere: list[str] = []
+
+    def go(
+        self,
+        stage: Stage,
+        names: Sequence[str],
+        roles: Sequence[str],
+        validity: Span | None,
+        progress: Progress | None,
+    ) -> Stage:
+        """Stage all that leads to ``stage``; the stage that is reached.
+
+        It is the present one where the new identity CA has no revocation list yet, which has to be
+        distributed first: Fast DDS 2.9.1 refuses whoever is of a CA without one (ran).
+        """
+        if self._rotation.stage is Stage.REISSUE:
+            self._retire(names)
+        elif self._rotation.stage is Stage.NONE:
+            turns = self._begin(roles, validity, stage)
+            if stage is Stage.DISTRIBUTE:
+                self._distribute(turns, names)
+            else:
+                self._reissue(turns, names, stage, progress)
+        else:
+            turns = self._resume()
+            if stage is Stage.REISSUE and self._lacks_crl(turns):
+                stage = Stage.DISTRIBUTE
+                self._distribute(turns, names)
+            else:
+                self._reissue(turns, names, stage, progress)
+        append(self._transaction, self._entries)
+        return stage
+
+    # ── the new CAs ────────────────────────────────────────────────────────────────────────
+
+    def _begin(
+        self, roles: Sequence[str], validity: Span | None, stage: Stage
+    ) -> list[_Succession]:
+        files = authority_files(self._root)
+        wanted = set(roles or ROLES)
+        for file, serves in files.items():
+            if wanted & set(serves) and not set(serves) <= wanted:
+                raise UsageError(
+                    f"the CA in '{PUBLIC}/{file}.cert.pem' does both jobs",
+                    "It can only be replaced for both.",
+                    "Leave out --identity and --permissions.",
+                )
+        check_places(self._new_keys, replace(self._template, separate_authorities=len(files) > 1))
+        turns = []
+        for file, serves in files.items():
+            if wanted & set(serves):
+                prefix = "next_" if stage is Stage.DISTRIBUTE else ""
+                at = f"{PRIVATE}/{prefix}{file}.key.pem"
+                turns.append(self._make(file, serves, at, validity))
+        return turns
+
+    def _make(
+        self, file: str, roles: tuple[str, ...], at: str, validity: Span | None
+    ) -> _Succession:
+        old = certificates_of(self._root, file)
+        place = self._new_keys.places.get(roles[0], "")
+        in_keystore = (self._root / f"{PRIVATE}/{file}.key.pem").is_file()
+        if not place and not in_keystore:
+            raise KeystoreError(
+                f"the key of the {roles[0]} CA is not in the keystore, so its successor's should "
+                "not be either",
+                f"It is at '{self._keyring.place(roles[0], self._template)}'.",
+                f"Name a place for the new one with --{roles[0]}-key.",
+            )
+        bare = replace(self._template, identity_key="", permissions_key="")
+        new_keys = replace(self._new_keys, encrypt=self._new_keys.encrypt or self._encrypted(file))
+        key = new_keys.make(self._transaction, at, roles[0], bare)
+        if same_key(old[0], key):
+            raise KeystoreError(
+                f"the key at '{place}' is that of the present {roles[0]} CA",
+                "A new CA needs a new key.",
+                "Name another place.",
+            )
+        # Fast DDS refuses peers whose permissions CA has another name (2.9.1: ran).
+        name = old[0].subject
+        if PERMISSIONS not in roles:
+            text = f"{self._template.authority_name} identity CA {secrets.token_hex(4)}"
+            name = common_name(text)
+        span = validity or self._template.authority_validity
+        certificate = issue_ca(key, name, window(self._now, span))
+        check_later(old[0], certificate)
+        self.replacements.append(
+            Replacement(file, digest(old[0]), digest(certificate), place or at)
+        )
+        self._entries.append(certificate_entry(self._now, "ca", certificate))
+        return _Succession(file, roles, old, Authority(certificate, key), place or at)
+
+    def _encrypted(self, file: str) -> bool:
+        path = self._root / f"{PRIVATE}/{file}.key.pem"
+        return path.is_file() and b"ENCRYPTED" in read_bytes(path, "CA key")
+
+    def _resume(self) -> list[_Succession]:
+        """The new CAs that were distributed, with their keys."""
+        turns = []
+        files = authority_files(self._root)
+        for each in self._rotation.replacements:
+            roles = files[each.file]
+            found = certificates_of(self._root, each.file)
+            (new,) = [one for one in found if digest(one) == each.new]
+            template = replace(self._template, identity_key=each.key, permissions_key=each.key)
+            key = replace(self._keyring, places={}).open(self._root, roles[0], template)
+            if not same_key(new, key):
+                raise KeystoreError(
+                    f"the key at '{each.key}' is not that of the new {roles[0]} CA",
+                    "",
+                    "Restore it from a backup.",
+                )
+            old = tuple(one for one in found if one != new)
+            turns.append(_Succession(each.file, roles, old, Authority(new, key), each.key))
+        return turns
+
+    # ── the stages ─────────────────────────────────────────────────────────────────────────
+
+    def _distribute(self, turns: list[_Succession], names: Sequence[str]) -> None:
+        for each in turns:
+            bundle = b"".join(map(pem, (*each.old, each.new.certificate)))
+            if IDENTITY in each.roles and (old := read_crl(self._root)):
+                bundle += self._empty_crl(each.new, old.number + 1)
+            self._write_authority(each.file, each.roles, bundle, names)
+        self._write_state(Stage.DISTRIBUTE)
+
+    def _lacks_crl(self, turns: list[_Succession]) -> bool:
+        """Whether something was revoked since the new identity CA was distributed."""
+        return (self._root / CRL).exists() and any(
+            IDENTITY in each.roles and not carries_crl(self._root, each.file) for each in turns
+        )
+
+    def _reissue(
+        self,
+        turns: list[_Succession],
+        names: Sequence[str],
+        stage: Stage,
+        progress: Progress | None,
+    ) -> None:
+        of = {role: each.turn() for each in turns for role in each.roles}
+        identity, permissions = of.get(IDENTITY), of.get(PERMISSIONS)
+        self._entries += reissue(
+            self._transaction, names, identity, permissions, self._template, self._now, progress
+        )
+        for each in turns:
+            trusted = (each.new.certificate, *(each.old if stage is Stage.REISSUE else ()))
+            bundle = b"".join(map(pem, trusted))
+            if IDENTITY in each.roles and (old := read_crl(self._root)):
+                if stage is Stage.REISSUE:
+                    bundle += read_bytes(self._root / CRL, "revocation list")
+                crl = self._empty_crl(each.new, old.number + 2)
+                self._transaction.write(CRL, crl)
+                self._write_copies(names, "crl.pem", crl)
+            self._write_authority(each.file, each.roles, bundle, names)
+            self._install_key(each)
+            if stage is Stage.RETIRE:
+                self._keep_certificate(each.old[0])
+        self._write_settings(turns)
+        if stage is Stage.REISSUE:
+            self._write_state(stage)
+        elif self._rotation.stage is not Stage.NONE:
+            self._transaction.remove(ROTATION)
+
+    def _retire(self, names: Sequence[str]) -> None:
+        files = authority_files(self._root)
+        for each in self._rotation.replacements:
+            new, *others = certificates_of(self._root, each.file)
+            (old,) = [one for one in others if digest(one) == each.old]
+            self._write_authority(each.file, files[each.file], pem(new), names)
+            self._keep_certificate(old)
+            key = f"{RETIRED}/{old.serial_number:x}.key.pem"
+            if self._delete and (self._root / key).exists():
+                self._transaction.remove(key)
+        self._transaction.remove(ROTATION)
+
+    # ── files ──────────────────────────────────────────────────────────────────────────────
+
+    def _write_authority(
+        self, file: str, roles: tuple[str, ...], bundle: bytes, names: Sequence[str]
+    ) -> None:
+        self._transaction.write(f"{PUBLIC}/{file}.cert.pem", bundle)
+        for role in roles:
+            self._write_copies(names, f"{role}_ca.cert.pem", bundle)
+
+    def _write_copies(self, names: Sequence[str], name: str, data: bytes) -> None:
+        write_copies(self._transaction, names, name, data)
+
+    def _write_state(self, stage: Stage) -> None:
+        rotation = Rotation(stage, tuple(self.replacements))
+        self._transaction.write(ROTATION, render_rotation(rotation))
+
+    def _keep_certificate(self, old: x509.Certificate) -> None:
+        self._transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
+
+    def _install_key(self, each: _Succession) -> None:
+        """Put the new key in the place of the old one, which goes to ``retired``."""
+        transaction, root = self._transaction, self._root
+        place = f"{PRIVATE}/{each.file}.key.pem"
+        if (root / place).is_file():
+            if not self._delete:
+                key = read_bytes(root / place, "CA key")
+                name = f"{RETIRED}/{each.old[0].serial_number:x}.key.pem"
+                transaction.write(name, key, private=True)
+        else:
+            self.kept_elsewhere.append(self._keyring.place(each.roles[0], self._template))
+        if each.key == f"{PRIVATE}/next_{each.file}.key.pem":
+            transaction.write(place, read_bytes(root / each.key, "CA key"), private=True)
+            transaction.remove(each.key)
+        elif each.key != place and (root / place).is_file():
+            transaction.remove(place)
+            for role in each.roles:
+                if (root / ca_key(role)).is_symlink():
+                    transaction.remove(ca_key(role))
+
+    def _write_settings(self, turns: list[_Succession]) -> None:
+        """Have the settings name the places of the new keys."""
+        places = {
+            role: "" if each.key.startswith(f"{PRIVATE}/") else each.key
+            for each in turns
+            for role in each.roles
+        }
+        template: Template = replace(
+            self._template,
+            identity_key=places.get(IDENTITY, self._template.identity_key),
+            permissions_key=places.get(PERMISSIONS, self._template.permissions_key),
+        )
+        if template != self._template:
+            comment = b"# The choices of this keystore; what is added later follows them.\n"
+            self._transaction.write(SETTINGS, comment + render_template(template).encode())
+
+    def _empty_crl(self, authority: Authority, number: int) -> bytes:
+        """A list of the new CA, which has issued nothing yet that could be revoked."""
+        validity = validity_of(authority.certificate)
+        moment = self._now.replace(microsecond=0)
+        begin = max(moment - BACKDATE, validity.not_before)
+        end = min(moment + self._template.revocation_validity, validity.not_after)
+        document = sign_crl(
+            authority.certificate,
+            authority.key,
+            (),
+            number=number,
+            this_update=begin,
+            next_update=end,
+        )
+        entry = document_entry(self._now, "crl", document, validity=Window(begin, end))
+        self._entries.append(entry)
+        return document
+
+
+def check_later(old: x509.Certificate, new: x509.Certificate) -> None:
+    """Raise `UsageError` where a new CA would end before the old one."""
+    if new.not_valid_after_utc < old.not_valid_after_utc:
+        raise UsageError(
+            "the new CA would end before the old one",
+            f"The old one ends at {old.not_valid_after_utc:%Y-%m-%d}, the new one would at "
+            f"{new.not_valid_after_utc:%Y-%m-%d}.",
+            "Name a longer validity with --ca-validity.",
+        )
+
+
+def write_copies(transaction: Transaction, names: Sequence[str], name: str, data: bytes) -> None:
+    """Stage a file in every enclave that has a copy of it, not a link."""
+    for enclave in names:
+        path = f"{enclave_folder(enclave)}/{name}"
+        if (transaction.root / path).is_file() and not (transaction.root / path).is_symlink():
+            transaction.write(path, data)
