@@ -7,7 +7,6 @@ DDS 2.9.1 trusts all that it holds (ran).
 from __future__ import annotations
 
 import json
-import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -30,12 +29,12 @@ from sros_tool.keystore.layout import (
     ca_certificate,
     enclave_folder,
 )
+from sros_tool.keystore.transaction import STAGE
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
-    UNREADABLE,
     issued_by,
     load_certificate,
-    read_in_full,
+    load_certificates,
     subject_text,
     validity_of,
 )
@@ -121,14 +120,17 @@ def authority_files(root: Path) -> dict[str, tuple[str, ...]]:
     found: dict[str, tuple[str, ...]] = {}
     for role in ROLES:
         path = root / ca_certificate(role)
-        real = Path(os.path.realpath(path))
-        if not real.is_file() or real.parent != Path(os.path.realpath(root / PUBLIC)):
+        file = path
+        # A link into the stage is a file of its own that an interrupted transaction left so.
+        if path.is_symlink() and STAGE not in (to := str(path.readlink())):
+            file = path.with_name(to)
+        if not file.is_file() or file.parent != path.parent:
             raise KeystoreError(
                 f"keystore '{root}' has no {role} CA of its own",
                 f"'{path}' is missing, or leads out of the keystore.",
                 "Use the keystore that it was exported from.",
             )
-        stem = real.name.removesuffix(".cert.pem")
+        stem = file.name.removesuffix(".cert.pem")
         found[stem] = (*found.get(stem, ()), role)
     return found
 
@@ -136,13 +138,7 @@ def authority_files(root: Path) -> dict[str, tuple[str, ...]]:
 def certificates_of(root: Path, file: str) -> tuple[x509.Certificate, ...]:
     """All certificates of a CA file, the issuing one first."""
     path = root / PUBLIC / f"{file}.cert.pem"
-    try:
-        found = x509.load_pem_x509_certificates(read_bytes(path, "CA certificate"))
-        return tuple(read_in_full(each) for each in found)
-    except UNREADABLE as error:
-        raise KeystoreError(
-            f"the CA certificate '{path}' cannot be read", "It is not PEM, or it is damaged."
-        ) from error
+    return load_certificates(read_bytes(path, "CA certificate"), f"'{path}'")
 
 
 def carries_crl(root: Path, file: str) -> bool:

@@ -149,6 +149,18 @@ def load_certificate(data: bytes, name: str) -> x509.Certificate:
         ) from error
 
 
+def load_certificates(data: bytes, name: str) -> tuple[x509.Certificate, ...]:
+    """All certificates of a PEM file, one at least; ``name`` stands for it in errors."""
+    first = load_certificate(data, name)
+    try:
+        others = [read_in_full(each) for each in x509.load_pem_x509_certificates(data)[1:]]
+    except UNREADABLE as error:
+        raise PkiError(
+            f"the certificates {name} cannot be read", "One after the first is damaged."
+        ) from error
+    return (first, *others)
+
+
 def read_in_full(certificate: x509.Certificate) -> x509.Certificate:
     """``certificate``, after every part of it that sros asks for was read once.
 

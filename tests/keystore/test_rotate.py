@@ -1,0 +1,445 @@
+"""Rotating CAs: every stage is whole, openssl agrees, and killed means run it again."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from harness import check_enclave_whole, policy_text, publish, remains, snapshot, sros
+from test_transaction import DIED, in_child
+
+from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts, list_enclaves
+from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.export import distribute
+from sros_tool.keystore.keyring import Keyring
+from sros_tool.keystore.ledger import read_ledger
+from sros_tool.keystore.revoke import read_crl, revoke
+from sros_tool.keystore.rotate import RotationStep, renew_identity_ca, rotate_ca
+from sros_tool.keystore.rotation import (
+    ROTATION,
+    Stage,
+    certificates_of,
+    digest,
+    rotation_status,
+)
+from sros_tool.keystore.template import load_template
+from sros_tool.keystore.verify import check_enclave
+from sros_tool.policy import read_policy
+
+NOW = datetime.now(UTC)
+STAGES = (Stage.DISTRIBUTE, Stage.REISSUE, Stage.RETIRE)
+NAMES = ("/a", "/a/inner", "/b")
+
+
+@pytest.fixture(params=["development", "production", "sros2"])
+def root(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    return make(tmp_path, request.param)
+
+
+@pytest.fixture
+def separate(tmp_path: Path) -> Path:
+    return make(tmp_path, "production")
+
+
+def make(folder: Path, template: str) -> Path:
+    policy = folder / "policy.xml"
+    policy.write_text(policy_text({name: publish(f"t{name}") for name in NAMES}))
+    create_keystore(folder / "ks", template=load_template(template), now=NOW)
+    generate_artifacts(folder / "ks", policies=[read_policy(policy)], now=NOW)
+    return folder / "ks"
+
+
+def check(root: Path, now: datetime = NOW) -> None:
+    """Every enclave can be loaded by its first CA alone (Cyclone DDS), and openssl agrees."""
+    assert not remains(root.parent)
+    for name in list_enclaves(root):
+        folder = enclave_path(root, name)
+        assert check_enclave(folder, now=now).problems == (), name
+        check_enclave_whole(folder)
+        identity, permissions = (folder / f"{r}_ca.cert.pem" for r in ("identity", "permissions"))
+        openssl("verify", "-x509_strict", "-CAfile", identity, folder / "cert.pem")
+        for document in ("permissions", "governance"):
+            signed = folder / f"{document}.p7s"
+            openssl("smime", "-verify", "-text", "-in", signed, "-CAfile", permissions)
+    for path in (*root.glob("private/*.pem"), *root.glob("retired/*.key.pem")):
+        assert path.is_symlink() or path.stat().st_mode & 0o777 == 0o600, path
+
+
+def openssl(*words: object) -> None:
+    done = subprocess.run(["openssl", *map(str, words)], capture_output=True, text=True)
+    assert done.returncode == 0, (words, done.stderr)
+
+
+def states(root: Path) -> list[tuple[str, str, int]]:
+    found = rotation_status(root, now=NOW).authorities
+    return [(each.roles[0], each.standing, each.enclaves) for each in found]
+
+
+# ── the stages ─────────────────────────────────────────────────────────────────────────────
+
+
+def test_every_stage_is_whole(root: Path) -> None:
+    files = sorted({path.resolve().name[: -len(".cert.pem")] for path in root.glob("public/*")})
+    old = {file: certificates_of(root, file) for file in files}
+    rights = {name: (enclave_path(root, name) / "permissions.xml").read_bytes() for name in NAMES}
+    roles = ["identity", "permissions"] if len(files) == 2 else ["identity"]
+    assert states(root) == [(role, "issuing", 3) for role in roles]
+
+    step = rotate_ca(root, now=NOW)
+    assert (step.stage, sorted(step.files)) == (Stage.DISTRIBUTE, files)
+    check(root)
+    assert states(root) == [
+        state for role in roles for state in ((role, "issuing", 3), (role, "next", 0))
+    ]
+    both = {file: certificates_of(root, file) for file in files}
+    assert all(both[file][0] == old[file][0] for file in files)
+
+    rotate_ca(root, now=NOW)
+    check(root)
+    assert states(root) == [
+        state for role in roles for state in ((role, "issuing", 3), (role, "old", 0))
+    ]
+    assert all(certificates_of(root, file) == both[file][::-1] for file in files)
+    assert len(list(root.glob("retired/*.key.pem"))) == len(files)
+
+    rotate_ca(root, now=NOW)
+    check(root)
+    assert states(root) == [(role, "issuing", 3) for role in roles]
+    assert all(certificates_of(root, file) == both[file][1:] for file in files)
+    assert not (root / ROTATION).exists()
+    assert sorted(path.name.split(".")[1] for path in root.glob("retired/*")) == sorted(
+        ["cert", "key"] * len(files)
+    )
+    for name in NAMES:  # rights stay, word for word
+        assert (enclave_path(root, name) / "permissions.xml").read_bytes() == rights[name]
+
+
+def test_the_keystore_can_be_used_at_every_stage(root: Path) -> None:
+    for index, stage in enumerate(STAGES):
+        rotate_ca(root, stage, now=NOW)
+        create_enclaves(root, [f"/new{index}"], now=NOW)
+        sros("renew", root, "/a").ok()
+        sros("inspect", root).ok()
+        check(root)
+
+
+def test_the_ledger_has_everything(separate: Path) -> None:
+    for _ in STAGES:
+        rotate_ca(separate, now=NOW)
+    entries = read_ledger(separate)
+    assert [e.what for e in entries].count("ca") == 4
+    known = {entry.sha256 for entry in entries}
+    for file in ("identity_ca", "permissions_ca"):
+        assert digest(certificates_of(separate, file)[0]) in known
+    last = {e.enclave: e for e in entries if e.what == "permissions"}
+    first = {e.enclave: e for e in reversed(entries) if e.what == "permissions"}
+    assert all(last[name].policy == first[name].policy != "" for name in NAMES)
+    assert all(last[name].sha256 != first[name].sha256 for name in NAMES)
+
+
+@pytest.mark.parametrize("role", ["identity", "permissions"])
+def test_one_ca_alone(role: str, separate: Path) -> None:
+    other = {"identity": "permissions", "permissions": "identity"}[role]
+    (separate / f"private/{other}_ca.key.pem").unlink()  # it is not needed
+    before = certificates_of(separate, f"{other}_ca")
+    for _ in STAGES:
+        rotate_ca(separate, roles=[role], now=NOW)
+        check(separate)
+    assert certificates_of(separate, f"{other}_ca") == before
+
+
+def test_names_of_new_cas(separate: Path) -> None:
+    """Fast DDS compares the name of the permissions CA with that of the peer."""
+    rotate_ca(separate, now=NOW)
+    old, new = certificates_of(separate, "permissions_ca")
+    assert old.subject == new.subject
+    assert old.public_key() != new.public_key()
+    old, new = certificates_of(separate, "identity_ca")
+    assert old.subject != new.subject
+
+
+def test_all_at_once_from_every_stage(root: Path, tmp_path: Path) -> None:
+    for steps in range(3):
+        copy = Path(shutil.copytree(root, tmp_path / f"copy{steps}", symlinks=True))
+        for _ in range(steps):
+            rotate_ca(copy, now=NOW)
+        step = rotate_ca(copy, finish=True, now=NOW)
+        assert step.stage is Stage.RETIRE
+        check(copy)
+        assert {standing for _, standing, _ in states(copy)} == {"issuing"}
+        assert certificates_of(copy, step.files[0]) != certificates_of(root, step.files[0])
+        assert not (copy / ROTATION).exists()
+        assert not list(copy.glob("private/next_*"))
+
+
+def test_an_expired_ca_is_replaced(separate: Path) -> None:
+    later = NOW + timedelta(days=6 * 365)
+    with pytest.raises(KeystoreError, match="not valid now"):
+        create_enclaves(separate, ["/c"], now=later)
+    rotate_ca(separate, finish=True, now=later)
+    check_at = [check_enclave(enclave_path(separate, name), now=later) for name in NAMES]
+    assert all(state.problems == () for state in check_at)
+    create_enclaves(separate, ["/c"], now=later)
+
+
+def test_same_key(separate: Path) -> None:
+    later = NOW + timedelta(hours=12)
+    before = snapshot(separate / "enclaves")
+    (old,) = certificates_of(separate, "identity_ca")
+    renew_identity_ca(separate, now=later)
+    (new,) = certificates_of(separate, "identity_ca")
+    assert (new.subject, new.public_key()) == (old.subject, old.public_key())
+    assert new.not_valid_after_utc > old.not_valid_after_utc
+    assert snapshot(separate / "enclaves") == before
+    check(separate, later)
+
+
+def test_same_key_is_not_for_a_ca_that_signs_permissions(tmp_path: Path) -> None:
+    root = make(tmp_path, "sros2")
+    before = snapshot(root)
+    with pytest.raises(KeystoreError, match="cannot keep its key"):
+        renew_identity_ca(root, now=NOW)
+    assert snapshot(root) == before
+
+
+# ── old keys, and keys elsewhere ───────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("when", [Stage.REISSUE, Stage.RETIRE])
+def test_the_old_key_is_deleted_when_asked(when: Stage, root: Path) -> None:
+    for stage in STAGES:
+        rotate_ca(root, stage, now=NOW, delete_old_key=stage is when)
+    assert not list(root.glob("retired/*.key.pem"))
+    check(root)
+
+
+def test_keys_in_files_elsewhere(tmp_path: Path) -> None:
+    def places(name: str) -> Keyring:
+        return Keyring(
+            places={r: f"file:{tmp_path}/{name}_{r}" for r in ("identity", "permissions")}
+        )
+
+    root = tmp_path / "ks"
+    create_keystore(root, template=load_template("production"), now=NOW, keyring=places("old"))
+    create_enclaves(root, NAMES, now=NOW)
+    before = snapshot(tmp_path)
+    with pytest.raises(KeystoreError, match="--identity-key"):
+        rotate_ca(root, now=NOW)
+    with pytest.raises(KeystoreError, match="that of the present"):
+        rotate_ca(root, now=NOW, new_keys=places("old"))
+    assert snapshot(tmp_path) == before
+    rotate_ca(root, now=NOW, new_keys=places("new"))
+    check(root)
+    step = rotate_ca(root, now=NOW)
+    assert step.kept_elsewhere == tuple(places("old").places.values())
+    rotate_ca(root, now=NOW)
+    check(root)
+    create_enclaves(root, ["/later"], now=NOW)
+    check(root)
+    assert not list(root.glob("private/*.pem"))
+    assert not list(root.glob("retired/*.key.pem"))
+
+
+def test_from_the_keystore_to_elsewhere(tmp_path: Path) -> None:
+    root = make(tmp_path, "sros2")
+    place = f"file:{tmp_path}/ca.key"
+    elsewhere = Keyring(places={"identity": place, "permissions": place})
+    for stage in STAGES:
+        rotate_ca(root, stage, now=NOW, new_keys=elsewhere)
+        check(root)
+    assert not [path for path in root.glob("private/*") if path.name]
+    create_enclaves(root, ["/later"], now=NOW)
+    check(root)
+
+
+def test_an_encrypted_key_has_an_encrypted_successor(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    locked = Keyring(secrets=lambda what: "secret", encrypt=True)
+    create_keystore(root, template=load_template("development"), now=NOW, keyring=locked)
+    opened = replace(locked, encrypt=False)
+    create_enclaves(root, NAMES, now=NOW, keyring=opened)
+    for _ in STAGES:
+        rotate_ca(root, now=NOW, keyring=opened, new_keys=opened)
+        keys = [*root.glob("private/*.pem"), *root.glob("retired/*.key.pem")]
+        assert all(b"ENCRYPTED" in path.read_bytes() for path in keys)
+    create_enclaves(root, ["/later"], now=NOW, keyring=opened)
+    check(root)
+
+
+# ── revocation ─────────────────────────────────────────────────────────────────────────────
+
+
+def test_revocation_lists_go_along(separate: Path) -> None:
+    revoke(separate, ["/b"], now=NOW)
+    numbers = []
+    for stage in STAGES:
+        rotate_ca(separate, stage, now=NOW)
+        check(separate)
+        crl = read_crl(separate)
+        assert crl
+        numbers.append(crl.number)
+        text = (separate / "public/identity_ca.cert.pem").read_text()
+        assert text.count("BEGIN X509 CRL") == (0 if stage is Stage.RETIRE else 1)
+        folder = enclave_path(separate, "/a")
+        ca, own = folder / "identity_ca.cert.pem", folder / "crl.pem"
+        openssl("verify", "-crl_check", "-CAfile", ca, "-CRLfile", own, folder / "cert.pem")
+    assert numbers == sorted(numbers)
+    assert numbers[0] < numbers[1]
+
+
+def test_a_first_revocation_in_between(separate: Path) -> None:
+    """The list of the new CA is distributed before anybody is of that CA."""
+    rotate_ca(separate, now=NOW)
+    revoke(separate, ["/b"], now=NOW)
+    assert rotate_ca(separate, now=NOW).stage is Stage.DISTRIBUTE
+    assert "X509 CRL" in (separate / "public/identity_ca.cert.pem").read_text()
+    check(separate)
+    assert rotate_ca(separate, now=NOW).stage is Stage.REISSUE
+    check(separate)
+    assert rotate_ca(separate, now=NOW).stage is Stage.RETIRE
+    check(separate)
+
+
+# ── stopped, repeated, refused ─────────────────────────────────────────────────────────────
+
+
+def test_a_stage_can_be_repeated(root: Path) -> None:
+    for stage in STAGES:
+        rotate_ca(root, stage, now=NOW)
+        before = snapshot(root)
+        assert rotate_ca(root, stage, now=NOW).changes == ()
+        assert snapshot(root) == before
+
+
+def shape(root: Path) -> tuple[object, ...]:
+    """What a keystore is, apart from keys and signatures, which are never the same."""
+    files = {path for path in snapshot(root) if not path.startswith("retired/")}
+    kept = sorted(path.name.split(".", 1)[1] for path in root.glob("retired/*"))
+    return frozenset(files), tuple(kept), tuple(states(root)), len(read_ledger(root))
+
+
+@pytest.mark.parametrize("stage", [*STAGES, None])
+def test_death_at_every_step(stage: Stage | None, tmp_path: Path) -> None:
+    """Killed at any step, and run again: the same end state (None is all stages at once)."""
+    base = make(tmp_path, "production")
+    for before in STAGES[: STAGES.index(stage) if stage else 0]:
+        rotate_ca(base, before, now=NOW)
+    work = tmp_path / "work"
+
+    def fresh() -> Path:
+        shutil.rmtree(work, ignore_errors=True)
+        return Path(shutil.copytree(base, work, symlinks=True))
+
+    def verb(root: Path) -> Callable[[], RotationStep]:
+        return lambda: rotate_ca(root, stage, now=NOW, finish=stage is None)
+
+    status, steps = in_child(verb(fresh()))
+    assert status == 0
+    wanted, start = shape(work), shape(base)
+    for step in steps:
+        root = fresh()
+        assert in_child(verb(root), step)[0] == DIED, step
+        for name in NAMES:
+            assert check_enclave(enclave_path(root, name), now=NOW).problems == (), (step, name)
+            check_enclave_whole(enclave_path(root, name))
+        rotation_status(root, now=NOW)
+        if stage is not None or shape_after_tidy(root) == start:
+            verb(root)()
+        assert shape(root) == wanted, step
+        assert not remains(tmp_path)
+
+
+def shape_after_tidy(root: Path) -> tuple[object, ...]:
+    from sros_tool.keystore.transaction import tidy
+
+    tidy(root)
+    return shape(root)
+
+
+def test_dry_run_changes_nothing_and_says_what_would(root: Path) -> None:
+    for stage in STAGES:
+        before = snapshot(root)
+        would = rotate_ca(root, stage, now=NOW, dry_run=True)
+        assert snapshot(root) == before
+        done = rotate_ca(root, stage, now=NOW)
+        pattern = [(each.action, each.path) for each in would.changes]
+        actual = [(each.action, each.path) for each in done.changes]
+        assert pattern == actual
+
+
+def refused(call: Callable[[], object], root: Path, match: str) -> None:
+    before = snapshot(root)
+    with pytest.raises(SrosError, match=match):
+        call()
+    assert snapshot(root) == before
+
+
+def test_refusals(separate: Path, tmp_path: Path) -> None:
+    refused(lambda: rotate_ca(separate, Stage.REISSUE, now=NOW), separate, "distribute")
+    rotate_ca(separate, now=NOW)
+    refused(lambda: rotate_ca(separate, Stage.RETIRE, now=NOW), separate, "reissue")
+    refused(lambda: renew_identity_ca(separate, now=NOW), separate, "under way")
+    rotate_ca(separate, now=NOW)
+    refused(lambda: rotate_ca(separate, Stage.DISTRIBUTE, now=NOW), separate, "is over")
+    (separate / ROTATION).write_text("{}")
+    refused(lambda: rotate_ca(separate, now=NOW), separate, "cannot be continued")
+
+
+def test_one_ca_for_both_jobs_is_replaced_for_both(tmp_path: Path) -> None:
+    root = make(tmp_path, "sros2")
+    with pytest.raises(UsageError, match="both jobs"):
+        rotate_ca(root, roles=["identity"], now=NOW)
+
+
+def test_an_enclave_of_another_ca_stops_everything(separate: Path, tmp_path: Path) -> None:
+    create_keystore(tmp_path / "other", template=load_template("production"), now=NOW)
+    create_enclaves(tmp_path / "other", ["/b"], now=NOW)
+    foreign = enclave_path(tmp_path / "other", "/b") / "cert.pem"
+    shutil.copy(foreign, enclave_path(separate, "/b") / "cert.pem")
+    rotate_ca(separate, now=NOW)
+    refused(lambda: rotate_ca(separate, now=NOW), separate, "enclave /b cannot be moved")
+
+
+def test_a_ca_never_ends_before_the_old_one(separate: Path) -> None:
+    span = timedelta(days=30)
+    refused(lambda: rotate_ca(separate, now=NOW, validity=span), separate, "end before the old")
+
+
+def test_exports_can_be_replaced_during_a_rotation(separate: Path, tmp_path: Path) -> None:
+    """A robot's folder gets its enclaves one after the other."""
+    distribute(separate, ["/a", "/b"], tmp_path / "robot", now=NOW)
+    for stage in STAGES:
+        rotate_ca(separate, stage, now=NOW)
+        for name in ("/a", "/b"):
+            distribute(separate, [name], tmp_path / "robot", now=NOW, force=True)
+            folder = enclave_path(tmp_path / "robot", name)
+            assert check_enclave(folder, now=NOW).problems == ()
+
+
+# ── the verb ───────────────────────────────────────────────────────────────────────────────
+
+
+def test_the_verb(separate: Path) -> None:
+    told = json.loads(sros("rotate_ca", separate, "--json").ok().out)
+    assert (told["stage"], told["next"], told["enclaves"]) == ("none", "distribute", 3)
+    assert sros("rotate-ca", separate, "--next").ok().out == (
+        "distributed the new CA beside the old one: identity_ca, permissions_ca\n"
+    )
+    told = json.loads(sros("rotate_ca", separate, "--status", "--json").ok().out)
+    assert [(each["standing"], each["enclaves"]) for each in told["authorities"]] == [
+        ("issuing", 3),
+        ("next", 0),
+    ] * 2
+    assert "Cyclone DDS" in sros("rotate_ca", separate, "--to", "reissue").ok().err
+    assert "nothing is left to do" in sros("rotate_ca", separate, "--to", "reissue").ok().err
+    assert sros("rotate_ca", separate, "--finish").ok().out.startswith("retired the old CA")
+    assert sros("rotate_ca", separate, "--same-key").ok().out.startswith("renewed the identity CA")
+    assert sros("rotate_ca", separate, "--next", "--finish").status == 2
+    assert sros("rotate_ca", separate, "--same-key", "--permissions").status == 2
