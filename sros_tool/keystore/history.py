@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import ssl
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
 
-from cryptography.hazmat.primitives import hashes
-
-from sros_tool.errors import SrosError
 from sros_tool.keystore.create import list_enclaves
 from sros_tool.keystore.layout import (
     CRL,
@@ -22,7 +20,6 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.keystore.revoke import read_crl
-from sros_tool.pki.certificates import load_certificate
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
@@ -109,7 +106,7 @@ def _digest(path: Path) -> str:
     data = read_bytes(path, "file")
     if path.name.endswith("cert.pem"):
         try:
-            return load_certificate(data, f"'{path}'").fingerprint(hashes.SHA256()).hex()
-        except SrosError:
+            data = ssl.PEM_cert_to_DER_cert(data.decode("ascii").strip())
+        except ValueError:
             return "unreadable"
     return hashlib.sha256(data).hexdigest()

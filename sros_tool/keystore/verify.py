@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -63,6 +64,28 @@ class EnclaveState:
         return self.governance.domains().closed() if self.governance else None
 
 
+# The enclaves of a keystore have all but their own files in common: these are read once.
+_certificate = lru_cache(maxsize=8)(load_certificate)
+_governance = lru_cache(maxsize=8)(parse_governance)
+
+
+@lru_cache(maxsize=8)
+def _content(message: bytes, authority: x509.Certificate | None) -> bytes:
+    signed = smime.parse(message)
+    if authority:
+        signed.verify(authority)
+    return signed.document
+
+
+@lru_cache(maxsize=8)
+def _revocation_list(
+    data: bytes, authority: x509.Certificate | None
+) -> tuple[x509.CertificateRevocationList, bool]:
+    """A revocation list, and whether it is of that authority."""
+    crl = x509.load_pem_x509_crl(data)
+    return crl, authority is None or signed_by(crl, authority)
+
+
 def check_enclave(folder: Path, *, now: datetime, domain: int | None = None) -> EnclaveState:
     """Read and check the files of an enclave; with ``domain``, also whether it may join that."""
     return _Check(folder, now).run(domain)
@@ -83,7 +106,7 @@ class _Check:
         self._revocation(certificate, identity_ca)
         governance = permissions = None
         if (document := self._signed("governance.p7s", files, permissions_ca)) is not None:
-            governance = self._parsed("governance.p7s", document, parse_governance)
+            governance = self._parsed("governance.p7s", document, _governance)
         if (document := self._signed("permissions.p7s", files, permissions_ca)) is not None:
             permissions = self._parsed("permissions.p7s", document, parse_permissions)
         if governance and domain is not None and domain not in governance.domains().closed():
@@ -127,7 +150,7 @@ class _Check:
         if data is None:
             return None
         try:
-            certificate = load_certificate(data, name)
+            certificate = _certificate(data, name)
         except SrosError as error:
             self._fault(name, error.why.rstrip("."))
             return None
@@ -166,11 +189,11 @@ class _Check:
         if not path.exists():
             return
         try:
-            crl = x509.load_pem_x509_crl(read_bytes(path, "revocation list"))
+            crl, authentic = _revocation_list(read_bytes(path, "revocation list"), ca)
         except (SrosError, ValueError):
             self._fault("crl.pem", "it is not a revocation list, and DDS then refuses everybody")
             return
-        if ca and not signed_by(crl, ca):
+        if not authentic:
             self._fault("crl.pem", "it is not of the identity CA, and DDS then refuses everybody")
         if crl.last_update_utc > self._now:
             self._fault(
@@ -191,10 +214,7 @@ class _Check:
         if data is None:
             return None
         try:
-            signed = smime.parse(data)
-            if authority:
-                signed.verify(authority)
-            return signed.document
+            return _content(data, authority)
         except SrosError as error:
             self._fault(name, str(error))
             return None
