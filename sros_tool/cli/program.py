@@ -12,11 +12,12 @@ from sros_tool import __version__
 
 @dataclass(frozen=True, slots=True)
 class Verb:
-    """A verb: the module that holds it, what it does, and other names for it."""
+    """A verb: the module that holds it, what it does, other names, and its name in the module."""
 
     module: str
     help: str
     aliases: tuple[str, ...] = ()
+    attribute: str = ""
 
 
 FAMILIES: dict[str, dict[str, Verb]] = {
@@ -26,9 +27,6 @@ FAMILIES: dict[str, dict[str, Verb]] = {
         "create_permission": Verb("keystore", "Give an enclave the permissions of a policy."),
         "generate_artifacts": Verb("keystore", "Create enclaves and permissions from policies."),
         "list_enclaves": Verb("keystore", "List the enclaves of a keystore.", ("list_keys",)),
-        "distribute_key": Verb(
-            "keystore", "Export an enclave for the robot it runs on.", ("export_enclave",)
-        ),
         "inspect": Verb("inspect", "Show what a keystore, certificate or document says."),
     },
     "Life of keys": {
@@ -37,6 +35,15 @@ FAMILIES: dict[str, dict[str, Verb]] = {
         "rotate_ca": Verb("rotate", "Replace the CAs, stage by stage."),
         "crl": Verb("life", "Show the revocation list, or sign it anew."),
         "check": Verb("life", "Say which enclaves need to be renewed."),
+    },
+    "Deployment": {
+        "distribute_key": Verb(
+            "deploy", "Export enclaves for the robot they run on.", ("export_enclave",)
+        ),
+        "verify": Verb("deploy", "Say whether what arrived on a robot can be used."),
+        "create_request": Verb("deploy", "Make a key on the robot, and the request to certify it."),
+        "sign_request": Verb("deploy", "Answer the request of a robot."),
+        "import": Verb("deploy", "Put an answer beside its key.", attribute="import_verb"),
     },
     "Policy": {
         "generate_policy": Verb("generate_policy", "Learn a policy from the running robot."),
@@ -70,7 +77,7 @@ class Program(click.Group):
         if name is None:
             return None
         module = importlib.import_module(f"sros_tool.cli.{_VERBS[name].module}")
-        command = getattr(module, name)
+        command = getattr(module, _VERBS[name].attribute or name)
         assert isinstance(command, click.Command)
         return command
 

@@ -17,7 +17,15 @@ from sros_tool.dds.portable import document_notes
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.authority import Authorities
 from sros_tool.keystore.defaults import default_enclave
-from sros_tool.keystore.layout import CRL, ENCLAVES, IDENTITY, PERMISSIONS, PUBLIC, enclave_folder
+from sros_tool.keystore.layout import (
+    CRL,
+    ENCLAVES,
+    IDENTITY,
+    PERMISSIONS,
+    PUBLIC,
+    REQUEST,
+    enclave_folder,
+)
 from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
 from sros_tool.keystore.parallel import in_shares
 from sros_tool.keystore.template import Template
@@ -127,7 +135,7 @@ class Registrar:
         self._links(folder, present)
         if policy is not None or "permissions.p7s" not in present:
             self._permissions(name, folder, policy, certificate)
-        if "key.pem" not in present:
+        if not present & {"key.pem", REQUEST}:
             return Fate.CREATED
         if "permissions.p7s" in present and policy is not None:
             return Fate.CHANGED
@@ -143,7 +151,7 @@ class Registrar:
         return {name for name in names if Path(path, name).exists()}
 
     def _identity(self, name: str, folder: str, present: set[str]) -> x509.Certificate:
-        if "cert.pem" in present and "key.pem" in present:
+        if "cert.pem" in present and present & {"key.pem", REQUEST}:
             return self._existing(name, folder)
         if "cert.pem" in present:
             raise KeystoreError(

@@ -2,34 +2,35 @@
 
 from __future__ import annotations
 
-import gzip
-import io
 import os
-import tarfile
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 from sros_tool.errors import KeystoreError
+from sros_tool.keystore.archive import SUFFIXES, file_mode, pack, staged_file
 from sros_tool.keystore.create import list_enclaves
 from sros_tool.keystore.enclave import enclave_path
 from sros_tool.keystore.layout import (
-    ENCLAVES,
     OPTIONAL_FILES,
     PRIVATE,
+    REQUEST,
     REQUIRED_FILES,
     enclave_folder,
-    folder_mode,
 )
 from sros_tool.keystore.transaction import Change, Transaction
+from sros_tool.keystore.trust import check_same_authority
 from sros_tool.keystore.verify import check_enclave
 from sros_tool.names import check_enclave_name
-from sros_tool.pki.certificates import load_certificate
 from sros_tool.xml import read_bytes
 
-ARCHIVE_SUFFIXES = (".tar.gz", ".tgz")
+ARCHIVE_SUFFIXES = SUFFIXES
+_ANSWER_AGAIN = (
+    "Send the robot a new answer, by `sros sign_request --renew` of the request.pem that lies in "
+    "the enclave's folder."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +40,46 @@ class Export:
     target: Path
     enclaves: tuple[str, ...]
     changes: tuple[Change, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """The enclaves to export, and those that fit but whose key is on their robot."""
+
+    names: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def select(
+    root: Path, names: Sequence[str], patterns: Sequence[str] = (), *, every: bool = False
+) -> Selection:
+    """The named enclaves, and those of the keystore that fit a pattern, or ``every`` one.
+
+    In a pattern ``*`` stands for any part of a name, "/" included, as in policies.  Those that are
+    found so are left out if their key is not at home; those that are named are refused later.
+    """
+    existing = list_enclaves(root)
+    chosen = list(dict.fromkeys(names))
+    left_out: list[str] = []
+    for pattern in ("*",) if every else patterns:
+        fitting = [name for name in existing if fnmatchcase(name, pattern)]
+        if not fitting:
+            raise KeystoreError(
+                f"no enclave of keystore '{root}' fits {pattern!r}",
+                "",
+                f"See `sros list_enclaves {root}`.",
+            )
+        for name in fitting:
+            if name in chosen or name in left_out:
+                continue
+            (left_out if _born_elsewhere(root, name) else chosen).append(name)
+    if not chosen:
+        raise KeystoreError(
+            f"the keys of {', '.join(left_out)} are not in keystore '{root}'",
+            "They were made on their robots and stay there.",
+            _ANSWER_AGAIN,
+        )
+    return Selection(tuple(chosen), tuple(left_out))
 
 
 def distribute(
@@ -55,7 +96,7 @@ def distribute(
     The same enclaves give the same bytes.  An enclave that cannot run is not exported.  In a
     folder that already is an export, other enclaves stay; files that would change need ``force``.
     """
-    files = _collect(root, names, now)
+    files = collect(root, names, now)
     if target.name.endswith(ARCHIVE_SUFFIXES):
         changes = _write_archive(target, files, force, dry_run)
     else:
@@ -63,7 +104,22 @@ def distribute(
     return Export(target, tuple(names), changes)
 
 
-def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]:
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """An archive, and the paths of the files in it."""
+
+    data: bytes
+    paths: tuple[str, ...]
+
+
+def pack_enclaves(root: Path, names: Sequence[str], *, now: datetime) -> Packed:
+    """Export enclaves as the bytes of an archive, for a pipe."""
+    files = collect(root, names, now)
+    return Packed(pack(files), tuple(files))
+
+
+def collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]:
+    """The files that are sent, by their paths; raises `KeystoreError` for what would not run."""
     existing = set(list_enclaves(root))
     files: dict[str, bytes] = {}
     for name in names:
@@ -73,6 +129,12 @@ def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes
                 f"enclave {name} does not exist in keystore '{root}'",
                 "",
                 f"Make it with `sros create_enclave {root} {name}`.",
+            )
+        if _born_elsewhere(root, name):
+            raise KeystoreError(
+                f"the key of enclave {name} is not in keystore '{root}'",
+                "It was made on its robot and stays there, so there is nothing that could run.",
+                _ANSWER_AGAIN,
             )
         folder = enclave_path(root, name)
         state = check_enclave(folder, now=now)
@@ -88,13 +150,14 @@ def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes
     return dict(sorted(files.items()))
 
 
+def _born_elsewhere(root: Path, name: str) -> bool:
+    folder = enclave_path(root, name)
+    return (folder / REQUEST).exists() and not (folder / "key.pem").exists()
+
+
 def _real(path: Path) -> Path:
     # Unlike Path.resolve, realpath does not fail at links that lead in a circle.
     return Path(os.path.realpath(path))
-
-
-def _mode(path: str) -> int:
-    return 0o600 if path.endswith("/key.pem") else 0o644
 
 
 def _write_folder(
@@ -112,7 +175,7 @@ def _write_folder(
             "It is a keystore of its own, not an export.",
             "Choose another folder.",
         )
-    _check_same_authority(target, files)
+    check_same_authority(target, files)
     different = {
         path: data
         for path, data in files.items()
@@ -127,29 +190,15 @@ def _write_folder(
         )
     with Transaction(target, fresh=True, dry_run=dry_run) as transaction:
         for path, data in different.items():
-            transaction.write(path, data, private=_mode(path) == 0o600)
+            transaction.write(path, data, private=file_mode(path) == 0o600)
         transaction.commit()
     return tuple(transaction.changes)
-
-
-def _check_same_authority(target: Path, files: dict[str, bytes]) -> None:
-    """One folder holds the enclaves of one keystore only: others would never talk to each other."""
-    ours = {data for path, data in files.items() if path.endswith("/identity_ca.cert.pem")}
-    for path in sorted((target / ENCLAVES).rglob("identity_ca.cert.pem")):
-        theirs = read_bytes(path, "certificate")
-        if f"{path.relative_to(target)}" not in files and theirs not in ours:
-            name = load_certificate(theirs, f"'{path}'").subject.rfc4514_string()
-            raise KeystoreError(
-                f"'{target}' holds enclaves of another keystore",
-                f"Those trust {name}, and would not talk to these.",
-                "Choose another folder.",
-            )
 
 
 def _write_archive(
     target: Path, files: dict[str, bytes], force: bool, dry_run: bool
 ) -> tuple[Change, ...]:
-    data = _archive(files)
+    data = pack(files)
     if target.exists():
         if not target.is_file():
             raise KeystoreError(f"'{target}' is in the way", "It is not a regular file.")
@@ -163,42 +212,6 @@ def _write_archive(
             )
     change = Change("replace" if target.exists() else "create", target.name)
     if not dry_run:
-        _write_whole(target, data)
+        with staged_file(target, data) as put_in_place:
+            put_in_place()
     return (change,)
-
-
-def _archive(files: dict[str, bytes]) -> bytes:
-    """A gzipped tar that depends on the files alone: no names, numbers or moments of a machine."""
-    buffer = io.BytesIO()
-    with (
-        gzip.GzipFile(fileobj=buffer, mode="wb", filename="", mtime=0) as packed,
-        tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as tar,
-    ):
-        folders = {
-            str(parent) for path in files for parent in Path(path).parents if str(parent) != "."
-        }
-        for folder in sorted(folders):
-            entry = tarfile.TarInfo(folder)
-            entry.type, entry.mode = tarfile.DIRTYPE, folder_mode(folder)
-            tar.addfile(entry)
-        for path, data in files.items():
-            entry = tarfile.TarInfo(path)
-            entry.size, entry.mode = len(data), _mode(path)
-            tar.addfile(entry, io.BytesIO(data))
-    return buffer.getvalue()
-
-
-def _write_whole(target: Path, data: bytes) -> None:
-    """Write a file that holds keys: whole or not at all, and readable by its owner only."""
-    spare = target.with_name(f".{target.name}.{os.getpid()}")
-    handle = os.open(spare, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        spare.replace(target)
-    except BaseException:
-        with suppress(OSError):
-            spare.unlink()
-        raise

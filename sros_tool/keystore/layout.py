@@ -36,6 +36,9 @@ REQUIRED_FILES = (
 
 OPTIONAL_FILES = ("crl.pem",)
 
+REQUEST = "request.pem"
+"""The signing request of an enclave whose key was made on its robot and stays there."""
+
 
 def ca_certificate(role: str) -> str:
     """The certificate of the identity or permissions CA."""

@@ -207,6 +207,12 @@ class _Renewer:
         state.signed.verify(self._authorities.permissions.certificate)
         public = state.certificate.public_key()
         if self._new_key:
+            if not (self._transaction.root / folder / "key.pem").exists():
+                raise KeystoreError(
+                    f"the key of enclave {name} is not in this keystore",
+                    "It was made on its robot and stays there, so no new one is made here.",
+                    "Have a new request made there, and sign it with --renew.",
+                )
             key = generate_key()
             public = key.public_key()
             self._transaction.write(f"{folder}/key.pem", key_pem(key), private=True)

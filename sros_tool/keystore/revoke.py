@@ -15,6 +15,7 @@ from sros_tool.keystore.layout import (
     CRL,
     IDENTITY,
     OPTIONAL_FILES,
+    REQUEST,
     REQUIRED_FILES,
     REVOKED,
     enclave_folder,
@@ -29,7 +30,7 @@ from sros_tool.pki.crl import REASONS, RevocationList, Revoked, load_crl, sign_c
 from sros_tool.validity import BACKDATE, Window, iso
 from sros_tool.xml import read_bytes
 
-_FILES = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml")
+_FILES = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml", REQUEST)
 _PRIVATE = "key.pem"
 
 

@@ -1,0 +1,122 @@
+"""Archives that are sent to robots: the same files give the same bytes, and nothing is trusted."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import secrets
+import tarfile
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePosixPath
+
+from sros_tool.errors import DocumentError
+from sros_tool.keystore.layout import folder_mode
+
+SUFFIXES = (".tar.gz", ".tgz")
+MAX_PACKED = 4 * 1024 * 1024
+MAX_UNPACKED = 8 * 1024 * 1024
+MAX_MEMBER = 1024 * 1024
+"""Largest archive that is read, in bytes: packed, unpacked, and each file in it."""
+_MOST_MEMBERS = 200
+_GZIP = 16 + zlib.MAX_WBITS
+
+
+def file_mode(path: str) -> int:
+    """The permission bits of a file that is sent: private keys are their owner's alone."""
+    return 0o600 if path.rpartition("/")[2] == "key.pem" else 0o644
+
+
+def pack(files: Mapping[str, bytes]) -> bytes:
+    """A gzipped tar that depends on the files alone: no names, numbers or moments of a machine."""
+    buffer = io.BytesIO()
+    with (
+        gzip.GzipFile(fileobj=buffer, mode="wb", filename="", mtime=0) as packed,
+        tarfile.open(fileobj=packed, mode="w", format=tarfile.PAX_FORMAT) as tar,
+    ):
+        folders = {
+            str(parent)
+            for path in files
+            for parent in PurePosixPath(path).parents
+            if str(parent) != "."
+        }
+        for folder in sorted(folders):
+            entry = tarfile.TarInfo(folder)
+            entry.type, entry.mode = tarfile.DIRTYPE, folder_mode(folder)
+            tar.addfile(entry)
+        for path, data in files.items():
+            entry = tarfile.TarInfo(path)
+            entry.size, entry.mode = len(data), file_mode(path)
+            tar.addfile(entry, io.BytesIO(data))
+    return buffer.getvalue()
+
+
+def unpack(data: bytes) -> dict[str, bytes]:
+    """The files of an archive by their paths, in memory; nothing is written.
+
+    Raises `DocumentError` for anything but plain files and folders of bounded size and number:
+    links, devices, sparse files, a name that comes twice, bytes behind the end.  Whether the names
+    are welcome is for the caller to say.
+    """
+    try:
+        with tarfile.open(fileobj=io.BytesIO(_unzip(data)), mode="r:") as tar:
+            return dict(_members(tar))
+    except (tarfile.TarError, zlib.error, EOFError, OSError, ValueError, OverflowError) as error:
+        raise DocumentError("it is no .tar.gz, or it is damaged") from error
+
+
+def _unzip(data: bytes) -> bytes:
+    if len(data) > MAX_PACKED:
+        raise DocumentError(f"it is too large: more than {MAX_PACKED // 1024**2} MiB")
+    stream = zlib.decompressobj(_GZIP)
+    plain = stream.decompress(data, MAX_UNPACKED + 1)
+    if len(plain) > MAX_UNPACKED:
+        raise DocumentError(f"it unpacks to more than {MAX_UNPACKED // 1024**2} MiB")
+    if not stream.eof:
+        raise EOFError
+    if stream.unused_data:
+        raise DocumentError("there is more behind its end")
+    return plain
+
+
+def _members(tar: tarfile.TarFile) -> Iterator[tuple[str, bytes]]:
+    seen: set[str] = set()
+    for entry in tar:
+        name = entry.name
+        if name in seen or len(seen) >= _MOST_MEMBERS:
+            raise DocumentError(
+                f"it holds {name!r} twice" if name in seen else "it holds too many files"
+            )
+        seen.add(name)
+        if entry.isdir():
+            continue
+        if entry.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or entry.issparse():
+            raise DocumentError(f"it holds {name!r}, which is no plain file")
+        if entry.size > MAX_MEMBER:
+            raise DocumentError(f"it holds {name!r}, which has {entry.size} bytes")
+        content = tar.extractfile(entry)
+        read = content.read() if content else b""
+        if len(read) != entry.size:
+            raise EOFError
+        yield name, read
+
+
+@contextmanager
+def staged_file(target: Path, data: bytes) -> Iterator[Callable[[], None]]:
+    """Write a file beside ``target``; calling what is yielded puts it in place, as a whole.
+
+    It is readable by its owner only, and on the disk before it can be put in place.
+    """
+    spare = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}")
+    handle = os.open(spare, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        yield lambda: os.replace(spare, target)  # noqa: PTH105
+    finally:
+        with suppress(FileNotFoundError):
+            spare.unlink()

@@ -1,0 +1,315 @@
+"""Answers the signing request of a robot: all that its enclave needs but the key it has."""
+
+from __future__ import annotations
+
+import hashlib
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+from cryptography import x509
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.permissions import Permissions, parse_permissions, render_permissions
+from sros_tool.dds.portable import document_notes, name_notes
+from sros_tool.errors import KeystoreError, PkiError, PolicyError, SrosError
+from sros_tool.keystore.answer import Answer, check_answer
+from sros_tool.keystore.archive import pack, staged_file
+from sros_tool.keystore.authority import Authorities, load_authorities
+from sros_tool.keystore.create import list_enclaves
+from sros_tool.keystore.defaults import default_enclave
+from sros_tool.keystore.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.layout import (
+    CRL,
+    ENCLAVES,
+    GOVERNANCE_P7S,
+    REQUEST,
+    REVOKED,
+    ROLES,
+    ca_certificate,
+    enclave_folder,
+)
+from sros_tool.keystore.ledger import append, certificate_entry, document_entry, read_ledger
+from sros_tool.keystore.open import check_domain, load_governance, load_settings
+from sros_tool.keystore.template import Template
+from sros_tool.keystore.transaction import Change, Transaction, tidy
+from sros_tool.names import check_enclave_name
+from sros_tool.notes import Note
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import enclave_subject, load_certificate, pem, validity_of
+from sros_tool.pki.certificates import subject_text as text_of
+from sros_tool.pki.keys import load_key
+from sros_tool.pki.requests import SigningRequest, key_digest, load_request
+from sros_tool.policy.model import Enclave, Policy
+from sros_tool.translate import permissions_for
+from sros_tool.validity import iso, window
+from sros_tool.xml import read_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Signed:
+    """A request that was answered; ``archive`` is the answer for the robot, as `.tar.gz`.
+
+    ``identity_ca`` is the certificate of the CA that the robot is going to trust.
+    """
+
+    name: str
+    key: str
+    identity_ca: x509.Certificate
+    archive: bytes
+    renewed: bool
+    changes: tuple[Change, ...]
+    notes: tuple[Note, ...]
+
+
+def sign_request(
+    root: Path,
+    data: bytes,
+    *,
+    now: datetime,
+    policy: Policy | None = None,
+    renew: bool = False,
+    answer: Path | None = None,
+    force: bool = False,
+    domain: int | None = None,
+    keyring: Keyring = IN_KEYSTORE,
+    dry_run: bool = False,
+) -> Signed:
+    """Certify the key of a request, sign the permissions, and make the answer for the robot.
+
+    The keystore gets everything but the key.  The rights are those that ``policy`` states; else,
+    with ``renew``, those that are signed already; else the default of the keystore's template.
+    ``answer`` is the file that the answer goes to, which appears after the keystore has changed.
+    """
+    request = load_request(data, "that was given")
+    name = check_enclave_name(request.name)
+    enclave = policy.enclave(name) if policy else None
+    if policy and enclave is None:
+        there = ", ".join(each.path for each in policy.enclaves)
+        raise PolicyError(
+            f"unable to find enclave {name} in the policy '{policy.file}'", f"It has {there}."
+        )
+    if answer is not None:
+        _check_free(answer, force)
+    if not dry_run:
+        tidy(root)
+    list_enclaves(root)
+    with Transaction(root, dry_run=dry_run) as transaction:
+        existing = list_enclaves(root)
+        _check_name(root, name, renew, name in existing)
+        _check_key(root, request)
+        template = load_settings(root)
+        authorities = load_authorities(root, template, keyring, now)
+        domains = load_governance(root, authorities.permissions.certificate).domains().closed()
+        check_domain(domains, domain, root)
+        work = _Signer(transaction, authorities, template, domains, now)
+        files, notes = work.sign(request, enclave, renew=renew)
+        _check_result(files, name, request, now)
+        archive = pack(files)
+        staged = staged_file(answer, archive) if answer and not dry_run else nullcontext()
+        with staged as put_in_place:
+            transaction.commit()
+            if put_in_place:
+                put_in_place()
+    if not renew:
+        notes += name_notes({*existing, name}, [name])
+    return Signed(
+        name,
+        key_digest(request.public_key),
+        authorities.identity.certificate,
+        archive,
+        renew,
+        tuple(transaction.changes),
+        tuple(notes),
+    )
+
+
+def _check_free(answer: Path, force: bool) -> None:
+    if answer.exists() and not answer.is_file():
+        raise KeystoreError(f"'{answer}' is in the way", "It is not a regular file.")
+    if answer.exists() and not force:
+        raise KeystoreError(
+            f"'{answer}' already exists",
+            "Nothing was changed.",
+            "Add --force to replace it, or choose another name with -o.",
+        )
+
+
+def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
+    if exists and not renew:
+        raise KeystoreError(
+            f"enclave {name} exists already in keystore '{root}'",
+            "Whoever sent the request would get its rights.",
+            "If that is meant, add --renew; otherwise have the request made for another name.",
+        )
+    if renew and not exists:
+        raise KeystoreError(
+            f"enclave {name} does not exist in keystore '{root}'",
+            "There is nothing to renew.",
+            "Leave --renew out.",
+        )
+
+
+def _check_key(root: Path, request: SigningRequest) -> None:
+    """Refuse a key that was revoked, and one beside which the keystore has another."""
+    for path in sorted((root / REVOKED).glob("*/cert.pem")):
+        certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+        if certificate.public_key() == request.public_key:
+            raise KeystoreError(
+                f"the key of the request for {request.name} was revoked",
+                f"It is that of the certificate {certificate.serial_number:x} of "
+                f"{text_of(certificate.subject)}.",
+                "Have a new key made on the robot, in another folder.",
+            )
+    path = root / enclave_folder(request.name) / "key.pem"
+    if path.exists():
+        key = load_key(read_bytes(path, "private key"), f"'{path}'")
+        if key.public_key() != request.public_key:
+            raise KeystoreError(
+                f"enclave {request.name} has another key in keystore '{root}'",
+                "Its key.pem would be useless with the certificate of the request.",
+                f"Revoke the enclave first, with `sros revoke {root} {request.name}`.",
+            )
+
+
+def _check_result(
+    files: dict[str, bytes], name: str, request: SigningRequest, now: datetime
+) -> None:
+    """See that the robot will accept the answer, before anybody relies on it."""
+    try:
+        check_answer(Answer(name, files), request.public_key, now=now)
+    except SrosError as error:
+        raise KeystoreError(
+            f"the answer for {name} would be of no use on the robot: {error.what}",
+            error.why,
+            "Nothing was changed; `sros inspect` tells more of the keystore.",
+        ) from error
+
+
+class _Signer:
+    """Puts what a request asks for into a transaction."""
+
+    def __init__(
+        self,
+        transaction: Transaction,
+        authorities: Authorities,
+        template: Template,
+        domains: DomainSet,
+        now: datetime,
+    ) -> None:
+        self._transaction = transaction
+        self._root = transaction.root
+        self._authorities = authorities
+        self._template = template
+        self._domains = domains
+        self._now = now
+
+    def sign(
+        self, request: SigningRequest, enclave: Enclave | None, *, renew: bool
+    ) -> tuple[dict[str, bytes], list[Note]]:
+        """Stage the enclave; the files of the answer by their paths, and remarks."""
+        name, folder = request.name, enclave_folder(request.name)
+        notes = self._new_key(request) if renew else []
+        certificate = self._authorities.identity.issuer().issue(
+            enclave_subject(name, unique=self._template.unique_subject),
+            request.public_key,
+            window(self._now, self._template.certificate_validity),
+        )
+        permissions, policy = self._permissions(name, certificate, enclave, renew)
+        document = render_permissions(permissions)
+        message = self._authorities.permissions.sign(
+            document, permissions, parse_permissions, f"the permissions of {name}"
+        )
+        files = {f"{folder}/cert.pem": pem(certificate), f"{folder}/permissions.p7s": message}
+        for path, data in files.items():
+            self._transaction.write(path, data)
+        self._transaction.write(f"{folder}/permissions.xml", document)
+        self._transaction.write(f"{folder}/{REQUEST}", request.pem)
+        append(
+            self._transaction,
+            [
+                certificate_entry(self._now, "certificate", certificate, name),
+                document_entry(
+                    self._now,
+                    "permissions",
+                    message,
+                    enclave=name,
+                    subject=text_of(certificate.subject),
+                    validity=permissions.grants[0].validity,
+                    policy=policy,
+                ),
+            ],
+        )
+        files |= self._shared(folder)
+        notes += document_notes(name, permissions, len(message))
+        return dict(sorted(files.items())), notes
+
+    def _new_key(self, request: SigningRequest) -> list[Note]:
+        path = self._root / enclave_folder(request.name) / "cert.pem"
+        old = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+        if old.public_key() == request.public_key:
+            return []
+        until = iso(validity_of(old).not_after)
+        return [
+            Note(
+                "request.new-key",
+                f"{request.name}: the request has a new key. The certificate of the earlier one "
+                f"stays valid until {until}, for whoever has that key.",
+            )
+        ]
+
+    def _permissions(
+        self, name: str, certificate: x509.Certificate, enclave: Enclave | None, renew: bool
+    ) -> tuple[Permissions, str]:
+        """What to sign, and the digest of the policy that it comes from."""
+        subject = text_of(certificate.subject)
+        validity = (
+            window(self._now, self._template.permissions_validity)
+            .within(validity_of(self._authorities.permissions.certificate))
+            .within(validity_of(certificate))
+        )
+        if enclave is None and renew:
+            path = self._root / enclave_folder(name) / "permissions.p7s"
+            message = read_bytes(path, "permissions document")
+            signed = smime.parse(message)
+            signed.verify(self._authorities.permissions.certificate)
+            grants = parse_permissions(signed.document, f"'{path}'").grants
+            old = text_of(self._certificate(name).subject)
+            grant = next((each for each in grants if each.subject == old), None)
+            if grant is None:
+                raise PkiError(
+                    f"the permissions of enclave {name} have no grant for {old}",
+                    "They belong to another certificate.",
+                    "State the rights with -p POLICY_FILE.",
+                )
+            digest = hashlib.sha256(message).hexdigest()
+            policies = {each.sha256: each.policy for each in read_ledger(self._root)}
+            begin, end = iso(validity.not_before), iso(validity.not_after)
+            renewed = replace(grant, subject=subject, not_before=begin, not_after=end)
+            return Permissions((renewed,)), policies.get(digest, "")
+        meant = enclave or default_enclave(self._template.default_permissions, name)
+        made = permissions_for(meant, subject=subject, validity=validity, domains=self._domains)
+        return made, meant.digest
+
+    def _certificate(self, name: str) -> x509.Certificate:
+        path = self._root / enclave_folder(name) / "cert.pem"
+        return load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+
+    def _shared(self, folder: str) -> dict[str, bytes]:
+        """Link what all enclaves share, where that is missing, and return it for the answer."""
+        up = "../" * folder.count("/")
+        sources = {f"{role}_ca.cert.pem": (ca_certificate(role), "../") for role in ROLES}
+        if (self._root / CRL).exists():
+            sources["crl.pem"] = (CRL, "../")
+        found = {}
+        for file, (source, above) in sources.items():
+            path = f"{folder}/{file}"
+            if not (self._root / path).exists():
+                self._transaction.link(path, f"{up}{above}{source}")
+            found[path] = read_bytes(self._root / source, "file")
+        path = f"{folder}/governance.p7s"
+        if folder != ENCLAVES and not (self._root / path).exists():
+            self._transaction.link(path, f"{up}governance.p7s")
+        found[path] = read_bytes(self._root / GOVERNANCE_P7S, "governance document")
+        return found

@@ -1,0 +1,60 @@
+"""Whom the enclaves of a robot trust: those of one folder have an identity CA in common."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+
+from sros_tool.errors import KeystoreError, PkiError
+from sros_tool.keystore.layout import ENCLAVES, PRIVATE, PUBLIC
+from sros_tool.pki.certificates import UNREADABLE, subject_text
+from sros_tool.xml import read_bytes
+
+_AUTHORITY = "identity_ca.cert.pem"
+
+
+def fingerprints(pem: bytes) -> frozenset[str]:
+    """The SHA-256 of every certificate in a PEM file: more than one while a CA is rotated."""
+    return frozenset(each.fingerprint(hashes.SHA256()).hex() for each in _load(pem))
+
+
+def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
+    """One folder holds the enclaves of one keystore only: others would never talk to each other.
+
+    ``files`` are those that are to be written below ``target``, by their paths.
+    """
+    ours: set[str] = set()
+    for path, data in files.items():
+        if path.endswith(f"/{_AUTHORITY}"):
+            ours |= fingerprints(data)
+    for place in sorted((target / ENCLAVES).rglob(_AUTHORITY)):
+        if f"{place.relative_to(target)}" in files or not place.exists():
+            continue
+        theirs = read_bytes(place, "certificate")
+        if not fingerprints(theirs) & ours:
+            raise KeystoreError(
+                f"'{target}' holds enclaves of another keystore",
+                f"Those trust {subject_text(_load(theirs)[0].subject)}, and would not talk to "
+                "these.",
+                "Choose another folder.",
+            )
+
+
+def refuse_home(folder: Path, remedy: str) -> None:
+    """Raise `KeystoreError` where ``folder`` is the keystore that has the CAs, not a robot's."""
+    if (folder / PRIVATE).exists() or (folder / PUBLIC).exists():
+        raise KeystoreError(
+            f"'{folder}' is a keystore with CAs",
+            "Requests are made, and their answers used, in a folder of the robot.",
+            remedy,
+        )
+
+
+def _load(pem: bytes) -> list[x509.Certificate]:
+    try:
+        return x509.load_pem_x509_certificates(pem)
+    except UNREADABLE as error:
+        raise PkiError("the certificate of a CA cannot be read") from error

@@ -1,0 +1,96 @@
+"""Certificate signing requests (PKCS#10, RFC 2986): making them, and reading those of others."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+from cryptography import x509
+from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
+
+from sros_tool.errors import PkiError
+from sros_tool.pki.certificates import common_name, common_name_of, subject_text
+from sros_tool.pki.keys import PrivateKey, PublicKey, algorithm
+
+MAX_BYTES = 64 * 1024
+"""Largest request that is read."""
+_DIGESTS = (hashes.SHA256, hashes.SHA384, hashes.SHA512)
+
+
+@dataclass(frozen=True, slots=True)
+class SigningRequest:
+    """A request whose signature was verified: its common name, its key, and itself as PEM."""
+
+    name: str
+    public_key: PublicKey
+    pem: bytes
+
+
+def make_request(key: PrivateKey, name: str) -> bytes:
+    """A request, as PEM, for a certificate of ``key`` with the common name ``name``."""
+    builder = x509.CertificateSigningRequestBuilder().subject_name(common_name(name))
+    return builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
+
+
+def load_request(data: bytes, what: str) -> SigningRequest:
+    """Read a PEM request and verify that its sender has the key; ``what`` stands for it in errors.
+
+    The keys are those that every DDS vendor takes: EC prime256v1 and RSA 2048.  Extensions that a
+    request asks for have no effect: the keystore decides what a certificate says.
+    """
+    try:
+        if len(data) > MAX_BYTES:
+            raise ValueError("too large")
+        request = x509.load_pem_x509_csr(data)
+        subject, public, digest = (
+            request.subject,
+            request.public_key(),
+            request.signature_hash_algorithm,
+        )
+        said = subject_text(subject)
+    except (ValueError, UnsupportedAlgorithm, x509.InvalidVersion) as error:
+        raise PkiError(
+            f"the request {what} cannot be read",
+            "It is not a PEM certificate request, or it is damaged.",
+            "Make one with `sros create_request` on the robot, and send its request.pem.",
+        ) from error
+    if not (
+        isinstance(public, ec.EllipticCurvePublicKey) and public.curve.name == "secp256r1"
+    ) and (not (isinstance(public, rsa.RSAPublicKey) and public.key_size == 2048)):
+        raise PkiError(
+            f"the request {what} is for a key of {algorithm(public)}",
+            "Every DDS vendor takes EC prime256v1 and RSA 2048, and some take nothing else.",
+            "Make the key with `sros create_request`.",
+        )
+    if not isinstance(digest, _DIGESTS) or not _holds(request):
+        raise PkiError(
+            f"the signature of the request {what} does not hold",
+            "Whoever sent it has not shown to have the key, or it was changed on its way.",
+            "Have it sent again.",
+        )
+    if len(list(subject)) != 1 or not common_name_of(subject):
+        raise PkiError(
+            f"the request {what} is for {said or 'an empty subject'}",
+            "A request names the enclave as its common name, and nothing else.",
+            "Make it with `sros create_request`.",
+        )
+    return SigningRequest(
+        common_name_of(subject), public, request.public_bytes(serialization.Encoding.PEM)
+    )
+
+
+def _holds(request: x509.CertificateSigningRequest) -> bool:
+    try:
+        return request.is_signature_valid
+    except (ValueError, UnsupportedAlgorithm):
+        return False
+
+
+def key_digest(key: PublicKey) -> str:
+    """The SHA-256 of a public key (its DER SubjectPublicKeyInfo), in hexadecimal."""
+    der = key.public_bytes(
+        serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
+    )
+    return hashlib.sha256(der).hexdigest()
