@@ -1,0 +1,322 @@
+"""Renewing enclaves: what changes, what stays, when it is time, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from harness import certificate, check_whole, policy_text, publish, snapshot, sros, topics_of
+
+from sros_tool.dds.permissions import parse_permissions
+from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.renew import Threshold, lifetimes, parse_threshold, renew
+from sros_tool.keystore.template import load_template
+from sros_tool.keystore.verify import check_enclave
+from sros_tool.pki import smime
+from sros_tool.policy import read_policy
+
+NOW = datetime(2026, 6, 1, tzinfo=UTC)
+LATER = NOW + timedelta(days=100)
+RENEWED = {"cert.pem", "permissions.p7s", "permissions.xml"}
+
+
+def made(root: Path, *names: str, template: str = "production", **more: timedelta) -> Path:
+    choices = replace(load_template(template), **more)  # type: ignore[arg-type]
+    create_keystore(root, template=choices, now=NOW)
+    create_enclaves(root, names, now=NOW)
+    return root
+
+
+def changed(before: dict[str, tuple[int, bytes]], root: Path) -> set[str]:
+    after = snapshot(root)
+    return {path for path in before.keys() | after.keys() if before.get(path) != after.get(path)}
+
+
+def problems(root: Path, name: str, now: datetime) -> list[str]:
+    return [str(each) for each in check_enclave(enclave_path(root, name), now=now).problems]
+
+
+@pytest.mark.parametrize("template", ["production", "development", "sros2"])
+@pytest.mark.parametrize("new_key", [False, True])
+@pytest.mark.parametrize("name", ["/a", "/", "/a/b"])
+def test_one_is_renewed_and_nothing_else_changes(
+    template: str, new_key: bool, name: str, tmp_path: Path
+) -> None:
+    root = made(tmp_path / "ks", "/a", "/", "/a/b", template=template)
+    folder = enclave_path(root, name)
+    before, old = snapshot(root), certificate(folder / "cert.pem")
+    done = renew(root, [name], now=LATER, new_key=new_key)
+    files = RENEWED | ({"key.pem"} if new_key else set())
+    expected = {f"{folder.relative_to(root)}/{file}" for file in files} | {"ledger.jsonl"}
+    assert changed(before, root) == expected
+    assert {change.path for change in done.changes} == expected
+    assert done.renewed == (name,)
+    new = certificate(folder / "cert.pem")
+    assert new.serial_number != old.serial_number
+    assert (new.public_key() == old.public_key()) is not new_key
+    assert (new.subject == old.subject) is (template != "production")
+    assert new.not_valid_after_utc - LATER == min(
+        load_template(template).certificate_validity,
+        certificate(root / "public/identity_ca.cert.pem").not_valid_after_utc - LATER,
+    )
+    assert not problems(root, name, LATER)
+    check_whole(root)
+
+
+@pytest.mark.parametrize("template", ["production", "development"])
+def test_the_rights_stay(template: str, tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b", template=template)
+    policy = tmp_path / "p.xml"
+    policy.write_text(policy_text({"/a": publish("x", "/y/*")}))
+    generate_artifacts(root, policies=[read_policy(policy)], now=NOW)
+    topics = {name: topics_of(enclave_path(root, name)) for name in ("/a", "/b")}
+    grants = {
+        name: parse_permissions(
+            smime.parse((enclave_path(root, name) / "permissions.p7s").read_bytes()).document
+        ).grants
+        for name in topics
+    }
+    renew(root, ["/b", "/a", "/b"], now=LATER)
+    for name in topics:
+        folder = enclave_path(root, name)
+        assert topics_of(folder) == topics[name]
+        message = (folder / "permissions.p7s").read_bytes()
+        (grant,) = parse_permissions(smime.parse(message).document).grants
+        (old,) = grants[name]
+        assert grant.rules == old.rules
+        assert grant.name == old.name
+        assert grant.not_before > old.not_before
+        # In development they end with their CA already.
+        assert (grant.not_after > old.not_after) is (template == "production")
+
+
+def test_the_subject_is_unique_in_production_only(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b")
+    subjects = set()
+    for day in range(5):
+        renew(root, ["/a", "/b"], now=NOW + timedelta(days=day))
+        for name in ("/a", "/b"):
+            text = certificate(enclave_path(root, name) / "cert.pem").subject.rfc4514_string()
+            assert text.startswith(f"CN={name},OU=")
+            subjects.add(text)
+    assert len(subjects) == 10
+
+
+def test_an_expired_enclave_is_renewed(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a")
+    late = NOW + timedelta(days=500)
+    assert len(problems(root, "/a", late)) == 2
+    with pytest.raises(KeystoreError, match="sros renew"):
+        create_enclaves(root, ["/a"], now=late)
+    renew(root, ["/a"], now=late)
+    assert not problems(root, "/a", late)
+
+
+def test_nothing_outlives_its_authority(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a")
+    late = NOW + timedelta(days=5 * 365 - 10)
+    renew(root, ["/a"], now=late)
+    (life,) = lifetimes(root)
+    end = certificate(root / "public/identity_ca.cert.pem").not_valid_after_utc
+    assert life.certificate.not_after == life.permissions.not_after == end
+    assert not problems(root, "/a", end)
+    before = snapshot(root)
+    with pytest.raises(KeystoreError, match="identity CA .* is not valid now"):  # noqa: RUF043
+        renew(root, ["/a"], now=end + timedelta(seconds=1))
+    assert snapshot(root) == before
+
+
+# ── when it is time ────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("30d", Threshold(remaining=timedelta(days=30))),
+        (" 72h ", Threshold(remaining=timedelta(hours=72))),
+        ("66%", Threshold(elapsed=0.66)),
+        ("0%", Threshold(elapsed=0.0)),
+        ("100%", Threshold(elapsed=1.0)),
+    ],
+)
+def test_thresholds(text: str, expected: Threshold) -> None:
+    assert parse_threshold(text) == expected
+
+
+@pytest.mark.parametrize("text", ["", "%", "101%", "-1%", "6.5%", "30", "d", "0d", "٣%", "1e1%"])
+def test_what_is_no_threshold(text: str) -> None:
+    with pytest.raises(UsageError):
+        parse_threshold(text)
+
+
+@pytest.mark.parametrize(
+    ("threshold", "day", "due"),
+    [
+        ("30d", 149, False),  # the permissions end on day 180, and before the certificate
+        ("30d", 150, True),
+        ("30d", 200, True),
+        ("50%", 89, False),
+        ("50%", 90, True),
+        ("100%", 179, False),
+        ("100%", 180, True),
+        ("0%", 0, True),
+    ],
+)
+def test_due(threshold: str, day: int, due: bool, tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a")
+    (life,) = lifetimes(root)
+    assert life.due(parse_threshold(threshold), NOW + timedelta(days=day)) is due
+
+
+@pytest.mark.parametrize("hours", [1, 6, 24, 72])
+def test_a_short_life_is_not_over_as_it_begins(hours: int, tmp_path: Path) -> None:
+    """It is back-dated by a day, which is not part of its life."""
+    short = timedelta(hours=hours)
+    root = made(tmp_path / "ks", "/a", certificate_validity=short, permissions_validity=short)
+    (life,) = lifetimes(root)
+    assert not life.due(parse_threshold("66%"), NOW)
+    assert not life.due(parse_threshold("66%"), NOW + 0.6 * short)
+    assert life.due(parse_threshold("66%"), NOW + 0.7 * short)
+
+
+def test_all_that_expire(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b", "/c")
+    renew(root, ["/b"], now=LATER)
+    soon = NOW + timedelta(days=160)
+    seen: list[str] = []
+    month = parse_threshold("30d")
+    done = renew(root, ["/b"], now=soon, expiring=month, progress=seen.append)
+    assert done.renewed == ("/b", "/a", "/c")
+    assert seen == ["/b", "/a", "/c"]
+    assert renew(root, now=soon, expiring=month).renewed == ()
+    assert renew(root, now=soon, expiring=month).changes == ()
+
+
+def test_many_are_renewed_by_several_processes(tmp_path: Path) -> None:
+    names = [f"/n{index:03}" for index in range(230)]
+    root = made(tmp_path / "ks", *names)
+    seen: list[str] = []
+    done = renew(root, names, now=LATER, new_key=True, progress=seen.append)
+    assert sorted(seen) == names
+    assert len(done.changes) == 4 * len(names) + 1
+    assert not [problem for name in names for problem in problems(root, name, LATER)]
+    keys = {(enclave_path(root, name) / "key.pem").read_bytes() for name in names}
+    assert len(keys) == len(names)
+    check_whole(root)
+
+
+# ── what is refused ────────────────────────────────────────────────────────────────────────
+
+
+def lose_key(root: Path) -> None:
+    shutil.rmtree(root / "private")
+
+
+def foreign_certificate(root: Path) -> None:
+    other = made(root.with_name("other"), "/b")
+    shutil.copy(other / "enclaves/b/cert.pem", root / "enclaves/b/cert.pem")
+
+
+def foreign_permissions(root: Path) -> None:
+    other = made(root.with_name("other"), "/b", template="sros2")
+    shutil.copy(other / "enclaves/b/permissions.p7s", root / "enclaves/b/permissions.p7s")
+
+
+def tampered(root: Path) -> None:
+    path = root / "enclaves/b/permissions.p7s"
+    path.write_bytes(path.read_bytes().replace(b"rt/rosout", b"rt/cmdvel"))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lose_key, "the key of the identity CA is not at"),
+        (foreign_certificate, "was not issued by the identity CA|no grant for"),
+        (foreign_permissions, "not by the permissions CA|no grant for"),
+        (tampered, "signature does not match"),
+        (lambda root: (root / "enclaves/b/cert.pem").unlink(), "enclave /b cannot be read"),
+        (lambda root: (root / "enclaves/b/permissions.p7s").unlink(), "enclave /b cannot be read"),
+        (lambda root: (root / "enclaves/b/cert.pem").write_text("x"), "enclave /b cannot be read"),
+        (lambda root: shutil.rmtree(root / "enclaves/b"), "enclave /b does not exist"),
+    ],
+)
+def test_one_that_cannot_be_renewed_changes_nothing(
+    spoil: object, said: str, tmp_path: Path
+) -> None:
+    root = made(tmp_path / "ks", "/a", "/b")
+    assert callable(spoil)
+    spoil(root)
+    before = snapshot(root)
+    with pytest.raises(SrosError, match=said):
+        renew(root, ["/a", "/b"], now=LATER)
+    assert snapshot(root) == before
+
+
+def test_the_key_of_another_enclave_is_not_certified(tmp_path: Path) -> None:
+    """A key that is not that of the certificate was put there by somebody."""
+    root = made(tmp_path / "ks", "/a", "/b")
+    shutil.copy(root / "enclaves/a/key.pem", root / "enclaves/b/key.pem")
+    renew(root, ["/b"], now=LATER)
+    new = certificate(root / "enclaves/b/cert.pem")
+    assert new.public_key() != certificate(root / "enclaves/a/cert.pem").public_key()
+
+
+def test_a_certificate_made_anew_fits_the_permissions_that_are_there(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a")
+    (root / "enclaves/a/cert.pem").unlink()
+    create_enclaves(root, ["/a"], now=NOW)
+    assert not problems(root, "/a", NOW)
+    renew(root, ["/a"], now=LATER)
+    assert not problems(root, "/a", LATER)
+
+
+def test_permissions_of_another_enclave_do_not_name_a_certificate(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b")
+    (root / "enclaves/a/cert.pem").unlink()
+    shutil.copy(root / "enclaves/b/permissions.p7s", root / "enclaves/a/permissions.p7s")
+    create_enclaves(root, ["/a"], now=NOW)
+    subject = certificate(root / "enclaves/a/cert.pem").subject.rfc4514_string()
+    assert subject.startswith("CN=/a,OU=")
+    assert len(problems(root, "/a", NOW)) == 1
+
+
+# ── the program ────────────────────────────────────────────────────────────────────────────
+
+
+def test_the_program(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", "production").ok()
+    sros("create_enclave", root, "/a", "/b").ok()
+    before = snapshot(root)
+    plan = sros("renew", root, "/a", "--dry-run").ok()
+    assert snapshot(root) == before
+    for file in RENEWED:
+        assert f"enclaves/a/{file}" in plan.out
+    assert "enclaves/b" not in plan.out
+    assert sros("renew", root, "/a").ok().out == "renewed enclave /a\n"
+    assert sros("renew", root, "--all-expiring", "30d").ok().out == ""
+    every = sros("renew", root, "--all-expiring", "200d").ok().out
+    assert every == "renewed enclave /a\nrenewed enclave /b\n"
+    assert sros("renew", root).status == 2
+    assert sros("renew", root, "--all-expiring", "soon").status == 2
+    assert sros("renew", root, "/missing").status == 1
+
+
+def test_the_check_answers_by_its_exit_status(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", "production").ok()
+    sros("create_enclave", root, "/a").ok()
+    check = ("check", "keystore", root, "--needs-renewal")
+    assert sros(*check, "66%").ok().out == ""
+    due = sros(*check, "181d")
+    assert (due.status, due.out.startswith("/a  permissions until ")) == (1, True), due
+    (entry,) = json.loads(sros(*check, "181d", "--json").out)
+    assert set(entry) == {"enclave", "certificate_until", "permissions_until"}
+    assert json.loads(sros(*check, "30d", "--json").ok().out) == []
+    assert sros(*check, "often").status == 2

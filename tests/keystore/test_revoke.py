@@ -1,0 +1,329 @@
+"""Revoking enclaves: the list, its way to everybody, and the files out of the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from harness import certificate, check_whole, snapshot, sros
+
+from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.keystore import create_enclaves, create_keystore, list_enclaves
+from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.export import distribute
+from sros_tool.keystore.ledger import read_ledger
+from sros_tool.keystore.renew import renew
+from sros_tool.keystore.revoke import read_crl, refresh_crl, revoke
+from sros_tool.keystore.template import load_template
+from sros_tool.keystore.verify import check_enclave
+from sros_tool.pki.crl import REASONS, RevocationList
+
+NOW = datetime(2026, 6, 1, tzinfo=UTC)
+DAY = timedelta(days=1)
+
+
+def made(root: Path, *names: str, template: str = "production", **more: timedelta) -> Path:
+    choices = replace(load_template(template), **more)  # type: ignore[arg-type]
+    create_keystore(root, template=choices, now=NOW)
+    create_enclaves(root, names, now=NOW)
+    return root
+
+
+def serial(root: Path, name: str) -> int:
+    return certificate(enclave_path(root, name) / "cert.pem").serial_number
+
+
+def crl_of(root: Path) -> RevocationList:
+    found = read_crl(root)
+    assert found
+    return found
+
+
+def problems(folder: Path, now: datetime = NOW) -> list[str]:
+    return [str(each) for each in check_enclave(folder, now=now).problems]
+
+
+@pytest.mark.parametrize("template", ["production", "development", "sros2"])
+@pytest.mark.parametrize("name", ["/a", "/", "/a/b"])
+def test_one_is_revoked(template: str, name: str, tmp_path: Path) -> None:
+    names = ("/", "/a", "/a/b", "/c")
+    root = made(tmp_path / "ks", *names, template=template)
+    folder = enclave_path(root, name)
+    stolen = Path(shutil.copytree(folder, tmp_path / "stolen"))
+    number = serial(root, name)
+    done = revoke(root, [name], now=NOW, reason="keyCompromise")
+    others = tuple(each for each in names if each != name)
+    assert done.revoked == (name,)
+    assert done.restart == list_enclaves(root) == others
+    (entry,) = crl_of(root).revoked
+    assert (entry.serial, entry.reason, entry.date) == (number, "keyCompromise", NOW)
+    for other in others:
+        path = enclave_path(root, other) / "crl.pem"
+        assert path.resolve() == (root / "public/identity_ca.crl.pem").resolve()
+        assert not problems(enclave_path(root, other))
+    moved = root / f"revoked/{number:x}"
+    assert {path.name for path in moved.iterdir()} == {
+        "cert.pem",
+        "key.pem",
+        "permissions.p7s",
+        "permissions.xml",
+    }
+    assert (moved / "key.pem").read_bytes() == (stolen / "key.pem").read_bytes()
+    assert (moved / "key.pem").stat().st_mode & 0o777 == 0o600
+    assert moved.stat().st_mode & 0o777 == moved.parent.stat().st_mode & 0o777 == 0o700
+    left = {path.name for path in folder.iterdir()} if folder.exists() else set()
+    assert left <= {"a", "b", "c", "governance.xml", "governance.p7s"}
+    check_whole(root)
+    shutil.copy(root / "public/identity_ca.crl.pem", stolen / "crl.pem")
+    assert problems(stolen) == ["cert.pem: it is revoked by crl.pem"]
+
+
+def test_folders_of_which_nothing_is_left_go(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/x/y/z", "/x/w", "/v")
+    revoke(root, ["/x/y/z"], now=NOW)
+    assert not (root / "enclaves/x/y").exists()
+    assert (root / "enclaves/x/w").exists()
+    revoke(root, ["/x/w", "/v"], now=NOW)
+    assert sorted(path.name for path in (root / "enclaves").iterdir()) == [
+        "governance.p7s",
+        "governance.xml",
+    ]
+
+
+def test_earlier_certificates_are_revoked_too(tmp_path: Path) -> None:
+    """One that was renewed is not revoked by that: with the key, it is as good as the last."""
+    root = made(tmp_path / "ks", "/a", "/b")
+    serials = [serial(root, "/a")]
+    for day in (10, 20):
+        renew(root, ["/a"], now=NOW + day * DAY, new_key=day == 20)
+        serials.append(serial(root, "/a"))
+    other = serial(root, "/b")
+    revoke(root, ["/a"], now=NOW + 30 * DAY)
+    assert {each.serial for each in crl_of(root).revoked} == set(serials)
+    assert not crl_of(root).names(other)
+    told = [int(each.serial, 16) for each in read_ledger(root) if each.what == "revocation"]
+    assert sorted(told) == sorted(serials)
+
+
+def test_one_that_has_ended_needs_no_revocation(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b")
+    first = serial(root, "/a")
+    late = NOW + 366 * DAY
+    renew(root, ["/a"], now=late)
+    second = serial(root, "/a")
+    revoke(root, ["/a"], now=late)
+    assert [each.serial for each in crl_of(root).revoked] == [second]
+    assert first != second
+
+
+def test_what_was_revoked_stays_revoked(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b", "/c", "/d")
+    serials = {name: serial(root, name) for name in ("/a", "/b", "/c")}
+    for number, (name, reason) in enumerate(
+        [("/a", "keyCompromise"), ("/b", "unspecified"), ("/c", "cessationOfOperation")], 1
+    ):
+        revoke(root, [name], now=NOW + number * DAY, reason=reason)
+        assert crl_of(root).number == number
+    expected = [
+        (serials["/a"], "keyCompromise", NOW + DAY),
+        (serials["/b"], "unspecified", NOW + 2 * DAY),
+        (serials["/c"], "cessationOfOperation", NOW + 3 * DAY),
+    ]
+    refresh_crl(root, now=NOW + 9 * DAY)
+    found = crl_of(root)
+    assert [(each.serial, each.reason, each.date) for each in found.revoked] == expected
+    assert found.number == 4
+
+
+@pytest.mark.parametrize("reason", REASONS)
+def test_every_reason(reason: str, tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b")
+    revoke(root, ["/a"], now=NOW, reason=reason)
+    assert crl_of(root).revoked[0].reason == reason
+
+
+def test_again_under_the_same_name(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b")
+    old = certificate(root / "enclaves/a/cert.pem")
+    revoke(root, ["/a"], now=NOW)
+    create_enclaves(root, ["/a", "/new"], now=NOW)
+    new = certificate(root / "enclaves/a/cert.pem")
+    assert new.public_key() != old.public_key()
+    assert not crl_of(root).names(new.serial_number)
+    for name in ("a", "new"):
+        assert not problems(root / "enclaves" / name)
+        assert (root / "enclaves" / name / "crl.pem").is_symlink()
+    revoke(root, ["/a"], now=NOW)
+    assert len(crl_of(root).revoked) == 2
+    assert len(list((root / "revoked").iterdir())) == 2
+
+
+def test_put_back_and_revoked_again(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b")
+    kept = Path(shutil.copytree(root / "enclaves/a", tmp_path / "kept", symlinks=True))
+    revoke(root, ["/a"], now=NOW)
+    shutil.copytree(kept, root / "enclaves/a", symlinks=True)
+    revoke(root, ["/a"], now=NOW + DAY)
+    (entry,) = crl_of(root).revoked
+    assert entry.date == NOW
+    assert list_enclaves(root) == ("/b",)
+
+
+@pytest.mark.parametrize("there", ["copy", "another link", "dangling link"])
+def test_a_list_that_would_grow_stale_becomes_a_link(there: str, tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b", "/c")
+    revoke(root, ["/a"], now=NOW)
+    path = root / "enclaves/b/crl.pem"
+    data = path.read_bytes()
+    path.unlink()
+    if there == "copy":
+        path.write_bytes(data)
+    else:
+        (tmp_path / "elsewhere").write_bytes(data)
+        path.symlink_to(tmp_path / ("elsewhere" if there == "another link" else "nowhere"))
+    revoke(root, ["/c"], now=NOW)
+    assert os.readlink(path) == "../../public/identity_ca.crl.pem"
+    check = check_enclave(root / "enclaves/b", now=NOW)
+    assert not check.problems
+
+
+# ── how long it holds ──────────────────────────────────────────────────────────────────────
+
+
+def test_the_list_ends_with_its_authority(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b", authority_validity=100 * DAY)
+    done = revoke(root, ["/a"], now=NOW)
+    end = certificate(root / "public/identity_ca.cert.pem").not_valid_after_utc
+    assert done.next_update == crl_of(root).next_update == end
+
+
+def test_an_ended_list_locks_everybody_out_until_it_is_refreshed(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b", revocation_validity=30 * DAY)
+    revoke(root, ["/a"], now=NOW)
+    folder = root / "enclaves/b"
+    assert problems(folder, NOW + 30 * DAY) == []
+    assert len(problems(folder, NOW + 31 * DAY)) == 1
+    assert len(problems(folder, NOW - 2 * DAY)) > 1  # the list begins a day before
+    refresh_crl(root, now=NOW + 31 * DAY)
+    assert problems(folder, NOW + 31 * DAY) == []
+
+
+def test_a_list_of_another_authority_is_seen(tmp_path: Path) -> None:
+    """Also where that has the same name, as all of ros2/sros2 have."""
+    roots = [made(tmp_path / name, "/a", "/b", template="sros2") for name in ("one", "two")]
+    for root in roots:
+        revoke(root, ["/a"], now=NOW)
+    crls = [root / "public/identity_ca.crl.pem" for root in roots]
+    shutil.copy(crls[1], crls[0])
+    (problem,) = problems(roots[0] / "enclaves/b")
+    assert "not of the identity CA" in problem
+    assert not problems(roots[1] / "enclaves/b")
+
+
+def test_refresh_reaches_an_enclave_without_a_list(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b")
+    done = refresh_crl(root, now=NOW)  # nothing is revoked yet
+    assert done.restart == ("/a", "/b")
+    assert crl_of(root).revoked == ()
+    (root / "enclaves/a/crl.pem").unlink()
+    refresh_crl(root, now=NOW)
+    assert (root / "enclaves/a/crl.pem").is_symlink()
+
+
+def test_an_export_brings_the_list(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b")
+    distribute(root, ["/b"], tmp_path / "out", now=NOW)
+    revoke(root, ["/a"], now=NOW)
+    distribute(root, ["/b"], tmp_path / "out", now=NOW, force=True)
+    sent = tmp_path / "out/enclaves/b/crl.pem"
+    assert sent.read_bytes() == (root / "public/identity_ca.crl.pem").read_bytes()
+    assert not sent.is_symlink()
+
+
+# ── what is refused ────────────────────────────────────────────────────────────────────────
+
+
+def lose_key(root: Path) -> None:
+    shutil.rmtree(root / "private")
+
+
+def foreign_certificate(root: Path) -> None:
+    other = made(root.with_name("other"), "/b")
+    shutil.copy(other / "enclaves/b/cert.pem", root / "enclaves/b/cert.pem")
+
+
+def damaged_list(root: Path) -> None:
+    (root / "public/identity_ca.crl.pem").write_text("no list")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (lose_key, "the key of the identity CA is not at"),
+        (foreign_certificate, "was not issued by the identity CA"),
+        (damaged_list, "revocation list .* cannot be read"),
+        (lambda root: (root / "enclaves/b/cert.pem").write_text("x"), "cannot be read"),
+        (lambda root: shutil.rmtree(root / "enclaves/b"), "enclave /b does not exist"),
+    ],
+)
+def test_what_cannot_be_revoked_changes_nothing(spoil: object, said: str, tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b", "/c")
+    assert callable(spoil)
+    spoil(root)
+    before = snapshot(root)
+    with pytest.raises(SrosError, match=said):
+        revoke(root, ["/a", "/b"], now=NOW)
+    assert snapshot(root) == before
+
+
+def test_no_reason(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a")
+    with pytest.raises(UsageError, match="is not a reason"):
+        revoke(root, ["/a"], now=NOW, reason="boredom")
+    with pytest.raises(KeystoreError, match="not a valid keystore"):
+        revoke(tmp_path / "none", ["/a"], now=NOW)
+
+
+# ── the program ────────────────────────────────────────────────────────────────────────────
+
+
+def test_the_program(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", "production").ok()
+    sros("create_enclave", root, "/a", "/b", "/c").ok()
+    assert "nothing was ever revoked" in sros("crl", root).ok().err
+    assert json.loads(sros("crl", root, "--json").ok().out) is None
+    before = snapshot(root)
+    plan = sros("revoke", root, "/a", "--dry-run").ok()
+    assert snapshot(root) == before
+    assert "enclaves/a/key.pem" in plan.out
+    done = sros("revoke", root, "/a", "--reason", "key-compromise").ok()
+    assert done.out == "revoked enclave /a\n"
+    assert "restart the processes of 2 enclaves for it to take effect: /b, /c" in done.err
+    listed = sros("crl", root).ok().out
+    assert listed.startswith("revocation list 1, until ")
+    assert "keyCompromise" in listed
+    sros("crl", root, "--refresh", "--dry-run").ok()
+    found = json.loads(sros("crl", root, "--refresh", "--json").ok().out)
+    assert (found["number"], found["ends_soon"], len(found["revoked"])) == (2, False, 1)
+    assert sros("revoke", root, "/b", "--reason", "boredom").status == 2
+    assert sros("revoke", root, "/a").status == 1
+    assert sros("revoke", root).status == 2
+
+
+def test_a_list_that_ends_soon_is_an_alarm(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    choices = replace(load_template("production"), revocation_validity=20 * DAY)
+    now = datetime.now(UTC)
+    create_keystore(root, template=choices, now=now)
+    create_enclaves(root, ["/a", "/b"], now=now)
+    revoke(root, ["/a"], now=now)
+    ended = sros("crl", root)
+    assert ended.status == 1
+    assert "--refresh" in ended.err
+    assert json.loads(sros("crl", root, "--json").out)["ends_soon"] is True
