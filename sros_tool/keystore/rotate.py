@@ -25,7 +25,8 @@ from sros_tool.keystore.rotation import (
     certificates_of,
     read_rotation,
 )
-from sros_tool.keystore.succession import RETIRED, Rotator, check_later, write_copies
+from sros_tool.keystore.succession import RETIRED, Rotator, write_copies
+from sros_tool.keystore.successor import check_later
 from sros_tool.keystore.transaction import Change, Transaction, tidy
 from sros_tool.pki.certificates import issue_ca, pem, same_key
 from sros_tool.validity import Span, window

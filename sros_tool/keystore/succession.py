@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import datetime
 
 from cryptography import x509
 
-from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.keystore.authority import Authority
-from sros_tool.keystore.keyring import Keyring, check_places
+from sros_tool.keystore.keyring import Keyring
 from sros_tool.keystore.layout import (
     CRL,
     IDENTITY,
     PERMISSIONS,
     PRIVATE,
     PUBLIC,
-    ROLES,
     SETTINGS,
     ca_key,
     enclave_folder,
 )
 from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
 from sros_tool.keystore.open import load_settings
-from sros_tool.keystore.reissue import Progress, Turn, reissue
+from sros_tool.keystore.reissue import Progress, reissue
 from sros_tool.keystore.revoke import read_crl
 from sros_tool.keystore.rotation import (
     ROTATION,
-    Replacement,
     Rotation,
     Stage,
     authority_files,
@@ -38,29 +34,16 @@ from sros_tool.keystore.rotation import (
     digest,
     render_rotation,
 )
+from sros_tool.keystore.successor import Successor, begin, check_later, resume
 from sros_tool.keystore.template import Template, render_template
 from sros_tool.keystore.transaction import Transaction
-from sros_tool.pki.certificates import common_name, issue_ca, pem, same_key, validity_of
+from sros_tool.pki.certificates import pem, validity_of
 from sros_tool.pki.crl import sign_crl
 from sros_tool.validity import BACKDATE, Span, Window, window
 from sros_tool.xml import read_bytes
 
 RETIRED = "retired"
 """Where certificates and keys of CAs go that are used no longer."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Succession:
-    """One CA file in turn: the certificates of the old CA (with its chain), and the new CA."""
-
-    file: str
-    roles: tuple[str, ...]
-    old: tuple[x509.Certificate, ...]
-    new: Authority
-    key: str
-
-    def turn(self) -> Turn:
-        return Turn(self.old[0], self.new)
 
 
 class Rotator:
@@ -108,13 +91,26 @@ class Rotator:
         if self._rotation.stage is Stage.REISSUE:
             self._retire(names)
         elif self._rotation.stage is Stage.NONE:
-            turns = self._begin(roles, validity, stage)
+            turns = begin(
+                self._transaction,
+                roles,
+                self._new_keys,
+                self._keyring,
+                self._template,
+                window(self._now, validity or self._template.authority_validity),
+                beside=stage is Stage.DISTRIBUTE,
+            )
+            for each in turns:
+                if validity is None:
+                    check_later(each.old[0], each.new.certificate)
+                self._entries.append(certificate_entry(self._now, "ca", each.new.certificate))
+            self.replacements = [each.replacement() for each in turns]
             if stage is Stage.DISTRIBUTE:
                 self._distribute(turns, names)
             else:
                 self._reissue(turns, names, stage, progress)
         else:
-            turns = self._resume()
+            turns = resume(self._root, self._rotation, self._keyring, self._template)
             if stage is Stage.REISSUE and self._lacks_crl(turns):
                 stage = Stage.DISTRIBUTE
                 self._distribute(turns, names)
@@ -123,92 +119,9 @@ class Rotator:
         append(self._transaction, self._entries)
         return stage
 
-    # ── the new CAs ────────────────────────────────────────────────────────────────────────
-
-    def _begin(
-        self, roles: Sequence[str], validity: Span | None, stage: Stage
-    ) -> list[_Succession]:
-        files = authority_files(self._root)
-        wanted = set(roles or ROLES)
-        for file, serves in files.items():
-            if wanted & set(serves) and not set(serves) <= wanted:
-                raise UsageError(
-                    f"the CA in '{PUBLIC}/{file}.cert.pem' does both jobs",
-                    "It can only be replaced for both.",
-                    "Leave out --identity and --permissions.",
-                )
-        check_places(self._new_keys, replace(self._template, separate_authorities=len(files) > 1))
-        turns = []
-        for file, serves in files.items():
-            if wanted & set(serves):
-                prefix = "next_" if stage is Stage.DISTRIBUTE else ""
-                at = f"{PRIVATE}/{prefix}{file}.key.pem"
-                turns.append(self._make(file, serves, at, validity))
-        return turns
-
-    def _make(
-        self, file: str, roles: tuple[str, ...], at: str, validity: Span | None
-    ) -> _Succession:
-        old = certificates_of(self._root, file)
-        place = self._new_keys.places.get(roles[0], "")
-        in_keystore = (self._root / f"{PRIVATE}/{file}.key.pem").is_file()
-        if not place and not in_keystore:
-            raise KeystoreError(
-                f"the key of the {roles[0]} CA is not in the keystore, so its successor's should "
-                "not be either",
-                f"It is at '{self._keyring.place(roles[0], self._template)}'.",
-                f"Name a place for the new one with --{roles[0]}-key.",
-            )
-        bare = replace(self._template, identity_key="", permissions_key="")
-        new_keys = replace(self._new_keys, encrypt=self._new_keys.encrypt or self._encrypted(file))
-        key = new_keys.make(self._transaction, at, roles[0], bare)
-        if same_key(old[0], key):
-            raise KeystoreError(
-                f"the key at '{place}' is that of the present {roles[0]} CA",
-                "A new CA needs a new key.",
-                "Name another place.",
-            )
-        # Fast DDS refuses peers whose permissions CA has another name (2.9.1: ran).
-        name = old[0].subject
-        if PERMISSIONS not in roles:
-            text = f"{self._template.authority_name} identity CA {secrets.token_hex(4)}"
-            name = common_name(text)
-        span = validity or self._template.authority_validity
-        certificate = issue_ca(key, name, window(self._now, span))
-        check_later(old[0], certificate)
-        self.replacements.append(
-            Replacement(file, digest(old[0]), digest(certificate), place or at)
-        )
-        self._entries.append(certificate_entry(self._now, "ca", certificate))
-        return _Succession(file, roles, old, Authority(certificate, key), place or at)
-
-    def _encrypted(self, file: str) -> bool:
-        path = self._root / f"{PRIVATE}/{file}.key.pem"
-        return path.is_file() and b"ENCRYPTED" in read_bytes(path, "CA key")
-
-    def _resume(self) -> list[_Succession]:
-        """The new CAs that were distributed, with their keys."""
-        turns = []
-        files = authority_files(self._root)
-        for each in self._rotation.replacements:
-            roles = files[each.file]
-            found = certificates_of(self._root, each.file)
-            (new,) = [one for one in found if digest(one) == each.new]
-            template = replace(self._template, identity_key=each.key, permissions_key=each.key)
-            key = replace(self._keyring, places={}).open(self._root, roles[0], template)
-            if not same_key(new, key):
-                raise KeystoreError(
-                    f"the key at '{each.key}' is not that of the new {roles[0]} CA",
-                    "",
-                    "Restore it from a backup.",
-                )
-            old = tuple(one for one in found if one != new)
-            turns.append(_Succession(each.file, roles, old, Authority(new, key), each.key))
-        return turns
-
     # ── the stages ─────────────────────────────────────────────────────────────────────────
 
-    def _distribute(self, turns: list[_Succession], names: Sequence[str]) -> None:
+    def _distribute(self, turns: list[Successor], names: Sequence[str]) -> None:
         for each in turns:
             bundle = b"".join(map(pem, (*each.old, each.new.certificate)))
             if IDENTITY in each.roles and (old := read_crl(self._root)):
@@ -216,7 +129,7 @@ class Rotator:
             self._write_authority(each.file, each.roles, bundle, names)
         self._write_state(Stage.DISTRIBUTE)
 
-    def _lacks_crl(self, turns: list[_Succession]) -> bool:
+    def _lacks_crl(self, turns: list[Successor]) -> bool:
         """Whether something was revoked since the new identity CA was distributed."""
         return (self._root / CRL).exists() and any(
             IDENTITY in each.roles and not carries_crl(self._root, each.file) for each in turns
@@ -224,7 +137,7 @@ class Rotator:
 
     def _reissue(
         self,
-        turns: list[_Succession],
+        turns: list[Successor],
         names: Sequence[str],
         stage: Stage,
         progress: Progress | None,
@@ -284,7 +197,7 @@ class Rotator:
     def _keep_certificate(self, old: x509.Certificate) -> None:
         self._transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
 
-    def _install_key(self, each: _Succession) -> None:
+    def _install_key(self, each: Successor) -> None:
         """Put the new key in the place of the old one, which goes to ``retired``."""
         transaction, root = self._transaction, self._root
         place = f"{PRIVATE}/{each.file}.key.pem"
@@ -304,7 +217,7 @@ class Rotator:
                 if (root / ca_key(role)).is_symlink():
                     transaction.remove(ca_key(role))
 
-    def _write_settings(self, turns: list[_Succession]) -> None:
+    def _write_settings(self, turns: list[Successor]) -> None:
         """Have the settings name the places of the new keys."""
         places = {
             role: "" if each.key.startswith(f"{PRIVATE}/") else each.key
@@ -337,17 +250,6 @@ class Rotator:
         entry = document_entry(self._now, "crl", document, validity=Window(begin, end))
         self._entries.append(entry)
         return document
-
-
-def check_later(old: x509.Certificate, new: x509.Certificate) -> None:
-    """Raise `UsageError` where a new CA would end before the old one."""
-    if new.not_valid_after_utc < old.not_valid_after_utc:
-        raise UsageError(
-            "the new CA would end before the old one",
-            f"The old one ends at {old.not_valid_after_utc:%Y-%m-%d}, the new one would at "
-            f"{new.not_valid_after_utc:%Y-%m-%d}.",
-            "Name a longer validity with --ca-validity.",
-        )
 
 
 def write_copies(transaction: Transaction, names: Sequence[str], name: str, data: bytes) -> None:

@@ -407,9 +407,15 @@ def test_an_enclave_of_another_ca_stops_everything(separate: Path, tmp_path: Pat
     refused(lambda: rotate_ca(separate, now=NOW), separate, "enclave /b cannot be moved")
 
 
-def test_a_ca_never_ends_before_the_old_one(separate: Path) -> None:
-    span = timedelta(days=30)
-    refused(lambda: rotate_ca(separate, now=NOW, validity=span), separate, "end before the old")
+def test_a_ca_never_ends_before_the_old_one_unasked(tmp_path: Path) -> None:
+    template = replace(load_template("production"), authority_validity=timedelta(days=3650))
+    root = tmp_path / "ks"
+    create_keystore(root, template=template, now=NOW)
+    settings = (root / "sros.toml").read_text()
+    assert settings.count('"3650d"') == 2
+    (root / "sros.toml").write_text(settings.replace('"3650d"', '"90d"', 1))
+    refused(lambda: rotate_ca(root, now=NOW), root, "end before the old")
+    rotate_ca(root, now=NOW, validity=timedelta(days=90))
 
 
 def test_exports_can_be_replaced_during_a_rotation(separate: Path, tmp_path: Path) -> None:
