@@ -213,11 +213,7 @@ class Transaction:
         except FileNotFoundError:
             return False
         if stat.S_ISLNK(mode):
-            raise KeystoreError(
-                f"'{real}' is a symbolic link",
-                "What is written below it would land elsewhere, outside of the keystore.",
-                "Put a real folder in its place.",
-            )
+            raise _is_a_link(real)
         if not stat.S_ISDIR(mode):
             raise KeystoreError(f"'{real}' is in the way", "It is not a folder.")
         return True
@@ -294,6 +290,14 @@ class Transaction:
         return iter(sorted([*staged, *self._removed]))
 
 
+def _is_a_link(path: str | Path) -> KeystoreError:
+    return KeystoreError(
+        f"'{path}' is a symbolic link",
+        "What is written below it would land elsewhere, outside of the keystore.",
+        "Put a real folder in its place.",
+    )
+
+
 def tidy(root: Path) -> None:
     """Complete or undo what an interrupted transaction left behind, if there is anything."""
     if (root / STAGE).is_dir():
@@ -352,6 +356,8 @@ def _settle(source: Path, target: Path) -> None:
             place = target / entry.name
             if not entry.is_dir(follow_symlinks=False):
                 os.replace(entry.path, place)
+            elif place.is_symlink():
+                raise _is_a_link(place)
             elif os.path.lexists(place):
                 _settle(Path(entry.path), place)
             else:
