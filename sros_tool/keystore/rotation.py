@@ -21,7 +21,6 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.create import list_enclaves
 from sros_tool.keystore.layout import (
-    CRL,
     IDENTITY,
     PERMISSIONS,
     PUBLIC,
@@ -252,10 +251,10 @@ def _remarks(root: Path, rotation: Rotation) -> list[str]:
         "Cyclone DDS: it trusts one CA at a time, so restart all processes together; one that is "
         "restarted does not talk with one that is not.",
     ]
-    if (root / CRL).exists() and any(file != "permissions_ca" for file in files):
+    if any(file != "permissions_ca" for file in files):
         remarks.append(
-            "Until the old CA is retired, earlier certificates of enclaves that are revoked from "
-            "now on are still accepted: retire it first."
+            "Retire the old CA before you revoke anything: until then, earlier certificates of a "
+            "revoked enclave are still accepted."
         )
     return remarks
 
