@@ -117,3 +117,69 @@ def test_everything_but_signing_works_without_the_token(
     ):
         ended = sros(without, *words)
         assert ended.returncode == 0, (words, ended.stderr)
+
+
+def test_enclaves_are_renewed_and_revoked_by_the_token(
+    token: dict[str, str], tmp_path: Path
+) -> None:
+    root = tmp_path / "ks"
+    make(token, root)
+    names = [f"/robot/part_{index}" for index in range(205)]  # enough for several processes
+    assert sros(token, "create_enclave", root, *names).returncode == 0
+    old = (root / "enclaves/robot/part_7/cert.pem").read_bytes()
+    (tmp_path / "old.pem").write_bytes(old)
+    for words in (
+        ("renew", root, *names),
+        ("renew", root, names[7], "--new-key"),
+        ("revoke", root, names[8], "--reason", "key_compromise"),
+        ("revoke", root, names[7]),
+        ("create_enclave", root, names[7]),
+        ("crl", root, "--refresh"),
+    ):
+        ended = sros(token, *words)
+        assert ended.returncode == 0, (words, ended.stderr)
+    identity, permissions = (root / f"public/{r}_ca.cert.pem" for r in ("identity", "permissions"))
+    crl = ["-crl_check", "-CRLfile", root / "public/identity_ca.crl.pem"]
+    verify = ["verify", "-x509_strict", *crl, "-CAfile", identity]
+    for name, accepted in (
+        (root / "enclaves/robot/part_7/cert.pem", True),
+        (root / "enclaves/robot/part_9/cert.pem", True),
+        (tmp_path / "old.pem", False),
+        *((path, False) for path in sorted(root.glob("revoked/*/cert.pem"))),
+    ):
+        checked = subprocess.run(
+            ["openssl", *map(str, [*verify, name])], capture_output=True, text=True
+        )
+        assert (checked.returncode == 0) is accepted, (name, checked.stderr)
+        assert accepted or "certificate revoked" in checked.stderr
+    assert len(list(root.glob("revoked/*"))) == 2
+    message = root / "enclaves/robot/part_9/permissions.p7s"
+    smime = ["smime", "-verify", "-text", "-in", message, "-CAfile", permissions]
+    assert subprocess.run(["openssl", *map(str, smime)], capture_output=True).returncode == 0
+    keys = [p for p in root.rglob("*") if p.is_file() and b"PRIVATE KEY" in p.read_bytes()]
+    assert {key.name for key in keys} == {"key.pem"}
+
+
+def test_without_the_token_nothing_is_renewed_or_revoked(
+    token: dict[str, str], tmp_path: Path
+) -> None:
+    root = tmp_path / "ks"
+    make(token, root)
+    assert sros(token, "create_enclave", root, "/a", "/b").returncode == 0
+    assert sros(token, "revoke", root, "/b").returncode == 0
+    without = {**token, "SOFTHSM2_CONF": os.devnull}
+    before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
+    for words in (
+        ("renew", root, "/a"),
+        ("revoke", root, "/a"),
+        ("crl", root, "--refresh"),
+    ):
+        ended = sros(without, *words)
+        assert (ended.returncode, ended.stderr.count("\n")) == (1, 1), (words, ended.stderr)
+    assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
+    for reading in (
+        ("crl", root),
+        ("check", "keystore", root),
+        ("inspect", root, "--history"),
+    ):
+        assert sros(without, *reading).returncode == 0, reading
