@@ -43,6 +43,7 @@ def main() -> int:
     )
     parser.add_argument("--enclaves", type=int, default=1000)
     parser.add_argument("--topics", type=int, default=20000)
+    parser.add_argument("--renew", type=int, default=0, help="also renew so many enclaves (10000)")
     parser.add_argument("--check", action="store_true", help="exit 1 if a limit is not kept")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
@@ -51,6 +52,7 @@ def main() -> int:
         rows += _topics(folder, options.topics, options.rounds)
         rows += _starts(folder, options.rounds)
         rows += _memory(folder, options.enclaves)
+        rows += _renewal(folder, options.renew) if options.renew else []
     print(f"Python {platform.python_version()}, {os.cpu_count()} cores, medians")
     print(f"{'task':58} {'sros':>9} {'floor':>9} {'ratio':>6}  limit")
     for row in rows:
@@ -61,6 +63,13 @@ def main() -> int:
     if options.json:
         options.json.write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n")
     return 1 if options.check and not all(row.kept for row in rows) else 0
+
+
+def _renewal(folder: Path, count: int) -> list[Row]:
+    from benchmarks.life import measure_renewal
+
+    taken, floor = measure_renewal(folder, count)
+    return [Row(f"renew {count} enclaves", taken, floor, "2 x floor", taken <= 2 * floor)]
 
 
 def _timed(action: Callable[[int], object], rounds: int) -> float:
