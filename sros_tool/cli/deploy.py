@@ -1,13 +1,11 @@
-"""The verbs that bring enclaves to robots: exporting, requests and their answers, verifying."""
+"""The verbs that bring enclaves to robots: exporting them, and verifying what arrived."""
 
 from __future__ import annotations
 
-import os
 import sys
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -19,17 +17,13 @@ from sros_tool.cli.common import (
     keystore_from_environment,
     now,
     print_json,
-    print_notes,
     print_plan,
     split_root,
 )
-from sros_tool.cli.secrets import keyring
-from sros_tool.errors import DocumentError, UsageError
+from sros_tool.errors import UsageError
 
-if TYPE_CHECKING:
-    from cryptography import x509
-
-_STREAM = Path("-")
+STREAM = Path("-")
+"""Standard input or output, where a file could be named."""
 
 
 @click.command(
@@ -77,15 +71,15 @@ def distribute_key(
     target = PATH.convert(rest[-1], None, None)
     _check_target(root, rest[-1])
     selection = select(root, names, patterns, every=every)
-    if target == _STREAM:
+    if target == STREAM:
         if not dry_run:
-            _refuse_terminal()
+            refuse_terminal()
         packed = pack_enclaves(root, selection.names, now=now())
         if dry_run:
             for path in packed.paths:
                 click.echo(f"would send {path}")
         else:
-            _write_stdout(packed.data)
+            write_stdout(packed.data)
         where, done = "standard output", not dry_run
     else:
         export = distribute(root, selection.names, target, now=now(), force=force, dry_run=dry_run)
@@ -100,7 +94,7 @@ def distribute_key(
             if change.action == "replace":
                 click.echo(f"replaced {change.path}", err=True)
     for name in selection.names if done else ():
-        click.echo(f"exported enclave {name} to {where}", err=target == _STREAM)
+        click.echo(f"exported enclave {name} to {where}", err=target == STREAM)
     for name in selection.left_out:
         click.echo(f"left out enclave {name}: its key was made on its robot", err=True)
 
@@ -117,172 +111,21 @@ def _check_target(root: Path, word: str) -> None:
         )
 
 
-def _write_stdout(data: bytes) -> None:
+def write_stdout(data: bytes) -> None:
+    """Write binary data on standard output, after what was printed."""
     sys.stdout.flush()
     sys.stdout.buffer.write(data)
     sys.stdout.buffer.flush()
 
 
-def _refuse_terminal() -> None:
+def refuse_terminal() -> None:
+    """Raise `UsageError` where binary data would land on a terminal."""
     if sys.stdout is not None and sys.stdout.isatty():
         raise UsageError(
             "an archive would be written to this terminal",
             "It is binary, and it may hold private keys.",
             "Lead it into a pipe, such as `| ssh robot tar -xz -C /etc/robot`, or name a file.",
         )
-
-
-@click.command(
-    "create_request",
-    epilog="""\b
-Example:
-  $ sros create_request /arm/camera /etc/robot
-  made the key of enclave /arm/camera, which stays in '/etc/robot'
-    its SHA-256 is 5b1f0e0c44bd7f1f2f0c6c0ad57a9c1c6f9b4d4d9e4a5ea1a3b7f7c1d8f3a900
-    have '/etc/robot/enclaves/arm/camera/request.pem' signed: sros sign_request
-  $ ssh robot cat /etc/robot/enclaves/arm/camera/request.pem |
-      sros sign_request keystore - -o - | ssh robot sros import - /etc/robot    # at home""",
-)
-@click.argument("name")
-@click.argument("folder", metavar="[DIR]", type=PATH, required=False)
-@click.option("--again", is_flag=True, help="Make the request anew, for the key that is there.")
-@dry_run_option
-def create_request(name: str, folder: Path | None, again: bool, dry_run: bool) -> None:
-    """On a robot: make the key of the enclave NAME in the folder DIR, and a signing request.
-
-    The key never leaves DIR.  Send the request home, where `sros sign_request` answers it; `sros
-    import` puts the answer beside the key.
-    """
-    from sros_tool.keystore.request import create_request as create
-
-    folder = folder or keystore_from_environment()
-    made = create(folder, name, again=again, dry_run=dry_run)
-    if dry_run:
-        print_plan(folder, made.changes)
-        return
-    if again:
-        click.echo(f"made the request of enclave {name} anew, for the key that is there")
-    else:
-        click.echo(f"made the key of enclave {name}, which stays in '{folder}'")
-    click.echo(f"  its SHA-256 is {made.key}")
-    click.echo(f"  have '{made.file}' signed: sros sign_request")
-
-
-@click.command(
-    "sign_request",
-    epilog="""\b
-Example:
-  $ sros sign_request keystore request.pem -p camera.xml
-  signed the request of enclave /arm/camera for the key 5b1f0e0c...
-  send 'request.answer.tar.gz' to the robot: sros import request.answer.tar.gz DIR""",
-)
-@click.argument("words", metavar="[ROOT] REQUEST", nargs=-1, required=True)
-@click.option(
-    "-p",
-    "--policy-file",
-    type=PATH,
-    help="The policy that states the rights. [default: by the template of the keystore]",
-)
-@click.option(
-    "-o",
-    "--output",
-    type=PATH,
-    metavar="ANSWER",
-    help="Where to write the answer; - is standard output. [default: beside REQUEST]",
-)
-@click.option(
-    "--renew", is_flag=True, help="Answer for an enclave that exists; it keeps its rights."
-)
-@click.option("--force", is_flag=True, help="Replace ANSWER if it exists.")
-@dry_run_option
-def sign_request(
-    words: tuple[str, ...],
-    policy_file: Path | None,
-    output: Path | None,
-    renew: bool,
-    force: bool,
-    dry_run: bool,
-) -> None:
-    """At home: certify the key of the file REQUEST (or -), and sign the enclave's permissions.
-
-    The answer is one .tar.gz for `sros import` on the robot.  It holds no secret: certificate,
-    permissions, governance, the certificates of the CAs, and what was revoked.  The keystore knows
-    the enclave from then on, without its key.  Compare the key's SHA-256 with what the robot says.
-    """
-    from sros_tool.keystore.signing import sign_request as sign
-    from sros_tool.policy import read_policy
-    from sros_tool.runtime.environment import domain_from
-
-    root, rest = split_root(words) if len(words) > 1 else (keystore_from_environment(), words)
-    if len(rest) != 1:
-        raise UsageError("sign_request takes a keystore and one request")
-    request = PATH.convert(rest[0], None, None)
-    if output is None:
-        output = _STREAM if request == _STREAM else request.with_suffix(".answer.tar.gz")
-    stream = output == _STREAM
-    if stream and not dry_run:
-        _refuse_terminal()
-    signed = sign(
-        root,
-        _read(request, "signing request"),
-        now=now(),
-        policy=read_policy(policy_file) if policy_file else None,
-        renew=renew,
-        answer=None if stream else output,
-        force=force,
-        domain=domain_from(os.environ),
-        keyring=keyring(),
-        dry_run=dry_run,
-    )
-    if dry_run:
-        print_plan(root, signed.changes)
-        if not stream:
-            click.echo(f"would {'replace' if output.exists() else 'create'} {output}")
-    else:
-        if stream:
-            _write_stdout(signed.archive)
-        word = "renewed" if renew else "signed the request of"
-        click.echo(f"{word} enclave {signed.name} for the key {signed.key}", err=stream)
-        click.echo(f"  the robot will trust {_named(signed.identity_ca)}", err=stream)
-        if not stream:
-            click.echo(f"  send '{output}' to the robot: sros import {output.name} DIR")
-    print_notes(signed.notes)
-
-
-@click.command(
-    "import",
-    epilog="""\b
-Example:
-  $ sros import request.answer.tar.gz /etc/robot
-  imported enclave /arm/camera, which can run until 2027-05-20T07:30:11Z
-    it trusts CN=sros identity CA 5f0c3a1e, SHA-256 1f8d...
-  $ sros run /etc/robot /arm/camera -- ros2 run camera driver""",
-)
-@click.argument("answer", type=PATH)
-@click.argument("folder", metavar="[DIR]", type=PATH, required=False)
-@click.option("--force", is_flag=True, help="Go back to an older answer, or to other CAs.")
-@dry_run_option
-def import_verb(answer: Path, folder: Path | None, force: bool, dry_run: bool) -> None:
-    """On a robot: put the file ANSWER (or -) beside the key that waits in DIR, or change nothing.
-
-    All of it is checked first: that the certificate is for this key, the chain, the signatures,
-    the dates, and that the archive holds nothing else.
-    """
-    from sros_tool.keystore.answer import import_answer
-
-    folder = folder or keystore_from_environment()
-    data = _read(answer, "answer")
-    done = import_answer(folder, data, now=now(), force=force, dry_run=dry_run)
-    if dry_run:
-        print_plan(folder, done.changes)
-        return
-    if not done.changes:
-        click.echo(f"'{folder}' already holds enclave {done.name} as it is", err=True)
-        return
-    from sros_tool.validity import iso
-
-    click.echo(f"imported enclave {done.name}, which can run until {iso(done.until)}")
-    click.echo(f"  it trusts {_named(done.identity_ca)}")
 
 
 @click.command(
@@ -341,27 +184,3 @@ def _moment(text: str) -> datetime:
     raise UsageError(
         f"--at {text!r} is no moment", "", "Write for example 2027-06-01 or 2027-06-01T12:00:00Z."
     )
-
-
-def _read(path: Path, what: str) -> bytes:
-    """The bytes of a file, or of standard input; more than any answer has is refused."""
-    from sros_tool.keystore.archive import MAX_PACKED
-    from sros_tool.xml import read_bytes
-
-    if path != _STREAM:
-        return read_bytes(path, what)
-    data = sys.stdin.buffer.read(MAX_PACKED + 1) if sys.stdin else b""
-    if not data:
-        raise DocumentError(
-            f"the {what} is empty", "Nothing came from standard input.", "See what sends it."
-        )
-    return data
-
-
-def _named(certificate: x509.Certificate) -> str:
-    from cryptography.hazmat.primitives import hashes
-
-    from sros_tool.pki.certificates import subject_text
-
-    digest = certificate.fingerprint(hashes.SHA256()).hex()
-    return f"{subject_text(certificate.subject)}, SHA-256 {digest}"

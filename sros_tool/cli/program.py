@@ -41,9 +41,11 @@ FAMILIES: dict[str, dict[str, Verb]] = {
             "deploy", "Export enclaves for the robot they run on.", ("export_enclave",)
         ),
         "verify": Verb("deploy", "Say whether what arrived on a robot can be used."),
-        "create_request": Verb("deploy", "Make a key on the robot, and the request to certify it."),
-        "sign_request": Verb("deploy", "Answer the request of a robot."),
-        "import": Verb("deploy", "Put an answer beside its key.", attribute="import_verb"),
+        "create_request": Verb(
+            "request", "Make a key on the robot, and the request to certify it."
+        ),
+        "sign_request": Verb("request", "Answer the request of a robot."),
+        "import": Verb("request", "Put an answer beside its key.", attribute="import_verb"),
     },
     "Policy": {
         "generate_policy": Verb("generate_policy", "Learn a policy from the running robot."),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -11,6 +13,7 @@ from cryptography import x509
 
 from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
 from sros_tool.keystore.archive import unpack
+from sros_tool.keystore.authority import Authority
 from sros_tool.keystore.layout import (
     ENCLAVES,
     OPTIONAL_FILES,
@@ -18,9 +21,10 @@ from sros_tool.keystore.layout import (
     enclave_folder,
 )
 from sros_tool.keystore.transaction import Change, Transaction, tidy
-from sros_tool.keystore.trust import check_same_authority, fingerprints, refuse_home
+from sros_tool.keystore.trust import check_same_authority, refuse_home, trusted_in
 from sros_tool.keystore.verify import EnclaveState, check_enclave
 from sros_tool.names import check_enclave_name
+from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name_of, load_certificate, subject_text, validity_of
 from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import PublicKey, load_key
@@ -30,14 +34,23 @@ from sros_tool.xml import read_bytes
 _KEY = "key.pem"
 _REQUIRED = tuple(file for file in REQUIRED_FILES if file != _KEY)
 _AGAIN = "Have the request signed again, and the answer sent again."
+SEAL = "answer.p7s"
+"""The list of all files of an answer with their digests, signed by the permissions CA.
+
+Without it, one who carries an answer could put an earlier governance or a further CA into it.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The files for one enclave, by their paths in a keystore; its key is not among them."""
+    """The files for one enclave, by their paths in a keystore; its key is not among them.
+
+    ``seal`` is the signed list of the files.
+    """
 
     name: str
     files: dict[str, bytes]
+    seal: bytes
 
     def file(self, name: str) -> bytes | None:
         """The content of a file of the enclave, such as ``cert.pem``."""
@@ -46,12 +59,31 @@ class Answer:
 
 @dataclass(frozen=True, slots=True)
 class Imported:
-    """What an answer brought; without changes, everything was there already."""
+    """What an answer brought; without changes, everything was there already.
+
+    ``first`` is whether the CAs were unknown in the folder, so that nothing vouches for them.
+    """
 
     name: str
     identity_ca: x509.Certificate
+    first: bool
     until: datetime
     changes: tuple[Change, ...]
+
+
+def seal(files: dict[str, bytes], authority: Authority) -> bytes:
+    """The signed list of the files of an answer."""
+    listed = _listed(files)
+    return authority.sign(listed, listed, _lines, "the list of the files of the answer")
+
+
+def _listed(files: dict[str, bytes]) -> bytes:
+    digests = (f"{hashlib.sha256(data).hexdigest()}  {path}" for path, data in files.items())
+    return "\n".join(["sros answer 1", *sorted(digests), ""]).encode()
+
+
+def _lines(document: bytes) -> bytes:
+    return document.replace(b"\r\n", b"\n")
 
 
 def read_answer(data: bytes) -> Answer:
@@ -61,6 +93,7 @@ def read_answer(data: bytes) -> Answer:
     """
     try:
         files = unpack(data)
+        signed = files.pop(SEAL, b"")
         own = [path for path in files if path.endswith("/cert.pem")]
         if len(own) != 1 or not own[0].startswith(f"{ENCLAVES}/"):
             raise DocumentError("it is not the answer for one enclave")
@@ -71,18 +104,21 @@ def read_answer(data: bytes) -> Answer:
             raise DocumentError(f"it holds {strange[0]!r}, which no answer has")
         if missing := [file for file in _REQUIRED if f"{folder}/{file}" not in files]:
             raise DocumentError(f"{', '.join(missing)} is missing in it")
+        if not signed:
+            raise DocumentError(f"{SEAL} is missing in it")
     except SrosError as error:
         raise DocumentError(
-            "the answer cannot be used", f"{error.what}. {error.why}".capitalize(), _AGAIN
+            f"the answer cannot be used: {error.what}", error.why, _AGAIN
         ) from error
-    return Answer(name, files)
+    return Answer(name, files, signed)
 
 
 def check_answer(answer: Answer, key: PublicKey, *, now: datetime) -> EnclaveState:
     """Check that DDS would load an answer together with the private half of ``key``.
 
     Raises `PkiError` with all that is wrong: another key's certificate, another enclave's, a
-    chain or a signature that does not hold, what is not in date, what was revoked.
+    chain or a signature that does not hold, what is not in date, what was revoked, and files that
+    are not those that were sent.
     """
     with tempfile.TemporaryDirectory(prefix="sros-") as folder:
         for path, data in answer.files.items():
@@ -92,6 +128,8 @@ def check_answer(answer: Answer, key: PublicKey, *, now: datetime) -> EnclaveSta
     certificate = state.certificate
     if certificate and certificate.public_key() != key:
         problems.insert(0, "cert.pem: it is for another key than the one that is here")
+    if state.permissions_ca and (problem := _broken_seal(answer, [state.permissions_ca])):
+        problems.append(f"{SEAL}: {problem}")
     if certificate and common_name_of(certificate.subject) != answer.name:
         problems.insert(0, f"cert.pem: it is for {subject_text(certificate.subject)}")
     if problems:
@@ -99,6 +137,24 @@ def check_answer(answer: Answer, key: PublicKey, *, now: datetime) -> EnclaveSta
             f"the answer for enclave {answer.name} does not hold", "; ".join(problems) + ".", _AGAIN
         )
     return state
+
+
+def _broken_seal(answer: Answer, authorities: Iterable[x509.Certificate]) -> str:
+    """Why the list of the files does not hold by any of the authorities; "" if it does."""
+    try:
+        signed = smime.parse(answer.seal)
+    except SrosError as error:
+        return str(error)
+    if _lines(signed.document) != _listed(answer.files):
+        return "the files are not those that were sent"
+    problem = ""
+    for authority in authorities:
+        try:
+            signed.verify(authority)
+            return ""
+        except SrosError as error:
+            problem = str(error)
+    return problem
 
 
 def import_answer(
@@ -126,8 +182,9 @@ def import_answer(
         key = load_key(read_bytes(place / _KEY, "private key"), f"'{place / _KEY}'")
         state = check_answer(answer, key.public_key(), now=now)
         assert state.certificate and state.identity_ca and state.permissions
+        known = trusted_in(folder, "permissions_ca.cert.pem")
         if not force:
-            check_same_authority(folder, answer.files)
+            _check_known(folder, answer, known)
             _check_newer(place, answer, state.certificate)
         for path, content in answer.files.items():
             present = folder / path
@@ -140,21 +197,23 @@ def import_answer(
     subject = subject_text(state.certificate.subject)
     ends = [each.validity.not_after for each in state.permissions.grants if each.subject == subject]
     until = min(validity_of(state.certificate).not_after, ends[0])
-    return Imported(name, state.identity_ca, until, tuple(transaction.changes))
+    return Imported(name, state.identity_ca, not known, until, tuple(transaction.changes))
+
+
+def _check_known(folder: Path, answer: Answer, known: list[x509.Certificate]) -> None:
+    """The answer to the first request of a robot tells it whom to trust; later ones have to fit."""
+    if known and (problem := _broken_seal(answer, known)):
+        raise KeystoreError(
+            f"the answer for enclave {answer.name} comes from another keystore",
+            f"The permissions CA that '{folder}' trusts has not signed it: {problem.rstrip('.')}.",
+            "Add --force if this robot moves to that keystore.",
+        )
+    check_same_authority(folder, answer.files)
 
 
 def _check_newer(place: Path, answer: Answer, certificate: x509.Certificate) -> None:
     """Refuse what would bring back an earlier state: who held the answer back may want that."""
     remedy = "Have a new answer made, or add --force if going back is meant."
-    path = place / "identity_ca.cert.pem"
-    new_ca = answer.file("identity_ca.cert.pem") or b""
-    if path.exists() and not fingerprints(read_bytes(path, "file")) & fingerprints(new_ca):
-        raise KeystoreError(
-            f"the answer for enclave {answer.name} comes from another identity CA",
-            f"'{path}' is of {subject_text(load_certificate(read_bytes(path, 'file'), '').subject)}"
-            f", the answer of {subject_text(load_certificate(new_ca, '').subject)}.",
-            "Add --force if this robot moves to another keystore.",
-        )
     path = place / "cert.pem"
     if path.exists():
         old = validity_of(load_certificate(read_bytes(path, "certificate"), f"'{path}'"))

@@ -28,10 +28,10 @@ LEDGER = "ledger.jsonl"
 class Entry:
     """One line: what was issued (or revoked), when, for whom, and how long it is valid.
 
-    ``what`` is ca, certificate, permissions, governance, crl or revocation.  ``sha256`` is that of
-    the DER of a certificate or of the bytes of a document; ``serial`` is hexadecimal; ``policy`` is
-    the SHA-256 of the policy file, with its includes, that permissions were made from.  Moments
-    are ISO 8601 in UTC.
+    ``what`` is ca, certificate, permissions, governance, crl, revocation, or answer (the signed
+    list of what was sent to a robot).  ``sha256`` is that of the DER of a certificate or of the
+    bytes of a document; ``serial`` is hexadecimal; ``policy`` is the SHA-256 of the policy file,
+    with its includes, that permissions were made from.  Moments are ISO 8601 in UTC.
     """
 
     time: str

@@ -14,7 +14,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Permissions, parse_permissions, render_permissions
 from sros_tool.dds.portable import document_notes, name_notes
 from sros_tool.errors import KeystoreError, PkiError, PolicyError, SrosError
-from sros_tool.keystore.answer import Answer, check_answer
+from sros_tool.keystore.answer import SEAL, Answer, check_answer, seal
 from sros_tool.keystore.archive import pack, staged_file
 from sros_tool.keystore.authority import Authorities, load_authorities
 from sros_tool.keystore.create import list_enclaves
@@ -30,7 +30,13 @@ from sros_tool.keystore.layout import (
     ca_certificate,
     enclave_folder,
 )
-from sros_tool.keystore.ledger import append, certificate_entry, document_entry, read_ledger
+from sros_tool.keystore.ledger import (
+    Entry,
+    append,
+    certificate_entry,
+    document_entry,
+    read_ledger,
+)
 from sros_tool.keystore.open import check_domain, load_governance, load_settings
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Change, Transaction, tidy
@@ -104,9 +110,12 @@ def sign_request(
         domains = load_governance(root, authorities.permissions.certificate).domains().closed()
         check_domain(domains, domain, root)
         work = _Signer(transaction, authorities, template, domains, now)
-        files, notes = work.sign(request, enclave, renew=renew)
-        _check_result(files, name, request, now)
-        archive = pack(files)
+        prepared = work.sign(request, enclave, renew=renew)
+        notes, sealed = prepared.notes, seal(prepared.files, authorities.permissions)
+        _check_result(Answer(name, prepared.files, sealed), request, now)
+        archive = pack({SEAL: sealed, **prepared.files})
+        sent = document_entry(now, "answer", sealed, enclave=name)
+        append(transaction, [*prepared.entries, sent])
         staged = staged_file(answer, archive) if answer and not dry_run else nullcontext()
         with staged as put_in_place:
             transaction.commit()
@@ -173,18 +182,25 @@ def _check_key(root: Path, request: SigningRequest) -> None:
             )
 
 
-def _check_result(
-    files: dict[str, bytes], name: str, request: SigningRequest, now: datetime
-) -> None:
+def _check_result(answer: Answer, request: SigningRequest, now: datetime) -> None:
     """See that the robot will accept the answer, before anybody relies on it."""
     try:
-        check_answer(Answer(name, files), request.public_key, now=now)
+        check_answer(answer, request.public_key, now=now)
     except SrosError as error:
         raise KeystoreError(
-            f"the answer for {name} would be of no use on the robot: {error.what}",
+            f"the answer for {answer.name} would be of no use on the robot: {error.what}",
             error.why,
             "Nothing was changed; `sros inspect` tells more of the keystore.",
         ) from error
+
+
+@dataclass(frozen=True, slots=True)
+class _Prepared:
+    """The files of the answer by their paths, what the ledger is told, and remarks."""
+
+    files: dict[str, bytes]
+    entries: list[Entry]
+    notes: list[Note]
 
 
 class _Signer:
@@ -205,10 +221,8 @@ class _Signer:
         self._domains = domains
         self._now = now
 
-    def sign(
-        self, request: SigningRequest, enclave: Enclave | None, *, renew: bool
-    ) -> tuple[dict[str, bytes], list[Note]]:
-        """Stage the enclave; the files of the answer by their paths, and remarks."""
+    def sign(self, request: SigningRequest, enclave: Enclave | None, *, renew: bool) -> _Prepared:
+        """Stage the enclave."""
         name, folder = request.name, enclave_folder(request.name)
         notes = self._new_key(request) if renew else []
         certificate = self._authorities.identity.issuer().issue(
@@ -226,28 +240,24 @@ class _Signer:
             self._transaction.write(path, data)
         self._transaction.write(f"{folder}/permissions.xml", document)
         self._transaction.write(f"{folder}/{REQUEST}", request.pem)
-        append(
-            self._transaction,
-            [
-                certificate_entry(self._now, "certificate", certificate, name),
-                document_entry(
-                    self._now,
-                    "permissions",
-                    message,
-                    enclave=name,
-                    subject=text_of(certificate.subject),
-                    validity=permissions.grants[0].validity,
-                    policy=policy,
-                ),
-            ],
-        )
+        entries = [
+            certificate_entry(self._now, "certificate", certificate, name),
+            document_entry(
+                self._now,
+                "permissions",
+                message,
+                enclave=name,
+                subject=text_of(certificate.subject),
+                validity=permissions.grants[0].validity,
+                policy=policy,
+            ),
+        ]
         files |= self._shared(folder)
         notes += document_notes(name, permissions, len(message))
-        return dict(sorted(files.items())), notes
+        return _Prepared(dict(sorted(files.items())), entries, notes)
 
     def _new_key(self, request: SigningRequest) -> list[Note]:
-        path = self._root / enclave_folder(request.name) / "cert.pem"
-        old = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+        old = self._certificate(request.name)
         if old.public_key() == request.public_key:
             return []
         until = iso(validity_of(old).not_after)

@@ -21,6 +21,19 @@ def fingerprints(pem: bytes) -> frozenset[str]:
     return frozenset(each.fingerprint(hashes.SHA256()).hex() for each in _load(pem))
 
 
+def trusted_in(folder: Path, file: str) -> list[x509.Certificate]:
+    """The CAs that the enclaves of a robot's folder trust, by the name of the CA file."""
+    found: dict[str, x509.Certificate] = {}
+    for path in sorted((folder / ENCLAVES).rglob(file)):
+        if path.exists():
+            found |= {each.fingerprint(hashes.SHA256()).hex(): each for each in _of(path)}
+    return list(found.values())
+
+
+def _of(path: Path) -> list[x509.Certificate]:
+    return _load(read_bytes(path, "certificate"))
+
+
 def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
     """One folder holds the enclaves of one keystore only: others would never talk to each other.
 
@@ -33,12 +46,11 @@ def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
     for place in sorted((target / ENCLAVES).rglob(_AUTHORITY)):
         if f"{place.relative_to(target)}" in files or not place.exists():
             continue
-        theirs = read_bytes(place, "certificate")
-        if not fingerprints(theirs) & ours:
+        theirs = _of(place)
+        if not {each.fingerprint(hashes.SHA256()).hex() for each in theirs} & ours:
             raise KeystoreError(
                 f"'{target}' holds enclaves of another keystore",
-                f"Those trust {subject_text(_load(theirs)[0].subject)}, and would not talk to "
-                "these.",
+                f"Those trust {subject_text(theirs[0].subject)}, and would not talk to these.",
                 "Choose another folder.",
             )
 

@@ -1,0 +1,625 @@
+"""Keys that are born on the robot: requests, answers, and what is refused on either side."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import shutil
+import stat
+import subprocess
+import tarfile
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
+from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
+from cryptography.x509.oid import NameOID
+from harness import certificate, policy_text, publish, remains, snapshot, topics_of
+
+from sros_tool.errors import KeystoreError, PkiError, PolicyError, SrosError
+from sros_tool.keystore import create_enclaves, create_keystore, create_permission, list_enclaves
+from sros_tool.keystore.answer import SEAL, import_answer
+from sros_tool.keystore.archive import MAX_MEMBER, MAX_UNPACKED, pack, unpack
+from sros_tool.keystore.arrival import verify_arrival
+from sros_tool.keystore.history import history
+from sros_tool.keystore.ledger import read_ledger
+from sros_tool.keystore.renew import renew
+from sros_tool.keystore.request import create_request
+from sros_tool.keystore.revoke import refresh_crl, revoke
+from sros_tool.keystore.signing import Signed, sign_request
+from sros_tool.keystore.template import load_template
+from sros_tool.pki.certificates import common_name
+from sros_tool.pki.keys import generate_key
+from sros_tool.pki.requests import key_digest, load_request, make_request
+from sros_tool.policy import read_policy
+
+NOW = datetime.now(UTC)
+LATER = NOW + timedelta(days=30)
+NAME, FOLDER = "/arm/camera", "enclaves/arm/camera"
+SENT = {"cert.pem", "identity_ca.cert.pem", "permissions_ca.cert.pem"} | {
+    "governance.p7s",
+    "permissions.p7s",
+}
+
+
+@pytest.fixture(scope="session")
+def made_home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("home") / "ks"
+    create_keystore(root, template=load_template("production"), now=NOW)
+    create_enclaves(root, ["/base"], now=NOW)
+    return root
+
+
+@pytest.fixture
+def home(made_home: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made_home, tmp_path / "ks", symlinks=True))
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    create_request(tmp_path / "robot", NAME)
+    return tmp_path / "robot"
+
+
+def request_of(robot: Path) -> bytes:
+    return (robot / FOLDER / "request.pem").read_bytes()
+
+
+def sign(home: Path, robot: Path, now: datetime = NOW, *, renew: bool = False) -> Signed:
+    return sign_request(home, request_of(robot), now=now, renew=renew)
+
+
+# ── on the robot: the request ──────────────────────────────────────────────────────────────
+
+
+def test_a_request_has_a_key_that_stays(robot: Path, free_umask: None) -> None:
+    files = snapshot(robot)
+    assert set(files) == {
+        "enclaves",
+        "enclaves/arm",
+        *(f"{FOLDER}{file}" for file in ("", "/key.pem", "/request.pem")),
+    }
+    assert stat.S_IMODE(files[f"{FOLDER}/key.pem"][0]) == 0o600
+    assert stat.S_IMODE(files[FOLDER][0]) == 0o700
+    request = x509.load_pem_x509_csr(request_of(robot))
+    assert request.is_signature_valid
+    assert request.subject == common_name(NAME)
+    assert isinstance(request.signature_hash_algorithm, hashes.SHA256)
+    key = request.public_key()
+    assert isinstance(key, ec.EllipticCurvePublicKey)
+    assert key.curve.name == "secp256r1"
+
+
+def test_openssl_reads_a_request_and_agrees_about_the_key(robot: Path, tmp_path: Path) -> None:
+    made = create_request(tmp_path / "other", "/x")
+    subprocess.run(
+        ["openssl", "req", "-in", made.file, "-verify", "-noout"], check=True, capture_output=True
+    )
+    script = "openssl req -in $0 -pubkey -noout | openssl pkey -pubin -outform DER | sha256sum"
+    said = subprocess.run(["sh", "-c", script, made.file], capture_output=True, text=True)
+    assert said.stdout.split()[0] == made.key
+
+
+def test_no_key_is_replaced(robot: Path) -> None:
+    before = snapshot(robot)
+    with pytest.raises(KeystoreError, match="has a key in"):
+        create_request(robot, NAME)
+    assert snapshot(robot) == before
+    create_request(robot, "/other")
+    create_request(robot, NAME, again=True)
+    after = snapshot(robot)
+    assert after[f"{FOLDER}/key.pem"] == before[f"{FOLDER}/key.pem"]
+    assert after[f"{FOLDER}/request.pem"] != before[f"{FOLDER}/request.pem"]
+    with pytest.raises(SrosError, match="does not exist"):
+        create_request(robot, "/third", again=True)
+
+
+def test_a_dry_run_makes_nothing(tmp_path: Path) -> None:
+    made = create_request(tmp_path / "robot", NAME, dry_run=True)
+    assert [change.path for change in made.changes] == [
+        f"{FOLDER}/key.pem",
+        f"{FOLDER}/request.pem",
+    ]
+    assert not (tmp_path / "robot").exists()
+
+
+def _certificate_alone(robot: Path) -> None:
+    (robot / FOLDER).mkdir(parents=True)
+    (robot / FOLDER / "cert.pem").touch()
+
+
+def _link_for_a_folder(robot: Path) -> None:
+    robot.mkdir()
+    (robot / "enclaves").symlink_to("/tmp")
+
+
+BAD_PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
+    "a keystore with CAs": (lambda robot: (robot / "private").mkdir(parents=True), "with CAs"),
+    "a file": (Path.touch, "the operating system"),
+    "a link for a folder": (_link_for_a_folder, "symbolic link"),
+    "a certificate without its key": (_certificate_alone, "no key"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_PLACES)
+def test_places_in_which_no_key_is_made(case: str, tmp_path: Path) -> None:
+    make, why = BAD_PLACES[case]
+    make(tmp_path / "robot")
+    before = snapshot(tmp_path)
+    with pytest.raises((SrosError, OSError)) as caught:
+        create_request(tmp_path / "robot", NAME)
+    assert why in str(caught.value) or isinstance(caught.value, OSError)
+    assert snapshot(tmp_path) == before
+
+
+# ── at home: signing ───────────────────────────────────────────────────────────────────────
+
+
+def test_signing_records_everything_but_the_key(home: Path, robot: Path) -> None:
+    signed = sign(home, robot)
+    assert NAME in list_enclaves(home)
+    folder = home / FOLDER
+    assert {path.name for path in folder.iterdir()} == SENT | {"permissions.xml", "request.pem"}
+    assert os.readlink(folder / "identity_ca.cert.pem") == ("../../../public/identity_ca.cert.pem")
+    assert os.readlink(folder / "governance.p7s") == "../../governance.p7s"
+    assert all(path.exists() for path in folder.iterdir())
+    issued = certificate(folder / "cert.pem")
+    issued.verify_directly_issued_by(certificate(home / "public/identity_ca.cert.pem"))
+    subject = issued.subject
+    assert len(subject.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)) == 1
+    assert key_digest(issued.public_key()) == signed.key  # type: ignore[arg-type]
+    entries = [entry for entry in read_ledger(home) if entry.enclave == NAME]
+    assert [entry.what for entry in entries] == ["certificate", "permissions", "answer"]
+    assert not history(home, now=NOW).unexplained
+    with tarfile.open(fileobj=io.BytesIO(signed.archive)) as tar:
+        names = {member.name for member in tar if member.isfile()}
+        assert names == {SEAL, *(f"{FOLDER}/{file}" for file in SENT)}
+        assert {(each.uid, each.uname, each.mtime) for each in tar} == {(0, "", 0)}
+    assert pack(unpack(signed.archive)) == signed.archive
+    assert b"PRIVATE" not in b"".join(unpack(signed.archive).values())
+
+
+def test_the_rights_are_those_of_the_policy_and_a_renewal_keeps_them(
+    home: Path, robot: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "p.xml").write_text(policy_text({NAME: publish("image")}))
+    policy = read_policy(tmp_path / "p.xml")
+    sign_request(home, request_of(robot), now=NOW, policy=policy)
+    assert topics_of(home / FOLDER) == {"rt/image", "ros_discovery_info"}
+    first = certificate(home / FOLDER / "cert.pem")
+    sign(home, robot, LATER, renew=True)
+    assert topics_of(home / FOLDER) == {"rt/image", "ros_discovery_info"}
+    second = certificate(home / FOLDER / "cert.pem")
+    assert second.not_valid_after_utc - first.not_valid_after_utc == timedelta(days=30)
+    assert second.public_key() == first.public_key()
+    entries = [entry for entry in read_ledger(home) if entry.what == "permissions"]
+    assert entries[-1].policy == entries[-2].policy != ""
+
+
+def test_without_a_policy_the_rights_are_the_default_of_the_template(
+    home: Path, robot: Path
+) -> None:
+    sign(home, robot)
+    assert "rt/*" not in topics_of(home / FOLDER)
+    assert "rt/rosout" in topics_of(home / FOLDER)
+
+
+def test_an_enclave_that_exists_is_not_given_to_whoever_asks(
+    home: Path, robot: Path, tmp_path: Path
+) -> None:
+    sign(home, robot)
+    thief = create_request(tmp_path / "thief", NAME)
+    before = snapshot(home)
+    with pytest.raises(KeystoreError, match="exists already"):
+        sign_request(home, thief.file.read_bytes(), now=NOW)
+    base = create_request(tmp_path / "thief", "/base")
+    with pytest.raises(KeystoreError, match="has another key"):
+        sign_request(home, base.file.read_bytes(), now=NOW, renew=True)
+    assert snapshot(home) == before
+    (note,) = sign_request(home, thief.file.read_bytes(), now=NOW, renew=True).notes
+    assert note.id == "request.new-key"
+
+
+def test_other_verbs_know_an_enclave_without_its_key(
+    home: Path, robot: Path, tmp_path: Path
+) -> None:
+    sign(home, robot)
+    (tmp_path / "p.xml").write_text(policy_text({NAME: publish("new"), "/base": publish("new")}))
+    create_permission(home, NAME, read_policy(tmp_path / "p.xml"), now=NOW)
+    assert topics_of(home / FOLDER) == {"rt/new", "ros_discovery_info"}
+    assert create_enclaves(home, [NAME], now=NOW).kept == (NAME,)
+    before = certificate(home / FOLDER / "cert.pem")
+    with pytest.raises(KeystoreError, match="not in this keystore"):
+        renew(home, [NAME], now=LATER, new_key=True)
+    renew(home, [NAME], now=LATER)
+    assert certificate(home / FOLDER / "cert.pem").public_key() == before.public_key()
+    import_answer(robot, sign(home, robot, LATER, renew=True).archive, now=LATER)
+    assert topics_of(robot / FOLDER) == {"rt/new", "ros_discovery_info"}
+    assert not (home / FOLDER / "key.pem").exists()
+
+
+def test_a_revoked_key_is_not_certified_again(home: Path, robot: Path) -> None:
+    sign(home, robot)
+    revoke(home, [NAME], now=NOW)
+    assert not (home / FOLDER).exists()
+    assert list_enclaves(home) == ("/base",)
+    with pytest.raises(KeystoreError, match="was revoked"):
+        sign(home, robot)
+
+
+def other_subject(
+    key: ec.EllipticCurvePrivateKey, *parts: tuple[x509.ObjectIdentifier, str]
+) -> bytes:
+    name = x509.Name([x509.NameAttribute(oid, text) for oid, text in parts])
+    builder = x509.CertificateSigningRequestBuilder().subject_name(name)
+    return builder.sign(key, hashes.SHA256()).public_bytes(Encoding.PEM)
+
+
+def request_with(key: ec.EllipticCurvePrivateKey | rsa.RSAPrivateKey, name: str = NAME) -> bytes:
+    return make_request(key, name)
+
+
+def ed25519_request() -> bytes:
+    builder = x509.CertificateSigningRequestBuilder().subject_name(common_name(NAME))
+    return builder.sign(ed25519.Ed25519PrivateKey.generate(), None).public_bytes(Encoding.PEM)
+
+
+def with_another_key() -> bytes:
+    """A request that carries a key whose owner has not signed it."""
+    mine, theirs = generate_key(), generate_key()
+    request = x509.load_pem_x509_csr(make_request(mine, NAME)).public_bytes(Encoding.DER)
+    form = (Encoding.X962, PublicFormat.UncompressedPoint)
+    old, new = (key.public_key().public_bytes(*form) for key in (mine, theirs))
+    forged = x509.load_der_x509_csr(request.replace(old, new))
+    return forged.public_bytes(Encoding.PEM)
+
+
+_CN, _OU = NameOID.COMMON_NAME, NameOID.ORGANIZATIONAL_UNIT_NAME
+
+BAD_REQUESTS: dict[str, tuple[Callable[[], bytes], str]] = {
+    "nothing": (lambda: b"", "cannot be read"),
+    "garbage": (lambda: os.urandom(500), "cannot be read"),
+    "too much": (lambda: make_request(generate_key(), NAME) + b"x" * 70000, "cannot be read"),
+    "a key that was not signed with": (with_another_key, "does not hold"),
+    "P-384": (
+        lambda: request_with(ec.generate_private_key(ec.SECP384R1())),
+        "key of EC secp384r1",
+    ),
+    "RSA 1024": (
+        lambda: request_with(rsa.generate_private_key(65537, 1024)),
+        "key of RSA 1024",
+    ),
+    "Ed25519": (ed25519_request, "key of Ed25519"),
+    "a relative name": (lambda: request_with(generate_key(), "camera"), "not a valid enclave"),
+    "dots": (lambda: request_with(generate_key(), "/../x"), "not a valid enclave"),
+    "a wildcard": (lambda: request_with(generate_key(), "/*"), "not a valid enclave"),
+    "no name": (lambda: other_subject(generate_key()), "an empty subject"),
+    "more than a name": (
+        lambda: other_subject(generate_key(), (_OU, "0123"), (_CN, NAME)),
+        "is for CN=/arm/camera,OU=0123",
+    ),
+    "two names": (
+        lambda: other_subject(generate_key(), (_CN, "/base"), (_CN, NAME)),
+        "is for CN",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_REQUESTS)
+def test_requests_that_are_refused(case: str, home: Path) -> None:
+    make, why = BAD_REQUESTS[case]
+    before = snapshot(home)
+    with pytest.raises(SrosError) as caught:
+        sign_request(home, make(), now=NOW)
+    assert why in str(caught.value)
+    assert snapshot(home) == before
+
+
+def test_a_request_of_openssl_with_rsa_works(home: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "robot" / FOLDER
+    folder.mkdir(parents=True)
+    command = ["openssl", "req", "-new", "-newkey", "rsa:2048", "-noenc"]
+    command += ["-subj", r"/CN=\/arm\/camera"]
+    command += ["-keyout", str(folder / "key.pem"), "-out", str(folder / "request.pem")]
+    subprocess.run(command, check=True, capture_output=True)
+    import_answer(tmp_path / "robot", sign(home, tmp_path / "robot").archive, now=NOW)
+    assert verify_arrival(tmp_path / "robot", now=NOW).enclaves[0].loadable
+
+
+def test_a_policy_without_the_enclave_is_refused(home: Path, robot: Path, tmp_path: Path) -> None:
+    (tmp_path / "p.xml").write_text(policy_text({"/x": publish("y")}))
+    with pytest.raises(PolicyError, match="unable to find enclave /arm/camera"):
+        sign_request(home, request_of(robot), now=NOW, policy=read_policy(tmp_path / "p.xml"))
+
+
+def test_the_answer_appears_with_the_keystore_or_not_at_all(
+    home: Path, robot: Path, tmp_path: Path
+) -> None:
+    before = snapshot(tmp_path)
+    for answer in (tmp_path / "no/a.tar.gz", tmp_path / "ks"):
+        with pytest.raises((SrosError, OSError)):
+            sign_request(home, request_of(robot), now=NOW, answer=answer)
+        assert snapshot(tmp_path) == before
+    target = tmp_path / "a.tar.gz"
+    signed = sign_request(home, request_of(robot), now=NOW, answer=target)
+    assert target.read_bytes() == signed.archive
+    assert not [path for path in snapshot(tmp_path) if ".a.tar.gz" in path]
+    before = snapshot(tmp_path)
+    with pytest.raises(KeystoreError, match="already exists"):
+        sign_request(home, request_of(robot), now=NOW, renew=True, answer=target)
+    assert snapshot(tmp_path) == before
+    sign_request(home, request_of(robot), now=NOW, renew=True, answer=target, force=True)
+
+
+def test_an_answer_that_the_robot_would_refuse_is_not_made(home: Path, robot: Path) -> None:
+    revoke(home, ["/base"], now=NOW)
+    before = snapshot(home)
+    distant = NOW + timedelta(days=4 * 365)
+    crl = (home / "public/identity_ca.crl.pem").read_bytes()
+    sign_request(home, request_of(robot), now=NOW, dry_run=True)
+    (home / "public/identity_ca.crl.pem").write_bytes(crl[:200])
+    with pytest.raises(KeystoreError, match=r"of no use on the robot.*crl\.pem"):
+        sign_request(home, request_of(robot), now=distant)
+    (home / "public/identity_ca.crl.pem").write_bytes(crl)
+    assert snapshot(home) == before
+
+
+# ── on the robot: the answer ───────────────────────────────────────────────────────────────
+
+
+def test_an_answer_completes_the_enclave(home: Path, robot: Path, free_umask: None) -> None:
+    key = (robot / FOLDER / "key.pem").read_bytes()
+    signed = sign(home, robot)
+    before = snapshot(robot)
+    planned = import_answer(robot, signed.archive, now=NOW, dry_run=True)
+    assert {each.path for each in planned.changes} == {f"{FOLDER}/{file}" for file in SENT}
+    assert snapshot(robot) == before
+    done = import_answer(robot, signed.archive, now=NOW)
+    assert done.changes == planned.changes
+    assert done.first
+    assert (robot / FOLDER / "key.pem").read_bytes() == key
+    assert {path.name for path in (robot / FOLDER).iterdir()} == SENT | {"key.pem", "request.pem"}
+    arrival = verify_arrival(robot, now=NOW)
+    assert not arrival.findings
+    assert arrival.enclaves[0].until == done.until
+    assert not import_answer(robot, signed.archive, now=NOW).changes
+    assert not remains(robot)
+
+
+def test_the_root_enclave_is_asked_for_as_well(home: Path, tmp_path: Path) -> None:
+    made = create_request(tmp_path / "robot", "/")
+    answer = sign_request(home, made.file.read_bytes(), now=NOW).archive
+    import_answer(tmp_path / "robot", answer, now=NOW)
+    assert not verify_arrival(tmp_path / "robot", now=NOW).findings
+    assert not verify_arrival(tmp_path / "robot/enclaves", now=NOW).findings
+
+
+def test_what_was_revoked_is_told_to_the_robot(home: Path, robot: Path) -> None:
+    first = sign(home, robot).archive
+    import_answer(robot, first, now=NOW)
+    revoke(home, ["/base"], now=LATER)
+    import_answer(robot, sign(home, robot, LATER, renew=True).archive, now=LATER)
+    listed = x509.load_pem_x509_crl((robot / FOLDER / "crl.pem").read_bytes())
+    assert len(listed) == 1
+    assert not verify_arrival(robot, now=LATER).findings
+
+
+def test_going_back_needs_force(home: Path, robot: Path) -> None:
+    old = sign(home, robot).archive
+    refresh_crl(home, now=LATER)
+    import_answer(robot, sign(home, robot, LATER, renew=True).archive, now=LATER)
+    before = snapshot(robot)
+    with pytest.raises(KeystoreError, match="older than what is there"):
+        import_answer(robot, old, now=LATER)
+    assert snapshot(robot) == before
+    import_answer(robot, old, now=LATER, force=True)
+    assert not (robot / FOLDER / "crl.pem").exists()
+
+
+def test_a_robot_keeps_to_its_keystore(home: Path, robot: Path, tmp_path: Path) -> None:
+    import_answer(robot, sign(home, robot).archive, now=NOW)
+    create_keystore(tmp_path / "evil", template=load_template("production"), now=NOW)
+    evil = sign(tmp_path / "evil", robot).archive
+    other = create_request(robot, "/other")
+    answer = sign_request(tmp_path / "evil", other.file.read_bytes(), now=NOW).archive
+    before = snapshot(robot)
+    for each in (evil, answer):
+        with pytest.raises(KeystoreError, match="another keystore"):
+            import_answer(robot, each, now=NOW)
+    assert snapshot(robot) == before
+    import_answer(robot, evil, now=NOW, force=True)
+
+
+def test_an_answer_needs_the_key_that_asked(home: Path, robot: Path, tmp_path: Path) -> None:
+    archive = sign(home, robot).archive
+    create_request(tmp_path / "twin", NAME)
+    before = snapshot(tmp_path)
+    with pytest.raises(PkiError, match="for another key"):
+        import_answer(tmp_path / "twin", archive, now=NOW)
+    create_request(tmp_path / "empty", "/else")
+    for place in ("empty", "none"):
+        with pytest.raises(KeystoreError, match="no key of enclave /arm/camera"):
+            import_answer(tmp_path / place, archive, now=NOW)
+    with pytest.raises(KeystoreError, match="with CAs"):
+        import_answer(home, archive, now=NOW)
+    assert (
+        snapshot(tmp_path / "twin").items()
+        <= {path.removeprefix("twin/"): value for path, value in before.items()}.items()
+    )
+
+
+@pytest.mark.parametrize("days", [-2, 400])
+def test_an_answer_has_to_be_in_date(days: int, home: Path, robot: Path) -> None:
+    archive = sign(home, robot).archive
+    with pytest.raises(PkiError, match=r"expired|not valid before"):
+        import_answer(robot, archive, now=NOW + timedelta(days=days))
+
+
+Files = dict[str, bytes]
+
+
+def rebuilt(files: Files, *extra: tuple[tarfile.TarInfo, bytes]) -> bytes:
+    buffer = io.BytesIO()
+    with tarfile.open(fileobj=buffer, mode="w:gz") as tar:
+        for path, data in files.items():
+            entry = tarfile.TarInfo(path)
+            entry.size = len(data)
+            tar.addfile(entry, io.BytesIO(data))
+        for entry, data in extra:
+            tar.addfile(entry, io.BytesIO(data))
+    return buffer.getvalue()
+
+
+def member(
+    name: str, kind: bytes = tarfile.REGTYPE, target: str = "", data: bytes = b"x"
+) -> tuple[tarfile.TarInfo, bytes]:
+    entry = tarfile.TarInfo(name)
+    entry.type, entry.linkname = kind, target
+    entry.size = len(data) if kind == tarfile.REGTYPE else 0
+    return entry, data
+
+
+def changed(files: Files, file: str, old: bytes, new: bytes) -> bytes:
+    path = f"{FOLDER}/{file}"
+    assert old in files[path]
+    return rebuilt({**files, path: files[path].replace(old, new)})
+
+
+def without(files: Files, path: str) -> bytes:
+    return rebuilt({name: data for name, data in files.items() if name != path})
+
+
+def sparse(files: Files) -> bytes:
+    entry, data = member(f"{FOLDER}/crl.pem")
+    entry.pax_headers = {
+        "GNU.sparse.major": "0", "GNU.sparse.minor": "1", "GNU.sparse.name": f"{FOLDER}/crl.pem",
+        "GNU.sparse.realsize": str(1 << 40), "GNU.sparse.map": "0,1", "GNU.sparse.numblocks": "1",
+    }  # fmt: skip
+    return rebuilt(files, (entry, data))
+
+
+CERT = f"{FOLDER}/cert.pem"
+TAMPERED: dict[str, tuple[Callable[[Files], bytes], str]] = {
+    "nothing": (lambda files: b"", "no .tar.gz"),
+    "garbage": (lambda files: os.urandom(999), "no .tar.gz"),
+    "cut short": (lambda files: pack(files)[:-100], "no .tar.gz"),
+    "a bit flipped": (
+        lambda files: (raw := bytearray(pack(files))).__setitem__(900, raw[900] ^ 1) or bytes(raw),
+        "",
+    ),
+    "more behind it": (lambda files: pack(files) + pack(files), "behind its end"),
+    "a bomb": (lambda files: gzip.compress(bytes(MAX_UNPACKED + 1)), "unpacks to more"),
+    "a huge file": (
+        lambda files: rebuilt(files, member("x", data=bytes(MAX_MEMBER + 1))),
+        f"{MAX_MEMBER + 1} bytes",
+    ),
+    "a sparse file": (sparse, "no plain file"),
+    "many files": (
+        lambda files: rebuilt(files, *(member(f"x{n}") for n in range(300))),
+        "too many",
+    ),
+    "a path out": (lambda files: rebuilt(files, member("../../etc/cron.d/x")), "'../../etc/cron"),
+    "an absolute path": (lambda files: rebuilt(files, member("/etc/passwd")), "etc/passwd"),
+    "dots within": (
+        lambda files: rebuilt(files, member(f"{FOLDER}/../x/cert.pem")),
+        "not the answer for one",
+    ),
+    "a key": (lambda files: rebuilt(files, member(f"{FOLDER}/key.pem")), "key.pem"),
+    "a CA key": (lambda files: rebuilt(files, member("private/ca.key.pem")), "ca.key.pem"),
+    "a second enclave": (
+        lambda files: rebuilt(files, member("enclaves/base/cert.pem")),
+        "not the answer for one",
+    ),
+    "a file of another enclave": (
+        lambda files: rebuilt(files, member("enclaves/base/permissions.p7s")),
+        "enclaves/base",
+    ),
+    "a link": (
+        lambda files: rebuilt(files, member(f"{FOLDER}/crl.pem", tarfile.SYMTYPE, "/etc/shadow")),
+        "no plain file",
+    ),
+    "a hard link": (
+        lambda files: rebuilt(files, member(f"{FOLDER}/crl.pem", tarfile.LNKTYPE, CERT)),
+        "no plain file",
+    ),
+    "a device": (lambda files: rebuilt(files, member("x", tarfile.CHRTYPE)), "no plain file"),
+    "a FIFO": (lambda files: rebuilt(files, member("x", tarfile.FIFOTYPE)), "no plain file"),
+    "a name twice": (lambda files: rebuilt(files, member(CERT)), "twice"),
+    "no certificate": (lambda files: without(files, CERT), "not the answer"),
+    "no permissions": (lambda files: without(files, f"{FOLDER}/permissions.p7s"), "missing"),
+    "no seal": (lambda files: without(files, SEAL), f"{SEAL} is missing"),
+    "other permissions": (
+        lambda files: changed(files, "permissions.p7s", b"rt/rosout", b"rt/cmd_ve"),
+        "does not match",
+    ),
+    "another governance": (
+        lambda files: changed(files, "governance.p7s", b"ENCRYPT", b"NONE"),
+        "does not match",
+    ),
+    "a further CA": (
+        lambda files: rebuilt(
+            {
+                **files,
+                f"{FOLDER}/identity_ca.cert.pem": files[f"{FOLDER}/identity_ca.cert.pem"]
+                + files[f"{FOLDER}/permissions_ca.cert.pem"],
+            }
+        ),
+        "not those that were sent",
+    ),
+    "another enclave's name": (
+        lambda files: rebuilt(
+            {path.replace("arm/camera", "arm/other"): data for path, data in files.items()}
+        ),
+        "",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", TAMPERED)
+def test_answers_that_were_tampered_with_leave_nothing(
+    case: str, home: Path, robot: Path, tmp_path: Path
+) -> None:
+    tamper, why = TAMPERED[case]
+    archive = sign(home, robot).archive
+    create_request(robot, "/arm/other")
+    bad = tamper(unpack(archive))
+    before = snapshot(tmp_path)
+    with pytest.raises(SrosError) as caught:
+        import_answer(robot, bad, now=NOW)
+    assert why in str(caught.value)
+    assert snapshot(tmp_path) == before
+    import_answer(robot, archive, now=NOW)
+
+
+def test_an_earlier_governance_cannot_be_slipped_in(home: Path, robot: Path) -> None:
+    """It is signed by the right CA; only the list of the files tells it from the present one."""
+    files = unpack(sign(home, robot).archive)
+    earlier = home.parent / "earlier"
+    shutil.copytree(home, earlier, symlinks=True)
+    again = unpack(sign(earlier, robot, renew=True).archive)
+    path = f"{FOLDER}/governance.p7s"
+    resigned = files[path].replace(b'micalg="sha-256"', b"micalg=sha-256")
+    assert resigned != files[path]
+    with pytest.raises(PkiError, match="not those that were sent"):
+        import_answer(robot, rebuilt({**files, path: resigned}), now=NOW)
+    mixed = {**again, SEAL: files[SEAL]}
+    with pytest.raises(PkiError, match="not those that were sent"):
+        import_answer(robot, rebuilt(mixed), now=NOW)
+
+
+def test_a_repacked_answer_is_as_good(home: Path, robot: Path) -> None:
+    """The positive twin: what counts is what it holds, not how it was packed."""
+    import_answer(robot, rebuilt(unpack(sign(home, robot).archive)), now=NOW)
+    assert not verify_arrival(robot, now=NOW).findings
+
+
+def test_the_request_that_is_kept_at_home_serves_to_answer_again(home: Path, robot: Path) -> None:
+    sign(home, robot)
+    kept = (home / FOLDER / "request.pem").read_bytes()
+    assert load_request(kept, "kept").public_key == load_request(request_of(robot), "").public_key
+    import_answer(robot, sign_request(home, kept, now=NOW, renew=True).archive, now=NOW)
