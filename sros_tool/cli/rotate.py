@@ -38,15 +38,15 @@ _DONE = {
 Example:
   $ sros rotate_ca keystore --next
   distributed the new CA beside the old one: identity_ca, permissions_ca
-  All vendors: restart the processes one by one, when it suits; those restarted and those not yet
-  restarted talk with each other. Go on when all have been restarted.
   $ sros rotate_ca keystore --status
   stage: distribute, next: reissue
-    identity CA     issuing  2 of 2 enclaves  until 2036-11-18T07:30:12Z  CN=sros identity CA 11f0
-    identity CA     next     0 of 2 enclaves  until 2036-11-19T07:30:14Z  CN=sros identity CA 5e2c
-  $ sros rotate_ca keystore --next       # reissue, once all were restarted
-  $ sros rotate_ca keystore --next       # retire, once all were restarted
-  $ sros rotate_ca keystore --finish     # or all stages at once; then restart all together""",
+    identity CA    issuing 2 of 2 enclaves  until 2036-11-18T07:37:42Z  CN=sros identity CA b6d1525f
+    identity CA    next    0 of 2 enclaves  until 2036-11-18T07:37:45Z  CN=sros identity CA 45aff1c0
+  $ sros rotate_ca keystore --next     # once all processes were restarted
+  issued and signed everything anew by the new CA: identity_ca, permissions_ca
+  $ sros rotate_ca keystore --next     # once more, all processes were restarted
+  retired the old CA: identity_ca, permissions_ca
+  $ sros rotate_ca keystore --finish   # or all stages at once; then restart all together""",
 )
 @click.argument("root", type=PATH, required=False)
 @click.option("--identity", is_flag=True, help="Only the identity CA.")
@@ -149,6 +149,11 @@ def _say(step: RotationStep, status: RotationStatus, *, together: bool, same_key
         return
     if same_key:
         click.echo("renewed the identity CA with its key; what it has issued stays valid")
+        click.echo(
+            "Restart the processes when it suits; those restarted and those not yet restarted talk "
+            f"with each other. Certificates end when they did: `sros renew {step.root}`.",
+            err=True,
+        )
         return
     anew = any(each.path.endswith("/cert.pem") for each in step.changes)
     done = f"{_DONE['reissue']}, and " if together and anew else ""
@@ -195,7 +200,7 @@ def _show_status(status: RotationStatus, as_json: bool) -> None:
         if each.validity.not_after < now():
             end = f"ENDED {iso(each.validity.not_after)}"
         click.echo(
-            f"  {name:14}  {each.standing:7}  {each.enclaves} of {status.enclaves} enclaves  {end}"
+            f"  {name:14} {each.standing:7} {each.enclaves} of {status.enclaves} enclaves  {end}"
             f"  {each.subject}"
         )
     for remark in status.remarks:

@@ -27,7 +27,12 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.open import load_settings
 from sros_tool.keystore.verify import EnclaveState, check_enclave
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import load_certificate, subject_text, validity_of
+from sros_tool.pki.certificates import (
+    load_certificate,
+    load_certificates,
+    subject_text,
+    validity_of,
+)
 from sros_tool.pki.keys import algorithm, load_key
 from sros_tool.translate import RosRight, ros_rights
 from sros_tool.validity import iso
@@ -65,8 +70,11 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
 
 def _file(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
     if b"-----BEGIN CERTIFICATE-----" in data:
-        certificate = load_certificate(data, "in it")
-        return {"kind": "certificate", **describe_certificate(certificate, now)}
+        certificate, *further = load_certificates(data, "in it")
+        described = {"kind": "certificate", **describe_certificate(certificate, now)}
+        if further:  # the chain of a CA, or the other one while a CA is being replaced
+            described["further"] = [describe_certificate(each, now) for each in further]
+        return described
     if b"PRIVATE KEY-----" in data:
         mode = path.stat().st_mode & 0o777
         key = load_key(data, "in it")

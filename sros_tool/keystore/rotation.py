@@ -10,7 +10,7 @@ import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
 
@@ -37,11 +37,13 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
-from sros_tool.validity import Window
+from sros_tool.validity import Window, iso
 from sros_tool.xml import read_bytes
 
 ROTATION = "rotation.json"
 """Which CAs are being replaced; there while a rotation is under way."""
+SOON = timedelta(days=90)
+"""How long before its end a CA should be replaced."""
 _CRL_MARK = b"-----BEGIN X509 CRL-----"
 
 
@@ -202,8 +204,8 @@ def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
                     counts[index],
                 )
             )
-    remarks = tuple(_remarks(root, rotation))
-    return RotationStatus(root, rotation, tuple(states), len(names), remarks)
+    remarks = _ending(states, now) if rotation.stage is Stage.NONE else _remarks(root, rotation)
+    return RotationStatus(root, rotation, tuple(states), len(names), tuple(remarks))
 
 
 def _count(
@@ -232,11 +234,35 @@ def _count(
 # ── what the vendors make of it ────────────────────────────────────────────────────────────
 
 
+def _ending(states: Sequence[AuthorityState], now: datetime) -> list[str]:
+    """What to do about CAs that end soon, or have ended."""
+    remarks = []
+    for each in states:
+        if each.standing != "issuing" or each.validity.not_after - now > SOON:
+            continue
+        name = "CA" if len(each.roles) > 1 else f"{each.roles[0]} CA"
+        end = iso(each.validity.not_after)
+        if each.validity.not_after < now:
+            remarks.append(
+                f"The {name} ended at {end}, and no process starts any more: replace it at once "
+                "with --finish."
+            )
+        elif each.roles == (IDENTITY,):
+            remarks.append(
+                f"The {name} ends at {end}: --same-key gives it a longer life and disturbs nobody; "
+                "--next begins to replace it."
+            )
+        else:
+            remarks.append(
+                f"The {name} ends at {end}: --next begins to replace it. With Fast DDS, robots run "
+                "on; with Cyclone DDS, plan a common restart of all processes."
+            )
+    return remarks
+
+
 def _remarks(root: Path, rotation: Rotation) -> list[str]:
     """What to restart at this stage, and how, by vendor."""
     files = [each.file for each in rotation.replacements]
-    if rotation.stage is Stage.NONE:
-        return []
     if rotation.stage is Stage.DISTRIBUTE:
         return [
             "All vendors: restart the processes one by one, when it suits; those restarted and "

@@ -11,6 +11,9 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import rsa
 from harness import check_enclave_whole, policy_text, publish, remains, snapshot, sros
 from test_transaction import DIED, in_child
 
@@ -31,6 +34,8 @@ from sros_tool.keystore.rotation import (
 )
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.verify import check_enclave
+from sros_tool.pki.certificates import common_name, pem
+from sros_tool.pki.keys import generate_key
 from sros_tool.policy import read_policy
 
 NOW = datetime.now(UTC)
@@ -187,6 +192,53 @@ def test_an_expired_ca_is_replaced(separate: Path) -> None:
     check_at = [check_enclave(enclave_path(separate, name), now=later) for name in NAMES]
     assert all(state.problems == () for state in check_at)
     create_enclaves(separate, ["/c"], now=later)
+
+
+@pytest.mark.parametrize(
+    ("days", "identity", "permissions"),
+    [
+        (5 * 365 - 91, "", ""),
+        (5 * 365 - 89, "--same-key", "--next"),
+        (6 * 365,) + ("--finish",) * 2,
+    ],
+)
+def test_the_status_says_when_it_is_time(
+    days: int, identity: str, permissions: str, separate: Path
+) -> None:
+    remarks = rotation_status(separate, now=NOW + timedelta(days=days)).remarks
+    wanted = [text for text in (identity, permissions) if text]
+    assert len(remarks) == len(wanted)
+    assert all(text in remark for text, remark in zip(wanted, remarks, strict=True))
+
+
+@pytest.mark.parametrize("kind", ["without identifiers", "RSA"])
+def test_what_fast_dds_cannot_tell_apart_is_said(kind: str, separate: Path) -> None:
+    """ros2/sros2 makes CAs without identifiers; Fast DDS 2.9.1 was run with those."""
+    rotate_ca(separate, now=NOW)
+    rotate_ca(separate, now=NOW)
+    fast = rotation_status(separate, now=NOW).remarks[0]
+    assert fast.startswith("Fast DDS: restart the processes one by one")
+    foreign = foreign_ca(kind)
+    path = separate / "public/permissions_ca.cert.pem"
+    path.write_bytes(path.read_bytes() + foreign)
+    fast = rotation_status(separate, now=NOW).remarks[0]
+    assert fast.startswith("Fast DDS: the old permissions CA has ")
+    assert fast.endswith("Restart all processes together.")
+
+
+def foreign_ca(kind: str) -> bytes:
+    private = rsa.generate_private_key(65537, 2048) if kind == "RSA" else generate_key()
+    name = common_name("sros2CA")
+    return pem(
+        x509.CertificateBuilder(
+            issuer_name=name,
+            subject_name=name,
+            public_key=private.public_key(),
+            serial_number=7,
+            not_valid_before=NOW,
+            not_valid_after=NOW + timedelta(days=9),
+        ).sign(private, hashes.SHA256())
+    )
 
 
 def test_same_key(separate: Path) -> None:
@@ -438,6 +490,8 @@ def test_the_verb(separate: Path) -> None:
     assert sros("rotate-ca", separate, "--next").ok().out == (
         "distributed the new CA beside the old one: identity_ca, permissions_ca\n"
     )
+    told = json.loads(sros("inspect", separate / "public/identity_ca.cert.pem", "--json").ok().out)
+    assert [each["is_ca"] for each in told["further"]] == [True]
     told = json.loads(sros("rotate_ca", separate, "--status", "--json").ok().out)
     assert [(each["standing"], each["enclaves"]) for each in told["authorities"]] == [
         ("issuing", 3),
