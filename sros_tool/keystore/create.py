@@ -310,6 +310,8 @@ def _check_free(root: Path) -> None:
             "",
             "Nothing was changed. Add to it with `sros create_enclave`, or choose another path.",
         )
+    if root.resolve() == Path("/"):
+        raise KeystoreError("the root of the file system is no place for a keystore")
     if os.path.lexists(root) and not root.is_dir():
         raise KeystoreError(f"'{root}' is in the way", "It is not a folder.")
     remains = [part for part in (PUBLIC, PRIVATE, ENCLAVES) if (root / part).exists()]

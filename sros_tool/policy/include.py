@@ -25,6 +25,7 @@ _FALLBACKS = frozenset(f"{{{ns}}}fallback" for ns in _NAMESPACES)
 _XPOINTER = re.compile(r"xpointer\((.+)\)\Z", re.DOTALL)
 _MAX_INCLUDES = 10_000
 _MAX_DEPTH = 32
+_MAX_BYTES = 64 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,6 +43,7 @@ class Includer:
     root: Path
     _documents: dict[Path, etree._Element] = field(default_factory=dict)
     _count: int = 0
+    _bytes: int = 0
     _digests: list[bytes] = field(default_factory=list)
 
     def digest(self) -> str:
@@ -56,6 +58,12 @@ class Includer:
 
     def hold(self, file: Path, content: bytes) -> None:
         """Take ``content`` for what the file (its real path) holds, wherever it is included."""
+        self._bytes += len(content)
+        if self._bytes > _MAX_BYTES:
+            raise PolicyError(
+                f"the policy and its includes are too large at '{file}'",
+                f"Together they have more than {_MAX_BYTES // 1024**2} MiB.",
+            )
         self._documents[file] = parse(content, f"the policy file '{file}'")
         self._digests.append(hashlib.sha256(content).digest())
 

@@ -532,3 +532,10 @@ def test_a_polite_end_leaves_nothing(number: signal.Signals, keystore: Path) -> 
     assert process.returncode == (143 if number == signal.SIGTERM else 130), said
     assert "Traceback" not in said
     assert snapshot(keystore.parent) == before
+
+
+def test_the_root_of_the_file_system_is_no_keystore() -> None:
+    for words in (("create_keystore", "/"), ("generate_artifacts", "-k", "/", "-e", "/a")):
+        ended = sros(*words)
+        assert ended.status == 1, ended
+        assert "root of the file system" in ended.err

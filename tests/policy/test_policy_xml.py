@@ -156,3 +156,21 @@ def test_comments_count_for_nothing(comment: str, tmp_path: Path) -> None:
     assert read_policy(tmp_path / "p.xml").enclaves[0].all_profiles()[0].groups[0].names == (
         "chatter",
     )
+
+
+def test_includes_have_a_size_in_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from sros_tool.policy import include
+
+    part = '<profile ns="/" node="n"><topics publish="ALLOW"><topic>t</topic></topics></profile>'
+    (tmp_path / "part.xml").write_text(part)
+    policy = tmp_path / "policy.xml"
+    policy.write_text(
+        '<policy version="0.2.0" xmlns:xi="http://www.w3.org/2001/XInclude"><enclaves>'
+        '<enclave path="/a"><profiles><xi:include href="part.xml"/></profiles></enclave>'
+        "</enclaves></policy>"
+    )
+    monkeypatch.setattr(include, "_MAX_BYTES", policy.stat().st_size + len(part))
+    read_policy(policy)
+    monkeypatch.setattr(include, "_MAX_BYTES", policy.stat().st_size + len(part) - 1)
+    with pytest.raises(PolicyError, match="too large"):
+        read_policy(policy)
