@@ -35,8 +35,8 @@ DUE = Threshold(remaining=timedelta(days=40))
 TEMPLATE = replace(
     load_template("production"),
     authority_validity=timedelta(days=11 * 365),
-    certificate_validity=timedelta(days=250),
-    permissions_validity=timedelta(days=170),
+    certificate_validity=timedelta(days=330),
+    permissions_validity=timedelta(days=270),
     revocation_validity=timedelta(days=150),
 )
 ENCLAVES = 200
@@ -119,8 +119,8 @@ def test_ten_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     counts = check_history(root, end)
     assert counts["current"] == 2 * ENCLAVES + 4  # and two CAs, governance and the list
     assert counts["revoked"] >= 2 * len(thieves)
-    assert counts["expired"] > ENCLAVES * 2 * 20
-    assert renewed > ENCLAVES * 20
+    assert counts["expired"] > ENCLAVES * 2 * 11
+    assert renewed > ENCLAVES * 12
     assert len(thieves) == 21
 
 
@@ -133,14 +133,14 @@ def test_without_renewal_the_checks_of_ten_years_would_fail(tmp_path: Path) -> N
     for days, expected in (
         (100, []),
         (151, ["crl.pem"]),
-        (171, ["crl.pem", "permissions.p7s"]),
-        (251, ["cert.pem", "crl.pem", "permissions.p7s"]),
+        (271, ["crl.pem", "permissions.p7s"]),
+        (331, ["cert.pem", "crl.pem", "permissions.p7s"]),
     ):
         now = BEGIN + timedelta(days=days)
         found = check_enclave(enclave_path(root, "/a"), now=now).problems
         assert sorted({problem.file for problem in found}) == expected, days
         (life,) = lifetimes(root)
-        assert life.due(Threshold(remaining=timedelta(0)), now) == (days > 170)
+        assert life.due(Threshold(remaining=timedelta(0)), now) == (days > 270)
     late = BEGIN + timedelta(days=400)
     with pytest.raises(AssertionError):
         check_history(root, late)
