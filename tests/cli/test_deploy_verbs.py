@@ -1,0 +1,282 @@
+"""The verbs of deployment as a person or a script uses them, pipes and terminals included."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import shutil
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from harness import policy_text, publish, remains, snapshot, sros, topics_of
+
+NAME, FOLDER = "/arm/camera", "enclaves/arm/camera"
+PROGRAM = f"{sys.executable} -m sros_tool"
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Processes that are started elsewhere find the package, too."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
+
+
+def shell(script: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    script = script.replace("sros ", f"{PROGRAM} ")
+    return subprocess.run(
+        ["bash", "-c", f"set -o pipefail; {script}"],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+def asked(tmp_path: Path, name: str = NAME) -> Path:
+    sros("create_request", name, tmp_path / "robot").ok()
+    return tmp_path / f"robot/enclaves{name}/request.pem"
+
+
+# ── distribute_key ─────────────────────────────────────────────────────────────────────────
+
+
+def test_several_enclaves_are_told_one_by_one(keystore: Path, tmp_path: Path) -> None:
+    ended = sros("distribute_key", keystore, "/b", "/a", tmp_path / "out").ok()
+    assert ended.out.splitlines() == [
+        f"exported enclave /b to '{tmp_path / 'out'}'",
+        f"exported enclave /a to '{tmp_path / 'out'}'",
+    ]
+    ended = sros("distribute_key", keystore, "--all", tmp_path / "out").ok()
+    assert (ended.out, ended.err.count("as it is")) == ("", 2)
+    assert sros("list_enclaves", tmp_path / "out").ok().out == "/a\n/b\n"
+
+
+def test_a_host_by_patterns(keystore: Path, tmp_path: Path) -> None:
+    sros("create_enclave", keystore, "/r1/x", "/r1/y/z", "/r2/x").ok()
+    sros("distribute_key", keystore, "--match", "/r1/*", "--match", "/a", tmp_path / "1.tgz").ok()
+    with_env = {"ROS_SECURITY_KEYSTORE": str(keystore)}
+    sros("distribute_key", "--match", "/r1/*", "/a", tmp_path / "2", env=with_env).ok()
+    (tmp_path / "1").mkdir()
+    assert shell("tar -xzf 1.tgz -C 1", tmp_path).returncode == 0
+    assert snapshot(tmp_path / "1") == snapshot(tmp_path / "2")
+    assert sros("list_enclaves", tmp_path / "1").ok().out.split() == ["/a", "/r1/x", "/r1/y/z"]
+    ended = sros("distribute_key", keystore, "--match", "/r3/*", tmp_path / "3")
+    assert (ended.status, "fits '/r3/*'" in ended.err) == (1, True)
+    assert not (tmp_path / "3").exists()
+
+
+def test_through_a_pipe_with_the_modes_of_keys(keystore: Path, tmp_path: Path) -> None:
+    (tmp_path / "robot").mkdir()
+    ended = shell("sros distribute_key ks --all - | tar -xz -C robot", tmp_path)
+    assert ended.returncode == 0, ended
+    assert ended.stdout == ""
+    assert "exported enclave /a to standard output" in ended.stderr
+    assert stat.S_IMODE((tmp_path / "robot/enclaves/a/key.pem").stat().st_mode) == 0o600
+    assert stat.S_IMODE((tmp_path / "robot/enclaves/a").stat().st_mode) == 0o700
+    assert sros("verify", tmp_path / "robot").ok().out.count("loadable in domain 0") == 2
+    sros("distribute_key", keystore, "--all", tmp_path / "file.tgz").ok()
+    ended = shell("sros distribute_key ks /a /b - | cmp - file.tgz", tmp_path)
+    assert ended.returncode == 0, ended
+
+
+def test_a_pipe_that_breaks_and_one_that_gets_nothing(keystore: Path, tmp_path: Path) -> None:
+    assert shell("sros distribute_key ks --all - | true", tmp_path).stderr.count("Traceback") == 0
+    ended = shell("sros distribute_key ks /none - > out", tmp_path)
+    assert ended.returncode == 1
+    assert (tmp_path / "out").read_bytes() == b""
+    ended = shell("sros distribute_key ks /a - >/dev/full", tmp_path)
+    assert (ended.returncode, ended.stderr.count("\n")) == (1, 1), ended
+    assert "exported" not in ended.stderr
+    assert "Nothing was changed" not in ended.stderr
+
+
+@pytest.mark.parametrize(
+    "words", [["distribute_key", "ks", "/a", "-"], ["sign_request", "ks", "r.pem", "-o", "-"]]
+)
+def test_a_terminal_gets_no_archive(words: list[str], keystore: Path, tmp_path: Path) -> None:
+    shutil.copy(asked(tmp_path), tmp_path / "r.pem")
+    before = snapshot(tmp_path)
+    leader, follower = pty.openpty()
+    ended = subprocess.run(
+        [sys.executable, "-m", "sros_tool", *words],
+        cwd=tmp_path,
+        stdout=follower,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    os.close(follower)
+    os.close(leader)
+    assert ended.returncode == 2
+    assert "terminal" in ended.stderr
+    assert snapshot(tmp_path) == before
+
+
+def test_a_forgotten_target_is_noticed(keystore: Path) -> None:
+    ended = sros("distribute_key", keystore, "/a", "/b")
+    assert ended.status == 2
+    assert "no target is named" in ended.err
+    assert not Path("/b").exists()
+
+
+def test_a_dry_run_of_a_pipe(keystore: Path) -> None:
+    said = sros("distribute_key", keystore, "/a", "-", "--dry-run").ok().out.splitlines()
+    assert said[0] == "would send enclaves/a/cert.pem"
+    assert len(said) == 6
+
+
+# ── keys that are born on the robot ────────────────────────────────────────────────────────
+
+
+def test_from_the_request_to_a_process_that_runs(keystore: Path, tmp_path: Path) -> None:
+    ended = sros("create_request", NAME, tmp_path / "robot").ok()
+    digest = ended.out.splitlines()[1].split()[-1]
+    request = tmp_path / "robot" / FOLDER / "request.pem"
+    assert str(request) in ended.out
+    assert "waits for the answer" in sros("verify", tmp_path / "robot").out
+    shutil.copy(request, tmp_path / "r.pem")
+    (tmp_path / "p.xml").write_text(policy_text({NAME: publish("image")}))
+    ended = sros("sign_request", keystore, "r.pem", "-p", "p.xml", cwd=tmp_path).ok()
+    assert digest in ended.out
+    assert "r.answer.tar.gz" in ended.out
+    trusted = ended.out.splitlines()[1].split()[-1]
+    ended = sros("import", tmp_path / "r.answer.tar.gz", tmp_path / "robot").ok()
+    assert f"imported enclave {NAME}" in ended.out
+    assert trusted in ended.out
+    assert topics_of(tmp_path / "robot" / FOLDER) == {"rt/image", "ros_discovery_info"}
+    ended_run = shell(f"sros run robot {NAME} -- printenv ROS_SECURITY_KEYSTORE", tmp_path)
+    assert ended_run.stdout == f"{tmp_path / 'robot'}\n"
+    sros("verify", tmp_path / "robot").ok()
+    assert NAME in sros("list_enclaves", keystore).ok().out
+    assert sros("inspect", keystore, "--history").ok().out.count(NAME) == 3
+    ended = sros("distribute_key", keystore, NAME, tmp_path / "out")
+    assert ended.status == 1
+    assert "It was made on its robot and stays there" in ended.err
+    ended = sros("distribute_key", keystore, "--all", tmp_path / "out").ok()
+    assert f"left out enclave {NAME}: its key was made on its robot" in ended.err
+
+
+def test_one_pipe_from_the_request_to_the_answer(keystore: Path, tmp_path: Path) -> None:
+    request = asked(tmp_path)
+    line = f"cat {request} | sros sign_request ks - | sros import - robot"
+    ended = shell(line, tmp_path)
+    assert ended.returncode == 0, ended
+    assert "imported enclave" in ended.stdout
+    sros("verify", tmp_path / "robot").ok()
+    ended = shell(line, tmp_path)
+    assert "exists already" in ended.stderr
+    assert "the answer is empty" in ended.stderr
+    assert shell(line.replace("ks -", "ks - --renew"), tmp_path).returncode == 0
+
+
+def test_roots_from_the_environment(keystore: Path, tmp_path: Path) -> None:
+    robot = {"ROS_SECURITY_KEYSTORE": str(tmp_path / "robot")}
+    sros("create_request", NAME, env=robot).ok()
+    request = tmp_path / "robot" / FOLDER / "request.pem"
+    home = {"ROS_SECURITY_KEYSTORE": str(keystore)}
+    sros("sign_request", request, "-o", tmp_path / "answer.tgz", env=home).ok()
+    sros("import", tmp_path / "answer.tgz", env=robot).ok()
+    sros("verify", env=robot).ok()
+    for words in (["create_request", NAME], ["import", "x"], ["verify"], ["sign_request", "x"]):
+        ended = sros(*words, env={"ROS_SECURITY_KEYSTORE": None})
+        assert (ended.status, "no keystore is named" in ended.err) == (2, True)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "create_request /new robot",
+        "create_request /new elsewhere",
+        "create_request /arm/camera robot --again",
+        "sign_request ks r.pem",
+        "sign_request ks r.pem -o a.tgz",
+        "import good.tgz robot",
+    ],
+)
+def test_a_dry_run_tells_what_the_verb_then_does(line: str, keystore: Path, tmp_path: Path) -> None:
+    request = asked(tmp_path)
+    shutil.copy(request, tmp_path / "r.pem")
+    shutil.copytree(keystore, tmp_path / "twin", symlinks=True)
+    sros("sign_request", tmp_path / "twin", request, "-o", tmp_path / "good.tgz").ok()
+    before = snapshot(tmp_path)
+    said = sros(*line.split(), "--dry-run", cwd=tmp_path).ok().out
+    assert snapshot(tmp_path) == before
+    sros(*line.split(), cwd=tmp_path).ok()
+    after = snapshot(tmp_path)
+    assert not remains(tmp_path)
+    told = {path: action for _, action, path in (w.split(" ", 2) for w in said.splitlines())}
+    assert told == {
+        path: "replace" if path in before else "create"
+        for path, (mode, content) in after.items()
+        if not stat.S_ISDIR(mode) and before.get(path, (0, None))[1] != content
+    }
+
+
+MISUSE: dict[str, tuple[str, int, str]] = {
+    "no request": ("sign_request ks", 2, "no keystore is named"),
+    "two requests": ("sign_request ks r.pem r.pem", 2, "takes"),
+    "a request that is missing": ("sign_request ks no.pem", 1, "does not exist"),
+    "no keystore for it": ("sign_request no r.pem", 1, "not a valid keystore"),
+    "a policy that is missing": ("sign_request ks r.pem -p no.xml", 1, "no.xml"),
+    "nothing to renew": ("sign_request ks r.pem --renew", 1, "Leave --renew out"),
+    "a certificate for a request": ("sign_request ks ks/enclaves/a/cert.pem", 1, "cannot be read"),
+    "the answer in a missing folder": ("sign_request ks r.pem -o no/a.tgz", 1, "no/"),
+    "a name that is none": ("create_request camera robot", 1, "not a valid enclave name"),
+    "a key that is there": ("create_request /arm/camera robot", 1, "has a key in 'robot'"),
+    "a request in a keystore": ("create_request /c ks", 1, "is a keystore with CAs"),
+    "an answer that is missing": ("import no.tgz robot", 1, "does not exist"),
+    "an answer that is none": ("import r.pem robot", 1, "no .tar.gz"),
+    "an export for an answer": ("import export.tgz robot", 1, "key.pem"),
+    "an answer in a keystore": ("import good.tgz ks", 1, "with CAs"),
+    "an answer elsewhere": ("import good.tgz elsewhere", 1, "no key of enclave"),
+    "verify nothing": ("verify no", 1, "neither"),
+    "verify at no moment": ("verify robot --at noon", 2, "is no moment"),
+    "verify at ''": ("verify robot --at ''", 2, "is no moment"),
+    "verify in no domain": ("verify robot --domain x", 2, "not a domain id"),
+    "verify in ''": ("verify robot --domain ''", 2, "empty"),
+    "an unknown option": ("verify robot --quick", 2, "No such option"),
+}
+
+
+@pytest.mark.parametrize("case", MISUSE)
+def test_misuse_is_told_in_one_paragraph(case: str, keystore: Path, tmp_path: Path) -> None:
+    line, status, why = MISUSE[case]
+    request = asked(tmp_path)
+    shutil.copy(request, tmp_path / "r.pem")
+    sros("distribute_key", keystore, "/a", tmp_path / "export.tgz").ok()
+    shutil.copytree(keystore, tmp_path / "twin", symlinks=True)
+    sros("sign_request", tmp_path / "twin", request, "-o", tmp_path / "good.tgz").ok()
+    before = snapshot(tmp_path)
+    ended = sros(*(word.replace("''", "") for word in line.split()), cwd=tmp_path)
+    assert ended.status == status, ended
+    assert ended.out == ""
+    assert ended.err.count("\n") == 1
+    assert why in ended.err
+    assert "defect" not in ended.err
+    assert snapshot(tmp_path) == before
+
+
+# ── verify ─────────────────────────────────────────────────────────────────────────────────
+
+
+def test_verify_says_what_is_wrong_and_answers_by_its_status(
+    keystore: Path, tmp_path: Path
+) -> None:
+    sros("distribute_key", keystore, "/a", "/b", tmp_path / "out").ok()
+    out = tmp_path / "out"
+    assert sros("verify", out, "--domain", "0").ok().err == ""
+    (out / "enclaves/a/key.pem").chmod(0o644)
+    (out / "enclaves/b/cert.pem").unlink()
+    ended = sros("verify", out)
+    assert ended.status == 1
+    assert "/b  NOT LOADABLE\n  cert.pem: missing\n" in ended.out
+    assert "  key.pem: others have access to it (mode 0644): chmod 600\n" in ended.out
+    said = json.loads(sros("verify", out, "--json", "--at", "2026-12-24", "--domain", "7").out)
+    assert (said["ok"], said["kind"], said["domain"]) == (False, "keystore", 7)
+    assert said["at"] == "2026-12-24T00:00:00Z"
+    assert [each["name"] for each in said["enclaves"]] == ["/a", "/b"]
+    assert {"enclave", "file", "text"} == set(said["findings"][0])
+    assert sros("verify", out / "enclaves/a", "--at", "2099-01-01").status == 1

@@ -1,0 +1,134 @@
+"""What was sent to robots, asked of a DDS that enforces security."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from harness import policy_text, publish, snapshot
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.errors import SrosError
+from sros_tool.keystore import create_keystore, generate_artifacts
+from sros_tool.keystore.answer import import_answer
+from sros_tool.keystore.archive import pack, unpack
+from sros_tool.keystore.arrival import verify_arrival
+from sros_tool.keystore.request import create_request
+from sros_tool.keystore.signing import sign_request
+from sros_tool.keystore.template import load_template
+from sros_tool.policy import read_policy
+from sros_tool.runtime.environment import secured_environment
+
+pytestmark = pytest.mark.dds
+
+DOMAIN = 130
+CAMERA, VIEWER = "/arm/camera", "/arm/viewer"
+HEARS = '<topics subscribe="ALLOW"><topic>/image</topic></topics>'
+
+
+@pytest.fixture
+def home(tmp_path: Path) -> Path:
+    """A keystore in which the viewer exists, and the camera is only in the policy."""
+    now = datetime.now(UTC)
+    root = tmp_path / "ks"
+    domains = DomainSet.of((DOMAIN, DOMAIN))
+    create_keystore(root, template=load_template("production"), domains=domains, now=now)
+    (tmp_path / "p.xml").write_text(policy_text({CAMERA: publish("/image"), VIEWER: HEARS}))
+    (tmp_path / "viewer.xml").write_text(policy_text({VIEWER: HEARS}))
+    generate_artifacts(root, policies=[read_policy(tmp_path / "viewer.xml")], now=now)
+    return root
+
+
+def party(role: str, root: Path, enclave: str) -> dict[str, str]:
+    names = {"role": role, "name": role, "topic": "/image", "text": "Hello"}
+    return {**names, "keystore": str(root), "enclave": enclave}
+
+
+def converse(*parties: dict[str, str]) -> dict[str, Any]:
+    script = Path(__file__).with_name("converse.py")
+    done = subprocess.run(
+        [sys.executable, str(script), str(DOMAIN)],
+        input=json.dumps(parties),
+        capture_output=True,
+        text=True,
+        timeout=90,
+    )
+    assert done.returncode == 0, done.stderr
+    return {node["name"]: node for node in json.loads(done.stdout)["nodes"]}
+
+
+def assert_heard(said: dict[str, Any]) -> None:
+    assert said["talker"]["sent"] > 10, said
+    assert len(said["listener"]["heard"]) > 10, said
+
+
+def test_an_enclave_that_was_born_on_the_robot_talks_with_an_ordinary_one(
+    home: Path, tmp_path: Path
+) -> None:
+    now = datetime.now(UTC)
+    robot = tmp_path / "robot"
+    made = create_request(robot, CAMERA)
+    policy = read_policy(tmp_path / "p.xml")
+    request = made.file.read_bytes()
+    archive = sign_request(home, request, now=now, policy=policy).archive
+    assert (robot / "enclaves" / "arm" / "camera" / "key.pem").read_bytes() not in archive
+
+    files = unpack(archive)
+    path = "enclaves/arm/camera/permissions.p7s"
+    tampered = pack({**files, path: files[path].replace(b"rt/image", b"rt/spied")})
+    before = snapshot(robot)
+    with pytest.raises(SrosError, match="does not match its content"):
+        import_answer(robot, tampered, now=now)
+    assert snapshot(robot) == before
+    # What import refuses, DDS would refuse as well: the twin that unpacks it by hand stays mute.
+    twin = Path(shutil.copytree(robot, tmp_path / "twin"))
+    for name, data in unpack(tampered).items():
+        (twin / name).write_bytes(data)
+    parties = party("talker", twin, CAMERA), party("listener", home, VIEWER)
+    refused = converse(*parties)
+    assert refused["talker"]["sent"] == 0, refused
+    assert "ready" not in refused["talker"]["kinds"], refused
+    assert "ready" in refused["listener"]["kinds"], refused
+
+    import_answer(robot, archive, now=now)
+    assert not verify_arrival(robot, now=now, domain=DOMAIN).findings
+    assert_heard(converse(party("talker", robot, CAMERA), party("listener", home, VIEWER)))
+
+
+def test_a_set_that_went_through_a_pipe_talks_when_the_original_is_gone(
+    home: Path, tmp_path: Path
+) -> None:
+    now = datetime.now(UTC)
+    generate_artifacts(home, policies=[read_policy(tmp_path / "p.xml")], now=now)
+    (tmp_path / "robot").mkdir()
+    script = '"$0" -m sros_tool distribute_key ks --match "/arm/*" - | tar -xz -C robot'
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    subprocess.run(["sh", "-c", script, sys.executable], cwd=tmp_path, env=environment, check=True)
+    shutil.rmtree(home)
+    robot = tmp_path / "robot"
+    arrival = verify_arrival(robot, now=now, domain=DOMAIN)
+    assert not arrival.findings
+    assert [each.name for each in arrival.enclaves] == [CAMERA, VIEWER]
+    assert_heard(converse(party("talker", robot, CAMERA), party("listener", robot, VIEWER)))
+
+
+def test_what_run_starts_is_what_dds_loads(home: Path, tmp_path: Path) -> None:
+    robot = tmp_path / "robot"
+    made = create_request(robot, CAMERA)
+    archive = sign_request(home, made.file.read_bytes(), now=datetime.now(UTC)).archive
+    import_answer(robot, archive, now=datetime.now(UTC))
+    done = subprocess.run(
+        [sys.executable, "-m", "sros_tool", "run", str(robot), CAMERA, "--", "env"],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    expected = secured_environment(robot, CAMERA, DOMAIN)
+    assert {f"{name}={value}" for name, value in expected.items()} <= set(done.stdout.split("\n"))

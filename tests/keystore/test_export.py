@@ -1,0 +1,287 @@
+"""Exports of several enclaves, and what is said of them where they arrive."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from harness import policy_text, publish, snapshot
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.errors import DocumentError, KeystoreError, SrosError
+from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.archive import unpack
+from sros_tool.keystore.arrival import verify_arrival
+from sros_tool.keystore.export import Selection, distribute, pack_enclaves, select
+from sros_tool.keystore.renew import renew
+from sros_tool.keystore.request import create_request
+from sros_tool.keystore.revoke import revoke
+from sros_tool.keystore.signing import sign_request
+from sros_tool.keystore.template import load_template
+from sros_tool.policy import read_policy
+
+NOW = datetime.now(UTC)
+NAMES = ("/arm/camera", "/arm/gripper", "/armada", "/base")
+BORN = "/arm/eye"
+
+
+@pytest.fixture(scope="session")
+def made_fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A keystore with four enclaves, and one whose key is on its robot."""
+    folder = tmp_path_factory.mktemp("fleet")
+    domains = DomainSet.of((5, 6))
+    template = load_template("production")
+    create_keystore(folder / "ks", template=template, domains=domains, now=NOW)
+    create_enclaves(folder / "ks", NAMES, now=NOW)
+    made = create_request(folder / "robot", BORN)
+    sign_request(folder / "ks", made.file.read_bytes(), now=NOW)
+    return folder / "ks"
+
+
+@pytest.fixture
+def fleet(made_fleet: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made_fleet, tmp_path / "ks", symlinks=True))
+
+
+@pytest.fixture
+def arrived(made_fleet: Path, tmp_path: Path) -> Path:
+    distribute(made_fleet, ["/arm/camera", "/base"], tmp_path / "robot", now=NOW)
+    return tmp_path / "robot"
+
+
+# ── what is chosen ─────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    ("names", "patterns", "every", "chosen", "left_out"),
+    [
+        (["/base"], [], False, ["/base"], []),
+        (["/base", "/base"], [], False, ["/base"], []),
+        ([], ["/arm/*"], False, ["/arm/camera", "/arm/gripper"], [BORN]),
+        ([], ["/arm*"], False, ["/arm/camera", "/arm/gripper", "/armada"], [BORN]),
+        (["/base"], ["/arm/c*", "/arm/*"], False, ["/base", "/arm/camera", "/arm/gripper"], [BORN]),
+        ([], [], True, list(NAMES), [BORN]),
+        ([], ["*"], False, list(NAMES), [BORN]),
+        ([BORN], [], False, [BORN], []),
+    ],
+)
+def test_selection(
+    names: list[str],
+    patterns: list[str],
+    every: bool,
+    chosen: list[str],
+    left_out: list[str],
+    made_fleet: Path,
+) -> None:
+    found = select(made_fleet, names, patterns, every=every)
+    assert found == Selection(tuple(chosen), tuple(left_out))
+
+
+@pytest.mark.parametrize(
+    ("patterns", "why"),
+    [(["/leg/*"], "fits '/leg/*'"), ([BORN], "not in keystore"), ([""], "fits")],
+)
+def test_a_selection_of_nothing_is_refused(patterns: list[str], why: str, made_fleet: Path) -> None:
+    with pytest.raises(KeystoreError) as caught:
+        select(made_fleet, [], patterns)
+    assert why in str(caught.value)
+
+
+def test_several_enclaves_go_whole_or_not_at_all(fleet: Path, tmp_path: Path) -> None:
+    before = snapshot(tmp_path)
+    for wrong, why in ((BORN, "made on its robot"), ("/none", "does not exist")):
+        for target in ("out", "out.tar.gz"):
+            with pytest.raises(KeystoreError, match=why):
+                distribute(fleet, ["/base", wrong], tmp_path / target, now=NOW)
+    (fleet / "enclaves/base/permissions.p7s").unlink()
+    with pytest.raises(KeystoreError, match="would not run"):
+        distribute(fleet, ["/arm/camera", "/base"], tmp_path / "out", now=NOW)
+    assert set(snapshot(tmp_path)) == set(before) - {"ks/enclaves/base/permissions.p7s"}
+
+
+def test_folder_archive_and_pipe_hold_the_same(fleet: Path, tmp_path: Path) -> None:
+    names = ["/base", "/arm/camera"]
+    distribute(fleet, names, tmp_path / "out", now=NOW)
+    distribute(fleet, names, tmp_path / "out.tgz", now=NOW)
+    packed = pack_enclaves(fleet, names[::-1], now=NOW)
+    assert packed.data == (tmp_path / "out.tgz").read_bytes()
+    files = unpack(packed.data)
+    assert tuple(files) == packed.paths
+    assert files == {
+        str(path.relative_to(tmp_path / "out")): path.read_bytes()
+        for path in (tmp_path / "out").rglob("*")
+        if path.is_file()
+    }
+
+
+def test_a_lost_key_is_not_taken_for_one_on_a_robot(fleet: Path, tmp_path: Path) -> None:
+    (fleet / "enclaves/base/key.pem").unlink()
+    with pytest.raises(KeystoreError, match=r"key\.pem: missing"):
+        distribute(fleet, ["/base"], tmp_path / "out", now=NOW)
+
+
+# ── what is said on the other side ─────────────────────────────────────────────────────────
+
+
+def test_what_arrived_as_it_was_sent_is_fine(arrived: Path) -> None:
+    arrival = verify_arrival(arrived, now=NOW, domain=5)
+    assert not arrival.findings
+    assert [(each.name, each.loadable, each.domains) for each in arrival.enclaves] == [
+        ("/arm/camera", True, "5-6"),
+        ("/base", True, "5-6"),
+    ]
+    until = arrival.enclaves[0].until
+    assert until
+    assert until - NOW > timedelta(days=179)
+    one = verify_arrival(arrived / "enclaves/arm/camera", now=NOW)
+    assert (one.kind, [each.name for each in one.enclaves]) == ("enclave", ["/arm/camera"])
+    assert not one.findings
+    assert arrival.describe()["ok"] is True
+
+
+def _mix_up(robot: Path) -> None:
+    enclaves = robot / "enclaves"
+    (enclaves / "base").rename(enclaves / "spare")
+
+
+def _other_ca(robot: Path) -> None:
+    root = robot.parent / "other"
+    create_keystore(root, template=load_template("production"), now=NOW)
+    create_enclaves(root, ["/zebra"], now=NOW)
+    distribute(root, ["/zebra"], robot.parent / "more", now=NOW)
+    shutil.copytree(robot.parent / "more/enclaves/zebra", robot / "enclaves/zebra")
+
+
+def _edit(path: Path, old: bytes, new: bytes) -> None:
+    data = path.read_bytes()
+    assert old in data
+    path.write_bytes(data.replace(old, new))
+
+
+FINDINGS: dict[str, tuple[Callable[[Path], object], str, str, str]] = {
+    "a file is missing": (
+        lambda robot: (robot / "enclaves/base/permissions.p7s").unlink(),
+        *("/base", "permissions.p7s", "missing"),
+    ),
+    "another key": (
+        lambda robot: shutil.copy(
+            robot / "enclaves/arm/camera/key.pem", robot / "enclaves/base/key.pem"
+        ),
+        *("/base", "key.pem", "not the key of cert.pem"),
+    ),
+    "tampered permissions": (
+        lambda robot: _edit(robot / "enclaves/base/permissions.p7s", b"rt/rosout", b"rt/rosin"),
+        *("/base", "permissions.p7s", "does not match"),
+    ),
+    "a key that others read": (
+        lambda robot: (robot / "enclaves/base/key.pem").chmod(0o644),
+        *("/base", "key.pem", "0644"),
+    ),
+    "a key that the group reads": (
+        lambda robot: (robot / "enclaves/base/key.pem").chmod(0o640),
+        *("/base", "key.pem", "0640"),
+    ),
+    "a folder that all can change": (
+        lambda robot: (robot / "enclaves/base").chmod(0o777),
+        *("", "enclaves/base", "everybody can change it"),
+    ),
+    "another name": (_mix_up, "/spare", "cert.pem", "not of this enclave"),
+    "another CA": (_other_ca, "/zebra", "identity_ca.cert.pem", "another CA than that of"),
+    "a link that leads out": (
+        lambda robot: (robot / "enclaves/base/notes").symlink_to("/etc/hostname"),
+        *("", "enclaves/base/notes", "leads out"),
+    ),
+    "a folder that is elsewhere": (
+        lambda robot: (robot / "enclaves/more").symlink_to("/etc"),
+        *("", "enclaves/more", "leads out"),
+    ),
+    "a key too many": (
+        lambda robot: shutil.copy(robot / "enclaves/base/key.pem", robot / "enclaves/ca.key.pem"),
+        *("", "enclaves/ca.key.pem", "private key"),
+    ),
+    "an answer that is not here yet": (
+        lambda robot: create_request(robot, "/late"),
+        *("/late", "request.pem", "waits for the answer"),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FINDINGS)
+def test_findings(case: str, arrived: Path) -> None:
+    spoil, enclave, file, text = FINDINGS[case]
+    spoil(arrived)
+    arrival = verify_arrival(arrived, now=NOW)
+    assert arrival.describe()["ok"] is False
+    found = [each for each in arrival.findings if (each.enclave, each.file) == (enclave, file)]
+    assert any(text in each.text for each in found), arrival.findings
+    others = {each.enclave for each in arrival.findings} - {enclave, ""}
+    assert not others, arrival.findings
+    good = next(each for each in arrival.enclaves if each.name == "/arm/camera")
+    assert good.loadable
+
+
+@pytest.mark.parametrize(
+    ("days", "text"), [(-2, "not valid before"), (190, "expired"), (1900, "expired")]
+)
+def test_another_moment(days: int, text: str, arrived: Path) -> None:
+    arrival = verify_arrival(arrived, now=NOW + timedelta(days=days))
+    assert any(text in each.text for each in arrival.findings)
+    assert not any(each.loadable for each in arrival.enclaves)
+
+
+def test_another_domain(arrived: Path) -> None:
+    findings = verify_arrival(arrived, now=NOW, domain=7).findings
+    assert any("for domain 5-6, not for 7" in each.text for each in findings)
+
+
+def test_a_copy_of_the_whole_keystore_has_ca_keys(fleet: Path) -> None:
+    findings = verify_arrival(fleet, now=NOW).findings
+    assert {each.file for each in findings if not each.enclave} == {
+        "private/identity_ca.key.pem",
+        "private/permissions_ca.key.pem",
+    }
+    # The links of an enclave lead out of its folder, but not out of the keystore.
+    assert not verify_arrival(fleet / "enclaves/base", now=NOW).findings
+
+
+def test_a_revoked_enclave_that_arrived_is_told(fleet: Path, tmp_path: Path) -> None:
+    distribute(fleet, ["/base", "/armada"], tmp_path / "robot", now=NOW)
+    revoke(fleet, ["/base"], now=NOW)
+    distribute(fleet, ["/armada"], tmp_path / "robot", now=NOW)
+    crl = tmp_path / "robot/enclaves/armada/crl.pem"
+    assert not verify_arrival(tmp_path / "robot", now=NOW).findings
+    shutil.copy(crl, tmp_path / "robot/enclaves/base")
+    (finding,) = verify_arrival(tmp_path / "robot", now=NOW).findings
+    assert "revoked" in finding.text
+
+
+@pytest.mark.parametrize("path", ["none", "empty", "ks/enclaves", "ks/sros.toml", "loose"])
+def test_what_is_neither_keystore_nor_enclave(path: str, fleet: Path, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    shutil.copytree(fleet / "enclaves/base", tmp_path / "loose")
+    with pytest.raises(DocumentError):
+        verify_arrival(tmp_path / path, now=NOW)
+
+
+def test_verifying_changes_nothing(arrived: Path) -> None:
+    (arrived / ".sros-transaction/new").mkdir(parents=True)
+    before = snapshot(arrived)
+    (finding,) = verify_arrival(arrived, now=NOW).findings
+    assert "interrupted" in finding.text
+    assert snapshot(arrived) == before
+
+
+def test_an_update_replaces_what_was_sent_before(fleet: Path, tmp_path: Path) -> None:
+    distribute(fleet, ["/base"], tmp_path / "robot", now=NOW)
+    (tmp_path / "p.xml").write_text(policy_text({"/base": publish("new")}))
+    generate_artifacts(fleet, policies=[read_policy(tmp_path / "p.xml")], now=NOW)
+    renew(fleet, ["/base"], now=NOW)
+    with pytest.raises(SrosError, match="another version"):
+        distribute(fleet, ["/base", "/armada"], tmp_path / "robot", now=NOW)
+    distribute(fleet, ["/base", "/armada"], tmp_path / "robot", now=NOW, force=True)
+    assert not verify_arrival(tmp_path / "robot", now=NOW).findings
+    assert not [path for path in os.listdir(tmp_path / "robot") if path.startswith(".")]
