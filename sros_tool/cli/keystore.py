@@ -207,8 +207,8 @@ def _say_what_is_open(template: Template) -> None:
         )
     if not template.separate_authorities:
         click.echo(
-            "still open: with one CA for both jobs, Cyclone DDS 0.10 lets an enclave sign its own "
-            "permissions; `--ca-layout separate` closes it.",
+            "still open: with one CA for both jobs, Cyclone DDS 0.10.2 and Fast DDS 2.9.1 let an "
+            "enclave sign its own permissions; `--ca-layout separate` closes it.",
             err=True,
         )
 

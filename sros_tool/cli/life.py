@@ -189,30 +189,42 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
     "check",
     epilog="""\b
 Example:
-  $ sros check keystore keystore --needs-renewal 66%
-  /talker  permissions until 2027-05-20T05:59:44Z
+  $ sros check keystore keystore
+  [keystore.one-authority] One CA issues identities and signs permissions. ...
   $ sros check keystore keystore --needs-renewal 30d || sros renew keystore --all-expiring 30d""",
 )
 @click.argument("what", type=click.Choice(["keystore"]))
 @click.argument("root", type=PATH, required=False)
 @click.option(
     "--needs-renewal",
-    default="66%",
-    show_default=True,
     metavar="DURATION|PERCENT",
-    help="What ends within 30d, or of whose life 66% is over.",
+    help="List only what ends within 30d, or of whose life 66% is over.",
 )
 @json_option
-def check(what: str, root: Path | None, needs_renewal: str, as_json: bool) -> int:
-    """List the enclaves of a keystore that need to be renewed.
+def check(what: str, root: Path | None, needs_renewal: str | None, as_json: bool) -> int:
+    """List what is wrong or weak in a keystore, or which enclaves need to be renewed.
 
-    The exit status is 0 if there are none, and 1 if there are.
+    The exit status is 0 if there is nothing, and 1 if there is.
     """
+    root = root or keystore_from_environment()
+    if needs_renewal is not None:
+        return _needs_renewal(root, needs_renewal, as_json)
+    from sros_tool.keystore.findings import keystore_findings
+
+    found = keystore_findings(root, now())
+    if as_json:
+        print_json([{"id": each.id, "text": each.text} for each in found])
+    else:
+        for each in found:
+            click.echo(f"[{each.id}] {each.text}")
+    return 1 if found else 0
+
+
+def _needs_renewal(root: Path, text: str, as_json: bool) -> int:
     from sros_tool.keystore.renew import describe_lifetime, lifetimes, parse_threshold
     from sros_tool.validity import iso
 
-    root = root or keystore_from_environment()
-    threshold, moment = parse_threshold(needs_renewal), now()
+    threshold, moment = parse_threshold(text), now()
     due = [each for each in lifetimes(root) if each.due(threshold, moment)]
     if as_json:
         print_json(

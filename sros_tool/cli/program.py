@@ -34,7 +34,7 @@ FAMILIES: dict[str, dict[str, Verb]] = {
         "revoke": Verb("life", "Revoke enclaves."),
         "rotate_ca": Verb("rotate", "Replace the CAs, stage by stage."),
         "crl": Verb("life", "Show the revocation list, or sign it anew."),
-        "check": Verb("life", "Say which enclaves need to be renewed."),
+        "check": Verb("life", "Say what is weak in a keystore, and what needs to be renewed."),
     },
     "Deployment": {
         "distribute_key": Verb(

@@ -102,8 +102,8 @@ class SignedDocument:
     def verify(self, authority: x509.Certificate) -> None:
         """Check that ``authority`` itself signed this document; else raise `PkiError`.
 
-        Stricter than Cyclone DDS 0.10, which accepts any signer whose chain ends at the
-        authority (the CVE-2023-24011 class), and just what Fast DDS asks for.
+        Stricter than Cyclone DDS 0.10.2 and Fast DDS 2.9.1, which accept any signer whose chain
+        ends at the authority (the CVE-2023-24011 class; both ran).
         """
         signer = self.signer()
         if signer is None or signer != authority:
