@@ -33,9 +33,10 @@ Example:
   $ sros distribute_key keystore /talker talker.tar.gz
   exported enclave /talker to 'talker.tar.gz'
   $ tar -xzf talker.tar.gz -C /etc/robot/keystore      # on the robot
-  $ sros distribute_key keystore --match '/arm/*' - | ssh robot tar -xz -C /etc/robot
-  exported enclave /arm/camera to standard output
-  exported enclave /arm/gripper to standard output""",
+  $ sros distribute_key keystore --match '/arm/*' - | ssh robot tar -xz -C robot
+  exported enclave /arm/gripper to standard output
+  exported enclave /arm/wrist to standard output
+  left out enclave /arm/camera: its key was made on its robot""",
 )
 @click.argument(
     "words",
@@ -132,12 +133,13 @@ def refuse_terminal() -> None:
     "verify",
     epilog="""\b
 Example:
-  $ sros verify /etc/robot
-  /arm/camera  loadable in domain 0 until 2027-05-20T07:30:11Z
-  /arm/gripper  NOT LOADABLE
+  $ sros verify robot
+  /arm/camera  loadable in domain 0 until 2027-05-20T07:45:12Z
+  /arm/gripper  loadable in domain 0 until 2027-05-20T07:45:12Z
+  /arm/wrist  NOT LOADABLE
     permissions.p7s: missing
     key.pem: others have access to it (mode 0644): chmod 600
-  $ sros verify /etc/robot --at 2027-06-01 || echo "renew before June" """,
+  $ sros verify robot --at 2027-06-01 || echo 'renew before June'""",
 )
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
 @click.option("--domain", metavar="ID", help="Ask also whether it may join this ROS domain.")

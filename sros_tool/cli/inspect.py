@@ -118,6 +118,8 @@ def _keystore(d: dict[str, Any]) -> Iterator[str]:
     for enclave in d["enclaves"]:
         until = enclave["valid_until"]
         state = "loadable" if enclave["loadable"] else "NOT LOADABLE"
+        if enclave["key_on_robot"] and not enclave["problems"]:
+            state = "key on its robot"
         yield f"    {enclave['name']}  {state}, certificate until {until or 'unknown'}"
         for problem in enclave["problems"]:
             yield f"      {problem}"

@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     "create_request",
     epilog="""\b
 Example:
-  $ sros create_request /arm/camera /etc/robot
-  made the key of enclave /arm/camera, which stays in '/etc/robot'
-    its SHA-256 is 5b1f0e0c44bd7f1f2f0c6c0ad57a9c1c6f9b4d4d9e4a5ea1a3b7f7c1d8f3a900
-    have '/etc/robot/enclaves/arm/camera/request.pem' signed: sros sign_request
-  $ ssh robot cat /etc/robot/enclaves/arm/camera/request.pem |
-      sros sign_request keystore - -o - | ssh robot sros import - /etc/robot    # at home""",
+  $ sros create_request /arm/camera robot
+  made the key of enclave /arm/camera, which stays in 'robot'
+    its SHA-256 is 6f5bbd292e91c5d0fbf579aa0d036ac044cdd9788c6efdbc730a4b3a2a2809da
+    have 'robot/enclaves/arm/camera/request.pem' signed: sros sign_request
+  $ ssh robot cat robot/enclaves/arm/camera/request.pem |          # all the rest, from home
+      sros sign_request keystore - | ssh robot sros import - robot""",
 )
 @click.argument("name")
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
@@ -67,8 +67,10 @@ def create_request(name: str, folder: Path | None, again: bool, dry_run: bool) -
     epilog="""\b
 Example:
   $ sros sign_request keystore request.pem -p camera.xml
-  signed the request of enclave /arm/camera for the key 5b1f0e0c...
-  send 'request.answer.tar.gz' to the robot: sros import request.answer.tar.gz DIR""",
+  signed the request of enclave /arm/camera for the key 6f5bbd292e91c5d0fbf579aa0d036ac044cdd978...
+    the robot will trust CN=sros identity CA 4f122aed, SHA-256 5fe417aaed47cccd3f4a6b3e8e94db18...
+    send 'request.answer.tar.gz' to the robot: sros import request.answer.tar.gz DIR
+  $ sros sign_request keystore keystore/enclaves/arm/camera/request.pem --renew -o camera.tgz""",
 )
 @click.argument("words", metavar="[ROOT] REQUEST", nargs=-1, required=True)
 @click.option(
@@ -82,7 +84,7 @@ Example:
     "--output",
     type=PATH,
     metavar="ANSWER",
-    help="Where to write the answer; - is standard output. [default: beside REQUEST]",
+    help="Where to write the answer; - is standard output. [default: request.answer.tar.gz]",
 )
 @click.option(
     "--renew", is_flag=True, help="Answer for an enclave that exists; it keeps its rights."
@@ -112,7 +114,7 @@ def sign_request(
         raise UsageError("sign_request takes a keystore and one request")
     request = PATH.convert(rest[0], None, None)
     if output is None:
-        output = STREAM if request == STREAM else request.with_suffix(".answer.tar.gz")
+        output = STREAM if request == STREAM else Path(request.name).with_suffix(".answer.tar.gz")
     stream = output == STREAM
     if stream and not dry_run:
         refuse_terminal()
@@ -147,10 +149,11 @@ def sign_request(
     "import",
     epilog="""\b
 Example:
-  $ sros import request.answer.tar.gz /etc/robot
-  imported enclave /arm/camera, which can run until 2027-05-20T07:30:11Z
-    it trusts CN=sros identity CA 5f0c3a1e, SHA-256 1f8d...
-  $ sros run /etc/robot /arm/camera -- ros2 run camera driver""",
+  $ sros import request.answer.tar.gz robot
+  imported enclave /arm/camera, which can run until 2027-05-20T07:45:12Z
+    it trusts CN=sros identity CA 4f122aed, SHA-256 5fe417aaed47cccd3f4a6b3e8e94db185bfc8e10...
+    compare that with what sign_request said: nothing else vouches for it
+  $ sros run robot /arm/camera -- ros2 run camera driver""",
 )
 @click.argument("answer", type=PATH)
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)

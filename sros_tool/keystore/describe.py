@@ -17,6 +17,7 @@ from sros_tool.keystore.enclave import enclave_path
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     PERMISSIONS,
+    REQUEST,
     ROLES,
     SETTINGS,
     ca_certificate,
@@ -104,10 +105,7 @@ def _keystore(root: Path, now: datetime) -> Description:
             }
         except SrosError as error:
             authorities[role] = {"error": str(error)}
-    enclaves = [
-        {"name": name, **describe_enclave(check_enclave(enclave_path(root, name), now=now))}
-        for name in enclave_names(root)
-    ]
+    enclaves = [_enclave_of(root, name, now) for name in enclave_names(root)]
     governance = None
     if (root / GOVERNANCE_P7S).exists():
         try:
@@ -127,6 +125,16 @@ def _keystore(root: Path, now: datetime) -> Description:
         "enclaves": enclaves,
         "problems": problems,
     }
+
+
+def _enclave_of(root: Path, name: str, now: datetime) -> Description:
+    """An enclave of a keystore; that its key was made on its robot, where it stays, is no fault."""
+    folder = enclave_path(root, name)
+    described = describe_enclave(check_enclave(folder, now=now))
+    elsewhere = (folder / REQUEST).exists() and not (folder / "key.pem").exists()
+    if elsewhere and (folder / "cert.pem").exists():
+        described["problems"] = [p for p in described["problems"] if p != "key.pem: missing"]
+    return {"name": name, "key_on_robot": elsewhere, **described}
 
 
 def describe_enclave(state: EnclaveState) -> Description:

@@ -35,6 +35,8 @@ class Status(StrEnum):
     """It is no longer in the keystore, but would still be accepted: replaced is not revoked."""
     REVOKED = "revoked"
     EXPIRED = "expired"
+    SENT = "sent"
+    """It went to a robot; the keystore keeps no copy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +64,8 @@ def history(root: Path, *, now: datetime) -> History:
     entries = read_ledger(root)
 
     def status(entry: Entry) -> Status:
+        if entry.what == "answer":
+            return Status.SENT
         if entry.what == "revocation" or entry.serial in revoked or entry.sha256 in put_away:
             return Status.REVOKED
         if entry.not_after and entry.not_after < iso(now):

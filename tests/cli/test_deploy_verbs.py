@@ -152,6 +152,7 @@ def test_from_the_request_to_a_process_that_runs(keystore: Path, tmp_path: Path)
     sros("verify", tmp_path / "robot").ok()
     assert NAME in sros("list_enclaves", keystore).ok().out
     assert sros("inspect", keystore, "--history").ok().out.count(NAME) == 3
+    assert f"{NAME}  key on its robot, certificate until" in sros("inspect", keystore).ok().out
     ended = sros("distribute_key", keystore, NAME, tmp_path / "out")
     assert ended.status == 1
     assert "It was made on its robot and stays there" in ended.err
@@ -280,3 +281,38 @@ def test_verify_says_what_is_wrong_and_answers_by_its_status(
     assert [each["name"] for each in said["enclaves"]] == ["/a", "/b"]
     assert {"enclave", "file", "text"} == set(said["findings"][0])
     assert sros("verify", out / "enclaves/a", "--at", "2099-01-01").status == 1
+
+
+# ── with what else happens to a keystore ───────────────────────────────────────────────────
+
+
+def test_a_robot_follows_a_rotation_of_the_cas_by_answers(keystore: Path, tmp_path: Path) -> None:
+    line = f"cat {asked(tmp_path)} | sros sign_request ks --renew - | sros import - robot"
+    assert shell(line.replace("--renew ", ""), tmp_path).returncode == 0
+    for _stage in ("distribute", "reissue", "retire"):
+        sros("rotate_ca", keystore, "--next").ok()
+        ended = shell(line, tmp_path)
+        assert ended.returncode == 0, ended
+        assert "nothing else vouches" not in ended.stdout
+        sros("verify", tmp_path / "robot").ok()
+    # One that missed the stages knows nobody who could vouch for the new CAs.
+    sros("rotate_ca", keystore, "--finish").ok()
+    ended = shell(line, tmp_path)
+    assert "has not signed it" in ended.stderr
+    assert shell(line.replace("import", "import --force"), tmp_path).returncode == 0
+    sros("verify", tmp_path / "robot").ok()
+
+
+def test_a_revoked_enclave_asks_again_with_a_new_key(keystore: Path, tmp_path: Path) -> None:
+    request = asked(tmp_path)
+    sros("sign_request", keystore, request, cwd=tmp_path).ok()
+    sros("revoke", keystore, NAME).ok()
+    assert NAME not in sros("list_enclaves", keystore).ok().out
+    ended = sros("sign_request", keystore, request, "-o", tmp_path / "again.tgz")
+    assert "was revoked" in ended.err
+    sros("create_request", NAME, tmp_path / "new").ok()
+    new = tmp_path / "new" / FOLDER / "request.pem"
+    sros("sign_request", keystore, new, "-o", tmp_path / "new.tgz").ok()
+    sros("import", tmp_path / "new.tgz", tmp_path / "new").ok()
+    assert (tmp_path / "new" / FOLDER / "crl.pem").exists()
+    sros("verify", tmp_path / "new").ok()
