@@ -8,7 +8,13 @@ from pathlib import Path
 from sros_tool.keystore.authority import load_ca_certificate
 from sros_tool.keystore.create import list_enclaves
 from sros_tool.keystore.enclave import enclave_path
-from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, PRIVATE, ca_certificate
+from sros_tool.keystore.layout import (
+    IDENTITY,
+    PERMISSIONS,
+    PRIVATE,
+    REQUEST,
+    ca_certificate,
+)
 from sros_tool.keystore.revoke import read_crl
 from sros_tool.keystore.verify import check_enclave
 from sros_tool.notes import Note
@@ -21,8 +27,13 @@ def keystore_findings(root: Path, now: datetime) -> tuple[Note, ...]:
     """What is wrong or weak in a keystore; `KeystoreError` if it is none."""
     found = []
     for name in list_enclaves(root):
-        problems = check_enclave(enclave_path(root, name), now=now).problems
-        found += [Note("enclave.not-loadable", f"{name}: {problem}") for problem in problems]
+        folder = enclave_path(root, name)
+        born_elsewhere = (folder / REQUEST).exists() and not (folder / "key.pem").exists()
+        found += [
+            Note("enclave.not-loadable", f"{name}: {problem}")
+            for problem in check_enclave(folder, now=now).problems
+            if not (born_elsewhere and problem.file == "key.pem")
+        ]
     authorities = [
         load_ca_certificate(root, role)
         for role in (IDENTITY, PERMISSIONS)

@@ -47,3 +47,14 @@ def test_a_revocation_list_that_ends(tmp_path: Path) -> None:
     sros("revoke", root, "/b").ok()
     assert ids(root) == []
     assert "keystore.revocation-list-ends" in ids(root, NOW + timedelta(days=3649))
+
+
+def test_a_key_on_its_robot_is_no_fault(tmp_path: Path) -> None:
+    root, robot = tmp_path / "ks", tmp_path / "robot"
+    sros("create_keystore", root).ok()
+    sros("create_request", "/arm", robot).ok()
+    answer = tmp_path / "answer.tar.gz"
+    sros("sign_request", root, robot / "enclaves/arm/request.pem", "-o", answer).ok()
+    assert ids(root) == []
+    (root / "enclaves/arm/cert.pem").write_text("nonsense")
+    assert set(ids(root)) == {"enclave.not-loadable"}
