@@ -9,7 +9,6 @@ import signal
 import stat
 import subprocess
 import sys
-import tarfile
 import time
 from pathlib import Path
 
@@ -294,8 +293,10 @@ def test_exports_repeat_byte_by_byte(keystore: Path, tmp_path: Path) -> None:
     assert not [path for path, (mode, _) in exported.items() if stat.S_ISLNK(mode)]
     assert not [path for path in exported if PRIVATE in path or "/b" in path]
     shutil.rmtree(keystore)
-    with tarfile.open(tmp_path / "1.tar.gz") as archive:
-        archive.extractall(tmp_path / "robot", filter="data")
+    (tmp_path / "robot").mkdir()
+    subprocess.run(  # as on a robot; Python's own way differs between its minor versions
+        ["tar", "-xzf", tmp_path / "1.tar.gz", "-C", tmp_path / "robot"], check=True
+    )
     assert snapshot(tmp_path / "robot").keys() == exported.keys()
     for place in ("robot", "1"):
         sros("env", tmp_path / place, "/a").ok()
