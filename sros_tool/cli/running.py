@@ -56,7 +56,7 @@ def env(words: tuple[str, ...], form: str, as_json: bool, domain: str | None) ->
     root, rest = split_root(words)
     if len(rest) != 1:
         raise UsageError("env takes a keystore and one enclave")
-    variables = _variables(root, rest[0], domain)
+    variables = loadable_environment(root, rest[0], domain)
     click.echo(render_environment(variables, "json" if as_json else form), nl=False)
 
 
@@ -102,7 +102,7 @@ def run(ctx: click.Context, words: tuple[str, ...], domain: str | None) -> None:
     name, command = rest[0] if rest else "", [*rest[1:], *ctx.meta[_COMMAND]]
     if not command:
         raise UsageError("no command is given", "", "Write `sros run ROOT NAME -- COMMAND...`.")
-    variables = _variables(root, name, domain)
+    variables = loadable_environment(root, name, domain)
     program = shutil.which(command[0])
     if program is None:
         raise UsageError(f"the command '{command[0]}' is not found")
@@ -113,7 +113,11 @@ def run(ctx: click.Context, words: tuple[str, ...], domain: str | None) -> None:
     os.execve(program, command, {**os.environ, **variables})
 
 
-def _variables(root: Path, name: str, domain_text: str | None) -> dict[str, str]:
+def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict[str, str]:
+    """The variables of an enclave, once it is checked that a process can run in it.
+
+    ``domain_text`` is an option's value; without it $ROS_DOMAIN_ID counts.
+    """
     from sros_tool.keystore.create import list_enclaves
     from sros_tool.keystore.enclave import enclave_path
     from sros_tool.keystore.verify import check_enclave
