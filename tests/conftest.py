@@ -10,7 +10,18 @@ from pathlib import Path
 import pytest
 from harness import policy_text, publish, sros
 
+STARTED_ONCE = ("learned", "shown")
+"""Fixtures that start many processes for many tests, which therefore share a worker."""
+
 POLICY = policy_text({"/a": publish("old_a"), "/b": publish("old_b")})
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep on one worker what shares an expensive fixture."""
+    for item in items:
+        for name in STARTED_ONCE:
+            if name in getattr(item, "fixturenames", ()):
+                item.add_marker(pytest.mark.xdist_group(f"{item.path.stem}.{name}"))
 
 
 @pytest.fixture(autouse=True)

@@ -260,3 +260,44 @@ def test_counts_come_from_the_reports_of_pytest(tmp_path: Path) -> None:
     )
     assert checks.count(report) == {"passed": 4, "failed": 3, "skipped": 3}
     assert checks.count(tmp_path / "none.xml") == {}
+
+
+def test_one_package_that_fails_does_not_keep_the_others_away(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    run: list[list[str]] = []
+
+    def succeeds(command: list[str], **_: Any) -> bool:
+        run.append(command)
+        return "broken" not in command
+
+    monkeypatch.setattr(apt, "root_prefix", list)
+    monkeypatch.setattr(apt, "available", lambda: True)
+    monkeypatch.setattr(apt, "find", lambda name: None if name == "unknown" else name)
+    monkeypatch.setattr(apt, "succeeds", succeeds)
+    assert apt.install_all(["good", "broken", "unknown"]) == ["broken", "unknown"]
+    assert [each[-1] for each in run] == ["update", "broken", "good", "broken"]
+    run.clear()
+    assert apt.install_all(["good", "other"]) == []
+    assert [each[-2:] for each in run[1:]] == [["good", "other"]]
+
+
+def test_nothing_is_installed_that_is_there(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked: list[list[str]] = []
+
+    def fail(names: list[str], _lock: int | None) -> list[str]:
+        asked.append(names)
+        return names
+
+    monkeypatch.setattr(apt, "install_all", fail)
+    there = ("openssl", "OpenSSL", lambda: True)
+    absent = ("chromium", "a browser", lambda: False)
+    monkeypatch.setattr(apt, "FOR_TESTS", (there,))
+    apt.provide_for_tests()
+    assert (asked, capsys.readouterr().err) == ([], "")
+    monkeypatch.setattr(apt, "FOR_TESTS", (there, absent))
+    apt.provide_for_tests()
+    assert asked == [["chromium"]]
+    assert "a browser (chromium) cannot be installed" in capsys.readouterr().err

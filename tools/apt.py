@@ -24,27 +24,56 @@ def install(pattern: str, lock: int | None = None) -> bool:
     The package lists are brought up to date first.  False where nobody is root, where no such
     package exists, or where apt fails; the log has its words.
     """
+    return install_all([pattern], lock) == []
+
+
+def install_all(patterns: Sequence[str], lock: int | None = None) -> list[str]:
+    """As `install`, of several packages at once; return the patterns that could not be had."""
     prefix = root_prefix()
     if prefix is None or not available():
-        return False
+        return list(patterns)
     apt_get = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", *_PATIENT]
     # One unreachable third-party source makes `update` fail while the rest is fine: go on.
     succeeds([*apt_get, "update"], keep_open=lock)
-    name = find(pattern)
-    if name is None:
-        return False
-    say(f"installing {name} through apt")
-    return succeeds([*apt_get, "install", "-y", "--no-install-recommends", name], keep_open=lock)
+    names = {pattern: find(pattern) for pattern in patterns}
+    found = [name for name in names.values() if name]
+    if found:
+        say(f"installing {', '.join(found)} through apt")
+        command = [*apt_get, "install", "-y", "--no-install-recommends"]
+        if not succeeds([*command, *found], keep_open=lock):
+            # One of them may be broken while the others are fine.
+            lost = {name for name in found if not succeeds([*command, name], keep_open=lock)}
+            return [each for each, name in names.items() if name is None or name in lost]
+    return [pattern for pattern, name in names.items() if name is None]
+
+
+def _command(*names: str) -> Callable[[], bool]:
+    return lambda: any(shutil.which(name) for name in names)
+
+
+FOR_TESTS: tuple[tuple[str, str, Callable[[], bool]], ...] = (
+    ("openssl", "OpenSSL", _command("openssl")),
+    ("softhsm2", "a PKCS#11 token in software", _command("softhsm2-util")),
+    (r"g\+\+", "a C++ compiler, for the programs that ask Fast DDS", _command("g++")),
+    (
+        "libfastrtps-dev",
+        "Fast DDS for C++, as a second vendor",
+        Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp").exists,
+    ),
+    ("chromium", "a browser for the pages", _command("chromium")),
+)
+"""What the tests hold sros against: the package, what it is, and how to see that it is there."""
 
 
 def provide_for_tests(lock: int | None = None) -> None:
-    """Make sure of what the tests hold sros against: OpenSSL, and a token in software."""
-    for command, package in (("openssl", "openssl"), ("softhsm2-util", "softhsm2")):
-        if shutil.which(command):
-            continue
-        say(f"no {command} command on this machine, which some tests compare with")
-        if not install(package, lock):
-            say(f"{package} cannot be installed; going on without")
+    """Make sure of `FOR_TESTS`; whatever cannot be had, its tests are skipped and say so."""
+    missing = {package: what for package, what, there in FOR_TESTS if not there()}
+    if not missing:
+        return
+    for what in missing.values():
+        say(f"not on this machine, and some tests compare with it: {what}")
+    for package in install_all(list(missing), lock):
+        say(f"{missing[package]} ({package}) cannot be installed; going on without")
 
 
 def find(pattern: str, options: Sequence[str] = ()) -> str | None:

@@ -30,8 +30,9 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     """Run every check whatever the others say; return the worst exit status.
 
     Without ``arguments`` the tests that start DDS processes run by themselves, after the others
-    have used all cores: they wait for real time to pass.  With ``arguments`` pytest runs once,
-    with just these.
+    have used all cores, and more of them at once than there are cores: each is in a network of its
+    own and mostly waits for real time to pass.  With ``arguments`` pytest runs once, with just
+    these.
     """
     started = time.monotonic()
     if read_record().ros_around:
@@ -48,7 +49,7 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
         cores = len(os.sched_getaffinity(0))
         parts = {
             "tests": ["-m", "not dds", "-n", str(cores)],
-            "tests on a real DDS": ["-m", "dds"],
+            "tests on a real DDS": ["-m", "dds", "-n", str(2 * cores), "--dist", "loadgroup"],
         }
         for name, words in parts.items():
             report = VENV / f"{name.replace(' ', '-')}.xml"
