@@ -6,8 +6,9 @@ name the cause where these stay silent.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import lru_cache
 from pathlib import Path
@@ -35,13 +36,21 @@ from sros_tool.xml import read_bytes
 
 Parsed = TypeVar("Parsed")
 
+_OWN = "cert.pem"
+_ENCRYPTED = re.compile(rb"ENCRYPTED")
+_SIGNED = re.compile(rb"(?i)multipart/signed")
+
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Something that keeps a process from running in an enclave; ``file`` is what it lies in."""
+    """Something that keeps a process from running in an enclave; ``file`` is what it lies in.
+
+    ``code`` is a stable word for programs, such as ``key-mismatch`` or ``certificate-expired``.
+    """
 
     file: str
     text: str
+    code: str = ""
 
     def __str__(self) -> str:
         return f"{self.file}: {self.text}"
@@ -58,6 +67,10 @@ class EnclaveState:
     permissions: Permissions | None
     permissions_bytes: int
     problems: tuple[Problem, ...]
+    files: Mapping[str, bytes] = field(default_factory=dict, repr=False)
+    """The bytes of the required files, of those that can be read."""
+    permissions_document: bytes = field(default=b"", repr=False)
+    """The XML within ``permissions.p7s``, also where it cannot be read as permissions."""
 
     def domains(self) -> DomainSet | None:
         """The domains that governance names, or None without governance."""
@@ -96,6 +109,7 @@ class _Check:
         self._folder = folder
         self._now = now
         self._problems: list[Problem] = []
+        self._permissions_document = b""
 
     def run(self, domain: int | None) -> EnclaveState:
         files = {name: self._read(name) for name in REQUIRED_FILES}
@@ -108,11 +122,13 @@ class _Check:
         if (document := self._signed("governance.p7s", files, permissions_ca)) is not None:
             governance = self._parsed("governance.p7s", document, _governance)
         if (document := self._signed("permissions.p7s", files, permissions_ca)) is not None:
+            self._permissions_document = document
             permissions = self._parsed("permissions.p7s", document, parse_permissions)
         if governance and domain is not None and domain not in governance.domains().closed():
             self._fault(
                 "governance.p7s",
                 f"it is for domain {governance.domains().closed()}, not for {domain}",
+                "governance-domain",
             )
         if permissions and certificate:
             self._grant(permissions, certificate, domain)
@@ -124,24 +140,28 @@ class _Check:
             permissions,
             len(files["permissions.p7s"] or b""),
             tuple(self._problems),
+            {name: data for name, data in files.items() if data is not None},
+            self._permissions_document,
         )
 
-    def _fault(self, file: str, text: str) -> None:
-        self._problems.append(Problem(file, text))
+    def _fault(self, file: str, text: str, code: str) -> None:
+        self._problems.append(Problem(file, text, code))
 
     def _read(self, name: str) -> bytes | None:
         path = self._folder / name
         if not path.exists():
-            lost = path.is_symlink()
-            self._fault(name, f"it is a link to nothing ({path.readlink()})" if lost else "missing")
+            if path.is_symlink():
+                self._fault(name, f"it is a link to nothing ({path.readlink()})", "link-dangling")
+            else:
+                self._fault(name, "missing", "file-missing")
             return None
         try:
             data = read_bytes(path, "file")
         except SrosError as error:
-            self._fault(name, f"it cannot be read: {error.why.rstrip('.')}")
+            self._fault(name, f"it cannot be read: {error.why.rstrip('.')}", "file-unreadable")
             return None
         if not data:
-            self._fault(name, "it is empty")
+            self._fault(name, "it is empty", "file-empty")
             return None
         return data
 
@@ -152,16 +172,17 @@ class _Check:
         try:
             certificate = _certificate(data, name)
         except SrosError as error:
-            self._fault(name, error.why.rstrip("."))
+            self._fault(name, error.why.rstrip("."), "certificate-malformed")
             return None
-        self._valid_now(name, validity_of(certificate))
+        self._valid_now(name, validity_of(certificate), "certificate" if name == _OWN else "ca")
         return certificate
 
-    def _valid_now(self, name: str, validity: Window) -> None:
+    def _valid_now(self, name: str, validity: Window, what: str) -> None:
         if self._now > validity.not_after:
-            self._fault(name, f"it expired at {iso(validity.not_after)}")
+            self._fault(name, f"it expired at {iso(validity.not_after)}", f"{what}-expired")
         elif self._now < validity.not_before:
-            self._fault(name, f"it is not valid before {iso(validity.not_before)}")
+            begin = iso(validity.not_before)
+            self._fault(name, f"it is not valid before {begin}", f"{what}-not-yet-valid")
 
     def _identity(
         self, certificate: x509.Certificate | None, ca: x509.Certificate | None, key: bytes | None
@@ -171,16 +192,18 @@ class _Check:
                 "cert.pem",
                 f"it was not issued by the identity CA of the enclave ({subject_text(ca.subject)}) "
                 f"but by {subject_text(certificate.issuer)}",
+                "certificate-issuer",
             )
         if key is None:
             return
         try:
             private = load_key(key, "key.pem")
         except SrosError as error:
-            self._fault("key.pem", error.why.rstrip("."))
+            code = "key-encrypted" if _ENCRYPTED.search(key) else "key-malformed"
+            self._fault("key.pem", error.why.rstrip("."), code)
             return
         if certificate and not same_key(certificate, private):
-            self._fault("key.pem", "it is not the key of cert.pem")
+            self._fault("key.pem", "it is not the key of cert.pem", "key-mismatch")
 
     def _revocation(
         self, certificate: x509.Certificate | None, ca: x509.Certificate | None
@@ -191,21 +214,23 @@ class _Check:
         try:
             crl, authentic = _revocation_list(read_bytes(path, "revocation list"), ca)
         except (SrosError, ValueError):
-            self._fault("crl.pem", "it is not a revocation list, and DDS then refuses everybody")
+            text = "it is not a revocation list, and DDS then refuses everybody"
+            self._fault("crl.pem", text, "crl-malformed")
             return
         if not authentic:
-            self._fault("crl.pem", "it is not of the identity CA, and DDS then refuses everybody")
+            text = "it is not of the identity CA, and DDS then refuses everybody"
+            self._fault("crl.pem", text, "crl-issuer")
         if crl.last_update_utc > self._now:
             self._fault(
                 "crl.pem",
                 f"it is not valid before {iso(crl.last_update_utc)}: everybody is refused",
+                "crl-not-yet-valid",
             )
         if crl.next_update_utc and crl.next_update_utc < self._now:
-            self._fault(
-                "crl.pem", f"it expired at {iso(crl.next_update_utc)}: everybody is refused"
-            )
+            text = f"it expired at {iso(crl.next_update_utc)}: everybody is refused"
+            self._fault("crl.pem", text, "crl-expired")
         if certificate and crl.get_revoked_certificate_by_serial_number(certificate.serial_number):
-            self._fault("cert.pem", "it is revoked by crl.pem")
+            self._fault("cert.pem", "it is revoked by crl.pem", "revoked")
 
     def _signed(
         self, name: str, files: dict[str, bytes | None], authority: x509.Certificate | None
@@ -216,7 +241,8 @@ class _Check:
         try:
             return _content(data, authority)
         except SrosError as error:
-            self._fault(name, str(error))
+            code = "signature" if _SIGNED.search(data[:1000]) else "not-signed"
+            self._fault(name, str(error), code)
             return None
 
     def _parsed(
@@ -225,7 +251,8 @@ class _Check:
         try:
             return read(document, name)
         except SrosError as error:
-            self._fault(name, error.why.rstrip(".") or error.what)
+            code = f"{name.removesuffix('.p7s')}-malformed"
+            self._fault(name, error.why.rstrip(".") or error.what, code)
             return None
 
     def _grant(
@@ -236,10 +263,12 @@ class _Check:
         grants = [grant for grant in permissions.grants if grant.subject == subject]
         if not grants:
             others = ", ".join(grant.subject for grant in permissions.grants)
-            self._fault(name, f"it has no grant for {subject}, only for {others or 'nobody'}")
+            text = f"it has no grant for {subject}, only for {others or 'nobody'}"
+            self._fault(name, text, "permissions-subject")
             return
         grant = grants[0]
-        self._valid_now(name, grant.validity)
+        self._valid_now(name, grant.validity, "permissions")
         rules = [rule for rule in grant.rules if rule.allow]
         if domain is not None and not any(domain in rule.domains.closed() for rule in rules):
-            self._fault(name, f"no rule of it allows anything in domain {domain}")
+            text = f"no rule of it allows anything in domain {domain}"
+            self._fault(name, text, "permissions-domain")

@@ -49,13 +49,21 @@ class Group:
     """Names of one kind (topics, services or actions) that share the same rights.
 
     ``rights`` are pairs of a right and its qualifier, in the order of `RIGHTS`; ``names`` are as
-    written: relative, private or absolute, perhaps with wildcards.
+    written: relative, private or absolute, perhaps with wildcards.  ``lines`` are those of the
+    names in the file of ``source``, where they were read from one.
     """
 
     kind: str
     rights: tuple[tuple[str, Qualifier], ...]
     names: tuple[str, ...]
     source: Source = field(default=_NOWHERE, compare=False)
+    lines: tuple[int, ...] = field(default=(), compare=False)
+
+    def source_of(self, index: int) -> Source:
+        """Where the name of that index stands."""
+        if index < len(self.lines):
+            return Source(self.source.file, self.lines[index])
+        return self.source
 
 
 @dataclass(frozen=True, slots=True)

@@ -171,13 +171,14 @@ class _Reader:
                 f'Write for example <{kind} {RIGHTS[kind][0]}="ALLOW">, or remove them.',
             )
         item = kind.removesuffix("s")
-        names = tuple(
-            self._name(*self._expect(child, at, item), node)
-            for child, at in self._children(element, place)
-        )
+        items = self._children(element, place)
+        names = tuple(self._name(*self._expect(child, at, item), node) for child, at in items)
         if not names:
             raise PolicyError(f"{self._where(element, place)}: the <{kind}> name no {item}")
-        return Group(kind, tuple(rights), names, self._source(element, place))
+        lines: tuple[int, ...] = ()
+        if all(at.file == place.file for _, at in items):  # names can be included one by one
+            lines = tuple(child.sourceline or 0 for child, _ in items)
+        return Group(kind, tuple(rights), names, self._source(element, place), lines)
 
     def _name(self, element: etree._Element, place: Place, node: str) -> str:
         name = element.text or ""
