@@ -17,7 +17,7 @@ _WILDCARD = re.compile(r"[*?\[]")
 _PIECE = re.compile(r"\*+|\?|\[(!?)([^\]]+)\]|(.)", re.DOTALL)
 _RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
 _ALPHABET = frozenset(map(chr, range(33, 127)))  # wider than ROS names: DDS topics may be foreign
-_ANY: frozenset[str] = frozenset()
+ANY: frozenset[str] = frozenset()
 """Stands for ``*`` among the pieces of a pattern."""
 
 
@@ -54,16 +54,16 @@ def covers(wide: str, narrow: str) -> bool:
 
 @lru_cache(maxsize=_MANY)
 def _covers(wide: str, narrow: str) -> bool:
-    outer, inner = _pieces(wide), _pieces(narrow)
+    outer, inner = pieces(wide), pieces(narrow)
     # reached[i]: the first i pieces of outer cover the pieces of inner that were seen so far.
     reached = _after_stars({0}, outer)
     for piece in inner:
-        following = {i for i in reached if i < len(outer) and outer[i] is _ANY}
-        if piece is not _ANY:
+        following = {i for i in reached if i < len(outer) and outer[i] is ANY}
+        if piece is not ANY:
             following |= {
                 i + 1
                 for i in reached
-                if i < len(outer) and outer[i] is not _ANY and piece <= outer[i]
+                if i < len(outer) and outer[i] is not ANY and piece <= outer[i]
             }
         reached = _after_stars(following, outer)
     return len(outer) in reached
@@ -81,7 +81,7 @@ def overlap(one: str, other: str) -> bool:
 
 @lru_cache(maxsize=_MANY)
 def _overlap(one: str, other: str) -> bool:
-    first, second = _pieces(one), _pieces(other)
+    first, second = pieces(one), pieces(other)
     seen: set[tuple[int, int]] = set()
     states = [(0, 0)]
     while states:
@@ -94,11 +94,11 @@ def _overlap(one: str, other: str) -> bool:
             return True
         here = first[i] if i < len(first) else None
         there = second[j] if j < len(second) else None
-        if here is _ANY:
+        if here is ANY:
             states.append((i + 1, j))
             if there is not None:
                 states.append((i, j + 1))
-        if there is _ANY:
+        if there is ANY:
             states.append((i, j + 1))
             if here is not None:
                 states.append((i + 1, j))
@@ -111,15 +111,15 @@ def _after_stars(reached: set[int], pieces: tuple[frozenset[str], ...]) -> set[i
     """The places reached when stars that follow stand for nothing."""
     grown = set(reached)
     for i in sorted(reached):
-        while i < len(pieces) and pieces[i] is _ANY:
+        while i < len(pieces) and pieces[i] is ANY:
             i += 1
             grown.add(i)
     return grown
 
 
 @lru_cache(maxsize=_MANY)
-def _pieces(expression: str) -> tuple[frozenset[str], ...]:
-    """The pattern piece by piece: `_ANY` for ``*``, else the characters that fit one place."""
+def pieces(expression: str) -> tuple[frozenset[str], ...]:
+    """An expression piece by piece: `ANY` for ``*``, else the characters that fit one place."""
     found: list[frozenset[str]] = []
     for piece in _PIECE.finditer(expression):
         negated, members, literal = piece.groups()
@@ -129,7 +129,7 @@ def _pieces(expression: str) -> tuple[frozenset[str], ...]:
             chosen = _members(members)
             found.append(_ALPHABET - chosen if negated else chosen)
         else:
-            found.append(_ALPHABET if piece[0] == "?" else _ANY)
+            found.append(_ALPHABET if piece[0] == "?" else ANY)
     return tuple(found)
 
 
