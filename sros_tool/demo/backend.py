@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from sros_tool.demo.scenarios import Role
+from sros_tool.demo.model import Condition, Role
 from sros_tool.errors import UnavailableError
 from sros_tool.runtime.cyclone_library import INSTALL_ADVICE
 from sros_tool.runtime.security_log import CYCLONE_EXPLAINS
@@ -52,26 +52,33 @@ class Backend:
         """How many rows run at the same time: an rclpy node costs some 0.6 s of CPU to start."""
         return 4 if self.name == RCLPY else 12
 
-    def library(self, role: Role) -> str:
-        """The library that a node of that role uses."""
-        if self.name == RCLPY or (role is Role.OBSERVER and self.ros_observer):
+    @property
+    def vendor(self) -> Condition | None:
+        """The vendor, as far as the outcome of a row depends on it."""
+        if self.dds.startswith("Cyclone DDS"):
+            return Condition.CYCLONE
+        return Condition.FAST if self.dds.startswith("Fast DDS") else None
+
+    def library(self, role: Role, *, secured: bool = False) -> str:
+        """The library that a node of that role uses; unsecured observers can be of rclpy."""
+        if self.name == RCLPY or (role is Role.OBSERVER and self.ros_observer and not secured):
             return RCLPY
         return self.dds
 
-    def command(self, role: Role) -> list[str]:
+    def command(self, role: Role, *, secured: bool = False) -> list[str]:
         """The program of a node, without its options."""
-        if self.library(role) == RCLPY:
+        if self.library(role, secured=secured) == RCLPY:
             return _module(f"sros_tool.demo.{role.value}")
         return [*_module("sros_tool.demo.cyclone_node"), role.value]
 
     def environment(
-        self, role: Role, *, wire: bool = False, denied: bool = False
+        self, role: Role, *, wire: bool = False, denied: bool = False, secured: bool = False
     ) -> Mapping[str, str]:
         """The variables that a node needs beside those of its security.
 
         ``wire`` keeps its messages off shared memory; ``denied`` makes it say why.
         """
-        on_ros = self.library(role) == RCLPY
+        on_ros = self.library(role, secured=secured) == RCLPY
         variables = {"RMW_IMPLEMENTATION": self.rmw} if on_ros and self.rmw else {}
         if on_ros and wire:
             variables |= _ON_THE_WIRE

@@ -25,13 +25,16 @@ _PROTECTED_SUBMESSAGES = range(0x30, 0x35)
 class PacketCounter:
     """Counts IPv4 packets in which one of ``marks`` is readable, and those that are protected.
 
-    ``plain`` counts by mark, ``protected`` by UDP port, for both ports of a packet.
+    ``plain`` counts by mark, ``protected`` by UDP port, for both ports of a packet.  With
+    ``keep``, the RTPS packets themselves are in ``kept``, by source port and in order.
     """
 
-    def __init__(self, marks: Sequence[str]) -> None:
+    def __init__(self, marks: Sequence[str], *, keep: bool = False) -> None:
         self._marks = {mark: mark.encode() for mark in marks}
+        self._keep = keep
         self.plain: Counter[str] = Counter()
         self.protected: Counter[int] = Counter()
+        self.kept: list[tuple[int, bytes]] = []
 
     def count(self, packet: bytes) -> None:
         """Count one packet; whatever is not UDP is passed over."""
@@ -41,6 +44,8 @@ class PacketCounter:
         source = int.from_bytes(packet[start : start + 2], "big")
         target = int.from_bytes(packet[start + 2 : start + 4], "big")
         payload = packet[start + 8 :]
+        if self._keep and payload[:4] == b"RTPS":
+            self.kept.append((source, packet))
         for mark, raw in self._marks.items():
             if raw in payload:
                 self.plain[mark] += 1
@@ -49,13 +54,13 @@ class PacketCounter:
 
 
 class Capture(PacketCounter):
-    """Listens on every interface and counts; nothing is stored.
+    """Listens on every interface and counts; only what is to be kept is stored, in memory.
 
     Raises `PermissionError` where it is not permitted.
     """
 
-    def __init__(self, marks: Sequence[str]) -> None:
-        super().__init__(marks)
+    def __init__(self, marks: Sequence[str], *, keep: bool = False) -> None:
+        super().__init__(marks, keep=keep)
         self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(_ETH_P_IP))
         self._socket.setblocking(False)
         try:

@@ -10,7 +10,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.demo.keystores import DEFAULT_TOPIC, make_keystores
+from sros_tool.demo.policies import DEFAULT_TOPIC
+from sros_tool.demo.scenarios.isolation import ISOLATION
+from sros_tool.demo.scenery import build_scenery
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.cyclone_library import INSTALL_ADVICE
 from sros_tool.runtime.rcl_security import spelling_warnings
@@ -52,8 +54,8 @@ def examine(environment: Mapping[str, str], now: datetime) -> Diagnosis:
     with TemporaryDirectory(prefix="sros-doctor-") as folder:
         domains = DomainSet.of((_PROBE_DOMAIN, _PROBE_DOMAIN))
         template = load_template(_TEMPLATE)
-        keystores = make_keystores(Path(folder), DEFAULT_TOPIC, domains, template, now)
-        stacks = survey(keystores.probe(DEFAULT_TOPIC, _PROBE_DOMAIN))
+        scenery = build_scenery(Path(folder), ISOLATION, DEFAULT_TOPIC, domains, template, now)
+        stacks = survey(scenery.probe(DEFAULT_TOPIC, _PROBE_DOMAIN))
     return Diagnosis(stacks, spelling_warnings(environment))
 
 

@@ -1,4 +1,4 @@
-"""The whole demo: check what was asked, make keystores, choose a backend, run the rows, answer."""
+"""The whole demo: check what was asked, make keystores, choose a backend, run scenarios, answer."""
 
 from __future__ import annotations
 
@@ -8,20 +8,22 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
-from typing import Any
 
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.demo.backend import AUTO, Backend, choose_backend
 from sros_tool.demo.isolated import run_isolated
-from sros_tool.demo.keystores import DEFAULT_TOPIC, check_topic, make_keystores
+from sros_tool.demo.model import Row, Scenario
+from sros_tool.demo.policies import DEFAULT_TOPIC, check_topic
+from sros_tool.demo.result import DemoResult, ScenarioResult
 from sros_tool.demo.runner import Limits, Plan, run_plan
-from sros_tool.demo.scenarios import ROWS, Row
-from sros_tool.demo.verdict import RowResult
+from sros_tool.demo.scenarios.isolation import ISOLATION
+from sros_tool.demo.scenery import Scenery, build_scenery
 from sros_tool.errors import UsageError
 from sros_tool.keystore.template import Template
 from sros_tool.runtime.netns import Isolation, try_isolation
@@ -35,7 +37,10 @@ HOST = "host"
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """What was asked for; ``keep`` is the folder to leave everything in, if any."""
+    """What was asked for; ``keep`` is the folder to leave everything in, if any.
+
+    ``only`` leaves those rows whose names contain one of its words.
+    """
 
     template: Template
     backend: str = AUTO
@@ -43,79 +48,91 @@ class DemoOptions:
     domain: int = DEFAULT_DOMAIN
     network: str = AUTO
     keep: Path | None = None
-    rows: tuple[Row, ...] = ROWS
+    scenarios: tuple[Scenario, ...] = (ISOLATION,)
+    only: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)
 
 
-@dataclass(frozen=True)
-class DemoResult:
-    """What the demo showed."""
-
-    backend: Backend
-    topic: str
-    isolation: Isolation
-    rows: tuple[RowResult, ...]
-
-    @property
-    def as_expected(self) -> bool:
-        """Whether every row is as expected or skipped with a reason."""
-        return all(row.as_expected for row in self.rows)
-
-    def as_json(self) -> dict[str, Any]:
-        """The result as `sros demo --json` shows it."""
-        return {
-            "backend": self.backend.name,
-            "dds": self.backend.dds,
-            "why": self.backend.why,
-            "topic": self.topic,
-            "own_network": self.isolation.isolated,
-            "network_reason": self.isolation.reason,
-            "as_expected": self.as_expected,
-            "rows": [row.as_json() for row in self.rows],
-        }
+Tell = Callable[[str], None]
 
 
-def run_demo(options: DemoOptions, now: datetime, tell: Callable[[str], None]) -> DemoResult:
+def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
     """Run the demo; ``tell`` gets lines about its progress.
 
     Raises `UsageError` before anything is made, `UnavailableError` where no DDS enforces
     security, and what making a keystore raises.
     """
     topic = check_topic(options.topic)
-    domains = _domains(options)
+    scenarios = [_chosen(scenario, options) for scenario in options.scenarios]
+    domains = [_domains(scenario, options) for scenario in scenarios]
+    isolation = _isolation(options.network)
+    results: list[ScenarioResult] = []
+    backend: Backend | None = None
     with _ended_by_signals(), _folder(options.keep) as folder:
-        spanned = DomainSet.of((domains[0], domains[-1]))
-        keystores = make_keystores(folder, topic, spanned, options.template, now)
-        tell("looking for a DDS that enforces security")
-        backend = choose_backend(options.backend, keystores.probe(topic, domains[0]))
-        tell(f"running {len(options.rows)} rows on {backend.name} ({backend.dds}): {backend.why}")
-        isolation = _isolation(options.network)
-        plan = Plan(
-            rows=options.rows,
-            domains=domains,
-            backend=backend,
-            keystores=keystores,
-            topic=topic,
-            folder=folder / "rows",
-            limits=options.limits,
-        )
-        rows = run_isolated(lambda told: run_plan(plan, told), isolation, tell)
-        result = DemoResult(backend, topic, isolation, tuple(rows))
+        for scenario, places in zip(scenarios, domains, strict=True):
+            under = folder if len(scenarios) == 1 else folder / scenario.name
+            spanned = DomainSet.of((places[0], places[-1]))
+            scenery = build_scenery(under, scenario, topic, spanned, options.template, now)
+            if backend is None:
+                tell("looking for a DDS that enforces security")
+                backend = choose_backend(options.backend, scenery.probe(topic, places[0]))
+            tell(
+                f"{scenario.name}: running {len(scenario.rows)} rows on {backend.name}"
+                f" ({backend.dds}): {backend.why}"
+            )
+            plan = _plan(options, scenario, places, backend, scenery, topic, under, isolation)
+            rows = run_isolated(partial(run_plan, plan), isolation, tell)
+            results.append(ScenarioResult(scenario.name, scenario.title, tuple(rows)))
+        assert backend is not None
+        result = DemoResult(backend, topic, isolation, options.template.name, tuple(results))
         if options.keep is not None:
             text = json.dumps(result.as_json(), indent=2) + "\n"
             (folder / "result.json").write_text(text, encoding="utf-8")
     return result
 
 
-def _domains(options: DemoOptions) -> tuple[int, ...]:
-    last = MAX_DOMAIN - len(options.rows) + 1
+def _plan(
+    options: DemoOptions,
+    scenario: Scenario,
+    domains: tuple[int, ...],
+    backend: Backend,
+    scenery: Scenery,
+    topic: str,
+    folder: Path,
+    isolation: Isolation,
+) -> Plan:
+    return Plan(
+        rows=scenario.rows,
+        domains=domains,
+        backend=backend,
+        scenery=scenery,
+        topic=topic,
+        folder=folder / "rows",
+        limits=options.limits,
+        own_networks=isolation.isolated,
+    )
+
+
+def _chosen(scenario: Scenario, options: DemoOptions) -> Scenario:
+    """The scenario with the rows that were asked for."""
+    if not options.only:
+        return scenario
+    return replace(scenario, rows=tuple(row for row in scenario.rows if _asked_for(row, options)))
+
+
+def _asked_for(row: Row, options: DemoOptions) -> bool:
+    return any(word.lower() in f"{row.attack} {row.name}".lower() for word in options.only)
+
+
+def _domains(scenario: Scenario, options: DemoOptions) -> tuple[int, ...]:
+    last = MAX_DOMAIN - len(scenario.rows) + 1
     if not 0 <= options.domain <= last:
         raise UsageError(
             f"the demo cannot start at domain {options.domain}",
-            f"It uses {len(options.rows)} domains in a row, and the highest is {MAX_DOMAIN}.",
+            f"It uses {len(scenario.rows)} domains in a row, and the highest is {MAX_DOMAIN}.",
             f"Choose a domain from 0 to {last}.",
         )
-    return tuple(range(options.domain, options.domain + len(options.rows)))
+    return tuple(range(options.domain, options.domain + len(scenario.rows)))
 
 
 @contextmanager

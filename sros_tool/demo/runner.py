@@ -1,7 +1,7 @@
-"""Run rows of the demo at the same time, each in a domain of its own, and record what happened.
+"""Run rows at the same time, each in a network or domain of its own, and record what happened.
 
-A row's window starts when all its processes are ready, so a busy machine is waited for; it is as
-long for silence as for sound, and ends early for neither.
+A row's window starts when all its processes are ready, so a busy machine is waited for.  It is as
+long for silence as for sound; only a brief row in which nobody has to be silent ends early.
 """
 
 from __future__ import annotations
@@ -15,18 +15,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from sros_tool.demo.backend import Backend
-from sros_tool.demo.capture import Capture
 from sros_tool.demo.isolated import ENDING_SIGNALS
-from sros_tool.demo.keystores import DemoKeystores
 from sros_tool.demo.launch import PartyProcess, base_environment
-from sros_tool.demo.scenarios import Claim, Party, Relation, Role, Row
-from sros_tool.demo.verdict import RowRecord, RowResult, WireCount, judge_row
+from sros_tool.demo.model import DENIALS, SPEAKING, Claim, Party, Relation, Role, Row, Wire
+from sros_tool.demo.network import RowNetwork
+from sros_tool.demo.scenery import Scenery
+from sros_tool.demo.verdict import Replay, RowRecord, RowResult, judge_row
+from sros_tool.demo.wiretap import Wiretap
 from sros_tool.runtime.events import Kind
 
 _TICK = 0.05
 _GRACE = 0.3
 _ENOUGH_MESSAGES = 3
 _AFTER_ENOUGH = 2.0
+_AFTER_REPLAY = 2.0
 _SECONDS_TO_END = 2.0
 
 
@@ -44,17 +46,19 @@ class Limits:
 class Plan:
     """All that is needed to run rows.
 
-    ``domains`` has one domain per row; ``topic`` is absolute; ``period`` is in seconds.
+    ``domains`` has one domain per row; ``topic`` is absolute; ``period`` is in seconds.  With
+    ``own_networks``, each row gets a network namespace of its own.
     """
 
     rows: tuple[Row, ...]
     domains: tuple[int, ...]
     backend: Backend
-    keystores: DemoKeystores
+    scenery: Scenery
     topic: str
     folder: Path
     limits: Limits = field(default_factory=Limits)
     period: float = 0.1
+    own_networks: bool = False
 
 
 def run_plan(plan: Plan, progress: Callable[[str], None]) -> list[RowResult]:
@@ -65,10 +69,8 @@ def run_plan(plan: Plan, progress: Callable[[str], None]) -> list[RowResult]:
 class _Stage:
     def __init__(self, plan: Plan, progress: Callable[[str], None]) -> None:
         self._plan = plan
-        self._capture_problem = ""
         self._progress = progress
         self._mark = uuid.uuid4().hex[:8]
-        self._capture: Capture | None = None
         self._places = asyncio.Semaphore(plan.backend.rows_at_once)
         self._end = 0.0
         self._finished = 0
@@ -79,28 +81,7 @@ class _Stage:
         assert task is not None
         for number in ENDING_SIGNALS:
             loop.add_signal_handler(number, task.cancel)
-        self._start_capture()
-        try:
-            return await asyncio.gather(*map(self._run_row, range(len(self._plan.rows))))
-        finally:
-            self._stop_capture()
-
-    def _start_capture(self) -> None:
-        wired = [index for index, row in enumerate(self._plan.rows) if row.wire]
-        if not wired:
-            return
-        marks = [self._text(i, party) for i in wired for party in self._plan.rows[i].parties]
-        try:
-            self._capture = Capture(marks)
-        except OSError as error:
-            self._capture_problem = f"capturing packets is not permitted: {error.strerror}"
-            return
-        asyncio.get_running_loop().add_reader(self._capture.fileno(), self._capture.drain)
-
-    def _stop_capture(self) -> None:
-        if self._capture is not None:
-            asyncio.get_running_loop().remove_reader(self._capture.fileno())
-            self._capture.close()
+        return await asyncio.gather(*map(self._run_row, range(len(self._plan.rows))))
 
     def _text(self, index: int, party: Party) -> str:
         """What a talker says; it occurs nowhere else, not in another row either."""
@@ -108,57 +89,88 @@ class _Stage:
 
     async def _run_row(self, index: int) -> RowResult:
         row, domain = self._plan.rows[index], self._plan.domains[index]
-        skipped = self._capture_problem if row.wire else ""
+        skipped = self._why_skipped(row)
         if skipped:
-            result = judge_row(RowRecord(row, domain, skipped=skipped))
+            record = RowRecord(row, domain, skipped=skipped)
         else:
             async with self._places:
-                result = judge_row(await self._play(index))
+                record = await self._play(index)
+        result = judge_row(record)
         self._finished += 1
         self._progress(
             f"[{self._finished}/{len(self._plan.rows)}] {row.name}: {result.observed.value}"
         )
         return result
 
+    def _why_skipped(self, row: Row) -> str:
+        handshake = any(claim.wire is not Wire.TEXT for claim in row.claims)
+        if (handshake or row.replay) and not self._plan.own_networks:
+            return "it needs a network namespace of its own"
+        return row.skipped or self._plan.scenery.problem(each.identity for each in row.parties)
+
     async def _play(self, index: int) -> RowRecord:
         row, domain = self._plan.rows[index], self._plan.domains[index]
         folder = self._plan.folder / f"row_{index + 1:02}"
         folder.mkdir(parents=True)
         processes: dict[str, PartyProcess] = {}
+        tap: Wiretap | None = None
+        network = RowNetwork(own=self._plan.own_networks)
         try:
-            for party in row.parties:
-                processes[party.name] = self._start(index, party, domain, folder)
+            with network.entered():
+                if row.wire or row.replay:
+                    tap = self._listen_in(index)
+                    if tap.problem:
+                        return RowRecord(row, domain, skipped=tap.problem)
+                for party in row.parties:
+                    processes[party.name] = self._start(index, party, domain, folder)
             window = await self._watch(row, processes)
             ports = frozenset[int]().union(*(each.ports() for each in processes.values()))
-            wire = self._count(index, ports)
+            wire = tap.count(ports) if tap and row.wire else {}
+            replay = None
+            if tap and row.replay and window:
+                replay = await self._replay(processes[row.replay], tap)
         finally:
             try:
                 await _end_softly(processes.values())
             finally:
                 for process in processes.values():
                     process.end()
+                if tap is not None:
+                    tap.close()
+                network.close()
         records = {name: process.record() for name, process in processes.items()}
-        return RowRecord(row, domain, records, window, wire)
+        return RowRecord(row, domain, records, window, wire, replay)
+
+    def _listen_in(self, index: int) -> Wiretap:
+        row = self._plan.rows[index]
+        texts = {party.name: self._text(index, party) for party in row.parties}
+        topic = f"rt{self._plan.topic}"
+        return Wiretap(texts, topic, replayed=bool(row.replay))
 
     def _start(self, index: int, party: Party, domain: int, folder: Path) -> PartyProcess:
         plan, row = self._plan, self._plan.rows[index]
         topic = _topic_of(party, plan.topic)
         options = ["--topic", topic, "--period", str(plan.period)]
         text = self._text(index, party)
-        if party.role is Role.TALKER:
+        if party.role in SPEAKING:
             options += ["--text", text]
         if party.role is Role.OBSERVER:
             for other in row.parties:
                 if other.role is Role.TALKER and other.aside:
                     options += ["--also", _topic_of(other, plan.topic)]
         environment = base_environment(os.environ)
+        secured = bool(party.identity.keystore)
         denied = any(
-            claim.relation is Relation.IS_REFUSED and claim.subject == party.name
+            (claim.relation is Relation.IS_REFUSED and claim.subject == party.name)
+            or (claim.denied and party.intruder)
             for claim in row.claims
         )
-        environment |= plan.backend.environment(party.role, wire=row.wire, denied=denied)
-        environment |= plan.keystores.environment(party.identity, domain)
-        command = [*plan.backend.command(party.role), *options]
+        backend = plan.backend
+        environment |= backend.environment(
+            party.role, wire=bool(row.wire or row.replay), denied=denied, secured=secured
+        )
+        environment |= plan.scenery.environment(party.identity, domain)
+        command = [*backend.command(party.role, secured=secured), *options]
         return PartyProcess(
             party.name,
             command,
@@ -166,7 +178,7 @@ class _Stage:
             folder,
             topic=topic,
             text=text,
-            through=plan.backend.library(party.role),
+            through=backend.library(party.role, secured=secured),
         )
 
     async def _watch(
@@ -181,20 +193,26 @@ class _Stage:
         if _is_decided_by_start(row):
             now = time.monotonic()
             return now, now
-        if not all(process.running for process in processes.values()):
+        needed = [processes[party.name] for party in row.parties if not party.intruder]
+        if not all(process.running for process in needed):
             return None
         start = time.monotonic()
         shortest = min(start + limits.window, self._end)
         longest = min(start + limits.longest_window, self._end)
-        positive = [claim for claim in (*row.claims, *row.controls) if claim.holds]
+        claims = (*row.claims, *row.controls)
+        positive = [claim for claim in claims if claim.holds]
+        silence = not row.brief or any(_awaits_silence(claim, row, processes) for claim in claims)
         enough_at = None
         while True:
             now = time.monotonic()
             if enough_at is None and all(self._is_met(claim, processes) for claim in positive):
                 enough_at = now
-            if enough_at is not None and now >= max(shortest, enough_at + _AFTER_ENOUGH):
-                break
-            if now >= longest or any(process.ended for process in processes.values()):
+            if enough_at is not None:
+                if not silence:
+                    break
+                if now >= max(shortest, enough_at + _AFTER_ENOUGH):
+                    break
+            if now >= longest or any(process.ended for process in needed):
                 break
             await asyncio.sleep(_TICK)
         await asyncio.sleep(_GRACE)
@@ -203,7 +221,7 @@ class _Stage:
     def _is_met(self, claim: Claim, processes: Mapping[str, PartyProcess]) -> bool:
         """Whether a claim that something happens has been seen to hold, several times."""
         events = processes[claim.subject].look()
-        if claim.relation is Relation.HEARS:
+        if claim.relation in (Relation.HEARS, Relation.IS_ANSWERED):
             mark = f"{processes[claim.talker].text}: "
             heard = [e for e in events if e.kind is Kind.HEARD and e.text.startswith(mark)]
             return len(heard) >= _ENOUGH_MESSAGES
@@ -211,16 +229,17 @@ class _Stage:
             return any(count for event in events for count in event.publishers.values() if count)
         return True
 
-    def _count(self, index: int, ports: frozenset[int]) -> Mapping[str, WireCount]:
-        row, capture = self._plan.rows[index], self._capture
-        if not row.wire or capture is None:
-            return {}
-        capture.drain()
-        protected = sum(capture.protected[port] for port in ports)
-        return {
-            party.name: WireCount(capture.plain[self._text(index, party)], protected)
-            for party in row.parties
-        }
+    async def _replay(self, talker: PartyProcess, tap: Wiretap) -> Replay:
+        """Let a talker leave, then send again what it had sent, from its first packet on."""
+        packets = tap.packets(talker.ports())
+        await _end_softly([talker])
+        await asyncio.sleep(_GRACE)
+        started = time.monotonic()
+        for packet in packets:
+            tap.send(packet)
+            await asyncio.sleep(0)
+        await asyncio.sleep(_AFTER_REPLAY)
+        return Replay(len(packets), started)
 
 
 async def _end_softly(processes: Collection[PartyProcess]) -> None:
@@ -233,7 +252,16 @@ async def _end_softly(processes: Collection[PartyProcess]) -> None:
 
 
 def _topic_of(party: Party, topic: str) -> str:
-    return f"{topic}_in_the_open" if party.aside else topic
+    name = party.topic or topic
+    return f"{name}_in_the_open" if party.aside else name
+
+
+def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, PartyProcess]) -> bool:
+    """Whether a claim needs time to pass: nothing must happen, and something still could."""
+    if claim.holds or claim.relation is Relation.HEARS_AGAIN:
+        return False
+    names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
+    return claim.denied not in DENIALS or all(processes[name].running for name in names)
 
 
 def _is_decided_by_start(row: Row) -> bool:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sros_tool.demo.program import DemoResult
-from sros_tool.demo.scenarios import Status
+from sros_tool.demo.model import Status
+from sros_tool.demo.result import DemoResult
 from sros_tool.demo.verdict import RowResult
 
 

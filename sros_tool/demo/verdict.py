@@ -6,22 +6,37 @@ a refusal only where DDS Security said so itself, about this topic.
 
 from __future__ import annotations
 
+import re
 import signal
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from sros_tool.demo.scenarios import STATUS_OF, Claim, Party, Relation, Role, Row, Status
+from sros_tool.demo.model import STATUS_OF, Claim, Party, Relation, Role, Row, Status, Wire
 from sros_tool.runtime.events import Event, Kind, Stage
 from sros_tool.runtime.security_log import endpoint_refusal, missing_security, participant_refusal
 
 
 @dataclass(frozen=True)
 class WireCount:
-    """How many packets held a talker's text in the open, and how many of its row were protected."""
+    """How many packets held a talker's text in the open, and how many of its row were protected.
+
+    ``topics`` and ``certificates`` count the packets of the row that show the name of its topic,
+    and a certificate.
+    """
 
     plain: int
     protected: int
+    topics: int = 0
+    certificates: int = 0
+
+
+@dataclass(frozen=True)
+class Replay:
+    """How many captured packets were sent again, and from when on (CLOCK_MONOTONIC)."""
+
+    packets: int
+    time: float
 
 
 @dataclass(frozen=True)
@@ -54,6 +69,7 @@ class RowRecord:
     parties: Mapping[str, PartyRecord] = field(default_factory=dict)
     window: tuple[float, float] | None = None
     wire: Mapping[str, WireCount] = field(default_factory=dict)
+    replay: Replay | None = None
     skipped: str = ""
 
 
@@ -76,11 +92,20 @@ class RowResult:
     detail: str
     domain: int
     seconds: float = 0.0
+    attack: str = ""
+    removed: str = ""
+    open_because: str = ""
+    remedy: str = ""
 
     @property
     def as_expected(self) -> bool:
         """Whether this row lets the demo succeed."""
         return self.observed in (self.expected, Status.SKIPPED)
+
+    @property
+    def known_open(self) -> bool:
+        """Whether it shows a way in that is known to be open, and why."""
+        return bool(self.open_because) and self.observed is self.expected
 
     def as_json(self) -> dict[str, Any]:
         """The row as `sros demo --json` shows it."""
@@ -93,6 +118,10 @@ class RowResult:
             "detail": self.detail,
             "domain": self.domain,
             "seconds": round(self.seconds, 1),
+            "attack": self.attack,
+            "defence_removed": self.removed,
+            "open_because": self.open_because,
+            "remedy": self.remedy,
         }
 
 
@@ -109,6 +138,10 @@ def judge_row(record: RowRecord) -> RowResult:
         finding.detail,
         record.domain,
         seconds,
+        row.attack,
+        row.removed,
+        row.open_because,
+        row.remedy,
     )
 
 
@@ -161,6 +194,10 @@ def _judge_claim(claim: Claim, record: RowRecord) -> Finding:
     if claim.relation is Relation.READABLE:
         return _judge_wire(claim, record, subject)
     talker = record.parties[claim.talker]
+    if claim.relation is Relation.HEARS_AGAIN:
+        return _judge_replay(claim, record, subject, talker)
+    if claim.relation is Relation.IS_ANSWERED:
+        return _judge_answers(claim, record, subject, talker)
     sent = {e.text for e in talker.events if e.kind is Kind.SENT and _inside(e, record)}
     if not sent:
         return Finding(Status.UNDECIDED, f"{claim.talker} sent nothing in that time")
@@ -173,6 +210,39 @@ def _judge_claim(claim: Claim, record: RowRecord) -> Finding:
     arrived = len(sent & {event.text for event in heard})
     heard_of = f"{arrived} of {len(sent)} messages of the {claim.talker}"
     return Finding(status, f"{claim.subject} heard {heard_of} in {seconds:.1f} s")
+
+
+def _judge_answers(
+    claim: Claim, record: RowRecord, client: PartyRecord, server: PartyRecord
+) -> Finding:
+    asked = [e for e in client.events if e.kind is Kind.SENT and _inside(e, record)]
+    if not asked:
+        return Finding(Status.UNDECIDED, f"{claim.subject} asked nothing in that time")
+    answers = [e for e in client.events if e.kind is Kind.HEARD and _is_of(e, server)]
+    status = STATUS_OF[Relation.IS_ANSWERED, bool(answers)]
+    within = sum(1 for event in answers if _inside(event, record))
+    counted = f"{min(within, len(asked))} right answers of the {claim.talker}"
+    return Finding(status, f"{claim.subject} asked {len(asked)} times and got {counted}")
+
+
+def _judge_replay(
+    claim: Claim, record: RowRecord, listener: PartyRecord, talker: PartyRecord
+) -> Finding:
+    replay = record.replay
+    if replay is None or not replay.packets:
+        return Finding(Status.UNDECIDED, "no packets were captured that could be sent again")
+    heard = [e for e in listener.events if e.kind is Kind.HEARD and _is_of(e, talker)]
+    again = sum(1 for event in heard if event.time >= replay.time)
+    status = STATUS_OF[Relation.HEARS_AGAIN, again > 0]
+    return Finding(
+        status,
+        f"{claim.subject} heard {again} messages in {replay.packets} packets of the"
+        f" {claim.talker} that were sent again after it had left",
+    )
+
+
+def _is_of(event: Event, speaker: PartyRecord) -> bool:
+    return event.text.startswith(f"{speaker.text}: ")
 
 
 def _judge_refusal(name: str, record: PartyRecord) -> Finding:
@@ -197,6 +267,12 @@ def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> Finding
     count = record.wire.get(claim.subject)
     if count is None:
         return Finding(Status.UNDECIDED, "no packets were captured")
+    if claim.wire is not Wire.TEXT:
+        shown = count.topics if claim.wire is Wire.TOPIC else count.certificates
+        if not shown and not count.protected:
+            return Finding(Status.UNDECIDED, "no packets of the row were captured")
+        what = f"the {claim.wire}" if claim.wire is Wire.TOPIC else f"a {claim.wire}"
+        return Finding(STATUS_OF[Relation.READABLE, shown > 0], f"{shown} packets show {what}")
     if count.plain:
         return Finding(Status.READABLE, f"{count.plain} packets show the text")
     sent = sum(1 for event in talker.events if event.kind is Kind.SENT and _inside(event, record))
@@ -245,13 +321,15 @@ def _own_denial(record: PartyRecord, told: str) -> str:
 
 
 def _speaks_of(line: str, topic: str) -> bool:
-    return f"rt{topic} " in f"{line} " or "not allowed by security" in line.lower()
+    """Whether a line is about that topic, or a service or action of that name."""
+    name = rf"r[tqr]{re.escape(topic)}(?:/_action/\w+)?(?:Request|Reply)?(?!\w|/)"
+    return bool(re.search(name, line)) or "not allowed by security" in line.lower()
 
 
 def _refused(name: str, stage: Stage | None, reason: str) -> Finding:
     if stage is Stage.ENDPOINT:
         return Finding(Status.REFUSED, f"{name}: {reason}")
-    return Finding(Status.NOT_STARTED, f"{name} was refused before it came to the topic: {reason}")
+    return Finding(Status.NOT_LET_IN, f"{name} was refused before it came to the topic: {reason}")
 
 
 def _ending(record: PartyRecord) -> str:

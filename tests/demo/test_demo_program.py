@@ -9,14 +9,17 @@ from pathlib import Path
 import pytest
 
 from sros_tool.demo import backend as backends
-from sros_tool.demo.backend import choose_backend
-from sros_tool.demo.keystores import check_topic, demo_policy
+from sros_tool.demo.backend import Backend, choose_backend
+from sros_tool.demo.model import Role, Status
 from sros_tool.demo.options import split_ros_args
+from sros_tool.demo.policies import check_topic, talking_policy
 from sros_tool.demo.program import DemoOptions, run_demo
-from sros_tool.demo.scenarios import Role
+from sros_tool.demo.result import DemoResult, ScenarioResult
 from sros_tool.demo.table import demo_table
+from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import load_template
+from sros_tool.runtime.netns import Isolation
 from sros_tool.runtime.stacks import ProbeEnclave, Stack
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
@@ -79,7 +82,7 @@ def test_nothing_is_kept_of_a_demo_that_could_not_run(
 
 
 def test_the_policy_follows_the_topic_and_leaves_two_enclaves_without_it() -> None:
-    policy = demo_policy("/camera")
+    policy = talking_policy("/camera")
     topics = {
         enclave.path.rpartition("/")[2]: {
             (right, name)
@@ -151,18 +154,18 @@ def test_ros_arguments(given: list[str], own: list[str], ros: list[str]) -> None
 
 
 def test_the_table_shows_reasons_and_a_summary() -> None:
-    from sros_tool.demo.backend import Backend
-    from sros_tool.demo.program import DemoResult
-    from sros_tool.demo.scenarios import Status
-    from sros_tool.demo.verdict import RowResult
-    from sros_tool.runtime.netns import Isolation
-
     rows = (
         RowResult("a", Status.HEARD, Status.HEARD, "m", "49 of 50", 1),
         RowResult("b", Status.REFUSED, Status.CRASHED, "m", "SIGSEGV", 2),
         RowResult("c", Status.READABLE, Status.SKIPPED, "m", "not permitted", 3),
     )
-    result = DemoResult(Backend("cyclone", "C 1", "w"), "/t", Isolation(False, "no right"), rows)
+    result = DemoResult(
+        Backend("cyclone", "C 1", "w"),
+        "/t",
+        Isolation(False, "no right"),
+        "production",
+        (ScenarioResult("s", "title", rows),),
+    )
     text = demo_table(result)
     assert "no right" in text
     assert "FAIL  b" in text

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.demo.scenarios import ROWS, STATUS_OF, Relation, Role, Row
+from sros_tool.demo.model import STATUS_OF, Relation, Role, Row
+from sros_tool.demo.scenarios.isolation import ROWS
 
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)

@@ -6,7 +6,8 @@ from collections.abc import Iterable
 
 import pytest
 
-from sros_tool.demo.scenarios import ROWS, Row, Status
+from sros_tool.demo.model import Row, Status
+from sros_tool.demo.scenarios.isolation import ROWS
 from sros_tool.demo.verdict import PartyRecord, RowRecord, RowResult, WireCount, judge_row
 from sros_tool.runtime.events import Event, Kind, Stage
 
@@ -117,7 +118,7 @@ CRASHES = {
     ),
     "refused already as a participant": (
         PartyRecord(events=(Event(Kind.REFUSED, 99, "bad file", stage=Stage.PARTICIPANT),)),
-        Status.NOT_STARTED,
+        Status.NOT_LET_IN,
         "before it came to the topic",
     ),
     "the log of another topic": (

@@ -12,8 +12,9 @@ from pathlib import Path
 import pytest
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.demo.keystores import DemoKeystores, make_keystores
-from sros_tool.demo.scenarios import Identity
+from sros_tool.demo.model import UNSECURED, Identity
+from sros_tool.demo.scenarios.isolation import ISOLATION, LISTENER, TALKER, TALKER_DENIED
+from sros_tool.demo.scenery import Scenery, build_scenery
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.cyclone_library import load_cyclone
@@ -55,14 +56,14 @@ def _needs_cyclone() -> None:
 
 
 @pytest.fixture(scope="module")
-def keystores(tmp_path_factory: pytest.TempPathFactory) -> DemoKeystores:
+def keystores(tmp_path_factory: pytest.TempPathFactory) -> Scenery:
     folder = tmp_path_factory.mktemp("keystores")
     domains, template = DomainSet.of((DOMAIN, DOMAIN)), load_template("production")
-    return make_keystores(folder, "/chatter", domains, template, datetime.now(UTC))
+    return build_scenery(folder, ISOLATION, "/chatter", domains, template, datetime.now(UTC))
 
 
 @pytest.fixture
-def child(keystores: DemoKeystores) -> Callable[[Identity, str], list[str]]:
+def child(keystores: Scenery) -> Callable[[Identity, str], list[str]]:
     """Runs code in a process of its own with an identity; returns the lines that it prints."""
 
     def run(identity: Identity, code: str, domain: int = DOMAIN) -> list[str]:
@@ -91,9 +92,9 @@ for topic in ("rt/chatter", "rt/other", "rq/chatterRequest", "ros_discovery_info
 @pytest.mark.parametrize(
     ("identity", "made"),
     [
-        (Identity.TALKER, {"writer rt/chatter"}),
-        (Identity.LISTENER, {"reader rt/chatter"}),
-        (Identity.TALKER_DENIED, set()),
+        (TALKER, {"writer rt/chatter"}),
+        (LISTENER, {"reader rt/chatter"}),
+        (TALKER_DENIED, set()),
     ],
 )
 def test_permissions_decide(
@@ -108,19 +109,19 @@ def test_permissions_decide(
 def test_without_security_every_name_can_be_used(
     child: Callable[[Identity, str], list[str]],
 ) -> None:
-    lines = child(Identity.NONE, ATTEMPTS)
+    lines = child(UNSECURED, ATTEMPTS)
     assert len(lines) == 8
     assert all(line.endswith(" made") for line in lines)
 
 
 def test_a_failure_that_is_no_refusal(child: Callable[[Identity, str], list[str]]) -> None:
-    (line,) = child(Identity.NONE, "print(attempt(join().writer, 'rt/not a name'))")
+    (line,) = child(UNSECURED, "print(attempt(join().writer, 'rt/not a name'))")
     assert line.startswith("failed")
 
 
 def test_what_is_written_is_read_and_seen(child: Callable[[Identity, str], list[str]]) -> None:
     lines = child(
-        Identity.NONE,
+        UNSECURED,
         """
         with join() as p:
             reader, writer = p.reader("rt/chatter"), p.writer("rt/chatter")
@@ -142,11 +143,11 @@ def test_what_is_written_is_read_and_seen(child: Callable[[Identity, str], list[
 @pytest.mark.parametrize("broken", ["permissions.p7s", "governance.p7s", "cert.pem", "key.pem"])
 def test_a_broken_enclave_is_refused(
     child: Callable[[Identity, str], list[str]],
-    keystores: DemoKeystores,
+    keystores: Scenery,
     tmp_path: Path,
     broken: str,
 ) -> None:
-    enclave = keystores.own / "enclaves/talker_listener/talker"
+    enclave = keystores.keystores["own"] / "enclaves/talker_listener/talker"
     code = "print(attempt(lambda _: Participant(110, Path({!r})), ''))"
     copy = tmp_path / "enclave"
     copy.mkdir()
@@ -155,11 +156,11 @@ def test_a_broken_enclave_is_refused(
         *("identity_ca.cert.pem", "permissions_ca.cert.pem"),
     ):
         (copy / name).write_bytes((enclave / name).read_bytes())
-    assert child(Identity.NONE, code.format(str(copy))) == ["made"]
+    assert child(UNSECURED, code.format(str(copy))) == ["made"]
     (copy / broken).write_bytes((copy / broken).read_bytes().replace(b"A", b"B"))
-    assert child(Identity.NONE, code.format(str(copy))) == ["refused"]
+    assert child(UNSECURED, code.format(str(copy))) == ["refused"]
     (copy / broken).unlink()
-    (line,) = child(Identity.NONE, code.format(str(copy)))
+    (line,) = child(UNSECURED, code.format(str(copy)))
     assert line.startswith("failed")
     assert broken in line
 
@@ -168,8 +169,8 @@ def test_a_domain_that_the_keystore_is_not_for(
     child: Callable[..., list[str]],
 ) -> None:
     code = "print(attempt(lambda _: join(), ''))"
-    assert child(Identity.TALKER, code) == ["made"]
-    assert child(Identity.TALKER, code, DOMAIN + 1) == ["refused"]
+    assert child(TALKER, code) == ["made"]
+    assert child(TALKER, code, DOMAIN + 1) == ["refused"]
 
 
 def test_unpacked_packages_are_used_alone(tmp_path: Path) -> None:

@@ -16,9 +16,10 @@ import pytest
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY, Backend, choose_backend
 from sros_tool.demo.isolated import run_isolated
-from sros_tool.demo.keystores import DemoKeystores, make_keystores
+from sros_tool.demo.model import UNSECURED, Status
 from sros_tool.demo.runner import Limits, Plan, run_plan
-from sros_tool.demo.scenarios import ROWS, Identity, Status
+from sros_tool.demo.scenarios.isolation import ISOLATION, ROWS, TALKER
+from sros_tool.demo.scenery import Scenery, build_scenery
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.events import Event, Kind, Stage, read_events
@@ -56,12 +57,12 @@ def wait_for(path: Path, kind: Kind, seconds: float = 30) -> list[Event]:
 
 
 def test_the_runner_drives_rclpy_nodes(tmp_path: Path) -> None:
-    rows = tuple(row for row in ROWS if all(p.identity is Identity.NONE for p in row.parties))
+    rows = tuple(row for row in ROWS if all(p.identity == UNSECURED for p in row.parties))
     plan = Plan(
         rows=rows,
         domains=tuple(range(191, 191 + len(rows))),
         backend=Backend(RCLPY, "Fast DDS", "a test"),
-        keystores=DemoKeystores(tmp_path, tmp_path),
+        scenery=Scenery({}),
         topic="/chatter",
         folder=tmp_path / "rows",
         limits=Limits(window=2.0, longest_window=10.0),
@@ -108,10 +109,10 @@ def test_a_cyclone_talker_is_heard_by_an_rclpy_listener(tmp_path: Path) -> None:
 def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
     """Over an RMW without security, the node must fail at the participant and say why."""
     domains, template = DomainSet.of((190, 190)), load_template("production")
-    keystores = make_keystores(tmp_path, "/chatter", domains, template, datetime.now(UTC))
+    keystores = build_scenery(tmp_path, ISOLATION, "/chatter", domains, template, datetime.now(UTC))
     stack = next(rclpy_stacks(keystores.probe("/chatter", 190)))
     assert stack.enforces is not None, stack.evidence
-    variables = keystores.environment(Identity.TALKER, 190)
+    variables = keystores.environment(TALKER, 190)
     talker = node("talker", tmp_path, **variables)
     if stack.enforces:
         wait_for(tmp_path / "talker.jsonl", Kind.READY)

@@ -16,9 +16,10 @@ import pytest
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.isolated import run_isolated
-from sros_tool.demo.keystores import DemoKeystores
+from sros_tool.demo.model import UNSECURED, Row, Status
 from sros_tool.demo.runner import Limits, Plan, run_plan
-from sros_tool.demo.scenarios import ROWS, Identity, Row, Status
+from sros_tool.demo.scenarios.isolation import ROWS
+from sros_tool.demo.scenery import Scenery
 from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.runtime.cyclone_library import load_cyclone
@@ -138,19 +139,18 @@ def play(rows: tuple[Row, ...], backend: Backend, folder: Path) -> dict[str, Row
         rows=rows,
         domains=tuple(range(180, 180 + len(rows))),
         backend=backend,
-        keystores=DemoKeystores(folder / "none", folder / "none"),
+        scenery=Scenery({}),
         topic="/chatter",
         folder=folder / "rows",
         limits=SHORT,
+        own_networks=try_isolation().isolated,
     )
     results = run_isolated(lambda tell: run_plan(plan, tell), try_isolation(), lambda _line: None)
     return {result.name: result for result in results}
 
 
 def without_security(row: Row) -> Row:
-    return replace(
-        row, parties=tuple(replace(party, identity=Identity.NONE) for party in row.parties)
-    )
+    return replace(row, parties=tuple(replace(party, identity=UNSECURED) for party in row.parties))
 
 
 CYCLONE = Backend("cyclone", "Cyclone DDS", "a test")
@@ -178,7 +178,7 @@ def test_a_node_that_dies_makes_its_row_fail(victim: str, tmp_path: Path) -> Non
     row = replace(row, controls=())
 
     class Dying(Backend):
-        def command(self, role: Any) -> list[str]:
+        def command(self, role: Any, *, secured: bool = False) -> list[str]:
             if role.value != victim:
                 return super().command(role)
             code = (
@@ -244,7 +244,7 @@ def test_a_denial_as_rclpy_over_fast_dds_shows_it(tmp_path: Path) -> None:
     """The exception misleads; what Fast DDS prints on stdout, in colour, is what counts."""
 
     class FastDds(Backend):
-        def command(self, role: Any) -> list[str]:
+        def command(self, role: Any, *, secured: bool = False) -> list[str]:
             return [sys.executable, "-c", FAST_DDS_NODE]
 
     rows = tuple(without_security(row) for row in ROWS if row.expected is Status.REFUSED)

@@ -1,4 +1,4 @@
-"""What the demo tries: rows of parties, and what is claimed about them, as plain data.
+"""Isolation: nobody hears secured nodes, or gets in, without permission.
 
 Every row that expects silence carries a control: another listener that must hear the very same
 messages, or the same program in an enclave that is permitted.
@@ -6,117 +6,27 @@ messages, or the same program in an enclave that is permitted.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from enum import StrEnum
+from sros_tool.demo.model import (
+    FOREIGN,
+    OWN,
+    UNSECURED,
+    Claim,
+    Identity,
+    Party,
+    Relation,
+    Role,
+    Row,
+    Scenario,
+    Status,
+)
+from sros_tool.demo.policies import talking_policy
 
-
-class Role(StrEnum):
-    """What a process does."""
-
-    TALKER = "talker"
-    LISTENER = "listener"
-    OBSERVER = "observer"
-
-
-class Identity(StrEnum):
-    """With which security a process runs: none, or in which enclave of which keystore."""
-
-    NONE = "unsecured"
-    TALKER = "may talk"
-    LISTENER = "may listen"
-    TALKER_DENIED = "may not talk"
-    LISTENER_DENIED = "may not listen"
-    FOREIGN_TALKER = "may talk in another keystore"
-    FOREIGN_LISTENER = "may listen in another keystore"
-
-
-class Status(StrEnum):
-    """What was expected or observed of a row."""
-
-    HEARD = "heard"
-    NOT_HEARD = "not heard"
-    REFUSED = "refused"
-    STARTED = "started"
-    UNDISTURBED = "undisturbed"
-    DISTURBED = "disturbed"
-    VISIBLE = "visible"
-    NOT_VISIBLE = "not visible"
-    READABLE = "readable"
-    NOT_READABLE = "not readable"
-    CRASHED = "crashed"
-    NOT_STARTED = "not started"
-    UNDECIDED = "undecided"
-    SKIPPED = "skipped"
-
-
-class Relation(StrEnum):
-    """What can be claimed of a party, or of a party and a talker."""
-
-    HEARS = "hears"
-    IS_REFUSED = "is refused"
-    STARTS = "starts"
-    SEES = "sees"
-    READABLE = "is readable on the wire"
-
-
-STATUS_OF: dict[tuple[Relation, bool], Status] = {
-    (Relation.HEARS, True): Status.HEARD,
-    (Relation.HEARS, False): Status.NOT_HEARD,
-    (Relation.IS_REFUSED, True): Status.REFUSED,
-    (Relation.IS_REFUSED, False): Status.STARTED,
-    (Relation.STARTS, True): Status.STARTED,
-    (Relation.STARTS, False): Status.REFUSED,
-    (Relation.SEES, True): Status.VISIBLE,
-    (Relation.SEES, False): Status.NOT_VISIBLE,
-    (Relation.READABLE, True): Status.READABLE,
-    (Relation.READABLE, False): Status.NOT_READABLE,
-}
-
-
-@dataclass(frozen=True)
-class Party:
-    """One process of a row.  ``aside`` puts a talker on a topic of its own."""
-
-    name: str
-    role: Role
-    identity: Identity
-    aside: bool = False
-
-
-@dataclass(frozen=True)
-class Claim:
-    """``subject`` hears, sees ... ``talker``, or, where not ``holds``, does not."""
-
-    relation: Relation
-    subject: str
-    talker: str = ""
-    holds: bool = True
-
-    @property
-    def expected(self) -> Status:
-        """The status that this claim expects."""
-        return STATUS_OF[self.relation, self.holds]
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of the demo's table.
-
-    ``mechanism`` says in a clause what brings the expected outcome about; ``wire`` asks for a
-    capture of the packets.
-    """
-
-    name: str
-    expected: Status
-    mechanism: str
-    parties: tuple[Party, ...]
-    claims: tuple[Claim, ...]
-    controls: tuple[Claim, ...] = ()
-    wire: bool = False
-
-    def party(self, name: str) -> Party:
-        """The party of that name.  Raises `KeyError`."""
-        return {party.name: party for party in self.parties}[name]
+TALKER = Identity(OWN, "talker")
+LISTENER = Identity(OWN, "listener")
+TALKER_DENIED = Identity(OWN, "talker without permission")
+LISTENER_DENIED = Identity(OWN, "listener without permission")
+FOREIGN_TALKER = Identity(FOREIGN, "talker")
+FOREIGN_LISTENER = Identity(FOREIGN, "listener")
 
 
 def _hears(listener: str, talker: str) -> Claim:
@@ -127,16 +37,16 @@ def _hears_not(listener: str, talker: str) -> Claim:
     return Claim(Relation.HEARS, listener, talker, holds=False)
 
 
-_SECURED_TALKER = Party("secured talker", Role.TALKER, Identity.TALKER)
-_SECURED_LISTENER = Party("secured listener", Role.LISTENER, Identity.LISTENER)
-_OPEN_TALKER = Party("unsecured talker", Role.TALKER, Identity.NONE)
-_OPEN_LISTENER = Party("unsecured listener", Role.LISTENER, Identity.NONE)
-_DENIED_TALKER = Party("talker without permission", Role.TALKER, Identity.TALKER_DENIED)
-_DENIED_LISTENER = Party("listener without permission", Role.LISTENER, Identity.LISTENER_DENIED)
-_FOREIGN_TALKER = Party("foreign talker", Role.TALKER, Identity.FOREIGN_TALKER)
-_FOREIGN_LISTENER = Party("foreign listener", Role.LISTENER, Identity.FOREIGN_LISTENER)
-_OPEN_TALKER_ASIDE = Party("unsecured talker aside", Role.TALKER, Identity.NONE, aside=True)
-_OBSERVER = Party("observer", Role.OBSERVER, Identity.NONE)
+_SECURED_TALKER = Party("secured talker", Role.TALKER, TALKER)
+_SECURED_LISTENER = Party("secured listener", Role.LISTENER, LISTENER)
+_OPEN_TALKER = Party("unsecured talker", Role.TALKER, UNSECURED)
+_OPEN_LISTENER = Party("unsecured listener", Role.LISTENER, UNSECURED)
+_DENIED_TALKER = Party("talker without permission", Role.TALKER, TALKER_DENIED)
+_DENIED_LISTENER = Party("listener without permission", Role.LISTENER, LISTENER_DENIED)
+_FOREIGN_TALKER = Party("foreign talker", Role.TALKER, FOREIGN_TALKER)
+_FOREIGN_LISTENER = Party("foreign listener", Role.LISTENER, FOREIGN_LISTENER)
+_OPEN_TALKER_ASIDE = Party("unsecured talker aside", Role.TALKER, UNSECURED, aside=True)
+_OBSERVER = Party("observer", Role.OBSERVER, UNSECURED)
 
 ROWS: tuple[Row, ...] = (
     Row(
@@ -231,4 +141,17 @@ ROWS: tuple[Row, ...] = (
         (_hears("secured listener", "secured talker"),),
         wire=True,
     ),
+)
+
+ISOLATION = Scenario(
+    "isolation",
+    "nobody hears secured nodes, or gets in, without permission",
+    ROWS,
+    {
+        "talker": "/talker_listener/talker",
+        "listener": "/talker_listener/listener",
+        "talker without permission": "/talker_listener/talker_without_permission",
+        "listener without permission": "/talker_listener/listener_without_permission",
+    },
+    talking_policy,
 )

@@ -1,0 +1,83 @@
+"""The policies that the demo's enclaves live by: those that ship with sros, on the demo's topic."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from typing import Final
+
+from sros_tool.errors import UsageError
+from sros_tool.policy import Enclave, Group, Policy, Profile, read_policy
+from sros_tool.resources import policies_dir
+
+DEFAULT_TOPIC: Final = "/chatter"
+DENIED_TOPIC: Final = "/sros_not_allowed"
+"""A topic that no enclave of the demo may use."""
+
+_POLICY_FILE = "talker_listener.xml"
+_POLICY_TOPIC = "chatter"
+_TALKER, _LISTENER = "/talker_listener/talker", "/talker_listener/listener"
+_WITHOUT = "_without_permission"
+
+_ROS_TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
+_LONGEST_TOPIC = 200
+_EVERY_NODE_MAY = ("/rosout", "/parameter_events", "/clock", DENIED_TOPIC)
+
+
+def check_topic(topic: str) -> str:
+    """The absolute form of a topic name for the demo.  Raises `UsageError`."""
+    if len(topic) > _LONGEST_TOPIC or not _ROS_TOPIC.match(topic):
+        raise UsageError(
+            f"{topic!r} is not a topic name that the demo can use",
+            "It must be made of letters, digits and underscores, in parts joined by '/', none of"
+            f" which starts with a digit, and have at most {_LONGEST_TOPIC} characters.",
+            "Use a name such as /chatter or /robot/camera.",
+        )
+    absolute = topic if topic.startswith("/") else f"/{topic}"
+    if absolute in _EVERY_NODE_MAY:
+        raise UsageError(
+            f"the demo cannot use {absolute}",
+            "It is one of the topics that a ROS 2 node uses by itself.",
+            "Use a name such as /chatter.",
+        )
+    return absolute
+
+
+def shipped_policy(file: str) -> Policy:
+    """A policy that ships with sros."""
+    return read_policy(policies_dir() / file)
+
+
+def talking_policy(topic: str) -> Policy:
+    """The shipped policy, for ``topic``, and the two enclaves that are not allowed it."""
+    shipped = shipped_policy(_POLICY_FILE)
+    by_path = {enclave.path: enclave for enclave in shipped.enclaves}
+    talker, listener = by_path[_TALKER], by_path[_LISTENER]
+    return replace(
+        shipped,
+        enclaves=(
+            with_topic(talker, topic),
+            with_topic(listener, topic),
+            replace(with_topic(talker, None), path=f"{_TALKER}{_WITHOUT}"),
+            replace(with_topic(listener, None), path=f"{_LISTENER}{_WITHOUT}"),
+        ),
+    )
+
+
+def with_topic(enclave: Enclave, topic: str | None) -> Enclave:
+    """The enclave with ``topic`` in place of the shipped policy's, or without either."""
+
+    def of_group(group: Group) -> Group | None:
+        if group.kind != "topics" or _POLICY_TOPIC not in group.names:
+            return group
+        return None if topic is None else replace(group, names=(topic,))
+
+    def of_profile(profile: Profile) -> Profile:
+        groups = (of_group(group) for group in profile.groups)
+        return replace(profile, groups=tuple(group for group in groups if group is not None))
+
+    blocks = (
+        replace(block, profiles=tuple(of_profile(profile) for profile in block.profiles))
+        for block in enclave.profiles
+    )
+    return replace(enclave, profiles=tuple(blocks))

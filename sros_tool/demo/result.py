@@ -1,0 +1,90 @@
+"""What a demo showed, and its JSON.
+
+`DemoResult.as_json` is what ``sros demo --json`` prints and ``--keep`` leaves as ``result.json``:
+
+- ``backend``, ``dds``, ``why``: what the nodes ran on, its version, how it was chosen;
+- ``template``: the keystore template, whose expectations hold; ``topic``: the topic of the demo;
+- ``own_network``, ``network_reason``: whether it ran in a network namespace, and if not, why;
+- ``as_expected``: whether the exit status is 0;
+- ``scenarios``: a list of ``{"name", "title", "as_expected", "rows", "cost"}``;
+- ``rows``: the rows of all scenarios, in order, each with its ``scenario``.
+
+A row has ``name``, ``expected``, ``observed`` (statuses of `sros_tool.demo.model.Status`),
+``as_expected``, ``mechanism`` (what brings the expectation about), ``detail`` (what was seen,
+counted), ``domain``, ``seconds`` (how long the window was), and for attacks ``attack`` (which
+one; "" elsewhere), ``defence_removed`` ("" for the attack itself; otherwise the row shows that
+the attack works without the defence named here), ``open_because`` ("" for a closed door;
+otherwise why it is known to be open) and ``remedy``.
+
+``cost`` is null, or what `sros_tool.demo.cost.CostResult.as_json` describes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from sros_tool.demo.backend import Backend
+from sros_tool.demo.verdict import RowResult
+from sros_tool.runtime.netns import Isolation
+
+
+@dataclass(frozen=True)
+class ScenarioResult:
+    """What one scenario showed."""
+
+    name: str
+    title: str
+    rows: tuple[RowResult, ...]
+
+    @property
+    def as_expected(self) -> bool:
+        """Whether every row is as expected or skipped with a reason."""
+        return all(row.as_expected for row in self.rows)
+
+    def as_json(self) -> dict[str, Any]:
+        """The scenario as `sros demo --json` shows it."""
+        return {
+            "name": self.name,
+            "title": self.title,
+            "as_expected": self.as_expected,
+            "rows": [{**row.as_json(), "scenario": self.name} for row in self.rows],
+            "cost": None,
+        }
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demo showed."""
+
+    backend: Backend
+    topic: str
+    isolation: Isolation
+    template: str
+    scenarios: tuple[ScenarioResult, ...]
+
+    @property
+    def rows(self) -> tuple[RowResult, ...]:
+        """The rows of all scenarios."""
+        return tuple(row for scenario in self.scenarios for row in scenario.rows)
+
+    @property
+    def as_expected(self) -> bool:
+        """Whether every row is as expected or skipped with a reason."""
+        return all(scenario.as_expected for scenario in self.scenarios)
+
+    def as_json(self) -> dict[str, Any]:
+        """The result as the head of this module describes it."""
+        scenarios = [scenario.as_json() for scenario in self.scenarios]
+        return {
+            "backend": self.backend.name,
+            "dds": self.backend.dds,
+            "why": self.backend.why,
+            "template": self.template,
+            "topic": self.topic,
+            "own_network": self.isolation.isolated,
+            "network_reason": self.isolation.reason,
+            "as_expected": self.as_expected,
+            "scenarios": scenarios,
+            "rows": [row for scenario in scenarios for row in scenario["rows"]],
+        }
