@@ -1,0 +1,66 @@
+"""What is asked of the access control of DDS, and what it answers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from sros_tool.dds.governance import TopicRule
+
+
+class Verb(StrEnum):
+    """What an identity wants to do."""
+
+    JOIN = "join"
+    PUBLISH = "publish"
+    SUBSCRIBE = "subscribe"
+
+
+class Outcome(StrEnum):
+    """What becomes of it."""
+
+    ALLOWED = "allowed"
+    DENIED = "denied"
+    """The call fails where it is made."""
+    PEER_DENIES = "peer denies"
+    """It is created, but no permitted peer will match it."""
+    REFUSED = "refused"
+    """The participant does not start at all."""
+    CRASHES = "crashes"
+    """The process ends with a fault."""
+
+    @property
+    def ok(self) -> bool:
+        """Whether data can flow."""
+        return self is Outcome.ALLOWED
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """An outcome and what decided it.
+
+    ``reason`` is a stable word for programs, ``text`` a sentence for people.  ``grant`` is an
+    index in the permissions, ``rule`` one in the grant, ``expression`` the ``<topic>`` that
+    matched, ``topic_rule`` what the governance says of the topic.
+    """
+
+    outcome: Outcome
+    reason: str
+    text: str
+    grant: int | None = None
+    rule: int | None = None
+    expression: str | None = None
+    topic_rule: TopicRule | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """Why a vendor does not accept a document; ``outcome`` is REFUSED or CRASHES."""
+
+    reason: str
+    text: str
+    outcome: Outcome = Outcome.REFUSED
+
+    def decision(self) -> Decision:
+        """The answer to every question under such a document."""
+        return Decision(self.outcome, self.reason, self.text)

@@ -1,0 +1,180 @@
+"""Expressions with wildcards, as each vendor matches topics and partitions against them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from functools import lru_cache
+
+from sros_tool.dds.decision.vendors import Style
+
+Matcher = Callable[[str], object]
+"""Truthy if a name matches."""
+
+SPECIAL = frozenset("*?[")
+"""An expression without any of these means itself, for every vendor."""
+
+_NEVER = "(?!)"
+_CLASS = re.compile(r"\[:([a-y]*):\]")
+_CLASSES = {
+    "alnum": "0-9A-Za-z",
+    "alpha": "A-Za-z",
+    "blank": " \\t",
+    "cntrl": "\\x00-\\x1f\\x7f",
+    "digit": "0-9",
+    "graph": "!-~",
+    "lower": "a-z",
+    "print": " -~",
+    "punct": "!-/:-@\\[-`{-~",
+    "space": " \\t-\\r",
+    "upper": "A-Z",
+    "xdigit": "0-9A-Fa-f",
+}
+
+
+@lru_cache(maxsize=65536)
+def matcher(style: Style, expression: str) -> Matcher | None:
+    """What matches names against ``expression``; None if it matches only itself."""
+    if SPECIAL.isdisjoint(expression):
+        return None
+    take_set = _fnmatch_set if style is Style.FNMATCH else _cyclone_set
+    parts = []
+    index = 0
+    while index < len(expression):
+        char = expression[index]
+        index += 1
+        if char == "*":
+            parts.append(".*")
+        elif char == "?":
+            parts.append(".")
+        elif char == "[":
+            part, index = take_set(expression, index)
+            parts.append(part)
+        else:
+            parts.append(re.escape(char))
+    joined = re.sub(r"(\.\*)+", ".*", "".join(parts))
+    return re.compile(joined + r"\Z", re.DOTALL).match
+
+
+def matches(style: Style, expression: str, name: str) -> bool:
+    """Whether ``name`` matches ``expression``."""
+    match = matcher(style, expression)
+    return expression == name if match is None else bool(match(name))
+
+
+class Expressions:
+    """Expressions in their order, asked which of them match a name; plain ones cost nothing."""
+
+    def __init__(self, style: Style, texts: Iterable[str], *, both_ways: bool = False) -> None:
+        self._style = style
+        self._texts = tuple(texts)
+        self._both_ways = both_ways
+        self._plain: dict[str, list[int]] = {}
+        self._wild: list[tuple[int, Matcher]] = []
+        for position, text in enumerate(self._texts):
+            match = matcher(style, text)
+            if match is None:
+                self._plain.setdefault(text, []).append(position)
+            else:
+                self._wild.append((position, match))
+
+    def matching(self, name: str) -> Iterator[int]:
+        """The positions of the expressions that match ``name``, in order."""
+        if self._both_ways and not SPECIAL.isdisjoint(name):
+            yield from self._either_way(name)
+            return
+        plain = iter(self._plain.get(name, ()))
+        next_plain = next(plain, None)
+        for position, match in self._wild:
+            while next_plain is not None and next_plain < position:
+                yield next_plain
+                next_plain = next(plain, None)
+            if match(name):
+                yield position
+        while next_plain is not None:
+            yield next_plain
+            next_plain = next(plain, None)
+
+    def first(self, name: str) -> int | None:
+        """The position of the first expression that matches ``name``."""
+        return next(self.matching(name), None)
+
+    def _either_way(self, name: str) -> Iterator[int]:
+        for position, text in enumerate(self._texts):
+            if matches(self._style, text, name) or matches(self._style, name, text):
+                yield position
+
+
+def _set_of(members: list[str], negated: bool) -> str:
+    if not members:
+        return "." if negated else _NEVER
+    return f"[{'^' if negated else ''}{''.join(members)}]"
+
+
+def _fnmatch_set(text: str, start: int) -> tuple[str, int]:
+    """The set that begins behind ``[``, as glibc reads it, and where the expression goes on.
+
+    A set that is never closed is a plain ``[``.  From an unknown class on, nothing matches.
+    """
+    index = start
+    negated = text[index : index + 1] in ("!", "^")
+    index += negated
+    members: list[str] = []
+    known = True
+    first = True
+    while index < len(text):
+        if text[index] == "]" and not first:
+            return (_NEVER if negated and not known else _set_of(members, negated)), index + 1
+        first = False
+        if found := _CLASS.match(text, index):
+            known = known and found[1] in _CLASSES
+            if known:
+                members.append(_CLASSES[found[1]])
+            index = found.end()
+            continue
+        low, index = _member(text, index)
+        if text[index : index + 1] == "-" and text[index + 1 : index + 2] not in ("", "]"):
+            high, index = _member(text, index + 1)
+            if known and low <= high:
+                members.append(f"{re.escape(low)}-{re.escape(high)}")
+        elif known:
+            members.append(re.escape(low))
+    return re.escape("["), start
+
+
+def _member(text: str, index: int) -> tuple[str, int]:
+    """One character of a set, also as ``[=a=]`` or ``[.a.]``, and where the set goes on."""
+    if (
+        text[index : index + 2] in ("[=", "[.")
+        and text[index + 3 : index + 5] == text[index + 1] + "]"
+    ):
+        return text[index + 2], index + 5
+    return text[index], index + 1
+
+
+def _cyclone_set(text: str, start: int) -> tuple[str, int]:
+    """The set that begins behind ``[``, as Cyclone DDS 0.10 reads it, and what follows it.
+
+    Its loop ends only after it took the closing bracket for a member, and looks for a range there
+    as well: ``[ab]`` also matches ``]``, and ``[ab]-x`` is one set with the range ``]`` to ``x``.
+    """
+    index = start
+    negated = text[index : index + 1] == "!"
+    index += negated
+    members: list[str] = []
+    last = text[index : index + 1]
+    while last != "]":
+        last = text[index : index + 1]
+        if not last:
+            return _NEVER, len(text)
+        if text[index + 1 : index + 2] == "-":
+            high = text[index + 2 : index + 3]
+            if high in ("", "]"):
+                return _NEVER, len(text)
+            if last <= high:
+                members.append(f"{re.escape(last)}-{re.escape(high)}")
+            index += 2
+        else:
+            members.append(re.escape(last))
+        index += 1
+    return _set_of(members, negated), index

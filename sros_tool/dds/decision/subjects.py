@@ -1,0 +1,90 @@
+"""Whether the subject of a grant is that of a certificate, as each vendor compares them.
+
+Certificates' subjects are RFC 4514 text, the most specific attribute first, as OpenSSL and
+`sros_tool.pki.certificates.subject_text` print them.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+from sros_tool.dds.decision.vendors import Subjects
+
+_MOST_PARTS = 20  # Cyclone DDS 0.10 refuses a grant's subject of more
+
+
+def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
+    """Whether a grant for ``granted`` is one for the certificate's subject ``certified``."""
+    return _COMPARE[rule](granted, certified)
+
+
+def _exact(granted: str, certified: str) -> bool:
+    return _attributes(granted) == _attributes(certified)
+
+
+def _whole_attributes(granted: str, certified: str) -> bool:
+    # Fast DDS 2.9 splits at every comma, also at an escaped one.
+    return _stripped(granted) == _stripped(certified)
+
+
+def _stripped(name: str) -> list[str]:
+    return [part.strip(" ") for part in name.split(",")] if name else []
+
+
+def _any_order(granted: str, certified: str) -> bool:
+    ours, theirs = _attributes(granted), _attributes(certified)
+    first_values: dict[str, str] = {}
+    for kind, value in theirs:
+        first_values.setdefault(kind, value)
+    # Only the first value of a kind is ever found, so a repeated kind fits nothing.
+    return len(ours) == len(theirs) and all(first_values.get(k, "") == v for k, v in ours)
+
+
+_PART = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^,"\\])*', re.DOTALL)
+_EQUALS = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^="\\])*', re.DOTALL)
+
+
+def _attributes(name: str) -> list[tuple[str, str]]:
+    """Kinds and values without quotes, escapes and outer spaces; up to the first malformed one."""
+    found = []
+    index = 0
+    while index < len(name):
+        part = _PART.match(name, index)
+        text = part[0].strip(" ") if part else ""
+        kind = _EQUALS.match(text)
+        if not text or not kind or kind.end() >= len(text):
+            break
+        found.append((_plain(kind[0]), _plain(text[kind.end() + 1 :])))
+        index += len(part[0]) + 1 if part else 1
+    return found
+
+
+def _plain(text: str) -> str:
+    return text.strip(" ").replace("\\", "").replace('"', "")
+
+
+def _subset(granted: str, certified: str) -> bool:
+    parts = [part for part in re.split(r"[,/|]", granted) if part]
+    if len(parts) > _MOST_PARTS:
+        return False
+    values: dict[str, str] = {}
+    for part in parts:
+        kind, _, value = part.partition("=")
+        values.setdefault(kind, value)
+    wanted = re.split(r"[,/|]", certified)
+    if wanted and not wanted[-1]:  # what ends in a separator has nothing behind it
+        wanted.pop()
+    for part in wanted:
+        kind, _, value = part.partition("=")
+        if not part or values.get(kind) != value:
+            return False
+    return True
+
+
+_COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
+    Subjects.EXACT: _exact,
+    Subjects.WHOLE_ATTRIBUTES: _whole_attributes,
+    Subjects.ANY_ORDER: _any_order,
+    Subjects.SUBSET: _subset,
+}

@@ -1,0 +1,159 @@
+"""The vendors of DDS Security, and in what their decisions differ, as data.
+
+Measured on the real libraries where `Vendor.documented_only` is false: Fast DDS 2.9.1 and 2.14.5,
+and Cyclone DDS 0.10.2.  OpenDDS and Connext are as their manuals say.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum, StrEnum, auto
+
+
+class Vendor(StrEnum):
+    """A DDS implementation, or the specification itself."""
+
+    STANDARD = "standard"
+    FAST = "fastdds"
+    FAST_2_9 = "fastdds-2.9"
+    CYCLONE = "cyclonedds"
+    OPENDDS = "opendds"
+    CONNEXT = "connext"
+
+    @property
+    def title(self) -> str:  # type: ignore[override]
+        """The name and version for people, as in ``Fast DDS 2.14``."""
+        return TRAITS[self].title
+
+    @property
+    def documented_only(self) -> bool:
+        """Whether its rules come from documentation alone and were never measured."""
+        return TRAITS[self].documented_only
+
+
+class Style(Enum):
+    """How an expression with wildcards is read."""
+
+    FNMATCH = auto()
+    """POSIX fnmatch of glibc, without escapes, where ``*`` crosses ``/``."""
+    CYCLONE = auto()
+    """Cyclone DDS' own ``* ? [..]``."""
+
+
+class Subjects(Enum):
+    """How the subject of a grant is compared with that of a certificate."""
+
+    EXACT = auto()
+    """The same attributes in the same order; spaces around them do not count."""
+    WHOLE_ATTRIBUTES = auto()
+    """The same, but spaces around ``=`` count (Fast DDS 2.9)."""
+    ANY_ORDER = auto()
+    """The same attributes in any order (Fast DDS 2.14)."""
+    SUBSET = auto()
+    """What lies between ``, / |`` in the certificate's subject occurs in the grant's (Cyclone)."""
+
+
+class Moments(Enum):
+    """How a date of a grant is read."""
+
+    STANDARD = auto()
+    """With its offset; UTC if it has none."""
+    LOCAL = auto()
+    """In the standard time of the host's zone, the offset dropped (Fast DDS)."""
+    CYCLONE = auto()
+    """With its offset; only whole dates and times of 1970 to 2262, all else is long past."""
+
+
+class OpenRange(Enum):
+    """What a range of domains with one end means."""
+
+    OPEN = auto()
+    """From N on; up to N."""
+    SINGLE = auto()
+    """Without an upper end N alone; without a lower end up to N (Fast DDS)."""
+    CRASHES = auto()
+    """Without an upper end N alone; without a lower end a crash (Cyclone DDS)."""
+
+
+class DenyPartitions(Enum):
+    """Which partitions of an endpoint a deny rule must name to hold for it."""
+
+    ANY = auto()
+    """One of them; a deny rule without partitions holds for all."""
+    ALL = auto()
+    """All of them; a deny rule without partitions holds for the default one only."""
+    IGNORED = auto()
+    """None: a deny rule holds whatever its partitions."""
+
+
+@dataclass(frozen=True, slots=True)
+class Traits:
+    """The rules by which one vendor decides, where vendors differ."""
+
+    title: str
+    documented_only: bool = False
+    style: Style = Style.FNMATCH
+    governance_both_ways: bool = False
+    """A topic's name is also taken as an expression for the governance's expressions."""
+    trims_texts: bool = False
+    """Spaces around the text of an element do not count."""
+    subjects: Subjects = Subjects.EXACT
+    moments: Moments = Moments.STANDARD
+    passes_over_outdated_grants: bool = False
+    """A later grant is used if the first of the subject is out of date."""
+    open_range: OpenRange = OpenRange.OPEN
+    filters_own_domain: bool = True
+    """Rules for other domains do not count for the own participant (they never do for peers)."""
+    topic_decides: bool = False
+    """The first rule whose topic matches decides, and then its partitions must fit."""
+    deny_partitions: DenyPartitions = DenyPartitions.ANY
+    honours_default: bool = True
+    creates_topics: bool = False
+    """A topic is created before its endpoint, and needs a right in either direction."""
+    always_needs_allow_rule: bool = False
+    """Without any allow rule the participant does not start, even without join control."""
+    needs_domain_rule: bool = True
+    """The participant does not start on a domain that the governance does not list."""
+    refuses_open_rtps: bool = False
+    """Unauthenticated participants together with RTPS protection are refused."""
+
+
+_FAST = Traits(
+    "Fast DDS 2.14",
+    governance_both_ways=True,
+    subjects=Subjects.ANY_ORDER,
+    moments=Moments.LOCAL,
+    passes_over_outdated_grants=True,
+    open_range=OpenRange.SINGLE,
+    filters_own_domain=False,
+    topic_decides=True,
+    deny_partitions=DenyPartitions.IGNORED,
+    honours_default=False,
+    always_needs_allow_rule=True,
+    needs_domain_rule=False,
+    refuses_open_rtps=True,
+)
+
+TRAITS = {
+    Vendor.STANDARD: Traits("DDS-Security 1.1"),
+    Vendor.FAST: _FAST,
+    Vendor.FAST_2_9: replace(
+        _FAST,
+        title="Fast DDS 2.9.1",
+        subjects=Subjects.WHOLE_ATTRIBUTES,
+        refuses_open_rtps=False,
+    ),
+    Vendor.CYCLONE: Traits(
+        "Cyclone DDS 0.10.2",
+        style=Style.CYCLONE,
+        trims_texts=True,
+        subjects=Subjects.SUBSET,
+        moments=Moments.CYCLONE,
+        open_range=OpenRange.CRASHES,
+        deny_partitions=DenyPartitions.ALL,
+        creates_topics=True,
+    ),
+    Vendor.OPENDDS: Traits("OpenDDS", documented_only=True),
+    Vendor.CONNEXT: Traits("Connext 6.1.1 and later", documented_only=True),
+}
+"""The rules of every vendor."""
