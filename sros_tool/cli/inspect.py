@@ -43,7 +43,8 @@ Example:
 )
 @json_option
 def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) -> int:
-    """Show what PATH says: a keystore, an enclave's folder, a certificate, a key or a .p7s file.
+    """Show what PATH says: a keystore, an enclave's folder, a certificate or several, a revocation
+    list, a key or a .p7s file.
 
     The exit status is 1 if an enclave cannot run, a signature does not verify, or the ledger of
     the keystore does not know a certificate or signed document in it.
@@ -109,6 +110,13 @@ def _keystore(d: dict[str, Any]) -> Iterator[str]:
             f"  {role} CA {authority['subject']}, {authority['key']}, {key}, "
             f"valid until {authority['not_after']}"
         )
+        for other in authority.get("further", ()):
+            yield (
+                f"    beside it {other['subject']}, {other['key']}, "
+                f"valid until {other['not_after']}, serial {other['serial']}"
+            )
+        if "crl" in authority:
+            yield from _indented(_indented(_list(authority["crl"])))
     if d["governance"]:
         if "error" in d["governance"]:
             yield f"  governance: {d['governance']['error']}"
@@ -139,13 +147,36 @@ def _enclave(d: dict[str, Any]) -> Iterator[str]:
 def _certificate(d: dict[str, Any]) -> Iterator[str]:
     kind = "CA certificate" if d["is_ca"] else "certificate"
     yield f"{kind} {d['path']}"
-    yield f"  subject {d['subject']}"
-    yield f"  issuer {d['issuer']}"
-    yield f"  serial {d['serial']}"
-    yield f"  {d['key']}, signed with {d['signature']}"
+    yield from _indented(_facts(d))
+    for other in d.get("further", ()):
+        yield "beside it, in the same file"
+        yield from _indented(_facts(other))
+    if "crl" in d:
+        yield from _list(d["crl"])
+
+
+def _facts(d: dict[str, Any]) -> Iterator[str]:
+    yield f"subject {d['subject']}"
+    yield f"issuer {d['issuer']}"
+    yield f"serial {d['serial']}"
+    yield f"{d['key']}, signed with {d['signature']}"
     valid = "valid now" if d["valid_now"] else "NOT VALID NOW"
-    yield f"  from {d['not_before']} to {d['not_after']}: {valid}"
-    yield f"  SHA-256 {d['sha256']}"
+    yield f"from {d['not_before']} to {d['not_after']}: {valid}"
+    yield f"SHA-256 {d['sha256']}"
+
+
+def _revocation_list(d: dict[str, Any]) -> Iterator[str]:
+    yield from _list(d)
+    for serial in d["revoked"]:
+        yield f"  {serial}"
+
+
+def _list(d: dict[str, Any]) -> Iterator[str]:
+    valid = "" if d["valid_now"] else ": NOT VALID NOW"
+    yield (
+        f"revocation list {d['number']} of {d['issuer']}, until {d['not_after']}{valid}, "
+        f"{len(d['revoked'])} revoked"
+    )
 
 
 def _key(d: dict[str, Any]) -> Iterator[str]:
@@ -224,6 +255,7 @@ _TEXT = {
     "enclave": _enclave,
     "certificate": _certificate,
     "private key": _key,
+    "revocation list": _revocation_list,
     "permissions": _permissions,
     "governance": _governance_file,
 }

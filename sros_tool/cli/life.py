@@ -99,12 +99,21 @@ Example:
     show_default=True,
     help="Why, in a word of RFC 5280, such as key_compromise, superseded, cessation_of_operation.",
 )
+@click.option(
+    "--until-retired",
+    is_flag=True,
+    help="While CAs are replaced: revoke without the key of the old identity CA.",
+)
 @dry_run_option
-def revoke(words: tuple[str, ...], reason: str, dry_run: bool) -> None:
+def revoke(words: tuple[str, ...], reason: str, until_retired: bool, dry_run: bool) -> None:
     """Revoke the enclaves NAME...: nobody who reads the new crl.pem talks to them any more.
 
     Their files move to the folder "revoked" of the keystore.  Exported enclaves need their
-    crl.pem exported again.
+    crl.pem exported again, and their CA files, too, while a rotation of CAs is under way.
+
+    In a rotation both CAs revoke, for Fast DDS trusts both. Where the key of the old one is gone,
+    its certificates are refused only once `sros rotate_ca --to retire` is done; --until-retired
+    accepts that.
     """
     from sros_tool.keystore.revoke import revoke as work
 
@@ -113,13 +122,23 @@ def revoke(words: tuple[str, ...], reason: str, dry_run: bool) -> None:
         raise UsageError("no enclave is named", "", "Name one or more, such as /talker.")
     words_of_rfc = reason.replace("-", "_").split("_")
     told = words_of_rfc[0] + "".join(word.capitalize() for word in words_of_rfc[1:])
-    result = work(root, names, now=now(), reason=told, keyring=keyring(), dry_run=dry_run)
+    result = work(
+        root,
+        names,
+        now=now(),
+        reason=told,
+        keyring=keyring(),
+        until_retired=until_retired,
+        dry_run=dry_run,
+    )
     if dry_run:
         print_plan(root, result.changes)
     else:
         for name in result.revoked:
             click.echo(f"revoked enclave {name}")
     _say_restart(result.restart)
+    for remark in result.remarks:
+        click.echo(remark, err=True)
 
 
 @click.command(
@@ -144,7 +163,9 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
     from datetime import timedelta
 
     from sros_tool.keystore.create import list_enclaves
-    from sros_tool.keystore.revoke import read_crl, refresh_crl
+    from sros_tool.keystore.lists import read_lists
+    from sros_tool.keystore.revoke import refresh_crl
+    from sros_tool.pki.certificates import subject_text
     from sros_tool.validity import iso
 
     root = root or keystore_from_environment()
@@ -155,11 +176,14 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
             print_plan(root, result.changes)
             return 0
         _say_restart(result.restart)
-    found = read_crl(root)
-    if found is None:
+        for remark in result.remarks:
+            click.echo(remark, err=True)
+    lists = read_lists(root)
+    if not lists:
         print_json(None) if as_json else click.echo("nothing was ever revoked", err=True)
         return 0
-    soon = found.next_update - now() < timedelta(days=30)
+    found, *beside = lists
+    soon = min(each.next_update for each in lists) - now() < timedelta(days=30)
     if as_json:
         print_json(
             {
@@ -171,12 +195,27 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
                     {"serial": f"{each.serial:x}", "date": iso(each.date), "reason": each.reason}
                     for each in found.revoked
                 ],
+                "beside": [
+                    {
+                        "issuer": subject_text(each.list.issuer),
+                        "number": each.number,
+                        "this_update": iso(each.this_update),
+                        "next_update": iso(each.next_update),
+                        "revoked": [f"{one.serial:x}" for one in each.revoked],
+                    }
+                    for each in beside
+                ],
             }
         )
     else:
         click.echo(f"revocation list {found.number}, until {iso(found.next_update)}")
         for each in found.revoked:
             click.echo(f"  {each.serial:x}  {iso(each.date)}  {each.reason}")
+        for other in beside:  # of the CA that comes or goes, while one replaces the other
+            click.echo(
+                f"beside it, list {other.number} of {subject_text(other.list.issuer)}, until "
+                f"{iso(other.next_update)}: {len(other.revoked)} revoked"
+            )
     if soon:
         click.echo(
             f"it ends soon, and DDS then refuses everybody: run `sros crl {root} --refresh`.",

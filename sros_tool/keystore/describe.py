@@ -34,6 +34,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
+from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl
 from sros_tool.pki.keys import algorithm, load_key
 from sros_tool.translate import RosRight, ros_rights
 from sros_tool.validity import iso
@@ -45,7 +46,8 @@ Description = dict[str, Any]
 def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Description:
     """What ``path`` is and says; ``kind`` tells which description follows.
 
-    Kinds: keystore, enclave, certificate, private key, permissions, governance.  ``authority`` is
+    Kinds: keystore, enclave, certificate, revocation list, private key, permissions, governance.
+    ``authority`` is
     the permissions CA certificate against which a signed document is verified; by default the one
     that lies with it.  Raises `DocumentError` for what is none of these.
     """
@@ -71,11 +73,9 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
 
 def _file(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
     if b"-----BEGIN CERTIFICATE-----" in data:
-        certificate, *further = load_certificates(data, "in it")
-        described = {"kind": "certificate", **describe_certificate(certificate, now)}
-        if further:  # the chain of a CA, or the other one while a CA is being replaced
-            described["further"] = [describe_certificate(each, now) for each in further]
-        return described
+        return {"kind": "certificate", **_certificates(data, "in it", now)}
+    if CRL_MARK in data:
+        return {"kind": "revocation list", **_list(load_crl(data, "in it"), now)}
     if b"PRIVATE KEY-----" in data:
         mode = path.stat().st_mode & 0o777
         key = load_key(data, "in it")
@@ -85,7 +85,7 @@ def _file(path: Path, data: bytes, now: datetime, authority: Path | None) -> Des
     if data.lstrip()[:1] == b"<":
         return {**_document(data, now), "signed": False, "signature_verified": False}
     raise DocumentError(
-        "it is neither a PEM certificate or key, nor a signed document, nor XML",
+        "it is neither a PEM certificate, revocation list or key, nor a signed document, nor XML",
     )
 
 
@@ -98,9 +98,7 @@ def _keystore(root: Path, now: datetime) -> Description:
             continue
         try:
             authorities[role] = {
-                **describe_certificate(
-                    load_certificate(read_bytes(path, "file"), f"'{path}'"), now
-                ),
+                **_certificates(read_bytes(path, "file"), f"'{path}'", now),
                 "key_present": (root / ca_key(role)).exists(),
             }
         except SrosError as error:
@@ -174,6 +172,29 @@ def describe_certificate(certificate: x509.Certificate, now: datetime) -> Descri
         "not_before": iso(validity.not_before),
         "not_after": iso(validity.not_after),
         "valid_now": validity.contains(now),
+    }
+
+
+def _certificates(data: bytes, name: str, now: datetime) -> Description:
+    """The first certificate of a file, and what else is in it under "further" and "crl"."""
+    certificate, *further = load_certificates(data, name)
+    described = describe_certificate(certificate, now)
+    if further:  # the chain of a CA, or the other one while a CA is being replaced
+        described["further"] = [describe_certificate(each, now) for each in further]
+    if CRL_MARK in data:
+        described["crl"] = _list(load_crl(data, name), now)
+    return described
+
+
+def _list(crl: RevocationList, now: datetime) -> Description:
+    """A revocation list; an expired one makes DDS refuse whom its CA has certified."""
+    return {
+        "issuer": subject_text(crl.list.issuer),
+        "number": crl.number,
+        "not_before": iso(crl.this_update),
+        "not_after": iso(crl.next_update),
+        "valid_now": crl.this_update <= now <= crl.next_update,
+        "revoked": [f"{each.serial:x}" for each in crl.revoked],
     }
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import binascii
 import hashlib
-import ssl
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
@@ -19,11 +20,13 @@ from sros_tool.keystore.layout import (
     enclave_folder,
 )
 from sros_tool.keystore.ledger import Entry, read_ledger
-from sros_tool.keystore.revoke import read_crl
+from sros_tool.keystore.lists import read_lists
+from sros_tool.keystore.rotation import RETIRED
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
 _ISSUED = ("cert.pem", "permissions.p7s")
+_PEM = re.compile(rb"-----BEGIN ([A-Z0-9 ]+)-----(.*?)-----END \1-----\n?", re.DOTALL)
 
 
 class Status(StrEnum):
@@ -34,6 +37,8 @@ class Status(StrEnum):
     SUPERSEDED = "superseded"
     """It is no longer in the keystore, but would still be accepted: replaced is not revoked."""
     REVOKED = "revoked"
+    RETIRED = "retired"
+    """A CA that was replaced, and is trusted no longer."""
     EXPIRED = "expired"
     SENT = "sent"
     """It went to a robot; the keystore keeps no copy."""
@@ -59,21 +64,26 @@ class History:
 def history(root: Path, *, now: datetime) -> History:
     """Compare the ledger of a keystore with its certificates and signed documents."""
     issued, put_away = _files(root, _served(root)), _files(root, _put_away(root))
-    crl = read_crl(root)
-    revoked = {f"{each.serial:x}" for each in crl.revoked} if crl else set()
+    retired = _files(root, _retired(root))
     entries = read_ledger(root)
+    # A list of a new CA begins empty, and what has ended is on none: the ledger knows it still.
+    revoked = {each.serial for each in entries if each.what == "revocation"}
+    revoked |= {f"{each.serial:x}" for crl in read_lists(root) for each in crl.revoked}
+    moment = iso(now)
 
     def status(entry: Entry) -> Status:
         if entry.what == "answer":
             return Status.SENT
         if entry.what == "revocation" or entry.serial in revoked or entry.sha256 in put_away:
             return Status.REVOKED
-        if entry.not_after and entry.not_after < iso(now):
+        if entry.sha256 in retired and entry.sha256 not in issued:
+            return Status.RETIRED
+        if entry.not_after and entry.not_after < moment:
             return Status.EXPIRED
         return Status.CURRENT if entry.sha256 in issued else Status.SUPERSEDED
 
     known = {entry.sha256 for entry in entries}
-    found = {**put_away, **issued}
+    found = {**retired, **put_away, **issued}
     return History(
         tuple(
             Item(entry, status(entry), (found.get(entry.sha256) or [""])[0]) for entry in entries
@@ -97,20 +107,32 @@ def _put_away(root: Path) -> Iterator[str]:
         yield from (f"{REVOKED}/{folder.name}/{file}" for file in _ISSUED)
 
 
+def _retired(root: Path) -> Iterator[str]:
+    yield from (f"{RETIRED}/{path.name}" for path in sorted((root / RETIRED).glob("*.cert.pem")))
+
+
 def _files(root: Path, paths: Iterator[str]) -> dict[str, list[str]]:
-    """Those of the files that are there, by their digest as the ledger has it."""
+    """Those of the files that are there, by the digests of what they hold as the ledger has it."""
     found: dict[str, list[str]] = {}
     for path in paths:
         if (root / path).is_file() and not (root / path).is_symlink():
-            found.setdefault(_digest(root / path), []).append(path)
+            for digest in _digests(root / path):
+                found.setdefault(digest, []).append(path)
     return found
 
 
-def _digest(path: Path) -> str:
+def _digests(path: Path) -> list[str]:
+    """Of everything in a file: that of a CA holds more while it is being replaced."""
     data = read_bytes(path, "file")
-    if path.name.endswith("cert.pem"):
-        try:
-            data = ssl.PEM_cert_to_DER_cert(data.decode("ascii").strip())
-        except ValueError:
-            return "unreadable"
-    return hashlib.sha256(data).hexdigest()
+    if not path.name.endswith("cert.pem"):
+        return [hashlib.sha256(data).hexdigest()]
+    found = []
+    for part in _PEM.finditer(data):
+        content = part[0]
+        if part[1] == b"CERTIFICATE":
+            try:
+                content = binascii.a2b_base64(part[2])
+            except binascii.Error:
+                return ["unreadable"]
+        found.append(hashlib.sha256(content).hexdigest())
+    return found or ["unreadable"]

@@ -20,15 +20,17 @@ from sros_tool.keystore.layout import (
     REVOKED,
     enclave_folder,
 )
-from sros_tool.keystore.ledger import Entry, append, document_entry, read_ledger
+from sros_tool.keystore.ledger import Entry, append, read_ledger
+from sros_tool.keystore.lists import Lists, read_crl
 from sros_tool.keystore.open import load_settings
-from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Change, Transaction, tidy
 from sros_tool.names import check_enclave_name
-from sros_tool.pki.certificates import issued_by, load_certificate, subject_text, validity_of
-from sros_tool.pki.crl import REASONS, RevocationList, Revoked, load_crl, sign_crl
-from sros_tool.validity import BACKDATE, Window, iso
+from sros_tool.pki.certificates import issued_by, load_certificate, subject_text
+from sros_tool.pki.crl import REASONS, Revoked
+from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
+
+__all__ = ["Revocation", "read_crl", "refresh_crl", "revoke"]
 
 _FILES = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml", REQUEST)
 _PRIVATE = "key.pem"
@@ -39,7 +41,7 @@ class Revocation:
     """What was revoked, and until when the list holds.
 
     ``restart`` are the enclaves whose processes go on trusting the revoked ones until they are
-    started again.
+    started again.  ``remarks`` are sentences on what is still to be done.
     """
 
     root: Path
@@ -47,6 +49,7 @@ class Revocation:
     restart: tuple[str, ...]
     next_update: datetime
     changes: tuple[Change, ...]
+    remarks: tuple[str, ...] = ()
 
 
 def revoke(
@@ -56,6 +59,7 @@ def revoke(
     now: datetime,
     reason: str = "unspecified",
     keyring: Keyring = IN_KEYSTORE,
+    until_retired: bool = False,
     dry_run: bool = False,
 ) -> Revocation:
     """Revoke the certificates of enclaves and move their files to ``revoked`` in the keystore.
@@ -63,6 +67,8 @@ def revoke(
     Every certificate of an enclave is revoked that the ledger knows and that has not ended: an
     earlier one would serve whoever has a copy of it, with the key, just as well.
     Every other enclave gets ``crl.pem``, a link to the one list.  ``reason`` is one of `REASONS`.
+    While the identity CA is being replaced, both CAs revoke; where the key of the old one is not at
+    hand, ``until_retired`` says that its certificates may be accepted until it is retired.
     """
     if reason not in REASONS:
         raise UsageError(f"{reason!r} is not a reason", f"Reasons are {', '.join(REASONS)}.")
@@ -73,10 +79,10 @@ def revoke(
         existing = _check_names(root, names)  # another process may have been faster
         template = load_settings(root)
         authority = load_authority(root, IDENTITY, template, keyring, now)
-        old = read_crl(root)
-        revoked = list(old.revoked) if old else []
-        listed = {each.serial for each in revoked}
         issued = read_ledger(root)
+        lists = Lists(transaction, authority, template, keyring, issued, now)
+        listed = {each.serial for each in lists.present.revoked} if lists.present else set()
+        revoked: list[Revoked] = []
         entries: list[Entry] = []
         for name in dict.fromkeys(names):
             subjects = _still_valid(issued, name, now)
@@ -88,20 +94,29 @@ def revoke(
                     entries.append(
                         Entry(iso(now), "revocation", name, subject, f"{serial:x}", reason=reason)
                     )
-        next_update = _sign(transaction, authority, template, revoked, old, now, entries)
         remaining = tuple(name for name in existing if name not in names)
+        next_update, signed = lists.sign(revoked, remaining, incomplete=until_retired)
+        entries += signed
         _link_everywhere(transaction, remaining)
         append(transaction, entries)
         transaction.commit()
     return Revocation(
-        root, tuple(dict.fromkeys(names)), remaining, next_update, tuple(transaction.changes)
+        root,
+        tuple(dict.fromkeys(names)),
+        remaining,
+        next_update,
+        tuple(transaction.changes),
+        tuple(lists.remarks),
     )
 
 
 def refresh_crl(
     root: Path, *, now: datetime, keyring: Keyring = IN_KEYSTORE, dry_run: bool = False
 ) -> Revocation:
-    """Sign the revocation list anew, so that it holds for longer; what it revokes is kept."""
+    """Sign the revocation list anew, so that it holds for longer.
+
+    What it revokes is kept, but for certificates that have ended and were on it since.
+    """
     if not dry_run:
         tidy(root)
     list_enclaves(root)
@@ -109,22 +124,13 @@ def refresh_crl(
         existing = list_enclaves(root)
         template = load_settings(root)
         authority = load_authority(root, IDENTITY, template, keyring, now)
-        old = read_crl(root)
-        entries: list[Entry] = []
-        revoked = list(old.revoked) if old else []
-        next_update = _sign(transaction, authority, template, revoked, old, now, entries)
+        lists = Lists(transaction, authority, template, keyring, read_ledger(root), now)
+        next_update, entries = lists.sign((), existing, incomplete=True)
         _link_everywhere(transaction, existing)
         append(transaction, entries)
         transaction.commit()
-    return Revocation(root, (), existing, next_update, tuple(transaction.changes))
-
-
-def read_crl(root: Path) -> RevocationList | None:
-    """The revocation list of a keystore, or None if nothing was ever revoked."""
-    path = root / CRL
-    if not path.exists():
-        return None
-    return load_crl(read_bytes(path, "revocation list"), f"'{path}'")
+    changes, remarks = tuple(transaction.changes), tuple(lists.remarks)
+    return Revocation(root, (), existing, next_update, changes, remarks)
 
 
 def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
@@ -169,32 +175,6 @@ def _move_away(transaction: Transaction, authority: Authority, name: str) -> tup
             transaction.write(f"{target}/{file}", data, private=file == _PRIVATE)
         transaction.remove(f"{folder}/{file}")
     return serial, subject_text(certificate.subject)
-
-
-def _sign(
-    transaction: Transaction,
-    authority: Authority,
-    template: Template,
-    revoked: list[Revoked],
-    old: RevocationList | None,
-    now: datetime,
-    entries: list[Entry],
-) -> datetime:
-    """Stage the list; it ends with its CA at the latest.  An expired one locks everybody out."""
-    moment = now.replace(microsecond=0)
-    end = min(moment + template.revocation_validity, validity_of(authority.certificate).not_after)
-    begin = max(moment - BACKDATE, validity_of(authority.certificate).not_before)
-    document = sign_crl(
-        authority.certificate,
-        authority.key,
-        revoked,
-        number=old.number + 1 if old else 1,
-        this_update=begin,
-        next_update=end,
-    )
-    transaction.write(CRL, document)
-    entries.append(document_entry(now, "crl", document, validity=Window(begin, end)))
-    return end
 
 
 def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:

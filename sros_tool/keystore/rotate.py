@@ -12,20 +12,15 @@ from datetime import datetime
 from pathlib import Path
 
 from sros_tool.errors import KeystoreError, UsageError
+from sros_tool.keystore.bundle import authority_files, certificates_of, write_bundle
 from sros_tool.keystore.create import list_enclaves
 from sros_tool.keystore.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.layout import IDENTITY, PUBLIC
+from sros_tool.keystore.layout import IDENTITY
 from sros_tool.keystore.ledger import append, certificate_entry
 from sros_tool.keystore.open import load_settings
 from sros_tool.keystore.reissue import Progress
-from sros_tool.keystore.rotation import (
-    Rotation,
-    Stage,
-    authority_files,
-    certificates_of,
-    read_rotation,
-)
-from sros_tool.keystore.succession import RETIRED, Rotator, write_copies
+from sros_tool.keystore.rotation import RETIRED, Rotation, Stage, read_rotation
+from sros_tool.keystore.succession import Rotator
 from sros_tool.keystore.successor import check_later
 from sros_tool.keystore.transaction import Change, Transaction, tidy
 from sros_tool.pki.certificates import issue_ca, pem, same_key
@@ -152,8 +147,7 @@ def renew_identity_ca(
             )
         new = issue_ca(key, old.subject, window(now, validity or template.authority_validity))
         check_later(old, new)
-        transaction.write(f"{PUBLIC}/identity_ca.cert.pem", pem(new))
-        write_copies(transaction, names, "identity_ca.cert.pem", pem(new))
+        write_bundle(transaction, "identity_ca", (IDENTITY,), pem(new), names)
         transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
         append(transaction, [certificate_entry(now, "ca", new)])
         transaction.commit()

@@ -1,8 +1,4 @@
-"""How far a rotation of CAs has come: its one small file, and who is on which CA.
-
-A CA file holds the issuing CA first, for Cyclone DDS 0.10.2 reads nothing else of it (ran); Fast
-DDS 2.9.1 trusts all that it holds (ran).
-"""
+"""How far a rotation of CAs has come: its one small file, and who is on which CA."""
 
 from __future__ import annotations
 
@@ -19,32 +15,20 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.keystore.bundle import authority_files, certificates_of
 from sros_tool.keystore.create import list_enclaves
-from sros_tool.keystore.layout import (
-    IDENTITY,
-    PERMISSIONS,
-    PUBLIC,
-    ROLES,
-    ca_certificate,
-    enclave_folder,
-)
-from sros_tool.keystore.transaction import STAGE
+from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, enclave_folder
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import (
-    issued_by,
-    load_certificate,
-    load_certificates,
-    subject_text,
-    validity_of,
-)
+from sros_tool.pki.certificates import issued_by, load_certificate, subject_text, validity_of
 from sros_tool.validity import Window, iso
 from sros_tool.xml import read_bytes
 
 ROTATION = "rotation.json"
 """Which CAs are being replaced; there while a rotation is under way."""
+RETIRED = "retired"
+"""Where certificates and keys of CAs go that issue nothing any more."""
 SOON = timedelta(days=90)
 """How long before its end a CA should be replaced."""
-_CRL_MARK = b"-----BEGIN X509 CRL-----"
 
 
 class Stage(StrEnum):
@@ -65,13 +49,18 @@ class Replacement:
 
     ``file`` is the stem of its files ("identity_ca", "permissions_ca", or "ca" for both jobs);
     ``old`` and ``new`` are SHA-256 of the certificates; ``key`` is where the new key is, by URI or
-    path in the keystore.
+    path in the keystore; ``old_key`` the same of the old one, where that is not kept in `RETIRED`.
     """
 
     file: str
     old: str
     new: str
     key: str
+    old_key: str = ""
+
+    def place_of_old(self, certificate: x509.Certificate) -> str:
+        """Where the key of the old CA, which has this ``certificate``, is once it was replaced."""
+        return self.old_key or retired_key(certificate)
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,40 +100,14 @@ class RotationStatus:
     remarks: tuple[str, ...]
 
 
+def retired_key(certificate: x509.Certificate) -> str:
+    """The path of the key of a CA that was replaced."""
+    return f"{RETIRED}/{certificate.serial_number:x}.key.pem"
+
+
 def digest(certificate: x509.Certificate) -> str:
     """The SHA-256 of a certificate, in hexadecimal."""
     return certificate.fingerprint(hashes.SHA256()).hex()
-
-
-def authority_files(root: Path) -> dict[str, tuple[str, ...]]:
-    """The stem of each CA file, with the roles for which it serves."""
-    found: dict[str, tuple[str, ...]] = {}
-    for role in ROLES:
-        path = root / ca_certificate(role)
-        file = path
-        # A link into the stage is a file of its own that an interrupted transaction left so.
-        if path.is_symlink() and STAGE not in (to := str(path.readlink())):
-            file = path.with_name(to)
-        if not file.is_file() or file.parent != path.parent:
-            raise KeystoreError(
-                f"keystore '{root}' has no {role} CA of its own",
-                f"'{path}' is missing, or leads out of the keystore.",
-                "Use the keystore that it was exported from.",
-            )
-        stem = file.name.removesuffix(".cert.pem")
-        found[stem] = (*found.get(stem, ()), role)
-    return found
-
-
-def certificates_of(root: Path, file: str) -> tuple[x509.Certificate, ...]:
-    """All certificates of a CA file, the issuing one first."""
-    path = root / PUBLIC / f"{file}.cert.pem"
-    return load_certificates(read_bytes(path, "CA certificate"), f"'{path}'")
-
-
-def carries_crl(root: Path, file: str) -> bool:
-    """Whether a CA file carries a revocation list, too: Fast DDS 2.9.1 reads it (ran)."""
-    return _CRL_MARK in read_bytes(root / PUBLIC / f"{file}.cert.pem", "CA certificate")
 
 
 def read_rotation(root: Path) -> Rotation:
@@ -279,8 +242,8 @@ def _remarks(root: Path, rotation: Rotation) -> list[str]:
     ]
     if any(file != "permissions_ca" for file in files):
         remarks.append(
-            "Retire the old CA before you revoke anything: until then, earlier certificates of a "
-            "revoked enclave are still accepted."
+            "What is revoked now is revoked by both CAs, as long as the key of the old one is at "
+            "hand."
         )
     return remarks
 

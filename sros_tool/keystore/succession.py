@@ -9,41 +9,34 @@ from datetime import datetime
 from cryptography import x509
 
 from sros_tool.keystore.authority import Authority
-from sros_tool.keystore.keyring import Keyring
-from sros_tool.keystore.layout import (
-    CRL,
-    IDENTITY,
-    PERMISSIONS,
-    PRIVATE,
-    PUBLIC,
-    SETTINGS,
-    ca_key,
-    enclave_folder,
+from sros_tool.keystore.bundle import (
+    authority_files,
+    carried_crl,
+    certificates_of,
+    write_bundle,
+    write_copies,
 )
-from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
+from sros_tool.keystore.keyring import Keyring
+from sros_tool.keystore.layout import CRL, IDENTITY, PERMISSIONS, PRIVATE, SETTINGS, ca_key
+from sros_tool.keystore.ledger import Entry, append, certificate_entry
+from sros_tool.keystore.lists import read_crl, sign_list
 from sros_tool.keystore.open import load_settings
 from sros_tool.keystore.reissue import Progress, reissue
-from sros_tool.keystore.revoke import read_crl
 from sros_tool.keystore.rotation import (
+    RETIRED,
     ROTATION,
     Rotation,
     Stage,
-    authority_files,
-    carries_crl,
-    certificates_of,
     digest,
     render_rotation,
+    retired_key,
 )
 from sros_tool.keystore.successor import Successor, begin, check_later, resume
 from sros_tool.keystore.template import Template, render_template
 from sros_tool.keystore.transaction import Transaction
-from sros_tool.pki.certificates import pem, validity_of
-from sros_tool.pki.crl import sign_crl
-from sros_tool.validity import BACKDATE, Span, Window, window
+from sros_tool.pki.certificates import pem
+from sros_tool.validity import Span, window
 from sros_tool.xml import read_bytes
-
-RETIRED = "retired"
-"""Where certificates and keys of CAs go that are used no longer."""
 
 
 class Rotator:
@@ -126,13 +119,19 @@ class Rotator:
             bundle = b"".join(map(pem, (*each.old, each.new.certificate)))
             if IDENTITY in each.roles and (old := read_crl(self._root)):
                 bundle += self._empty_crl(each.new, old.number + 1)
-            self._write_authority(each.file, each.roles, bundle, names)
+            write_bundle(self._transaction, each.file, each.roles, bundle, names)
         self._write_state(Stage.DISTRIBUTE)
+
+    def _empty_crl(self, authority: Authority, number: int) -> bytes:
+        """A list of the new CA, which has issued nothing yet that could be revoked."""
+        signed = sign_list(authority, (), number=number, template=self._template, now=self._now)
+        self._entries.append(signed.entry)
+        return signed.document
 
     def _lacks_crl(self, turns: list[Successor]) -> bool:
         """Whether something was revoked since the new identity CA was distributed."""
         return (self._root / CRL).exists() and any(
-            IDENTITY in each.roles and not carries_crl(self._root, each.file) for each in turns
+            IDENTITY in each.roles and not carried_crl(self._root, each.file) for each in turns
         )
 
     def _reissue(
@@ -147,6 +146,7 @@ class Rotator:
         self._entries += reissue(
             self._transaction, names, identity, permissions, self._template, self._now, progress
         )
+        self.replacements = []
         for each in turns:
             trusted = (each.new.certificate, *(each.old if stage is Stage.REISSUE else ()))
             bundle = b"".join(map(pem, trusted))
@@ -155,9 +155,10 @@ class Rotator:
                     bundle += read_bytes(self._root / CRL, "revocation list")
                 crl = self._empty_crl(each.new, old.number + 2)
                 self._transaction.write(CRL, crl)
-                self._write_copies(names, "crl.pem", crl)
-            self._write_authority(each.file, each.roles, bundle, names)
-            self._install_key(each)
+                write_copies(self._transaction, names, "crl.pem", crl)
+            write_bundle(self._transaction, each.file, each.roles, bundle, names)
+            old_key = self._install_key(each)
+            self.replacements.append(replace(each.replacement(), old_key=old_key))
             if stage is Stage.RETIRE:
                 self._keep_certificate(each.old[0])
         self._write_settings(turns)
@@ -171,24 +172,14 @@ class Rotator:
         for each in self._rotation.replacements:
             new, *others = certificates_of(self._root, each.file)
             (old,) = [one for one in others if digest(one) == each.old]
-            self._write_authority(each.file, files[each.file], pem(new), names)
+            write_bundle(self._transaction, each.file, files[each.file], pem(new), names)
             self._keep_certificate(old)
-            key = f"{RETIRED}/{old.serial_number:x}.key.pem"
+            key = retired_key(old)
             if self._delete and (self._root / key).exists():
                 self._transaction.remove(key)
         self._transaction.remove(ROTATION)
 
     # ── files ──────────────────────────────────────────────────────────────────────────────
-
-    def _write_authority(
-        self, file: str, roles: tuple[str, ...], bundle: bytes, names: Sequence[str]
-    ) -> None:
-        self._transaction.write(f"{PUBLIC}/{file}.cert.pem", bundle)
-        for role in roles:
-            self._write_copies(names, f"{role}_ca.cert.pem", bundle)
-
-    def _write_copies(self, names: Sequence[str], name: str, data: bytes) -> None:
-        write_copies(self._transaction, names, name, data)
 
     def _write_state(self, stage: Stage) -> None:
         rotation = Rotation(stage, tuple(self.replacements))
@@ -197,17 +188,21 @@ class Rotator:
     def _keep_certificate(self, old: x509.Certificate) -> None:
         self._transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
 
-    def _install_key(self, each: Successor) -> None:
-        """Put the new key in the place of the old one, which goes to ``retired``."""
+    def _install_key(self, each: Successor) -> str:
+        """Put the new key in the place of the old one, which goes to ``retired``.
+
+        Returns the place of the old key where that is elsewhere.
+        """
         transaction, root = self._transaction, self._root
+        old_key = ""
         place = f"{PRIVATE}/{each.file}.key.pem"
         if (root / place).is_file():
             if not self._delete:
                 key = read_bytes(root / place, "CA key")
-                name = f"{RETIRED}/{each.old[0].serial_number:x}.key.pem"
-                transaction.write(name, key, private=True)
+                transaction.write(retired_key(each.old[0]), key, private=True)
         else:
-            self.kept_elsewhere.append(self._keyring.place(each.roles[0], self._template))
+            old_key = self._keyring.place(each.roles[0], self._template)
+            self.kept_elsewhere.append(old_key)
         if each.key == f"{PRIVATE}/next_{each.file}.key.pem":
             transaction.write(place, read_bytes(root / each.key, "CA key"), private=True)
             transaction.remove(each.key)
@@ -216,6 +211,7 @@ class Rotator:
             for role in each.roles:
                 if (root / ca_key(role)).is_symlink():
                     transaction.remove(ca_key(role))
+        return old_key
 
     def _write_settings(self, turns: list[Successor]) -> None:
         """Have the settings name the places of the new keys."""
@@ -232,29 +228,3 @@ class Rotator:
         if template != self._template:
             comment = b"# The choices of this keystore; what is added later follows them.\n"
             self._transaction.write(SETTINGS, comment + render_template(template).encode())
-
-    def _empty_crl(self, authority: Authority, number: int) -> bytes:
-        """A list of the new CA, which has issued nothing yet that could be revoked."""
-        validity = validity_of(authority.certificate)
-        moment = self._now.replace(microsecond=0)
-        begin = max(moment - BACKDATE, validity.not_before)
-        end = min(moment + self._template.revocation_validity, validity.not_after)
-        document = sign_crl(
-            authority.certificate,
-            authority.key,
-            (),
-            number=number,
-            this_update=begin,
-            next_update=end,
-        )
-        entry = document_entry(self._now, "crl", document, validity=Window(begin, end))
-        self._entries.append(entry)
-        return document
-
-
-def write_copies(transaction: Transaction, names: Sequence[str], name: str, data: bytes) -> None:
-    """Stage a file in every enclave that has a copy of it, not a link."""
-    for enclave in names:
-        path = f"{enclave_folder(enclave)}/{name}"
-        if (transaction.root / path).is_file() and not (transaction.root / path).is_symlink():
-            transaction.write(path, data)

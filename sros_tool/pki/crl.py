@@ -14,6 +14,8 @@ from sros_tool.errors import PkiError
 from sros_tool.pki.certificates import authority_identifier
 from sros_tool.pki.keys import PrivateKey
 
+CRL_MARK = b"-----BEGIN X509 CRL-----"
+"""What a PEM revocation list begins with."""
 REASONS = tuple(
     flag.value
     for flag in x509.ReasonFlags
@@ -78,7 +80,7 @@ def sign_crl(
 
 
 def load_crl(pem: bytes, name: str) -> RevocationList:
-    """Read a PEM revocation list; ``name`` stands for it in errors."""
+    """Read the first revocation list of a PEM file; ``name`` stands for it in errors."""
     try:
         crl = x509.load_pem_x509_crl(pem)
         revoked = tuple(_revoked(entry) for entry in crl)

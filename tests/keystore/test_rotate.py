@@ -19,23 +19,19 @@ from test_transaction import DIED, in_child
 
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts, list_enclaves
+from sros_tool.keystore.bundle import authority_files, certificates_of
 from sros_tool.keystore.enclave import enclave_path
 from sros_tool.keystore.export import distribute
 from sros_tool.keystore.keyring import Keyring
 from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.revoke import read_crl, revoke
+from sros_tool.keystore.lists import read_crl, read_lists
+from sros_tool.keystore.revoke import refresh_crl, revoke
 from sros_tool.keystore.rotate import RotationStep, renew_identity_ca, rotate_ca
-from sros_tool.keystore.rotation import (
-    ROTATION,
-    Stage,
-    certificates_of,
-    digest,
-    rotation_status,
-)
+from sros_tool.keystore.rotation import ROTATION, Stage, digest, retired_key, rotation_status
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.verify import check_enclave
 from sros_tool.pki.certificates import common_name, pem
-from sros_tool.pki.keys import generate_key
+from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.policy import read_policy
 
 NOW = datetime.now(UTC)
@@ -346,12 +342,137 @@ def test_revocation_lists_go_along(separate: Path) -> None:
     assert numbers[0] < numbers[1]
 
 
-def test_a_first_revocation_in_between(separate: Path) -> None:
-    """The list of the new CA is distributed before anybody is of that CA."""
+def lists_of(root: Path) -> list[tuple[str, set[int]]]:
+    """The subject of each issuer of a list that DDS reads, and the serial numbers on the list."""
+    return [
+        (each.list.issuer.rfc4514_string(), {one.serial for one in each.revoked})
+        for each in read_lists(root)
+    ]
+
+
+def revoked_by_all(root: Path, old: Path) -> None:
+    """By every CA that is trusted, OpenSSL refuses ``old`` and accepts the enclaves."""
+    public = root / "public"
+    for path in (public / "identity_ca.crl.pem", public / "identity_ca.cert.pem"):
+        # The CA file has both CAs, and the list of the second one; the first one's is crl.pem.
+        assert b"X509 CRL" in path.read_bytes()
+    words = ["verify", "-crl_check", "-CAfile", public / "identity_ca.cert.pem"]
+    words += ["-CRLfile", public / "identity_ca.crl.pem"]
+    for name in list_enclaves(root):
+        openssl(*words, enclave_path(root, name) / "cert.pem")
+    refused = subprocess.run(["openssl", *map(str, [*words, old])], capture_output=True, text=True)
+    assert "certificate revoked" in refused.stderr, refused
+
+
+@pytest.mark.parametrize("earlier", [False, True], ids=["the first", "not the first"])
+def test_a_revocation_in_between(earlier: bool, root: Path, tmp_path: Path) -> None:
+    """While both CAs are trusted, both revoke: what an enclave had of either is refused."""
+    create_enclaves(root, ["/c", "/d"], now=NOW)
+    old = {
+        name: Path(shutil.copy(enclave_path(root, name) / "cert.pem", tmp_path / name[1:]))
+        for name in ("/c", "/d")
+    }
+    serials = {name: serial_of(path) for name, path in old.items()}
+    public = root / "public"
+    if earlier:
+        create_enclaves(root, ["/e"], now=NOW)
+        revoke(root, ["/e"], now=NOW)
+    rotate_ca(root, Stage.DISTRIBUTE, now=NOW)
+    assert not revoke(root, ["/c"], now=NOW).remarks
+    if (public / "identity_ca.cert.pem").is_symlink():
+        assert (public / "identity_ca.cert.pem").resolve() == (public / "ca.cert.pem").resolve()
+    check(root)
+    (_, first), (_, second) = lists_of(root)
+    assert serials["/c"] in first
+    assert not second  # the new CA has issued nothing yet
+    numbers = [each.number for each in read_lists(root)]
+    assert rotate_ca(root, now=NOW).stage is Stage.REISSUE  # all is there that it needs
+    check(root)
+    assert [each.number for each in read_lists(root)] == [numbers[1] + 1, numbers[0]]
+    new = Path(shutil.copy(enclave_path(root, "/d") / "cert.pem", tmp_path / "new"))
+    assert not revoke(root, ["/d"], now=NOW).remarks
+    check(root)
+    (_, first), (_, second) = lists_of(root)
+    assert {serials["/d"], serial_of(new)} <= first
+    assert {serials["/c"], serials["/d"], serial_of(new)} <= second
+    for path in (*old.values(), new):
+        revoked_by_all(root, path)
+    refresh_crl(root, now=NOW)
+    assert lists_of(root) == [(_subject(root), first), (_subject(root, 1), second)]
+    rotate_ca(root, Stage.RETIRE, now=NOW)
+    check(root)
+    ((_, third),) = lists_of(root)
+    assert third == first
+
+
+def _subject(root: Path, index: int = 0) -> str:
+    file = next(iter(authority_files(root)))
+    return certificates_of(root, file)[index].subject.rfc4514_string()
+
+
+def serial_of(path: Path) -> int:
+    return x509.load_pem_x509_certificate(path.read_bytes()).serial_number
+
+
+@pytest.mark.parametrize("how", ["deleted", "another", "elsewhere"])
+def test_without_the_old_key_revoking_waits_for_the_end(
+    how: str, separate: Path, tmp_path: Path
+) -> None:
+    """Fast DDS would accept what the old CA has issued, which nobody could revoke."""
+    create_enclaves(separate, ["/c", "/d"], now=NOW)
+    revoke(separate, ["/c"], now=NOW)
+    rotate_ca(separate, Stage.DISTRIBUTE, now=NOW)
+    rotate_ca(separate, Stage.REISSUE, now=NOW, delete_old_key=how == "deleted")
+    if how != "deleted":
+        kept = separate / retired_key(certificates_of(separate, "identity_ca")[1])
+        assert kept.exists()
+        kept.write_bytes(key_pem(generate_key()))
+        if how == "elsewhere":
+            kept.unlink()
+    before = snapshot(separate)
+    refused = sros("revoke", separate, "/d")
+    assert refused.status == 1
+    assert refused.err.count("\n") == 1
+    assert "the key of the old identity CA" in refused.err
+    assert f"rotate_ca {separate} --to retire" in refused.err
+    assert snapshot(separate) == before
+    carried = lists_of(separate)[1]
+    done = sros("revoke", separate, "/d", "--until-retired").ok()
+    assert "Fast DDS accepts the revoked certificates that it issued" in done.err
+    assert lists_of(separate)[1] == carried
+    refreshed = sros("crl", separate, "--refresh").ok()
+    assert "was not signed anew" in refreshed.err
+    check(separate)
+    rotate_ca(separate, Stage.RETIRE, now=NOW)
+    assert "was not signed" not in sros("crl", separate, "--refresh").ok().err
+    check(separate)
+
+
+def test_an_old_key_outside_of_the_keystore_is_found_again(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    places = {role: f"file:{tmp_path / role}.key" for role in ("identity", "permissions")}
+    create_keystore(
+        root, template=load_template("production"), keyring=Keyring(places=places), now=NOW
+    )
+    create_enclaves(root, ["/a", "/b"], now=NOW)
+    old = Path(shutil.copy(root / "enclaves/b/cert.pem", tmp_path / "old.pem"))
+    new = Keyring(places={role: f"{place}2" for role, place in places.items()})
+    rotate_ca(root, Stage.DISTRIBUTE, new_keys=new, now=NOW)
+    rotate_ca(root, Stage.REISSUE, now=NOW)
+    assert not revoke(root, ["/b"], now=NOW).remarks
+    revoked_by_all(root, old)
+
+
+def test_revoking_while_the_next_key_is_away(separate: Path) -> None:
+    """The new CA has issued nothing: the list it needs is distributed by the next stage."""
     rotate_ca(separate, now=NOW)
-    revoke(separate, ["/b"], now=NOW)
+    key = separate / "private/next_identity_ca.key.pem"
+    key.rename(separate.parent / "away")
+    assert not revoke(separate, ["/b"], now=NOW).remarks
+    assert len(lists_of(separate)) == 1
+    (separate.parent / "away").rename(key)
     assert rotate_ca(separate, now=NOW).stage is Stage.DISTRIBUTE
-    assert "X509 CRL" in (separate / "public/identity_ca.cert.pem").read_text()
+    assert len(lists_of(separate)) == 2
     check(separate)
     assert rotate_ca(separate, now=NOW).stage is Stage.REISSUE
     check(separate)

@@ -1,0 +1,113 @@
+"""Whom two DDS still hear when an enclave is revoked in the middle of a rotation of CAs."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from test_life_on_dds import HEARD, Ask, Question, ask, copy, make, open_template, probe
+
+from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.revoke import revoke
+from sros_tool.keystore.rotate import rotate_ca
+from sros_tool.keystore.rotation import Stage
+
+__all__ = ["ask", "probe"]
+
+pytestmark = pytest.mark.dds
+
+LISTENER, TALKER, LOST = "/listener", "/talker", "/lost"
+
+
+def now() -> datetime:
+    return datetime.now(UTC)
+
+
+def with_earlier_identity(trust: Path, earlier: Path, name: str) -> Path:
+    """A thief's keystore: an earlier identity of the lost enclave, and whom to trust from now."""
+    folder = copy(trust, name)
+    for file in ("cert.pem", "key.pem", "permissions.p7s"):
+        shutil.copy(enclave_path(earlier, LOST) / file, enclave_path(folder, LOST) / file)
+    return folder
+
+
+def hears(ask: Ask, root: Path, **talkers: tuple[Path, str]) -> dict[str, bool]:
+    """Whether the listener, started now, hears each; those that do not start are not heard."""
+    questions = [Question(who, (root, LISTENER), f"/{name}") for name, who in talkers.items()]
+    answers = ask(questions)
+    return {name: answer == HEARD for name, answer in zip(talkers, answers, strict=True)}
+
+
+def vendor(request: pytest.FixtureRequest) -> str:
+    return str(request.node.callspec.params["ask"]).split()[0]
+
+
+@pytest.mark.parametrize(
+    ("stage", "template", "earlier"),
+    [
+        # Whether there is a list already decides whether Fast DDS asks for one of every CA.
+        (Stage.DISTRIBUTE, "production", False),
+        (Stage.REISSUE, "production", False),
+        (Stage.REISSUE, "production", True),
+        (Stage.REISSUE, "sros2", True),
+    ],
+)
+def test_a_revocation_takes_effect_in_every_stage(
+    stage: Stage,
+    template: str,
+    earlier: bool,
+    ask: Ask,
+    request: pytest.FixtureRequest,
+    tmp_path: Path,
+) -> None:
+    """Once the listener is restarted; what was heard before, and others, show that it listens."""
+    root = tmp_path / "ks"
+    make(root, open_template(template), {}, TALKER, LISTENER, LOST, "/other")
+    if earlier:
+        revoke(root, ["/other"], now=now())
+    before = copy(root, "before")
+    rotate_ca(root, Stage.DISTRIBUTE, now=now())
+    thieves = {"distributed": (copy(root, "distributed"), LOST)}
+    both_trusted = vendor(request) == "Fast" or stage is Stage.DISTRIBUTE
+    if stage is Stage.REISSUE:
+        rotate_ca(root, stage, now=now())
+        reissued = copy(root, "reissued")
+        thieves["reissued"] = (reissued, LOST)
+        thieves["mixed"] = (with_earlier_identity(reissued, before, "mixed"), LOST)
+    heard = {name: both_trusted or name == "reissued" for name in thieves}
+    friends = {"restarted": (root, TALKER)}
+    if both_trusted:  # one who runs since the stage before
+        friends["running"] = (copy(thieves["distributed"][0], "running"), TALKER)
+    assert hears(ask, root, **thieves, **friends) == heard | dict.fromkeys(friends, True)
+    assert not revoke(root, [LOST], now=now()).remarks
+    refused = dict.fromkeys(thieves, False)
+    assert hears(ask, root, **thieves, **friends) == refused | dict.fromkeys(friends, True)
+    if stage is Stage.DISTRIBUTE:  # it stays so when the other CA issues
+        rotate_ca(root, Stage.REISSUE, now=now())
+        assert hears(ask, root, **thieves, restarted=(root, TALKER)) == refused | {
+            "restarted": True
+        }
+    rotate_ca(root, Stage.RETIRE, now=now())
+    assert hears(ask, root, **thieves, restarted=(root, TALKER)) == refused | {"restarted": True}
+
+
+def test_without_the_old_key_it_takes_effect_with_the_end_of_the_rotation(
+    ask: Ask, request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    """What `--until-retired` accepts, and what it is that a list of the old CA prevents."""
+    root = tmp_path / "ks"
+    make(root, open_template("production"), {}, TALKER, LISTENER, LOST, "/other")
+    revoke(root, ["/other"], now=now())
+    rotate_ca(root, Stage.DISTRIBUTE, now=now())
+    old = {"old": (copy(root, "distributed"), LOST)}
+    rotate_ca(root, Stage.REISSUE, now=now(), delete_old_key=True)
+    new = {"new": (copy(root, "reissued"), LOST)}
+    assert revoke(root, [LOST], now=now(), until_retired=True).remarks
+    friend = {"friend": (root, TALKER)}
+    trusted = vendor(request) == "Fast"
+    expected = {"old": trusted, "new": False, "friend": True}
+    assert hears(ask, root, **old, **new, **friend) == expected
+    rotate_ca(root, Stage.RETIRE, now=now())
+    assert hears(ask, root, **old, **new, **friend) == expected | {"old": False}

@@ -1,0 +1,127 @@
+"""What `inspect`, its history and `crl` show of both CAs while one replaces the other."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from harness import sros
+
+from sros_tool.keystore import create_enclaves, create_keystore
+from sros_tool.keystore.bundle import authority_files, certificates_of
+from sros_tool.keystore.history import Status, history
+from sros_tool.keystore.revoke import revoke
+from sros_tool.keystore.rotate import renew_identity_ca, rotate_ca
+from sros_tool.keystore.rotation import Stage, digest
+from sros_tool.keystore.template import load_template
+
+NOW = datetime.now(UTC)
+STAGES = (Stage.DISTRIBUTE, Stage.REISSUE, Stage.RETIRE)
+
+
+@pytest.fixture(params=["production", "sros2"])
+def root(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    create_keystore(tmp_path / "ks", template=load_template(request.param), now=NOW)
+    create_enclaves(tmp_path / "ks", ["/a", "/b", "/c"], now=NOW)
+    return tmp_path / "ks"
+
+
+def standing(root: Path) -> dict[str, tuple[Status, str]]:
+    """By the digests of CAs and lists, what the history says of each, and where it lies."""
+    found = history(root, now=NOW)
+    assert not found.unexplained
+    return {
+        item.entry.sha256: (item.status, item.path)
+        for item in found.items
+        if item.entry.what in ("ca", "crl")
+    }
+
+
+def test_the_history_knows_both_cas_and_their_lists(root: Path) -> None:
+    revoke(root, ["/c"], now=NOW)
+    old = {file: certificates_of(root, file)[0] for file in authority_files(root)}
+    for stage in STAGES:
+        rotate_ca(root, stage, now=NOW)
+        for file, first in old.items():
+            path = f"public/{file}.cert.pem"
+            new = next(each for each in certificates_of(root, file) if each != first)
+            assert standing(root)[digest(new)] == (Status.CURRENT, path)
+            expected = (Status.CURRENT, path)
+            if stage is Stage.RETIRE:
+                expected = (Status.RETIRED, f"retired/{first.serial_number:x}.cert.pem")
+            assert standing(root)[digest(first)] == expected
+        lists = [each for each in history(root, now=NOW).items if each.entry.what == "crl"]
+        current = [each for each in lists if each.status is Status.CURRENT]
+        assert len(current) == (1 if stage is Stage.RETIRE else 2)
+    gone = [each for each in history(root, now=NOW).items if each.entry.enclave == "/c"]
+    # Its permissions were put away with its certificate; the new CA's list names neither.
+    assert Counter(each.status for each in gone) == {Status.REVOKED: 3}
+
+
+def test_a_stranger_in_the_file_of_a_ca_is_named(root: Path, tmp_path: Path) -> None:
+    """Fast DDS would trust it: the first certificate of a file does not vouch for the next."""
+    create_keystore(tmp_path / "other", template=load_template("production"), now=NOW)
+    file = f"public/{next(iter(authority_files(root)))}.cert.pem"
+    assert not history(root, now=NOW).unexplained
+    with (root / file).open("ab") as stream:
+        stream.write((tmp_path / "other/public/identity_ca.cert.pem").read_bytes())
+    assert history(root, now=NOW).unexplained == (file,)
+    assert f"NOT IN THE LEDGER  {file}" in sros("inspect", root, "--history").out
+
+
+def test_a_ca_of_the_same_key_is_followed(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    create_keystore(root, template=load_template("production"), now=NOW)
+    create_enclaves(root, ["/a"], now=NOW)
+    old = certificates_of(root, "identity_ca")[0]
+    renew_identity_ca(root, now=NOW)
+    assert standing(root)[digest(old)][0] is Status.RETIRED
+
+
+def test_inspect_shows_all_that_a_ca_file_holds(root: Path) -> None:
+    revoke(root, ["/c"], now=NOW)
+    rotate_ca(root, now=NOW)
+    file = next(iter(authority_files(root)))
+    old, new = certificates_of(root, file)
+    path = root / f"public/{file}.cert.pem"
+    said = sros("inspect", path).ok().out
+    for each in (old, new):
+        assert f"serial {each.serial_number:x}\n" in said
+        assert digest(each) in said
+    assert said.count("beside it, in the same file") == 1
+    assert "revocation list 2 of " in said
+    described = json.loads(sros("inspect", path, "--json").ok().out)
+    assert described["sha256"] == digest(old)
+    assert [each["sha256"] for each in described["further"]] == [digest(new)]
+    assert described["crl"]["revoked"] == []
+    whole = sros("inspect", root).ok().out
+    assert f"serial {new.serial_number:x}" in whole
+    assert "revocation list 2 of " in whole
+    authorities = json.loads(sros("inspect", root, "--json").ok().out)["authorities"]
+    assert authorities["identity"]["further"][0]["sha256"] == digest(new)
+
+
+def test_inspect_shows_a_revocation_list(root: Path) -> None:
+    serial = root / "enclaves/c/cert.pem"
+    told = json.loads(sros("inspect", serial, "--json").ok().out)["serial"]
+    revoke(root, ["/c"], now=NOW)
+    path = root / "public/identity_ca.crl.pem"
+    said = sros("inspect", path).ok().out
+    assert said.startswith("revocation list 1 of CN=")
+    assert said.endswith(f"1 revoked\n  {told}\n")
+    assert json.loads(sros("inspect", path, "--json").ok().out)["revoked"] == [told]
+
+
+def test_crl_shows_the_list_beside(root: Path) -> None:
+    revoke(root, ["/c"], now=NOW)
+    assert "beside it" not in sros("crl", root).ok().out
+    rotate_ca(root, now=NOW)
+    assert "beside it, list 2 of CN=" in sros("crl", root).ok().out
+    (beside,) = json.loads(sros("crl", root, "--json").ok().out)["beside"]
+    assert (beside["number"], beside["revoked"]) == (2, [])
+    for _ in range(2):
+        rotate_ca(root, now=NOW)
+    assert json.loads(sros("crl", root, "--json").ok().out)["beside"] == []
