@@ -47,12 +47,11 @@ TOPICS = (
     "rt/a/b",
     "rt/ab",
     "rt/a1",
-    "rt/b-x",
     "rq/aRequest",
     "rr/aReply",
     "ros_discovery_info",
 )
-ODD_TOPICS = ("*", "rt/*", "rt/a?", "rt/[ab]")
+ODD_TOPICS = ("rt/b-x", "*", "rt/*", "rt/a?", "rt/[ab]")
 WILDCARDS = (
     "*",
     "rt/*",

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from datetime import UTC, datetime, tzinfo
 
 from sros_tool.dds.decision.answers import Decision, Outcome, Refusal, Verb
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
 from sros_tool.dds.decision.domains import holds_for
+from sros_tool.dds.decision.governed import Governed
 from sros_tool.dds.decision.grants import choose_grant
-from sros_tool.dds.decision.matching import Expressions
-from sros_tool.dds.decision.rights import Rights, Verdict
+from sros_tool.dds.decision.rights import EMPTY_TOPIC, Rights, Verdict
 from sros_tool.dds.decision.vendors import TRAITS, Vendor
-from sros_tool.dds.governance import DomainRule, Governance, Protection, TopicRule
+from sros_tool.dds.governance import Governance, Protection, TopicRule
 from sros_tool.dds.permissions import Grant, Permissions, Rule
 
+_TOPIC_NAME = re.compile(r"[A-Za-z_/][A-Za-z0-9_/]*\Z")
 _ENDPOINTS = (Verb.PUBLISH, Verb.SUBSCRIBE)
 
 
@@ -41,7 +43,7 @@ class Access:
         self._vendor = vendor
         self._traits = TRAITS[vendor]
         self._domain = domain
-        self._domain_rule = self._find_domain_rule(governance)
+        self._governed = Governed(self._traits, governance, domain)
         self._grant_index: int | None = None
         self._grant: Grant | None = None
         self._crash_at: int | None = None
@@ -95,12 +97,6 @@ class Access:
 
     # ── preparing ──────────────────────────────────────────────────────────────────────────
 
-    def _find_domain_rule(self, governance: Governance) -> DomainRule | None:
-        for rule in governance.domain_access_rules:
-            if holds_for(self._traits.open_range, rule.domains, self._domain):
-                return rule
-        return None
-
     def _on_domain(self, rules: list[tuple[int, Rule]]) -> list[tuple[int, Rule]]:
         """The rules for the domain, up to the one over whose domains the vendor crashes."""
         found = []
@@ -121,19 +117,9 @@ class Access:
         if not traits.filters_own_domain:
             self._peers = {verb: Rights(traits, local, verb.value) for verb in _ENDPOINTS}
         self._either = Rights(traits, local, "publish", "subscribe")
-        rules = self._domain_rule.topic_access_rules if self._domain_rule else ()
-        self._topic_rules = rules
-        self._topics = Expressions(
-            traits.style,
-            (
-                rule.topic_expression.strip() if traits.trims_texts else rule.topic_expression
-                for rule in rules
-            ),
-            both_ways=traits.governance_both_ways,
-        )
 
     def _decide_join(self, grant: Grant) -> Decision:
-        traits, rule = self._traits, self._domain_rule
+        traits, rule = self._traits, self._governed.rule
         where = f"domain {self._domain}"
         if traits.always_needs_allow_rule and not any(each.allow for each in grant.rules):
             return self._refused("no-rule", "the grant has no allow rule, so nothing starts")
@@ -141,11 +127,8 @@ class Access:
             text = f"the governance does not list {where}"
             if traits.needs_domain_rule:
                 return self._refused("domain-not-in-governance", text)
-            return self._answer(
-                Outcome.PEER_DENIES,
-                "domain-not-in-governance",
-                f"{text}, so that no endpoint can be created",
-            )
+            text += "; the participant starts, but no endpoint can be created"
+            return self._answer(Outcome.ALLOWED, "domain-not-in-governance", text)
         if (
             traits.refuses_open_rtps
             and rule.allow_unauthenticated_participants
@@ -162,10 +145,7 @@ class Access:
         if self._allows_domain:
             return self._answer(Outcome.ALLOWED, "allow-rule", f"an allow rule holds on {where}")
         missing = f"no allow rule of the grant holds on {where}"
-        if traits.always_needs_allow_rule or any(
-            not (each.enable_read_access_control and each.enable_write_access_control)
-            for each in rule.topic_access_rules
-        ):
+        if traits.always_needs_allow_rule or not self._governed.all_controlled():
             return self._answer(Outcome.PEER_DENIES, "no-rule", missing)
         if self._crash_at is not None:
             return self._crash(self._crash_at)
@@ -182,16 +162,16 @@ class Access:
         traits = self._traits
         if traits.creates_topics and not _is_topic_name(topic):
             return self._answer(Outcome.DENIED, "invalid-name", f"{topic!r} is no name for a topic")
-        if self._domain_rule is None:
-            return self._answer(
-                Outcome.DENIED, "domain-not-in-governance", join.text.partition(": ")[2][:-1]
-            )
-        position = self._topics.first(topic)
-        if position is None:
-            return self._answer(
-                Outcome.DENIED, "no-topic-rule", f"no topic rule of the governance matches {topic}"
-            )
-        rule = self._topic_rules[position]
+        rule = self._governed.topic_rule(topic)
+        if rule is None:
+            if self._governed.rule is None:
+                reason, what = "domain-not-in-governance", f"does not list domain {self._domain}"
+            else:
+                reason, what = "no-topic-rule", f"has no topic rule for {topic}"
+            return self._answer(Outcome.DENIED, reason, f"the governance {what}")
+        if traits.crashes_on_empty_expressions and not rule.topic_expression.strip():
+            text = "a topic rule of the governance is without its expression, over which it crashes"
+            return self._answer(Outcome.CRASHES, EMPTY_TOPIC, text)
         controlled = (
             rule.enable_write_access_control
             if verb is Verb.PUBLISH
@@ -236,6 +216,9 @@ class Access:
     ) -> Decision:
         if verdict.rule is None and self._crash_at is not None:
             return self._crash(self._crash_at)
+        if verdict.reason == EMPTY_TOPIC and verdict.rule is not None:
+            text = f"rule {verdict.rule + 1} has a <topic> without text, over which it crashes"
+            return self._answer(Outcome.CRASHES, EMPTY_TOPIC, text, verdict.rule)
         asked = f"{verb.value} {topic}"
         number = f"rule {verdict.rule + 1}" if verdict.rule is not None else ""
         reason = verdict.reason
@@ -299,5 +282,5 @@ class Access:
 
 
 def _is_topic_name(name: str) -> bool:
-    """Whether Cyclone DDS 0.10 takes it: no blanks, no quotes, no wildcards."""
-    return bool(name) and all("!" <= char <= "~" and char not in '*?"' for char in name)
+    """Whether Cyclone DDS 0.10 takes it: letters, digits, ``_`` and ``/``, no digit first."""
+    return bool(_TOPIC_NAME.match(name))

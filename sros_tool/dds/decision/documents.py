@@ -2,17 +2,30 @@
 
 from __future__ import annotations
 
+from sros_tool.dds.decision import cyclone_documents, fast_documents
 from sros_tool.dds.decision.answers import Refusal
+from sros_tool.dds.decision.elements import UnreadableError
 from sros_tool.dds.decision.vendors import TRAITS, Vendor
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Permissions, parse_permissions
 from sros_tool.errors import DocumentError
 
+_PERMISSIONS = "permissions"
+_GOVERNANCE = "governance"
+
 
 def read_permissions_as(vendor: Vendor, xml: bytes) -> Permissions | Refusal:
     """The permissions that ``vendor`` finds in ``xml``, or why it refuses them."""
     try:
-        return parse_permissions(xml, "the permissions document")
+        match vendor:
+            case Vendor.FAST | Vendor.FAST_2_9:
+                return fast_documents.read_permissions(xml)
+            case Vendor.CYCLONE:
+                return cyclone_documents.read_permissions(xml)
+            case _:
+                return parse_permissions(xml, _PERMISSIONS)
+    except UnreadableError as error:
+        return error.refusal(TRAITS[vendor].title, _PERMISSIONS)
     except DocumentError as error:
         return Refusal("malformed", f"{TRAITS[vendor].title}: {error}")
 
@@ -20,6 +33,14 @@ def read_permissions_as(vendor: Vendor, xml: bytes) -> Permissions | Refusal:
 def read_governance_as(vendor: Vendor, xml: bytes) -> Governance | Refusal:
     """The governance that ``vendor`` finds in ``xml``, or why it refuses it."""
     try:
-        return parse_governance(xml, "the governance document")
+        match vendor:
+            case Vendor.FAST | Vendor.FAST_2_9:
+                return fast_documents.read_governance(xml)
+            case Vendor.CYCLONE:
+                return cyclone_documents.read_governance(xml)
+            case _:
+                return parse_governance(xml, _GOVERNANCE)
+    except UnreadableError as error:
+        return error.refusal(TRAITS[vendor].title, _GOVERNANCE)
     except DocumentError as error:
         return Refusal("malformed", f"{TRAITS[vendor].title}: {error}")

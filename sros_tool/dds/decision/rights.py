@@ -34,6 +34,14 @@ class _Entry:
     expression: str
     partitions: tuple[str, ...]
 
+    @property
+    def crashes(self) -> bool:
+        return not self.expression
+
+
+EMPTY_TOPIC = "empty-topic"
+"""The reason of a verdict that is a crash."""
+
 
 class Rights:
     """The rules of one verb in their order, or with both verbs those on which a topic rests."""
@@ -47,16 +55,19 @@ class Rights:
                 # Fast DDS weighs the partitions of all criteria of a rule together.
                 weighed = _partitions(traits, rule, criteria if traits.topic_decides else (each,))
                 self._entries += [
-                    _Entry(index, rule.allow, _text(traits, expression), weighed)
+                    _Entry(index, rule.allow, trimmed(traits, expression), weighed)
                     for expression in each.topics
                 ]
-        self._topics = Expressions(traits.style, (entry.expression for entry in self._entries))
+        texts = (stand_in(traits, entry.expression) for entry in self._entries)
+        self._topics = Expressions(traits.style, texts)
 
     def ask(self, topic: str, partitions: tuple[str, ...]) -> Verdict:
         """The verdict on an endpoint of ``topic`` in ``partitions`` (none: the default one)."""
         wanted = partitions or DEFAULT_PARTITION
         for position in self._topics.matching(topic):
             entry = self._entries[position]
+            if entry.crashes:
+                return Verdict(False, EMPTY_TOPIC, entry.rule)
             fits = self._fits(entry, wanted)
             if fits or self._traits.topic_decides:
                 reason = ("allow-rule" if fits else "partition") if entry.allow else "deny-rule"
@@ -69,6 +80,8 @@ class Rights:
         if position is None:
             return NO_RULE
         entry = self._entries[position]
+        if entry.crashes:
+            return Verdict(False, EMPTY_TOPIC, entry.rule)
         reason = "allow-rule" if entry.allow else "deny-rule"
         return Verdict(entry.allow, reason, entry.rule, entry.expression)
 
@@ -85,7 +98,14 @@ def _named(style: Style, expressions: tuple[str, ...], partition: str) -> bool:
     return any(matches(style, expression, partition) for expression in expressions)
 
 
-def _text(traits: Traits, text: str) -> str:
+def stand_in(traits: Traits, text: str) -> str:
+    """An expression that matches every name, for one over which the vendor crashes."""
+    text = trimmed(traits, text)
+    return text or "*" if traits.crashes_on_empty_expressions else text
+
+
+def trimmed(traits: Traits, text: str) -> str:
+    """The text as the vendor takes it from its element."""
     return text.strip(" \t\v\r\n") if traits.trims_texts else text
 
 
@@ -94,4 +114,4 @@ def _partitions(traits: Traits, rule: Rule, criteria: tuple[Criteria, ...]) -> t
     everywhere = not rule.allow and traits.deny_partitions is DenyPartitions.ANY
     implied = ("*",) if everywhere else DEFAULT_PARTITION
     found = [text for each in criteria for text in each.partitions or implied]
-    return tuple(dict.fromkeys(_text(traits, text) for text in found))
+    return tuple(dict.fromkeys(trimmed(traits, text) for text in found))

@@ -108,12 +108,14 @@ class Traits:
     """The first rule whose topic matches decides, and then its partitions must fit."""
     deny_partitions: DenyPartitions = DenyPartitions.ANY
     honours_default: bool = True
+    crashes_on_empty_expressions: bool = False
+    """An expression without text ends the process once matching comes to it."""
     creates_topics: bool = False
     """A topic is created before its endpoint, and needs a right in either direction."""
     always_needs_allow_rule: bool = False
     """Without any allow rule the participant does not start, even without join control."""
     needs_domain_rule: bool = True
-    """The participant does not start on a domain that the governance does not list."""
+    """On a domain that the governance does not list, the participant does not even start."""
     refuses_open_rtps: bool = False
     """Unauthenticated participants together with RTPS protection are refused."""
 
@@ -151,6 +153,7 @@ TRAITS = {
         moments=Moments.CYCLONE,
         open_range=OpenRange.CRASHES,
         deny_partitions=DenyPartitions.ALL,
+        crashes_on_empty_expressions=True,
         creates_topics=True,
     ),
     Vendor.OPENDDS: Traits("OpenDDS", documented_only=True),

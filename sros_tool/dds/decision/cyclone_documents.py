@@ -1,0 +1,284 @@
+"""How Cyclone DDS 0.10 reads signed documents (its own XML parser and access_control_parser.c).
+
+Tags may be written in capitals, come in any order, and the last of several counts; blanks around
+texts do not.  Any element or attribute that it does not know makes the document malformed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from typing import TypeVar
+
+from lxml import etree
+
+from sros_tool.dds.decision.elements import (
+    UnreadableError,
+    attributes_of,
+    elements_of,
+    name_of,
+    root_of,
+    texts_of,
+)
+from sros_tool.dds.domains import MAX_DOMAIN, DomainRange, DomainSet
+from sros_tool.dds.governance import (
+    DATA_PROTECTIONS,
+    DomainRule,
+    Governance,
+    Protection,
+    TopicRule,
+)
+from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
+
+Read = TypeVar("Read")
+BLANKS = " \t\v\r\n"
+_MARK = b"\xef\xbb\xbf"
+_SCHEMA_ATTRIBUTES = ("xmlns:xsi", "xsi:nonamespaceschemalocation")
+_IGNORED = ("relay", "value", "name", "tag", "data_tags")
+_INTEGER = re.compile(r"[+-]?(?:0[xX][0-9a-fA-F]+|0[0-7]*|[1-9]\d*)\Z", re.ASCII)
+
+# What may stand in what; without an entry, only text may.
+_DOMAINS = {"domains": ("id", "id_range"), "id_range": ("min", "max")}
+_DOMAIN_FLAGS = ("allow_unauthenticated_participants", "enable_join_access_control")
+_DOMAIN_KINDS = (
+    "discovery_protection_kind",
+    "liveliness_protection_kind",
+    "rtps_protection_kind",
+)
+_TOPIC_FLAGS = (
+    "enable_discovery_protection",
+    "enable_liveliness_protection",
+    "enable_read_access_control",
+    "enable_write_access_control",
+)
+_TOPIC_KINDS = ("metadata_protection_kind", "data_protection_kind")
+_GOVERNANCE = _DOMAINS | {
+    "dds": ("domain_access_rules",),
+    "domain_access_rules": ("domain_rule",),
+    "domain_rule": ("domains", "topic_access_rules", *_DOMAIN_FLAGS, *_DOMAIN_KINDS),
+    "topic_access_rules": ("topic_rule",),
+    "topic_rule": ("topic_expression", *_TOPIC_FLAGS, *_TOPIC_KINDS),
+}
+_RULE = ("domains", "publish", "subscribe")
+_PERMISSIONS = _DOMAINS | {
+    "dds": ("permissions",),
+    "permissions": ("grant",),
+    "grant": ("subject_name", "validity", "allow_rule", "deny_rule", "default"),
+    "validity": ("not_before", "not_after"),
+    "allow_rule": _RULE,
+    "deny_rule": _RULE,
+    "publish": ("topics", "partitions"),
+    "subscribe": ("topics", "partitions"),
+    "topics": ("topic",),
+    "partitions": ("partition",),
+}
+
+
+def read_governance(xml: bytes) -> Governance:
+    """Its governance; raises `UnreadableError`."""
+    dds = _Node.root(xml, _GOVERNANCE, ())
+    parent = dds.last("domain_access_rules")
+    rules = parent.all("domain_rule") if parent else []
+    if not rules:
+        raise UnreadableError("it has no <domain_rule>")
+    return Governance(tuple(_domain_rule(each) for each in rules))
+
+
+def read_permissions(xml: bytes) -> Permissions:
+    """Its permissions; raises `UnreadableError`.
+
+    A ``<topic>`` without text is "", a rule without domains has a range without ends: over both it
+    crashes once it comes to them.
+    """
+    dds = _Node.root(xml, _PERMISSIONS, _IGNORED)
+    parent = dds.last("permissions")
+    grants = parent.all("grant") if parent else []
+    if not grants:
+        raise UnreadableError("it has no <grant>")
+    return Permissions(tuple(_grant(each) for each in grants))
+
+
+class _Node:
+    """An element that may stand where it does, with the children that count."""
+
+    def __init__(
+        self,
+        element: etree._Element,
+        grammar: Mapping[str, tuple[str, ...]],
+        skipped: tuple[str, ...],
+    ) -> None:
+        self.tag = name_of(element).lower()
+        self.attribute = element.get("name")
+        self.text = "".join(texts_of(element)).strip(BLANKS)
+        _check_attributes(element, self.tag)
+        children = elements_of(element)
+        if self.text and (children or self.tag in grammar):
+            raise UnreadableError(f"<{self.tag}> holds text")
+        self._children = []
+        for child in children:
+            tag = name_of(child).lower()
+            if tag in skipped:
+                _check_skipped(child)
+            elif tag in grammar.get(self.tag, ()):
+                self._children.append(_Node(child, grammar, skipped))
+            else:
+                raise UnreadableError(f"<{self.tag}> holds <{name_of(child)}>")
+
+    @classmethod
+    def root(
+        cls, xml: bytes, grammar: Mapping[str, tuple[str, ...]], skipped: tuple[str, ...]
+    ) -> _Node:
+        if xml.startswith(_MARK):
+            raise UnreadableError("it begins with a byte order mark")
+        root = root_of(xml)
+        if name_of(root).lower() != "dds":
+            raise UnreadableError("its root is not <dds>")
+        return cls(root, grammar, skipped)
+
+    def all(self, *tags: str) -> list[_Node]:
+        return [child for child in self._children if child.tag in tags]
+
+    def last(self, tag: str) -> _Node | None:
+        found = self.all(tag)
+        return found[-1] if found else None
+
+
+def _check_attributes(element: etree._Element, tag: str) -> None:
+    for name in attributes_of(element):
+        if name.lower() not in _SCHEMA_ATTRIBUTES and (name, tag) != ("name", "grant"):
+            raise UnreadableError(f"<{tag}> has the attribute {name!r}")
+
+
+def _check_skipped(element: etree._Element) -> None:
+    for each in element.iter():
+        if isinstance(each.tag, str):
+            _check_attributes(each, "")
+
+
+# ── values ─────────────────────────────────────────────────────────────────────────────────
+
+
+def _number(node: _Node) -> int:
+    if not node.text:
+        return 0
+    if not _INTEGER.match(node.text):
+        raise UnreadableError(f"<{node.tag}> holds {node.text!r}, which is no number")
+    sign, digits = ("-", node.text[1:]) if node.text[0] == "-" else ("", node.text.lstrip("+"))
+    octal = len(digits) > 1 and digits[0] == "0" and digits[1] not in "xX"
+    number = int(sign + digits, 8 if octal else 0)
+    if not 0 <= number <= MAX_DOMAIN:
+        raise UnreadableError(f"<{node.tag}> holds {number}, which is above {MAX_DOMAIN}")
+    return number
+
+
+def _flag(node: _Node) -> bool:
+    word = node.text.lower()
+    if word not in ("", "true", "false", "0", "1"):
+        raise UnreadableError(f"<{node.tag}> holds {node.text!r} instead of true or false")
+    return word in ("true", "1")
+
+
+def _kind(node: _Node) -> Protection:
+    known: tuple[str, ...] = tuple(Protection)
+    if node.tag == "data_protection_kind":
+        known = DATA_PROTECTIONS
+    if node.text and node.text not in known:
+        raise UnreadableError(
+            f"<{node.tag}> holds {node.text!r}, which is no protection kind there"
+        )
+    return Protection(node.text) if node.text else Protection.NONE
+
+
+def _domains(node: _Node | None) -> DomainSet:
+    if node is None:
+        return DomainSet((DomainRange(None, None),))
+    ranges = []
+    for child in node.all("id", "id_range"):
+        if child.tag == "id":
+            number = _number(child)
+            ranges.append(DomainRange(number, number))
+            continue
+        ends = [child.last("min"), child.last("max")]
+        first, last = (None if end is None else _number(end) for end in ends)
+        ranges.append(DomainRange(first, last))
+    return DomainSet(tuple(ranges))
+
+
+# ── governance ─────────────────────────────────────────────────────────────────────────────
+
+
+def _domain_rule(node: _Node) -> DomainRule:
+    domains, topics = node.last("domains"), node.last("topic_access_rules")
+    if domains is None:
+        raise UnreadableError("a <domain_rule> lacks its <domains>")
+    read = _domains(domains)
+    if not read.ranges:
+        raise UnreadableError("<domains> is empty")
+    for part in read.ranges:
+        if part.first is None:
+            raise UnreadableError("an <id_range> lacks its <min>")
+        if part.last is not None and part.last < part.first:
+            raise UnreadableError("an <id_range> ends before it begins")
+    rules = topics.all("topic_rule") if topics else []
+    if not rules:
+        raise UnreadableError("a <domain_rule> has no topic rules")
+    return DomainRule(
+        domains=read,
+        allow_unauthenticated_participants=_field(node, _DOMAIN_FLAGS[0], _flag),
+        enable_join_access_control=_field(node, _DOMAIN_FLAGS[1], _flag),
+        discovery_protection_kind=_field(node, _DOMAIN_KINDS[0], _kind),
+        liveliness_protection_kind=_field(node, _DOMAIN_KINDS[1], _kind),
+        rtps_protection_kind=_field(node, _DOMAIN_KINDS[2], _kind),
+        topic_access_rules=tuple(_topic_rule(each) for each in rules),
+    )
+
+
+def _topic_rule(node: _Node) -> TopicRule:
+    expression = node.last("topic_expression")
+    return TopicRule(
+        topic_expression=expression.text if expression else "",
+        enable_discovery_protection=_field(node, _TOPIC_FLAGS[0], _flag),
+        enable_liveliness_protection=_field(node, _TOPIC_FLAGS[1], _flag),
+        enable_read_access_control=_field(node, _TOPIC_FLAGS[2], _flag),
+        enable_write_access_control=_field(node, _TOPIC_FLAGS[3], _flag),
+        metadata_protection_kind=_field(node, _TOPIC_KINDS[0], _kind),
+        data_protection_kind=_field(node, _TOPIC_KINDS[1], _kind),
+    )
+
+
+def _field(node: _Node, name: str, read: Callable[[_Node], Read]) -> Read:
+    child = node.last(name)
+    if child is None:
+        raise UnreadableError(f"a <{node.tag}> lacks its <{name}>")
+    return read(child)
+
+
+# ── permissions ────────────────────────────────────────────────────────────────────────────
+
+
+def _grant(node: _Node) -> Grant:
+    subject, validity = node.last("subject_name"), node.last("validity")
+    begin = validity.last("not_before") if validity else None
+    end = validity.last("not_after") if validity else None
+    if not (subject and subject.text and begin and begin.text and end and end.text):
+        raise UnreadableError("a <grant> lacks its <subject_name> or its <validity>")
+    rules = tuple(_rule(each) for each in node.all("allow_rule", "deny_rule"))
+    default = node.last("default")
+    allow = default is not None and default.text == "ALLOW"
+    return Grant(node.attribute or "", subject.text, begin.text, end.text, rules, allow)
+
+
+def _rule(node: _Node) -> Rule:
+    publish, subscribe = (
+        tuple(_criteria(each) for each in node.all(verb)) for verb in ("publish", "subscribe")
+    )
+    allow = node.tag == "allow_rule"
+    return Rule(allow, _domains(node.last("domains")), publish, subscribe)
+
+
+def _criteria(node: _Node) -> Criteria:
+    topics, partitions = node.last("topics"), node.last("partitions")
+    return Criteria(
+        tuple(each.text for each in topics.all("topic")) if topics else (),
+        tuple(each.text for each in partitions.all("partition")) if partitions else (),
+    )
