@@ -20,7 +20,7 @@ from sros_tool.keystore.authority import (
     create_authorities,
     load_authorities,
 )
-from sros_tool.keystore.enclave import Fate, Progress, Registrar
+from sros_tool.keystore.enclave import Fate, Registrar
 from sros_tool.keystore.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
     ENCLAVES,
@@ -34,6 +34,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
 from sros_tool.keystore.open import check_domain, load_governance, load_settings
+from sros_tool.keystore.parallel import Progress
 from sros_tool.keystore.template import Template, render_template
 from sros_tool.keystore.transaction import Change, Transaction, tidy
 from sros_tool.names import check_enclave_name
@@ -236,12 +237,10 @@ def _produce(
             existing = tuple(enclave_names(root))
             entries = []
         registrar = Registrar(transaction, authorities, template, domains, now)
-        outcomes = registrar.register_all(list(wanted.items()), progress)
-        append(transaction, [*entries, *(e for outcome in outcomes for e in outcome.entries)])
+        fates = registrar.register_all(list(wanted.items()), progress)
+        append(transaction, [*entries, *registrar.entries])
         transaction.commit()
-    fates = {name: fate for outcome in outcomes for name, fate in outcome.fates}
     of = {fate: tuple(name for name in fates if fates[name] is fate) for fate in Fate}
-    notes = tuple(note for outcome in outcomes for note in outcome.notes)
     return Result(
         root,
         template,
@@ -252,7 +251,7 @@ def _produce(
         of[Fate.COMPLETED],
         of[Fate.KEPT],
         tuple(transaction.changes),
-        (*notes, *name_notes({*existing, *of[Fate.CREATED]}, of[Fate.CREATED])),
+        (*registrar.notes, *name_notes({*existing, *of[Fate.CREATED]}, of[Fate.CREATED])),
     )
 
 

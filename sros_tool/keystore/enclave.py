@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
@@ -12,11 +11,12 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import parse_permissions, render_permissions
+from sros_tool.dds.permissions import Permissions, parse_permissions
 from sros_tool.dds.portable import document_notes
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.authority import Authorities
 from sros_tool.keystore.defaults import default_enclave
+from sros_tool.keystore.issuance import Issuance
 from sros_tool.keystore.layout import (
     CRL,
     ENCLAVES,
@@ -26,10 +26,9 @@ from sros_tool.keystore.layout import (
     REQUEST,
     enclave_folder,
 )
-from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry
-from sros_tool.keystore.parallel import in_shares
+from sros_tool.keystore.parallel import Progress
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.transaction import Change, Transaction
+from sros_tool.keystore.transaction import Transaction
 from sros_tool.notes import Note
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
@@ -37,15 +36,13 @@ from sros_tool.pki.certificates import (
     enclave_subject,
     issued_by,
     load_certificate,
-    pem,
     subject_text,
     validity_of,
 )
 from sros_tool.pki.keys import generate_key, key_pem, load_key
-from sros_tool.pki.token import TokenKey
 from sros_tool.policy.model import Enclave
 from sros_tool.translate import permissions_for
-from sros_tool.validity import iso, window
+from sros_tool.validity import Window, iso
 from sros_tool.xml import read_bytes
 
 
@@ -58,22 +55,8 @@ class Fate(Enum):
     KEPT = "kept"
 
 
-Progress = Callable[[str], None]
-"""Told the name of each enclave when it is done."""
-
-
-@dataclass(slots=True)
-class Outcome:
-    """What became of each enclave of a share, with remarks, staged files and ledger entries."""
-
-    fates: list[tuple[str, Fate]]
-    notes: list[Note]
-    changes: list[Change]
-    entries: list[Entry]
-
-
 class Registrar:
-    """Adds enclaves to one transaction."""
+    """Adds enclaves to one transaction; ``entries`` are for the ledger, ``notes`` are remarks."""
 
     def __init__(
         self,
@@ -85,56 +68,47 @@ class Registrar:
     ) -> None:
         self._transaction = transaction
         self._authorities = authorities
-        self._issuer = authorities.identity.issuer()
+        self._issuance = Issuance(
+            transaction,
+            template,
+            now,
+            identity=authorities.identity,
+            permissions=authorities.permissions,
+        )
         self._template = template
         self._domains = domains
         self._now = now
-        self._certificate_validity = window(now, template.certificate_validity)
-        self._permissions_validity = window(now, template.permissions_validity).within(
-            validity_of(authorities.permissions.certificate)
-        )
-        self._notes: list[Note] = []
-        self._entries: list[Entry] = []
         self._has_crl = (transaction.root / CRL).exists()
+        self.notes: list[Note] = []
+        self.entries = self._issuance.entries
 
     def register_all(
         self, wanted: Sequence[tuple[str, Enclave | None]], progress: Progress | None
-    ) -> list[Outcome]:
+    ) -> dict[str, Fate]:
         """Make or complete each enclave; with a policy, give it those permissions."""
-        outcomes = []
-        own = os.getpid()
 
-        def work(share: Sequence[tuple[str, Enclave | None]]) -> Outcome:
-            before = len(self._transaction.changes)
-            fates = []
-            for name, enclave in share:
-                fates.append((name, self._register(name, enclave)))
-                if progress and os.getpid() == own:
-                    progress(name)
-            changes = self._transaction.changes[before:]
-            return Outcome(fates, self._notes, changes, self._entries)
+        def work(item: tuple[str, Enclave | None]) -> tuple[Fate, list[Note]]:
+            notes: list[Note] = []
+            return self._register(*item, notes), notes
 
-        # A session with a token does not survive a fork.
-        keys = (self._authorities.identity.key, self._authorities.permissions.key)
-        alone = any(isinstance(key, TokenKey) for key in keys)
-        shares = [(wanted, work(wanted))] if alone else in_shares(wanted, work)
-        for index, (share, outcome) in enumerate(shares):
-            if index:  # the first share was done here, the others by other processes
-                self._transaction.absorb(outcome.changes)
-                for name, _ in share:
-                    if progress:
-                        progress(name)
-            outcomes.append(outcome)
-        return outcomes
+        def told(item: tuple[str, Enclave | None], _: object) -> None:
+            if progress:
+                progress(item[0])
 
-    def _register(self, name: str, policy: Enclave | None) -> Fate:
+        done = self._issuance.spread(wanted, work, told)
+        self.notes += [note for _, notes in done for note in notes]
+        if self.entries:
+            self.notes += self._issuance.notes
+        return {name: fate for (name, _), (fate, _) in zip(wanted, done, strict=True)}
+
+    def _register(self, name: str, policy: Enclave | None, notes: list[Note]) -> Fate:
         folder = enclave_folder(name)
         present = self._present(folder)
         before = len(self._transaction.changes)
         certificate = self._identity(name, folder, present)
         self._links(folder, present)
         if policy is not None or "permissions.p7s" not in present:
-            self._permissions(name, folder, policy, certificate)
+            self._permissions(name, policy, certificate, notes)
         if not present & {"key.pem", REQUEST}:
             return Fate.CREATED
         if "permissions.p7s" in present and policy is not None:
@@ -171,10 +145,7 @@ class Registrar:
         subject = enclave_subject(name, unique=self._template.unique_subject)
         if "permissions.p7s" in present:
             subject = self._subject_of_permissions(folder, subject)
-        certificate = self._issuer.issue(subject, public, self._certificate_validity)
-        self._transaction.write(f"{folder}/cert.pem", pem(certificate))
-        self._entries.append(certificate_entry(self._now, "certificate", certificate, name))
-        return certificate
+        return self._issuance.certificate(name, subject, public)
 
     def _subject_of_permissions(self, folder: str, otherwise: x509.Name) -> x509.Name:
         """The subject of this name that the permissions of an enclave are signed for."""
@@ -223,40 +194,25 @@ class Registrar:
             self._transaction.link(f"{folder}/crl.pem", f"{up}../{CRL}")
 
     def _permissions(
-        self, name: str, folder: str, policy: Enclave | None, certificate: x509.Certificate
+        self, name: str, policy: Enclave | None, certificate: x509.Certificate, notes: list[Note]
     ) -> None:
         enclave = policy or default_enclave(self._template.default_permissions, name)
         if len(enclave.profiles) > 1:
-            self._notes.append(
+            notes.append(
                 Note(
                     "policy.several-profiles",
                     f"{name}: the rights of its {len(enclave.profiles)} <profiles> are joined. "
                     "ros2/sros2 makes a grant of each, of which DDS reads only the first.",
                 )
             )
-        subject = subject_text(certificate.subject)
-        validity = self._permissions_validity.within(validity_of(certificate))
-        permissions = permissions_for(
-            enclave, subject=subject, validity=validity, domains=self._domains
-        )
-        document = render_permissions(permissions)
-        message = self._authorities.permissions.sign(
-            document, permissions, parse_permissions, f"the permissions of {name}"
-        )
-        self._transaction.write(f"{folder}/permissions.xml", document)
-        self._transaction.write(f"{folder}/permissions.p7s", message)
-        self._entries.append(
-            document_entry(
-                self._now,
-                "permissions",
-                message,
-                enclave=name,
-                subject=subject,
-                validity=validity,
-                policy=enclave.digest,
+
+        def make(subject: str, validity: Window) -> Permissions:
+            return permissions_for(
+                enclave, subject=subject, validity=validity, domains=self._domains
             )
-        )
-        self._notes += document_notes(name, permissions, len(message))
+
+        permissions, message = self._issuance.permissions(name, certificate, make, enclave.digest)
+        notes += document_notes(name, permissions, len(message))
 
 
 def enclave_path(root: Path, name: str) -> Path:

@@ -21,6 +21,9 @@ from sros_tool.errors import SrosError
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
+Progress = Callable[[str], None]
+"""Told the name of each enclave when it is done."""
+
 _SMALLEST_SHARE = 100
 _MOST_PROCESSES = 8
 _PR_SET_PDEATHSIG = 1
@@ -98,9 +101,9 @@ def _collect(child: int, pipe: int) -> Outcome:  # type: ignore[type-var]
     _, status = os.waitpid(child, 0)
     if not message:
         raise SrosError(
-            "a process that was signing died",
+            "a process that shared the work died",
             f"It ended with status {status}; perhaps there was too little memory.",
-            "Nothing was changed. Try again.",
+            "Try again.",
         )
     outcome = pickle.loads(message)  # noqa: S301 - from our own child, through a pipe
     if isinstance(outcome, BaseException):

@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime
 
 from cryptography import x509
 
 from sros_tool.dds.governance import parse_governance
-from sros_tool.dds.permissions import Permissions, parse_permissions, render_permissions
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.authority import Authority
+from sros_tool.keystore.granted import read_granted
+from sros_tool.keystore.issuance import Issuance, policies_of, renewed, teller
 from sros_tool.keystore.layout import GOVERNANCE_P7S, enclave_folder
-from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry, read_ledger
-from sros_tool.keystore.parallel import in_shares
+from sros_tool.keystore.ledger import Entry, document_entry
+from sros_tool.keystore.parallel import Progress
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.transaction import Change, Transaction
+from sros_tool.keystore.transaction import Transaction
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import issued_by, load_certificate, pem, subject_text, validity_of
-from sros_tool.pki.token import TokenKey
-from sros_tool.validity import iso, window
+from sros_tool.pki.certificates import issued_by, load_certificate, subject_text
 from sros_tool.xml import read_bytes
 
-Progress = Callable[[str], None]
+__all__ = ["Progress", "Turn", "reissue"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,11 +63,15 @@ class _Reissuer:
         self._transaction = transaction
         self._identity = identity
         self._permissions = permissions
-        self._issuer = identity.new.issuer() if identity else None
+        self._issuance = Issuance(
+            transaction,
+            template,
+            now,
+            identity=identity.new if identity else None,
+            permissions=permissions.new if permissions else None,
+        )
         self._now = now
-        self._certificate_validity = window(now, template.certificate_validity)
-        self._permissions_validity = window(now, template.permissions_validity)
-        self._policies = {each.sha256: each.policy for each in read_ledger(transaction.root)}
+        self._policies = policies_of(transaction.root)
 
     def governance(self, names: Sequence[str]) -> list[Entry]:
         """Sign the keystore's governance anew, as it is, and that of enclaves with a copy."""
@@ -94,103 +95,49 @@ class _Reissuer:
 
     def enclaves(self, names: Sequence[str], progress: Progress | None) -> list[Entry]:
         """Issue and sign for all enclaves, on all cores."""
-        own = os.getpid()
+        self._issuance.spread(names, self._enclave, teller(progress))
+        return self._issuance.entries
 
-        def work(share: Sequence[str]) -> tuple[list[Entry], list[Change]]:
-            before = len(self._transaction.changes)
-            entries: list[Entry] = []
-            for name in share:
-                entries += self._enclave(name)
-                if progress and os.getpid() == own:
-                    progress(name)
-            return entries, self._transaction.changes[before:]
-
-        turns = [turn for turn in (self._identity, self._permissions) if turn]
-        # A session with a token does not survive a fork.
-        alone = any(isinstance(turn.new.key, TokenKey) for turn in turns)
-        found: list[Entry] = []
-        for index, (share, (entries, changes)) in enumerate(
-            [(names, work(names))] if alone else in_shares(names, work)
-        ):
-            if index:
-                self._transaction.absorb(changes)
-                for name in share:
-                    if progress:
-                        progress(name)
-            found += entries
-        return found
-
-    def _enclave(self, name: str) -> list[Entry]:
+    def _enclave(self, name: str) -> None:
         folder = enclave_folder(name)
         path = self._transaction.root / folder / "cert.pem"
         if not path.exists():
-            return []  # its key waits for a certificate, which will be of the new CA
+            return  # its key waits for a certificate, which will be of the new CA
         try:
             certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
-            entries = []
-            if self._identity and self._issuer:
+            if self._identity:
                 if not issued_by(certificate, self._identity.old):
                     raise KeystoreError(
                         f"its certificate was not issued by the identity CA of this keystore but "
                         f"by {subject_text(certificate.issuer)}"
                     )
-                public = certificate.public_key()
-                certificate = self._issuer.issue(
+                certificate = self._issuance.certificate(
+                    name,
                     certificate.subject,
-                    public,  # type: ignore[arg-type]
-                    self._certificate_validity,
+                    certificate.public_key(),  # type: ignore[arg-type]
                 )
-                self._transaction.write(f"{folder}/cert.pem", pem(certificate))
-                entries.append(certificate_entry(self._now, "certificate", certificate, name))
             if self._permissions:
-                entries += self._sign_permissions(name, folder, certificate, self._permissions)
+                self._sign_permissions(name, certificate, self._permissions)
         except SrosError as error:
             raise KeystoreError(
                 f"enclave {name} cannot be moved to the new CA: {error.what}",
                 error.why,
                 error.remedy or f"See `sros inspect {path.parent}`; nothing was changed.",
             ) from error
-        return entries
 
-    def _sign_permissions(
-        self, name: str, folder: str, certificate: x509.Certificate, turn: Turn
-    ) -> list[Entry]:
-        path = self._transaction.root / folder / "permissions.p7s"
+    def _sign_permissions(self, name: str, certificate: x509.Certificate, turn: Turn) -> None:
+        path = self._transaction.root / enclave_folder(name) / "permissions.p7s"
         if not path.exists():
-            return []
-        old = read_bytes(path, "permissions document")
-        signed = smime.parse(old)
-        signed.verify(turn.old)
+            return
         subject = subject_text(certificate.subject)
-        grants = parse_permissions(signed.document, f"'{path}'").grants
-        # The first grant that fits is the one that DDS reads.
-        grant = next((each for each in grants if each.subject == subject), None)
-        if grant is None:
+        old = read_granted(path, subject)
+        old.signed.verify(turn.old)
+        if old.grant is None:
             raise KeystoreError(
                 f"its permissions have no grant for {subject}",
                 "They belong to another certificate.",
                 f"Sign them anew with `sros create_permission {self._transaction.root} {name} "
                 "POLICY_FILE`.",
             )
-        validity = self._permissions_validity.within(validity_of(turn.new.certificate)).within(
-            validity_of(certificate)
-        )
-        begin, end = iso(validity.not_before), iso(validity.not_after)
-        permissions = Permissions((replace(grant, not_before=begin, not_after=end),))
-        document = render_permissions(permissions)
-        message = turn.new.sign(
-            document, permissions, parse_permissions, f"the permissions of {name}"
-        )
-        self._transaction.write(f"{folder}/permissions.xml", document)
-        self._transaction.write(f"{folder}/permissions.p7s", message)
-        return [
-            document_entry(
-                self._now,
-                "permissions",
-                message,
-                enclave=name,
-                subject=subject,
-                validity=validity,
-                policy=self._policies.get(hashlib.sha256(old).hexdigest(), ""),
-            )
-        ]
+        policy = self._policies.get(old.digest, "")
+        self._issuance.permissions(name, certificate, renewed(old.grant), policy)

@@ -85,7 +85,7 @@ def revoke(
         revoked: list[Revoked] = []
         entries: list[Entry] = []
         for name in dict.fromkeys(names):
-            subjects = _still_valid(issued, name, now)
+            subjects = still_valid(issued, name, now)
             subjects.update([_move_away(transaction, authority, name)])
             for serial, subject in subjects.items():
                 if serial not in listed:
@@ -97,7 +97,7 @@ def revoke(
         remaining = tuple(name for name in existing if name not in names)
         next_update, signed = lists.sign(revoked, remaining, incomplete=until_retired)
         entries += signed
-        _link_everywhere(transaction, remaining)
+        link_everywhere(transaction, remaining)
         append(transaction, entries)
         transaction.commit()
     return Revocation(
@@ -126,7 +126,7 @@ def refresh_crl(
         authority = load_authority(root, IDENTITY, template, keyring, now)
         lists = Lists(transaction, authority, template, keyring, read_ledger(root), now)
         next_update, entries = lists.sign((), existing, incomplete=True)
-        _link_everywhere(transaction, existing)
+        link_everywhere(transaction, existing)
         append(transaction, entries)
         transaction.commit()
     changes, remarks = tuple(transaction.changes), tuple(lists.remarks)
@@ -143,7 +143,7 @@ def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
     return existing
 
 
-def _still_valid(issued: Sequence[Entry], name: str, now: datetime) -> dict[int, str]:
+def still_valid(issued: Sequence[Entry], name: str, now: datetime) -> dict[int, str]:
     """Serial numbers and subjects of what was issued to an enclave and has not ended."""
     return {
         int(each.serial, 16): each.subject
@@ -177,7 +177,8 @@ def _move_away(transaction: Transaction, authority: Authority, name: str) -> tup
     return serial, subject_text(certificate.subject)
 
 
-def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
+def link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
+    """Have the ``crl.pem`` of each enclave lead to the one list."""
     for name in names:
         folder = enclave_folder(name)
         path = transaction.root / folder / "crl.pem"

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
 from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import Permissions, parse_permissions, render_permissions
+from sros_tool.dds.permissions import Permissions
 from sros_tool.dds.portable import document_notes, name_notes
 from sros_tool.errors import KeystoreError, PkiError, PolicyError, SrosError
 from sros_tool.keystore.answer import SEAL, Answer, check_answer, seal
@@ -19,6 +18,8 @@ from sros_tool.keystore.archive import pack, staged_file
 from sros_tool.keystore.authority import Authorities, load_authorities
 from sros_tool.keystore.create import list_enclaves
 from sros_tool.keystore.defaults import default_enclave
+from sros_tool.keystore.granted import read_granted
+from sros_tool.keystore.issuance import Issuance, Make, policies_of, renewed
 from sros_tool.keystore.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
     CRL,
@@ -30,26 +31,19 @@ from sros_tool.keystore.layout import (
     ca_certificate,
     enclave_folder,
 )
-from sros_tool.keystore.ledger import (
-    Entry,
-    append,
-    certificate_entry,
-    document_entry,
-    read_ledger,
-)
+from sros_tool.keystore.ledger import Entry, append, document_entry
 from sros_tool.keystore.open import check_domain, load_governance, load_settings
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Change, Transaction, tidy
 from sros_tool.names import check_enclave_name
 from sros_tool.notes import Note
-from sros_tool.pki import smime
 from sros_tool.pki.certificates import enclave_subject, load_certificate, pem, validity_of
 from sros_tool.pki.certificates import subject_text as text_of
 from sros_tool.pki.keys import load_key
 from sros_tool.pki.requests import SigningRequest, key_digest, load_request
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.translate import permissions_for
-from sros_tool.validity import iso, window
+from sros_tool.validity import Window, iso
 from sros_tool.xml import read_bytes
 
 
@@ -217,44 +211,31 @@ class _Signer:
         self._transaction = transaction
         self._root = transaction.root
         self._authorities = authorities
+        self._issuance = Issuance(
+            transaction,
+            template,
+            now,
+            identity=authorities.identity,
+            permissions=authorities.permissions,
+        )
         self._template = template
         self._domains = domains
-        self._now = now
 
     def sign(self, request: SigningRequest, enclave: Enclave | None, *, renew: bool) -> _Prepared:
         """Stage the enclave."""
         name, folder = request.name, enclave_folder(request.name)
         notes = self._new_key(request) if renew else []
-        certificate = self._authorities.identity.issuer().issue(
-            enclave_subject(name, unique=self._template.unique_subject),
-            request.public_key,
-            window(self._now, self._template.certificate_validity),
+        made, policy = self._rights(name, enclave, renew)
+        certificate = self._issuance.certificate(
+            name, enclave_subject(name, unique=self._template.unique_subject), request.public_key
         )
-        permissions, policy = self._permissions(name, certificate, enclave, renew)
-        document = render_permissions(permissions)
-        message = self._authorities.permissions.sign(
-            document, permissions, parse_permissions, f"the permissions of {name}"
-        )
-        files = {f"{folder}/cert.pem": pem(certificate), f"{folder}/permissions.p7s": message}
-        for path, data in files.items():
-            self._transaction.write(path, data)
-        self._transaction.write(f"{folder}/permissions.xml", document)
+        permissions, message = self._issuance.permissions(name, certificate, made, policy)
         self._transaction.write(f"{folder}/{REQUEST}", request.pem)
-        entries = [
-            certificate_entry(self._now, "certificate", certificate, name),
-            document_entry(
-                self._now,
-                "permissions",
-                message,
-                enclave=name,
-                subject=text_of(certificate.subject),
-                validity=permissions.grants[0].validity,
-                policy=policy,
-            ),
-        ]
+        files = {f"{folder}/cert.pem": pem(certificate), f"{folder}/permissions.p7s": message}
         files |= self._shared(folder)
         notes += document_notes(name, permissions, len(message))
-        return _Prepared(dict(sorted(files.items())), entries, notes)
+        notes += self._issuance.notes
+        return _Prepared(dict(sorted(files.items())), self._issuance.entries, notes)
 
     def _new_key(self, request: SigningRequest) -> list[Note]:
         old = self._certificate(request.name)
@@ -269,38 +250,25 @@ class _Signer:
             )
         ]
 
-    def _permissions(
-        self, name: str, certificate: x509.Certificate, enclave: Enclave | None, renew: bool
-    ) -> tuple[Permissions, str]:
-        """What to sign, and the digest of the policy that it comes from."""
-        subject = text_of(certificate.subject)
-        validity = (
-            window(self._now, self._template.permissions_validity)
-            .within(validity_of(self._authorities.permissions.certificate))
-            .within(validity_of(certificate))
-        )
+    def _rights(self, name: str, enclave: Enclave | None, renew: bool) -> tuple[Make, str]:
+        """What makes the permissions, and the digest of the policy that it comes from."""
         if enclave is None and renew:
-            path = self._root / enclave_folder(name) / "permissions.p7s"
-            message = read_bytes(path, "permissions document")
-            signed = smime.parse(message)
-            signed.verify(self._authorities.permissions.certificate)
-            grants = parse_permissions(signed.document, f"'{path}'").grants
-            old = text_of(self._certificate(name).subject)
-            grant = next((each for each in grants if each.subject == old), None)
-            if grant is None:
+            subject = text_of(self._certificate(name).subject)
+            old = read_granted(self._root / enclave_folder(name) / "permissions.p7s", subject)
+            old.signed.verify(self._authorities.permissions.certificate)
+            if old.grant is None:
                 raise PkiError(
-                    f"the permissions of enclave {name} have no grant for {old}",
+                    f"the permissions of enclave {name} have no grant for {subject}",
                     "They belong to another certificate.",
                     "State the rights with -p POLICY_FILE.",
                 )
-            digest = hashlib.sha256(message).hexdigest()
-            policies = {each.sha256: each.policy for each in read_ledger(self._root)}
-            begin, end = iso(validity.not_before), iso(validity.not_after)
-            renewed = replace(grant, subject=subject, not_before=begin, not_after=end)
-            return Permissions((renewed,)), policies.get(digest, "")
+            return renewed(old.grant), policies_of(self._root).get(old.digest, "")
         meant = enclave or default_enclave(self._template.default_permissions, name)
-        made = permissions_for(meant, subject=subject, validity=validity, domains=self._domains)
-        return made, meant.digest
+
+        def make(subject: str, validity: Window) -> Permissions:
+            return permissions_for(meant, subject=subject, validity=validity, domains=self._domains)
+
+        return make, meant.digest
 
     def _certificate(self, name: str) -> x509.Certificate:
         path = self._root / enclave_folder(name) / "cert.pem"

@@ -1,37 +1,46 @@
 """All writes to a keystore: staged, flushed to disk once, and put in place as a whole.
 
-New files are written below ``.sros-transaction/new`` of the keystore.  Files that already exist
-change together at a single moment: each is first replaced by a link to
+New files are written below ``.sros-transaction`` of the keystore (`stage`).  Files that already
+exist change together at a single moment: each first becomes a link to
 ``.sros-transaction/live/...`` (still its old content), then ``live`` itself, a link, is turned
-from ``old`` to ``new``.  That turn is the commit.  Afterwards the links give way to the plain
-files, and new folders are moved in.  Whatever the moment at which the machine stops, DDS finds
-either all the old files or all the new ones, and the next transaction tidies up.
+from ``before`` to ``after`` (`commit`).  That turn is the commit.  Afterwards the links give way
+to the plain files, and new folders are moved in (`recovery`).  Whatever the moment at which the
+machine stops, DDS finds either all the old files or all the new ones, and the next transaction
+tidies up.
 """
 
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import errno
-import fcntl
 import glob
 import os
 import secrets
 import shutil
 import stat
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from sros_tool.errors import KeystoreError
-from sros_tool.keystore.layout import ENCLAVES, folder_mode
+from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.keystore import commit, filesystem
+from sros_tool.keystore.folders import is_folder
+from sros_tool.keystore.layout import folder_mode
+from sros_tool.keystore.recovery import recover, tidy
+from sros_tool.keystore.stage import (
+    ADDED,
+    AFTER,
+    STAGE,
+    Move,
+    number,
+    seen_from_stage,
+    turn,
+    write_manifest,
+)
 
-STAGE = ".sros-transaction"
-_REMOVED = "removed"
-_LOCK_SECONDS = 60.0
+__all__ = ["STAGE", "Change", "Staged", "Transaction", "recover", "tidy"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +49,14 @@ class Change:
 
     action: str
     path: str
+
+
+@dataclass(frozen=True, slots=True)
+class Staged:
+    """What was staged since some moment, for the process that shares its work with this one."""
+
+    changes: tuple[Change, ...]
+    moves: tuple[Move, ...]
 
 
 class Transaction:
@@ -58,11 +75,11 @@ class Transaction:
         self._made_parents: list[Path] = []
         self._lock = -1
         self._stage = root / STAGE
-        self._content = self._stage / "new"
+        self._added = f"{self._stage}/{ADDED}"
         self._staged: set[str] = set()
         self._folders: dict[str, bool] = {}  # whether the folder is there already
+        self._moves: list[Move] = []
         self._undo: list[Callable[[], None]] = []
-        self._removed: list[str] = []
 
     def on_failure(self, undo: Callable[[], None]) -> None:
         """Have ``undo`` called at the end, unless everything was put in place."""
@@ -86,10 +103,11 @@ class Transaction:
             self._make_parents()
             self._make_sibling()
             return
-        self._lock = _lock(self.root)
+        self._lock = filesystem.lock_folder(self.root)
         recover(self.root)
         self._stage.mkdir(mode=0o700)
-        self._content.mkdir(mode=0o700)
+        os.mkdir(self._added, 0o700)
+        os.mkdir(f"{self._stage}/{AFTER}", 0o700)
 
     def __exit__(
         self,
@@ -128,11 +146,11 @@ class Transaction:
     def _make_sibling(self) -> None:
         while self._lock < 0:
             self._stage = self.root.parent / f".{self.root.name}.sros-{secrets.token_hex(4)}"
-            self._content = self._stage
+            self._added = f"{self._stage}"
             self._stage.mkdir(mode=0o700)
             # Until it is locked, another process may take it for a stale one and remove it.
             with contextlib.suppress(FileNotFoundError):
-                lock = _lock(self._stage)
+                lock = filesystem.lock_folder(self._stage)
                 if self._stage.exists():
                     self._lock = lock
                 else:
@@ -141,7 +159,7 @@ class Transaction:
     def _remove_stale_siblings(self) -> None:
         for stale in self.root.parent.glob(f".{glob.escape(self.root.name)}.sros-*"):
             with contextlib.suppress(KeystoreError, OSError):
-                lock = _lock(stale, wait=0.0)
+                lock = filesystem.lock_folder(stale, wait=0.0)
                 shutil.rmtree(stale, ignore_errors=True)
                 os.close(lock)
 
@@ -149,7 +167,7 @@ class Transaction:
 
     def write(self, path: str, data: bytes, *, private: bool = False) -> None:
         """Stage a file; ``private`` ones are readable by their owner only, from the first byte."""
-        staged = self._prepare(path)
+        staged = self._prepare(path, "")
         if staged is None:
             return
         mode = 0o600 if private else 0o644
@@ -159,71 +177,96 @@ class Transaction:
             while view:
                 view = view[os.write(handle, view) :]
         except OSError as error:
-            error.filename = str(self.root / path)
+            error.filename = f"{self.root}/{path}"
             raise
         finally:
             os.close(handle)
 
     def link(self, path: str, target: str) -> None:
         """Stage a symbolic link to ``target``, which is relative to the folder of ``path``."""
-        staged = self._prepare(path)
+        staged = self._prepare(path, target)
         if staged is not None:
-            os.symlink(target, staged)
+            flat = self._folders[path.rpartition("/")[0]]
+            os.symlink(seen_from_stage(path, target) if flat else target, staged)
 
     def remove(self, path: str) -> None:
         """Have a file or link go, together with the changes of the transaction.
 
         Folders of which nothing is left go too.
         """
-        if not self._is_folder(path.rpartition("/")[0]) or not os.path.lexists(self.root / path):
-            raise KeystoreError(f"'{self.root / path}' does not exist")
-        self._removed.append(path)
-        self.changes.append(Change("remove", path))
+        there = self._prepare_folder(path.rpartition("/")[0], wanted=False)
+        before = self._at(path) if there else None
+        if before is None:
+            raise KeystoreError(f"'{self.root}/{path}' does not exist")
+        self._begin_change(path, "remove")
+        self._moves.append(Move(path, before, None))
 
-    def _prepare(self, path: str) -> str | None:
+    def _prepare(self, path: str, after: str) -> str | None:
+        """Where to write what is staged for a path; ``after`` as of `Move`."""
+        exists = self._prepare_folder(path.rpartition("/")[0])
+        before = self._at(path) if exists else None
+        self._begin_change(path, "create" if before is None else "replace")
+        if exists:
+            self._moves.append(Move(path, before, after))
+        if self.dry_run:
+            return None
+        return f"{self._stage}/{AFTER}/{number(path)}" if exists else f"{self._added}/{path}"
+
+    def _begin_change(self, path: str, action: str) -> None:
         if path in self._staged:
             raise KeystoreError(f"{path} would be written twice")
         self._staged.add(path)
-        existed = self._prepare_folder(path.rpartition("/")[0]) and os.path.lexists(
-            os.path.join(self.root, path)
-        )
-        self.changes.append(Change("replace" if existed else "create", path))
-        return None if self.dry_run else f"{self._content}/{path}"
+        self.changes.append(Change(action, path))
 
-    def _prepare_folder(self, path: str) -> bool:
-        """Stage a folder; tell whether it is in the keystore already."""
+    def _at(self, path: str) -> str | None:
+        real = f"{self.root}/{path}"
+        try:
+            mode = os.lstat(real).st_mode
+        except FileNotFoundError:
+            return None
+        if stat.S_ISDIR(mode):
+            raise KeystoreError(f"'{real}' is in the way", "It is a folder.")
+        return os.readlink(real) if stat.S_ISLNK(mode) else ""
+
+    def _prepare_folder(self, path: str, *, wanted: bool = True) -> bool:
+        """Tell whether a folder is in the keystore already; if it is not, stage it."""
         if path in self._folders:
             return self._folders[path]
         exists = not self._new_root
         if path:
-            exists = self._prepare_folder(path.rpartition("/")[0]) and self._is_folder(path)
-            if not self.dry_run:
-                staged, mode = f"{self._content}/{path}", folder_mode(path)
-                with contextlib.suppress(FileExistsError):  # by a process with another share
-                    os.mkdir(staged, mode)
-                if mode != 0o700:
-                    os.chmod(staged, mode)
+            exists = self._prepare_folder(path.rpartition("/")[0], wanted=wanted) and is_folder(
+                f"{self.root}/{path}"
+            )
+            if not wanted and not exists:
+                return False
+            if not exists and not self.dry_run:
+                self._stage_folder(path)
         self._folders[path] = exists
         return exists
 
-    def _is_folder(self, path: str) -> bool:
-        real = os.path.join(self.root, path)
-        try:
-            mode = os.lstat(real).st_mode
-        except FileNotFoundError:
-            return False
-        if stat.S_ISLNK(mode):
-            raise _is_a_link(real)
-        if not stat.S_ISDIR(mode):
-            raise KeystoreError(f"'{real}' is in the way", "It is not a folder.")
-        return True
+    def _stage_folder(self, path: str) -> None:
+        staged, mode = f"{self._added}/{path}", folder_mode(path)
+        os.makedirs(os.path.dirname(staged), 0o700, exist_ok=True)
+        with contextlib.suppress(FileExistsError):  # by a process with another share
+            os.mkdir(staged, mode)
+        if mode != 0o700:
+            os.chmod(staged, mode)
 
-    def absorb(self, changes: Sequence[Change]) -> None:
+    # ── by several processes ───────────────────────────────────────────────────────────────
+
+    def mark(self) -> tuple[int, int]:
+        """This moment, for `since`."""
+        return len(self.changes), len(self._moves)
+
+    def since(self, mark: tuple[int, int]) -> Staged:
+        """What was staged since `mark`."""
+        return Staged(tuple(self.changes[mark[0] :]), tuple(self._moves[mark[1] :]))
+
+    def absorb(self, staged: Staged) -> None:
         """Take over what a forked process staged for this transaction."""
-        for change in changes:
-            self._staged.add(change.path)
-            self._prepare_folder(change.path.rpartition("/")[0])
-        self.changes += changes
+        self._staged.update(change.path for change in staged.changes)
+        self.changes += staged.changes
+        self._moves += staged.moves
 
     # ── commit ─────────────────────────────────────────────────────────────────────────────
 
@@ -231,17 +274,17 @@ class Transaction:
         """Put everything in place; after this it is on the disk."""
         if self.dry_run or not self.changes:
             return
-        if self._removed:
-            (self._stage / _REMOVED).write_text("\0".join(self._removed), encoding="utf-8")
-        _flush_file_system(self._stage)
         if self._new_root:
+            filesystem.flush_file_system(self._stage)
             self._appear()
-        else:
-            self._bridge()
-            _turn(self._stage, "new")
-            self._undo.clear()
-            with contextlib.suppress(OSError):  # it is done; the end tries to tidy up once more
-                recover(self.root)
+            return
+        write_manifest(self._stage, self._moves)
+        filesystem.flush_file_system(self._stage)
+        commit.bridge(self.root, self._stage, self._moves)
+        turn(self._stage, AFTER)
+        self._undo.clear()
+        with contextlib.suppress(OSError, SrosError):  # it is done; the end tries once more
+            recover(self.root)
 
     def _appear(self) -> None:
         os.chmod(self._stage, folder_mode(""))
@@ -256,181 +299,4 @@ class Transaction:
         self._made_parents.clear()
         self._undo.clear()
         with contextlib.suppress(OSError):  # it is there; the system writes it down in time anyway
-            _flush_folder(self.root.parent)
-
-    def _bridge(self) -> None:
-        """Let every file that is to change be reached through ``live``, still with old content."""
-        plain = [
-            path for path in self._in_existing_folders() if not (self.root / path).is_symlink()
-        ]
-        if not plain:
-            return
-        old = self._stage / "old"
-        old.mkdir(mode=0o700)
-        _turn(self._stage, "old")
-        copied = False
-        for path in plain:
-            target, kept = self.root / path, old / path
-            if target.exists():
-                kept.parent.mkdir(parents=True, exist_ok=True)
-                try:
-                    os.link(target, kept)
-                except OSError:  # a file system, or an owner, that allows no hard links
-                    shutil.copy2(target, kept)
-                    copied = True
-        if copied:
-            _flush_file_system(old)
-        spare = self._stage / "spare"
-        for path in plain:
-            os.symlink("../" * path.count("/") + f"{STAGE}/live/{path}", spare)
-            os.replace(spare, self.root / path)
-
-    def _in_existing_folders(self) -> Iterator[str]:
-        staged = (path for path in self._staged if self._folders[path.rpartition("/")[0]])
-        return iter(sorted([*staged, *self._removed]))
-
-
-def _is_a_link(path: str | Path) -> KeystoreError:
-    return KeystoreError(
-        f"'{path}' is a symbolic link",
-        "What is written below it would land elsewhere, outside of the keystore.",
-        "Put a real folder in its place.",
-    )
-
-
-def tidy(root: Path) -> None:
-    """Complete or undo what an interrupted transaction left behind, if there is anything."""
-    if (root / STAGE).is_dir():
-        lock = _lock(root)
-        try:
-            recover(root)
-        finally:
-            os.close(lock)
-
-
-def recover(root: Path) -> None:
-    """As `tidy`, for a caller that holds the lock."""
-    stage = root / STAGE
-    if not stage.is_dir():
-        return
-    live = stage / "live"
-    committed = live.is_symlink() and os.readlink(live) == "new"
-    if committed:
-        _settle_links(stage / "new", root)
-        _settle(stage / "new", root)
-        _remove(stage / _REMOVED, root)
-        _flush_folder(root)
-    else:
-        for path in _files_below(stage / "old"):
-            if _leads_into_stage(root / path):
-                os.replace(stage / "old" / path, root / path)
-        for path in _files_below(stage / "new"):
-            if _leads_into_stage(root / path):
-                os.unlink(root / path)
-    with contextlib.suppress(FileNotFoundError):
-        os.unlink(live)  # first, for without it what is left of the stage is only to be removed
-    shutil.rmtree(stage)
-
-
-def _settle_links(source: Path, target: Path) -> None:
-    """Move the links that belong into folders which are there.
-
-    They come first, for a link that is still reached through ``live`` leads to nothing as soon as
-    the file that it names has left the stage.
-    """
-    with os.scandir(source) as entries:
-        for entry in entries:
-            if entry.is_symlink():
-                os.replace(entry.path, target / entry.name)
-            elif entry.is_dir() and (target / entry.name).is_dir():
-                _settle_links(Path(entry.path), target / entry.name)
-
-
-def _settle(source: Path, target: Path) -> None:
-    """Move everything below ``source`` to its place below ``target``.
-
-    The enclaves come last: without them, a new keystore that is not complete yet is none.
-    """
-    with os.scandir(source) as entries:
-        for entry in sorted(entries, key=lambda each: each.name == ENCLAVES):
-            place = target / entry.name
-            if not entry.is_dir(follow_symlinks=False):
-                os.replace(entry.path, place)
-            elif place.is_symlink():
-                raise _is_a_link(place)
-            elif os.path.lexists(place):
-                _settle(Path(entry.path), place)
-            else:
-                os.rename(entry.path, place)
-
-
-def _remove(names: Path, root: Path) -> None:
-    """Remove what a file lists, and the folders that are empty then."""
-    if not names.exists():
-        return
-    for name in names.read_text(encoding="utf-8").split("\0"):
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(root / name)
-        folder = name.rpartition("/")[0]
-        with contextlib.suppress(OSError):  # it is not empty
-            while "/" in folder:
-                with contextlib.suppress(FileNotFoundError):  # by whoever was stopped here
-                    os.rmdir(root / folder)
-                folder = folder.rpartition("/")[0]
-
-
-def _turn(stage: Path, to: str) -> None:
-    spare = stage / "live.next"
-    os.symlink(to, spare)
-    os.replace(spare, stage / "live")
-
-
-def _files_below(folder: Path) -> Iterator[str]:
-    for parent, _, files in os.walk(folder):
-        for file in files:
-            yield os.path.relpath(os.path.join(parent, file), folder)
-
-
-def _leads_into_stage(path: Path) -> bool:
-    return path.is_symlink() and f"{STAGE}/live/" in os.readlink(path)
-
-
-def _lock(folder: Path, wait: float = _LOCK_SECONDS) -> int:
-    """An exclusive lock on a folder itself, so that no lock file is left behind."""
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    deadline = time.monotonic() + wait
-    while True:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            return handle
-        except BlockingIOError:
-            if time.monotonic() >= deadline:
-                os.close(handle)
-                raise KeystoreError(
-                    f"keystore '{folder}' is busy",
-                    f"Another process has been writing to it for {_LOCK_SECONDS:.0f} seconds.",
-                    "Try again when it is done.",
-                ) from None
-            time.sleep(0.02)
-
-
-def _flush_file_system(folder: Path) -> None:
-    """One flush for all files of a transaction: one for each would cost more than all else."""
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        libc = ctypes.CDLL(None, use_errno=True)
-        if libc.syncfs(handle) != 0:
-            number = ctypes.get_errno()
-            raise OSError(number, os.strerror(number), str(folder))
-    except AttributeError:  # a C library without syncfs
-        os.sync()
-    finally:
-        os.close(handle)
-
-
-def _flush_folder(folder: Path) -> None:
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+            filesystem.flush_folder(self.root.parent)

@@ -19,7 +19,7 @@ from harness import check_whole, remains
 from test_kill import Server
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore import create_enclaves, list_enclaves, transaction
+from sros_tool.keystore import create_enclaves, filesystem, list_enclaves
 from sros_tool.keystore.enclave import enclave_path
 from sros_tool.keystore.history import history
 from sros_tool.keystore.renew import renew
@@ -167,7 +167,7 @@ def copy(source: Path, target: Path) -> Path:
 def test_death_at_every_step(
     verb: str, life: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(transaction, "_flush_file_system", lambda _: None)
+    monkeypatch.setattr(filesystem, "flush_file_system", lambda _: None)
     before = settled(life)
     work = tmp_path / "work" / "ks"
     work.parent.mkdir()

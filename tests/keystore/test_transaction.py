@@ -22,8 +22,8 @@ from sros_tool.keystore import (
     create_enclaves,
     create_keystore,
     create_permission,
+    filesystem,
     generate_artifacts,
-    transaction,
 )
 from sros_tool.keystore.export import distribute
 from sros_tool.keystore.layout import REQUIRED_FILES, enclave_folder, is_keystore
@@ -55,7 +55,7 @@ DIED, REFUSED = 99, 98
 @pytest.fixture(autouse=True)
 def no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     """A process that dies takes nothing with it that the system was given."""
-    monkeypatch.setattr(transaction, "_flush_file_system", lambda _: None)
+    monkeypatch.setattr(filesystem, "flush_file_system", lambda _: None)
     monkeypatch.setattr(os, "fsync", lambda _: None)
 
 
@@ -71,8 +71,8 @@ class Steps:
     def install(self) -> None:
         for name in PRIMITIVES:
             setattr(os, name, self._counting(name, getattr(os, name)))
-        flush = self._counting("flush", transaction._flush_file_system)
-        transaction._flush_file_system = flush
+        filesystem.flush_file_system = self._counting("flush", filesystem.flush_file_system)
+        filesystem.exchange = self._counting("exchange", filesystem.exchange)
 
     def _counting(self, name: str, real: Callable[..., Any]) -> Callable[..., Any]:
         def primitive(*arguments: Any, **options: Any) -> Any:
@@ -174,6 +174,16 @@ def lost_permissions(w: Path) -> None:
         (w / "ks/enclaves/b" / name).unlink()
 
 
+def links_elsewhere(w: Path) -> None:
+    """Somebody keeps documents in a folder of his own, and links to them in two ways."""
+    folder = w / "ks/enclaves/a"
+    (w / "elsewhere").mkdir()
+    (folder / "permissions.p7s").rename(w / "elsewhere/a.p7s")
+    (folder / "permissions.p7s").symlink_to("../../../elsewhere/a.p7s")
+    (folder / "permissions.xml").rename(w / "elsewhere/a.xml")
+    (folder / "permissions.xml").symlink_to(w.with_name("prepared") / "elsewhere/a.xml")
+
+
 def export(w: Path) -> None:
     distribute(w / "ks", ["/a"], w / "out", now=NOW)
     create_permission(w / "ks", "/a", policy(w), now=NOW)
@@ -198,6 +208,12 @@ SCENARIOS = {
         {"/a": "old_a"},
         {"/a": "old_a", "/b": "*"},
         lost_permissions,
+    ),
+    "links": Scenario(
+        lambda w: create_permission(w / "ks", "/a", policy(w), now=NOW),
+        OLD,
+        {**OLD, "/a": "new_a"},
+        links_elsewhere,
     ),
     "create_keystore": Scenario(
         lambda w: create_keystore(w / "ks", template=TEMPLATE, now=NOW), {}, {}, no_root
@@ -375,12 +391,26 @@ def test_no_space_at_every_step(name: str, stage: Stage) -> None:
     assert refused > 5
 
 
-@pytest.mark.parametrize("name", ["create_permission", "completion"])
-def test_without_hard_links(name: str, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
+def cannot_exchange(monkeypatch: pytest.MonkeyPatch, *, hard_links: bool) -> list[str]:
+    """Make the file system one without an exchange of names; what was asked of it instead."""
+    asked: list[str] = []
+
+    def refuse(source: object, *_: object, **__: object) -> None:
+        asked.append(str(source))
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
-    monkeypatch.setattr(os, "link", refuse)
+    monkeypatch.setattr(filesystem, "exchange", lambda *_: False)
+    if not hard_links:
+        monkeypatch.setattr(os, "link", refuse)
+    return asked
+
+
+@pytest.mark.parametrize("hard_links", [True, False])
+@pytest.mark.parametrize("name", ["create_permission", "completion", "links"])
+def test_death_without_exchange(
+    name: str, hard_links: bool, stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cannot_exchange(monkeypatch, hard_links=hard_links)
     test_death_at_every_step(name, stage)
 
 
@@ -488,8 +518,7 @@ def test_a_transaction_waits_for_another(keystore: Path) -> None:
 
 
 def test_a_busy_keystore_is_told(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(transaction, "_LOCK_SECONDS", 0.05)
-    monkeypatch.setattr(transaction._lock, "__defaults__", (0.05,))
+    monkeypatch.setattr(filesystem, "LOCK_SECONDS", 0.05)
     with Transaction(keystore):
         before = snapshot(keystore)
         with pytest.raises(KeystoreError, match="is busy"), Transaction(keystore):
@@ -507,7 +536,7 @@ def test_stale_stages_beside_a_keystore_are_removed_and_those_in_use_are_not(
         (folder / "private/ca.key.pem").write_text("secret")
     used = tmp_path / ".k[s]*.sros-87654321"
     used.mkdir()
-    lock = transaction._lock(used)
+    lock = filesystem.lock_folder(used)
     create_keystore(tmp_path / "k[s]*", template=TEMPLATE, now=NOW)
     os.close(lock)
     assert not stale.exists()
@@ -519,17 +548,17 @@ def test_stale_stages_beside_a_keystore_are_removed_and_those_in_use_are_not(
 def test_a_stage_that_was_removed_before_it_was_locked_is_made_anew(
     opened: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lock = transaction._lock
+    lock = filesystem.lock_folder
     removed: list[Path] = []
 
-    def lose_the_first(folder: Path, wait: float = 60.0) -> int:
+    def lose_the_first(folder: Path, wait: float | None = None) -> int:
         handle = lock(folder, wait) if opened else -1
         if not removed:
             removed.append(folder)
             folder.rmdir()
         return handle if opened else lock(folder, wait)
 
-    monkeypatch.setattr(transaction, "_lock", lose_the_first)
+    monkeypatch.setattr(filesystem, "lock_folder", lose_the_first)
     create_keystore(tmp_path / "ks", template=TEMPLATE, now=NOW)
     assert removed
     check_whole(tmp_path / "ks")
@@ -651,8 +680,9 @@ def test_content_is_on_the_disk_before_its_name(
         monkeypatch.setattr(module, name, noting)
 
     if verb == "without hard links":
-        monkeypatch.setattr(os, "link", lambda *_, **__: run_out_of_space("link", ()))
-    note(transaction, "_flush_file_system")
+        cannot_exchange(monkeypatch, hard_links=False)
+    note(filesystem, "flush_file_system")
+    note(filesystem, "exchange")
     for name in ("rename", "replace"):
         note(os, name)
     if verb == "create_keystore":
@@ -660,7 +690,10 @@ def test_content_is_on_the_disk_before_its_name(
     else:
         create_permission(keystore, "/a", policy(tmp_path), now=NOW)
     moved = [call.split()[0] for call in calls]
-    assert moved[0] == "_flush_file_system"
-    assert "rename" in moved or "replace" in moved
+    assert moved[0] == "flush_file_system"
+    assert ("rename" if verb == "create_keystore" else "replace") in moved
     if verb == "without hard links":
-        assert [call for call in calls if call.startswith("_flush") and call.endswith("/old")]
+        copies = calls.index(f"flush_file_system {keystore / STAGE / 'before'}")
+        link = f"replace {keystore / STAGE}/spare"
+        assert not [call for call in calls[:copies] if call.startswith(link)]
+        assert [call for call in calls[copies:] if call.startswith(link)]
