@@ -190,9 +190,16 @@ def _topics(right: Right) -> Iterator[tuple[str, str]]:
     yield from (("subscribe", topic) for topic in names.subscribe)
 
 
-def _plain_first(topic: str) -> tuple[bool, bool, str]:
-    """Tells ways by plain topics before those by wildcards, and parts of actions last."""
-    return _ACTION in topic, is_expression(topic), topic
+def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
+    """Tells ways by topics of the robot before those by services, and every node's log last."""
+    kind = topic[:3]
+    return (
+        topic == "rt/rosout",
+        kind == "rr/",
+        kind != "rt/" or _ACTION in topic,
+        is_expression(topic),
+        topic,
+    )
 
 
 def _shared(one: _End, other: _End) -> str:

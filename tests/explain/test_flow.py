@@ -129,7 +129,7 @@ def test_hops_of_one_enclave() -> None:
 
 ENCLAVES = ["/a", "/b", "/c", "/d"]
 NAMES = ["/x", "/y", "/xx", "/x/y", "/*", "/x*", "/?", "/*y"]
-KNOWN = ["/x", "/y", "/xx", "/x/y", "/z", "/zy", "/xz"]
+KNOWN = ["/x", "/y", "/xx", "/x/y", "/z", "/zy", "/xz", "/zz", "/xy"]
 """Every combination of NAMES that is not empty holds one of these."""
 
 drawn = st.lists(

@@ -1,0 +1,143 @@
+"""A question in ROS terms, and the DDS topics on which its answer rests.
+
+Nodes speak of calling and serving; a policy says request and reply for services, and call and
+execute for actions.  Mapping of names: ROS 2 design "Topic and Service name mapping to DDS".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from sros_tool.dds.decision import Verb
+from sros_tool.errors import UsageError
+from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expression_problem, is_expression
+from sros_tool.policy.model import ALLOW
+from sros_tool.policy.rights import Right
+
+JOIN = "join"
+TYPES = ("topic", "service", "action")
+_RIGHTS = {
+    ("publish", "topic"): "publish",
+    ("subscribe", "topic"): "subscribe",
+    ("call", "service"): "request",
+    ("serve", "service"): "reply",
+    ("call", "action"): "call",
+    ("execute", "action"): "execute",
+    ("request", "service"): "request",
+    ("reply", "service"): "reply",
+}
+WORDS = (*dict.fromkeys(word for word, _ in _RIGHTS), JOIN)
+"""What can be asked for; request and reply are the policy's words for call and serve."""
+
+_ENDS = {"rq": ("Request", "requests"), "rr": ("Reply", "replies")}
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One DDS endpoint that a right needs; ``role`` names it in ROS terms, "" for a topic."""
+
+    verb: Verb
+    topic: str
+    role: str = ""
+
+    def __str__(self) -> str:
+        """As ``publish its requests (rq/addRequest)``."""
+        return f"{self.verb.value} its {self.role} ({self.topic})" if self.role else self.topic
+
+
+OWN_PARTS = (
+    Part(Verb.PUBLISH, ROS_DISCOVERY_TOPIC, "node names"),
+    Part(Verb.SUBSCRIBE, ROS_DISCOVERY_TOPIC, "node names"),
+)
+"""What every ROS 2 process needs before anything else."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """May an enclave do ``word`` with ``name``?  ``right`` is what a policy says of it.
+
+    ``name`` is an absolute ROS name; of the question whether it may join at all, both it and
+    ``right`` are "".
+    """
+
+    word: str
+    type: str = ""
+    right: str = ""
+    name: str = ""
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """The endpoints that are needed; none for joining."""
+        if not self.right:
+            return ()
+        names = dds_names(self.right, self.name)
+        published = (Part(Verb.PUBLISH, topic, _role(topic, self.type)) for topic in names.publish)
+        read = (Part(Verb.SUBSCRIBE, topic, _role(topic, self.type)) for topic in names.subscribe)
+        return (*published, *read)
+
+    def allowed(self, enclave: str) -> Right:
+        """The right that a policy would have to state."""
+        return Right(enclave, ALLOW, self.right, self.name)
+
+    def __str__(self) -> str:
+        """As ``call service /add``."""
+        return f"{self.word} {self.type} {self.name}" if self.right else "join the domain"
+
+
+def ask(word: str, name: str = "", kind: str | None = None) -> Question:
+    """The question of the command line: ``call /add``, with ``kind`` topic, service or action.
+
+    Without ``kind``, call means a service.  Raises `UsageError` for what no node can do.
+    """
+    if word not in WORDS:
+        raise UsageError(
+            f"{word!r} is nothing that an enclave could do",
+            "",
+            f"Ask for {', '.join(WORDS[:-1])} or {WORDS[-1]}.",
+        )
+    if word == JOIN:
+        if name or kind:
+            raise UsageError("join takes neither a name nor a type", "It is about the domain.")
+        return Question(JOIN)
+    fitting = [each for each in TYPES if (word, each) in _RIGHTS]
+    chosen = kind or fitting[0]
+    if chosen not in fitting:
+        others = " or ".join(verb for verb, each in _RIGHTS if each == chosen)
+        raise UsageError(
+            f"nobody can {word} {_a(chosen)}",
+            f"A node can {word} {' or '.join(map(_a, fitting))}, and {others} {_a(chosen)}.",
+            f"Leave --type out, or write --type {fitting[0]}.",
+        )
+    return Question(word, chosen, _RIGHTS[word, chosen], _checked(name, word, chosen))
+
+
+def _checked(name: str, word: str, kind: str) -> str:
+    if not name:
+        raise UsageError(f"{word} needs the name of {_a(kind)}", "", f"Write `{word} /NAME`.")
+    problem = expression_problem(name)
+    remedy = ""
+    if not problem and is_expression(name):
+        problem = "It has a wildcard, and a node uses one name."
+        remedy = "Ask for one name, as it shows in the running robot."
+    elif not problem and not name.startswith("/"):
+        problem = "It is relative to a node, and an enclave may hold nodes of many namespaces."
+        remedy = (
+            f"Write /{name.removeprefix('~').lstrip('/') or 'NAME'}, or /NAMESPACE/... in full."
+        )
+    elif not problem and name == "/":
+        problem = "It is a namespace."
+    if problem:
+        raise UsageError(f"{name!r} cannot be the name of {_a(kind)} here", problem, remedy)
+    return name
+
+
+def _a(kind: str) -> str:
+    return f"an {kind}" if kind[0] in "aeiou" else f"a {kind}"
+
+
+def _role(topic: str, kind: str) -> str:
+    if kind == "topic":
+        return ""
+    end, word = _ENDS.get(topic[:2], ("", ""))
+    last = topic.removesuffix(end).rpartition("/")[2]
+    return f"{last} {word}".rstrip() if kind == "action" else word

@@ -1,0 +1,160 @@
+"""Every rule of every example policy, explained: allowed as it says, and a twin of it denied.
+
+On Fast DDS and on Cyclone DDS, with the line of the policy where it stands, and for the denied
+twin with a change of the policy after which it is allowed, and nothing else is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from sros_tool.dds.decision import Outcome, Vendor
+from sros_tool.dds.domains import DomainSet
+from sros_tool.explain.answer import Judge, Setting
+from sros_tool.explain.case import Case, explain
+from sros_tool.explain.change import as_policy
+from sros_tool.explain.material import from_policy
+from sros_tool.explain.question import Question, ask
+from sros_tool.keystore.template import load_template
+from sros_tool.names import is_expression
+from sros_tool.policy import ALLOW, DENY, Enclave, Policy, read_policy
+from sros_tool.policy.patterns import matches
+from sros_tool.policy.rights import Right, Rules, policy_rights
+from sros_tool.policy.witness import common_name
+from sros_tool.resources import policies_dir
+from sros_tool.translate import governance_for
+
+FILES = sorted(policies_dir().glob("*.xml")) + sorted(policies_dir().glob("defaults/*.xml"))
+VENDORS = [Vendor.FAST, Vendor.CYCLONE, Vendor.FAST_2_9]
+NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
+SETTING = Setting(0, NOW)
+GOVERNANCE = governance_for(load_template("production").protection, DomainSet.parse("0"))
+WORDS = {
+    "publish": ("publish", "topic"),
+    "subscribe": ("subscribe", "topic"),
+    "request": ("call", "service"),
+    "reply": ("serve", "service"),
+    "call": ("call", "action"),
+    "execute": ("execute", "action"),
+}
+OPPOSITE = {"publish": "subscribe", "request": "reply", "call": "execute"}
+OPPOSITE |= {other: right for right, other in OPPOSITE.items()}
+
+
+@cache
+def policy(file: Path) -> Policy:
+    return read_policy(file)
+
+
+def enclaves() -> Iterator[tuple[Path, Enclave]]:
+    for file in FILES:
+        for enclave in policy(file).enclaves:
+            yield file, enclave
+
+
+def question(right: str, name: str) -> Question:
+    word, kind = WORDS[right]
+    return ask(word, name, kind)
+
+
+def test_there_are_policies_of_every_kind() -> None:
+    rights = [right for file in FILES for right in policy_rights(policy(file))]
+    assert {right.right for right in rights} == set(WORDS)
+    assert any(is_expression(right.name) for right in rights)
+    assert len(rights) > 300
+
+
+@pytest.mark.parametrize("vendor", VENDORS)
+@pytest.mark.parametrize(
+    ("file", "enclave"), list(enclaves()), ids=lambda value: getattr(value, "path", None)
+)
+def test_every_rule(file: Path, enclave: Enclave, vendor: Vendor) -> None:
+    rights = sorted(each for each in policy_rights(policy(file)) if each.enclave == enclave.path)
+    rules = Rules(rights)
+    material = from_policy(enclave, GOVERNANCE, at=NOW)
+    case = Case(material, SETTING, policy=enclave)
+    judge = Judge(vendor, material, SETTING)
+    denials = [each.name for each in rights if each.qualifier is DENY]
+    for right in rights:
+        if right.qualifier is DENY:
+            continue
+        name = common_name([right.name], denials)
+        assert name is not None
+        found = explain(case, question(right.right, name), vendor)
+        assert found.answer.outcome is Outcome.ALLOWED, (right, found.answer.deciding)
+        assert bool(found.wildcard) == is_expression(
+            found.answer.deciding.decision.expression or ""
+        )
+        assert found.change is None
+        if not is_expression(found.answer.deciding.decision.expression or ""):
+            lines = Path(found.origins[0].source.file).read_text().splitlines()
+            stands = lines[found.origins[0].source.line - 1]
+            assert f">{found.origins[0].name}</" in stands, (right, stands)
+        # The other direction is what the policy says it is, by its own meaning.
+        other = OPPOSITE[right.right]
+        answer = judge.answer(question(other, name))
+        assert answer.allowed == rules.allow(enclave.path, other, name), (other, name)
+
+
+@pytest.mark.parametrize("vendor", VENDORS[:2])
+@pytest.mark.parametrize(
+    ("file", "enclave"), list(enclaves()), ids=lambda value: getattr(value, "path", None)
+)
+def test_every_denied_twin(file: Path, enclave: Enclave, vendor: Vendor) -> None:
+    rights = {each for each in policy_rights(policy(file)) if each.enclave == enclave.path}
+    rules = Rules(rights)
+    case = Case(from_policy(enclave, GOVERNANCE, at=NOW), SETTING, policy=enclave)
+    for right in sorted(rights):
+        expressions = [each.name for each in rights if is_expression(each.name)]
+        name = f"{right.name.replace('*', 'any')}_twin"
+        if right.qualifier is DENY:
+            continue
+        if any(matches(each, name) for each in expressions):
+            continue  # a wildcard for everything has no twin that is denied
+        asked = question(right.right, name)
+        found = explain(case, asked, vendor)
+        assert found.answer.outcome is Outcome.DENIED, (right, found.answer.deciding)
+        assert not rules.allow(enclave.path, right.right, name)
+        assert found.change is not None and found.change.lift == ()
+        assert found.change.add == (Right(enclave.path, ALLOW, right.right, name),)
+        changed = from_policy(
+            as_policy(enclave.path, rights.union(found.change.add)), GOVERNANCE, at=NOW
+        )
+        assert Judge(vendor, changed, SETTING).answer(asked).allowed
+        still = question(OPPOSITE[right.right], name)
+        assert not Judge(vendor, changed, SETTING).answer(still).allowed
+
+
+def denials() -> Iterator[tuple[Enclave, Right]]:
+    for file, enclave in enclaves():
+        for right in sorted(policy_rights(policy(file))):
+            if right.enclave == enclave.path and right.qualifier is DENY:
+                yield enclave, right
+
+
+@pytest.mark.parametrize("vendor", VENDORS[:2])
+@pytest.mark.parametrize(("enclave", "right"), list(denials()), ids=str)
+def test_every_denial(enclave: Enclave, right: Right, vendor: Vendor) -> None:
+    name = common_name([right.name])
+    assert name
+    case = Case(from_policy(enclave, GOVERNANCE, at=NOW), SETTING, policy=enclave)
+    found = explain(case, question(right.right, name), vendor)
+    assert (found.answer.outcome, found.answer.deciding.decision.reason) == ("denied", "deny-rule")
+    assert [(each.qualifier, each.right) for each in found.origins] == [(DENY, right.right)]
+    assert found.change is not None
+    assert (found.change.lift, found.change.add) == ((right,), ())
+    assert [edit.source for edit in found.change.edits] == [found.origins[0].group.source]
+    rights = {
+        r for each in FILES for r in policy_rights(policy(each)) if r.enclave == right.enclave
+    }
+    lifted = from_policy(as_policy(enclave.path, rights - {right}), GOVERNANCE, at=NOW)
+    assert Judge(vendor, lifted, SETTING).answer(question(right.right, name)).allowed
+
+
+def test_there_is_a_denial() -> None:
+    assert list(denials())
