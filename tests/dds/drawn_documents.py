@@ -219,8 +219,10 @@ class _Draw:
     # ── permissions ────────────────────────────────────────────────────────────────────────
 
     def grant(self, index: int) -> str:
-        count = self.random.choice((1, 1, 2, 3)) if self.chance(0.97) or self.portable else 0
-        rules = [self.rule() for _ in range(count)]
+        count = self.random.choice((0, 0, 1, 2))
+        rules = [self.rule(allow=self.chance(0.7)) for _ in range(count)]
+        if self.portable or self.chance(0.8):
+            rules.append(self.rule(allow=True))
         if self.portable:
             rules = sorted(rules, key=lambda rule: rule.startswith("<allow"))
         default = f"<default>{'ALLOW' if self.seldom(0.2) else 'DENY'}</default>"
@@ -245,7 +247,7 @@ class _Draw:
         subject = self.subject
         if self.odd == "spaced subject":
             return f" {subject} "
-        if not self.seldom(0.3):
+        if not self.seldom(0.2):
             return subject
         return self.random.choice(
             (
@@ -293,8 +295,7 @@ class _Draw:
         text = moment.strftime("%Y-%m-%dT%H:%M:%S")
         return text if self.seldom(0.1) else text + "Z"
 
-    def rule(self) -> str:
-        allow = self.chance(0.7)
+    def rule(self, *, allow: bool) -> str:
         criteria = [
             self.criteria(verb, allow)
             for verb in ("publish", "subscribe")

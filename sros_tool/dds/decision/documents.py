@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sros_tool.dds.decision import cyclone_documents, fast_documents
+from sros_tool.dds.decision import cyclone_documents, fast_documents, schema
 from sros_tool.dds.decision.answers import Refusal
 from sros_tool.dds.decision.elements import UnreadableError
 from sros_tool.dds.decision.vendors import TRAITS, Vendor
@@ -15,7 +15,10 @@ _GOVERNANCE = "governance"
 
 
 def read_permissions_as(vendor: Vendor, xml: bytes) -> Permissions | Refusal:
-    """The permissions that ``vendor`` finds in ``xml``, or why it refuses them."""
+    """The permissions that ``vendor`` finds in ``xml``, or why it refuses them.
+
+    The standard's reading, also taken for vendors without one of their own here, is its schema's.
+    """
     try:
         match vendor:
             case Vendor.FAST | Vendor.FAST_2_9:
@@ -23,6 +26,7 @@ def read_permissions_as(vendor: Vendor, xml: bytes) -> Permissions | Refusal:
             case Vendor.CYCLONE:
                 return cyclone_documents.read_permissions(xml)
             case _:
+                schema.check_permissions(xml)
                 return parse_permissions(xml, _PERMISSIONS)
     except UnreadableError as error:
         return error.refusal(TRAITS[vendor].title, _PERMISSIONS)
@@ -39,6 +43,7 @@ def read_governance_as(vendor: Vendor, xml: bytes) -> Governance | Refusal:
             case Vendor.CYCLONE:
                 return cyclone_documents.read_governance(xml)
             case _:
+                schema.check_governance(xml)
                 return parse_governance(xml, _GOVERNANCE)
     except UnreadableError as error:
         return error.refusal(TRAITS[vendor].title, _GOVERNANCE)

@@ -1,0 +1,108 @@
+"""Whether a document has the elements of the specification's schemas, in their order.
+
+DDS-Security 1.1, the schemas omg_shared_ca_permissions and omg_shared_ca_governance of 20170901.
+"""
+
+from __future__ import annotations
+
+import re
+
+from lxml import etree
+
+from sros_tool.dds.decision.elements import (
+    UnreadableError,
+    attributes_of,
+    elements_of,
+    name_of,
+    root_of,
+    texts_of,
+)
+
+# The children of each element as an expression over "name,"; the others hold text.
+_DOMAINS = {
+    "domains": "(id,|id_range,)+",
+    "id_range": "min,(max,)?|max,",
+}
+_RULE = "domains,(publish,)*(subscribe,)*(relay,)*"
+# The schema lets these stand in any order, each once.
+_CRITERIA = "(?!.*(?:^|,)(\\w+,).*\\1)(?=.*topics,)(topics,|partitions,|data_tags,)*"
+_PERMISSIONS = _DOMAINS | {
+    "dds": "permissions,",
+    "permissions": "(grant,)+",
+    "grant": "subject_name,validity,(allow_rule,|deny_rule,)*default,",
+    "validity": "not_before,not_after,",
+    "allow_rule": _RULE,
+    "deny_rule": _RULE,
+    "publish": _CRITERIA,
+    "subscribe": _CRITERIA,
+    "relay": _CRITERIA,
+    "topics": "(topic,)+",
+    "partitions": "(partition,)+",
+    "data_tags": "(tag,)+",
+    "tag": "name,value,",
+}
+_GOVERNANCE = _DOMAINS | {
+    "dds": "domain_access_rules,",
+    "domain_access_rules": "(domain_rule,)+",
+    "domain_rule": "domains,allow_unauthenticated_participants,enable_join_access_control,"
+    "discovery_protection_kind,liveliness_protection_kind,rtps_protection_kind,"
+    "topic_access_rules,",
+    "topic_access_rules": "(topic_rule,)+",
+    "topic_rule": "topic_expression,enable_discovery_protection,enable_liveliness_protection,"
+    "enable_read_access_control,enable_write_access_control,metadata_protection_kind,"
+    "data_protection_kind,",
+}
+
+_KIND = r"(NONE|(SIGN|ENCRYPT)(_WITH_ORIGIN_AUTHENTICATION)?)"
+_NUMBER = r"\s*\+?\d+\s*"
+_FLAG = r"\s*(true|false|0|1)\s*"
+_DATE = r"\s*-?\d{4,}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|[+-]\d\d:\d\d)?\s*"
+_TEXTS = {
+    "id": _NUMBER,
+    "min": _NUMBER,
+    "max": _NUMBER,
+    "not_before": _DATE,
+    "not_after": _DATE,
+    "default": "ALLOW|DENY",
+    "allow_unauthenticated_participants": _FLAG,
+    "enable_join_access_control": _FLAG,
+    "enable_discovery_protection": _FLAG,
+    "enable_liveliness_protection": _FLAG,
+    "enable_read_access_control": _FLAG,
+    "enable_write_access_control": _FLAG,
+    "discovery_protection_kind": _KIND,
+    "liveliness_protection_kind": _KIND,
+    "rtps_protection_kind": _KIND,
+    "metadata_protection_kind": _KIND,
+    "data_protection_kind": "NONE|SIGN|ENCRYPT",
+}
+_EVERYWHERE = re.compile(r"xmlns(:.*)?|xsi:.*", re.DOTALL)
+
+
+def check_permissions(xml: bytes) -> None:
+    """Raises `UnreadableError` unless ``xml`` is valid permissions."""
+    _check(root_of(xml), "dds", _PERMISSIONS)
+
+
+def check_governance(xml: bytes) -> None:
+    """Raises `UnreadableError` unless ``xml`` is valid governance."""
+    _check(root_of(xml), "dds", _GOVERNANCE)
+
+
+def _check(element: etree._Element, name: str, grammar: dict[str, str]) -> None:
+    if name_of(element) != name:
+        raise UnreadableError(f"its root is not <{name}>")
+    children = elements_of(element)
+    text = "".join(texts_of(element))
+    attributes = [each for each in attributes_of(element) if not _EVERYWHERE.fullmatch(each)]
+    if attributes != (["name"] if name == "grant" else []):
+        raise UnreadableError(f"<{name}> has not the attributes that it should have")
+    if name not in grammar:
+        if children or not re.fullmatch(_TEXTS.get(name, "(?s:.*)"), text, re.ASCII):
+            raise UnreadableError(f"<{name}> does not hold what it should, but {text!r}")
+        return
+    names = "".join(f"{name_of(child)}," for child in children)
+    if text.strip() or not re.fullmatch(grammar[name], names):
+        raise UnreadableError(f"<{name}> has not the elements that it should have, in their order")
+    for child in children:
+        _check(child, name_of(child), grammar)
