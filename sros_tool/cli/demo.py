@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from sros_tool.cli.common import complete_template, json_option, now, print_json
+
+if TYPE_CHECKING:
+    from sros_tool.demo.model import Scenario
 
 
 @click.command(
@@ -32,6 +37,20 @@ Exit status: 0 if every row is as expected (or skipped with its reason), 1 if no
     default="auto",
     show_default=True,
     help="What the nodes run on; auto takes rclpy where its RMW enforces security.",
+)
+@click.option(
+    "--scenario",
+    "scenarios",
+    multiple=True,
+    metavar="NAME",
+    help="What to show: a name of --list, `all`, or a TOML file of yours; can be repeated.",
+)
+@click.option("--list", "list_them", is_flag=True, help="List the scenarios.")
+@click.option(
+    "--only",
+    multiple=True,
+    metavar="WORD",
+    help="Only rows and attacks with WORD in their name; can be repeated.",
 )
 @click.option("--topic", default="/chatter", show_default=True, help="ROS topic to talk on.")
 @click.option(
@@ -64,6 +83,9 @@ Exit status: 0 if every row is as expected (or skipped with its reason), 1 if no
 @json_option
 def demo(
     backend: str,
+    scenarios: tuple[str, ...],
+    list_them: bool,
+    only: tuple[str, ...],
     topic: str,
     domain: int,
     template: str,
@@ -77,10 +99,16 @@ def demo(
     without them, and compares what was expected with what happened. Takes about ten seconds.
     """
     from sros_tool.demo.program import DemoOptions, run_demo
+    from sros_tool.demo.scenarios import SCENARIOS, choose_scenarios
     from sros_tool.demo.table import demo_table
     from sros_tool.keystore.template import load_template
 
+    if list_them:
+        _list(SCENARIOS, as_json)
+        return
     options = DemoOptions(
+        scenarios=choose_scenarios(scenarios),
+        only=only,
         template=load_template(template),
         backend=backend,
         topic=topic,
@@ -95,6 +123,15 @@ def demo(
         click.echo(demo_table(result))
     if not result.as_expected:
         sys.exit(1)
+
+
+def _list(scenarios: Sequence[Scenario], as_json: bool) -> None:
+    if as_json:
+        print_json([{"name": s.name, "title": s.title, "rows": len(s.rows)} for s in scenarios])
+        return
+    width = max(len(scenario.name) for scenario in scenarios)
+    for scenario in scenarios:
+        click.echo(f"{scenario.name:<{width}}  {len(scenario.rows):>3} rows  {scenario.title}")
 
 
 def _progress(line: str) -> None:

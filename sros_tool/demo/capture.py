@@ -7,9 +7,11 @@ namespace of his own (`sros_tool.runtime.netns`).
 from __future__ import annotations
 
 import socket
+import time
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 _ETH_P_IP = 0x0800
 _PACKET_OUTGOING = 4
@@ -22,11 +24,19 @@ _PROTECTED_SUBMESSAGES = range(0x30, 0x35)
 """SEC_BODY, SEC_PREFIX, SEC_POSTFIX, SRTPS_PREFIX, SRTPS_POSTFIX (DDS-Security 1.1 §7.3.6)."""
 
 
+class Kept(NamedTuple):
+    """A captured packet: when it was read (CLOCK_MONOTONIC), its UDP source port, all of it."""
+
+    time: float
+    source: int
+    packet: bytes
+
+
 class PacketCounter:
     """Counts IPv4 packets in which one of ``marks`` is readable, and those that are protected.
 
     ``plain`` counts by mark, ``protected`` by UDP port, for both ports of a packet.  With
-    ``keep``, the RTPS packets themselves are in ``kept``, by source port and in order.
+    ``keep``, the RTPS packets themselves are in ``kept``, in order.
     """
 
     def __init__(self, marks: Sequence[str], *, keep: bool = False) -> None:
@@ -34,7 +44,7 @@ class PacketCounter:
         self._keep = keep
         self.plain: Counter[str] = Counter()
         self.protected: Counter[int] = Counter()
-        self.kept: list[tuple[int, bytes]] = []
+        self.kept: list[Kept] = []
 
     def count(self, packet: bytes) -> None:
         """Count one packet; whatever is not UDP is passed over."""
@@ -45,7 +55,7 @@ class PacketCounter:
         target = int.from_bytes(packet[start + 2 : start + 4], "big")
         payload = packet[start + 8 :]
         if self._keep and payload[:4] == b"RTPS":
-            self.kept.append((source, packet))
+            self.kept.append(Kept(time.monotonic(), source, packet))
         for mark, raw in self._marks.items():
             if raw in payload:
                 self.plain[mark] += 1

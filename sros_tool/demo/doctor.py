@@ -12,7 +12,7 @@ from typing import Any
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.policies import DEFAULT_TOPIC
 from sros_tool.demo.scenarios.isolation import ISOLATION
-from sros_tool.demo.scenery import build_scenery
+from sros_tool.demo.scenery import Setting, build_scenery
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.cyclone_library import INSTALL_ADVICE
 from sros_tool.runtime.rcl_security import spelling_warnings
@@ -54,7 +54,8 @@ def examine(environment: Mapping[str, str], now: datetime) -> Diagnosis:
     with TemporaryDirectory(prefix="sros-doctor-") as folder:
         domains = DomainSet.of((_PROBE_DOMAIN, _PROBE_DOMAIN))
         template = load_template(_TEMPLATE)
-        scenery = build_scenery(Path(folder), ISOLATION, DEFAULT_TOPIC, domains, template, now)
+        setting = Setting(DEFAULT_TOPIC, domains, template, now)
+        scenery = build_scenery(Path(folder), ISOLATION, setting)
         stacks = survey(scenery.probe(DEFAULT_TOPIC, _PROBE_DOMAIN))
     return Diagnosis(stacks, spelling_warnings(environment))
 

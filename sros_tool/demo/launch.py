@@ -58,7 +58,7 @@ class PartyProcess:
     ) -> None:
         stem = name.replace(" ", "_")
         self.name = name
-        self._topic = topic
+        self.topic = topic
         self.text = text
         self._through = through
         self._log = folder / f"{stem}.log"
@@ -143,7 +143,7 @@ class PartyProcess:
         late = [event for event in self._reader.new_events() if event.kind is not Kind.FAILED]
         return PartyRecord(
             text=self.text,
-            topic=self._topic,
+            topic=self.topic,
             through=self._through,
             events=(*self._events, *late),
             output=plain_text(self._log.read_text(encoding="utf-8", errors="replace")),

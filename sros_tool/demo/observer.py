@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from sros_tool.demo.options import NodeOptions, option_parser, split_ros_args
+from sros_tool.demo.options import option_parser, options_of, split_ros_args
 from sros_tool.demo.ros_node import run_ros_node
 from sros_tool.runtime.events import EventWriter, Kind
 
@@ -18,7 +18,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = option_parser("sros_tool.demo.observer", "Count the publishers of topics.")
     parser.add_argument("--also", action="append", default=[], help="one more topic to look at")
     parsed = parser.parse_args(own)
-    options = NodeOptions(parsed.topic, parsed.period, parsed.text, parsed.report)
+    options = options_of(parsed)
     topics = [parsed.topic, *parsed.also]
 
     def build(node: Any, events: EventWriter) -> None:

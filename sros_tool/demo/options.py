@@ -11,22 +11,27 @@ from pathlib import Path
 DEFAULT_TEXT = "Hello World"
 DEFAULT_TOPIC = "chatter"
 DEFAULT_PERIOD = 0.5
+DEFAULT_SERVICE = "/add_two_ints"
 
 
 @dataclass(frozen=True)
 class NodeOptions:
-    """What a node was asked to do; ``period`` is in seconds."""
+    """What a node was asked to do; ``period`` is in seconds.
+
+    ``topic`` is also the name of an action; ``service`` that of a service.
+    """
 
     topic: str
     period: float
     text: str
     report: Path | None
+    service: str = DEFAULT_SERVICE
 
 
 def option_parser(program: str, description: str) -> argparse.ArgumentParser:
     """A parser of the common options; a caller may add its own."""
     parser = argparse.ArgumentParser(prog=f"python -m {program}", description=description)
-    parser.add_argument("--topic", default=DEFAULT_TOPIC, help="ROS topic (default: %(default)s)")
+    parser.add_argument("--topic", default=DEFAULT_TOPIC, help="ROS name (default: %(default)s)")
     parser.add_argument(
         "--period",
         type=_positive,
@@ -45,8 +50,16 @@ def option_parser(program: str, description: str) -> argparse.ArgumentParser:
 
 def node_options(program: str, description: str, arguments: Sequence[str]) -> NodeOptions:
     """Parse the arguments that are left without ``--ros-args``; exits with status 2 on an error."""
-    parsed = option_parser(program, description).parse_args(arguments)
-    return NodeOptions(parsed.topic, parsed.period, parsed.text, parsed.report)
+    return options_of(option_parser(program, description).parse_args(arguments))
+
+
+def options_of(parsed: argparse.Namespace, role: str = "") -> NodeOptions:
+    """The common options of a command line that was parsed.
+
+    The topic of a server or client is its service; composed nodes serve the default one.
+    """
+    service = parsed.topic if role in ("server", "client") else DEFAULT_SERVICE
+    return NodeOptions(parsed.topic, parsed.period, parsed.text, parsed.report, service)
 
 
 def split_ros_args(arguments: Sequence[str]) -> tuple[list[str], list[str]]:

@@ -18,6 +18,10 @@ _POLICY_FILE = "talker_listener.xml"
 _POLICY_TOPIC = "chatter"
 _TALKER, _LISTENER = "/talker_listener/talker", "/talker_listener/listener"
 _WITHOUT = "_without_permission"
+GUEST: Final = "/talker_listener/guest"
+GUEST_TOPIC: Final = "/guest_book"
+SERVICE: Final = "/add_two_ints"
+ACTION: Final = "/fibonacci"
 
 _ROS_TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
 _LONGEST_TOPIC = 200
@@ -62,6 +66,20 @@ def talking_policy(topic: str) -> Policy:
             replace(with_topic(listener, None), path=f"{_LISTENER}{_WITHOUT}"),
         ),
     )
+
+
+def attacked_policy(topic: str) -> Policy:
+    """A talker and a listener on ``topic``, a service, and a guest who may use neither.
+
+    The name of the guest's enclave is contained in that of an enclave which may publish ``topic``.
+    """
+    talking = talking_policy(topic)
+    talker = next(each for each in shipped_policy(_POLICY_FILE).enclaves if each.path == _TALKER)
+    guest = replace(with_topic(talker, GUEST_TOPIC), path=GUEST)
+    guests = (guest, replace(with_topic(talker, topic), path=f"{GUEST}/admin"))
+    service = shipped_policy("add_two_ints.xml").enclaves
+    allowed = tuple(each for each in talking.enclaves if not each.path.endswith(_WITHOUT))
+    return replace(talking, enclaves=(*allowed, *guests, *service))
 
 
 def with_topic(enclave: Enclave, topic: str | None) -> Enclave:

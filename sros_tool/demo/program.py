@@ -17,13 +17,14 @@ from types import FrameType
 
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.demo.backend import AUTO, Backend, choose_backend
+from sros_tool.demo.conditions import conditions
 from sros_tool.demo.isolated import run_isolated
 from sros_tool.demo.model import Row, Scenario
 from sros_tool.demo.policies import DEFAULT_TOPIC, check_topic
 from sros_tool.demo.result import DemoResult, ScenarioResult
 from sros_tool.demo.runner import Limits, Plan, run_plan
 from sros_tool.demo.scenarios.isolation import ISOLATION
-from sros_tool.demo.scenery import Scenery, build_scenery
+from sros_tool.demo.scenery import Scenery, Setting, build_scenery
 from sros_tool.errors import UsageError
 from sros_tool.keystore.template import Template
 from sros_tool.runtime.netns import Isolation, try_isolation
@@ -72,7 +73,8 @@ def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
         for scenario, places in zip(scenarios, domains, strict=True):
             under = folder if len(scenarios) == 1 else folder / scenario.name
             spanned = DomainSet.of((places[0], places[-1]))
-            scenery = build_scenery(under, scenario, topic, spanned, options.template, now)
+            setting = Setting(topic, spanned, options.template, now)
+            scenery = build_scenery(under, scenario, setting)
             if backend is None:
                 tell("looking for a DDS that enforces security")
                 backend = choose_backend(options.backend, scenery.probe(topic, places[0]))
@@ -80,6 +82,8 @@ def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
                 f"{scenario.name}: running {len(scenario.rows)} rows on {backend.name}"
                 f" ({backend.dds}): {backend.why}"
             )
+            holding = conditions(backend, options.template, topic)
+            scenario = replace(scenario, rows=tuple(row.under(holding) for row in scenario.rows))
             plan = _plan(options, scenario, places, backend, scenery, topic, under, isolation)
             rows = run_isolated(partial(run_plan, plan), isolation, tell)
             results.append(ScenarioResult(scenario.name, scenario.title, tuple(rows)))

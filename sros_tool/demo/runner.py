@@ -29,6 +29,8 @@ _GRACE = 0.3
 _ENOUGH_MESSAGES = 3
 _AFTER_ENOUGH = 2.0
 _AFTER_REPLAY = 2.0
+_BRIEFEST = 1.0
+_LONGEST_PAUSE = 0.5
 _SECONDS_TO_END = 2.0
 
 
@@ -208,9 +210,9 @@ class _Stage:
             if enough_at is None and all(self._is_met(claim, processes) for claim in positive):
                 enough_at = now
             if enough_at is not None:
-                if not silence:
+                if not silence and now >= start + _BRIEFEST:
                     break
-                if now >= max(shortest, enough_at + _AFTER_ENOUGH):
+                if silence and now >= max(shortest, enough_at + _AFTER_ENOUGH):
                     break
             if now >= longest or any(process.ended for process in needed):
                 break
@@ -226,18 +228,19 @@ class _Stage:
             heard = [e for e in events if e.kind is Kind.HEARD and e.text.startswith(mark)]
             return len(heard) >= _ENOUGH_MESSAGES
         if claim.relation is Relation.SEES:
-            return any(count for event in events for count in event.publishers.values() if count)
+            topic = processes[claim.talker].topic
+            return any(event.publishers.get(topic) for event in events)
         return True
 
     async def _replay(self, talker: PartyProcess, tap: Wiretap) -> Replay:
-        """Let a talker leave, then send again what it had sent, from its first packet on."""
+        """Let a talker leave, then send again what it had sent, at the pace of the original."""
         packets = tap.packets(talker.ports())
         await _end_softly([talker])
         await asyncio.sleep(_GRACE)
         started = time.monotonic()
-        for packet in packets:
-            tap.send(packet)
-            await asyncio.sleep(0)
+        for before, each in zip([*packets[:1], *packets], packets, strict=False):
+            await asyncio.sleep(min(each.time - before.time, _LONGEST_PAUSE))
+            tap.send(each.packet)
         await asyncio.sleep(_AFTER_REPLAY)
         return Replay(len(packets), started)
 

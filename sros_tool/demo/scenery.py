@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
+from sros_tool.demo.bench import Bench, copy_keystore
+from sros_tool.demo.forgeries import FORGERIES, REMOVALS
 from sros_tool.demo.model import FOREIGN, OWN, Identity, Scenario
 from sros_tool.demo.policies import DENIED_TOPIC
+from sros_tool.errors import SrosError
 from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.template import Template
 from sros_tool.runtime.environment import DOMAIN, secured_environment
@@ -23,23 +26,26 @@ PROBED = "talker"
 class Scenery:
     """Where the keystores are, by label, and which enclave plays which part.
 
-    ``missing`` has the reason for which a keystore could not be made.
+    ``missing`` has the reason for which a keystore could not be made; ``casts`` the parts of
+    those keystores that have other enclaves than the rest.
     """
 
     keystores: Mapping[str, Path]
     cast: Mapping[str, str] = field(default_factory=dict)
     missing: Mapping[str, str] = field(default_factory=dict)
+    casts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
-    def enclave(self, part: str) -> str:
-        """The enclave that plays a part, or that is named itself.  Raises `KeyError`."""
-        return part if part.startswith("/") else self.cast[part]
+    def enclave(self, identity: Identity) -> str:
+        """The enclave of an identity.  Raises `KeyError` where nobody plays its part."""
+        part = identity.enclave
+        return part if part.startswith("/") else self._cast(identity)[part]
 
     def environment(self, identity: Identity, domain: int) -> Mapping[str, str]:
         """The ROS_SECURITY_* variables and ROS_DOMAIN_ID of a process with that identity."""
         if not identity.keystore:
             return {DOMAIN: str(domain)}
         root = self.keystores[identity.keystore]
-        secured = secured_environment(root, self.enclave(identity.enclave), domain)
+        secured = secured_environment(root, self.enclave(identity), domain)
         return secured | dict(identity.variables)
 
     def probe(self, topic: str, domain: int) -> ProbeEnclave:
@@ -50,43 +56,76 @@ class Scenery:
     def problem(self, identities: Iterable[Identity]) -> str:
         """Why a party with one of these identities cannot take part, or ""."""
         for identity in identities:
+            part = identity.enclave
+            if part and not part.startswith("/") and part not in self._cast(identity):
+                return f"the keystore has no enclave for the part of the {part}"
             if identity.keystore in self.missing:
                 return self.missing[identity.keystore]
-            part = identity.enclave
-            if part and not part.startswith("/") and part not in self.cast:
-                return f"the keystore has no enclave for the part of the {part}"
         return ""
 
+    def _cast(self, identity: Identity) -> Mapping[str, str]:
+        return self.casts.get(identity.keystore, self.cast)
 
-def build_scenery(
-    folder: Path,
-    scenario: Scenario,
-    topic: str,
-    domains: DomainSet,
-    template: Template,
-    now: datetime,
-) -> Scenery:
-    """Create both keystores of a scenario in ``folder``, for an absolute ``topic``.
 
-    Raises what the keystore raises: `KeystoreError` and `OSError` among them.
+@dataclass(frozen=True)
+class Setting:
+    """What keystores are made for: an absolute ``topic``, ``domains``, a template, a moment."""
+
+    topic: str
+    domains: DomainSet
+    template: Template
+    now: datetime
+
+
+def build_scenery(folder: Path, scenario: Scenario, setting: Setting) -> Scenery:
+    """Create the keystores of a scenario in ``folder``: its own, a stranger's, and forged ones.
+
+    Raises what the keystore raises: `KeystoreError` and `OSError` among them; a forgery that
+    cannot be made, only leaves out the rows in which it is used.
     """
     keystores = {OWN: folder / "keystore", FOREIGN: folder / "another_keystore"}
     for root in keystores.values():
-        make_keystore(root, scenario, topic, domains, template, now)
-    return Scenery(keystores, scenario.cast)
+        make_keystore(root, scenario, setting)
+    return _with_forgeries(Scenery(keystores, scenario.cast), folder, scenario, setting)
 
 
-def make_keystore(
-    root: Path,
-    scenario: Scenario,
-    topic: str,
-    domains: DomainSet,
-    template: Template,
-    now: datetime,
-) -> None:
+def make_keystore(root: Path, scenario: Scenario, setting: Setting) -> None:
     """A keystore with the enclaves of a scenario."""
-    create_keystore(root, template=template, domains=domains, now=now)
+    create_keystore(root, template=setting.template, domains=setting.domains, now=setting.now)
     if scenario.policy is not None:
-        generate_artifacts(root, policies=[scenario.policy(topic)], now=now)
+        generate_artifacts(root, policies=[scenario.policy(setting.topic)], now=setting.now)
     if scenario.unpermitted:
-        create_enclaves(root, scenario.unpermitted, now=now)
+        create_enclaves(root, scenario.unpermitted, now=setting.now)
+
+
+def _with_forgeries(
+    scenery: Scenery, folder: Path, scenario: Scenario, setting: Setting
+) -> Scenery:
+    """The scenery with the forged keystores that the rows of the scenario ask for."""
+    keystores, missing = dict(scenery.keystores), dict(scenery.missing)
+    asked = {party.identity.keystore for row in scenario.rows for party in row.parties}
+    for label in sorted(asked - set(keystores) - {""}):
+        root = folder / "forged" / label.replace(" ", "_").replace(",", "")
+        bench = Bench(
+            root,
+            keystores[FOREIGN],
+            scenery.casts.get(label, scenery.cast),
+            setting.topic,
+            next(iter(setting.domains)),
+            setting.now,
+        )
+        try:
+            if label in FORGERIES:
+                copy_keystore(keystores[OWN], root)
+                FORGERIES[label](bench)
+            else:
+                removal = REMOVALS[label]
+                weakened = replace(setting, template=removal.weakened(setting.template))
+                make_keystore(root, scenario, weakened)
+                removal.forge(bench)
+        except SrosError as error:
+            missing[label] = str(error)
+        except KeyError as error:
+            missing[label] = f"the keystore has no enclave for the part of the {error.args[0]}"
+        keystores[label] = root
+    return replace(scenery, keystores=keystores, missing=missing)

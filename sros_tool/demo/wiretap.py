@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Collection, Mapping
 
-from sros_tool.demo.capture import Capture
+from sros_tool.demo.capture import Capture, Kept
 from sros_tool.demo.replay import Injector, packets_of
 from sros_tool.demo.verdict import WireCount
 
@@ -46,7 +46,7 @@ class Wiretap:
             for name, text in self._texts.items()
         }
 
-    def packets(self, ports: Collection[int]) -> list[bytes]:
+    def packets(self, ports: Collection[int]) -> list[Kept]:
         """The packets that were sent from one of the ports so far, in order."""
         if self._capture is None:
             return []

@@ -38,7 +38,7 @@ _KEEP_LAST, _RELIABLE, _XCDR1 = 0, 1, 0
 _STRING_OPS = (ctypes.c_uint32 * 3)(0x01 << 24 | 0x05 << 16, 0, 0)
 _NO_OPTIMIZE = 1
 
-_ENCLAVE_FILES = {
+_FILE_PROPERTIES = {
     "dds.sec.auth.identity_ca": "identity_ca.cert.pem",
     "dds.sec.auth.identity_certificate": "cert.pem",
     "dds.sec.auth.private_key": "key.pem",
@@ -46,6 +46,8 @@ _ENCLAVE_FILES = {
     "dds.sec.access.governance": "governance.p7s",
     "dds.sec.access.permissions": "permissions.p7s",
 }
+ENCLAVE_FILES = tuple(_FILE_PROPERTIES.values())
+"""The files that an enclave must have."""
 _PLUGINS = {
     "auth": ("dds_security_auth", "authentication"),
     "access": ("dds_security_ac", "access_control"),
@@ -208,14 +210,14 @@ def security_properties(enclave: Path, plugins: Path | None) -> dict[str, str]:
     them.  Raises `DdsError` where the enclave lacks a file.
     """
     folder = enclave.absolute()
-    for name in _ENCLAVE_FILES.values():
+    for name in ENCLAVE_FILES:
         if not (folder / name).is_file():
             raise DdsError(
                 f"cannot load the enclave {folder}",
                 f"It has no file {name}.",
                 "Make the enclave again with `sros create_enclave`.",
             )
-    properties = {key: f"file:{folder / name}" for key, name in _ENCLAVE_FILES.items()}
+    properties = {key: f"file:{folder / name}" for key, name in _FILE_PROPERTIES.items()}
     if (folder / "crl.pem").is_file():
         properties[_CRL_PROPERTY] = f"file:{folder / 'crl.pem'}"
     for part, (library, function) in _PLUGINS.items():

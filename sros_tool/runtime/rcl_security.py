@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sros_tool.errors import SrosError
+from sros_tool.runtime.cyclone import ENCLAVE_FILES
 from sros_tool.runtime.environment import ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
 
 
@@ -41,6 +42,23 @@ def choose_enclave(environment: Mapping[str, str], enclave: str = "/") -> Securi
         why = f"{KEYSTORE} is not set."
     if enforce:
         raise SrosError("cannot start a secured process", why, f"Set {KEYSTORE} and the enclave.")
+    return SecurityChoice(None, f"running without security, as {STRATEGY} is not 'Enforce'. {why}")
+
+
+def choose_loadable(environment: Mapping[str, str], enclave: str = "/") -> SecurityChoice:
+    """As `choose_enclave`, and then as the RMWs go on: an enclave that lacks a file is none.
+
+    Raises `SrosError` where that ends the process (Enforce), with the words of the RMWs, which do
+    not say which file it is (rmw_dds_common ``security.cpp``).
+    """
+    choice = choose_enclave(environment, enclave)
+    folder = choice.enclave
+    lacking = [name for name in ENCLAVE_FILES if folder and not (folder / name).is_file()]
+    if not lacking:
+        return choice
+    why = f"couldn't find all security files! {folder} has no {', '.join(lacking)}."
+    if environment.get(STRATEGY) == "Enforce":
+        raise SrosError("cannot start a secured process", why, "Make the enclave again.")
     return SecurityChoice(None, f"running without security, as {STRATEGY} is not 'Enforce'. {why}")
 
 

@@ -42,6 +42,7 @@ _PARTICIPANT_REFUSALS = (
     "error occurred while validating local permission",
     "error occurred while validating local identity",
     "could not find domain",
+    "couldn't find all security files",
 )
 _NOT_BUILT_IN = (
     "doesn't have the security libraries",

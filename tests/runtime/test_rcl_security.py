@@ -7,7 +7,13 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import SrosError
-from sros_tool.runtime.rcl_security import choose_enclave, domain_of, spelling_warnings
+from sros_tool.runtime.cyclone import ENCLAVE_FILES
+from sros_tool.runtime.rcl_security import (
+    choose_enclave,
+    choose_loadable,
+    domain_of,
+    spelling_warnings,
+)
 
 
 @pytest.fixture
@@ -54,6 +60,26 @@ def test_a_missing_enclave(
     else:
         with pytest.raises(SrosError):
             choose_enclave(environment)
+
+
+@pytest.mark.parametrize(("strategy", "starts"), [("Enforce", False), ("Permissive", True)])
+def test_a_missing_file(
+    environment: dict[str, str], tmp_path: Path, strategy: str, starts: bool
+) -> None:
+    """The RMWs run a node unsecured, or not at all; with all files, secured."""
+    environment["ROS_SECURITY_STRATEGY"] = strategy
+    folder = tmp_path / "enclaves/a/b"
+    for name in ENCLAVE_FILES:
+        (folder / name).touch()
+    assert choose_loadable(environment).enclave == folder
+    (folder / "key.pem").unlink()
+    if starts:
+        choice = choose_loadable(environment)
+        assert choice.enclave is None
+        assert "key.pem" in choice.note
+    else:
+        with pytest.raises(SrosError, match=r"couldn't find all security files.*key\.pem"):
+            choose_loadable(environment)
 
 
 def test_domains() -> None:

@@ -2,8 +2,30 @@
 
 from __future__ import annotations
 
-from sros_tool.demo.model import Scenario
-from sros_tool.demo.scenarios.isolation import ISOLATION
+from collections.abc import Sequence
 
-SCENARIOS: tuple[Scenario, ...] = (ISOLATION,)
+from sros_tool.demo.model import Scenario
+from sros_tool.demo.scenarios.attacks import ATTACKS
+from sros_tool.demo.scenarios.isolation import ISOLATION
+from sros_tool.errors import UsageError
+
+SCENARIOS: tuple[Scenario, ...] = (ISOLATION, ATTACKS)
 DEFAULT_SCENARIO = ISOLATION.name
+ALL = "all"
+
+
+def choose_scenarios(names: Sequence[str]) -> tuple[Scenario, ...]:
+    """The scenarios of those names, in order; none is the default.  Raises `UsageError`."""
+    if ALL in names:
+        return SCENARIOS
+    known = {scenario.name: scenario for scenario in SCENARIOS}
+    chosen = []
+    for name in dict.fromkeys(names or (DEFAULT_SCENARIO,)):
+        if name not in known:
+            raise UsageError(
+                f"there is no scenario {name!r}",
+                f"sros has {', '.join(known)}.",
+                "Name one of them, `all`, or a TOML file.",
+            )
+        chosen.append(known[name])
+    return tuple(chosen)

@@ -1,0 +1,202 @@
+"""Rows of the same kind: somebody injects, listens, looks around, asks, or poses as a server.
+
+In each, the attacker is the party "attacker".  Its victims and the control are those of the
+keystore with the label ``victims``; where no keystore stands in its way (``removed``), there is
+nothing but the victim.
+"""
+
+from __future__ import annotations
+
+from sros_tool.demo.model import (
+    OWN,
+    Case,
+    Claim,
+    Identity,
+    Party,
+    Relation,
+    Role,
+    Row,
+    Status,
+)
+from sros_tool.demo.policies import SERVICE
+
+ATTACKER = "attacker"
+
+
+def injection(
+    name: str,
+    attacker: Identity,
+    expected: Status,
+    mechanism: str,
+    *,
+    attack: str,
+    removed: str = "",
+    victims: str = OWN,
+    cases: tuple[Case, ...] = (),
+    open_because: str = "",
+    remedy: str = "",
+    tampered: bool = False,
+    crowd: bool = True,
+) -> Row:
+    """Whether the attacker is heard on the topic.
+
+    With ``tampered``, it is the listener whose files were changed: it may be kept from starting,
+    and the control is a listener beside it with its files as they should be.
+    """
+    listener = Party("listener", Role.LISTENER, Identity(victims, "listener"), intruder=tampered)
+    parties = [Party(ATTACKER, Role.TALKER, attacker, intruder=True), listener]
+    controls: list[Claim] = []
+    if tampered:
+        parties += [
+            Party("untouched listener", Role.LISTENER, Identity(OWN, "listener")),
+            Party("talker", Role.TALKER, Identity(OWN, "talker")),
+        ]
+        controls.append(Claim(Relation.HEARS, "untouched listener", "talker"))
+    elif crowd and not removed:
+        parties.append(Party("talker", Role.TALKER, Identity(victims, "talker")))
+        controls.append(Claim(Relation.HEARS, "listener", "talker"))
+    return Row(
+        name,
+        expected,
+        mechanism,
+        tuple(parties),
+        (Claim(Relation.HEARS, "listener", ATTACKER).expecting(expected),),
+        tuple(controls),
+        brief=True,
+        cases=cases,
+        attack=attack,
+        removed=removed,
+        open_because=open_because,
+        remedy=remedy,
+    )
+
+
+def succeeds(name: str, attacker: Identity, *, attack: str, removed: str, victims: str) -> Row:
+    """The same attacker with nothing wrong about him is heard."""
+    mechanism = "with nothing wrong about it, it is heard"
+    return injection(
+        name, attacker, Status.HEARD, mechanism, attack=attack, removed=removed, victims=victims
+    )
+
+
+def listening(
+    name: str,
+    attacker: Identity,
+    expected: Status,
+    mechanism: str,
+    *,
+    attack: str,
+    removed: str = "",
+    victims: str = OWN,
+    cases: tuple[Case, ...] = (),
+) -> Row:
+    """Whether the attacker hears the topic."""
+    return Row(
+        name,
+        expected,
+        mechanism,
+        (
+            Party(ATTACKER, Role.LISTENER, attacker, intruder=True),
+            Party("talker", Role.TALKER, Identity(victims, "talker")),
+            Party("listener", Role.LISTENER, Identity(victims, "listener")),
+        ),
+        (Claim(Relation.HEARS, ATTACKER, "talker").expecting(expected),),
+        (Claim(Relation.HEARS, "listener", "talker"),),
+        brief=True,
+        cases=cases,
+        attack=attack,
+        removed=removed,
+    )
+
+
+def looking(
+    name: str,
+    attacker: Identity,
+    expected: Status,
+    mechanism: str,
+    *,
+    attack: str,
+    removed: str = "",
+    victims: str = OWN,
+    cases: tuple[Case, ...] = (),
+    open_because: str = "",
+    remedy: str = "",
+) -> Row:
+    """Whether the attacker counts a publisher of the topic."""
+    in_the_open = Party("unsecured talker", Role.TALKER, aside=True)
+    unsecured = not attacker.keystore
+    return Row(
+        name,
+        expected,
+        mechanism,
+        (
+            Party(ATTACKER, Role.OBSERVER, attacker, intruder=True),
+            Party("talker", Role.TALKER, Identity(victims, "talker")),
+            *((in_the_open,) if unsecured else ()),
+        ),
+        (Claim(Relation.SEES, ATTACKER, "talker").expecting(expected),),
+        (Claim(Relation.SEES, ATTACKER, "unsecured talker"),) if unsecured else (),
+        brief=True,
+        cases=cases,
+        attack=attack,
+        removed=removed,
+        open_because=open_because,
+        remedy=remedy,
+    )
+
+
+def with_service(
+    name: str,
+    attacker: Identity,
+    expected: Status,
+    mechanism: str,
+    *,
+    attack: str,
+    removed: str = "",
+    victims: str = OWN,
+) -> Row:
+    """Whether the attacker gets answers of a service."""
+    return Row(
+        name,
+        expected,
+        mechanism,
+        (
+            Party(ATTACKER, Role.CLIENT, attacker, SERVICE, intruder=True),
+            Party("server", Role.SERVER, Identity(victims, "server"), SERVICE),
+            Party("client", Role.CLIENT, Identity(victims, "client"), SERVICE),
+        ),
+        (Claim(Relation.IS_ANSWERED, ATTACKER, "server").expecting(expected),),
+        (Claim(Relation.IS_ANSWERED, "client", "server"),),
+        brief=True,
+        attack=attack,
+        removed=removed,
+    )
+
+
+def served(
+    name: str,
+    attacker: Identity,
+    expected: Status,
+    mechanism: str,
+    *,
+    attack: str,
+    removed: str = "",
+    victims: str = OWN,
+) -> Row:
+    """Whether a client takes answers of the attacker, who poses as the server."""
+    rightful = Party("server", Role.SERVER, Identity(victims, "server"), SERVICE)
+    return Row(
+        name,
+        expected,
+        mechanism,
+        (
+            Party(ATTACKER, Role.SERVER, attacker, SERVICE, intruder=True),
+            Party("client", Role.CLIENT, Identity(victims, "client"), SERVICE),
+            *(() if removed else (rightful,)),
+        ),
+        (Claim(Relation.IS_ANSWERED, "client", ATTACKER).expecting(expected),),
+        () if removed else (Claim(Relation.IS_ANSWERED, "client", "server"),),
+        brief=True,
+        attack=attack,
+        removed=removed,
+    )
