@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 
 from sros_tool.dds.decision.vendors import Style
@@ -14,6 +14,7 @@ Matcher = Callable[[str], object]
 SPECIAL = frozenset("*?[")
 """An expression without any of these means itself, for every vendor."""
 
+_BEFORE_SPECIAL = re.compile(r"[^*?\[]*")
 _NEVER = "(?!)"
 _CLASS = re.compile(r"\[:([a-y]*):\]")
 _CLASSES = {
@@ -63,46 +64,50 @@ def matches(style: Style, expression: str, name: str) -> bool:
 
 
 class Expressions:
-    """Expressions in their order, asked which of them match a name; plain ones cost nothing."""
+    """Expressions in their order, asked which of them match a name.
+
+    Plain ones are looked up by the name, those with wildcards by what stands before the first
+    wildcard, so that thousands of them cost little more than one.
+    """
 
     def __init__(self, style: Style, texts: Iterable[str], *, both_ways: bool = False) -> None:
         self._style = style
         self._texts = tuple(texts)
         self._both_ways = both_ways
         self._plain: dict[str, list[int]] = {}
-        self._wild: list[tuple[int, Matcher]] = []
+        wild: dict[int, dict[str, list[tuple[int, Matcher]]]] = {}
         for position, text in enumerate(self._texts):
             match = matcher(style, text)
             if match is None:
                 self._plain.setdefault(text, []).append(position)
-            else:
-                self._wild.append((position, match))
+                continue
+            before = _BEFORE_SPECIAL.match(text)
+            prefix = before[0] if before else ""
+            wild.setdefault(len(prefix), {}).setdefault(prefix, []).append((position, match))
+        self._wild = tuple(wild.items())
 
-    def matching(self, name: str) -> Iterator[int]:
+    def matching(self, name: str) -> Sequence[int]:
         """The positions of the expressions that match ``name``, in order."""
         if self._both_ways and not SPECIAL.isdisjoint(name):
-            yield from self._either_way(name)
-            return
-        plain = iter(self._plain.get(name, ()))
-        next_plain = next(plain, None)
-        for position, match in self._wild:
-            while next_plain is not None and next_plain < position:
-                yield next_plain
-                next_plain = next(plain, None)
-            if match(name):
-                yield position
-        while next_plain is not None:
-            yield next_plain
-            next_plain = next(plain, None)
+            return self._either_way(name)
+        found = self._plain.get(name, [])
+        for length, by_prefix in self._wild:
+            candidates = by_prefix.get(name[:length])
+            if candidates:
+                found = found + [place for place, match in candidates if match(name)]
+        return sorted(found)
 
     def first(self, name: str) -> int | None:
         """The position of the first expression that matches ``name``."""
-        return next(self.matching(name), None)
+        found = self.matching(name)
+        return found[0] if found else None
 
-    def _either_way(self, name: str) -> Iterator[int]:
-        for position, text in enumerate(self._texts):
-            if matches(self._style, text, name) or matches(self._style, name, text):
-                yield position
+    def _either_way(self, name: str) -> Sequence[int]:
+        return [
+            position
+            for position, text in enumerate(self._texts)
+            if matches(self._style, text, name) or matches(self._style, name, text)
+        ]
 
 
 def _set_of(members: list[str], negated: bool) -> str:
