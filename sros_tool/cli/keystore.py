@@ -49,6 +49,8 @@ Example:
     template development: encrypted and authenticated; every enclave may do everything until it
     gets a policy
     identity CA and permissions CA: separate, valid for 3650d; certificates 3650d, permissions 3650d
+    identity CA SHA-256 5fe417aaed47cccd3f4a6b3e8e94db185bfc8e1003ee5b8c8a4cb3dc1dc9a4e6
+    permissions CA SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91a0f5ac3e5ef1b0c4e47
   $ sros create_keystore fleet --template production --domain 10-19""",
 )
 @click.argument("root", type=PATH)
@@ -179,6 +181,9 @@ def _imported(files: dict[str, Path | None]) -> dict[str, bytes]:
 
 
 def _say_new_keystore(root: Path, template: Template, domains: DomainSet) -> None:
+    from sros_tool.keystore.authority import load_ca_certificate
+    from sros_tool.keystore.layout import ROLES
+    from sros_tool.pki.certificates import digest
     from sros_tool.validity import span_text
 
     layout = (
@@ -193,6 +198,10 @@ def _say_new_keystore(root: Path, template: Template, domains: DomainSet) -> Non
         f"{span_text(template.certificate_validity)}, permissions "
         f"{span_text(template.permissions_validity)}"
     )
+    # By these, those who get something from here know whose it is.
+    for role in ROLES if template.separate_authorities else ROLES[:1]:
+        name = f"{role} CA" if template.separate_authorities else "CA"
+        click.echo(f"  {name} SHA-256 {digest(load_ca_certificate(root, role))}")
 
 
 def _say_what_is_open(template: Template) -> None:

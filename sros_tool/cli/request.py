@@ -69,7 +69,8 @@ Example:
   $ sros sign_request keystore request.pem -p camera.xml
   signed the request of enclave /arm/camera for the key 6f5bbd292e91c5d0fbf579aa0d036ac044cdd978...
     the robot will trust CN=sros identity CA 4f122aed, SHA-256 5fe417aaed47cccd3f4a6b3e8e94db18...
-    send 'request.answer.tar.gz' to the robot: sros import request.answer.tar.gz DIR
+    and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91a...
+    send 'request.answer.tar.gz' to the robot: sros import request.answer.tar.gz DIR --ca e15ab4...
   $ sros sign_request keystore keystore/enclaves/arm/camera/request.pem --renew -o camera.tgz""",
 )
 @click.argument("words", metavar="[ROOT] REQUEST", nargs=-1, required=True)
@@ -105,7 +106,10 @@ def sign_request(
     permissions, governance, the certificates of the CAs, and what was revoked.  The keystore knows
     the enclave from then on, without its key.  Compare the key's SHA-256 with what the robot says.
     """
+    from sros_tool.keystore.authority import load_ca_certificate
+    from sros_tool.keystore.layout import PERMISSIONS
     from sros_tool.keystore.signing import sign_request as sign
+    from sros_tool.pki.certificates import digest
     from sros_tool.policy import read_policy
     from sros_tool.runtime.environment import domain_from
 
@@ -139,9 +143,15 @@ def sign_request(
             write_stdout(signed.archive)
         word = "renewed" if renew else "signed the request of"
         click.echo(f"{word} enclave {signed.name} for the key {signed.key}", err=stream)
+        permissions_ca = load_ca_certificate(root, PERMISSIONS)
         click.echo(f"  the robot will trust {_named(signed.identity_ca)}", err=stream)
+        if permissions_ca != signed.identity_ca:
+            click.echo(f"  and {_named(permissions_ca)}", err=stream)
         if not stream:
-            click.echo(f"  send '{output}' to the robot: sros import {output.name} DIR")
+            click.echo(
+                f"  send '{output}' to the robot: sros import {output.name} DIR --ca "
+                f"{digest(permissions_ca)}"
+            )
     print_notes(signed.notes)
 
 
@@ -152,24 +162,39 @@ Example:
   $ sros import request.answer.tar.gz robot
   imported enclave /arm/camera, which can run until 2027-05-20T07:45:12Z
     it trusts CN=sros identity CA 4f122aed, SHA-256 5fe417aaed47cccd3f4a6b3e8e94db185bfc8e10...
-    compare that with what sign_request said: nothing else vouches for it
+    and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd9...
+    compare both with what sign_request said, or say --ca: nothing else vouches for them
+  $ sros import request.answer.tar.gz robot --ca e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91...
   $ sros run robot /arm/camera -- ros2 run camera driver""",
 )
 @click.argument("answer", type=PATH)
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
 @click.option("--force", is_flag=True, help="Go back to an older answer, or move to other CAs.")
+@click.option(
+    "--ca",
+    "pin",
+    metavar="FILE|SHA-256",
+    help="Accept it only if this permissions CA has signed it: its certificate, or the SHA-256 "
+    "that sign_request and create_keystore say.",
+)
 @dry_run_option
-def import_verb(answer: Path, folder: Path | None, force: bool, dry_run: bool) -> None:
+def import_verb(
+    answer: Path, folder: Path | None, force: bool, pin: str | None, dry_run: bool
+) -> None:
     """On a robot: put the file ANSWER (or -) beside the key that waits in DIR, or change nothing.
 
     All of it is checked first: that the certificate is for this key, the chain, the signatures,
-    the dates, and that the archive holds nothing else.
+    the dates, and that the archive holds nothing else.  The first answer tells the robot whom to
+    trust; whoever carries it could send one of his own, unless --ca says whose it has to be.  Later
+    ones have to come from the same CAs.
     """
     from sros_tool.keystore.answer import import_answer
+    from sros_tool.keystore.trust import read_pin
 
     folder = folder or keystore_from_environment()
+    pinned = read_pin(pin) if pin is not None else frozenset[str]()
     data = _read(answer, "answer")
-    done = import_answer(folder, data, now=now(), force=force, dry_run=dry_run)
+    done = import_answer(folder, data, now=now(), pinned=pinned, force=force, dry_run=dry_run)
     if dry_run:
         print_plan(folder, done.changes)
         return
@@ -180,8 +205,12 @@ def import_verb(answer: Path, folder: Path | None, force: bool, dry_run: bool) -
 
     click.echo(f"imported enclave {done.name}, which can run until {iso(done.until)}")
     click.echo(f"  it trusts {_named(done.identity_ca)}")
-    if done.first:
-        click.echo("  compare that with what sign_request said: nothing else vouches for it")
+    if done.permissions_ca != done.identity_ca:
+        click.echo(f"  and {_named(done.permissions_ca)}")
+    if done.first and not pinned:
+        click.echo(
+            "  compare both with what sign_request said, or say --ca: nothing else vouches for them"
+        )
 
 
 def _read(path: Path, what: str) -> bytes:
@@ -200,9 +229,6 @@ def _read(path: Path, what: str) -> bytes:
 
 
 def _named(certificate: x509.Certificate) -> str:
-    from cryptography.hazmat.primitives import hashes
+    from sros_tool.pki.certificates import digest, subject_text
 
-    from sros_tool.pki.certificates import subject_text
-
-    digest = certificate.fingerprint(hashes.SHA256()).hex()
-    return f"{subject_text(certificate.subject)}, SHA-256 {digest}"
+    return f"{subject_text(certificate.subject)}, SHA-256 {digest(certificate)}"

@@ -25,7 +25,13 @@ from sros_tool.keystore.trust import check_same_authority, refuse_home, trusted_
 from sros_tool.keystore.verify import EnclaveState, check_enclave
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import common_name_of, load_certificate, subject_text, validity_of
+from sros_tool.pki.certificates import (
+    common_name_of,
+    digest,
+    load_certificate,
+    subject_text,
+    validity_of,
+)
 from sros_tool.pki.crl import load_crl
 from sros_tool.pki.keys import PublicKey, load_key
 from sros_tool.validity import iso
@@ -61,11 +67,12 @@ class Answer:
 class Imported:
     """What an answer brought; without changes, everything was there already.
 
-    ``first`` is whether the CAs were unknown in the folder, so that nothing vouches for them.
+    ``first`` is whether the CAs were unknown in the folder, so that nothing there vouches for them.
     """
 
     name: str
     identity_ca: x509.Certificate
+    permissions_ca: x509.Certificate
     first: bool
     until: datetime
     changes: tuple[Change, ...]
@@ -158,11 +165,18 @@ def _broken_seal(answer: Answer, authorities: Iterable[x509.Certificate]) -> str
 
 
 def import_answer(
-    folder: Path, data: bytes, *, now: datetime, force: bool = False, dry_run: bool = False
+    folder: Path,
+    data: bytes,
+    *,
+    now: datetime,
+    pinned: frozenset[str] = frozenset(),
+    force: bool = False,
+    dry_run: bool = False,
 ) -> Imported:
     """Put the answer to a request of ``folder`` beside the key that waits there, or change nothing.
 
     An answer that is older than what is there, or that comes from other CAs, needs ``force``.
+    Where CAs are ``pinned``, by their SHA-256, one of them has to have signed it in any case.
     """
     answer = read_answer(data)
     name = answer.name
@@ -181,7 +195,9 @@ def import_answer(
     with Transaction(folder, dry_run=dry_run) as transaction:
         key = load_key(read_bytes(place / _KEY, "private key"), f"'{place / _KEY}'")
         state = check_answer(answer, key.public_key(), now=now)
-        assert state.certificate and state.identity_ca and state.permissions
+        assert state.certificate and state.identity_ca and state.permissions_ca
+        assert state.permissions
+        _check_pinned(answer, state.identity_ca, state.permissions_ca, pinned)
         known = trusted_in(folder, "permissions_ca.cert.pem")
         if not force:
             _check_known(folder, answer, known)
@@ -197,7 +213,37 @@ def import_answer(
     subject = subject_text(state.certificate.subject)
     ends = [each.validity.not_after for each in state.permissions.grants if each.subject == subject]
     until = min(validity_of(state.certificate).not_after, ends[0])
-    return Imported(name, state.identity_ca, not known, until, tuple(transaction.changes))
+    return Imported(
+        name,
+        state.identity_ca,
+        state.permissions_ca,
+        not known,
+        until,
+        tuple(transaction.changes),
+    )
+
+
+def _check_pinned(
+    answer: Answer,
+    identity_ca: x509.Certificate,
+    permissions_ca: x509.Certificate,
+    pinned: frozenset[str],
+) -> None:
+    """See that a CA that a person named vouches for all of the answer: its seal says so.
+
+    The identity CA vouches for the certificate alone, which anybody may put beside permissions and
+    a governance of his own.
+    """
+    if not pinned or digest(permissions_ca) in pinned:
+        return
+    why = f"It comes from {subject_text(permissions_ca.subject)}, SHA-256 {digest(permissions_ca)}."
+    remedy = "Ask for the SHA-256 at home: `sros sign_request` says it. Nothing was changed."
+    if digest(identity_ca) in pinned:
+        why = "What is named is its identity CA, which vouches for the certificate alone."
+        remedy = "Name the permissions CA: it signs the whole answer. Nothing was changed."
+    raise KeystoreError(
+        f"the answer for enclave {answer.name} is not signed by the CA that is named", why, remedy
+    )
 
 
 def _check_known(folder: Path, answer: Answer, known: list[x509.Certificate]) -> None:

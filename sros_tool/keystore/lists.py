@@ -22,10 +22,11 @@ from sros_tool.keystore.bundle import authority_files, carried_crl, certificates
 from sros_tool.keystore.keyring import Keyring
 from sros_tool.keystore.layout import CRL, IDENTITY, REVOKED
 from sros_tool.keystore.ledger import Entry, document_entry
-from sros_tool.keystore.rotation import Replacement, Stage, digest, read_rotation
+from sros_tool.keystore.rotation import Replacement, Stage, read_rotation
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Transaction
 from sros_tool.pki.certificates import (
+    digest,
     load_certificate,
     pem,
     same_key,

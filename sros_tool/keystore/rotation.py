@@ -11,7 +11,6 @@ from enum import StrEnum
 from pathlib import Path
 
 from cryptography import x509
-from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from sros_tool.errors import KeystoreError, SrosError
@@ -19,7 +18,13 @@ from sros_tool.keystore.bundle import authority_files, certificates_of
 from sros_tool.keystore.create import list_enclaves
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, enclave_folder
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import issued_by, load_certificate, subject_text, validity_of
+from sros_tool.pki.certificates import (
+    digest,
+    issued_by,
+    load_certificate,
+    subject_text,
+    validity_of,
+)
 from sros_tool.validity import Window, iso
 from sros_tool.xml import read_bytes
 
@@ -103,11 +108,6 @@ class RotationStatus:
 def retired_key(certificate: x509.Certificate) -> str:
     """The path of the key of a CA that was replaced."""
     return f"{RETIRED}/{certificate.serial_number:x}.key.pem"
-
-
-def digest(certificate: x509.Certificate) -> str:
-    """The SHA-256 of a certificate, in hexadecimal."""
-    return certificate.fingerprint(hashes.SHA256()).hex()
 
 
 def read_rotation(root: Path) -> Rotation:

@@ -27,14 +27,13 @@ from sros_tool.keystore.rotation import (
     ROTATION,
     Rotation,
     Stage,
-    digest,
     render_rotation,
     retired_key,
 )
 from sros_tool.keystore.successor import Successor, begin, check_later, resume
 from sros_tool.keystore.template import Template, render_template
 from sros_tool.keystore.transaction import Transaction
-from sros_tool.pki.certificates import pem
+from sros_tool.pki.certificates import digest, pem
 from sros_tool.validity import Span, window
 from sros_tool.xml import read_bytes
 

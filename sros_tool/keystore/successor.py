@@ -15,10 +15,10 @@ from sros_tool.keystore.bundle import authority_files, certificates_of
 from sros_tool.keystore.keyring import Keyring, check_places
 from sros_tool.keystore.layout import PERMISSIONS, PRIVATE, PUBLIC, ROLES
 from sros_tool.keystore.reissue import Turn
-from sros_tool.keystore.rotation import Replacement, Rotation, digest
+from sros_tool.keystore.rotation import Replacement, Rotation
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Transaction
-from sros_tool.pki.certificates import common_name, issue_ca, same_key
+from sros_tool.pki.certificates import common_name, digest, issue_ca, same_key
 from sros_tool.validity import Window
 from sros_tool.xml import read_bytes
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
-from sros_tool.errors import KeystoreError, PkiError
+from sros_tool.errors import KeystoreError, PkiError, UsageError
 from sros_tool.keystore.layout import ENCLAVES, PRIVATE, PUBLIC
 from sros_tool.pki.certificates import UNREADABLE, subject_text
 from sros_tool.xml import read_bytes
@@ -19,6 +20,25 @@ _AUTHORITY = "identity_ca.cert.pem"
 def fingerprints(pem: bytes) -> frozenset[str]:
     """The SHA-256 of every certificate in a PEM file: more than one while a CA is rotated."""
     return frozenset(each.fingerprint(hashes.SHA256()).hex() for each in _load(pem))
+
+
+def read_pin(text: str) -> frozenset[str]:
+    """The SHA-256 of the CAs that a person named: by a fingerprint, or a file of certificates.
+
+    Raises `UsageError` for what is neither; colons and capitals in a fingerprint do not matter, so
+    that one may be copied from ``openssl x509 -fingerprint -sha256``.
+    """
+    plain = text.strip().rpartition("=")[2].replace(":", "").lower()
+    if re.fullmatch(r"[0-9a-f]{64}", plain):
+        return frozenset({plain})
+    path = Path(text)
+    if path.is_file():
+        return fingerprints(read_bytes(path, "certificate"))
+    raise UsageError(
+        f"{text!r} is neither the file of a certificate nor its SHA-256",
+        "A fingerprint has 64 hexadecimal digits.",
+        "Copy the one that `sros sign_request` says, or name a file.",
+    )
 
 
 def trusted_in(folder: Path, file: str) -> list[x509.Certificate]:

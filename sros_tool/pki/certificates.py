@@ -190,6 +190,11 @@ def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> boo
     return True
 
 
+def digest(certificate: x509.Certificate) -> str:
+    """The SHA-256 of a certificate, in hexadecimal: its fingerprint."""
+    return certificate.fingerprint(hashes.SHA256()).hex()
+
+
 def subject_text(name: x509.Name) -> str:
     """A distinguished name as the permissions document writes it (RFC 4514, most general last)."""
     return name.rfc4514_string()

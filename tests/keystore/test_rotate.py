@@ -27,10 +27,10 @@ from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lists import read_crl, read_lists
 from sros_tool.keystore.revoke import refresh_crl, revoke
 from sros_tool.keystore.rotate import RotationStep, renew_identity_ca, rotate_ca
-from sros_tool.keystore.rotation import ROTATION, Stage, digest, retired_key, rotation_status
+from sros_tool.keystore.rotation import ROTATION, Stage, retired_key, rotation_status
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.verify import check_enclave
-from sros_tool.pki.certificates import common_name, pem
+from sros_tool.pki.certificates import common_name, digest, pem
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.policy import read_policy
 

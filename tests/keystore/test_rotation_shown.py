@@ -15,8 +15,9 @@ from sros_tool.keystore.bundle import authority_files, certificates_of
 from sros_tool.keystore.history import Status, history
 from sros_tool.keystore.revoke import revoke
 from sros_tool.keystore.rotate import renew_identity_ca, rotate_ca
-from sros_tool.keystore.rotation import Stage, digest
+from sros_tool.keystore.rotation import Stage
 from sros_tool.keystore.template import load_template
+from sros_tool.pki.certificates import digest
 
 NOW = datetime.now(UTC)
 STAGES = (Stage.DISTRIBUTE, Stage.REISSUE, Stage.RETIRE)

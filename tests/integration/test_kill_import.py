@@ -1,0 +1,133 @@
+"""An import that is stopped at every step and at random moments: the robot has all of it, or none.
+
+A robot is not attended, so what a killed import leaves must neither keep the old enclave from
+running nor the next import from going through.
+"""
+
+from __future__ import annotations
+
+import random
+import signal
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from harness import remains, snapshot
+from test_kill import Server
+from test_kill_life import DIED, copy, in_child
+
+from sros_tool.keystore import create_enclaves, create_keystore, filesystem
+from sros_tool.keystore.answer import import_answer
+from sros_tool.keystore.arrival import verify_arrival
+from sros_tool.keystore.request import create_request
+from sros_tool.keystore.revoke import revoke
+from sros_tool.keystore.signing import sign_request
+from sros_tool.keystore.template import load_template
+from sros_tool.keystore.verify import check_enclave
+
+NOW = datetime.now(UTC)
+LATER = NOW + timedelta(hours=1)
+NAME, FOLDER = "/arm/camera", "enclaves/arm/camera"
+KILLS = 40
+
+
+@pytest.fixture(params=["the first", "a renewal"])
+def robot(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[Path, bytes]:
+    """A robot, and the answer that it is to import."""
+    home, folder = tmp_path / "home", tmp_path / "robot"
+    create_keystore(home, template=load_template("production"), now=NOW)
+    create_enclaves(home, ["/lost"], now=NOW)
+    wanted = create_request(folder, NAME).file.read_bytes()
+    answer = sign_request(home, wanted, now=NOW).archive
+    if request.param == "a renewal":
+        import_answer(folder, answer, now=NOW)
+        revoke(home, ["/lost"], now=LATER)  # so that crl.pem is among what is new
+        answer = sign_request(home, wanted, now=LATER, renew=True).archive
+    return folder, answer
+
+
+def see(robot: Path, before: Path) -> bool:
+    """Whether the answer is in place as a whole, after nothing else was found than before."""
+    now, then = robot / FOLDER, before / FOLDER
+    key = now / "key.pem"
+    assert key.read_bytes() == (then / "key.pem").read_bytes()
+    assert key.stat().st_mode & 0o777 == 0o600
+    files = {path.name: path.read_bytes() for path in now.iterdir() if path.exists()}
+    old = {path.name: path.read_bytes() for path in then.iterdir()}
+    if files == old:
+        return False
+    assert files.keys() >= old.keys()
+    assert not check_enclave(now, now=LATER).problems
+    return True
+
+
+def settled(robot: Path) -> dict[str, tuple[int, bytes]]:
+    """All that is there, when all is done."""
+    assert not remains(robot.parent)
+    assert not verify_arrival(robot, now=LATER).findings
+    return snapshot(robot)
+
+
+def test_death_at_every_step(
+    robot: tuple[Path, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(filesystem, "flush_file_system", lambda _: None)
+    folder, answer = robot
+    work = tmp_path / "work" / "robot"
+    work.parent.mkdir()
+
+    def run() -> object:
+        return import_answer(work, answer, now=LATER)
+
+    copy(folder, work)
+    status, steps = in_child(run)
+    assert status == 0
+    expected = settled(work)
+    outcomes = set()
+    for step in range(1, steps + 1):
+        copy(folder, work)
+        assert in_child(run, step) == (DIED, 0), step
+        outcomes.add(see(work, folder))
+        run()
+        assert settled(work) == expected, step
+    assert outcomes == {True, False}
+    assert steps > 10
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    serving = Server()
+    yield serving
+    serving.close()
+
+
+def test_killed_at_random_moments(
+    server: Server, robot: tuple[Path, bytes], tmp_path: Path
+) -> None:
+    folder, answer = robot
+    sent = tmp_path / "answer.tgz"
+    sent.write_bytes(answer)
+    work = tmp_path / "work" / "robot"
+    work.parent.mkdir()
+    durations = []
+    for _ in range(3):
+        copy(folder, work)
+        started = time.monotonic()
+        assert server.run("import", sent, work) == 0
+        durations.append(time.monotonic() - started)
+    expected = settled(work)
+    moments = random.Random(7)
+    killed = done = 0
+    for _ in range(KILLS):
+        copy(folder, work)
+        pause = moments.uniform(0, 1.1 * sorted(durations)[1])
+        status = server.run("import", sent, work, kill_after=pause)
+        assert status in (0, -signal.SIGKILL)
+        killed += status != 0
+        done += see(work, folder)
+        import_answer(work, answer, now=LATER)
+        assert settled(work) == expected
+    assert killed > KILLS / 4
+    assert done

@@ -1,0 +1,162 @@
+"""The first answer that a robot gets is accepted from the CA that a person named, if one did."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from harness import certificate, snapshot, sros
+
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore import create_keystore
+from sros_tool.keystore.answer import SEAL, import_answer, seal
+from sros_tool.keystore.archive import pack, unpack
+from sros_tool.keystore.arrival import verify_arrival
+from sros_tool.keystore.authority import load_authority
+from sros_tool.keystore.keyring import IN_KEYSTORE
+from sros_tool.keystore.layout import PERMISSIONS
+from sros_tool.keystore.open import load_settings
+from sros_tool.keystore.request import create_request
+from sros_tool.keystore.rotate import rotate_ca
+from sros_tool.keystore.rotation import Stage
+from sros_tool.keystore.signing import sign_request
+from sros_tool.keystore.template import load_template
+from sros_tool.keystore.trust import read_pin
+from sros_tool.pki.certificates import digest
+
+NOW = datetime.now(UTC)
+NAME, FOLDER = "/arm/camera", "enclaves/arm/camera"
+
+
+def made(folder: Path, name: str, template: str = "production") -> Path:
+    create_keystore(folder / name, template=load_template(template), now=NOW)
+    return folder / name
+
+
+@pytest.fixture(params=["production", "sros2"])
+def home(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    return made(tmp_path, "home", request.param)
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    create_request(tmp_path / "robot", NAME)
+    return tmp_path / "robot"
+
+
+def answer_of(home: Path, robot: Path) -> bytes:
+    return sign_request(home, (robot / FOLDER / "request.pem").read_bytes(), now=NOW).archive
+
+
+def pin(home: Path, role: str = "permissions") -> frozenset[str]:
+    return frozenset({digest(certificate(home / f"public/{role}_ca.cert.pem"))})
+
+
+def test_the_named_ca_is_accepted_and_no_other(home: Path, robot: Path, tmp_path: Path) -> None:
+    evil = made(tmp_path, "evil")
+    answers = answer_of(home, robot), answer_of(evil, robot)
+    before = snapshot(robot)
+    with pytest.raises(KeystoreError, match="not signed by the CA that is named"):
+        import_answer(robot, answers[1], now=NOW, pinned=pin(home))
+    assert snapshot(robot) == before
+    assert import_answer(robot, answers[0], now=NOW, pinned=pin(home)).first
+    # Moving to other CAs is no reason to accept anybody.
+    with pytest.raises(KeystoreError, match="not signed by the CA that is named"):
+        import_answer(robot, answers[1], now=NOW, pinned=pin(home), force=True)
+    import_answer(robot, answers[1], now=NOW, pinned=pin(evil), force=True)
+
+
+def test_the_identity_ca_does_not_vouch_for_the_permissions(robot: Path, tmp_path: Path) -> None:
+    """On its way, permissions, governance and their CA are replaced; the certificate is genuine."""
+    home, evil = made(tmp_path, "home"), made(tmp_path, "evil", "development")
+    genuine = unpack(answer_of(home, robot))
+    forged = unpack(answer_of(evil, robot))
+    files = {path: data for path, data in forged.items() if path != SEAL}
+    for file in ("cert.pem", "identity_ca.cert.pem"):
+        files[f"{FOLDER}/{file}"] = genuine[f"{FOLDER}/{file}"]
+    subject = certificate(home / FOLDER / "cert.pem").subject.rfc4514_string()
+    files = resigned(evil, files, subject)
+    authority = load_authority(evil, PERMISSIONS, load_settings(evil), IN_KEYSTORE, NOW)
+    archive = pack({SEAL: seal(files, authority), **files})
+    before = snapshot(robot)
+    with pytest.raises(KeystoreError, match="vouches for the certificate alone"):
+        import_answer(robot, archive, now=NOW, pinned=pin(home, "identity"))
+    with pytest.raises(KeystoreError, match=digest(authority.certificate)):
+        import_answer(robot, archive, now=NOW, pinned=pin(home))
+    assert snapshot(robot) == before
+    # It is a good forgery: whoever names nobody believes it.
+    import_answer(robot, archive, now=NOW)
+    assert not verify_arrival(robot, now=NOW).findings
+
+
+def resigned(home: Path, files: dict[str, bytes], subject: str) -> dict[str, bytes]:
+    """The permissions for another subject, signed by a keystore's permissions CA."""
+    text = (home / FOLDER / "permissions.xml").read_text()
+    text = re.sub(r"<subject_name>[^<]*", f"<subject_name>{subject}", text)
+    text = re.sub(r"<not_after>[^<]*", "<not_after>2027-01-01T00:00:00Z", text)
+    wanted = home / "wanted.xml"
+    wanted.write_text(text)
+    words = ["smime", "-sign", "-text", "-in", wanted]
+    words += ["-signer", home / "public/permissions_ca.cert.pem"]
+    words += ["-inkey", home / "private/permissions_ca.key.pem"]
+    message = subprocess.run(["openssl", *map(str, words)], check=True, capture_output=True)
+    return {**files, f"{FOLDER}/permissions.p7s": message.stdout}
+
+
+def test_after_a_rotation_the_new_ca_is_named(robot: Path, tmp_path: Path) -> None:
+    home = made(tmp_path, "home")
+    old = pin(home)
+    for stage in (Stage.DISTRIBUTE, Stage.REISSUE, Stage.RETIRE):
+        rotate_ca(home, stage, now=NOW)
+    archive = answer_of(home, robot)
+    with pytest.raises(KeystoreError, match="not signed by the CA that is named"):
+        import_answer(robot, archive, now=NOW, pinned=old)
+    import_answer(robot, archive, now=NOW, pinned=pin(home))
+
+
+# ── the program ────────────────────────────────────────────────────────────────────────────
+
+
+def openssl_fingerprint(path: Path) -> str:
+    words = ["openssl", "x509", "-in", str(path), "-noout", "-fingerprint", "-sha256"]
+    return subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip()
+
+
+def test_everybody_says_the_same_fingerprint(tmp_path: Path) -> None:
+    home, robot = tmp_path / "home", tmp_path / "robot"
+    created = sros("create_keystore", home, "--template", "production").ok().out
+    (told,) = re.findall(r"permissions CA SHA-256 ([0-9a-f]{64})", created)
+    ca = home / "public/permissions_ca.cert.pem"
+    assert read_pin(openssl_fingerprint(ca)) == read_pin(told) == read_pin(str(ca)) == pin(home)
+    assert "identity CA SHA-256 " + next(iter(pin(home, "identity"))) in created
+    sros("create_request", NAME, robot).ok()
+    request = robot / FOLDER / "request.pem"
+    signed = sros("sign_request", home, request, "-o", tmp_path / "answer.tgz").ok().out
+    assert f"sros import answer.tgz DIR --ca {told}\n" in signed
+    assert signed.count("SHA-256") == 2
+    for wrong in ("0" * 64, told.replace(told[0], "f" if told[0] != "f" else "e")):
+        refused = sros("import", tmp_path / "answer.tgz", robot, "--ca", wrong)
+        assert refused.status == 1
+        assert refused.err.count("\n") == 1
+        assert told in refused.err
+    unclear = sros("import", tmp_path / "answer.tgz", robot, "--ca", told[:-1])
+    assert (unclear.status, "64 hexadecimal digits" in unclear.err) == (2, True)
+    without = sros("import", tmp_path / "answer.tgz", robot, "--dry-run").ok()
+    assert "would create" in without.out
+    done = sros("import", tmp_path / "answer.tgz", robot, "--ca", ca).ok().out
+    assert f"SHA-256 {told}" in done
+    assert "nothing else vouches" not in done
+
+
+def test_without_a_name_it_says_what_to_compare(tmp_path: Path) -> None:
+    home, robot = made(tmp_path, "home"), tmp_path / "robot"
+    sros("create_request", NAME, robot).ok()
+    request = robot / FOLDER / "request.pem"
+    sros("sign_request", home, request, "-o", tmp_path / "answer.tgz").ok()
+    said = sros("import", tmp_path / "answer.tgz", robot).ok().out
+    assert next(iter(pin(home))) in said
+    assert next(iter(pin(home, "identity"))) in said
+    assert "nothing else vouches for them" in said
