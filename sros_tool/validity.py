@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import lru_cache
 
 from sros_tool.errors import UsageError
 
@@ -130,6 +131,7 @@ def duration_text(duration: timedelta) -> str:
     return f"{seconds // 86400}d" if seconds % 86400 == 0 else f"{seconds}s"
 
 
+@lru_cache(maxsize=64)  # what is made at once shares its moments
 def iso(moment: datetime) -> str:
     """``moment`` as CCYY-MM-DDThh:mm:ssZ, in UTC."""
     return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

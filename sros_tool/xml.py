@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import stat
 from functools import cache
 from pathlib import Path
 
@@ -29,15 +32,21 @@ def _parser() -> etree.XMLParser:
 def read_bytes(path: Path, what: str) -> bytes:
     """The bytes of a regular file of bounded size; ``what`` names it in errors."""
     try:
-        if not path.exists():
-            raise DocumentError(f"the {what} '{path}' does not exist")
-        if not path.is_file():
+        there = path.stat()  # asked first, for to open a pipe is to wait
+        if not stat.S_ISREG(there.st_mode):
             raise DocumentError(f"the {what} '{path}' is not a regular file")
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise DocumentError(f"the {what} '{path}' cannot be read", f"{error.strerror}.") from error
-    if len(data) > MAX_BYTES:
+        data = b""
+        if there.st_size <= MAX_BYTES:
+            with path.open("rb", buffering=0) as file:
+                data = file.readall()
+    except (OSError, ValueError) as error:
+        number = getattr(error, "errno", errno.ENOENT)  # a name that holds NUL is of no file
+        if number in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP):
+            raise DocumentError(f"the {what} '{path}' does not exist") from error
+        raise DocumentError(
+            f"the {what} '{path}' cannot be read", f"{os.strerror(number)}."
+        ) from error
+    if max(there.st_size, len(data)) > MAX_BYTES:
         raise DocumentError(
             f"the {what} '{path}' is too large", f"More than {MAX_BYTES // 1024**2} MiB."
         )

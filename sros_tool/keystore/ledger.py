@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from datetime import datetime
 from pathlib import Path
 
@@ -44,6 +44,9 @@ class Entry:
     not_after: str = ""
     policy: str = ""
     reason: str = ""
+
+
+_FIELDS = tuple(each.name for each in fields(Entry))
 
 
 def certificate_entry(
@@ -117,5 +120,5 @@ def append(transaction: Transaction, entries: Iterable[Entry]) -> None:
 
 
 def _line(entry: Entry) -> bytes:
-    filled = {name: value for name, value in asdict(entry).items() if value}
+    filled = {name: value for name in _FIELDS if (value := getattr(entry, name))}
     return json.dumps(filled, separators=(",", ":")).encode() + b"\n"

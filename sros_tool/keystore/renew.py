@@ -32,7 +32,7 @@ from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Change, Transaction, tidy
 from sros_tool.names import check_enclave_name
 from sros_tool.notes import Note
-from sros_tool.pki.certificates import enclave_subject, issued_by, subject_text, validity_of
+from sros_tool.pki.certificates import enclave_subject, issued_by, validity_of
 from sros_tool.pki.crl import Revoked
 from sros_tool.pki.keys import PublicKey, generate_key, key_pem
 from sros_tool.validity import iso
@@ -205,13 +205,10 @@ class _Renewer:
             self._renew(state)
         except SrosError as error:
             return Unreadable(name, error)
-        certificate = state.certificate
-        return _Replaced(
-            name,
-            certificate.serial_number,
-            subject_text(certificate.subject),
-            validity_of(certificate).not_after,
-        )
+        old = state.certificate
+        # The grant that DDS reads has the subject of the certificate.
+        until = validity_of(old).not_after
+        return _Replaced(name, old.serial_number, state.grant.subject, until)
 
     def _renew(self, state: Standing) -> None:
         name = state.name
