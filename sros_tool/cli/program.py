@@ -34,7 +34,6 @@ FAMILIES: dict[str, dict[str, Verb]] = {
         "revoke": Verb("life", "Revoke enclaves."),
         "rotate_ca": Verb("rotate", "Replace the CAs, stage by stage."),
         "crl": Verb("life", "Show the revocation list, or sign it anew."),
-        "check": Verb("life", "Say what is weak in a keystore, and what needs to be renewed."),
     },
     "Deployment": {
         "distribute_key": Verb(
@@ -52,11 +51,14 @@ FAMILIES: dict[str, dict[str, Verb]] = {
         "merge_policy": Verb("policy", "Add the rights of policies to a policy file."),
         "diff_policy": Verb("policy", "Compare the rights of policies, permissions, keystores."),
         "minimize_policy": Verb("minimize", "Narrow a policy to what was observed."),
+        "explain": Verb("explain", "Say what DDS will decide, by which rule, and why."),
+        "view": Verb("view", "Draw who may do what, as a page, SVG, DOT, Mermaid or JSON."),
         "policies": Verb("policies", "List or copy the policies that ship with sros."),
     },
     "Running": {
         "env": Verb("running", "Print the environment of an enclave."),
         "run": Verb("running", "Run a command in an enclave."),
+        "check": Verb("check", "Find what is wrong or weak in policies, keystores, the runtime."),
         "doctor": Verb("doctor", "Find out which DDS here enforces security."),
         "demo": Verb("demo", "Show on a real DDS that secured nodes are isolated."),
         "completion": Verb("completion", "Print the completion script of a shell."),

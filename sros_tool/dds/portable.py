@@ -6,7 +6,7 @@ and on Cyclone DDS 0.10.2.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from itertools import combinations
 
@@ -19,13 +19,24 @@ _LONGEST_NAME = 8  # parts; longer enclave names are not compared, the subsets w
 
 def document_notes(what: str, permissions: Permissions, signed_bytes: int) -> Iterator[Note]:
     """Remarks on one permissions document; ``what`` names it, ``signed_bytes`` is its size."""
+    for identity, fact in outside(permissions, signed_bytes):
+        yield Note(identity, f"{what}: {fact}{_CONSEQUENCES[identity]}")
+
+
+_CONSEQUENCES = {
+    "portable.document-size": f"; from {MAX_SIGNED_BYTES} on, the DDS handshake breaks and the "
+    "node hears nobody. Use wildcards, or split the enclave.",
+    "portable.deny-blocks-topic": " there on Cyclone DDS, which refuses the topic as a whole; Fast "
+    "DDS allows it. What no rule allows is denied anyway, so the denial may be needless.",
+    "portable.character-set": ". Vendors read plain sets alike, but only * and ? are part of the "
+    "portable profile.",
+}
+
+
+def outside(permissions: Permissions, signed_bytes: int) -> Iterator[tuple[str, str]]:
+    """What of a document lies outside of the profile: the id of the remark, and a clause."""
     if signed_bytes >= MAX_SIGNED_BYTES:
-        yield Note(
-            "portable.document-size",
-            f"{what}: the signed permissions have {signed_bytes} bytes; from {MAX_SIGNED_BYTES} "
-            "on, the DDS handshake breaks and the node hears nobody. Use wildcards, or split the "
-            "enclave.",
-        )
+        yield "portable.document-size", f"the signed permissions have {signed_bytes} bytes"
     for grant in permissions.grants:
         allowed = [r for r in grant.rules if r.allow]
         denied = [r for r in grant.rules if not r.allow]
@@ -36,21 +47,16 @@ def document_notes(what: str, permissions: Permissions, signed_bytes: int) -> It
                 [t for r in allowed for t in _topics(getattr(r, other))],
             )
             if blocked:
-                yield Note(
+                kept_from = "subscribing" if other == "subscribe" else "publishing"
+                yield (
                     "portable.deny-blocks-topic",
-                    f"{what}: denying to {direction} {_some(blocked)} also keeps the enclave from "
-                    f"{'subscribing' if other == 'subscribe' else 'publishing'} there on Cyclone "
-                    "DDS, which refuses the topic as a whole; Fast DDS allows it. What no rule "
-                    "allows is denied anyway, so the denial may be needless.",
+                    f"denying to {direction} {_some(blocked)} also keeps the enclave from "
+                    f"{kept_from}",
                 )
         sets = [t for r in grant.rules for c in (*r.publish, *r.subscribe) for t in c.topics]
         sets = sorted({topic for topic in sets if "[" in topic})
         if sets:
-            yield Note(
-                "portable.character-set",
-                f"{what}: {_some(sets)} uses a [set] of characters. Vendors read plain sets alike, "
-                "but only * and ? are part of the portable profile.",
-            )
+            yield "portable.character-set", f"{_some(sets)} uses a [set] of characters"
 
 
 def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:
@@ -70,32 +76,44 @@ def _blocked(denied: list[str], denied_too: set[str], allowed: list[str]) -> lis
 def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
     """A remark on enclaves of which Cyclone DDS takes one for the other.
 
+    ``names`` are all enclaves, ``new`` those just added.
+    """
+    fresh = set(new)
+    pairs = [pair for pair in mistaken_names(names) if not fresh.isdisjoint(pair)]
+    if pairs:
+        yield Note(
+            "portable.enclave-names",
+            f"Cyclone DDS 0.10 accepts the identity of {some_pairs(pairs)}, if it presents that "
+            "other enclave's (public) permissions, because all parts of its name occur there. "
+            "Choose names none of which is made of parts of another, such as /robot_admin.",
+        )
+
+
+def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
+    """The pairs of which Cyclone DDS takes the identity of the first for the second, sorted.
+
     It compares the parts of two subjects as sets, one way: the identity ``/robot`` fits the
-    permissions of ``/robot/admin``.  ``names`` are all enclaves, ``new`` those just added.
+    permissions of ``/robot/admin``.
     """
     parts_of = {name: frozenset(name.strip("/").split("/")) for name in names}
     by_parts: dict[frozenset[str], list[str]] = {}
     for name, parts in parts_of.items():
         by_parts.setdefault(parts, []).append(name)
-    fresh = set(new)
-    pairs = sorted(
+    return sorted(
         {
             (inner, outer)
             for outer, parts in parts_of.items()
             if len(parts) <= _LONGEST_NAME
             for inner in _contained(parts, by_parts)
-            if inner != outer and (inner in fresh or outer in fresh)
+            if inner != outer
         }
     )
-    if pairs:
-        shown = ", ".join(f"{inner} as {outer}" for inner, outer in pairs[:_MANY])
-        more = f" and {len(pairs) - _MANY} more" if len(pairs) > _MANY else ""
-        yield Note(
-            "portable.enclave-names",
-            f"Cyclone DDS 0.10 accepts the identity of {shown}{more}, if it presents that other "
-            "enclave's (public) permissions, because all parts of its name occur there. Choose "
-            "names none of which is made of parts of another, such as /robot_admin.",
-        )
+
+
+def some_pairs(pairs: Sequence[tuple[str, str]]) -> str:
+    """A few pairs in words: "/robot as /robot/admin and 2 more"."""
+    shown = ", ".join(f"{inner} as {outer}" for inner, outer in pairs[:_MANY])
+    return f"{shown} and {len(pairs) - _MANY} more" if len(pairs) > _MANY else shown
 
 
 def _contained(

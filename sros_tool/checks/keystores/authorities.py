@@ -1,0 +1,266 @@
+"""The CAs of a keystore: their keys, their ends, what they may sign, and their revocation list."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import timedelta
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
+
+from sros_tool.checks.keystores.opened import OpenedKeystore
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.errors import SrosError
+from sros_tool.keystore.layout import CRL, IDENTITY, PERMISSIONS, ca_certificate, ca_key
+from sros_tool.pki.certificates import same_key, subject_text, validity_of
+from sros_tool.pki.crl import signed_by
+from sros_tool.pki.keys import algorithm, load_key
+from sros_tool.validity import iso
+from sros_tool.xml import read_bytes
+
+UNREADABLE = Kind(
+    "keystore.file-unreadable",
+    ERROR,
+    "a file of the keystore that cannot be read",
+    "Verbs that need it fail.",
+    "sros keystore layout.",
+    "Restore it from a backup.",
+)
+ONE_AUTHORITY = Kind(
+    "keystore.one-authority",
+    WARNING,
+    "one CA issues identities and signs permissions",
+    "Cyclone DDS 0.10.2 and Fast DDS 2.9.1 then accept permissions that an enclave signed for "
+    "itself: they verify a chain, and the certificate of every enclave ends at that CA.",
+    "CVE-2023-24011 class; an enclave did so here on Cyclone DDS 0.10.2 and was heard.",
+    "Make a keystore with separate CAs, which all templates but sros2 do.",
+)
+CA_ENDS = Kind(
+    "keystore.ca-ends-soon",
+    WARNING,
+    "a CA that ends soon",
+    "With it ends everything that it issued or signed, at one moment; to replace it takes stages.",
+    "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
+    "Begin now, with `sros rotate_ca ROOT`.",
+)
+CA_EXPIRED = Kind(
+    "keystore.ca-expired",
+    ERROR,
+    "a CA of the keystore is not valid now",
+    "Nothing can be issued or signed with it, and DDS refuses what was.",
+    "RFC 5280, 6.1.3; Fast DDS 2.14.5 (Error '10' verifying CA certificate).",
+    "Replace it with `sros rotate_ca ROOT`, or correct the clock.",
+)
+CA_MISSING = Kind(
+    "keystore.ca-missing",
+    ERROR,
+    "the certificate of a CA is missing",
+    "The links of every enclave lead to it.",
+    "ROS 2 keystore layout (public/).",
+    "Restore it from a backup; any enclave that was exported has a copy.",
+)
+CA_MISMATCH = Kind(
+    "keystore.ca-key-mismatch",
+    ERROR,
+    "the key and the certificate of a CA do not belong together",
+    "Nothing that it signs could be verified.",
+    "RFC 5280, 6.1.3.",
+    "Restore the pair from a backup.",
+)
+CA_KEY_PLAIN = Kind(
+    "keystore.ca-key-plain",
+    NOTE,
+    "the key of a CA lies in the keystore without a passphrase",
+    "Who copies the folder can make any enclave with any rights.",
+    "ros2/sros2 issues 282 and 319; NIST SP 800-57 part 1, 5.3.",
+    "Make keystores with --encrypt-ca-keys or with keys on a token, or keep private/ offline.",
+)
+NOT_A_CA = Kind(
+    "keystore.not-a-ca",
+    ERROR,
+    "a CA certificate that does not say that it is one",
+    "OpenSSL refuses chains over it.",
+    "RFC 5280, 4.2.1.9 and 4.2.1.3 (BasicConstraints, KeyUsage keyCertSign).",
+    "Replace it with `sros rotate_ca ROOT`.",
+)
+CA_EXTENSIONS = Kind(
+    "keystore.ca-extensions",
+    NOTE,
+    "a CA certificate without key identifiers or key usage",
+    "Fast DDS checks strictly, and refuses it as soon as an intermediate CA is in play. CAs of "
+    "ros2/sros2 are so.",
+    "RFC 5280, 4.2.1.1 to 4.2.1.3; openssl verify -x509_strict.",
+    "Replace it with `sros rotate_ca ROOT`, if intermediates are to come.",
+)
+INTERMEDIATE = Kind(
+    "portable.intermediate",
+    WARNING,
+    "a CA that is not self-signed",
+    "Cyclone DDS takes a self-signed identity CA only. The permissions CA has to sign documents "
+    "itself; no vendor follows its chain.",
+    "Cyclone DDS 0.10.2, Fast DDS 2.14.5; measured.",
+    "Use a root for robots of its own, unless all run Fast DDS.",
+    vendors=("cyclonedds",),
+)
+KEY_ALGORITHM = Kind(
+    "portable.key-algorithm",
+    WARNING,
+    "a key that not every vendor takes",
+    "Cyclone DDS takes EC prime256v1 and RSA of exactly 2048 bits; Ed25519 fails in the handshake "
+    "of Fast DDS.",
+    "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10.2, Fast DDS 2.14.5; measured.",
+    "Use EC prime256v1, as sros does.",
+)
+SIGNATURE_HASH = Kind(
+    "portable.signature-hash",
+    WARNING,
+    "a certificate that is not signed with SHA-256",
+    "Fast DDS rejects SHA-384 in a CA.",
+    "Fast DDS 2.14.5 (PKIDH.cpp); measured.",
+    "Issue it with SHA-256, as sros does.",
+    vendors=("fastdds",),
+)
+CRL_ENDS = Kind(
+    "keystore.revocation-list-ends",
+    ERROR,
+    "a revocation list that ends soon, or ended",
+    "From its end on DDS refuses everybody.",
+    "RFC 5280, 5.1.2.5; Fast DDS 2.14.5; measured.",
+    "Run `sros crl ROOT --refresh`.",
+)
+CRL_ISSUER = Kind(
+    "keystore.revocation-list-issuer",
+    ERROR,
+    "a revocation list that is not of the identity CA",
+    "DDS cannot verify anybody with it, and refuses everybody.",
+    "RFC 5280, 6.3.3; Fast DDS 2.14.5.",
+    "Run `sros crl ROOT --refresh`.",
+)
+
+KINDS = by_id(
+    UNREADABLE, ONE_AUTHORITY, CA_ENDS, CA_EXPIRED, CA_MISSING, CA_MISMATCH, CA_KEY_PLAIN, NOT_A_CA,
+    CA_EXTENSIONS, INTERMEDIATE, KEY_ALGORITHM, SIGNATURE_HASH, CRL_ENDS, CRL_ISSUER,
+)  # fmt: skip
+
+_SOON = timedelta(days=90)
+_LIST_SOON = timedelta(days=30)
+
+
+def check_authorities(keystore: OpenedKeystore) -> Iterator[Finding]:
+    """The certificates of the CAs, their keys where these lie in the keystore, and the list."""
+    for each in keystore.unread:
+        why = f"{each.error.what}. {each.error.why}".strip()
+        yield UNREADABLE.found(each.path, why, keystore.shown(each.path), remedy=each.error.remedy)
+    unread = {each.path for each in keystore.unread}
+    if keystore.is_home:
+        for role in (IDENTITY, PERMISSIONS):
+            path = ca_certificate(role)
+            if role not in keystore.authorities and path not in unread:
+                text = f"there is no certificate of the {role} CA"
+                yield CA_MISSING.found(f"{role} CA", text, keystore.shown(path))
+    told: set[bytes] = set()
+    for role, chain in keystore.authorities.items():
+        fingerprint = chain[0].fingerprint(hashes.SHA256())
+        if fingerprint not in told:
+            told.add(fingerprint)
+            yield from _authority(keystore, role, chain)
+    yield from _one_for_both(keystore)
+    yield from _revocation_list(keystore)
+
+
+def key_findings(
+    certificate: x509.Certificate, subject: str, file: str, *, what: str = "it has"
+) -> Iterator[Finding]:
+    """Whether every vendor takes the key and the signature of a certificate."""
+    key = certificate.public_key()
+    fits = (isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name == "secp256r1") or (
+        isinstance(key, rsa.RSAPublicKey) and key.key_size == 2048
+    )
+    if not fits:
+        yield KEY_ALGORITHM.found(subject, f"{what} a key of {algorithm(key)}", file)
+    digest = certificate.signature_hash_algorithm
+    if not isinstance(digest, hashes.SHA256):
+        name = digest.name.upper() if digest else "no digest"
+        yield SIGNATURE_HASH.found(subject, f"{what} a signature with {name}", file)
+
+
+def _authority(
+    keystore: OpenedKeystore, role: str, chain: tuple[x509.Certificate, ...]
+) -> Iterator[Finding]:
+    certificate = chain[0]
+    file, subject = keystore.shown(ca_certificate(role)), f"{role} CA"
+    name, validity = subject_text(certificate.subject), validity_of(certificate)
+    begin, end = iso(validity.not_before), iso(validity.not_after)
+    if not validity.contains(keystore.now):
+        yield CA_EXPIRED.found(subject, f"{name} is valid from {begin} to {end}", file)
+    elif validity.not_after - keystore.now < _SOON:
+        yield CA_ENDS.found(subject, f"{name} ends at {end}", file)
+    if certificate.issuer != certificate.subject:
+        issuer = subject_text(certificate.issuer)
+        yield INTERMEDIATE.found(subject, f"{name} is issued by {issuer}", file)
+    yield from key_findings(certificate, subject, file, what=f"{name} has")
+    yield from _extensions(certificate, subject, name, file)
+    yield from _key(keystore, role, certificate)
+
+
+def _extensions(
+    certificate: x509.Certificate, subject: str, name: str, file: str
+) -> Iterator[Finding]:
+    extensions = certificate.extensions
+    present = {type(each.value): each.value for each in extensions}
+    constraints = present.get(x509.BasicConstraints)
+    usage = present.get(x509.KeyUsage)
+    is_ca = isinstance(constraints, x509.BasicConstraints) and constraints.ca
+    may_sign = not isinstance(usage, x509.KeyUsage) or usage.key_cert_sign
+    if not (is_ca and may_sign):
+        yield NOT_A_CA.found(subject, f"{name} may not issue certificates", file)
+    wanted = (x509.KeyUsage, x509.SubjectKeyIdentifier, x509.AuthorityKeyIdentifier)
+    missing = [kind.__name__ for kind in wanted if kind not in present]
+    if missing:
+        yield CA_EXTENSIONS.found(subject, f"{name} lacks {', '.join(missing)}", file)
+
+
+def _key(keystore: OpenedKeystore, role: str, certificate: x509.Certificate) -> Iterator[Finding]:
+    path = keystore.root / ca_key(role)
+    if not path.exists():
+        return  # it is kept elsewhere
+    try:
+        pem = read_bytes(path, "key")
+        if b"ENCRYPTED" in pem:
+            return
+        key = load_key(pem, f"'{path}'")
+    except SrosError as error:
+        yield UNREADABLE.found(f"{role} CA key", f"{error.what}. {error.why}", str(path))
+        return
+    yield CA_KEY_PLAIN.found(f"{role} CA key", "it has no passphrase", str(path))
+    if not same_key(certificate, key):
+        text = f"'{path.name}' is not the key of '{ca_certificate(role)}'"
+        yield CA_MISMATCH.found(f"{role} CA", text, str(path))
+
+
+def _one_for_both(keystore: OpenedKeystore) -> Iterator[Finding]:
+    found = [chain[0] for chain in keystore.authorities.values()]
+    if len(found) == 2 and found[0].public_key() == found[1].public_key():
+        text = f"{subject_text(found[0].subject)} does both jobs"
+        settings = keystore.settings
+        chosen = settings is not None and not settings.separate_authorities
+        yield ONE_AUTHORITY.found(
+            "the CAs",
+            text,
+            keystore.shown(ca_certificate(IDENTITY)),
+            accepted=f"template {settings.name}" if settings and chosen else "",
+        )
+
+
+def _revocation_list(keystore: OpenedKeystore) -> Iterator[Finding]:
+    crl = keystore.crl
+    if crl is None:
+        return
+    file = keystore.shown(CRL)
+    if crl.next_update - keystore.now < _LIST_SOON:
+        text = f"it ends at {iso(crl.next_update)}, and DDS then refuses everybody"
+        yield CRL_ENDS.found("revocation list", text, file)
+    identity = keystore.authorities.get(IDENTITY, ())
+    if identity and not any(signed_by(crl.list, each) for each in identity):
+        yield CRL_ISSUER.found("revocation list", "no identity CA of the keystore signed it", file)

@@ -1,0 +1,230 @@
+"""Enclaves that load today: what ends soon, does not fit together, or is open to all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import datetime, timedelta
+
+from cryptography import x509
+
+from sros_tool.checks.keystores.authorities import key_findings
+from sros_tool.checks.keystores.loading import check_loading
+from sros_tool.checks.keystores.opened import OpenedEnclave
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.dds.permissions import Grant
+from sros_tool.keystore.layout import REQUEST
+from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
+from sros_tool.validity import BACKDATE, Span, Window, iso
+
+ENDS_SOON = Kind(
+    "enclave.ends-soon",
+    WARNING,
+    "a certificate or permissions that end soon",
+    "From then on the node does not start any more; on Cyclone DDS a running one stops.",
+    "Fast DDS 2.14.5 (at start), Cyclone DDS 0.10.2 (timer).",
+    "Run `sros renew ROOT NAME`, and export the enclave again.",
+)
+OUTLIVES_CA = Kind(
+    "enclave.outlives-ca",
+    WARNING,
+    "a certificate that is valid for longer than its CA",
+    "It ends with the CA, whatever it says itself.",
+    "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
+    "Plan by the end of the CA, or renew the enclave after `sros rotate_ca`.",
+)
+PERMISSIONS_OUTLIVE = Kind(
+    "enclave.permissions-outlive",
+    WARNING,
+    "permissions that are valid for longer than the certificate",
+    "A later certificate with the same subject can be used with them, whatever was changed since.",
+    "ros2/sros2 issue 275; DDS-Security 1.1, 9.4.1.3.",
+    "Run `sros renew ROOT NAME`, which signs them for the life of the certificate at most.",
+)
+NAME_MISMATCH = Kind(
+    "enclave.name-mismatch",
+    WARNING,
+    "a certificate with the name of another enclave",
+    "DDS does not ask where a certificate lies. The files of two enclaves were mixed up, and the "
+    "node has the rights of the other one.",
+    "rcl 9 (security.c); ros2/sros2 (CN is the name of the enclave).",
+    "Restore the files of this enclave, or make it anew.",
+)
+IS_A_CA = Kind(
+    "enclave.certificate-is-ca",
+    ERROR,
+    "an enclave whose certificate may issue others",
+    "Whoever has its key can make identities that every node accepts.",
+    "RFC 5280, 4.2.1.9.",
+    "Revoke it, and make the enclave anew.",
+)
+NOT_UNIQUE = Kind(
+    "enclave.subject-not-unique",
+    WARNING,
+    "a subject without the part that makes it unique",
+    "The keystore gives every certificate such a part, so that neither permissions of another "
+    "enclave nor earlier ones fit; this certificate is older, or from elsewhere.",
+    "Cyclone DDS 0.10.2 (subsets of subjects); ros2/sros2 issue 275; measured on both vendors.",
+    "Run `sros renew ROOT NAME`.",
+)
+LONG_PERMISSIONS = Kind(
+    "enclave.long-permissions",
+    WARNING,
+    "permissions for years, for a subject that stays the same",
+    "Permissions that were replaced stay valid until they expire, for whoever kept a copy.",
+    "ros2/sros2 issue 275; DDS-Security 1.1, 9.4.1.3 (there is no revocation of permissions).",
+    "Use the template production, whose subjects change with every renewal, or shorter ones.",
+)
+EVERYTHING = Kind(
+    "keystore.allow-everything",
+    WARNING,
+    "an enclave that may do everything",
+    "It is authenticated and encrypted, and can command every node all the same.",
+    "ros2/sros2 0.13 grants this to every enclave without a policy.",
+    "Give it a policy, with `sros create_permission ROOT NAME POLICY_FILE`.",
+)
+XML_DIFFERS = Kind(
+    "enclave.xml-differs",
+    WARNING,
+    "permissions.xml says something else than what is signed",
+    "DDS loads permissions.p7s. Somebody changed the readable copy, and it was never signed.",
+    "DDS-Security 1.1, 9.4.1.3; rcl 9 (security.c).",
+    "Sign what is meant with `sros create_permission ROOT NAME POLICY_FILE`.",
+)
+CRL_MISSING = Kind(
+    "enclave.crl-missing",
+    ERROR,
+    "an enclave without the revocation list of its keystore",
+    "Its node goes on talking to enclaves that were revoked.",
+    "rmw_dds_common (crl.pem), since ROS 2 Galactic.",
+    "Run `sros crl ROOT --refresh`, and export the enclave again.",
+)
+WAITS = Kind(
+    "enclave.waits-for-answer",
+    NOTE,
+    "an enclave whose request was not answered yet",
+    "It has a key, and no certificate.",
+    "sros: create_request, sign_request, import.",
+    "Answer it with `sros sign_request`, and put the answer in place with `sros import`.",
+)
+
+KINDS = by_id(
+    ENDS_SOON, OUTLIVES_CA, PERMISSIONS_OUTLIVE, NAME_MISMATCH, IS_A_CA, NOT_UNIQUE,
+    LONG_PERMISSIONS, EVERYTHING, XML_DIFFERS, CRL_MISSING, WAITS,
+)  # fmt: skip
+
+_SOON = timedelta(days=30)
+_LONG = timedelta(days=2 * 366)
+_EVERY_TOPIC = frozenset({"*", "rt/*"})
+
+
+def check_enclave(enclave: OpenedEnclave) -> Iterator[Finding]:
+    """An enclave by itself."""
+    if (enclave.folder / REQUEST).exists() and not (enclave.folder / "cert.pem").exists():
+        yield WAITS.found(enclave.name, "its certificate is missing", enclave.file(REQUEST))
+        return
+    yield from check_loading(enclave)
+    grant = grant_of(enclave)
+    if certificate := enclave.state.certificate:
+        yield from _certificate(enclave, certificate)
+        yield from _ends(enclave, certificate, grant)
+    if grant:
+        yield from _rights(enclave, grant)
+    yield from _copies(enclave)
+
+
+def grant_of(enclave: OpenedEnclave) -> Grant | None:
+    """The grant that is for the certificate of the enclave."""
+    state = enclave.state
+    if not (state.certificate and state.permissions):
+        return None
+    subject = subject_text(state.certificate.subject)
+    return next((each for each in state.permissions.grants if each.subject == subject), None)
+
+
+def _certificate(enclave: OpenedEnclave, certificate: x509.Certificate) -> Iterator[Finding]:
+    name, file = enclave.name, enclave.file("cert.pem")
+    if common_name_of(certificate.subject) != name:
+        text = f"it is of {subject_text(certificate.subject)}"
+        yield NAME_MISMATCH.found(name, text, file)
+    yield from key_findings(certificate, name, file)
+    for extension in certificate.extensions:
+        value = extension.value
+        if isinstance(value, x509.BasicConstraints) and value.ca:
+            yield IS_A_CA.found(name, "its BasicConstraints say CA:TRUE", file)
+    ca = enclave.state.identity_ca
+    if ca and certificate.not_valid_after_utc > ca.not_valid_after_utc:
+        text = (
+            f"it says {iso(certificate.not_valid_after_utc)}, the CA {iso(ca.not_valid_after_utc)}"
+        )
+        yield OUTLIVES_CA.found(name, text, file)
+    settings = enclave.keystore.settings
+    if settings and settings.unique_subject and len(certificate.subject.rdns) < 2:
+        text = f"it is for {subject_text(certificate.subject)} alone"
+        yield NOT_UNIQUE.found(name, text, file)
+
+
+def _ends(
+    enclave: OpenedEnclave, certificate: x509.Certificate, grant: Grant | None
+) -> Iterator[Finding]:
+    now, validity = enclave.keystore.now, validity_of(certificate)
+    windows = [("cert.pem", "the certificate", validity)]
+    if grant:
+        windows.append(("permissions.p7s", "the permissions", grant.validity))
+        if grant.validity.not_after > validity.not_after:
+            text = f"they end at {grant.not_after}, the certificate at {iso(validity.not_after)}"
+            file = enclave.file("permissions.p7s")
+            yield PERMISSIONS_OUTLIVE.found(enclave.name, text, file)
+    for file, what, window in windows:
+        if window.contains(now) and _ends_soon(window, now):
+            verb = "ends" if what == "the certificate" else "end"
+            text = f"{what} {verb} at {iso(window.not_after)}"
+            yield ENDS_SOON.found(enclave.name, text, enclave.file(file))
+
+
+def _ends_soon(window: Window, now: datetime) -> bool:
+    """Within 30 days; what lives for less than 90, within its last third."""
+    return window.not_after - now < min(_SOON, (window.not_after - window.not_before) / 3)
+
+
+def _rights(enclave: OpenedEnclave, grant: Grant) -> Iterator[Finding]:
+    file, settings = enclave.file("permissions.p7s"), enclave.keystore.settings
+    allowed = [rule for rule in grant.rules if rule.allow]
+    wide = [
+        {topic for criteria in criterias for topic in criteria.topics} & _EVERY_TOPIC
+        for criterias in (
+            [each for rule in allowed for each in rule.publish],
+            [each for rule in allowed for each in rule.subscribe],
+        )
+    ]
+    if all(wide) or (grant.default_allow and not any(not rule.allow for rule in grant.rules)):
+        chosen = settings is not None and settings.default_permissions == "everything"
+        accepted = f"template {settings.name}" if settings and chosen else ""
+        text = "it may publish and subscribe every topic"
+        yield EVERYTHING.found(enclave.name, text, file, accepted=accepted)
+    unique = "," in grant.subject or "+" in grant.subject
+    window = grant.validity
+    length = window.not_after - window.not_before
+    if length > _LONG and not unique:
+        chosen = settings is not None and _is_as_long(settings.permissions_validity, length)
+        accepted = f"template {settings.name}" if settings and chosen else ""
+        text = f"they are valid from {iso(window.not_before)} to {iso(window.not_after)}"
+        yield LONG_PERMISSIONS.found(enclave.name, text, file, accepted=accepted)
+
+
+def _is_as_long(chosen: Span, length: timedelta) -> bool:
+    """Whether a keystore chose permissions of that length; what has fixed ends was chosen too."""
+    return not isinstance(chosen, timedelta) or length <= chosen + BACKDATE
+
+
+def _copies(enclave: OpenedEnclave) -> Iterator[Finding]:
+    xml, signed = enclave.folder / "permissions.xml", enclave.state.permissions_document
+    if signed and xml.is_file() and _plain(xml.read_bytes()) != _plain(signed):
+        text = "permissions.xml is not what permissions.p7s holds"
+        yield XML_DIFFERS.found(enclave.name, text, enclave.file("permissions.xml"))
+    if enclave.keystore.crl and not (enclave.folder / "crl.pem").exists():
+        text = "crl.pem is missing"
+        yield CRL_MISSING.found(enclave.name, text, str(enclave.folder))
+
+
+def _plain(document: bytes) -> bytes:
+    return document.replace(b"\r\n", b"\n").strip()

@@ -1,0 +1,235 @@
+"""The files of a keystore as files: who can read them, where links lead, what does not belong."""
+
+from __future__ import annotations
+
+import os
+import re
+import stat
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+
+from sros_tool.checks.keystores.opened import OpenedKeystore
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.keystore.layout import (
+    ENCLAVES,
+    OPTIONAL_FILES,
+    PRIVATE,
+    PUBLIC,
+    REQUEST,
+    REQUIRED_FILES,
+    REVOKED,
+    SETTINGS,
+)
+from sros_tool.keystore.ledger import LEDGER
+from sros_tool.keystore.rotation import RETIRED, ROTATION
+from sros_tool.keystore.transaction import STAGE
+
+KEY_READABLE = Kind(
+    "keystore.key-readable",
+    ERROR,
+    "a private key that others can read",
+    "Who reads it is that enclave, or with the key of a CA any enclave. Neither rcl nor DDS looks "
+    "at modes, and ros2/sros2 makes keys with 0644.",
+    "ros2/sros2 0.13; ros2-security contract: file modes are checked by nobody.",
+    "Run `chmod 600` on it. If strangers had access, revoke the enclave.",
+)
+WORLD_WRITABLE = Kind(
+    "keystore.world-writable",
+    ERROR,
+    "a file or folder that everybody can change",
+    "Who can replace certificates of CAs, links or documents decides whom a node trusts.",
+    "POSIX modes; CWE-732.",
+    "Run `chmod o-w` on it.",
+)
+FOLDER_OPEN = Kind(
+    "keystore.folder-open",
+    WARNING,
+    "a folder of keys that others may enter",
+    "A key that is written there with a mode too wide, by whatever tool, is readable at once.",
+    "ros2/sros2 0.13 makes private/ with 0755; sros with 0700.",
+    "Run `chmod 700` on it.",
+)
+LINK_DANGLING = Kind(
+    "keystore.link-dangling",
+    ERROR,
+    "a link to nothing",
+    "What it stands for is missing.",
+    "rcl 9 (security.c) follows links.",
+    "Restore the file that it names, or remove the link.",
+)
+LINK_ABSOLUTE = Kind(
+    "keystore.link-absolute",
+    WARNING,
+    "a link with an absolute path",
+    "It breaks as soon as the keystore is moved, copied to a robot, or mounted in a container.",
+    "ros2/sros2 keystore layout (relative links).",
+    "Replace it by a relative link, with `ln -sr`.",
+)
+LINK_OUTSIDE = Kind(
+    "keystore.link-outside",
+    WARNING,
+    "a link that leads out of the keystore",
+    "The file is not copied or backed up with the keystore, and whoever owns it there can change "
+    "it.",
+    "CWE-59.",
+    "Put the file itself into the keystore.",
+)
+INTERRUPTED = Kind(
+    "keystore.transaction-left",
+    WARNING,
+    "a write that was interrupted",
+    "What DDS loads is whole, old or new; the rest waits for the next verb that writes.",
+    "sros: keystore/transaction.py.",
+    "Run any verb of sros that writes, such as `sros create_enclave`; it completes or undoes it.",
+)
+STRAY_KEY = Kind(
+    "keystore.stray-key",
+    WARNING,
+    "a private key where none belongs",
+    "It is a copy, perhaps of a backup, that nobody looks after.",
+    "ROS 2 keystore layout: private/*.pem and enclaves/*/key.pem only.",
+    "Move it to a safe place, or delete it.",
+)
+CA_KEY_ON_ROBOT = Kind(
+    "keystore.ca-key-on-robot",
+    ERROR,
+    "the key of a CA among what was exported for a robot",
+    "Who breaks into the robot can make any enclave, with any rights.",
+    "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 5.3.",
+    "Delete it there; if strangers had access, replace the CA (`sros rotate_ca`).",
+)
+UNKNOWN_FILE = Kind(
+    "keystore.unknown-file",
+    NOTE,
+    "a file that is not part of a keystore",
+    "It is left over, or somebody's notes; nothing reads it.",
+    "ROS 2 keystore layout.",
+    "Delete it, or keep it elsewhere.",
+)
+
+KINDS = by_id(
+    KEY_READABLE, WORLD_WRITABLE, FOLDER_OPEN, LINK_DANGLING, LINK_ABSOLUTE, LINK_OUTSIDE,
+    INTERRUPTED, STRAY_KEY, CA_KEY_ON_ROBOT, UNKNOWN_FILE,
+)  # fmt: skip
+
+_OF_KEYS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
+_KEY_MARK = b"PRIVATE KEY-----"
+_MOST_READ = 65536
+_KNOWN = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml", REQUEST, "governance.xml")
+_TOP = (SETTINGS, LEDGER, ROTATION)
+_KNOWN_ANYWHERE = re.compile(
+    r".*\.(?:cert|key|crl)\.pem\Z|.*\.p11\Z|.*\.srl\Z|index\.txt.*|serial.*"
+)
+
+
+def check_files(keystore: OpenedKeystore) -> Iterator[Finding]:
+    """Every file, folder and link of a keystore, without reading what DDS reads."""
+    root = os.fspath(keystore.root)
+    real_root = os.path.realpath(root)
+    keys = {os.path.join(root, ENCLAVES, name[1:], "key.pem") for name in keystore.names}
+    keys |= {os.path.join(root, ENCLAVES, "key.pem")}
+    home = keystore.is_home
+    for parent, folders, files in os.walk(root):
+        folders.sort()
+        if STAGE in folders:
+            folders.remove(STAGE)
+            text = "an interrupted transaction waits to be completed or undone"
+            yield INTERRUPTED.found(root, text, os.path.join(parent, STAGE))
+        for name in folders:
+            yield from _folder(os.path.join(parent, name), root, home)
+        inside = os.path.relpath(parent, root)
+        for name in sorted(files):
+            path = os.path.join(parent, name)
+            info = os.lstat(path)
+            if stat.S_ISLNK(info.st_mode):
+                yield from _link(Path(path), real_root)
+                continue
+            yield from _mode(path, info.st_mode)
+            if path in keys:
+                yield from _key_mode(path, info.st_mode)
+            elif name in _KNOWN and inside.startswith(ENCLAVES) and name != "key.pem":
+                continue
+            else:
+                yield from _other(path, inside, info, home)
+
+
+def _folder(path: str, root: str, home: bool) -> Iterator[Finding]:
+    mode = os.lstat(path).st_mode
+    if stat.S_ISLNK(mode):
+        yield from _link(Path(path), os.path.realpath(root))
+        return
+    yield from _mode(path, mode)
+    inside = Path(path).relative_to(root)
+    # Below the top folder nobody gets in where that is closed.
+    asked = inside.parts[0] in _OF_KEYS and (len(inside.parts) == 1 or not home)
+    if asked and mode & 0o077 and not mode & stat.S_IWOTH:
+        yield FOLDER_OPEN.found(path, f"its mode is {stat.S_IMODE(mode):04o}", path)
+
+
+def _mode(path: str, mode: int) -> Iterator[Finding]:
+    if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
+        yield WORLD_WRITABLE.found(path, f"its mode is {stat.S_IMODE(mode):04o}", path)
+
+
+def _key_mode(path: str, mode: int) -> Iterator[Finding]:
+    if mode & 0o077:
+        text = f"others can read the private key '{path}' (mode {stat.S_IMODE(mode):04o})"
+        yield KEY_READABLE.found(path, text, path, remedy=f"Run `chmod 600 '{path}'`.")
+
+
+def _link(link: Path, real_root: str) -> Iterator[Finding]:
+    target, shown = link.readlink(), str(link)
+    if not link.exists():
+        # That an enclave lacks what it needs is told of the enclave.
+        if not (link.name in REQUIRED_FILES and ENCLAVES in link.parts):
+            yield LINK_DANGLING.found(shown, f"it leads to '{target}'", shown)
+        return
+    if target.is_absolute():
+        yield LINK_ABSOLUTE.found(shown, f"it leads to '{target}'", shown)
+    real = _real(link, target)
+    if real != real_root and not real.startswith(real_root + os.sep):
+        yield LINK_OUTSIDE.found(shown, f"it leads to '{real}'", shown)
+
+
+_real_folder = lru_cache(maxsize=64)(os.path.realpath)
+
+
+def _real(link: Path, target: Path) -> str:
+    """Where a link leads in the end; most lead into one of few folders.
+
+    The folder of the link is a real one, so its path can be shortened before it is followed.
+    """
+    end = Path(os.path.normpath(link.parent / target))
+    return os.path.realpath(link) if end.is_symlink() else f"{_real_folder(end.parent)}/{end.name}"
+
+
+def _other(path: str, inside: str, info: os.stat_result, home: bool) -> Iterator[Finding]:
+    """A file that is not one of an enclave's: a key in its place or out of it, or anything."""
+    place = inside.partition(os.sep)[0]
+    if info.st_size <= _MOST_READ and _holds_key(path):
+        yield from _key_mode(path, info.st_mode)
+        if place in (PRIVATE, REVOKED, RETIRED) and home:
+            return
+        if place == PRIVATE or not home:
+            text = "a private key that is not that of an enclave"
+            yield CA_KEY_ON_ROBOT.found(path, text, path)
+        else:
+            yield STRAY_KEY.found(path, "a private key out of place", path)
+        return
+    name = Path(path).name
+    known = (
+        (inside == "." and name in _TOP)
+        or (place in (PUBLIC, PRIVATE) and _KNOWN_ANYWHERE.match(name))
+        or (place == REVOKED and name in _KNOWN)
+        or place == RETIRED
+    )
+    if not known:
+        yield UNKNOWN_FILE.found(path, "nothing of ROS 2 or sros has this name there", path)
+
+
+def _holds_key(path: str) -> bool:
+    try:
+        return _KEY_MARK in Path(path).read_bytes()
+    except OSError:
+        return False

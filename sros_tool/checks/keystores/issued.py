@@ -1,0 +1,217 @@
+"""What the enclaves of a keystore are to each other, to its ledger, and to the policies."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TypeVar
+
+from cryptography.hazmat.primitives import hashes, serialization
+
+from sros_tool.checks.keystores.enclaves import grant_of
+from sros_tool.checks.keystores.governance import DIFFERS as GOVERNANCE_DIFFERS
+from sros_tool.checks.keystores.opened import OpenedEnclave, OpenedKeystore
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.checks.policies.portability import ENCLAVE_NAMES
+from sros_tool.dds.portable import mistaken_names, some_pairs
+from sros_tool.keystore.layout import enclave_folder
+from sros_tool.policy.diff import compare
+from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.translate import grant_rights
+
+SERIAL_TWICE = Kind(
+    "keystore.serial-twice",
+    ERROR,
+    "two certificates of one CA with the same serial number",
+    "Revoking one revokes the other.",
+    "RFC 5280, 4.1.2.2.",
+    "Run `sros renew ROOT NAME` for one of them.",
+)
+KEY_TWICE = Kind(
+    "keystore.key-twice",
+    ERROR,
+    "two enclaves with the same key",
+    "Who has one of them is the other one, too.",
+    "NIST SP 800-57 part 1, 5.2; DDS-Security 1.1, 9.3.1.",
+    "Run `sros renew ROOT NAME --new-key` for one of them.",
+)
+UNEXPLAINED = Kind(
+    "keystore.not-in-ledger",
+    WARNING,
+    "a certificate or document that the keystore never issued",
+    "It came from elsewhere, or the ledger was put back to an earlier state.",
+    "sros: ledger.jsonl.",
+    "Find out where it is from; `sros renew ROOT NAME` issues both anew.",
+)
+OLD_PERMISSIONS = Kind(
+    "enclave.old-permissions",
+    ERROR,
+    "permissions that were replaced are in place again",
+    "Their signature holds, and where subjects stay the same DDS takes them until they expire. "
+    "Perhaps a backup was restored, or somebody wants back a right that was taken away.",
+    "ros2/sros2 issue 275; sros: ledger.jsonl.",
+    "Sign what is meant, with `sros create_permission ROOT NAME POLICY_FILE` or `sros renew`.",
+)
+STALE = Kind(
+    "enclave.stale-permissions",
+    WARNING,
+    "permissions that are not what the policy says",
+    "The policy was changed and not signed since, or the permissions were made from another one.",
+    "sros: the rights of both, in ROS terms.",
+    "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`; `sros diff_policy` shows all.",
+)
+NOT_IN_POLICY = Kind(
+    "enclave.not-in-policy",
+    NOTE,
+    "an enclave that no policy speaks of",
+    "Its rights cannot be compared with anything.",
+    "sros: --policy.",
+    "Write a policy for it, or revoke it if nobody needs it.",
+)
+NOT_IN_KEYSTORE = Kind(
+    "keystore.enclave-missing",
+    WARNING,
+    "an enclave of the policy that the keystore does not have",
+    "A node that is started in it fails.",
+    "rcl 9 (security.c).",
+    "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`.",
+)
+
+KINDS = by_id(
+    SERIAL_TWICE, KEY_TWICE, UNEXPLAINED, OLD_PERMISSIONS, STALE, NOT_IN_POLICY, NOT_IN_KEYSTORE
+)
+
+Key = TypeVar("Key")
+
+_MANY = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Traits:
+    """What is compared among enclaves: small, for it is carried between processes."""
+
+    name: str
+    serial: int
+    issuer: str
+    key: bytes
+    certificate: str
+    permissions: str
+    governance: str
+    unique: bool
+
+
+def traits_of(enclave: OpenedEnclave) -> Traits | None:
+    """Those of an enclave that has a certificate."""
+    certificate = enclave.state.certificate
+    if certificate is None:
+        return None
+    key = certificate.public_key().public_bytes(
+        serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
+    )
+    message = enclave.state.files.get("permissions.p7s")
+    return Traits(
+        enclave.name,
+        certificate.serial_number,
+        certificate.issuer.rfc4514_string(),
+        hashlib.sha256(key).digest(),
+        certificate.fingerprint(hashes.SHA256()).hex(),
+        hashlib.sha256(message).hexdigest() if message else "",
+        hashlib.sha256(repr(enclave.state.governance).encode()).hexdigest()
+        if enclave.state.governance and not enclave.keystore.governance
+        else "",
+        len(certificate.subject.rdns) > 1,
+    )
+
+
+def check_issued(keystore: OpenedKeystore, all_traits: Sequence[Traits]) -> Iterator[Finding]:
+    """All enclaves together."""
+    for (_, serial), names in _twice(((t.issuer, t.serial), t.name) for t in all_traits):
+        yield SERIAL_TWICE.found(", ".join(names), f"the serial number is {serial:x}")
+    for _, names in _twice((each.key, each.name) for each in all_traits):
+        yield KEY_TWICE.found(", ".join(names), "their certificates are for one key")
+    # A part of its own in the subject keeps it from being a part of another.
+    plain = {each.name for each in all_traits if not each.unique}
+    names = [each.name for each in all_traits]
+    pairs = [(inner, outer) for inner, outer in mistaken_names(names) if inner in plain]
+    if pairs:
+        text = f"Cyclone DDS takes {some_pairs(pairs)}"
+        yield ENCLAVE_NAMES.found(pairs[0][0], text, str(keystore.root))
+    yield from _exported_governance(keystore, all_traits)
+    yield from _ledger(keystore, all_traits)
+    if keystore.policies:
+        wanted = {each.path for policy in keystore.policies for each in policy.enclaves}
+        for name in sorted(wanted.difference(keystore.names)):
+            yield NOT_IN_KEYSTORE.found(name, "the keystore does not have it", str(keystore.root))
+
+
+def _twice(pairs: Iterable[tuple[Key, str]]) -> Iterator[tuple[Key, list[str]]]:
+    found: dict[Key, list[str]] = defaultdict(list)
+    for key, name in pairs:
+        found[key].append(name)
+    return ((key, names) for key, names in found.items() if len(names) > 1)
+
+
+def _exported_governance(
+    keystore: OpenedKeystore, all_traits: Sequence[Traits]
+) -> Iterator[Finding]:
+    """Exported enclaves have copies of the governance, and each may be from another time."""
+    copies = [each for each in all_traits if each.governance]
+    for each in copies[1:]:
+        if each.governance != copies[0].governance:
+            file = f"{keystore.root}/{enclave_folder(each.name)}/governance.p7s"
+            text = f"its governance is not that of {copies[0].name}"
+            yield GOVERNANCE_DIFFERS.found(each.name, text, file)
+
+
+def _ledger(keystore: OpenedKeystore, all_traits: Sequence[Traits]) -> Iterator[Finding]:
+    if not keystore.ledger:
+        return
+    known = {entry.sha256 for entry in keystore.ledger}
+    latest = {
+        entry.enclave: entry.sha256 for entry in keystore.ledger if entry.what == "permissions"
+    }
+    for each in all_traits:
+        place = f"{keystore.root}/{enclave_folder(each.name)}"
+        for file, digest in (
+            ("cert.pem", each.certificate),
+            ("permissions.p7s", each.permissions),
+        ):
+            if digest and digest not in known:
+                text = f"{file} is not in the ledger"
+                yield UNEXPLAINED.found(each.name, text, f"{place}/{file}")
+        newest = latest.get(each.name)
+        if newest and each.permissions in known and each.permissions != newest:
+            text = "the ledger has permissions that were signed later"
+            yield OLD_PERMISSIONS.found(each.name, text, f"{place}/permissions.p7s")
+
+
+def check_policy(enclave: OpenedEnclave, wanted: dict[str, frozenset[Right]]) -> Iterator[Finding]:
+    """The rights of an enclave beside those that the policies state for it."""
+    if not wanted:
+        return
+    name, grant = enclave.name, grant_of(enclave)
+    if name not in wanted:
+        yield NOT_IN_POLICY.found(name, "no policy that was given has it", str(enclave.folder))
+        return
+    if grant is None:
+        return
+    difference = compare(wanted[name], grant_rights(name, grant))
+    if difference:
+        shown = [f"{sign} {right.qualifier} {right.told()}" for sign, right in difference.lines()]
+        more = f" and {len(shown) - _MANY} more" if len(shown) > _MANY else ""
+        text = f"policy (-) and permissions (+) differ: {'; '.join(shown[:_MANY])}{more}"
+        yield STALE.found(name, text, enclave.file("permissions.p7s"))
+
+
+def wanted_rights(keystore: OpenedKeystore) -> dict[str, frozenset[Right]]:
+    """The rights of every enclave that the policies speak of."""
+    found: dict[str, frozenset[Right]] = {}
+    for policy in keystore.policies:
+        rights = defaultdict(set)
+        for right in policy_rights(policy):
+            rights[right.enclave].add(right)
+        for enclave in policy.enclaves:
+            found[enclave.path] = frozenset(rights[enclave.path])
+    return found

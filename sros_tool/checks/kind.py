@@ -1,0 +1,138 @@
+"""What a check can find: a kind of finding is data, and a finding says where and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+
+class Severity(IntEnum):
+    """How bad it is; the words of `--severity` and `--fail-on` are the names in small letters."""
+
+    NOTE = 1
+    """Worth knowing; it may well be meant so."""
+    WARNING = 2
+    """It works today, and is a weakness, or will break."""
+    ERROR = 3
+    """Something does not work, or is not protected, although it was meant to be."""
+
+    @property
+    def word(self) -> str:
+        """The name as people write it."""
+        return self.name.lower()
+
+
+NOTE, WARNING, ERROR = Severity.NOTE, Severity.WARNING, Severity.ERROR
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of finding.
+
+    ``id`` is stable, a family and a name with a dot between them; ``title`` a clause; ``why``,
+    ``source`` and ``remedy`` are sentences.  ``source`` says where the rule comes from: a
+    section of a specification, a vendor and version, ROS.  ``group`` is a further id that stands
+    for several kinds.  ``vendors`` are the DDS vendors that it concerns, where these are not all.
+    """
+
+    id: str
+    severity: Severity
+    title: str
+    why: str
+    source: str
+    remedy: str
+    group: str = ""
+    vendors: tuple[str, ...] = ()
+
+    @property
+    def family(self) -> str:
+        """The part before the dot."""
+        return self.id.partition(".")[0]
+
+    def found(
+        self,
+        subject: str,
+        text: str,
+        file: str = "",
+        line: int | None = None,
+        remedy: str = "",
+        accepted: str = "",
+    ) -> Finding:
+        """A finding of this kind."""
+        return Finding(self, subject, text, file, line or None, remedy, accepted)
+
+    def as_json(self) -> dict[str, Any]:
+        """The kind as `sros check --list --json` shows it."""
+        return {
+            "id": self.id,
+            "severity": self.severity.word,
+            "title": self.title,
+            "why": self.why,
+            "source": self.source,
+            "remedy": self.remedy,
+            "vendors": list(self.vendors) or None,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that was found.
+
+    ``subject`` is what it is about (an enclave, a variable, a file); ``file`` is a path, or "";
+    ``line`` counts from 1.  ``text`` says why here, ``own_remedy`` what to do here, if that says
+    more than the kind does.  ``accepted`` names the choice by which its owner took it into
+    account: such a finding counts as a note.
+    """
+
+    kind: Kind
+    subject: str
+    text: str
+    file: str = ""
+    line: int | None = None
+    own_remedy: str = ""
+    accepted: str = ""
+
+    @property
+    def id(self) -> str:
+        """The id of its kind."""
+        return self.kind.id
+
+    @property
+    def severity(self) -> Severity:
+        """That of its kind, or `NOTE` where it was accepted."""
+        return NOTE if self.accepted else self.kind.severity
+
+    @property
+    def remedy(self) -> str:
+        """What to do."""
+        return self.own_remedy or self.kind.remedy
+
+    @property
+    def place(self) -> str:
+        """The file with its line, or else the subject."""
+        if not self.file:
+            return self.subject
+        return f"{self.file}:{self.line}" if self.line else self.file
+
+    def as_json(self) -> dict[str, Any]:
+        """The finding as `sros check --json` shows it."""
+        return {
+            "id": self.id,
+            "severity": self.severity.word,
+            "subject": self.subject,
+            "file": self.file or None,
+            "line": self.line,
+            "text": self.text,
+            "remedy": self.remedy,
+            "source": self.kind.source,
+            "accepted": self.accepted or None,
+        }
+
+
+def by_id(*kinds: Kind) -> Mapping[str, Kind]:
+    """A table of kinds by their ids, each of which is given once."""
+    table = {kind.id: kind for kind in kinds}
+    assert len(table) == len(kinds), "an id is given twice"
+    return table

@@ -1,0 +1,106 @@
+"""All kinds of findings, and which of them are wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+
+from sros_tool.checks.keystores import (
+    authorities,
+    documents,
+    enclaves,
+    governance,
+    issued,
+    loading,
+    vendors,
+)
+from sros_tool.checks.keystores import files as keystore_files
+from sros_tool.checks.kind import NOTE, WARNING, Finding, Kind, Severity, by_id
+from sros_tool.checks.policies import files, naming, nodes, portability, rules
+from sros_tool.checks.runtimes import host, variables
+from sros_tool.errors import UsageError
+
+_MODULES = (
+    files, rules, nodes, naming, portability,
+    keystore_files, authorities, loading, enclaves, documents, governance, issued, vendors,
+    variables, host,
+)  # fmt: skip
+
+KINDS: Mapping[str, Kind] = by_id(
+    *(kind for module in _MODULES for _, kind in sorted(module.KINDS.items()))
+)
+"""Every kind by its id."""
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Which findings are wanted.
+
+    With ``vendor``, what concerns others only is left out, and so is that vendors differ.
+    ``include`` and ``exclude`` hold ids, ids of groups, or patterns with ``*`` and ``?``; nothing
+    to include means all.  ``severity`` is the least that is shown.  ``strict`` takes back what
+    was accepted: a choice of the keystore's template counts like any other finding.
+
+    What a keystore's own settings chose openly, as one CA for both jobs by the template sros2,
+    is accepted: it counts as a note, and is named in one line where notes are not shown.  A
+    keystore without settings, of ros2/sros2, chose nothing, and gets every finding in full.
+    """
+
+    include: tuple[str, ...] = ()
+    exclude: tuple[str, ...] = ()
+    severity: Severity = WARNING
+    strict: bool = False
+    vendor: str = ""
+
+    def __post_init__(self) -> None:
+        for pattern in (*self.include, *self.exclude):
+            if not any(_matches(kind, pattern) for kind in KINDS.values()):
+                raise UsageError(
+                    f"no finding has the id {pattern!r}",
+                    "",
+                    "See `sros check --list`; patterns are written as 'policy.*'.",
+                )
+
+    def wants(self, kind: Kind) -> bool:
+        """Whether findings of that kind are wanted, if they are severe enough."""
+        included = not self.include or any(_matches(kind, each) for each in self.include)
+        if self.vendor and kind.vendors and self.vendor not in kind.vendors:
+            return False
+        if self.vendor and kind is vendors.DIFFER:
+            return False
+        return included and not any(_matches(kind, each) for each in self.exclude)
+
+    def choose(self, findings: Iterable[Finding]) -> Chosen:
+        """Those that are shown, the worst first, and those that were accepted and are not."""
+        wanted = [each for each in findings if self.wants(each.kind)]
+        if self.strict:
+            wanted = [replace(each, accepted="") for each in wanted]
+        shown = [each for each in wanted if each.severity >= self.severity]
+        shown.sort(key=lambda each: (-each.severity, each.kind.family))
+        hidden = [each for each in wanted if each.severity < self.severity]
+        accepted = [each for each in hidden if each.accepted and each.kind.severity > NOTE]
+        return Chosen(tuple(shown), tuple(accepted), len(hidden) - len(accepted))
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """The findings that are shown, those that were accepted, and the number of hidden ones."""
+
+    shown: tuple[Finding, ...]
+    accepted: tuple[Finding, ...]
+    hidden: int
+
+    def fails(self, level: Severity) -> bool:
+        """Whether something is shown that is at least as bad as that."""
+        return any(each.severity >= level for each in self.shown)
+
+
+def select_kinds(selection: Selection) -> Sequence[Kind]:
+    """The kinds that are wanted, in the order in which they are listed."""
+    return [kind for kind in KINDS.values() if selection.wants(kind)]
+
+
+def _matches(kind: Kind, pattern: str) -> bool:
+    names = (kind.id, kind.group)
+    return any(name and fnmatchcase(name, pattern) for name in names)

@@ -1,0 +1,86 @@
+"""Findings in SARIF 2.1.0 (OASIS), as code hosts and editors show them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from sros_tool.checks.kind import Finding, Kind
+
+VERSION = "2.1.0"
+SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
+_BASE = "SRCROOT"
+
+
+def sarif(
+    findings: Sequence[Finding], kinds: Sequence[Kind], *, version: str, base: Path
+) -> dict[str, Any]:
+    """A SARIF log of one run, in which ``kinds`` are the rules.
+
+    Paths are relative to the folder ``base``; a file without a line is told at its first one.
+    Accepted findings are there too, as suppressed.
+    """
+    rules = {kind.id: index for index, kind in enumerate(kinds)}
+    driver = {
+        "name": "sros",
+        "version": version,
+        "semanticVersion": version,
+        "rules": [_rule(kind) for kind in kinds],
+    }
+    run = {
+        "tool": {"driver": driver},
+        "columnKind": "unicodeCodePoints",
+        "originalUriBaseIds": {_BASE: {"uri": f"{base.absolute().as_uri()}/"}},
+        "results": [_result(each, rules[each.id], base) for each in findings],
+    }
+    return {"$schema": SCHEMA, "version": VERSION, "runs": [run]}
+
+
+def _rule(kind: Kind) -> dict[str, Any]:
+    return {
+        "id": kind.id,
+        "name": "".join(part.capitalize() for part in kind.id.replace(".", "-").split("-")),
+        "shortDescription": {"text": kind.title},
+        "fullDescription": {"text": kind.why},
+        "help": {"text": f"{kind.remedy}\n\nSource: {kind.source}"},
+        "defaultConfiguration": {"level": kind.severity.word},
+    }
+
+
+def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
+    result: dict[str, Any] = {
+        "ruleId": finding.id,
+        "ruleIndex": rule,
+        "level": finding.severity.word,
+        "message": {"text": f"{finding.subject}: {finding.text}. {finding.remedy}"},
+    }
+    if finding.file:
+        result["locations"] = [
+            {
+                "physicalLocation": {
+                    "artifactLocation": {
+                        "uri": quote(relative(finding.file, base)),
+                        "uriBaseId": _BASE,
+                    },
+                    "region": {"startLine": finding.line or 1},
+                }
+            }
+        ]
+    if finding.accepted:
+        result["suppressions"] = [
+            {"kind": "external", "status": "accepted", "justification": finding.accepted}
+        ]
+    return result
+
+
+def relative(file: str, base: Path) -> str:
+    """The path of ``file`` as seen from the folder ``base``, with "/" between its parts."""
+    path, start = (base / file).absolute(), base.absolute()
+    common = start
+    ups = 0
+    while not path.is_relative_to(common):
+        common = common.parent
+        ups += 1
+    return "/".join(("..",) * ups + path.relative_to(common).parts)

@@ -1,0 +1,90 @@
+"""Finds out what a path is, and checks it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime, tzinfo
+from pathlib import Path
+
+from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.kind import Finding
+from sros_tool.checks.policies.files import policy_file_findings
+from sros_tool.errors import DocumentError, SrosError
+from sros_tool.keystore.layout import ENCLAVES, REQUIRED_FILES, is_keystore
+from sros_tool.policy.model import Policy
+from sros_tool.xml import parse, read_bytes
+
+_OF_AN_ENCLAVE = (*REQUIRED_FILES, "permissions.xml", "crl.pem", "request.pem")
+_MANY = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class Circumstances:
+    """When and where something is checked; see `keystore_findings`."""
+
+    now: datetime
+    zone: tzinfo = UTC
+    domain: int | None = None
+    policies: tuple[Policy, ...] = ()
+
+
+def path_findings(path: Path, at: Circumstances) -> list[Finding]:
+    """What is found at a path: a policy, a keystore, an enclave, or a folder of policies.
+
+    Raises `DocumentError` for anything else.
+    """
+    if is_keystore(path):
+        return _keystore(path, at, None)
+    enclave = path if path.is_dir() else path.parent
+    if any((enclave / name).exists() for name in ("cert.pem", "key.pem", "permissions.p7s")) and (
+        path.is_dir() or path.name in _OF_AN_ENCLAVE
+    ):
+        root, name = _place_of(enclave)
+        return _keystore(root, at, name)
+    if path.is_dir():
+        policies = list(policies_below(path))
+        if policies:
+            return [finding for each in policies for finding in policy_file_findings(each)]
+        raise DocumentError(
+            f"'{path}' is neither a keystore nor an enclave, and holds no policy",
+            "It has no enclaves folder in use, no cert.pem, and no XML file that begins with "
+            "<policy>.",
+        )
+    read_bytes(path, "file")
+    return list(policy_file_findings(path))
+
+
+def policies_below(folder: Path) -> Iterator[Path]:
+    """The policy files in a folder and those below it, sorted; not the fragments they include."""
+    for path in sorted(folder.rglob("*.xml"))[:_MANY]:
+        try:
+            if parse(read_bytes(path, "file"), str(path)).tag == "policy":
+                yield path
+        except SrosError:
+            continue
+
+
+def _keystore(root: Path, at: Circumstances, only: str | None) -> list[Finding]:
+    return keystore_findings(
+        root,
+        now=at.now,
+        zone=at.zone,
+        domain=at.domain,
+        policies=at.policies,
+        only=None if only is None else (only,),
+    )
+
+
+def _place_of(folder: Path) -> tuple[Path, str]:
+    """The keystore that an enclave's folder lies in, and the name of the enclave."""
+    whole = Path(os.path.abspath(folder))  # noqa: PTH100 - a link is not followed to elsewhere
+    for above in (whole, *whole.parents):
+        if above.name == ENCLAVES:
+            return above.parent, f"/{'/'.join(whole.relative_to(above).parts)}"
+    raise DocumentError(
+        f"'{folder}' lies in no folder named {ENCLAVES}",
+        "rcl looks for an enclave below that, by its name.",
+        "Name the keystore, or the enclave's folder in it.",
+    )

@@ -1,0 +1,308 @@
+"""The verb `check`: named findings about policies, keystores, and the environment of nodes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from sros_tool.cli.common import PATH, json_option, keystore_from_environment, now, print_json
+from sros_tool.errors import UsageError
+
+if TYPE_CHECKING:
+    from sros_tool.checks.kind import Finding
+    from sros_tool.checks.registry import Chosen, Selection
+    from sros_tool.checks.targets import Circumstances
+
+_FAMILIES = ("policy", "keystore", "runtime")
+_LEVELS = click.Choice(["note", "warning", "error"])
+_SCHEMA = 1
+
+
+@click.command(
+    "check",
+    epilog="""\b
+Example:
+  $ sros check robot.xml keystore
+  robot.xml:12: error: a node that may not publish /rosout [policy.no-rosout]
+      /talker: node /talker may not publish /rosout
+      Allow <topics publish="ALLOW"><topic>/rosout</topic></topics>. ...
+  1 error
+  $ sros check keystore keystore --needs-renewal 30d || sros renew keystore --all-expiring 30d
+  $ sros check keystore --policy robot.xml --sarif > findings.sarif
+
+\b
+What the template of a keystore chose openly is accepted: it counts as a note, and is named in one
+line. --strict lets it count. Exit status: 1 if something of the level of --fail-on is shown.""",
+)
+@click.argument("targets", metavar="[policy|keystore|runtime] [PATH]...", nargs=-1, type=PATH)
+@click.option("--list", "as_list", is_flag=True, help="List all findings that there are.")
+@click.option("--include", metavar="ID", multiple=True, help="Only these; * and ? are wildcards.")
+@click.option("--exclude", metavar="ID", multiple=True, help="All but these.")
+@click.option(
+    "--severity",
+    type=_LEVELS,
+    default="warning",
+    show_default=True,
+    help="The least that is shown.",
+)
+@click.option(
+    "--fail-on",
+    type=click.Choice(["note", "warning", "error", "never"]),
+    default="warning",
+    show_default=True,
+    help="The least by which the exit status becomes 1.",
+)
+@click.option("--strict", is_flag=True, help="Let count what the template chose.")
+@click.option(
+    "--policy",
+    "policies",
+    type=PATH,
+    multiple=True,
+    metavar="FILE",
+    help="Compare the permissions of keystores with this policy.",
+)
+@click.option(
+    "--vendor",
+    type=click.Choice(["fastdds", "cyclonedds"]),
+    help="All nodes run this DDS; leave out what concerns others.",
+)
+@click.option("--domain", metavar="ID", help="The domain that enclaves have to join.")
+@click.option("--at", "moment", metavar="MOMENT", help="As if it were then, such as 2027-06-01.")
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(["text", "json", "sarif"]),
+    default="text",
+    show_default=True,
+    help="For people, programs, or code hosts.",
+)
+@json_option
+@click.option("--sarif", "as_sarif", is_flag=True, help="The same as --format sarif.")
+@click.option(
+    "--needs-renewal",
+    metavar="DURATION|PERCENT",
+    help="List only what ends within 30d, or of whose life 66% is over.",
+)
+def check(
+    targets: tuple[Path, ...],
+    as_list: bool,
+    include: tuple[str, ...],
+    exclude: tuple[str, ...],
+    severity: str,
+    fail_on: str,
+    strict: bool,
+    policies: tuple[Path, ...],
+    vendor: str | None,
+    domain: str | None,
+    moment: str | None,
+    form: str,
+    as_json: bool,
+    as_sarif: bool,
+    needs_renewal: str | None,
+) -> int:
+    """Find what is wrong or weak before a node starts.
+
+    PATH is a policy, a folder of policies, a keystore, or an enclave; the first word may say which
+    it has to be. Without one: the keystore of $ROS_SECURITY_KEYSTORE, and the runtime.
+    """
+    from sros_tool.checks.kind import Severity
+    from sros_tool.checks.registry import Selection
+
+    family, paths = _family(targets)
+    if needs_renewal is not None:
+        root = paths[0] if paths else keystore_from_environment()
+        return _needs_renewal(root, needs_renewal, as_json)
+    selection = Selection(include, exclude, Severity[severity.upper()], strict, vendor or "")
+    form = "json" if as_json else "sarif" if as_sarif else form
+    if as_list:
+        _print_list(selection, form)
+        return 0
+    at = _circumstances(domain, moment, policies)
+    found = [_shown(each) for each in _findings(family, paths, at)]
+    chosen = selection.choose(found)
+    {"json": _print_json, "sarif": _print_sarif, "text": _print_text}[form](chosen, selection)
+    return 1 if fail_on != "never" and chosen.fails(Severity[fail_on.upper()]) else 0
+
+
+def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:
+    """The family that the first word names, or "", and the paths."""
+    word = str(targets[0]) if targets else ""
+    if word in _FAMILIES:
+        if word == "runtime" and len(targets) > 1:
+            raise UsageError("the runtime is that of this machine", "", "Leave the path out.")
+        return word, targets[1:]
+    return "", targets
+
+
+def _circumstances(
+    domain: str | None, moment: str | None, policies: Sequence[Path]
+) -> Circumstances:
+    from sros_tool.checks.targets import Circumstances
+    from sros_tool.policy import read_policy
+    from sros_tool.runtime.environment import DOMAIN, domain_from
+    from sros_tool.validity import parse_iso
+
+    present = now()
+    zone = present.astimezone().tzinfo
+    assert zone is not None
+    if moment is not None:
+        try:
+            present = parse_iso(moment)
+        except ValueError as error:
+            raise UsageError(
+                f"{moment!r} is not a moment", "", "Write for example 2027-06-01T12:00:00Z."
+            ) from error
+    if domain == "":
+        raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
+    wanted = None if domain is None else domain_from({DOMAIN: domain})
+    return Circumstances(present, zone, wanted, tuple(read_policy(each) for each in policies))
+
+
+def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[Finding]:
+    from sros_tool.checks.keystores.keystore import keystore_findings
+    from sros_tool.checks.policies.files import policy_file_findings
+    from sros_tool.checks.targets import path_findings, policies_below
+    from sros_tool.keystore.layout import is_keystore
+
+    if family == "runtime":
+        return _runtime(at)
+    if family == "policy":
+        if not paths:
+            raise UsageError("no policy is named", "", "Name a file, or a folder of policies.")
+        files = [f for path in paths for f in (policies_below(path) if path.is_dir() else [path])]
+        return [finding for file in files for finding in policy_file_findings(file)]
+    if family == "keystore":
+        roots = paths or (keystore_from_environment(),)
+        return [
+            finding
+            for root in roots
+            for finding in keystore_findings(
+                root, now=at.now, zone=at.zone, domain=at.domain, policies=at.policies
+            )
+        ]
+    if paths:
+        every = (finding for path in paths for finding in path_findings(path, at))
+        return list(dict.fromkeys(every))
+    found = _runtime(at)
+    root = os.environ.get("ROS_SECURITY_KEYSTORE")
+    if root and is_keystore(Path(root)):
+        found += path_findings(Path(root), at)
+    return list(dict.fromkeys(found))
+
+
+def _runtime(at: Circumstances) -> list[Finding]:
+    from sros_tool.checks.runtimes.runtime import runtime_findings
+    from sros_tool.checks.runtimes.setting import Setting, running_processes
+    from sros_tool.runtime.stacks import rmw_implementations
+
+    environment = dict(os.environ)
+    if at.domain is not None:
+        environment["ROS_DOMAIN_ID"] = str(at.domain)
+    rmws = rmw_implementations(environment)
+    processes = tuple(running_processes())
+    return runtime_findings(Setting(environment, at.now, at.zone, processes, rmws))
+
+
+def _shown(finding: Finding) -> Finding:
+    """``finding`` with its file as seen from this folder, where it lies below."""
+    path = Path(finding.file)
+    if path.is_absolute() and path.is_relative_to(Path.cwd()):
+        return replace(finding, file=str(path.relative_to(Path.cwd())))
+    return finding
+
+
+# ── showing ────────────────────────────────────────────────────────────────────────────────
+
+
+def _print_text(chosen: Chosen, _selection: Selection) -> None:
+    for each in chosen.shown:
+        click.echo(f"{each.place}: {each.severity.word}: {each.kind.title} [{each.id}]")
+        subject = f"{each.subject}: " if each.subject not in (each.file, each.place) else ""
+        click.echo(f"    {subject}{each.text}{_by(each)}")
+        click.echo(f"    {each.remedy}")
+    for choice in dict.fromkeys(each.accepted for each in chosen.accepted):
+        kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
+        told = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
+        click.echo(f"accepted, as the {choice} chose it: {told}")
+    click.echo(_summary(chosen), err=True)
+
+
+def _by(finding: Finding) -> str:
+    return f" (chosen by the {finding.accepted})" if finding.accepted else ""
+
+
+def _summary(chosen: Chosen) -> str:
+    counts = _counts(chosen)
+    told = [f"{number} {word}{'s' * (number != 1)}" for word, number in counts.items() if number]
+    number = chosen.hidden
+    hidden = f" (not shown: {number} note{'s' * (number != 1)}, --severity note)" if number else ""
+    return f"{', '.join(told) or 'nothing found'}{hidden}"
+
+
+def _counts(chosen: Chosen) -> dict[str, int]:
+    words = [each.severity.word for each in chosen.shown]
+    return {word: words.count(word) for word in ("error", "warning", "note")}
+
+
+def _print_json(chosen: Chosen, _selection: Selection) -> None:
+    print_json(
+        {
+            "version": _SCHEMA,
+            "findings": [each.as_json() for each in chosen.shown],
+            "accepted": [each.as_json() for each in chosen.accepted],
+            "counts": {**_counts(chosen), "hidden": chosen.hidden},
+        }
+    )
+
+
+def _print_sarif(chosen: Chosen, selection: Selection) -> None:
+    from sros_tool import __version__
+    from sros_tool.checks.registry import select_kinds
+    from sros_tool.checks.sarif import sarif
+
+    kinds, findings = select_kinds(selection), (*chosen.shown, *chosen.accepted)
+    print_json(sarif(findings, kinds, version=__version__, base=Path.cwd()))
+
+
+def _print_list(selection: Selection, form: str) -> None:
+    from sros_tool.checks.registry import select_kinds
+
+    kinds = list(select_kinds(selection))
+    if form != "text":
+        print_json([each.as_json() for each in kinds])
+        return
+    width = max((len(each.id) for each in kinds), default=0)
+    for each in kinds:
+        click.echo(f"{each.id:{width}}  {each.severity.word:7}  {each.title}")
+
+
+def _needs_renewal(root: Path, text: str, as_json: bool) -> int:
+    from sros_tool.keystore.lifetime import describe_lifetime, parse_threshold, survey
+    from sros_tool.validity import iso
+
+    threshold, moment = parse_threshold(text), now()
+    found, unreadable = survey(root)
+    due = [each for each in found if each.due(threshold, moment)]
+    if as_json:
+        print_json(
+            [
+                {
+                    "enclave": each.name,
+                    "certificate_until": iso(each.certificate.not_after),
+                    "permissions_until": iso(each.permissions.not_after),
+                }
+                for each in due
+            ]
+            + [{"enclave": each.name, "problem": str(each.error)} for each in unreadable]
+        )
+    else:
+        for each in due:
+            click.echo(describe_lifetime(each, moment))
+        for other in unreadable:
+            click.echo(f"{other.name}  nobody can tell: {other.error}")
+    return 1 if due or unreadable else 0

@@ -1,0 +1,76 @@
+"""``sros check keystore`` as people run it: what it shows, accepts, and returns."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from harness import sros
+
+from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.registry import Selection
+
+NOW = datetime.now(UTC)
+
+
+def ids(root: Path, now: datetime = NOW) -> list[str]:
+    chosen = Selection().choose(keystore_findings(root, now=now))
+    return [each.id for each in chosen.shown]
+
+
+@pytest.mark.parametrize("template", ["sros2", "development", "production"])
+def test_nothing_is_found_in_what_sros_makes(template: str, tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", template).ok()
+    sros("create_enclave", root, "/a").ok()
+    ended = sros("check", "keystore", root).ok()
+    named = "keystore.one-authority" in ended.out
+    assert named == (template == "sros2")
+    assert sros("check", root, "--strict").status == (template != "production")
+
+
+def test_one_authority_that_nobody_chose(tmp_path: Path) -> None:
+    """A keystore of ros2/sros2 has no settings, so nothing in it counts as chosen."""
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", "sros2").ok()
+    (root / "sros.toml").unlink()
+    (root / "ledger.jsonl").unlink()
+    ended = sros("check", "keystore", root)
+    assert ended.status == 1
+    assert "keystore.one-authority" in ended.out
+
+
+def test_weaknesses_of_single_files(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root).ok()
+    sros("create_enclave", root, "/a", "/b").ok()
+    assert ids(root) == []
+    (root / "enclaves/a/key.pem").chmod(0o644)
+    assert ids(root) == ["keystore.key-readable"]
+    (root / "enclaves/b/cert.pem").unlink()
+    assert ids(root) == ["enclave.file-missing", "keystore.key-readable"]
+    words = ("check", root, "--json", "--include", "enclave.not-loadable")
+    found = json.loads(sros(*words).out)["findings"]
+    assert [each["id"] for each in found] == ["enclave.file-missing"]
+
+
+def test_a_revocation_list_that_ends(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root).ok()
+    sros("create_enclave", root, "/a", "/b").ok()
+    sros("revoke", root, "/b").ok()
+    assert ids(root) == []
+    assert "keystore.revocation-list-ends" in ids(root, NOW + timedelta(days=3649))
+
+
+def test_a_key_on_its_robot_is_no_fault(tmp_path: Path) -> None:
+    root, robot = tmp_path / "ks", tmp_path / "robot"
+    sros("create_keystore", root).ok()
+    sros("create_request", "/arm", robot).ok()
+    answer = tmp_path / "answer.tar.gz"
+    sros("sign_request", root, robot / "enclaves/arm/request.pem", "-o", answer).ok()
+    assert ids(root) == []
+    (root / "enclaves/arm/cert.pem").write_text("nonsense")
+    assert set(ids(root)) == {"enclave.certificate-malformed"}
