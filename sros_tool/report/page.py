@@ -1,0 +1,126 @@
+"""Writes the page: one HTML file with its script, its style and its data, that needs no network.
+
+The content security policy lets nothing run or load but the script and style that are in it, by
+their digests.  The data is JSON in which no letter can end the element that it stands in, and
+the script sets it as text only.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from dataclasses import asdict
+from datetime import datetime
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from sros_tool.policy.model import ALLOW
+from sros_tool.report.fold import Bundle, fold
+from sros_tool.report.picture import Picture
+from sros_tool.report.scene import Scene
+from sros_tool.validity import iso
+
+_ASSETS = Path(__file__).with_name("assets")
+_ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
+
+
+def render_page(picture: Picture, scenes: tuple[Scene, ...], now: datetime) -> str:
+    """The page of a picture with its scenes; ``now`` is when its findings were found."""
+    script, style = asset("view.js"), asset("view.css")
+    origins = ", ".join(f"{each.kind} {each.title}" for each in picture.origins)
+    made = f"{origins}. Findings are as of {iso(now)[:10]}."
+    return document(
+        f"{picture.title}: who may do what",
+        Template(asset("view.html")).substitute(title=escape(picture.title), made=escape(made)),
+        style,
+        script,
+        _data(picture, scenes),
+    )
+
+
+def asset(name: str) -> str:
+    """A file that was built for pages (from web/, see its package.json)."""
+    return (_ASSETS / name).read_text("utf-8")
+
+
+def document(title: str, body: str, style: str, script: str = "", data: object = None) -> str:
+    """A self-contained HTML document; ``body`` is markup, ``data`` becomes JSON for the script."""
+    policy = f"default-src 'none'; style-src {_digest(style)}; base-uri 'none'; form-action 'none'"
+    if script:
+        policy += f"; script-src {_digest(script)}"
+    lines = [
+        "<!doctype html>",
+        '<html lang="en" data-theme="auto">',
+        "<head>",
+        '<meta charset="utf-8">',
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">',
+        '<meta name="viewport" content="width=device-width, initial-scale=1">',
+        '<meta name="referrer" content="no-referrer">',
+        f"<title>{escape(title)}</title>",
+        f"<style>{style}</style>",
+        "</head>",
+        f"<body>{body}",
+    ]
+    if data is not None:
+        lines.append(f'<script type="application/json" id="picture">{safe_json(data)}</script>')
+    if script:
+        lines.append(f"<script>{script}</script>")
+    return "\n".join((*lines, "</body>", "</html>", ""))
+
+
+def safe_json(value: object) -> str:
+    """JSON that can stand in a script element: without < > & and line separators as such."""
+    text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
+    return text.translate(_ESCAPES)
+
+
+def _digest(text: str) -> str:
+    digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    return f"'sha256-{digest}'"
+
+
+# ── data ───────────────────────────────────────────────────────────────────────────────────
+
+
+def _data(picture: Picture, scenes: tuple[Scene, ...]) -> dict[str, Any]:
+    """The picture as the script wants it: names by bundles, which is much shorter than edges."""
+    return {
+        "overlay": asdict(picture.overlay) if picture.overlay else None,
+        "enclaves": [
+            {**asdict(each), "statements": [_said(s) for s in map(asdict, each.statements)]}
+            for each in picture.enclaves
+        ],
+        "bundles": [_bundle(each) for each in fold(picture.names, picture.edges)],
+        "scenes": [_scene(each) for each in scenes],
+        "differences": [asdict(each) for each in picture.differences],
+        "validities": [asdict(each) for each in picture.validities],
+        "findings": [asdict(each) for each in picture.findings],
+    }
+
+
+def _said(value: dict[str, Any]) -> dict[str, Any]:
+    value["deny"] = value.pop("qualifier") is not ALLOW
+    return value
+
+
+def _bundle(bundle: Bundle) -> dict[str, Any]:
+    ties = []
+    for tie in bundle.ties:
+        value = _said(asdict(tie))
+        value["enclave"] = value.pop("node")
+        ties.append(value)
+    return {
+        "kind": bundle.kind,
+        "names": bundle.names,
+        "protection": asdict(bundle.protection),
+        "ties": ties,
+    }
+
+
+def _scene(scene: Scene) -> dict[str, Any]:
+    value = asdict(scene)
+    value["links"] = [_said(link) for link in value["links"]]
+    return value

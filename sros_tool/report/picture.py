@@ -1,0 +1,195 @@
+"""The picture of a robot's rights as plain values, whatever is drawn from it.
+
+Everything is sorted, holds no path of the machine and no moment of its making, so the same
+sources give the same picture.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from sros_tool.policy.model import RIGHTS, Qualifier
+
+SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
+    ("subscribe", "reply", "execute"), False
+)
+"""Whether a right lets an enclave speak first on a name: the arrow leads to the name."""
+
+KINDS = (*RIGHTS, "dds")
+"""The kinds of names in the order of telling; dds is a topic that ROS has no word for."""
+
+
+class Mark(StrEnum):
+    """On which side of an overlay something stands; always BOTH where nothing is laid over."""
+
+    BOTH = "both"
+    FIRST = "first"
+    SECOND = "second"
+
+
+class Level(StrEnum):
+    """How strongly messages are protected on the wire, at least; from the weakest on."""
+
+    UNKNOWN = "unknown"
+    NONE = "none"
+    SIGN = "sign"
+    ENCRYPT = "encrypt"
+
+
+@dataclass(frozen=True, slots=True)
+class Protection:
+    """What governance says of a name: the weakest of the DDS topics that it consists of.
+
+    ``data``, ``metadata`` and ``rtps`` are protection kinds of DDS-Security 1.1; without
+    ``read_control`` anybody with an identity may read, whatever permissions say, and without
+    ``write_control`` anybody may write.
+    """
+
+    level: Level
+    data: str = ""
+    metadata: str = ""
+    rtps: str = ""
+    read_control: bool = True
+    write_control: bool = True
+
+
+UNKNOWN = Protection(Level.UNKNOWN)
+"""The protection where no governance is known, as that of a policy alone."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Edge:
+    """What one enclave may, or may not, do with one name.
+
+    ``by`` are the expressions that reach the name, empty where it is said by its own name.
+    ``parts`` are the parts of an action, such as feedback, where the right is not to all of it.
+    ``common`` is what every node needs to start.
+    """
+
+    enclave: str
+    kind: str
+    name: str
+    right: str
+    qualifier: Qualifier
+    by: tuple[str, ...] = ()
+    parts: tuple[str, ...] = ()
+    mark: Mark = Mark.BOTH
+    common: bool = False
+
+    @property
+    def sends(self) -> bool:
+        """Whether the arrow leads from the enclave to the name."""
+        return SENDS[self.right]
+
+
+@dataclass(frozen=True, slots=True)
+class Name:
+    """A topic, service or action; a ``wildcard`` is drawn itself where it reaches no known name."""
+
+    kind: str
+    name: str
+    namespace: str
+    protection: Protection
+    wildcard: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Statement:
+    """A right as it is written, and how many known names it reaches."""
+
+    qualifier: Qualifier
+    right: str
+    kind: str
+    name: str
+    reaches: int
+    mark: Mark = Mark.BOTH
+
+
+@dataclass(frozen=True, slots=True)
+class Enclave:
+    """An enclave with what is known of it; ``group`` is its host or its namespace.
+
+    ``subject``, ``issuer``, ``serial`` and ``key`` describe its certificate, "" without one.
+    ``problems`` keep a process from running in it.
+    """
+
+    path: str
+    group: str
+    nodes: tuple[str, ...] = ()
+    statements: tuple[Statement, ...] = ()
+    subject: str = ""
+    issuer: str = ""
+    serial: str = ""
+    key: str = ""
+    problems: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Validity:
+    """When something ends: a certificate, an authority, a permissions document, a CRL.
+
+    ``not_before`` and ``not_after`` are CCYY-MM-DDThh:mm:ssZ in UTC.
+    """
+
+    not_after: str
+    not_before: str
+    kind: str
+    title: str
+    enclave: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """Something that is wrong or weak; ``severity`` is error, warning or note."""
+
+    id: str
+    severity: str
+    text: str
+    remedy: str = ""
+    enclave: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """A source as it is called in the picture: its base name, and what kind of thing it is."""
+
+    title: str
+    kind: str
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """Two sources over each other.
+
+    ``kind`` is use (allowed and observed), change (before and after) or drift (policy and
+    keystore); ``first`` and ``second`` say what it means that only one side has a right.
+    """
+
+    kind: str
+    first: str
+    second: str
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A right as written that only one side has; ``covered`` are the other's wildcards for it."""
+
+    mark: Mark
+    text: str
+    covered: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """Who may do what, how it is protected, how long it holds, and what is wrong with it."""
+
+    title: str
+    origins: tuple[Origin, ...]
+    enclaves: tuple[Enclave, ...]
+    names: tuple[Name, ...]
+    edges: tuple[Edge, ...]
+    overlay: Overlay | None = None
+    differences: tuple[Difference, ...] = ()
+    validities: tuple[Validity, ...] = ()
+    findings: tuple[Finding, ...] = ()

@@ -1,0 +1,239 @@
+"""Reads the sources of pictures: policies, permissions, keystores and observations.
+
+Whatever is read is told by its base name: where it lies on this machine is nobody's business who
+gets the picture.  Of private keys nothing is read but whether they are there.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from datetime import datetime
+from pathlib import Path
+
+from cryptography import x509
+
+from sros_tool.dds.governance import Governance
+from sros_tool.dds.permissions import Grant
+from sros_tool.errors import DocumentError, SrosError
+from sros_tool.graph.learn import learn
+from sros_tool.graph.observation import from_json
+from sros_tool.keystore.authority import load_ca_certificate
+from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.layout import PERMISSIONS, PUBLIC, REQUEST, enclave_names
+from sros_tool.keystore.lists import read_lists
+from sros_tool.keystore.open import load_governance
+from sros_tool.keystore.rights import load_rights
+from sros_tool.keystore.template import load_template
+from sros_tool.keystore.verify import EnclaveState, check_enclave
+from sros_tool.pki.certificates import load_certificates, subject_text, validity_of
+from sros_tool.pki.keys import algorithm
+from sros_tool.policy.model import Policy
+from sros_tool.policy.reader import read_policy
+from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.report.compose import Source
+from sros_tool.report.picture import Enclave, Finding, Origin, Validity
+from sros_tool.resources import policies_dir
+from sros_tool.translate import governance_for
+from sros_tool.validity import iso
+from sros_tool.xml import read_bytes
+
+_LINK = re.compile(r"(it is a link to nothing) \([^)]*\)")
+_AUTHORITY_FILES = "*_ca.cert.pem"
+
+
+def read_source(path: Path, *, now: datetime) -> Source:
+    """What lies at ``path``: a policy, permissions, an enclave, a keystore, or an observation.
+
+    An observation is a policy that was learned, or what ``sros generate_policy --json`` prints.
+    Raises `DocumentError` for anything else.  Of a keystore, what is broken becomes a finding.
+    """
+    if path.is_file() and read_bytes(path, "file").lstrip()[:1] == b"{":
+        return _observation(path)
+    read = load_rights(path)
+    findings = tuple(Finding(note.id, "warning", note.text) for note in read.notes)
+    source = Source(
+        Origin(base_name(path), read.kind), read.rights, findings=findings, scope=read.scope
+    )
+    if read.kind == "policy":
+        source = replace(source, nodes=_nodes(read_policy(path)))
+    elif read.kind == "keystore":
+        source = _with_keystore(source, path, now)
+    elif read.kind == "enclave":
+        source = _with_enclave(source, path, now)
+    return replace(
+        with_findings(replace(source, findings=()), path, source.findings),
+        enclaves=tuple(
+            replace(each, problems=tuple(_without_path(text, path) for text in each.problems))
+            for each in source.enclaves
+        ),
+    )
+
+
+def with_findings(source: Source, path: Path, findings: Iterable[Finding]) -> Source:
+    """``source``, which lies at ``path``, with more findings, which then name no other place."""
+    found = tuple(_without_paths(each, path) for each in findings)
+    return replace(source, findings=tuple(dict.fromkeys((*source.findings, *found))))
+
+
+def base_name(path: Path) -> str:
+    """How a source is called in a picture, in characters that every format can hold."""
+    name = path.absolute().name or "/"
+    return "".join(
+        letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in name
+    )
+
+
+def common_rights() -> tuple[Right, ...]:
+    """What every node needs, by the policy that ships for it."""
+    policy = read_policy(policies_dir() / "defaults" / "node_basics.xml")
+    return tuple(sorted(policy_rights(policy)))
+
+
+def template_governance(choice: str) -> Governance:
+    """The governance that a keystore by this template would have."""
+    from sros_tool.dds.domains import DomainSet
+
+    return governance_for(load_template(choice).protection, DomainSet.of((0, 0)))
+
+
+def _nodes(policy: Policy) -> dict[str, tuple[str, ...]]:
+    return {
+        enclave.path: tuple(
+            sorted({f"{each.ns.rstrip('/')}/{each.node}" for each in enclave.all_profiles()})
+        )
+        for enclave in policy.enclaves
+    }
+
+
+def _observation(path: Path) -> Source:
+    try:
+        observed = from_json(json.loads(read_bytes(path, "file")))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DocumentError(
+            f"'{path}' is no observation",
+            "It is JSON, but not what `sros generate_policy --json` prints.",
+        ) from error
+    learned = learn(observed)
+    policy = learned.policy()
+    notes = tuple(Finding(note.id, "note", note.text) for note in learned.notes)
+    return Source(
+        Origin(base_name(path), "observation"),
+        policy_rights(policy),
+        _nodes(policy),
+        findings=notes,
+    )
+
+
+# ── keystores ──────────────────────────────────────────────────────────────────────────────
+
+
+def _with_keystore(source: Source, root: Path, now: datetime) -> Source:
+    findings = list(source.findings)
+    governance = None
+    try:
+        governance = load_governance(root, load_ca_certificate(root, PERMISSIONS))
+    except SrosError as error:
+        findings.append(Finding("view.no-governance", "error", str(error)))
+    enclaves, validities = [], set()
+    for name in enclave_names(root):
+        folder = enclave_path(root, name)
+        state = check_enclave(folder, now=now)
+        away = (folder / REQUEST).exists() and not (folder / "key.pem").exists()
+        enclaves.append(_described(name, state, key_elsewhere=away))
+        validities |= set(_validities_of(name, state))
+    try:
+        validities |= set(_authorities(root))
+    except SrosError as error:
+        findings.append(Finding("view.no-authorities", "error", str(error)))
+    return replace(
+        source,
+        enclaves=tuple(enclaves),
+        governance=governance,
+        validities=tuple(sorted(validities)),
+        findings=tuple(findings),
+    )
+
+
+def _with_enclave(source: Source, folder: Path, now: datetime) -> Source:
+    state = check_enclave(folder, now=now)
+    name = next(iter(sorted(source.scope or ())), base_name(folder))
+    return replace(
+        source,
+        enclaves=(_described(name, state, key_elsewhere=False),),
+        governance=state.governance,
+        validities=tuple(sorted(_validities_of(name, state))),
+    )
+
+
+def _described(name: str, state: EnclaveState, *, key_elsewhere: bool) -> Enclave:
+    problems = tuple(
+        str(each)
+        for each in state.problems
+        if not (key_elsewhere and (each.file, each.text) == ("key.pem", "missing"))
+    )
+    certificate = state.certificate
+    if certificate is None:
+        return Enclave(name, "", problems=problems)
+    return Enclave(
+        name,
+        "",
+        subject=subject_text(certificate.subject),
+        issuer=subject_text(certificate.issuer),
+        serial=f"{certificate.serial_number:x}",
+        key=algorithm(certificate.public_key()),
+        problems=problems,
+    )
+
+
+def _validities_of(name: str, state: EnclaveState) -> Iterator[Validity]:
+    if state.certificate:
+        yield _certificate(state.certificate, "certificate", name, name)
+    for grant in state.permissions.grants if state.permissions else ():
+        yield _grant(grant, name)
+
+
+def _grant(grant: Grant, name: str) -> Validity:
+    window = grant.validity
+    return Validity(iso(window.not_after), iso(window.not_before), "permissions", name, name)
+
+
+def _certificate(certificate: x509.Certificate, kind: str, title: str, name: str) -> Validity:
+    window = validity_of(certificate)
+    return Validity(iso(window.not_after), iso(window.not_before), kind, title, name)
+
+
+def _authorities(root: Path) -> Iterator[Validity]:
+    """Every certificate of the CAs, and every revocation list."""
+    roles: dict[x509.Certificate, list[str]] = defaultdict(list)
+    for path in sorted((root / PUBLIC).glob(_AUTHORITY_FILES)):
+        role = path.name.removesuffix("_ca.cert.pem")
+        for certificate in load_certificates(read_bytes(path, "CA certificate"), "of the CA"):
+            roles[certificate].append(role)
+    for certificate, found in roles.items():
+        named = [role for role in found if role != "ca"] or found
+        title = f"{' and '.join(dict.fromkeys(named))} CA, {subject_text(certificate.subject)}"
+        yield _certificate(certificate, "authority", title, "")
+    for crl in read_lists(root):
+        title = f"revocation list {crl.number}"
+        yield Validity(iso(crl.next_update), iso(crl.this_update), "revocation list", title)
+
+
+# ── nothing of the machine ─────────────────────────────────────────────────────────────────
+
+
+def _without_paths(finding: Finding, path: Path) -> Finding:
+    text, remedy = (_without_path(each, path) for each in (finding.text, finding.remedy))
+    return replace(finding, text=text, remedy=remedy)
+
+
+def _without_path(text: str, path: Path) -> str:
+    """``text`` with the source called by its base name, however its path was written."""
+    places = {str(path), str(path.absolute()), str(path.resolve())}
+    for place in sorted(places, key=len, reverse=True):
+        if "/" in place and place != "/":
+            text = text.replace(place, base_name(path))
+    return _LINK.sub(r"\1", text)

@@ -1,0 +1,238 @@
+"""Draws a scene as SVG: one file that needs nothing else, for light and dark surroundings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from xml.sax.saxutils import escape
+
+from sros_tool.policy.model import ALLOW
+from sros_tool.report.picture import Level, Mark, Overlay, Picture
+from sros_tool.report.scene import LINE, PAD, SMALL, Card, Link, Scene
+from sros_tool.report.wording import (
+    KIND_NAMES,
+    LEVEL_NAMES,
+    LISTENERS,
+    ONLOOKERS,
+    OWN,
+    SENDERS,
+    counted,
+)
+
+_HEAD = 40
+_STYLE = """\
+svg{--paper:#fbfcfd;--card:#fff;--ink:#17222e;--soft:#56657a;--rule:#cfd7e1;--frame:#eef2f6;\
+--line:#5d7590;--deny:#b3261e;--first:#a34a00;--second:#176b3a;--encrypt:#176b3a;--sign:#1f5fae;\
+--open:#a34a00;background:var(--paper)}
+@media (prefers-color-scheme:dark){svg{--paper:#10161d;--card:#1a232d;--ink:#e8eef5;--soft:#a3b2c4;\
+--rule:#37465a;--frame:#151d26;--line:#8aa3bf;--deny:#ff8a80;--first:#ffb070;--second:#7fd6a0;\
+--encrypt:#7fd6a0;--sign:#8fbcff;--open:#ffb070}}
+text{font:12px ui-monospace,"SFMono-Regular",Menlo,Consolas,"DejaVu Sans Mono",monospace;\
+fill:var(--ink);white-space:pre}
+.small{font:11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:var(--soft)}
+.title{font:600 15px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif}
+.head{font:600 11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:var(--soft);\
+letter-spacing:.06em}
+.enclave text{font-weight:600}.enclave .small{font-weight:400}
+.paper{fill:var(--paper)}.card rect{fill:var(--card);stroke:var(--rule)}
+.enclave rect,.group rect{stroke:var(--soft)}.frame{fill:var(--frame)}
+.link{fill:none;stroke:var(--line);stroke-width:1.5;marker-end:url(#to)}
+.wild{stroke-width:1;stroke-opacity:.75}
+.sign{stroke-dasharray:9 3}.none{stroke-dasharray:2 3}
+.first{stroke:var(--first);stroke-width:2.25;marker-end:url(#to1)}
+.second{stroke:var(--second);stroke-width:2.25;marker-end:url(#to2)}
+.deny{stroke:var(--deny);stroke-width:1.75;marker-end:url(#no)}
+.tip{fill:var(--line)}.tip1{fill:var(--first)}.tip2{fill:var(--second)}
+.cross{fill:var(--paper);stroke:var(--deny);stroke-width:1.6}
+.glyph{fill:none;stroke:var(--soft);stroke-width:1.4}
+.lock{fill:none;stroke-width:1.4}.lock-encrypt{stroke:var(--encrypt)}.lock-sign{stroke:var(--sign)}\
+.lock-none{stroke:var(--open)}
+.tag{font:700 11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:var(--soft)}
+.mark1{fill:var(--first);font-weight:700}.mark2{fill:var(--second);font-weight:700}
+"""
+_MARKERS = """\
+<marker id="to" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8" \
+markerUnits="userSpaceOnUse" orient="auto"><path class="tip" d="M0 0.5L8 4L0 7.5z"/></marker>
+<marker id="to1" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="9" markerHeight="9" \
+markerUnits="userSpaceOnUse" orient="auto"><path class="tip1" d="M0 0.5L8 4L0 7.5z"/></marker>
+<marker id="to2" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="9" markerHeight="9" \
+markerUnits="userSpaceOnUse" orient="auto"><path class="tip2" d="M0 0.5L8 4L0 7.5z"/></marker>
+<marker id="no" viewBox="0 0 14 14" refX="13" refY="7" markerWidth="14" markerHeight="14" \
+markerUnits="userSpaceOnUse" orient="0"><path class="cross" d="M7 1.5a5.5 5.5 0 1 0 .01 0z\
+M3.2 10.8L10.8 3.2"/></marker>"""
+GLYPHS = {
+    "topics": "M1 2.5h11M1 6.5h11M1 10.5h7",
+    "services": "M1 4h10.5l-3-3M12 9H1.5l3 3",
+    "actions": "M6.5 1a5.5 5.5 0 1 0 .01 0zM6.5 4.5a2 2 0 1 0 .01 0z",
+    "dds": "M6.5 1L12 6.5L6.5 12L1 6.5z",
+}
+"""What stands for a kind of names, 13 by 13: lines, two arrows, a target, a rhombus."""
+LOCKS = {
+    Level.ENCRYPT: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 5 0V6M6.5 8.3v2",
+    Level.SIGN: "M1.5 12h10M2.5 9.5l1-2.6L9.3 1.2l1.8 1.8L5.2 8.7z",
+    Level.NONE: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 4.8-1",
+}
+"""What stands for a protection, 13 by 13: a lock, a pen, an open lock."""
+
+
+def render_svg(picture: Picture, scene: Scene) -> str:
+    """The scene as an SVG document; the same scene gives the same bytes."""
+    legend = list(_legend(picture, scene))
+    height = scene.height + _HEAD + 16 + 20 * len(legend)
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {scene.width} {height}" '
+        f'width="{scene.width}" height="{height}" role="img">',
+        f"<title>{escape(picture.title)}: who may do what</title>",
+        f"<style>{_STYLE}</style>",
+        f"<defs>{_MARKERS}</defs>",
+        f'<rect class="paper" width="{scene.width}" height="{height}"/>',
+        f'<text class="title" x="14" y="26">{escape(picture.title)}</text>',
+        f'<text class="small" x="{scene.width - 14}" y="26" text-anchor="end">'
+        f"{escape(_summary(picture, scene))}</text>",
+        f'<g transform="translate(0 {_HEAD})">',
+        *_heads(scene),
+    ]
+    cards = {card.id: card for card in scene.cards}
+    for frame in scene.frames:
+        lines.append(
+            f'<rect class="frame" x="{frame.x}" y="{frame.y}" width="{frame.width}" '
+            f'height="{frame.height}" rx="8"/>'
+            f'<text class="small" x="{frame.x + 8}" y="{frame.y + 16}">{escape(frame.title)}</text>'
+        )
+    # What must not be overlooked is drawn last.
+    rank = {Mark.BOTH: 0, Mark.FIRST: 1, Mark.SECOND: 2}
+    for link in sorted(
+        scene.links, key=lambda each: (each.qualifier is not ALLOW, rank[each.mark])
+    ):
+        lines.append(_link(link, cards, picture.overlay))
+    lines += [line for card in scene.cards for line in _card(card)]
+    lines.append("</g>")
+    for number, text in enumerate(legend):
+        y = _HEAD + scene.height + 16 + 20 * number
+        lines.append(f'<g transform="translate(14 {y})">{text}</g>')
+    return "\n".join((*lines, "</svg>", ""))
+
+
+def _summary(picture: Picture, scene: Scene) -> str:
+    text = f"{counted(len(picture.enclaves), 'enclave')}, {counted(scene.shown, 'name')}"
+    return text + (f", {scene.hidden} left out that every node needs" if scene.hidden else "")
+
+
+def _heads(scene: Scene) -> Iterable[str]:
+    middle = scene.width / 2
+    for x, anchor, text in (
+        (14, "start", SENDERS),
+        (round(middle), "middle", "topics, services, actions"),
+        (scene.width - 14, "end", LISTENERS),
+    ):
+        yield (f'<text class="head" x="{x}" y="4" text-anchor="{anchor}">{text.upper()}</text>')
+
+
+def curve(link: Link, source: Card, target: Card) -> str:
+    """The path of a link, as SVG path data."""
+    x1, x2 = source.x + source.width, target.x - 1
+    middle = (x1 + x2) // 2
+    return f"M{x1} {link.y1}C{middle} {link.y1} {middle} {link.y2} {x2} {link.y2}"
+
+
+def link_text(link: Link, overlay: Overlay | None) -> str:
+    """What a link says, for who points at it."""
+    text = f"{link.qualifier.value} {', '.join(link.rights)}"
+    if link.wildcard:
+        text += " (by a wildcard)"
+    if overlay and link.mark is not Mark.BOTH:
+        text += f": {overlay.first if link.mark is Mark.FIRST else overlay.second}"
+    return f"{text}, {LEVEL_NAMES[link.level]}"
+
+
+def link_classes(link: Link) -> str:
+    """The classes of a link: how it is protected, said, marked."""
+    classes = ["link", link.level.value]
+    classes += ["wild"] if link.wildcard else []
+    classes += [link.mark.value] if link.mark is not Mark.BOTH else []
+    classes += ["deny"] if link.qualifier is not ALLOW else []
+    return " ".join(classes)
+
+
+def _link(link: Link, cards: dict[str, Card], overlay: Overlay | None) -> str:
+    source, target = cards[link.source], cards[link.target]
+    return (
+        f'<path class="{link_classes(link)}" d="{curve(link, source, target)}">'
+        f"<title>{escape(link_text(link, overlay))}</title></path>"
+    )
+
+
+def _card(card: Card) -> Iterable[str]:
+    names = card.role == "names"
+    yield (
+        f'<g class="card {card.role}" transform="translate({card.x} {card.y})">'
+        f"<title>{escape(', '.join(card.members))}</title>"
+        f'<rect width="{card.width}" height="{card.height}" rx="6"/>'
+    )
+    if names:
+        yield (f'<path class="glyph" transform="translate(10 11)" d="{GLYPHS[card.kind]}"/>')
+        if lock := LOCKS.get(card.level):
+            yield (
+                f'<path class="lock lock-{card.level.value}" '
+                f'transform="translate({card.width - 23} 11)" d="{lock}"/>'
+            )
+    x, y = (32 if names else 12), PAD + 12
+    for line in card.lines:
+        yield f'<text x="{x}" y="{y}">{escape(line)}</text>'
+        y += LINE
+    for number, tag in enumerate(reversed(card.tags)):
+        right = card.width - (32 if card.level in LOCKS else 12) - 18 * number
+        yield f'<text class="tag" x="{right}" y="{PAD + 12}" text-anchor="end">{tag}</text>'
+    for note in card.notes:
+        yield f'<text class="small" x="{x}" y="{y - 1}">{escape(note)}</text>'
+        y += SMALL
+    yield "</g>"
+
+
+def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
+    """One line for each thing that this picture holds and that needs to be explained."""
+    kinds = sorted({card.kind for card in scene.cards if card.kind}, key=list(GLYPHS).index)
+    yield _row(
+        (f'<path class="glyph" transform="translate(0 -10)" d="{GLYPHS[kind]}"/>', KIND_NAMES[kind])
+        for kind in kinds
+    )
+    levels = [level for level in LOCKS if any(link.level is level for link in scene.links)]
+    if levels:
+        yield _row(
+            (
+                f'<path class="lock lock-{level.value}" transform="translate(0 -10)" '
+                f'd="{LOCKS[level]}"/><path class="link {level.value}" d="M20 -4h40"/>',
+                LEVEL_NAMES[level],
+            )
+            for level in levels
+        )
+    rows = [('<path class="link" d="M0 -4h40"/>', "allowed")]
+    if any(link.wildcard for link in scene.links):
+        rows.append(('<path class="link wild" d="M0 -4h40"/>', "allowed by a wildcard only"))
+    if any(link.qualifier is not ALLOW for link in scene.links):
+        rows.append(('<path class="link deny" d="M0 -4h40"/>', "denied"))
+    if picture.overlay:
+        rows.append(('<path class="link first" d="M0 -4h40"/>', picture.overlay.first))
+        rows.append(('<path class="link second" d="M0 -4h40"/>', picture.overlay.second))
+    yield _row(rows)
+    if any(note.startswith(OWN) for card in scene.cards for note in card.notes):
+        yield _row([("", f"{OWN} what no other enclave may use")])
+    if scene.onlookers:
+        yield _row(
+            (
+                f'<text class="tag" x="4" y="0">{each.tag}</text>',
+                f"{ONLOOKERS[each.right]} {each.enclave.removeprefix(':')}",
+            )
+            for each in scene.onlookers
+        )
+
+
+def _row(rows: Iterable[tuple[str, str]]) -> str:
+    x, found = 0, []
+    for drawn, text in rows:
+        room = 68 if "M20 -4h40" in drawn else (48 if "h40" in drawn else (20 if drawn else 0))
+        found.append(
+            f'<g transform="translate({x} 0)">{drawn}'
+            f'<text class="small" x="{room}" y="0">{escape(text)}</text></g>'
+        )
+        x += room + round(6.2 * len(text)) + 26
+    return "".join(found)

@@ -1,0 +1,174 @@
+// Places parts of the picture that were asked for, by dagre's layered layout.
+
+import dagre from "@dagrejs/dagre";
+import { curveBumpX, line } from "d3-shape";
+import { KINDS, counted, sends } from "./words.js";
+
+const SIZES = { letter: 7.4, smallLetter: 6.2, line: 16, small: 14, pad: 7 };
+export const MOST_BUNDLES = 160;
+const MOST_NAMES = 8;
+
+// As the drawing on paper cuts names: after a slash or an underscore, where one is near.
+export function wrapped(text, letters) {
+  const lines = [];
+  while (text.length > letters) {
+    const head = text.slice(0, letters);
+    let cut = Math.max(head.lastIndexOf("/"), head.slice(0, -1).lastIndexOf("_"));
+    if (cut < letters / 2) cut = letters - 1;
+    else if (text[cut] === "_") cut += 1;
+    lines.push(text.slice(0, cut));
+    text = `  ${text.slice(cut)}`;
+  }
+  return [...lines, text];
+}
+
+function height(card) {
+  const { line: row, small, pad } = SIZES;
+  return 2 * pad + row * card.lines.length + small * card.notes.length;
+}
+
+function widthOf(card, around, least) {
+  const { letter, smallLetter } = SIZES;
+  const longest = (texts) => Math.max(0, ...texts.map((text) => text.length));
+  const room = Math.max(longest(card.lines) * letter, longest(card.notes) * smallLetter);
+  return Math.max(least, Math.round(room + around));
+}
+
+export function enclaveCard(id, path, notes = []) {
+  const card = { id, role: "enclave", members: [path], lines: wrapped(path, 22), notes, tags: "" };
+  return { ...card, width: widthOf(card, 24, 100), height: height(card) };
+}
+
+export function namesCard(id, bundle, notes = []) {
+  const shown = bundle.names.slice(0, bundle.names.length > MOST_NAMES ? MOST_NAMES - 1 : MOST_NAMES);
+  const rest = bundle.names.length - shown.length;
+  const card = {
+    id,
+    role: "names",
+    kind: bundle.kind,
+    level: bundle.protection.level,
+    members: bundle.names,
+    lines: shown.flatMap((name) => wrapped(name, 35)),
+    notes: [...(rest ? [`and ${counted(rest, KINDS[bundle.kind])} more`] : []), ...notes],
+    tags: "",
+  };
+  return { ...card, width: widthOf(card, 62, 130), height: height(card) };
+}
+
+// One link for all that an enclave may do with a bundle on one side of it.
+export function linkOf(source, target, bundle, ties) {
+  return {
+    source,
+    target,
+    rights: [...new Set(ties.map((tie) => tie.right))].sort(),
+    deny: ties.some((tie) => tie.deny),
+    level: bundle.protection.level,
+    wildcard: ties.every((tie) => tie.by.length > 0),
+    mark: ties[0].mark,
+  };
+}
+
+// The names that fit a filter: senders on the left, listeners on the right.
+export function columns(bundles) {
+  const cards = new Map();
+  const links = [];
+  bundles.slice(0, MOST_BUNDLES).forEach((bundle, number) => {
+    const id = `n${number}`;
+    cards.set(id, namesCard(id, bundle));
+    const groups = new Map();
+    for (const tie of bundle.ties) {
+      const key = `${sends(tie) ? "s" : "l"}${tie.enclave} ${tie.deny} ${tie.mark}`;
+      if (!groups.has(key)) groups.set(key, []);
+      groups.get(key).push(tie);
+    }
+    for (const ties of groups.values()) {
+      const side = `${sends(ties[0]) ? "s" : "l"}${ties[0].enclave}`;
+      if (!cards.has(side)) cards.set(side, enclaveCard(side, ties[0].enclave));
+      const ends = sends(ties[0]) ? [side, id] : [id, side];
+      links.push(linkOf(...ends, bundle, ties));
+    }
+  });
+  const scene = arranged([...cards.values()], links);
+  return { ...scene, heads: heads(scene.cards) };
+}
+
+// What the columns are, above them; only where every card is in one of the three.
+export function heads(cards) {
+  const found = [];
+  const add = (column, anchor, at, text) => {
+    const card = cards.find(column);
+    if (card) found.push({ x: card.x + card.width * at, anchor, text });
+  };
+  add((card) => card.role !== "names" && card.id[0] === "s", "start", 0, "may send");
+  add((card) => card.role === "names", "middle", 0.5, "topics, services, actions");
+  add((card) => card.role !== "names" && card.id[0] === "l", "end", 1, "may receive");
+  return found;
+}
+
+// What flows to a name, or from it, so many hops far.
+export function flowScene({ start, hops, steps }, upstream, most) {
+  const cards = new Map([["n0", { ...namesCard("n0", start), chosen: true }]]);
+  const ids = new Map([[start, "n0"]]);
+  const links = new Map();
+  for (const { hop, bundle, tie, near } of steps) {
+    if (hop > most || (!near && hop === most)) continue;
+    if (!ids.has(bundle)) {
+      const id = `n${ids.size}`;
+      ids.set(bundle, id);
+      cards.set(id, namesCard(id, bundle));
+    }
+    const id = `e${tie.enclave}`;
+    if (!cards.has(id)) {
+      cards.set(id, enclaveCard(id, tie.enclave, [counted(hops.get(tie.enclave), "hop")]));
+    }
+    const ends = near === upstream ? [id, ids.get(bundle)] : [ids.get(bundle), id];
+    const key = ends.join(" ");
+    if (!links.has(key)) links.set(key, linkOf(...ends, bundle, [tie]));
+    else links.get(key).rights = [...new Set([...links.get(key).rights, tie.right])].sort();
+  }
+  // A name that nobody uses on its far side, within these hops, leads nowhere.
+  const far = (link) => (upstream ? link.target : link.source);
+  const reached = new Set(["n0", ...[...links.values()].map(far)]);
+  const leads = (id) => id[0] !== "n" || reached.has(id);
+  const kept = [...links.values()].filter((link) => leads(link.source) && leads(link.target));
+  return arranged([...cards.values()].filter((card) => leads(card.id)), kept);
+}
+
+function arranged(cards, links) {
+  const graph = new dagre.graphlib.Graph({ multigraph: true });
+  graph.setGraph({ rankdir: "LR", nodesep: 9, edgesep: 4, ranksep: 90, marginx: 14, marginy: 34 });
+  graph.setDefaultEdgeLabel(() => ({}));
+  for (const card of cards) graph.setNode(card.id, { width: card.width, height: card.height });
+  links.forEach((link, number) => graph.setEdge(link.source, link.target, {}, `${number}`));
+  dagre.layout(graph);
+  const path = line().curve(curveBumpX).x((point) => point.x).y((point) => point.y);
+  const placed = cards.map((card) => {
+    const { x, y } = graph.node(card.id);
+    return { ...card, x: Math.round(x - card.width / 2), y: Math.round(y - card.height / 2) };
+  });
+  const box = new Map(placed.map((card) => [card.id, card]));
+  const drawn = links.map((link, number) => {
+    const { points } = graph.edge(link.source, link.target, `${number}`);
+    const ends = [points[0], ...points.slice(1, -1).filter((_, n) => n % 2), points.at(-1)];
+    const from = box.get(link.source);
+    const to = box.get(link.target);
+    const inner = points.length > 3 ? ends.slice(1, -1) : [];
+    return {
+      ...link,
+      path: path([
+        { x: from.x + from.width, y: from.y + from.height / 2 },
+        ...inner,
+        { x: to.x - 1, y: to.y + to.height / 2 },
+      ]),
+    };
+  });
+  const { width = 200, height: tall = 100 } = graph.graph();
+  return {
+    width: Math.ceil(width),
+    height: Math.ceil(tall),
+    cards: placed,
+    links: drawn,
+    frames: [],
+    onlookers: [],
+  };
+}

@@ -1,0 +1,213 @@
+// What is known of the enclave or the name that was chosen.
+
+import { counted, el } from "./dom.js";
+import { byRight, sends } from "./model.js";
+import { KINDS, LEVELS, markText } from "./words.js";
+import { daysLeft, dateText, leftText } from "./timeline.js";
+
+const VERBS = {
+  publish: "May publish",
+  subscribe: "May subscribe",
+  request: "May call",
+  reply: "May serve",
+  call: "May send goals",
+  execute: "May carry out",
+};
+const MOST = 60;
+
+function chip(kind, text) {
+  return el("span", { class: `chip ${kind}`, text });
+}
+
+export function chips(model, tie) {
+  const found = [];
+  if (tie.deny) found.push(chip("deny", "DENY"));
+  const marked = markText(model.overlay, tie.mark);
+  if (marked) found.push(chip(tie.mark, marked));
+  if (tie.by?.length) found.push(chip("", `by ${tie.by.join(", ")}`));
+  if (tie.parts?.length) found.push(chip("", `only ${tie.parts.join(", ")}`));
+  if (tie.common) found.push(chip("", "as every node"));
+  return found;
+}
+
+function link(text, onclick) {
+  return el("button", { type: "button", class: "link-button", text, onclick });
+}
+
+function section(title, ...content) {
+  return el("section", {}, el("h3", { text: title }), ...content);
+}
+
+function facts(pairs) {
+  const rows = pairs.filter(([, value]) => value);
+  return el(
+    "dl",
+    {},
+    rows.flatMap(([key, value]) => [el("dt", { text: key }), el("dd", { text: value })]),
+  );
+}
+
+function longList(items) {
+  if (items.length <= MOST) return el("ul", { class: "plain" }, items);
+  const rest = el("ul", { class: "plain" }, items.slice(MOST));
+  const more = el("details", {}, el("summary", { text: `${items.length - MOST} more` }), rest);
+  return el("div", {}, el("ul", { class: "plain" }, items.slice(0, MOST)), more);
+}
+
+export function findingItem(finding, onEnclave) {
+  return el(
+    "li",
+    { class: `finding ${finding.severity}` },
+    el("span", { class: `chip ${finding.severity}`, text: finding.severity }),
+    " ",
+    el("code", { text: finding.id }),
+    el("p", {}, finding.enclave && onEnclave ? [link(finding.enclave, () => onEnclave(finding.enclave)), ": "] : [], finding.text),
+    finding.remedy ? el("p", { class: "soft", text: finding.remedy }) : null,
+  );
+}
+
+export function enclaveDetails(model, path, act) {
+  const enclave = model.enclave.get(path);
+  const ties = model.tiesOf.get(path).filter(({ tie }) => !tie.common);
+  const common = model.tiesOf.get(path).length - ties.length;
+  const found = model.findingsOf(path);
+  const parts = [
+    el("p", { class: "kind", text: "Enclave" }),
+    el("h2", { text: path, tabindex: "-1" }),
+    el(
+      "p",
+      { class: "actions" },
+      el("button", { type: "button", text: "Show only its part of the map", onclick: () => act.only(path) }),
+    ),
+  ];
+  if (model.overlay?.kind === "use") {
+    const all = ties.filter(({ tie }) => !tie.deny);
+    const count = (mark) => all.filter(({ tie }) => tie.mark === mark).reduce((n, { bundle }) => n + bundle.names.length, 0);
+    const used = count("both");
+    parts.push(el("p", { class: "figure", text: `allowed ${used + count("first")}, observed ${used}` }));
+  }
+  if (enclave.problems.length) {
+    const items = enclave.problems.map((text) => el("li", { class: "finding error", text }));
+    parts.push(section("It cannot be used", el("ul", { class: "plain" }, items)));
+  }
+  if (found.length) {
+    parts.push(section("Findings", el("ul", { class: "plain" }, found.map((each) => findingItem(each)))));
+  }
+  parts.push(
+    facts([
+      ["Group", enclave.group],
+      ["Nodes", enclave.nodes.join(", ")],
+      ["Certificate", enclave.subject],
+      ["Issued by", enclave.issuer],
+      ["Serial number", enclave.serial],
+      ["Key", enclave.key],
+    ]),
+  );
+  const validities = model.validitiesOf(path);
+  if (validities.length) {
+    const items = validities.map((each) =>
+      el(
+        "li",
+        {},
+        el("b", { text: each.kind }),
+        ` ${dateText(each.not_before)} to ${dateText(each.not_after)} `,
+        chip(daysLeft(each) < 0 ? "error" : daysLeft(each) < 30 ? "warning" : "", leftText(each)),
+      ),
+    );
+    parts.push(section("Validity", el("ul", { class: "plain" }, items)));
+  }
+  for (const [right, group] of byRight(ties)) {
+    const names = group.flatMap(({ tie, bundle }) =>
+      bundle.names.map((name) => ({ tie, kind: bundle.kind, name })),
+    );
+    names.sort((a, b) => (a.name < b.name ? -1 : 1));
+    const deny = right.startsWith("DENY ");
+    const title = deny ? `Denied: ${right.slice(5)}` : VERBS[right];
+    const items = names.map(({ tie, kind, name }) =>
+      el("li", {}, link(name, () => act.name(kind, name)), " ", chips(model, { ...tie, deny: false })),
+    );
+    parts.push(section(`${title} (${names.length})`, longList(items)));
+  }
+  if (common) parts.push(el("p", { class: "soft", text: "And what every node needs to start." }));
+  const written = enclave.statements.filter((each) => /[*?[]/.test(each.name));
+  if (written.length) {
+    const items = written.map((each) =>
+      el(
+        "li",
+        {},
+        el("code", { text: `${each.deny ? "DENY " : ""}${each.right} ${each.name}` }),
+        ` reaches ${each.reaches} known here, and whatever else is called so`,
+      ),
+    );
+    parts.push(section("Wildcards as written", el("ul", { class: "plain" }, items)));
+  }
+  return parts;
+}
+
+export function nameDetails(model, kind, name, act) {
+  const bundle = model.bundle(kind, name);
+  const { protection } = bundle;
+  const hasFlow = kind !== "dds";
+  const parts = [
+    el("p", { class: "kind", text: KINDS[kind] }),
+    el("h2", { text: name, tabindex: "-1" }),
+    el(
+      "p",
+      { class: "actions" },
+      hasFlow ? el("button", { type: "button", text: "What reaches it", onclick: () => act.flow(kind, name, true) }) : null,
+      hasFlow ? el("button", { type: "button", text: "What it reaches", onclick: () => act.flow(kind, name, false) }) : null,
+    ),
+  ];
+  if (protection.level === "unknown") {
+    parts.push(el("p", { class: "soft", text: "How it is protected is not known: a policy does not say." }));
+  } else {
+    parts.push(
+      facts([
+        ["Protection", LEVELS[protection.level]],
+        ["Data", protection.data],
+        ["Metadata", protection.metadata],
+        ["RTPS messages", protection.rtps],
+        ["Who may read", protection.read_control ? "whom permissions allow it" : "everybody with an identity"],
+        ["Who may write", protection.write_control ? "whom permissions allow it" : "everybody with an identity"],
+      ]),
+    );
+  }
+  for (const [title, wanted] of [
+    [kind === "topics" || kind === "dds" ? "May publish" : "May call", (tie) => !tie.deny && sends(tie)],
+    [kind === "topics" || kind === "dds" ? "May listen" : kind === "actions" ? "May carry out, or listen" : "May serve", (tie) => !tie.deny && !sends(tie)],
+    ["Denied", (tie) => tie.deny],
+  ]) {
+    const ties = bundle.ties.filter(wanted);
+    if (!ties.length && title === "Denied") continue;
+    const items = ties.map((tie) =>
+      el(
+        "li",
+        {},
+        link(tie.enclave, () => act.enclave(tie.enclave)),
+        " ",
+        title === "Denied" || tie.parts.length ? chip("", tie.right) : null,
+        " ",
+        chips(model, { ...tie, deny: false }),
+      ),
+    );
+    const nobody = el("p", { class: "soft", text: "Nobody." });
+    parts.push(section(`${title} (${ties.length})`, ties.length ? longList(items) : nobody));
+  }
+  const others = bundle.names.filter((each) => each !== name);
+  if (others.length) {
+    const items = others.map((each) => el("li", {}, link(each, () => act.name(kind, each))));
+    const list = el("details", {}, el("summary", { text: counted(others.length, "name") }), longList(items));
+    parts.push(section("With the very same rights", list));
+  }
+  return parts;
+}
+
+// Several names on one card: which of them is meant?
+export function cardDetails(card, act) {
+  const items = card.members.map((name) => el("li", {}, link(name, () => act.name(card.kind, name))));
+  return [
+    el("p", { class: "kind", text: `${counted(card.members.length, KINDS[card.kind])} alike` }),
+    el("h2", { text: card.lines[0].trim(), tabindex: "-1" }),
+    section("Names", longList(items)),
+  ];
+}

@@ -1,0 +1,254 @@
+// Draws a scene, whoever placed it: cards, links and frames, by d3; the keyboard moves among cards.
+
+import { select } from "d3-selection";
+import { linkHorizontal } from "d3-shape";
+import { KINDS, LEVELS, ONLOOKERS, markText } from "./words.js";
+
+const GLYPHS = {
+  topics: "M1 2.5h11M1 6.5h11M1 10.5h7",
+  services: "M1 4h10.5l-3-3M12 9H1.5l3 3",
+  actions: "M6.5 1a5.5 5.5 0 1 0 .01 0zM6.5 4.5a2 2 0 1 0 .01 0z",
+  dds: "M6.5 1L12 6.5L6.5 12L1 6.5z",
+};
+const LOCKS = {
+  encrypt: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 5 0V6M6.5 8.3v2",
+  sign: "M1.5 12h10M2.5 9.5l1-2.6L9.3 1.2l1.8 1.8L5.2 8.7z",
+  none: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 4.8-1",
+};
+const TIPS = [
+  ["to", "tip", "M0 0.5L8 4L0 7.5z", 8, 7, "auto"],
+  ["to1", "tip1", "M0 0.5L8 4L0 7.5z", 8, 7, "auto"],
+  ["to2", "tip2", "M0 0.5L8 4L0 7.5z", 8, 7, "auto"],
+  ["no", "cross", "M7 1.5a5.5 5.5 0 1 0 .01 0zM3.2 10.8L10.8 3.2", 14, 13, "0"],
+];
+const horizontal = linkHorizontal().x((point) => point[0]).y((point) => point[1]);
+
+export function pathOf(link, cards) {
+  if (link.path) return link.path;
+  const from = cards.get(link.source);
+  const to = cards.get(link.target);
+  return horizontal({ source: [from.x + from.width, link.y1], target: [to.x - 1, link.y2] });
+}
+
+export function linkText(link, overlay) {
+  const said = `${link.deny ? "DENY" : "ALLOW"} ${link.rights.join(", ")}`;
+  const marked = markText(overlay, link.mark);
+  return [said, link.wildcard && "by a wildcard", marked, LEVELS[link.level]]
+    .filter(Boolean)
+    .join(", ");
+}
+
+function cardText(card, problems) {
+  const what = {
+    enclave: `enclave ${card.members[0]}`,
+    group: `group ${card.lines.join("").replaceAll(" ", "")}`,
+    names: `${KINDS[card.kind]} ${card.members.slice(0, 3).join(", ")}`,
+  }[card.role];
+  const more = card.role === "names" && card.members.length > 3 ? " and more" : "";
+  const level = card.role === "names" ? `, ${LEVELS[card.level]}` : "";
+  return `${what}${more}${level}${problems ? `, ${problems} problems` : ""}`;
+}
+
+// `choose(card)` is called for a card that was clicked, or chosen by Enter or the space bar.
+export function drawScene(node, scene, { overlay, problems, choose }) {
+  const root = select(node);
+  root.selectAll("*").remove();
+  root
+    .attr("viewBox", `0 0 ${scene.width} ${scene.height}`)
+    .attr("role", "group")
+    .attr("aria-label", "Map of who may do what");
+  root
+    .append("defs")
+    .selectAll("marker")
+    .data(TIPS)
+    .join("marker")
+    .attr("id", (tip) => tip[0])
+    .attr("viewBox", (tip) => `0 0 ${tip[3]} ${tip[3]}`)
+    .attr("refX", (tip) => tip[4])
+    .attr("refY", (tip) => tip[3] / 2)
+    .attr("markerWidth", (tip) => tip[3])
+    .attr("markerHeight", (tip) => tip[3])
+    .attr("markerUnits", "userSpaceOnUse")
+    .attr("orient", (tip) => tip[5])
+    .append("path")
+    .attr("class", (tip) => tip[1])
+    .attr("d", (tip) => tip[2]);
+  const frames = root.append("g").selectAll("g").data(scene.frames).join("g");
+  frames
+    .append("rect")
+    .attr("class", "frame")
+    .attr("x", (frame) => frame.x)
+    .attr("y", (frame) => frame.y)
+    .attr("width", (frame) => frame.width)
+    .attr("height", (frame) => frame.height)
+    .attr("rx", 8);
+  frames
+    .append("text")
+    .attr("class", "small")
+    .attr("x", (frame) => frame.x + 8)
+    .attr("y", (frame) => frame.y + 16)
+    .text((frame) => frame.title);
+  root
+    .append("g")
+    .selectAll("text")
+    .data(scene.heads ?? [])
+    .join("text")
+    .attr("class", "head")
+    .attr("x", (head) => head.x)
+    .attr("y", 16)
+    .attr("text-anchor", (head) => head.anchor)
+    .text((head) => head.text.toUpperCase());
+  const cards = new Map(scene.cards.map((card) => [card.id, card]));
+  const rank = (link) => (link.deny ? 3 : { both: 0, first: 1, second: 2 }[link.mark]);
+  const links = root
+    .append("g")
+    .selectAll("path")
+    .data([...scene.links].sort((a, b) => rank(a) - rank(b)))
+    .join("path")
+    .attr("class", (link) =>
+      ["link", link.level, link.wildcard && "wild", link.mark !== "both" && link.mark, link.deny && "deny"]
+        .filter(Boolean)
+        .join(" "),
+    )
+    .attr("d", (link) => pathOf(link, cards));
+  links.append("title").text((link) => linkText(link, overlay));
+  const drawn = root
+    .append("g")
+    .selectAll("g")
+    .data(scene.cards)
+    .join("g")
+    .attr("class", (card) => `card ${card.role}${card.chosen ? " chosen" : ""}`)
+    .attr("transform", (card) => `translate(${card.x} ${card.y})`)
+    .attr("role", "button")
+    .attr("tabindex", (_, number) => (number ? -1 : 0))
+    .attr("aria-label", (card) => cardText(card, problems(card)))
+    .on("click", (_, card) => choose(card))
+    .on("keydown", (event, card) => moved(event, card, drawn, choose))
+    .each(function draw(card) {
+      drawCard(select(this), card, problems(card));
+    });
+  return {
+    // Cards and links that have to do with what `belongs` says are shown, the others fade.
+    highlight(belongs) {
+      const near = new Set();
+      const lit = (link) => belongs(cards.get(link.source)) || belongs(cards.get(link.target));
+      const any = belongs && scene.cards.some(belongs);
+      if (any) {
+        for (const link of scene.links.filter(lit)) near.add(link.source).add(link.target);
+        const tags = scene.onlookers
+          .filter((each) => scene.cards.some((c) => belongs(c) && onlooks(c, each)))
+          .map((each) => each.tag);
+        for (const card of scene.cards) {
+          if (belongs(card) || tags.some((tag) => card.tags.includes(tag))) near.add(card.id);
+        }
+      }
+      drawn.classed("faded", (card) => any && !near.has(card.id));
+      drawn.classed("lit", (card) => any && belongs(card));
+      links.classed("faded", (link) => any && !lit(link));
+      return any;
+    },
+    card: (belongs) => drawn.filter(belongs).node(),
+  };
+}
+
+function onlooks(card, onlooker) {
+  return card.role !== "names" && card.id.slice(1) === onlooker.enclave;
+}
+
+function drawCard(group, card, problems) {
+  group
+    .append("rect")
+    .attr("width", card.width)
+    .attr("height", card.height)
+    .attr("rx", 6);
+  const names = card.role === "names";
+  if (names) {
+    group
+      .append("path")
+      .attr("class", "glyph")
+      .attr("transform", "translate(10 9)")
+      .attr("d", GLYPHS[card.kind]);
+    if (LOCKS[card.level]) {
+      group
+        .append("path")
+        .attr("class", `lock lock-${card.level}`)
+        .attr("transform", `translate(${card.width - 23} 9)`)
+        .attr("d", LOCKS[card.level]);
+    }
+  }
+  let y = 19;
+  for (const text of card.lines) {
+    group.append("text").attr("x", names ? 32 : 12).attr("y", y).text(text);
+    y += 16;
+  }
+  for (const text of card.notes) {
+    group.append("text").attr("class", "small").attr("x", names ? 32 : 12).attr("y", y - 1).text(text);
+    y += 14;
+  }
+  [...card.tags].reverse().forEach((tag, number) => {
+    const x = card.width - (LOCKS[card.level] ? 32 : 12) - 18 * number;
+    group.append("text").attr("class", "tag").attr("x", x).attr("y", 19).attr("text-anchor", "end").text(tag);
+  });
+  if (problems) {
+    group.append("circle").attr("class", "alarm").attr("cx", card.width - 14).attr("cy", 14).attr("r", 7);
+    group.append("text").attr("class", "alarm-text").attr("x", card.width - 14).attr("y", 18).attr("text-anchor", "middle").text("!");
+  }
+}
+
+// The arrow keys lead to the next card in their direction; only one card is in the tab order.
+function moved(event, card, drawn, choose) {
+  if (event.key === "Enter" || event.key === " ") {
+    event.preventDefault();
+    choose(card);
+    return;
+  }
+  const way = { ArrowDown: [0, 1], ArrowUp: [0, -1], ArrowRight: [1, 0], ArrowLeft: [-1, 0] }[event.key];
+  if (!way) return;
+  event.preventDefault();
+  const centre = (each) => [each.x + each.width / 2, each.y + each.height / 2];
+  const [x, y] = centre(card);
+  let best = null;
+  drawn.each(function look(other) {
+    const [toX, toY] = centre(other);
+    const ahead = (toX - x) * way[0] + (toY - y) * way[1];
+    const aside = Math.abs((toX - x) * way[1]) + Math.abs((toY - y) * way[0]);
+    // Sideways a column is far; upwards and downwards one stays in it.
+    if (ahead <= 20 || (way[1] && aside > 60)) return;
+    const distance = way[0] ? ahead * 0.2 + aside : ahead + aside;
+    if (!best || distance < best.distance) best = { distance, node: this };
+  });
+  if (best) {
+    drawn.attr("tabindex", -1);
+    best.node.setAttribute("tabindex", 0);
+    best.node.focus();
+    best.node.scrollIntoView({ block: "nearest", inline: "nearest" });
+  }
+}
+
+// What the symbols of this scene mean, as items of a list.
+export function legend(scene, overlay, make) {
+  const items = [];
+  const icon = (path, kind, wide) =>
+    make.svg("svg", { class: "icon", width: wide ? 46 : 15, height: 15, "aria-hidden": "true" }, make.svg("path", { class: kind, d: path, transform: "translate(1 1)" }));
+  const add = (drawing, text) => items.push(make.el("li", {}, drawing, make.el("span", { text })));
+  for (const kind of Object.keys(GLYPHS)) {
+    if (scene.cards.some((card) => card.kind === kind)) add(icon(GLYPHS[kind], "glyph"), KINDS[kind]);
+  }
+  for (const level of Object.keys(LOCKS)) {
+    if (scene.cards.some((card) => card.level === level)) {
+      add(icon(LOCKS[level], `lock lock-${level}`), LEVELS[level]);
+      if (level !== "encrypt") add(icon("M0 6h42", `link ${level}`, true), LEVELS[level]);
+    }
+  }
+  const line = (kind, text) => add(icon("M0 6h42", `link ${kind}`, true), text);
+  line("", "allowed");
+  if (scene.links.some((link) => link.wildcard)) line("wild", "by a wildcard only");
+  if (scene.links.some((link) => link.deny)) line("deny", "denied");
+  if (overlay && scene.links.some((link) => link.mark === "first")) line("first", overlay.first);
+  if (overlay && scene.links.some((link) => link.mark === "second")) line("second", overlay.second);
+  for (const each of scene.onlookers) {
+    const tag = make.el("b", { class: "tag", text: each.tag });
+    add(tag, `${ONLOOKERS[each.right]} ${each.enclave.replace(/^:/, "")}`);
+  }
+  return items;
+}

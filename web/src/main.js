@@ -1,0 +1,308 @@
+// Puts the page together: tabs, search, filters, the map, and what was chosen.
+
+import { MOST_BUNDLES, columns, flowScene, heads } from "./arrange.js";
+import { cardDetails, enclaveDetails, findingItem, nameDetails } from "./details.js";
+import { byId, counted, el, svg } from "./dom.js";
+import { drawScene, legend } from "./draw.js";
+import { Model } from "./model.js";
+import { timeline } from "./timeline.js";
+import { KINDS, LEVELS, markText } from "./words.js";
+
+const model = new Model(JSON.parse(byId("picture").textContent));
+const state = { scene: 0, filters: {}, flow: null, chosen: null, zoom: 0, drawing: null, shown: null };
+const FILTERS = ["enclave", "namespace", "direction", "protection", "mark"];
+const MOST_FOUND = 12;
+const problemsOf = new Map(
+  model.enclaves.map((each) => [
+    each.path,
+    each.problems.length + model.findingsOf(each.path).filter((f) => f.severity === "error").length,
+  ]),
+);
+const problems = (card) =>
+  card.role === "names" ? 0 : card.members.reduce((sum, path) => sum + (problemsOf.get(path) ?? 0), 0);
+
+// ── the map ──────────────────────────────────────────────────────────────────────────────────
+
+const filtering = () => FILTERS.some((key) => state.filters[key]);
+
+function currentScene() {
+  if (state.flow) {
+    const { kind, name, upstream, hops } = state.flow;
+    const flow = model.flow(kind, name, upstream);
+    const most = Math.max(1, ...flow.hops.values());
+    const scene = flowScene(flow, upstream, Math.min(hops, most));
+    const within = [...flow.hops.values()].filter((hop) => hop <= hops).length;
+    const verb = upstream ? "can reach" : "can be reached from";
+    scene.title = `${counted(within, "enclave")} ${verb} ${name} within ${counted(hops, "hop")}`;
+    if (within < flow.hops.size) scene.title += `, ${flow.hops.size} over any number`;
+    scene.most = most;
+    return scene;
+  }
+  if (filtering()) {
+    const bundles = model.filtered({ ...state.filters, common: state.scene > 0 });
+    const scene = columns(bundles);
+    const names = bundles.reduce((sum, bundle) => sum + bundle.names.length, 0);
+    scene.title = `${counted(names, "name")} fit`;
+    if (bundles.length > MOST_BUNDLES) scene.title += `; drawn are the first ${MOST_BUNDLES} groups of them: filter further`;
+    return scene;
+  }
+  const scene = model.scenes[state.scene];
+  return { ...scene, heads: heads(scene.cards) };
+}
+
+function showMap() {
+  const scene = currentScene();
+  state.shown = scene;
+  state.drawing = drawScene(byId("map"), scene, { overlay: model.overlay, problems, choose });
+  byId("legend").replaceChildren(...legend(scene, model.overlay, { el, svg }));
+  const summary = scene.title === "Overview" || scene.shown
+    ? `${counted(model.enclaves.length, "enclave")}, ${counted(scene.shown, "name")}${scene.hidden ? `; ${scene.hidden} are not in this view` : ""}`
+    : scene.title;
+  byId("summary").textContent = scene.cards.length ? summary : "Nothing fits.";
+  byId("back").hidden = !(state.flow || filtering());
+  byId("hops").hidden = !state.flow;
+  if (state.flow) byId("hops-number").textContent = Math.min(state.flow.hops, scene.most);
+  zoom(0);
+  light();
+}
+
+function zoom(step) {
+  const { width } = state.shown;
+  const room = byId("canvas").clientWidth - 2;
+  if (step === 0) state.zoom = Math.min(1.15, Math.max(0.55, room / width));
+  else state.zoom = Math.min(2.5, Math.max(0.3, state.zoom * (step > 0 ? 1.2 : 1 / 1.2)));
+  byId("map").setAttribute("width", Math.round(width * state.zoom));
+  byId("map").setAttribute("height", Math.round(state.shown.height * state.zoom));
+}
+
+function light() {
+  const chosen = state.chosen;
+  const belongs = chosen && {
+    enclave: (card) => card.role !== "names" && card.members.includes(chosen.path),
+    name: (card) => card.role === "names" && card.kind === chosen.kind && card.members.includes(chosen.name),
+    card: (card) => card.role === "names" && card.kind === chosen.card.kind && card.members[0] === chosen.card.members[0],
+  }[chosen.type];
+  // In a flow everything belongs to what was asked for.
+  const found = state.drawing.highlight(state.flow ? null : belongs);
+  if (found) state.drawing.card(belongs)?.scrollIntoView({ block: "nearest", inline: "nearest" });
+}
+
+// ── choosing ─────────────────────────────────────────────────────────────────────────────────
+
+const act = {
+  enclave: (path) => chosen({ type: "enclave", path }),
+  name: (kind, name) => chosen({ type: "name", kind, name }),
+  only: (path) => {
+    clear();
+    setFilter("enclave", path);
+  },
+  flow: (kind, name, upstream) => {
+    clear();
+    state.flow = { kind, name, upstream, hops: 2 };
+    showTab("map");
+    showMap();
+  },
+};
+
+function choose(card) {
+  if (card.role === "group") {
+    const at = model.scenes.findIndex((scene) => scene.id === `group ${card.id.slice(2)}`);
+    if (at >= 0) setScene(at);
+    return;
+  }
+  if (card.role === "enclave") act.enclave(card.members[0]);
+  else if (card.members.length === 1) act.name(card.kind, card.members[0]);
+  else chosen({ type: "card", card });
+}
+
+function chosen(what) {
+  state.chosen = what;
+  const content = {
+    enclave: () => enclaveDetails(model, what.path, act),
+    name: () => nameDetails(model, what.kind, what.name, act),
+    card: () => cardDetails(what.card, act),
+  }[what.type]();
+  byId("details-content").replaceChildren(...content);
+  document.body.classList.add("with-details");
+  if (byId("details").hidden) {
+    byId("details").hidden = false;
+    zoom(0);
+  }
+  byId("details").scrollTop = 0;
+  byId("details-content").querySelector("h2").focus({ preventScroll: true });
+  light();
+}
+
+function close() {
+  const was = state.chosen;
+  state.chosen = null;
+  byId("details").hidden = true;
+  document.body.classList.remove("with-details");
+  zoom(0);
+  light();
+  if (was) document.querySelector("#map [tabindex='0']")?.focus({ preventScroll: true });
+}
+
+function clear() {
+  state.flow = null;
+  state.filters = {};
+  for (const key of FILTERS) if (byId(`filter-${key}`)) byId(`filter-${key}`).value = "";
+}
+
+function setScene(at) {
+  clear();
+  state.scene = at;
+  byId("scene").value = String(at);
+  showMap();
+}
+
+function setFilter(key, value) {
+  state.flow = null;
+  state.filters[key] = value;
+  if (byId(`filter-${key}`).value !== value) byId(`filter-${key}`).value = value;
+  showTab("map");
+  showMap();
+}
+
+// ── search, filters, tabs ────────────────────────────────────────────────────────────────────
+
+function search() {
+  const text = byId("search").value;
+  const { enclaves, names, more } = model.search(text, MOST_FOUND);
+  const item = (kind, label, onclick) =>
+    el("li", {}, el("button", { type: "button", onclick }, el("span", { class: "kind", text: kind }), el("span", { class: "mono", text: label })));
+  const items = [
+    ...enclaves.map((each) => item("enclave", each.path, () => found(() => act.enclave(each.path)))),
+    ...names.map((each) => item(KINDS[each.kind], each.name, () => found(() => act.name(each.kind, each.name)))),
+  ];
+  if (more) items.push(el("li", { class: "soft", text: `and ${more} more: type on` }));
+  if (text.trim() && !items.length) items.push(el("li", { class: "soft", text: "Nothing is called so." }));
+  byId("results").replaceChildren(...items);
+  byId("results").hidden = !items.length;
+  byId("search-status").textContent = text.trim() ? `${enclaves.length + names.length + more} found` : "";
+}
+
+function found(then) {
+  byId("results").hidden = true;
+  showTab("map");
+  then();
+}
+
+function options(id, pairs) {
+  byId(id).replaceChildren(...pairs.map(([value, text]) => el("option", { value, text })));
+}
+
+function showTab(name) {
+  for (const tab of document.querySelectorAll("[role=tab]")) {
+    const on = tab.id === `tab-${name}`;
+    tab.setAttribute("aria-selected", String(on));
+    tab.tabIndex = on ? 0 : -1;
+    byId(tab.getAttribute("aria-controls")).hidden = !on;
+  }
+  document.body.dataset.tab = name;
+}
+
+function tabKeys(event) {
+  const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
+  if (!step) return;
+  const tabs = [...document.querySelectorAll("[role=tab]:not([hidden])")];
+  const next = tabs[(tabs.indexOf(event.target) + step + tabs.length) % tabs.length];
+  showTab(next.id.replace("tab-", ""));
+  next.focus();
+}
+
+function fillLists() {
+  const order = { error: 0, warning: 1, note: 2 };
+  const sorted = [...model.findings].sort((a, b) => order[a.severity] - order[b.severity]);
+  const onEnclave = (path) => {
+    showTab("map");
+    act.enclave(path);
+  };
+  const none = el("p", { class: "soft", text: "Nothing was found." });
+  const list = el("ul", { class: "plain cards" }, sorted.map((each) => findingItem(each, onEnclave)));
+  byId("findings").replaceChildren(sorted.length ? list : none);
+  byId("tab-findings").textContent = sorted.length ? `Findings (${sorted.length})` : "Findings";
+  byId("timeline").replaceChildren(...timeline(model.validities, onEnclave));
+  byId("tab-differences").hidden = !model.overlay;
+  if (!model.overlay) return;
+  const items = model.differences.map((each) =>
+    el(
+      "li",
+      {},
+      el("span", { class: `chip ${each.mark}`, text: markText(model.overlay, each.mark) }),
+      " ",
+      el("code", { text: each.text }),
+      each.covered.length ? el("span", { class: "soft", text: ` reached by ${each.covered.join(", ")}` }) : null,
+    ),
+  );
+  const same = el("p", { class: "soft", text: "There is no difference." });
+  byId("differences").replaceChildren(items.length ? el("ul", { class: "plain differences" }, items) : same);
+  byId("tab-differences").textContent = `Differences (${items.length})`;
+}
+
+function start() {
+  const any = (text) => ["", text];
+  options("scene", model.scenes.map((scene, at) => [String(at), scene.title]));
+  byId("scene-label").hidden = model.scenes.length < 2;
+  options("filter-enclave", [any("every enclave"), ...model.enclaves.map(({ path }) => [path, path])]);
+  options("filter-namespace", [any("every namespace"), ...model.namespaces.filter((ns) => ns !== "/").map((ns) => [ns, ns])]);
+  options("filter-direction", [any("both directions"), ["send", "may send"], ["receive", "may receive"], ["deny", "denied"]]);
+  const levels = [...new Set(model.bundles.map((bundle) => bundle.protection.level))];
+  options("filter-protection", [any("every protection"), ...levels.map((level) => [level, LEVELS[level]])]);
+  byId("mark-label").hidden = !model.overlay;
+  if (model.overlay) {
+    options("filter-mark", [any("all rights"), ["first", model.overlay.first], ["second", model.overlay.second], ["both", "on both sides"]]);
+  }
+  byId("scene").addEventListener("change", (event) => setScene(Number(event.target.value)));
+  for (const key of FILTERS) {
+    byId(`filter-${key}`).addEventListener("change", (event) => setFilter(key, event.target.value));
+  }
+  byId("search").addEventListener("input", search);
+  byId("search").addEventListener("keydown", (event) => {
+    if (event.key === "ArrowDown" || event.key === "Enter") {
+      const first = byId("results").querySelector("button");
+      if (first && event.key === "Enter") first.click();
+      else first?.focus();
+      event.preventDefault();
+    }
+  });
+  byId("back").addEventListener("click", () => setScene(state.scene));
+  byId("close").addEventListener("click", close);
+  byId("zoom-in").addEventListener("click", () => zoom(1));
+  byId("zoom-out").addEventListener("click", () => zoom(-1));
+  byId("zoom-fit").addEventListener("click", () => zoom(0));
+  byId("hops-more").addEventListener("click", () => hop(1));
+  byId("hops-less").addEventListener("click", () => hop(-1));
+  byId("print").addEventListener("click", () => window.print());
+  byId("theme").addEventListener("change", (event) => {
+    document.documentElement.dataset.theme = event.target.value;
+  });
+  for (const tab of document.querySelectorAll("[role=tab]")) {
+    tab.addEventListener("click", () => showTab(tab.id.replace("tab-", "")));
+    tab.addEventListener("keydown", tabKeys);
+  }
+  document.addEventListener("keydown", (event) => {
+    if (event.key === "Escape") {
+      if (!byId("results").hidden) byId("results").hidden = true;
+      else close();
+    }
+    if (event.key === "/" && !/^(INPUT|SELECT|TEXTAREA)$/.test(document.activeElement.tagName)) {
+      event.preventDefault();
+      byId("search").focus();
+    }
+  });
+  window.addEventListener("resize", () => zoom(0));
+  // On a small screen the map comes first.
+  if (window.innerWidth <= 720) for (const fold of document.querySelectorAll(".fold")) fold.open = false;
+  fillLists();
+  showTab("map");
+  showMap();
+  document.body.dataset.ready = "true";
+}
+
+function hop(step) {
+  state.flow.hops = Math.max(1, Math.min(state.shown.most, state.flow.hops + step));
+  showMap();
+}
+
+start();

@@ -1,0 +1,150 @@
+// The picture as it was written into the page, with the questions that are put to it.
+
+export const KINDS = { topics: "topic", services: "service", actions: "action", dds: "DDS topic" };
+export const LEVELS = {
+  encrypt: "encrypted",
+  sign: "signed, readable",
+  none: "not protected",
+  unknown: "protection unknown",
+};
+const SENDS = new Set(["publish", "request", "call"]);
+const ONE_WAY = new Set(["publish", "subscribe"]);
+// With this topic, which every node writes and reads, everybody would reach everybody.
+const OF_EVERY_NODE = "/parameter_events";
+
+export const sends = (tie) => SENDS.has(tie.right);
+
+export class Model {
+  constructor(data) {
+    Object.assign(this, data);
+    this.enclave = new Map(data.enclaves.map((each) => [each.path, each]));
+    this.bundleOf = new Map();
+    this.tiesOf = new Map(data.enclaves.map((each) => [each.path, []]));
+    for (const bundle of data.bundles) {
+      for (const name of bundle.names) this.bundleOf.set(`${bundle.kind} ${name}`, bundle);
+      for (const tie of bundle.ties) this.tiesOf.get(tie.enclave).push({ tie, bundle });
+    }
+    this.names = data.bundles.flatMap((bundle) =>
+      bundle.names.map((name) => ({ kind: bundle.kind, name, bundle })),
+    );
+    this.names.sort((a, b) => (a.name < b.name ? -1 : a.name > b.name ? 1 : 0));
+    this.namespaces = [...new Set(this.names.flatMap(({ name }) => prefixes(name)))].sort();
+  }
+
+  bundle(kind, name) {
+    return this.bundleOf.get(`${kind} ${name}`);
+  }
+
+  // What a person types, as enclaves and names that hold it; those that begin with it come first.
+  search(text, most) {
+    const wanted = text.trim().toLowerCase();
+    if (!wanted) return { enclaves: [], names: [], more: 0 };
+    const rank = (name) => {
+      const at = name.toLowerCase().indexOf(wanted);
+      return at < 0 ? -1 : Math.min(at, 2);
+    };
+    const found = (list, nameOf) =>
+      list
+        .map((each) => [rank(nameOf(each)), each])
+        .filter(([place]) => place >= 0)
+        .sort((a, b) => a[0] - b[0])
+        .map(([, each]) => each);
+    const enclaves = found(this.enclaves, (each) => each.path);
+    const names = found(this.names, (each) => each.name);
+    const more = Math.max(0, enclaves.length - most) + Math.max(0, names.length - most);
+    return { enclaves: enclaves.slice(0, most), names: names.slice(0, most), more };
+  }
+
+  validitiesOf(path) {
+    return this.validities.filter((each) => each.enclave === path);
+  }
+
+  findingsOf(path) {
+    return this.findings.filter((each) => each.enclave === path);
+  }
+
+  // The bundles that fit the filters, with the ties of them that do.
+  filtered({ enclave, namespace, direction, protection, mark, common }) {
+    const found = [];
+    for (const bundle of this.bundles) {
+      if (protection && bundle.protection.level !== protection) continue;
+      let names = bundle.names;
+      if (namespace) names = names.filter((name) => prefixes(name).includes(namespace));
+      if (!names.length) continue;
+      let ties = common ? bundle.ties : bundle.ties.filter((tie) => !tie.common);
+      if (mark) ties = ties.filter((tie) => (mark === "deny" ? tie.deny : tie.mark === mark));
+      if (direction === "deny") ties = ties.filter((tie) => tie.deny);
+      const own = enclave ? ties.filter((tie) => tie.enclave === enclave) : ties;
+      if (direction && direction !== "deny") {
+        const fits = own.filter((tie) => sends(tie) === (direction === "send"));
+        if (!fits.length) continue;
+        if (!enclave) ties = fits;
+        else ties = ties.filter((tie) => tie.enclave !== enclave || fits.includes(tie));
+      } else if (!own.length) continue;
+      if (ties.length) found.push({ ...bundle, names, ties });
+    }
+    return found;
+  }
+
+  // Who writes (or reads) a bundle in the sense of information that flows, denials left out.
+  #ends(bundle, writing) {
+    if (bundle.names.every((name) => name === OF_EVERY_NODE)) return [];
+    return bundle.ties.filter(
+      (tie) => !tie.deny && (!ONE_WAY.has(tie.right) || sends(tie) === writing),
+    );
+  }
+
+  // Where information comes from that reaches a name (or where it goes from there).  Steps lead
+  // from enclaves to names and on; each enclave has the number of hops at which it is first met.
+  // A service or an action carries both ways: requests there, replies back.
+  flow(kind, name, upstream) {
+    const start = this.bundle(kind, name);
+    const hops = new Map();
+    const steps = [];
+    const met = new Set([start]);
+    let front = [start];
+    for (let hop = 1; front.length; hop += 1) {
+      const reached = new Set();
+      for (const bundle of front) {
+        for (const tie of this.#ends(bundle, upstream)) {
+          if (!hops.has(tie.enclave)) {
+            hops.set(tie.enclave, hop);
+            reached.add(tie.enclave);
+          }
+          if (hops.get(tie.enclave) === hop) steps.push({ hop, bundle, tie, near: true });
+        }
+      }
+      front = [];
+      for (const path of reached) {
+        for (const { tie, bundle } of this.tiesOf.get(path)) {
+          if (met.has(bundle) || !this.#ends(bundle, !upstream).includes(tie)) continue;
+          steps.push({ hop, bundle, tie, near: false });
+          front.push(bundle);
+        }
+      }
+      front = [...new Set(front)];
+      for (const bundle of front) met.add(bundle);
+    }
+    return { start, hops, steps };
+  }
+}
+
+function prefixes(name) {
+  const parts = name.split("/").slice(0, -1);
+  const found = ["/"];
+  for (let length = 2; length <= parts.length; length += 1) {
+    found.push(parts.slice(0, length).join("/"));
+  }
+  return found;
+}
+
+// The rights of an enclave that carry no information: what only says who may listen is not told.
+export function byRight(ties) {
+  const groups = new Map();
+  for (const each of ties) {
+    const key = `${each.tie.deny ? "DENY " : ""}${each.tie.right}`;
+    if (!groups.has(key)) groups.set(key, []);
+    groups.get(key).push(each);
+  }
+  return groups;
+}
