@@ -186,7 +186,7 @@ class Access:
             if not self._permits(verdict):
                 return self._verdict(verb, topic, verdict, rule, Outcome.DENIED)
         if not controlled:
-            if join.outcome is Outcome.PEER_DENIES:
+            if join.outcome is Outcome.PEER_DENIES and not self._in_the_open(rule):
                 return self._peer_denies_all(rule)
             return self._answer(
                 Outcome.ALLOWED,
@@ -239,6 +239,18 @@ class Access:
                 text = f"no rule allows {asked}"
         return self._answer(
             outcome, reason, text, verdict.rule, verdict.expression, topic_rule=rule
+        )
+
+    def _in_the_open(self, rule: TopicRule) -> bool:
+        """Whether even participants that refuse each other exchange the topic."""
+        domain = self._governed.rule
+        return (
+            self._traits.shares_open_topics
+            and domain is not None
+            and domain.rtps_protection_kind is Protection.NONE
+            and not (rule.enable_read_access_control or rule.enable_write_access_control)
+            and rule.metadata_protection_kind is Protection.NONE
+            and rule.data_protection_kind is Protection.NONE
         )
 
     def _peer_denies_all(self, rule: TopicRule) -> Decision:

@@ -116,6 +116,8 @@ class Traits:
     """Without any allow rule the participant does not start, even without join control."""
     needs_domain_rule: bool = True
     """On a domain that the governance does not list, the participant does not even start."""
+    shares_open_topics: bool = False
+    """Participants that refused each other still exchange what nothing protects (ran)."""
     refuses_open_rtps: bool = False
     """Unauthenticated participants together with RTPS protection are refused."""
 
@@ -155,6 +157,7 @@ TRAITS = {
         deny_partitions=DenyPartitions.ALL,
         crashes_on_empty_expressions=True,
         creates_topics=True,
+        shares_open_topics=True,
     ),
     Vendor.OPENDDS: Traits("OpenDDS", documented_only=True),
     Vendor.CONNEXT: Traits("Connext 6.1.1 and later", documented_only=True),

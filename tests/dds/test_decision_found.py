@@ -1,0 +1,53 @@
+"""What comparing with the vendors themselves brought to light, as a table."""
+
+from __future__ import annotations
+
+import pytest
+from decision_documents import (
+    NOW,
+    SUBJECT,
+    allow,
+    governance,
+    grant,
+    permissions,
+    publish,
+    topic_rule,
+)
+
+from sros_tool.dds.decision import Access, Outcome, Vendor
+
+EVERYTHING = permissions(grant(allow(publish("*"))))
+ELSEWHERE = permissions(grant(allow(publish("rt/a"), domains="<id>7</id>")))
+
+
+def outcome(vendor: Vendor, perms: bytes, govern: bytes, topic: str) -> Outcome:
+    found = Access.of_documents(vendor, govern, perms, SUBJECT, domain=42, at=NOW)
+    assert isinstance(found, Access), found
+    return found.publish(topic).outcome
+
+
+@pytest.mark.parametrize(
+    "name", ["rt/-", "rt/]", "rt/a.b", "7", "rt/\N{LATIN SMALL LETTER E WITH ACUTE}"]
+)
+def test_cyclone_takes_letters_digits_and_slashes_as_topics(name: str) -> None:
+    assert outcome(Vendor.CYCLONE, EVERYTHING, governance(), "rt/a_7") is Outcome.ALLOWED
+    assert outcome(Vendor.CYCLONE, EVERYTHING, governance(), name) is Outcome.DENIED
+    assert outcome(Vendor.FAST_2_9, EVERYTHING, governance(), name) is Outcome.ALLOWED
+
+
+@pytest.mark.parametrize(
+    ("rtps", "data", "vendor", "expected"),
+    [
+        ("NONE", "NONE", Vendor.CYCLONE, Outcome.ALLOWED),
+        ("SIGN", "NONE", Vendor.CYCLONE, Outcome.PEER_DENIES),
+        ("NONE", "SIGN", Vendor.CYCLONE, Outcome.PEER_DENIES),
+        ("NONE", "NONE", Vendor.FAST_2_9, Outcome.PEER_DENIES),
+    ],
+)
+def test_what_nothing_protects_is_shared_with_those_that_were_refused(
+    rtps: str, data: str, vendor: Vendor, expected: Outcome
+) -> None:
+    free = topic_rule("rt/open", read=False, write=False, data=data)
+    free = free.replace("<metadata_protection_kind>ENCRYPT", "<metadata_protection_kind>NONE")
+    govern = governance(free, topic_rule(), rtps=rtps)
+    assert outcome(vendor, ELSEWHERE, govern, "rt/open") is expected

@@ -1,0 +1,311 @@
+// Asks Fast DDS, many times in one process, what signed documents let an identity do.
+//
+// Reads cases from standard input, a line each, of fields separated by tabs:
+//
+//   IDENTITY_FOLDER  DOCUMENTS_FOLDER  DOMAIN  TIME_ZONE  PEER_IDENTITY|-  PEER_DOCUMENTS|-  WAIT_MS
+//   QUESTION...
+//
+// A question is "publish" or "subscribe", the topic and the partitions, separated by
+// the character US (0x1f).  Answers each case with a line, flushed, of fields separated by tabs:
+//
+//   refused  LOG                      no participant
+//   peer refused  LOG                 none with the identity of the peer
+//   joined  ANSWER...                 to each question: denied, created, matched or unmatched
+//
+// With a peer, "created" becomes "matched" if the counterpart of the peer is found within WAIT_MS,
+// else "unmatched"; "peer denied" if the peer may not open it.  The line that lacks when the process
+// ends is that of the case at which it crashed.
+
+#include <fastdds/dds/domain/DomainParticipant.hpp>
+#include <fastdds/dds/domain/DomainParticipantFactory.hpp>
+#include <fastdds/dds/log/Log.hpp>
+#include <fastdds/dds/publisher/DataWriter.hpp>
+#include <fastdds/dds/publisher/Publisher.hpp>
+#include <fastdds/dds/subscriber/DataReader.hpp>
+#include <fastdds/dds/subscriber/Subscriber.hpp>
+#include <fastdds/dds/topic/Topic.hpp>
+#include <fastdds/dds/topic/TopicDataType.hpp>
+#include <fastdds/dds/topic/TypeSupport.hpp>
+#include <fastdds/rtps/transport/UDPv4TransportDescriptor.h>
+#include <fastrtps/xmlparser/XMLProfileManager.h>
+
+#include <chrono>
+#include <cstdint>
+#include <cstdlib>
+#include <ctime>
+#include <filesystem>
+#include <functional>
+#include <iostream>
+#include <memory>
+#include <mutex>
+#include <sstream>
+#include <string>
+#include <thread>
+#include <vector>
+
+namespace fast = eprosima::fastdds::dds;
+namespace rtps = eprosima::fastrtps::rtps;
+
+// A type of which nothing is ever written.
+class EmptyType : public fast::TopicDataType
+{
+public:
+    EmptyType()
+    {
+        setName("sros::Empty");
+        m_typeSize = 4;
+        m_isGetKeyDefined = false;
+        auto_fill_type_information(false);
+        auto_fill_type_object(false);
+    }
+
+    bool serialize(void*, rtps::SerializedPayload_t*) override { return false; }
+    bool deserialize(rtps::SerializedPayload_t*, void*) override { return false; }
+    std::function<uint32_t()> getSerializedSizeProvider(void*) override { return [] { return 4u; }; }
+    void* createData() override { return new char; }
+    void deleteData(void* value) override { delete static_cast<char*>(value); }
+    bool getKey(void*, rtps::InstanceHandle_t*, bool) override { return false; }
+};
+
+// Keeps what Fast DDS logs; it is called in a thread of Fast DDS.
+class Lines : public fast::LogConsumer
+{
+public:
+    void Consume(const fast::Log::Entry& entry) override
+    {
+        std::lock_guard<std::mutex> guard(lock);
+        for (char letter : entry.message)
+        {
+            text += letter == '\n' || letter == '\t' ? ' ' : letter;
+        }
+        text += "; ";
+    }
+
+    static std::string take()
+    {
+        fast::Log::Flush();
+        std::lock_guard<std::mutex> guard(lock);
+        std::string taken;
+        taken.swap(text);
+        return taken;
+    }
+
+private:
+    static std::mutex lock;
+    static std::string text;
+};
+
+std::mutex Lines::lock;
+std::string Lines::text;
+
+std::vector<std::string> split(const std::string& text, char mark)
+{
+    std::vector<std::string> parts(1);
+    for (char letter : text)
+    {
+        if (letter == mark)
+        {
+            parts.emplace_back();
+        }
+        else
+        {
+            parts.back() += letter;
+        }
+    }
+    return parts;
+}
+
+struct Party
+{
+    fast::DomainParticipant* participant = nullptr;
+
+    Party(std::uint32_t domain, const std::string& identity, const std::string& documents)
+    {
+        fast::DomainParticipantQos qos;
+        qos.transport().use_builtin_transports = false;
+        qos.transport().user_transports.push_back(
+            std::make_shared<eprosima::fastdds::rtps::UDPv4TransportDescriptor>());
+        auto set = [&qos](const std::string& name, const std::string& value)
+        {
+            qos.properties().properties().emplace_back(name, value);
+        };
+        const std::string mine = "file://" + identity + "/", signed_ones = "file://" + documents + "/";
+        const std::string authentication = "dds.sec.auth.builtin.PKI-DH.";
+        const std::string access = "dds.sec.access.builtin.Access-Permissions.";
+        set("dds.sec.auth.plugin", "builtin.PKI-DH");
+        set("dds.sec.access.plugin", "builtin.Access-Permissions");
+        set("dds.sec.crypto.plugin", "builtin.AES-GCM-GMAC");
+        set(authentication + "identity_ca", mine + "identity_ca.cert.pem");
+        set(authentication + "identity_certificate", mine + "cert.pem");
+        set(authentication + "private_key", mine + "key.pem");
+        if (std::filesystem::exists(identity + "/crl.pem"))
+        {
+            set(authentication + "identity_crl", mine + "crl.pem");
+        }
+        set(access + "permissions_ca", mine + "permissions_ca.cert.pem");
+        set(access + "governance", signed_ones + "governance.p7s");
+        set(access + "permissions", signed_ones + "permissions.p7s");
+        auto* factory = fast::DomainParticipantFactory::get_instance();
+        participant = factory->create_participant(domain, qos);
+        if (participant)
+        {
+            fast::TypeSupport(new EmptyType).register_type(participant);
+        }
+    }
+
+    ~Party()
+    {
+        if (participant)
+        {
+            participant->delete_contained_entities();
+            fast::DomainParticipantFactory::get_instance()->delete_participant(participant);
+        }
+    }
+};
+
+using Names = std::vector<std::string>;
+
+// One end of a topic, a writer or a reader.
+struct End
+{
+    fast::DataWriter* writer = nullptr;
+    fast::DataReader* reader = nullptr;
+
+    explicit operator bool() const { return writer || reader; }
+
+    bool matched() const
+    {
+        if (writer)
+        {
+            fast::PublicationMatchedStatus status;
+            writer->get_publication_matched_status(status);
+            return status.current_count > 0;
+        }
+        fast::SubscriptionMatchedStatus status;
+        reader->get_subscription_matched_status(status);
+        return status.current_count > 0;
+    }
+};
+
+fast::Topic* topic_of(fast::DomainParticipant* participant, const std::string& name)
+{
+    auto* known = participant->lookup_topicdescription(name);
+    return known ? static_cast<fast::Topic*>(known)
+                 : participant->create_topic(name, "sros::Empty", fast::TOPIC_QOS_DEFAULT);
+}
+
+End open(fast::DomainParticipant* participant, bool writes, const std::string& name, const Names& partitions)
+{
+    End end;
+    auto* topic = topic_of(participant, name);
+    if (!topic)
+    {
+        return end;
+    }
+    if (writes)
+    {
+        fast::PublisherQos qos;
+        for (const auto& each : partitions)
+        {
+            qos.partition().push_back(each.c_str());
+        }
+        end.writer = participant->create_publisher(qos)->create_datawriter(topic, fast::DATAWRITER_QOS_DEFAULT);
+    }
+    else
+    {
+        fast::SubscriberQos qos;
+        for (const auto& each : partitions)
+        {
+            qos.partition().push_back(each.c_str());
+        }
+        end.reader = participant->create_subscriber(qos)->create_datareader(topic, fast::DATAREADER_QOS_DEFAULT);
+    }
+    return end;
+}
+
+struct Pair
+{
+    End own, others;
+};
+
+void await(const std::vector<Pair>& pairs, int milliseconds)
+{
+    const auto end = std::chrono::steady_clock::now() + std::chrono::milliseconds(milliseconds);
+    auto waiting = [&pairs]
+    {
+        for (const auto& pair : pairs)
+        {
+            if (pair.own && pair.others && !(pair.own.matched() && pair.others.matched()))
+            {
+                return true;
+            }
+        }
+        return false;
+    };
+    while (waiting() && std::chrono::steady_clock::now() < end)
+    {
+        std::this_thread::sleep_for(std::chrono::milliseconds(10));
+    }
+}
+
+std::string answer(const std::vector<std::string>& fields)
+{
+    const auto domain = static_cast<std::uint32_t>(std::stoul(fields[2]));
+    setenv("TZ", fields[3].c_str(), 1);
+    tzset();
+    Lines::take();
+    Party self(domain, fields[0], fields[1]);
+    if (!self.participant)
+    {
+        return "refused\t" + Lines::take();
+    }
+    std::unique_ptr<Party> peer;
+    if (fields[4] != "-")
+    {
+        peer = std::make_unique<Party>(domain, fields[4], fields[5]);
+        if (!peer->participant)
+        {
+            return "peer refused\t" + Lines::take();
+        }
+    }
+    std::vector<Pair> pairs;
+    for (std::size_t i = 7; i < fields.size(); ++i)
+    {
+        const Names words = split(fields[i], '\x1f');
+        const Names partitions(words.begin() + 2, words.end());
+        const bool writes = words[0] == "publish";
+        Pair pair;
+        pair.own = open(self.participant, writes, words[1], partitions);
+        if (peer && pair.own)
+        {
+            pair.others = open(peer->participant, !writes, words[1], partitions);
+        }
+        pairs.push_back(pair);
+    }
+    await(pairs, std::stoi(fields[6]));
+    std::string said = "joined";
+    for (const auto& pair : pairs)
+    {
+        const bool matched = pair.own && pair.others && pair.own.matched() && pair.others.matched();
+        said += !pair.own           ? "\tdenied"
+                : !peer             ? "\tcreated"
+                : !pair.others      ? "\tpeer denied"
+                : matched           ? "\tmatched"
+                                    : "\tunmatched";
+    }
+    return said;
+}
+
+int main()
+{
+    fast::Log::ClearConsumers();  // it writes to standard output
+    fast::Log::RegisterConsumer(std::make_unique<Lines>());
+    eprosima::fastrtps::LibrarySettingsAttributes settings;
+    settings.intraprocess_delivery = eprosima::fastrtps::INTRAPROCESS_OFF;
+    eprosima::fastrtps::xmlparser::XMLProfileManager::library_settings(settings);
+    std::string line;
+    while (std::getline(std::cin, line))
+    {
+        std::cout << answer(split(line, '\t')) << std::endl;
+    }
+}

@@ -1,0 +1,168 @@
+"""The decision engine against the vendors themselves: what it says is what they do.
+
+First row by row what was found out about them, then documents drawn in two ways: such as people
+write, with one oddity at most, and such as nobody would.  How many of each: $SROS_DIFFERENTIAL
+(250); from which seed: $SROS_DIFFERENTIAL_SEED (1).
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from datetime import UTC, datetime
+from zoneinfo import ZoneInfo
+
+import pytest
+from drawn_cases import cases as drawn_cases
+from drawn_documents import documents
+from hypothesis import HealthCheck, Phase, given, seed, settings
+from vendor_oracle import (
+    Case,
+    Question,
+    Reply,
+    Workshop,
+    ask_cyclone,
+    ask_fastdds,
+)
+from vendor_rows import rows
+
+from sros_tool.dds.decision import Access, Outcome, Refusal, Vendor, Verb
+
+pytestmark = pytest.mark.dds
+
+COUNT = int(os.environ.get("SROS_DIFFERENTIAL", "250"))
+SEED = int(os.environ.get("SROS_DIFFERENTIAL_SEED", "1"))
+Draw = Callable[[int, int, datetime], list[Case]]
+ASK = {Vendor.FAST_2_9: ask_fastdds, Vendor.CYCLONE: ask_cyclone}
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Workshop:
+    return Workshop(tmp_path_factory.mktemp("workshop"))
+
+
+@pytest.mark.parametrize("vendor", ASK)
+def test_every_row_of_what_is_known(vendor: Vendor, workshop: Workshop) -> None:
+    table = rows()
+    replies = ASK[vendor](workshop, [row.case for row in table], at_once=6)
+    at = datetime.now(UTC)
+    wrong = []
+    for row, reply in zip(table, replies, strict=True):
+        expected = row.cyclone if vendor is Vendor.CYCLONE else row.fast
+        observed = reply.answers[0] if reply.end == "joined" else reply.end
+        if observed != expected:
+            wrong.append(f"{row.name}: {vendor.title} answers {observed}, not {expected}")
+        wrong += [f"{row.name}: {text}" for text in disagreements(vendor, row.case, reply, at)]
+    assert not wrong, "\n".join(wrong)
+
+
+def draw_sensible(count: int, number: int, now: datetime) -> list[Case]:
+    """Cases as people write documents, with one oddity at most."""
+    return [
+        Case(
+            each.governance_xml,
+            each.permissions_xml,
+            tuple(Question(*asked) for asked in each.questions if asked[0] is not Verb.JOIN),
+            each.subject,
+            each.domain,
+            each.zone,
+            peer=place % 6 == 0,
+        )
+        for place, each in enumerate(documents(number, count, now=now))
+    ]
+
+
+def draw_odd(count: int, number: int, now: datetime) -> list[Case]:
+    """So many different cases, always the same ones for a seed and a moment."""
+    found: dict[Case, None] = {}
+
+    @seed(number)
+    @settings(
+        max_examples=2 * count,
+        phases=[Phase.generate],
+        database=None,
+        deadline=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(drawn_cases(now))
+    def collect(case: Case) -> None:
+        found[case] = None
+
+    collect()
+    return list(found)[:count]
+
+
+@pytest.mark.parametrize("draw", [draw_sensible, draw_odd])
+@pytest.mark.parametrize("vendor", ASK)
+def test_drawn_documents(vendor: Vendor, draw: Draw, workshop: Workshop) -> None:
+    now = datetime.now(UTC).replace(microsecond=0)
+    drawn = draw(COUNT, SEED, now)
+    assert len(drawn) > 0.9 * COUNT
+    replies = ASK[vendor](workshop, drawn, at_once=4)
+    wrong = [
+        (text, case)
+        for case, reply in zip(drawn, replies, strict=True)
+        for text in disagreements(vendor, case, reply, now)
+    ]
+    print(f"{vendor.title}: {len(drawn)} documents, {summary(replies)}; {len(wrong)} disagreements")
+    assert not wrong, "\n".join(f"{text}\n{shown(case)}" for text, case in wrong[:3])
+    said = Counter(answer for reply in replies for answer in (reply.end, *reply.answers))
+    assert all(said[word] > COUNT / 50 for word in ("joined", "refused", "created", "denied"))
+
+
+# ── comparing ──────────────────────────────────────────────────────────────────────────────
+
+EXPECTED = {
+    Outcome.ALLOWED: ("created", "matched"),
+    Outcome.DENIED: ("denied", "invalid"),
+    Outcome.PEER_DENIES: ("created", "unmatched"),
+}
+
+
+def disagreements(vendor: Vendor, case: Case, reply: Reply, at: datetime) -> Iterator[str]:
+    """Where the engine says something else than the vendor did."""
+    access = Access.of_documents(
+        vendor,
+        case.governance,
+        case.permissions,
+        case.subject,
+        domain=case.domain,
+        at=at,
+        zone=ZoneInfo(case.zone),
+    )
+    if isinstance(access, Refusal):
+        if reply.end not in ("refused", "crashed") or (reply.end == "crashed") is not (
+            access.outcome is Outcome.CRASHES
+        ):
+            yield f"the engine says {access}, {vendor.title} {reply}"
+        return
+    join = access.join()
+    decisions = [
+        access.decide(Verb(each.verb), each.topic, each.partitions) for each in case.questions
+    ]
+    if reply.end == "crashed":
+        if not any(each.outcome is Outcome.CRASHES for each in (join, *decisions)):
+            yield f"the engine foresees no crash: {join}, {decisions}"
+        return
+    if (join.outcome is Outcome.REFUSED) is not (reply.end == "refused"):
+        yield f"to join, the engine says {join}, {vendor.title} {reply}"
+        return
+    if reply.end != "joined":
+        if reply.end != "refused":
+            yield f"{vendor.title} answers {reply}"
+        return
+    for question, decision, answer in zip(case.questions, decisions, reply.answers, strict=True):
+        if answer not in EXPECTED.get(decision.outcome, ()):
+            yield f"to {question}, the engine says {decision}, {vendor.title} {answer}; {reply.log}"
+
+
+def summary(replies: Sequence[Reply]) -> str:
+    counted = Counter(answer for reply in replies for answer in reply.answers or (reply.end,))
+    return ", ".join(f"{number} {word}" for word, number in sorted(counted.items()))
+
+
+def shown(case: Case) -> str:
+    """A case for whoever has to find out."""
+    head = f"{case.subject} on domain {case.domain} in {case.zone}, peer {case.peer}"
+    return f"{head}\n{case.governance.decode()}\n{case.permissions.decode()}"

@@ -1,0 +1,257 @@
+"""Ask real DDS vendors in bulk what signed documents let an identity do.
+
+A `Case` is a pair of documents as bytes, an identity, a domain and a time zone, with questions.
+`Workshop` signs the documents once each; `ask_fastdds` and `ask_cyclone` answer all cases, in the
+order of the cases.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import pytest
+from cryptography import x509
+
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem
+from sros_tool.pki.keys import generate_key, key_pem
+from sros_tool.runtime.netns import try_isolation
+from sros_tool.validity import Window
+
+HERE = Path(__file__).parent
+ISOLATED = """
+import os, sys
+from sros_tool.runtime.netns import end_with_parent, enter_isolation
+enter_isolation()
+os.execv(sys.argv[1], sys.argv[1:])
+"""
+CYCLONE, FASTDDS = "cyclonedds", "fastdds"
+MATCH_SECONDS = 2.5
+"""How long a match is waited for; those that come take a tenth of a second."""
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """Whether a topic may be opened; ``verb`` is publish or subscribe."""
+
+    verb: str
+    topic: str
+    partitions: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Documents, and who asks what where; with ``peer``, whether a permitted peer matches too."""
+
+    governance: bytes
+    permissions: bytes
+    questions: tuple[Question, ...]
+    subject: str = "CN=/t"
+    domain: int = 42
+    zone: str = "UTC"
+    peer: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Reply:
+    """What a vendor does.
+
+    ``end`` is joined, refused, crashed, hung or "peer refused"; ``answers`` has for each question
+    denied, created, or with a peer matched, unmatched, "peer denied"; ``log`` is the vendor's.
+    """
+
+    end: str
+    answers: tuple[str, ...] = ()
+    log: str = ""
+
+
+@dataclass
+class Workshop:
+    """Two authorities, identities by their subject, and signed documents, all in one folder."""
+
+    root: Path
+    _identities: dict[str, Path] = field(default_factory=dict)
+    _documents: dict[bytes, Path] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        now = datetime.now(UTC).replace(microsecond=0)
+        self.window = Window(now - timedelta(days=30), now + timedelta(days=30))
+        self.keys = {name: generate_key() for name in ("identity", "permissions")}
+        self.authorities = {
+            name: issue_ca(key, common_name(f"{name} CA"), self.window)
+            for name, key in self.keys.items()
+        }
+        self._issuer = Issuer(self.authorities["identity"], self.keys["identity"])
+
+    def identity(self, subject: str) -> Path:
+        """A folder with all files of an identity; its documents are those of nobody."""
+        if subject not in self._identities:
+            folder = self._folder(f"identity {subject}".encode())
+            key = generate_key()
+            name = x509.Name.from_rfc4514_string(subject)
+            certificate = self._issuer.issue(name, key.public_key(), self.window)
+            (folder / "key.pem").write_bytes(key_pem(key))
+            (folder / "cert.pem").write_bytes(pem(certificate))
+            for each, authority in self.authorities.items():
+                (folder / f"{each}_ca.cert.pem").write_bytes(pem(authority))
+            for each in ("governance.p7s", "permissions.p7s"):
+                (folder / each).touch()
+            self._identities[subject] = folder
+        return self._identities[subject]
+
+    def documents(self, governance: bytes, permissions: bytes) -> Path:
+        """A folder with governance.p7s and permissions.p7s, signed."""
+        folder = self._folder(governance + permissions)
+        for name, document in (("governance", governance), ("permissions", permissions)):
+            link = folder / f"{name}.p7s"
+            if not link.exists():
+                link.hardlink_to(self._signed(document))
+        return folder
+
+    def _signed(self, document: bytes) -> Path:
+        if document not in self._documents:
+            path = self.root / f"{len(self._documents)}.p7s"
+            certificate, key = self.authorities["permissions"], self.keys["permissions"]
+            path.write_bytes(smime.sign(document, certificate, key))
+            self._documents[document] = path
+        return self._documents[document]
+
+    def _folder(self, content: bytes) -> Path:
+        folder = self.root / sha256(content).hexdigest()[:20]
+        folder.mkdir(exist_ok=True)
+        return folder
+
+
+PEER = "CN=peer"
+PEER_PERMISSIONS = b"""<?xml version="1.0" encoding="UTF-8"?>
+<dds><permissions><grant name="peer"><subject_name>CN=peer</subject_name>
+<validity><not_before>2020-01-01T00:00:00</not_before><not_after>2037-01-01T00:00:00</not_after>
+</validity>
+<allow_rule><domains><id_range><min>0</min><max>230</max></id_range></domains>
+<publish><topics><topic>*</topic></topics><partitions><partition>*</partition></partitions></publish>
+<subscribe><topics><topic>*</topic></topics><partitions><partition>*</partition></partitions>
+</subscribe></allow_rule>
+<default>DENY</default></grant></permissions></dds>
+"""
+
+
+# ── Fast DDS ───────────────────────────────────────────────────────────────────────────────
+
+
+@cache
+def fastdds_oracle(folder: Path) -> Path:
+    """The program that asks Fast DDS, built once in a folder."""
+    if not shutil.which("g++") or not Path("/usr/include/fastdds").is_dir():
+        pytest.skip("g++ and libfastrtps-dev are not installed")
+    program = folder / "fastdds_oracle"
+    command = ["g++", "-std=c++17", "-O0", "-o", str(program), str(HERE / "fastdds_oracle.cpp")]
+    built = subprocess.run([*command, "-lfastrtps"], capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    return program
+
+
+def ask_fastdds(workshop: Workshop, cases: Sequence[Case], *, at_once: int = 2) -> list[Reply]:
+    """What Fast DDS does with each case; a process answers many, and a new one follows a crash."""
+    program = fastdds_oracle(workshop.root)
+    lines = [_line(workshop, case) for case in cases]
+    return _spread(lines, at_once, lambda some: _ask_one_program(program, some))
+
+
+def _line(workshop: Workshop, case: Case) -> str:
+    peer = ["-", "-"]
+    if case.peer:
+        documents = workshop.documents(case.governance, PEER_PERMISSIONS)
+        peer = [str(workshop.identity(PEER)), str(documents)]
+    questions = ["\x1f".join((each.verb, each.topic, *each.partitions)) for each in case.questions]
+    fields = [
+        workshop.identity(case.subject),
+        workshop.documents(case.governance, case.permissions),
+        case.domain,
+        case.zone,
+        *peer,
+        int(MATCH_SECONDS * 1000),
+        *questions,
+    ]
+    return "\t".join(map(str, fields))
+
+
+def _ask_one_program(program: Path, lines: Sequence[str]) -> list[Reply]:
+    command = [str(program)]
+    if try_isolation().isolated:
+        command = [sys.executable, "-c", ISOLATED, *command]
+    replies: list[Reply] = []
+    while len(replies) < len(lines):
+        rest = lines[len(replies) :]
+        limit = 60 + len(rest) * (MATCH_SECONDS + 1)
+        done = subprocess.run(
+            command, input="\n".join(rest) + "\n", capture_output=True, text=True, timeout=limit
+        )
+        replies += [_reply(line) for line in done.stdout.splitlines()]
+        if len(replies) < len(lines):
+            assert done.returncode < 0, (done.returncode, done.stderr)
+            replies.append(Reply("crashed", log=done.stderr))
+    return replies
+
+
+def _reply(line: str) -> Reply:
+    end, *rest = line.split("\t")
+    return Reply(end, tuple(rest)) if end == "joined" else Reply(end, log="".join(rest))
+
+
+# ── Cyclone DDS ────────────────────────────────────────────────────────────────────────────
+
+
+def ask_cyclone(workshop: Workshop, cases: Sequence[Case], *, at_once: int = 2) -> list[Reply]:
+    """What Cyclone DDS does with each case; every participant is a process of its own."""
+    return _spread([_record(workshop, case) for case in cases], at_once, ask_cyclone_records)
+
+
+def ask_cyclone_records(records: Sequence[dict[str, Any]]) -> list[Reply]:
+    """What Cyclone DDS does with cases in the form of `cyclone_oracle`."""
+    command = [sys.executable, str(HERE / "cyclone_oracle.py")]
+    done = subprocess.run(
+        command, input=json.dumps(list(records)), capture_output=True, text=True, timeout=3600
+    )
+    assert done.returncode == 0, done.stderr
+    replies = [json.loads(line) for line in done.stdout.splitlines()]
+    assert not [each for each in replies if each["end"] == "failed"], done.stderr
+    return [Reply(each["end"], tuple(each["answers"]), each["log"]) for each in replies]
+
+
+def _record(workshop: Workshop, case: Case) -> dict[str, Any]:
+    peer = None
+    if case.peer:
+        documents = workshop.documents(case.governance, PEER_PERMISSIONS)
+        peer = [str(workshop.identity(PEER)), str(documents)]
+    return {
+        "whole": str(workshop.identity(PEER)),
+        "identity": str(workshop.identity(case.subject)),
+        "documents": str(workshop.documents(case.governance, case.permissions)),
+        "domain": case.domain,
+        "zone": case.zone,
+        "questions": [(each.verb, each.topic, each.partitions) for each in case.questions],
+        "peer": peer,
+        "seconds": MATCH_SECONDS,
+    }
+
+
+def _spread(items: Sequence[Any], at_once: int, ask: Any) -> list[Reply]:
+    """Deal the items out, ask ``at_once`` programs, and put the replies in order again."""
+    hands = [items[start::at_once] for start in range(at_once) if items[start::at_once]]
+    with ThreadPoolExecutor(at_once) as pool:
+        answered: Iterable[list[Reply]] = list(pool.map(ask, hands))
+    replies: list[Reply] = [Reply("")] * len(items)
+    for start, found in enumerate(answered):
+        replies[start::at_once] = found
+    return replies

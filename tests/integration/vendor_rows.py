@@ -1,0 +1,371 @@
+"""What was found out about the vendors, row by row: small documents, and what each vendor answers.
+
+``YES`` is created and matched with a peer that may do everything.  The answers are those of Fast
+DDS 2.9.1 and Cyclone DDS 0.10.2; what Fast DDS 2.14.5 does otherwise stands in ``later``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+
+from decision_documents import allow, criteria, deny, grant, permissions, topic_rule
+from vendor_oracle import Case, Question
+
+YES, NO, PEER_DENIES, REFUSED = "matched", "denied", "unmatched", "refused"
+CRASHES, INVALID = "crashed", "invalid"
+
+DENY, ALLOW = "<default>DENY</default>", "<default>ALLOW</default>"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One document, one question; ``fast`` and ``cyclone`` are the answers."""
+
+    name: str
+    case: Case
+    fast: str
+    cyclone: str
+    later: str = ""
+
+
+# ── governance ─────────────────────────────────────────────────────────────────────────────
+
+
+def domain_rule(
+    topics: str = topic_rule(),
+    domains: str = "<id_range><min>0</min><max>230</max></id_range>",
+    strangers: bool = False,
+    join: bool = True,
+    rtps: str = "NONE",
+) -> str:
+    return f"""<domain_rule><domains>{domains}</domains>
+<allow_unauthenticated_participants>{str(strangers).lower()}</allow_unauthenticated_participants>
+<enable_join_access_control>{str(join).lower()}</enable_join_access_control>
+<discovery_protection_kind>NONE</discovery_protection_kind>
+<liveliness_protection_kind>NONE</liveliness_protection_kind>
+<rtps_protection_kind>{rtps}</rtps_protection_kind>
+<topic_access_rules>{topics}</topic_access_rules></domain_rule>"""
+
+
+def governance(*rules: str) -> bytes:
+    inside = "".join(rules or (domain_rule(),))
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n'
+    return f"{head}<dds><domain_access_rules>{inside}</domain_access_rules></dds>\n".encode()
+
+
+OPEN = governance()
+
+
+# ── rows ───────────────────────────────────────────────────────────────────────────────────
+
+
+def ask(
+    document: bytes,
+    topic: str = "rt/a",
+    verb: str = "publish",
+    partitions: tuple[str, ...] = (),
+    governed: bytes = OPEN,
+    zone: str = "UTC",
+    domain: int = 42,
+    subject: str = "CN=/t",
+) -> Case:
+    question = Question(verb, topic, partitions)
+    return Case(governed, document, (question,), subject, domain, zone, peer=True)
+
+
+def matching() -> list[Row]:
+    """Whether an expression matches a name, one row each."""
+    table = [
+        ("rt/a", "rt/a", YES, YES),
+        ("rt/*", "rt/a/b/c", YES, YES),
+        ("*", "rt/a", YES, YES),
+        ("rt/?", "rt/a", YES, YES),
+        ("rt/a?b", "rt/a/b", YES, YES),
+        ("rt/[a-c]", "rt/b", YES, YES),
+        ("rt/[!a-c]", "rt/x", YES, YES),
+        ("rt/[!a-c]", "rt/b", NO, NO),
+        ("rt[/]a", "rt/a", YES, YES),
+        ("rt[!x]a", "rt/a", YES, YES),
+        ("rt/[^a-c]", "rt/x", YES, NO),
+        ("rt/[^a-c]", "rt/b", NO, YES),
+        ("rt/[[:digit:]]", "rt/7", YES, NO),
+        (" rt/a ", "rt/a", NO, YES),
+        ("rt/A", "rt/a", NO, NO),
+        ("rt/a*b", "rt/ab", YES, YES),
+        ("rt/*x*y", "rt/1x2x3y", YES, YES),
+    ]
+    return [
+        Row(
+            f"{expression} matches {name}",
+            ask(permissions(grant(allow(criteria("publish", expression)))), name),
+            fast,
+            cyclone,
+        )
+        for expression, name, fast, cyclone in table
+    ]
+
+
+def rules() -> list[Row]:
+    """Order, directions, domains, partitions and defaults of rules."""
+    a, b = criteria("publish", "rt/a"), criteria("publish", "rt/b")
+    both = criteria("publish", "*") + criteria("subscribe", "*")
+    there = "<id>7</id>"
+    denied_writer = permissions(grant(deny(criteria("publish", "rt/s")), allow(both)))
+    one_way = permissions(
+        grant(deny(criteria("publish", "rt/s")), allow(criteria("subscribe", "rt/*")))
+    )
+    in_p1 = criteria("publish", "rt/a", partitions=("p1",))
+    two_lists = a.replace("</publish>", "") + b.replace("<publish>", "")
+    only_denied = permissions(grant(deny(b), default=ALLOW))
+    rows = [
+        ("allowed", ask(permissions(grant(allow(a)))), YES, YES),
+        ("not named", ask(permissions(grant(allow(b)))), NO, NO),
+        ("the other direction", ask(permissions(grant(allow(a))), verb="subscribe"), NO, NO),
+        ("deny, then allow", ask(permissions(grant(deny(a), allow(a)))), NO, NO),
+        ("allow, then deny", ask(permissions(grant(allow(a), deny(a)))), YES, YES),
+        ("denied writer, then everything: writer", ask(denied_writer, "rt/s"), NO, NO),
+        ("denied writer, then allowed reader", ask(one_way, "rt/s", "subscribe"), YES, NO),
+        (
+            "deny rule for another domain",
+            ask(permissions(grant(deny(a, domains=there), allow(a)))),
+            NO,
+            YES,
+        ),
+        (
+            "allow rule for another domain, and one for this",
+            ask(permissions(grant(allow(a, domains=there), allow(b)))),
+            PEER_DENIES,
+            NO,
+        ),
+        (
+            "allow rule for another domain only",
+            ask(permissions(grant(allow(a, domains=there)))),
+            PEER_DENIES,
+            REFUSED,
+        ),
+        (
+            "two lists of topics: the first",
+            ask(permissions(grant(allow(two_lists)))),
+            YES,
+            NO,
+        ),
+        (
+            "two lists of topics: the last",
+            ask(permissions(grant(allow(two_lists))), "rt/b"),
+            YES,
+            YES,
+        ),
+        ("default ALLOW beside a rule", ask(permissions(grant(allow(b), default=ALLOW))), NO, YES),
+        ("default ALLOW after denials", ask(only_denied), REFUSED, YES),
+        ("default ALLOW after denials: denied", ask(only_denied, "rt/b"), REFUSED, NO),
+        ("default ALLOW without rules", ask(permissions(grant(default=ALLOW))), REFUSED, YES),
+        ("no default", ask(permissions(grant(allow(a), default=""))), REFUSED, YES),
+        ("default first", ask(permissions(grant(DENY, allow(a), default=""))), REFUSED, YES),
+        (
+            "rule in a partition, then one without: without",
+            ask(permissions(grant(allow(in_p1), allow(a)))),
+            NO,
+            YES,
+        ),
+        (
+            "rule in a partition, then one without: in it",
+            ask(permissions(grant(allow(in_p1), allow(a))), partitions=("p1",)),
+            YES,
+            YES,
+        ),
+        (
+            "in a partition that no rule names",
+            ask(permissions(grant(allow(a))), partitions=("p1",)),
+            NO,
+            NO,
+        ),
+        (
+            "deny in a partition, then everything: in another",
+            ask(
+                permissions(
+                    grant(deny(in_p1), allow(criteria("publish", "*", partitions=("*",)))),
+                ),
+                partitions=("p2",),
+            ),
+            NO,
+            NO,
+        ),
+        (
+            "an empty topic",
+            ask(permissions(grant(allow(criteria("publish", "", "rt/a"))))),
+            REFUSED,
+            CRASHES,
+        ),
+        (
+            "an empty topic behind the one that matches",
+            ask(permissions(grant(allow(criteria("publish", "rt/a", ""))))),
+            REFUSED,
+            YES,
+        ),
+        ("a grant without a name", ask(permissions(grant(allow(a), name=""))), REFUSED, YES),
+        ("an unknown element", ask(permissions(grant(allow(a), "<extra/>"))), REFUSED, REFUSED),
+        ("no topics", ask(permissions(grant(allow("<publish><topics/></publish>")))), REFUSED, NO),
+    ]
+    return [Row(*row) for row in rows]
+
+
+def grants(now: datetime) -> list[Row]:
+    """Which grant is taken: subjects, domains and time."""
+    a = allow(criteria("publish", "rt/a"))
+
+    def moment(hours: float, offset: str = "Z") -> str:
+        shift = timedelta(hours=float(offset[:3])) if offset != "Z" else timedelta()
+        return (now + timedelta(hours=hours) + shift).strftime(f"%Y-%m-%dT%H:%M:%S{offset}")
+
+    def only(begin: str, end: str) -> bytes:
+        return permissions(grant(a, begin=begin, end=end))
+
+    hour = moment(-1), moment(1)
+    past = {"begin": moment(-48), "end": moment(-24)}
+    return [
+        Row(
+            "subject with spaces",
+            ask(permissions(grant(a, subject="CN = /t"))),
+            REFUSED,
+            REFUSED,
+            YES,
+        ),
+        Row("subject after a slash", ask(permissions(grant(a, subject="/CN=/t"))), REFUSED, YES),
+        Row(
+            "subject with more parts", ask(permissions(grant(a, subject="CN=/t,O=x"))), REFUSED, YES
+        ),
+        Row("another subject", ask(permissions(grant(a, subject="CN=/u"))), REFUSED, REFUSED),
+        Row(
+            "a name with more parts",
+            ask(permissions(grant(a, subject="CN=/t/admin"))),
+            REFUSED,
+            YES,
+        ),
+        Row("valid", ask(only(moment(-48), moment(48))), YES, YES),
+        Row("expired", ask(only(**past)), REFUSED, REFUSED),
+        Row("not yet valid", ask(only(moment(24), moment(48))), REFUSED, REFUSED),
+        Row(
+            "an expired grant, then a valid one",
+            ask(permissions(grant(a, **past), grant(a))),
+            YES,
+            REFUSED,
+        ),
+        Row(
+            "a grant for another domain, then one for this",
+            ask(
+                permissions(
+                    grant(allow(criteria("publish", "rt/b"), domains="<id>7</id>")), grant(a)
+                )
+            ),
+            NO,
+            REFUSED,
+        ),
+        Row("this hour in UTC, host in UTC", ask(only(*hour)), YES, YES),
+        Row(
+            "this hour in UTC, host in Los Angeles",
+            ask(only(*hour), zone="America/Los_Angeles"),
+            REFUSED,
+            YES,
+        ),
+        Row("this hour in UTC, host in Tokyo", ask(only(*hour), zone="Asia/Tokyo"), REFUSED, YES),
+        Row(
+            "this hour with its offset, host in UTC",
+            ask(only(moment(-1, "+09:00"), moment(1, "+09:00"))),
+            REFUSED,
+            YES,
+        ),
+        Row(
+            "expired by its offset, host in UTC",
+            ask(only(moment(-30, "+09:00"), moment(-1, "+09:00"))),
+            YES,
+            REFUSED,
+        ),
+        Row("a date only", ask(only("2020-01-01", "2037-01-01")), YES, REFUSED),
+        Row(
+            "until the year 9999",
+            ask(only("2020-01-01T00:00:00Z", "9999-12-31T23:59:59Z")),
+            YES,
+            REFUSED,
+        ),
+    ]
+
+
+def domains() -> list[Row]:
+    """Domain ids and ranges, in permissions and in governance."""
+
+    def allowed(text: str) -> Case:
+        return ask(permissions(grant(allow(criteria("publish", "rt/a"), domains=text))))
+
+    def governed(text: str) -> Case:
+        document = permissions(grant(allow(criteria("publish", "rt/a"))))
+        return ask(document, governed=governance(domain_rule(domains=text)))
+
+    low, high = "<id_range><min>40</min></id_range>", "<id_range><max>50</max></id_range>"
+    just = "<id_range><min>42</min></id_range>"
+    both = "<id_range><min>40</min><max>50</max></id_range>"
+    return [
+        Row("permissions for 40 to 50", allowed(both), YES, YES),
+        Row("permissions from 40 on", allowed(low), PEER_DENIES, REFUSED),
+        Row("permissions from 42 on", allowed(just), YES, YES),
+        Row("permissions up to 50", allowed(high), YES, CRASHES),
+        Row("governance for 40 to 50", governed(both), YES, YES),
+        Row("governance from 40 on", governed(low), NO, REFUSED),
+        Row("governance from 42 on", governed(just), YES, YES),
+        Row("governance up to 50", governed(high), YES, REFUSED),
+        Row("governance for another domain", governed("<id>7</id>"), NO, REFUSED),
+    ]
+
+
+def governances() -> list[Row]:
+    """Topic rules, and what the domain rule says about joining."""
+    a = permissions(grant(allow(criteria("publish", "rt/a"))))
+    b = permissions(grant(allow(criteria("publish", "rt/b"))))
+    nothing = permissions(grant(deny(criteria("publish", "rt/x"))))
+
+    def topics(*rules: str, join: bool = True) -> bytes:
+        return governance(domain_rule("".join(rules), join=join))
+
+    opened = topics(topic_rule("rt/open", read=False, write=False), topic_rule())
+    shut = topics(topic_rule(), topic_rule("rt/open", read=False, write=False))
+    some = topics(topic_rule("rt/open", read=False, write=False), topic_rule("rt/a"))
+    return [
+        Row("an open topic", ask(b, "rt/open", governed=opened), YES, YES),
+        Row("an open topic behind a rule for all", ask(b, "rt/open", governed=shut), NO, NO),
+        Row("a topic without a rule", ask(a, "rt/z", governed=some), NO, NO),
+        Row("a topic named *", ask(b, "*", governed=opened), YES, INVALID),
+        Row("a topic named rt/op*", ask(b, "rt/op*", governed=opened), YES, INVALID),
+        Row("no topic rules", ask(a, governed=topics()), REFUSED, REFUSED),
+        Row(
+            "strangers, and messages signed",
+            ask(a, governed=governance(domain_rule(strangers=True, rtps="SIGN"))),
+            YES,
+            YES,
+            REFUSED,
+        ),
+        Row(
+            "joining free, no allow rule",
+            ask(
+                nothing,
+                "rt/open",
+                governed=topics(
+                    topic_rule("rt/open", read=False, write=False), topic_rule(), join=False
+                ),
+            ),
+            REFUSED,
+            YES,
+        ),
+        Row(
+            "joining free, no allow rule: a closed topic",
+            ask(nothing, governed=topics(topic_rule(), join=False)),
+            REFUSED,
+            NO,
+        ),
+    ]
+
+
+def rows() -> list[Row]:
+    """All rows; those about time are made for this moment."""
+    made: list[Callable[[], list[Row]]] = [matching, rules, domains, governances]
+    return [row for part in made for row in part()] + grants(datetime.now(UTC))
