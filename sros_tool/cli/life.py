@@ -1,8 +1,9 @@
-"""The verbs for the life of keys: renewing, revoking, and knowing when it is time."""
+"""The verbs for the life of keys: renewing and revoking."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,12 +15,16 @@ from sros_tool.cli.common import (
     keystore_from_environment,
     now,
     print_json,
+    print_notes,
     print_plan,
     split_root,
 )
 from sros_tool.cli.keystore import progress_bar
 from sros_tool.cli.secrets import keyring
 from sros_tool.errors import UsageError
+
+if TYPE_CHECKING:
+    from sros_tool.keystore.renew import Renewal
 
 _MANY = 5
 
@@ -30,7 +35,8 @@ _MANY = 5
 Example:
   $ sros renew keystore /talker
   renewed enclave /talker
-  $ sros renew keystore --all-expiring 30d""",
+  the replaced certificate works until 2027-11-21T09:00:00Z, unless revoked: see --revoke-old
+  $ sros renew keystore --all-expiring 30d --revoke-old""",
 )
 @click.argument(
     "words",
@@ -44,12 +50,27 @@ Example:
     help="Renew also all that end within 30d, or of whose life 66% is over.",
 )
 @click.option("--new-key", is_flag=True, help="Make new keys, too.")
+@click.option(
+    "--revoke-old",
+    is_flag=True,
+    help="Revoke the earlier certificates of what is renewed, as superseded.",
+)
 @dry_run_option
-def renew(words: tuple[str, ...], all_expiring: str | None, new_key: bool, dry_run: bool) -> None:
+def renew(
+    words: tuple[str, ...],
+    all_expiring: str | None,
+    new_key: bool,
+    revoke_old: bool,
+    dry_run: bool,
+) -> None:
     """Issue new certificates for the enclaves NAME..., and sign their permissions anew.
 
     The rights stay as they are.  Processes that run go on with what they have loaded; restart
     them before it ends.
+
+    A certificate that is replaced works until it ends, together with the permissions of its time,
+    for whoever has a copy of the files.  With --revoke-old nobody who reads the new crl.pem
+    accepts it: restart the renewed processes first, then the others.
     """
     from sros_tool.keystore.renew import parse_threshold
     from sros_tool.keystore.renew import renew as work
@@ -65,17 +86,37 @@ def renew(words: tuple[str, ...], all_expiring: str | None, new_key: bool, dry_r
             now=now(),
             expiring=threshold,
             new_key=new_key,
+            revoke_old=revoke_old,
             keyring=keyring(),
             dry_run=dry_run,
             progress=step,
         )
     if dry_run:
         print_plan(root, result.changes)
-        return
-    for name in result.renewed:
-        click.echo(f"renewed enclave {name}")
-    if not result.renewed:
-        click.echo("no enclave needs to be renewed", err=True)
+    else:
+        for name in result.renewed:
+            click.echo(f"renewed enclave {name}")
+        if not result.renewed:
+            click.echo("no enclave needs to be renewed", err=True)
+    print_notes(result.notes)
+    _say_replaced(result)
+
+
+def _say_replaced(result: Renewal) -> None:
+    from sros_tool.validity import iso
+
+    if result.works_until:
+        end = iso(result.works_until)
+        what = (
+            f"the replaced certificate works until {end}"
+            if len(result.renewed) == 1
+            else f"the replaced certificates work until {end} at the latest"
+        )
+        click.echo(f"{what}, unless revoked: see --revoke-old", err=True)
+    elif result.restart:
+        _say_restart(result.restart)
+    for remark in result.remarks:
+        click.echo(remark, err=True)
 
 
 @click.command(
@@ -222,64 +263,6 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
             err=True,
         )
     return 1 if soon else 0
-
-
-@click.command(
-    "check",
-    epilog="""\b
-Example:
-  $ sros check keystore keystore
-  [keystore.one-authority] One CA issues identities and signs permissions. ...
-  $ sros check keystore keystore --needs-renewal 30d || sros renew keystore --all-expiring 30d""",
-)
-@click.argument("what", type=click.Choice(["keystore"]))
-@click.argument("root", type=PATH, required=False)
-@click.option(
-    "--needs-renewal",
-    metavar="DURATION|PERCENT",
-    help="List only what ends within 30d, or of whose life 66% is over.",
-)
-@json_option
-def check(what: str, root: Path | None, needs_renewal: str | None, as_json: bool) -> int:
-    """List what is wrong or weak in a keystore, or which enclaves need to be renewed.
-
-    The exit status is 0 if there is nothing, and 1 if there is.
-    """
-    root = root or keystore_from_environment()
-    if needs_renewal is not None:
-        return _needs_renewal(root, needs_renewal, as_json)
-    from sros_tool.keystore.findings import keystore_findings
-
-    found = keystore_findings(root, now())
-    if as_json:
-        print_json([{"id": each.id, "text": each.text} for each in found])
-    else:
-        for each in found:
-            click.echo(f"[{each.id}] {each.text}")
-    return 1 if found else 0
-
-
-def _needs_renewal(root: Path, text: str, as_json: bool) -> int:
-    from sros_tool.keystore.renew import describe_lifetime, lifetimes, parse_threshold
-    from sros_tool.validity import iso
-
-    threshold, moment = parse_threshold(text), now()
-    due = [each for each in lifetimes(root) if each.due(threshold, moment)]
-    if as_json:
-        print_json(
-            [
-                {
-                    "enclave": each.name,
-                    "certificate_until": iso(each.certificate.not_after),
-                    "permissions_until": iso(each.permissions.not_after),
-                }
-                for each in due
-            ]
-        )
-    else:
-        for each in due:
-            click.echo(describe_lifetime(each, moment))
-    return 1 if due else 0
 
 
 def _say_restart(names: tuple[str, ...]) -> None:

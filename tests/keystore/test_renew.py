@@ -15,7 +15,9 @@ from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.renew import Threshold, lifetimes, parse_threshold, renew
+from sros_tool.keystore.revoke import read_crl, revoke
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.verify import check_enclave
 from sros_tool.pki import smime
@@ -286,6 +288,109 @@ def test_permissions_of_another_enclave_do_not_name_a_certificate(tmp_path: Path
     assert len(problems(root, "/a", NOW)) == 1
 
 
+def test_every_one_that_cannot_be_renewed_is_named_at_once(tmp_path: Path) -> None:
+    names = [f"/n{index:03}" for index in range(230)]  # renewed by several processes
+    root = made(tmp_path / "ks", *names)
+    (root / "enclaves/n003/cert.pem").write_text("x")
+    (root / "enclaves/n229/permissions.p7s").unlink()
+    before = snapshot(root)
+    for call in (
+        lambda: renew(root, names, now=LATER),
+        lambda: renew(root, now=LATER, expiring=parse_threshold("100y")),
+        lambda: lifetimes(root),
+    ):
+        with pytest.raises(KeystoreError, match="2 enclaves cannot be re.*: /n003, /n229"):  # noqa: RUF043
+            call()
+        assert snapshot(root) == before
+    assert len(renew(root, names[4:-1], now=LATER).renewed) == 225
+
+
+# ── what becomes of the old ────────────────────────────────────────────────────────────────
+
+
+def serials(root: Path, *names: str) -> dict[str, int]:
+    return {
+        name: certificate(enclave_path(root, name) / "cert.pem").serial_number for name in names
+    }
+
+
+def revoked(root: Path) -> dict[int, str]:
+    crl = read_crl(root)
+    return {each.serial: each.reason for each in crl.revoked} if crl else {}
+
+
+def test_the_old_certificate_works_until_it_ends(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b")
+    end = certificate(enclave_path(root, "/a") / "cert.pem").not_valid_after_utc
+    done = renew(root, ["/a", "/b"], now=LATER)
+    assert (done.works_until, done.revoked, done.restart) == (end, 0, ())
+    assert not (root / "public/identity_ca.crl.pem").exists()
+    long_after = NOW + timedelta(days=500)  # the certificates of LATER have ended then
+    assert renew(root, ["/a"], now=long_after).works_until is None
+
+
+def test_all_earlier_certificates_of_the_renewed_are_revoked(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a", "/b", "/c")
+    first = serials(root, "/a", "/b", "/c")
+    renew(root, ["/a"], now=LATER)
+    second = serials(root, "/a", "/b", "/c")
+    done = renew(root, ["/a", "/b"], now=LATER, revoke_old=True)
+    gone = {first["/a"], second["/a"], second["/b"]}
+    assert revoked(root) == dict.fromkeys(gone, "superseded")
+    assert (done.works_until, done.revoked) == (None, 3)
+    assert done.restart == ("/a", "/b", "/c")
+    for name in ("/a", "/b", "/c"):
+        assert (enclave_path(root, name) / "crl.pem").is_symlink()
+        assert not problems(root, name, LATER)
+    told = {int(e.serial, 16): e.reason for e in read_ledger(root) if e.what == "revocation"}
+    assert told == revoked(root)
+    # What was revoked already stays as it was, and nothing is listed twice.
+    renew(root, ["/a"], now=LATER, revoke_old=True)
+    third = serials(root, "/b")
+    assert len(revoked(root)) == 4
+    revoke(root, ["/b"], now=LATER, reason="keyCompromise")
+    assert revoked(root)[third["/b"]] == "keyCompromise"
+    assert revoked(root)[first["/a"]] == "superseded"
+    check_whole(root)
+
+
+def test_nothing_is_revoked_where_nothing_is_renewed(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a")
+    before = snapshot(root)
+    done = renew(root, now=NOW, expiring=parse_threshold("30d"), revoke_old=True)
+    assert (done.renewed, done.changes, done.restart) == ((), (), ())
+    assert snapshot(root) == before
+    plan = renew(root, ["/a"], now=LATER, revoke_old=True, dry_run=True)
+    assert snapshot(root) == before
+    assert "public/identity_ca.crl.pem" in {change.path for change in plan.changes}
+
+
+def test_a_certificate_that_has_ended_needs_no_revocation(tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/a")
+    done = renew(root, ["/a"], now=NOW + timedelta(days=500), revoke_old=True)
+    assert (done.revoked, revoked(root)) == (0, {})
+
+
+@pytest.mark.parametrize("day", [1500, 1700, 1815])
+def test_what_is_cut_short_by_its_authority_says_so(day: int, tmp_path: Path) -> None:
+    """The CAs live for 1825 days, certificates for 365, permissions for 180."""
+    root = made(tmp_path / "ks", "/a")
+    late = NOW + timedelta(days=day)
+    expected = [what for what, days in (("certificates", 365), ("permissions", 180))
+                if day + days > 1825]  # fmt: skip
+    for notes in (
+        renew(root, ["/a"], now=late).notes,
+        create_enclaves(root, ["/b"], now=late).notes,
+    ):
+        said = [each.text for each in notes if each.id == "keystore.ends-with-ca"]
+        assert len(said) == len(expected)
+        for text, what in zip(said, expected, strict=True):
+            assert what in text
+            assert "ends with its CA at 2031-05-31" in text
+            assert "sros rotate_ca" in text
+    assert not create_enclaves(root, ["/b"], now=late).notes, "nothing was issued"
+
+
 # ── the program ────────────────────────────────────────────────────────────────────────────
 
 
@@ -299,10 +404,17 @@ def test_the_program(tmp_path: Path) -> None:
     for file in RENEWED:
         assert f"enclaves/a/{file}" in plan.out
     assert "enclaves/b" not in plan.out
-    assert sros("renew", root, "/a").ok().out == "renewed enclave /a\n"
+    done = sros("renew", root, "/a").ok()
+    assert done.out == "renewed enclave /a\n"
+    assert "the replaced certificate works until" in done.err
     assert sros("renew", root, "--all-expiring", "30d").ok().out == ""
     every = sros("renew", root, "--all-expiring", "200d").ok().out
     assert every == "renewed enclave /a\nrenewed enclave /b\n"
+    assert "the replaced certificates work until" in sros("renew", root, "/a", "/b").ok().err
+    told = sros("renew", root, "/a", "--revoke-old").ok()
+    assert "restart the processes of 2 enclaves" in told.err
+    assert "the replaced" not in told.err
+    assert sros("crl", root).ok().out.count("superseded") == 4
     assert sros("renew", root).status == 2
     assert sros("renew", root, "--all-expiring", "soon").status == 2
     assert sros("renew", root, "/missing").status == 1
@@ -320,3 +432,19 @@ def test_the_check_answers_by_its_exit_status(tmp_path: Path) -> None:
     assert set(entry) == {"enclave", "certificate_until", "permissions_until"}
     assert json.loads(sros(*check, "30d", "--json").ok().out) == []
     assert sros(*check, "often").status == 2
+
+
+def test_the_check_goes_on_after_one_that_cannot_be_read(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", "production").ok()
+    sros("create_enclave", root, "/a", "/b", "/c").ok()
+    (root / "enclaves/b/cert.pem").write_text("x")
+    check = ("check", "keystore", root, "--needs-renewal")
+    told = sros(*check, "30d")
+    assert (told.status, told.out.count("\n")) == (1, 1), told
+    assert told.out.startswith("/b  nobody can tell: enclave /b cannot be read")
+    told = sros(*check, "181d")
+    assert [line.split()[0] for line in told.out.splitlines()] == ["/a", "/c", "/b"]
+    *due, unreadable = json.loads(sros(*check, "181d", "--json").out)
+    assert [entry["enclave"] for entry in due] == ["/a", "/c"]
+    assert set(unreadable) == {"enclave", "problem"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 import time
@@ -25,6 +26,7 @@ from sros_tool.keystore import (
     filesystem,
     generate_artifacts,
 )
+from sros_tool.keystore import stage as stage_of
 from sros_tool.keystore.export import distribute
 from sros_tool.keystore.layout import REQUIRED_FILES, enclave_folder, is_keystore
 from sros_tool.keystore.template import load_template
@@ -650,6 +652,84 @@ def test_an_interrupted_transaction_of_a_stranger_writes_nowhere_else(
     outside.rename(keystore / "enclaves")
     create_enclaves(keystore, ["/new"], now=NOW)
     assert (keystore / "enclaves/authorized_keys").exists(), "it is completed where it may be"
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["../outside", "/etc/outside", "enclaves/../../x", "enclaves//a", f"{STAGE}/x", ""],
+)
+@pytest.mark.parametrize("live", ["before", "after"])
+def test_a_list_of_files_that_a_stranger_made_up_moves_nothing(
+    path: str, live: str, keystore: Path
+) -> None:
+    made_up_stage(keystore, live, [[path, "", ""]])
+    (keystore / STAGE / live / stage_of.number(path)).write_text("mine")
+    before = snapshot(keystore.parent)
+    with pytest.raises(KeystoreError, match=r"no path in a keystore.*restore"):
+        create_enclaves(keystore, ["/new"], now=NOW)
+    assert snapshot(keystore.parent) == before
+
+
+def test_a_list_of_files_leads_through_no_link(keystore: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    (keystore / "enclaves/a").rename(outside)
+    (keystore / "enclaves/a").symlink_to(outside)
+    made_up_stage(keystore, "after", [["enclaves/a/authorized_keys", None, ""]])
+    number = stage_of.number("enclaves/a/authorized_keys")
+    (keystore / STAGE / "after" / number).write_text("mine")
+    before = snapshot(tmp_path)
+    with pytest.raises(KeystoreError, match="symbolic link"):
+        create_enclaves(keystore, ["/new"], now=NOW)
+    assert snapshot(tmp_path) == before
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", '{"version": 3, "moves": []}', '{"version": 2}'])
+def test_a_list_of_files_that_cannot_be_read_is_told(text: str, keystore: Path) -> None:
+    made_up_stage(keystore, "after", [])
+    (keystore / STAGE / stage_of.MANIFEST).write_text(text)
+    before = snapshot(keystore)
+    with pytest.raises(KeystoreError, match="can be neither completed nor undone"):
+        create_enclaves(keystore, ["/new"], now=NOW)
+    assert snapshot(keystore) == before
+
+
+def made_up_stage(keystore: Path, live: str, moves: list[list[str | None]]) -> None:
+    for name in ("before", "after", "added"):
+        (keystore / STAGE / name).mkdir(parents=True)
+    (keystore / STAGE / "live").symlink_to(live)
+    text = json.dumps({"version": 2, "moves": moves})
+    (keystore / STAGE / stage_of.MANIFEST).write_text(text)
+
+
+@pytest.mark.parametrize("committed", [False, True])
+def test_what_an_earlier_version_left_is_recovered(committed: bool, keystore: Path) -> None:
+    """sros 0.1 staged trees; this is what it looked like on both sides of the change."""
+    stage, a = keystore / STAGE, keystore / "enclaves/a"
+    before = snapshot(keystore)
+    new = {"enclaves/a/cert.pem": b"new", "enclaves/x/cert.pem": b"x", "ledger.jsonl": b"new"}
+    for path, data in new.items():
+        (stage / "new" / path).parent.mkdir(parents=True, exist_ok=True)
+        (stage / "new" / path).write_bytes(data)
+    for path in ("enclaves/a/cert.pem", "ledger.jsonl", "enclaves/b/permissions.xml"):
+        (stage / "old" / path).parent.mkdir(parents=True, exist_ok=True)
+        os.link(keystore / path, stage / "old" / path)
+        (keystore / path).unlink()
+        (keystore / path).symlink_to("../" * path.count("/") + f"{STAGE}/live/{path}")
+    (stage / "removed").write_text("enclaves/b/permissions.xml")
+    (stage / "live").symlink_to("new" if committed else "old")
+    recover_all(keystore)
+    assert not remains(keystore)
+    if not committed:
+        assert snapshot(keystore) == before
+        return
+    assert {path: (keystore / path).read_bytes() for path in new} == new
+    assert not (a / "cert.pem").is_symlink()
+    assert not (keystore / "enclaves/b/permissions.xml").exists()
+
+
+def recover_all(keystore: Path) -> None:
+    with Transaction(keystore):
+        pass
 
 
 def test_a_file_that_is_a_link_is_replaced_and_not_followed(keystore: Path, tmp_path: Path) -> None:

@@ -1,0 +1,65 @@
+"""What a replaced certificate is still good for, asked of two DDS that enforce security."""
+
+from __future__ import annotations
+
+import shutil
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from harness import publish
+from test_life_on_dds import (
+    HEARD,
+    LISTENS,
+    REFUSED,
+    SILENT,
+    Ask,
+    Question,
+    ask,
+    copy,
+    make,
+    permit,
+    probe,
+)
+
+from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.renew import renew
+from sros_tool.keystore.template import load_template
+
+__all__ = ["ask", "probe"]
+
+pytestmark = pytest.mark.dds
+
+
+@pytest.mark.parametrize(
+    ("revoke_old", "kept", "put_back"), [(False, HEARD, HEARD), (True, SILENT, REFUSED)]
+)
+def test_the_old_certificate_with_its_old_permissions(
+    revoke_old: bool, kept: str, put_back: str, ask: Ask, tmp_path: Path
+) -> None:
+    """Who keeps the files of before has the rights of before, unless they are revoked.
+
+    Put back beside the new crl.pem, they are refused by the robot's own DDS already.
+    """
+    root = tmp_path / "ks"
+    make(
+        root,
+        load_template("production"),
+        {"/robot": publish("/secret", "/chatter"), "/listener": LISTENS},
+    )
+    before = copy(root, "before")
+    permit(root, {"/robot": publish("/chatter")})
+    renew(root, ["/robot", "/listener"], now=datetime.now(UTC), revoke_old=revoke_old)
+    after = copy(root, "after")
+    for file in ("cert.pem", "key.pem", "permissions.p7s"):
+        shutil.copy(enclave_path(before, "/robot") / file, enclave_path(after, "/robot") / file)
+    listener = (root, "/listener")
+    answers = ask(
+        [
+            Question((before, "/robot"), listener, "/secret"),
+            Question((after, "/robot"), listener, "/secret"),
+            Question((root, "/robot"), listener, "/secret"),
+            Question((root, "/robot"), listener, "/chatter"),
+        ]
+    )
+    assert answers == [kept, put_back, REFUSED, HEARD]
