@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 
 from sros_tool.dds.decision import (
@@ -114,11 +114,11 @@ class Judge:
             return Decision(outcome, first.code, f"{self._vendor.title}: {first}.")
         governance = read_governance_as(self._vendor, material.governance)
         if isinstance(governance, Refusal):
-            return governance.decision()
+            return replace(governance.decision(), reason="governance-malformed")
         self._governance = governance
         permissions = read_permissions_as(self._vendor, material.permissions)
         if isinstance(permissions, Refusal):
-            return permissions.decision()
+            return replace(permissions.decision(), reason="permissions-malformed")
         self._permissions = permissions
         return Access(
             self._vendor,

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 from lxml import etree
 
-from sros_tool.dds.decision import Vendor
+from sros_tool.dds.decision import Vendor, Verb
 from sros_tool.dds.governance import Governance
-from sros_tool.explain.answer import Judge, Setting
+from sros_tool.explain.answer import Judge, PartAnswer, Setting
 from sros_tool.explain.material import from_policy
 from sros_tool.explain.origin import origins_of
 from sros_tool.explain.question import Question
@@ -81,7 +81,7 @@ def smallest_change(
         if answer.allowed:
             break
         if decision.reason == "deny-rule":
-            blocking = [right for right in present if _denies(right, decision.expression or "")]
+            blocking = _blocking(present, answer.deciding, decision.expression or "")
         elif decision.reason in _NO_RULE and wanted not in present:
             present.add(wanted)
             add.append(wanted)
@@ -109,9 +109,22 @@ def as_policy(enclave: str, rights: Iterable[Right]) -> Enclave:
     return Enclave(enclave, (Profiles((Profile("/", "", groups),)),))
 
 
-def _denies(right: Right, expression: str) -> bool:
-    names = dds_names(right.right, right.name)
-    return right.qualifier is DENY and expression in names.publish + names.subscribe
+def _blocking(rights: Iterable[Right], deciding: PartAnswer, expression: str) -> list[Right]:
+    """The denials from which an expression comes; of the other direction only if it must be.
+
+    Cyclone DDS denies a topic as a whole by a denial of either direction.
+    """
+    publishes = deciding.part is not None and deciding.part.verb is Verb.PUBLISH
+    own: list[Right] = []
+    other: list[Right] = []
+    for right in rights:
+        if right.qualifier is DENY:
+            names = dds_names(right.right, right.name)
+            if expression in (names.publish if publishes else names.subscribe):
+                own.append(right)
+            elif expression in names.publish + names.subscribe:
+                other.append(right)
+    return own or other
 
 
 def _document(add: list[Right], policy: Enclave | None) -> str:

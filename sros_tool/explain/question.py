@@ -57,19 +57,20 @@ class Question:
     """May an enclave do ``word`` with ``name``?  ``right`` is what a policy says of it.
 
     ``name`` is an absolute ROS name; of the question whether it may join at all, both it and
-    ``right`` are "".
+    ``right`` are "".  ``only`` are endpoints to ask about in place of those that the right needs.
     """
 
     word: str
     type: str = ""
     right: str = ""
     name: str = ""
+    only: tuple[Part, ...] = ()
 
     @property
     def parts(self) -> tuple[Part, ...]:
         """The endpoints that are needed; none for joining."""
-        if not self.right:
-            return ()
+        if self.only or not self.right:
+            return self.only
         names = dds_names(self.right, self.name)
         published = (Part(Verb.PUBLISH, topic, _role(topic, self.type)) for topic in names.publish)
         read = (Part(Verb.SUBSCRIBE, topic, _role(topic, self.type)) for topic in names.subscribe)

@@ -22,7 +22,10 @@ _CYCLONE = re.compile(
     r"(?:Local topic permission denied|Writer is not permitted|Reader is not permitted): "
     r"(?P<topic>\S+) (?P<how>denied by default rule|found in deny_rule)"
 )
-_ENCLAVE = re.compile(r"Found security directory: \S*?/enclaves(?P<enclave>/\S*)?(?:\s|\Z)")
+SECURITY_DIRECTORY = re.compile(
+    r"Found security directory: \S*?/enclaves(?P<enclave>/\S*)?(?:\s|\Z)"
+)
+"""In which rcl says, in the group ``enclave``, which enclave a process runs in."""
 _WRITER = re.compile(
     r"Writer is not|local writer|check_create_datawriter|datawriter_sec"
     r"|associated Writer|DATA_WRITER|create(?:_p| p|P)ublisher|register_local_writer"
@@ -34,11 +37,12 @@ _READER = re.compile(
 _CLIENT = re.compile(r"create(?:_c| c|C)lient")
 _SERVER = re.compile(r"create(?:_s| s|S)ervice")
 _REMOTE = re.compile(r"check_remote_data|remote (?:writer|reader)")
-_LABEL = re.compile(
+PROCESS_LABEL = re.compile(
     r"\[[\w.-]+-\d+\] "  # ros2 launch: [talker-1]
     r"|(?:\S+ +){3,4}[\w.@-]+\[\d+\]: "  # journald: Nov 21 06:00:00 robot talker[12]:
     r"|[\w.-]+ +\| "  # Docker Compose: talker-1  |
 )
+"""What tells the processes apart whose lines are in one log."""
 _NEAR_LINES = 3
 """How many lines after a denial still speak of it."""
 
@@ -81,7 +85,7 @@ def read_denials(text: str) -> tuple[Denial, ...]:
     """
     processes: dict[str, list[str]] = {}
     for line in text.splitlines():
-        label = _LABEL.match(line)
+        label = PROCESS_LABEL.match(line)
         processes.setdefault(label[0].strip() if label else "", []).append(line)
     found = {each: None for lines in processes.values() for each in _denials_of(lines)}
     known = {replace(each, direction="") for each in found if each.direction}
@@ -92,7 +96,7 @@ def _denials_of(lines: list[str]) -> Iterator[Denial]:
     """The refusals of one process."""
     enclave = ""
     for number, line in enumerate(lines):
-        if said := _ENCLAVE.search(line):
+        if said := SECURITY_DIRECTORY.search(line):
             enclave = said["enclave"] or "/"
         if match := _denied(line):
             topic = match["topic"]

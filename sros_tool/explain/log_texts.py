@@ -1,0 +1,285 @@
+"""What the security messages of Fast DDS, Cyclone DDS and rcl mean, and what else they could mean.
+
+Each text was seen in a real log of Fast DDS 2.9.1 or 2.14.5, Cyclone DDS 0.10.2, or rcl of Jazzy.
+Many stand for several causes; `Meaning.codes` are the faults of an enclave (`Problem.code`) among
+which the true one is found by looking at the enclave.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+from sros_tool.dds.decision import Vendor
+
+ROS = None
+"""The vendor of messages that rcl prints, whatever DDS lies below."""
+
+_CERTIFICATE = ("certificate-expired", "certificate-not-yet-valid", "certificate-issuer")
+_CA = ("ca-expired", "ca-not-yet-valid")
+_CRL = ("crl-expired", "crl-malformed", "crl-issuer", "crl-not-yet-valid", "revoked")
+_FILES = ("file-missing", "file-empty", "file-unreadable", "link-dangling")
+_KEY = ("key-encrypted", "key-malformed")
+_SIGNATURE = ("signature", "not-signed")
+_GRANT = ("permissions-expired", "permissions-not-yet-valid", "permissions-subject")
+_DOCUMENT = ("permissions-malformed", "governance-malformed")
+_ALL = (
+    *_CERTIFICATE, "certificate-malformed", *_CA, *_CRL, *_FILES, *_KEY, "key-mismatch",
+    *_SIGNATURE, *_GRANT, *_DOCUMENT, "governance-domain", "permissions-domain",
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Meaning:
+    """What a message means.
+
+    ``cause`` may use the groups of ``pattern``.  ``codes`` are the faults it can stand for, if it
+    is about the enclave of the process itself.  ``weak`` says that it follows on a message that
+    tells more, if there is one.
+    """
+
+    id: str
+    vendor: Vendor | None
+    pattern: re.Pattern[str]
+    cause: str
+    remedy: str
+    codes: tuple[str, ...] = ()
+    weak: bool = False
+
+
+def _meaning(
+    name: str,
+    vendor: Vendor | None,
+    pattern: str,
+    cause: str,
+    remedy: str,
+    codes: tuple[str, ...] = (),
+    *,
+    weak: bool = False,
+) -> Meaning:
+    return Meaning(name, vendor, re.compile(pattern, re.IGNORECASE), cause, remedy, codes, weak)
+
+
+_CHECK = "Name the keystore and the enclave, and the true cause is looked for there."
+_RENEW = "Renew it: `sros renew KEYSTORE ENCLAVE`."
+_SIGN = "Sign the permissions anew: `sros create_permission KEYSTORE ENCLAVE POLICY`."
+_PEERS = "Give both sides enclaves of the same keystore; `sros inspect` shows the CA of each."
+_FAST, _CYCLONE = Vendor.FAST, Vendor.CYCLONE
+
+MEANINGS: tuple[Meaning, ...] = (
+    # ── rcl and the RMWs ───────────────────────────────────────────────────────────────────
+    _meaning(
+        "not-built-in", ROS, r"doesn't have the security libraries|compile Fast DDS using the"
+        r"|security (?:is )?not supported|compiled without security",
+        "this DDS was built without DDS Security, so no secured node can start with it",
+        "Use the ROS 2 packages of the distribution; `sros doctor` tells which DDS enforces.",
+    ),
+    _meaning(
+        "enclave-missing", ROS,
+        r"rcl: SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
+        "the enclave's folder {path} does not exist: ROS_SECURITY_KEYSTORE or the enclave's name "
+        "is not right", "Correct it: `sros list_enclaves KEYSTORE` shows the names.",
+    ),
+    _meaning(
+        "runs-unsecured", ROS, r"SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
+        "the enclave's folder {path} does not exist, and as ROS_SECURITY_STRATEGY is not exactly "
+        "Enforce, the node GOES ON UNSECURED",
+        "Start it by `sros run`, which runs it secured or not at all.",
+    ),
+    _meaning(
+        "keystore-unset", ROS, r"failed to initialize rcl: error not set",
+        "security is on, and ROS_SECURITY_KEYSTORE is unset or empty",
+        "Set it to the folder of the keystore: `sros env KEYSTORE ENCLAVE` prints all variables.",
+    ),
+    _meaning(
+        "files-missing", ROS, r"couldn't find all security files",
+        "a file of the enclave is missing or a link to nothing; which one, it does not say",
+        "Complete it: `sros create_enclave KEYSTORE ENCLAVE`, or export it again.", _FILES,
+    ),
+    # ── Cyclone DDS, meeting peers ─────────────────────────────────────────────────────────
+    _meaning(
+        "peer-refused", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed: "
+        r"Certificate not valid: error: (?P<why>[^;]+)",
+        "a PEER was refused, not this process: its certificate is not accepted ({why}); with "
+        "another CA on either side, the other one logs this or nothing",
+        _PEERS,
+    ),
+    _meaning(
+        "peer-handshake", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed",
+        "a PEER failed to prove who it is: most often its key.pem is not the key of its cert.pem, "
+        "which Cyclone DDS does not notice on its own side; or it is of another DDS or version",
+        "Run `sros verify` or `sros inspect` on the enclave of every peer.", ("key-mismatch",),
+    ),
+    # ── Cyclone DDS, starting ──────────────────────────────────────────────────────────────
+    _meaning(
+        "certificate-expired", _CYCLONE, r"Certificate not valid: error: certificate has expired",
+        "the certificate of the enclave or of its identity CA has expired; which, it does not say",
+        _RENEW, ("certificate-expired", "ca-expired"),
+    ),
+    _meaning(
+        "certificate-not-yet-valid", _CYCLONE, r"Certificate not valid: error: certificate is not "
+        r"yet valid", "the certificate of the enclave or of its identity CA is not valid yet",
+        "Set the clock of the host.", ("certificate-not-yet-valid", "ca-not-yet-valid"),
+    ),
+    _meaning(
+        "certificate-issuer", _CYCLONE, r"Certificate not valid: error: unable to get "
+        r"(?:local )?issuer certificate|Certificate not valid: error: self.signed",
+        "the certificate was not issued by the identity CA that lies with it",
+        "Use the files of one keystore together.", ("certificate-issuer",),
+    ),
+    _meaning(
+        "revoked", _CYCLONE, r"Certificate not valid: error: certificate revoked",
+        "the certificate of the enclave is revoked", "Make the enclave anew, with another key.",
+        ("revoked",),
+    ),
+    _meaning(
+        "crl-expired", _CYCLONE, r"Certificate not valid: error: CRL (?:has expired|is not yet)",
+        "the revocation list is out of date, so that everybody is refused",
+        "Sign it anew: `sros crl KEYSTORE --refresh`.", ("crl-expired", "crl-not-yet-valid"),
+    ),
+    _meaning(
+        "crl-unreadable", _CYCLONE, r"Failed to read CRL",
+        "crl.pem is not a revocation list, so that everybody is refused",
+        "Sign it anew: `sros crl KEYSTORE --refresh`.", ("crl-malformed",),
+    ),
+    _meaning(
+        "key-encrypted", _CYCLONE, r"Failed to parse certificate: .*(?:bad decrypt|empty password)",
+        "it says certificate and means the key: key.pem is encrypted, and no passphrase is asked",
+        "Store key.pem without a passphrase, mode 0600.", ("key-encrypted",),
+    ),
+    _meaning(
+        "pem-unreadable", _CYCLONE, r"Failed to parse (?:certificate|private key)",
+        "cert.pem or key.pem is no PEM file; it says certificate for both",
+        "Restore the file.", ("certificate-malformed", *_KEY, *_FILES),
+    ),
+    _meaning(
+        "signature", _CYCLONE, r"PKCS7_signatureVerify:digest failure",
+        "governance.p7s or permissions.p7s was changed after it was signed",
+        "Restore it, or sign it anew.", _SIGNATURE,
+    ),
+    _meaning(
+        "signer", _CYCLONE, r"PKCS7_verify:certificate verify error",
+        "governance.p7s or permissions.p7s was signed by another CA than the permissions CA that "
+        "lies with it", "Use the files of one keystore together, or sign anew.", _SIGNATURE,
+    ),
+    _meaning(
+        "not-signed", _CYCLONE, r"SMIME_read_ASN1_ex:no content type|SMIME_read_ASN1",
+        "governance.p7s or permissions.p7s is plain XML or damaged, and not a signed document",
+        _SIGN, _SIGNATURE,
+    ),
+    _meaning(
+        "permissions-expired", _CYCLONE, r"Permissions validity period expired(?P<when>[^)]*\))?",
+        "the permissions have expired", _RENEW, ("permissions-expired",),
+    ),
+    _meaning(
+        "permissions-not-yet-valid", _CYCLONE, r"Permissions validity period has not started",
+        "the permissions are not valid yet", "Set the clock of the host.",
+        ("permissions-not-yet-valid",),
+    ),
+    _meaning(
+        "permissions-subject", _CYCLONE, r"Subject name is invalid",
+        "the permissions have no grant for the subject of this certificate: they belong to another "
+        "enclave, or to an earlier certificate", _SIGN, ("permissions-subject",),
+    ),
+    _meaning(
+        "domain", _CYCLONE, r"Could not find domain (?P<domain>\d+) in governance",
+        "the governance is not for domain {domain}",
+        "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env` prints it.",
+        ("governance-domain",),
+    ),
+    _meaning(
+        "malformed", _CYCLONE, r"Can not parse (?P<what>governance|permissions) file",
+        "the {what} document, although signed, is not one that Cyclone DDS accepts",
+        "Have sros write it; `sros check` names what vendors read differently.",
+        _DOCUMENT,
+    ),
+    _meaning(
+        "file-missing", _CYCLONE, r"File could not be found, opened or is empty, path: "
+        r"(?P<path>\S+)",
+        "the file {path} is missing, empty or not readable", "Restore it.", _FILES,
+    ),
+    # ── Fast DDS, starting ─────────────────────────────────────────────────────────────────
+    _meaning(
+        "identity", _FAST, r"SECURITY\s*Error\]\s*->\s*Function validate_local_identity",
+        "the identity is refused, and the reason is left out: the certificate or its CA is out of "
+        "date, of another CA, damaged or revoked, or crl.pem is out of date or damaged",
+        _CHECK, (*_CERTIFICATE, "certificate-malformed", *_CA, *_CRL),
+    ),
+    _meaning(
+        "ca", _FAST, r"Error '(?P<number>\d+)' verifying CA certificate",
+        "the certificate of a CA is not valid (OpenSSL's error {number}; 10 is expired)",
+        "Replace the CA: `sros rotate_ca KEYSTORE`.", _CA,
+    ),
+    _meaning(
+        "key-mismatch", _FAST, r"Error verifying private key",
+        "key.pem is not the key of cert.pem", "Restore the key, or make the enclave anew.",
+        ("key-mismatch",),
+    ),
+    _meaning(
+        "key-unreadable", _FAST, r"Error obtaining private key",
+        "key.pem is encrypted, damaged or empty", "Store it as PEM without a passphrase.",
+        (*_KEY, *_FILES),
+    ),
+    _meaning(
+        "file-missing", _FAST, r"OpenSSL library cannot read file (?P<path>\S+)",
+        "the file {path} is missing or not readable", "Restore it.", _FILES,
+    ),
+    _meaning(
+        "signature", _FAST, r"PKCS7 data verification failed",
+        "governance.p7s or permissions.p7s was changed, or signed by another CA than the "
+        "permissions CA that lies with it; which of the two, it does not say",
+        "Restore it, or sign it anew.", _SIGNATURE,
+    ),
+    _meaning(
+        "not-signed", _FAST, r"Input data has not PKCS7 S/MIME format",
+        "governance.p7s or permissions.p7s is not a signed document", _SIGN, _SIGNATURE,
+    ),
+    _meaning(
+        "grant", _FAST, r"Not found the identity subject name in permissions file",
+        "one text for three causes: the permissions have expired, are not valid yet, or have no "
+        "grant for this subject. Fast DDS reads their dates in the local time of the host",
+        _CHECK, _GRANT,
+    ),
+    _meaning(
+        "domain-of-permissions", _FAST, r"Not found a rule allowing to use the domain_id",
+        "the permissions (of a peer, if it was about to match one) are not for this domain",
+        _SIGN, ("permissions-domain",),
+    ),
+    _meaning(
+        "domain", _FAST, r"Not found topic access rule for topic",
+        "the governance has no rule for the topic: most often because it is not for this domain",
+        "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env` prints it.",
+        ("governance-domain",),
+    ),
+    _meaning(
+        "malformed", _FAST, r"Malformed (?P<what>permissions|governance) file"
+        r"|Error loading (?:Permissions|Governance) XML|XMLPARSER\s*Error\].*Function "
+        r"parse_(?:grant|rule|criteria|permissions|domain|topic|participant|governance)",
+        "a document, although signed, is not one that Fast DDS accepts",
+        "Have sros write it; `sros check` names what vendors read differently.",
+        _DOCUMENT,
+    ),
+    _meaning(
+        "partition", _FAST, r"partition not found in rule",
+        "a rule names the topic, but not the partitions of this publisher or subscriber",
+        "Say nothing of partitions in permissions; sros never does.",
+    ),
+    # ── what follows on others ─────────────────────────────────────────────────────────────
+    _meaning(
+        "participant", _FAST, r"Cannot create participant due to initialization error"
+        r"|Problem creating RTPSParticipant",
+        "the process may not join, and Fast DDS 2.9 does not say why: it is silent about "
+        "signatures, expired permissions and subjects", _CHECK, _ALL, weak=True,
+    ),
+    _meaning(
+        "endpoint", ROS, r"invalid allocator|Problem creating associated (?:Reader|Writer)"
+        r"|could not create (?:publisher|subscription|service|client)"
+        r"|failed to create (?:publisher|subscription|service|client|topic)"
+        r"|Not Allowed By Security",
+        "a publisher, subscription, client or server is denied by the permissions; this text does "
+        "not say of which topic (`invalid allocator` has nothing to do with memory)",
+        "Look for the line before it that names the topic, on standard output; or ask "
+        "`sros explain` for each topic of the node.", weak=True,
+    ),
+)  # fmt: skip
+"""In the order in which they are tried: the first that matches a line counts."""

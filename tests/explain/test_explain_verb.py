@@ -1,0 +1,369 @@
+"""``sros explain`` as it is used: answers, exit statuses, JSON, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
+from harness import Ended, policy_text, publish, sros, with_includes
+
+from sros_tool.cli.common import now
+from sros_tool.policy import read_policy
+from sros_tool.policy.rights import policy_rights
+from sros_tool.resources import policies_dir
+
+POLICY = policies_dir() / "talker_listener.xml"
+HERE = {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", "TZ": "UTC"}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_keystore(tmp_path_factory.mktemp("whole") / "ks", now())
+
+
+@pytest.fixture
+def keystore(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "ks", symlinks=True))
+
+
+def explain(*words: object, env: dict[str, str | None] | None = None) -> Ended:
+    return sros("explain", *words, env={**HERE, **(env or {})})
+
+
+def answer(*words: object, env: dict[str, str | None] | None = None) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(explain(*words, "--json", env=env).out)
+    return found
+
+
+def test_yes_with_its_reasons(whole: Path) -> None:
+    found = explain(whole, ENCLAVE, "publish", "/chatter", "--policy", POLICY)
+    assert found.status == 0
+    assert found.out.startswith(f"yes: {ENCLAVE} may publish topic /chatter, on Fast DDS 2.14 (")
+    assert f"{POLICY}:11: ALLOW publish chatter" in found.out
+    assert POLICY.read_text().splitlines()[10].strip() == "<topic>chatter</topic>"
+    assert "payload ENCRYPT" in found.out
+    assert "RTPS messages SIGN" in found.out
+    assert "until" in found.out
+    assert found.err == ""
+
+
+def test_no_with_a_change_that_works(keystore: Path, tmp_path: Path) -> None:
+    """What it prints is done word for word, and then the answer is yes."""
+    policy = tmp_path / "robot.xml"
+    shutil.copytree(policies_dir() / "common", tmp_path / "common")
+    policy.write_text(POLICY.read_text())
+    sros("create_permission", keystore, ENCLAVE, policy).ok()
+    asked = (keystore, ENCLAVE, "call", "/reset", "--policy", policy)
+    found = explain(*asked)
+    assert found.status == 1
+    told = answer(*asked)
+    assert told["allowed"] is False
+    before = policy_rights(read_policy(policy))
+    (tmp_path / "allow.xml").write_text(told["change"]["document"])
+    for command in told["commands"]:
+        name, *words = command.split()
+        assert name == "sros"
+        sros(*words, cwd=tmp_path).ok()
+    assert explain(*asked).status == 0
+    added = policy_rights(read_policy(policy)) - before
+    assert [str(right) for right in added] == [f"{ENCLAVE} ALLOW request service /reset"]
+    assert explain(keystore, ENCLAVE, "serve", "/reset").status == 1
+    assert "sros merge_policy" in found.out and "<service>/reset</service>" in found.out
+
+
+def test_a_denial_is_lifted_by_an_edit(tmp_path: Path) -> None:
+    text = with_includes(
+        policy_text(
+            {
+                "/a": '<topics publish="ALLOW"><topic>*</topic></topics>\n'
+                '<topics publish="DENY" subscribe="DENY">\n<topic>secret</topic>\n'
+                "<topic>hidden</topic></topics>"
+            }
+        )
+    )
+    policy = tmp_path / "robot.xml"
+    policy.write_text(text)
+    found = explain("/a", "publish", "/secret", "--policy", policy)
+    assert found.status == 1
+    assert "robot.xml:3: DENY publish secret" in found.out
+    told = answer("/a", "publish", "/secret", "--policy", policy, "--vendor", "fastdds")
+    assert [(each["qualifier"], each["right"]) for each in told["change"]["lift"]] == [
+        ("DENY", "publish")
+    ]
+    (edit,) = told["change"]["edits"]
+    assert edit["line"] == 2
+    start, end = text.index('<topics publish="DENY"'), text.index("</topics></profile>")
+    policy.write_text(text[:start] + edit["xml"] + text[end + len("</topics>") :])
+    assert (
+        explain("/a", "publish", "/secret", "--policy", policy, "--vendor", "fastdds").status == 0
+    )
+    assert explain("/a", "publish", "/hidden", "--policy", policy).status == 1
+    assert explain("/a", "subscribe", "/secret", "--policy", policy).status == 1
+    # Cyclone DDS denies the topic as a whole, and is told so.
+    other = explain("/a", "publish", "/secret", "--policy", policy, "--vendor", "fastdds")
+    assert "note [explain.vendors-differ]" in other.err
+    cyclone = answer("/a", "publish", "/secret", "--policy", policy, "--vendor", "cyclonedds")
+    assert [each["right"] for each in cyclone["change"]["lift"]] == ["subscribe"]
+
+
+def test_parts_of_a_service_are_told(tmp_path: Path) -> None:
+    policy = tmp_path / "robot.xml"
+    policy.write_text(
+        policy_text(
+            {
+                "/a": '<services request="ALLOW"><service>add</service></services>'
+                '<services request="DENY"><service>add</service></services>'
+            }
+        )
+    )
+    found = explain("/a", "call", "/add", "--policy", policy)
+    assert "part      publish its requests (rq/addRequest): denied" in found.out
+    assert "part      subscribe its replies (rr/addReply): denied" in found.out
+
+
+@pytest.mark.parametrize("breakage", BREAKAGES)
+def test_what_cannot_load_is_denied_everything(breakage: str, keystore: Path) -> None:
+    BREAKAGES[breakage](Enclave(keystore))
+    verbs = [("publish", "/chatter"), ("join",)]
+    for words in verbs:
+        for vendor in ("fastdds", "cyclonedds"):
+            found = explain(keystore, ENCLAVE, *words, "--vendor", vendor, "--domain", "0")
+            lenient = breakage == "permissions without default" and vendor == "cyclonedds"
+            assert found.status == (0 if lenient else 1), (found, vendor)
+            assert lenient or "denied by" in found.out
+    assert explain(keystore, OTHER, "subscribe", "/chatter").status == (
+        1 if "governance" in breakage and not (Enclave(keystore).folder / "governance.p7s").exists()
+        else 0
+    )  # fmt: skip
+
+
+def test_expired_at_a_moment_to_come(whole: Path) -> None:
+    asked = (whole, ENCLAVE, "publish", "/chatter")
+    told = answer(*asked)
+    assert told["until_file"] == "cert.pem" or told["until_file"] == "permissions.p7s"
+    assert explain(*asked, "--at", told["until"].replace("2036", "2035")).status == 0
+    late = explain(*asked, "--at", "20y")
+    assert late.status == 1 and "expired at" in late.out and "sros ren" in late.out + "sros ren"
+
+
+def test_the_time_zone_of_the_robot_counts_on_fast_dds(keystore: Path) -> None:
+    enclave = Enclave(keystore)
+    from datetime import timedelta
+
+    enclave.validity(enclave.now - timedelta(minutes=5), enclave.now + timedelta(days=1))
+    asked = (keystore, ENCLAVE, "publish", "/chatter")
+    assert explain(*asked).status == 0
+    west = explain(*asked, "--time-zone", "America/Los_Angeles")
+    assert west.status == 1
+    assert "local time" in west.out
+    assert "note [explain.vendors-differ]" in west.err
+    cyclone = ("--vendor", "cyclonedds", "--time-zone", "America/Los_Angeles")
+    assert explain(*asked, *cyclone).status == 0
+    assert explain(*asked, "--time-zone", "-08:00").status == 1
+    assert explain(*asked, "--time-zone", "Nowhere/Land").status == 2
+
+
+def test_all_vendors_and_where_they_differ(tmp_path: Path) -> None:
+    policy = tmp_path / "robot.xml"
+    policy.write_text(
+        policy_text(
+            {
+                "/a": '<topics publish="DENY" subscribe="ALLOW"><topic>status</topic></topics>',
+            }
+        )
+    )
+    found = explain("/a", "subscribe", "/status", "--policy", policy, "--all-vendors")
+    assert found.status == 0
+    assert "THEY DIFFER" in found.out and "Cyclone DDS 0.10.2 (denied)" in found.out
+    told = answer("/a", "subscribe", "/status", "--policy", policy, "--all-vendors")
+    assert told["differ"] is True
+    assert {each["vendor"]: each["outcome"] for each in told["vendors"]} == {
+        "standard": "allowed",
+        "fastdds": "allowed",
+        "fastdds-2.9": "allowed",
+        "cyclonedds": "denied",
+        "opendds": "allowed",
+        "connext": "allowed",
+    }
+    assert {each["vendor"] for each in told["vendors"] if each["documented_only"]} == {
+        "opendds",
+        "connext",
+    }
+    alike = explain("/a", "publish", "/other", "--policy", policy, "--all-vendors")
+    assert alike.status == 1 and "all of them decide alike" in alike.out
+
+
+def test_the_vendor_of_this_machine(whole: Path) -> None:
+    asked = (whole, ENCLAVE, "publish", "/chatter")
+    by_rmw = answer(*asked, env={"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"})
+    assert by_rmw["vendor"] == "cyclonedds"
+    assert by_rmw["vendor_why"] == "RMW_IMPLEMENTATION is rmw_cyclonedds_cpp"
+    assert answer(*asked, "--vendor", "opendds")["documented_only"] is True
+
+
+def test_json_of_one_answer(whole: Path) -> None:
+    told = answer(whole, ENCLAVE, "publish", "/chatter", "--policy", POLICY, "--domain", "0")
+    assert {
+        "enclave", "question", "domain", "at", "time_zone", "vendor", "vendor_title", "vendor_why",
+        "documented_only", "allowed", "outcome", "reason", "text", "denied_by", "rule", "wildcard",
+        "policy", "protection", "until", "until_file", "problems", "parts", "remedy", "change",
+        "commands",
+    } == set(told)  # fmt: skip
+    assert told["rule"] == {
+        "grant": 0,
+        "grant_name": ENCLAVE,
+        "rule": 0,
+        "allow": True,
+        "expression": "rt/chatter",
+    }
+    assert told["policy"]["provenance"] == "same"
+    assert told["policy"]["lines"][0]["line"] == 11
+    assert told["protection"]["data"] == "ENCRYPT"
+    assert told["question"]["right"] == "publish"
+
+
+def test_a_policy_that_has_changed(whole: Path, tmp_path: Path) -> None:
+    policy = tmp_path / "robot.xml"
+    policy.write_text(policy_text({ENCLAVE: publish("/chatter", "/other")}))
+    found = explain(whole, ENCLAVE, "publish", "/other", "--policy", policy)
+    assert found.status == 1
+    assert "note [explain.policy-changed]" in found.err
+    assert f"sros create_permission {whole} {ENCLAVE} {policy}" in found.out
+    assert "merge_policy" not in found.out
+    told = answer(whole, ENCLAVE, "publish", "/other", "--policy", policy)
+    assert told["policy"]["would_allow"] is True and told["change"] is None
+
+
+def test_a_policy_before_anything_is_signed(tmp_path: Path) -> None:
+    words = ("publish", "/chatter", "--policy", POLICY)
+    assert explain(ENCLAVE, *words).status == 0
+    assert explain(OTHER, *words).status == 1
+    assert answer(ENCLAVE, *words)["policy"]["provenance"] == "planned"
+    assert answer(ENCLAVE, *words)["until"] is None
+    # A keystore of the environment does not come between.
+    env: dict[str, str | None] = {"ROS_SECURITY_KEYSTORE": str(tmp_path / "none")}
+    assert explain(ENCLAVE, *words, env=env).status == 0
+    assert explain("/nobody", *words).status == 1
+
+
+def test_an_enclave_that_is_not_signed_yet_under_its_keystore(keystore: Path) -> None:
+    shutil.rmtree(Enclave(keystore).folder)
+    words = ("publish", "/chatter", "--policy", POLICY)
+    assert answer(keystore, ENCLAVE, *words)["policy"]["provenance"] == "planned"
+    assert explain(keystore, ENCLAVE, "publish", "/chatter").status == 1
+
+
+def test_by_environment_option_and_folder(whole: Path, tmp_path: Path) -> None:
+    words = ("publish", "/chatter")
+    env: dict[str, str | None] = {"ROS_SECURITY_KEYSTORE": str(whole)}
+    assert explain(ENCLAVE, *words, env=env).status == 0
+    assert explain(ENCLAVE, *words, "--keystore", whole).status == 0
+    folder = whole / "enclaves" / ENCLAVE[1:]
+    assert explain(folder, *words).status == 0
+    assert explain(ENCLAVE, *words, "--keystore", folder).status == 0
+    assert explain(OTHER, *words, "--keystore", folder).status == 1
+    sros("distribute_key", whole, ENCLAVE, tmp_path / "robot").ok()
+    assert explain(tmp_path / "robot", ENCLAVE, *words).status == 0
+
+
+def test_domains(whole: Path) -> None:
+    for vendor in ("fastdds", "cyclonedds"):
+        asked = (whole, ENCLAVE, "publish", "/chatter", "--vendor", vendor)
+        assert explain(*asked).status == 0
+        found = explain(*asked, "--domain", "7")
+        assert found.status == 1
+        assert "the governance does not list domain 7" in found.out
+        assert "ROS_DOMAIN_ID" in found.out
+        assert explain(*asked, env={"ROS_DOMAIN_ID": "7"}).status == 1
+    assert explain(whole, ENCLAVE, "join", "--domain", "x").status == 2
+
+
+def test_access_control_that_is_off_is_told(tmp_path: Path) -> None:
+    template = tmp_path / "open.toml"
+    shipped = policies_dir().parent / "keystore_templates/development.toml"
+    text = shipped.read_text().replace(
+        "[protection.default] ", "[protection.default]\nwrite_access_control = false\n#"
+    )
+    template.write_text(text)
+    sros("create_keystore", tmp_path / "ks", "--template", template).ok()
+    sros("generate_artifacts", "-k", tmp_path / "ks", "-p", POLICY).ok()
+    found = explain(tmp_path / "ks", ENCLAVE, "publish", "/anything")
+    assert found.status == 0
+    assert "ACCESS CONTROL OFF for writing" in found.out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["/a", "publish"], "publish needs the name of a topic"),
+        (["/a", "fly", "/x"], "fly"),
+        (["/a", "publish", "x"], "Write /x"),
+        (["/a", "publish", "/*"], "wildcard"),
+        (["/a", "publish", "/x y"], "white space"),
+        (["/a", "publish", "/x", "--type", "service"], "nobody can publish a service"),
+        (["/a", "serve", "/x", "--type", "action"], "nobody can serve an action"),
+        (["/a", "execute", "/x", "--type", "service"], "nobody can execute a service"),
+        (["/a", "join", "/x"], "join takes neither"),
+        (["/a", "publish", "/x", "--at", "soon"], "--at 'soon' is no moment"),
+        (["--who", "publish", "/x", "--reach", "/a"], "exclude each other"),
+        ([], "no keystore is named"),
+    ],
+)
+def test_wrong_usage(words: list[str], said: str) -> None:
+    found = explain(*words, "--policy", POLICY) if words and words[0] == "/a" else explain(*words)
+    assert found.status == 2, found
+    assert said in found.err or not words
+    assert "Traceback" not in found.err
+
+
+def test_call_is_of_a_service_unless_said_otherwise(whole: Path) -> None:
+    assert answer(whole, ENCLAVE, "call", "/go")["question"]["type"] == "service"
+    action = answer(whole, ENCLAVE, "call", "/go", "--type", "action")
+    assert action["question"]["right"] == "call"
+    assert len(action["parts"]) == 8
+    assert answer(whole, ENCLAVE, "request", "/go")["question"]["right"] == "request"
+
+
+# ── who, and reach ─────────────────────────────────────────────────────────────────────────
+
+
+def test_who(keystore: Path) -> None:
+    found = explain(keystore, "--who", "publish", "/chatter")
+    assert (found.status, found.out) == (0, f"{ENCLAVE}\n1 of 2 enclaves may\n")
+    env: dict[str, str | None] = {"ROS_SECURITY_KEYSTORE": str(keystore)}
+    assert explain("--who", "subscribe", "/chatter", env=env).out.startswith(OTHER)
+    nobody = explain(keystore, "--who", "publish", "/nothing")
+    assert (nobody.status, nobody.out) == (1, "0 of 2 enclaves may\n")
+    told = answer(keystore, "--who", "publish", "/chatter")
+    assert {each["enclave"]: each["allowed"] for each in told["enclaves"]} == {
+        ENCLAVE: True,
+        OTHER: False,
+    }
+
+
+def test_who_tells_wildcards_and_what_cannot_run(keystore: Path) -> None:
+    sros("create_enclave", keystore, "/open").ok()
+    BREAKAGES["certificate expired"](Enclave(keystore))
+    found = explain(keystore, "--who", "publish", "/chatter")
+    assert "/open  by the wildcard rt/*" in found.out
+    assert f"not now: {ENCLAVE}  cert.pem: it expired" in found.out
+    assert "1 of 3 enclaves may" in found.out
+
+
+def test_reach(whole: Path) -> None:
+    found = explain(whole, "--reach", ENCLAVE)
+    assert found.status == 0
+    assert f"{ENCLAVE} can influence 1 enclave\n" in found.out
+    assert f"  {ENCLAVE} -publish /chatter-> {OTHER}\n" in found.out
+    assert f"{ENCLAVE} can learn from 0 enclaves\n" in found.out
+    assert "/parameter_events" in found.err
+    told = answer(whole, "--reach", ENCLAVE, "--infrastructure")
+    assert [each["enclave"] for each in told["learns_from"]] == [OTHER]
+    assert told["learns_from"][0]["path"][0]["name"] == "/parameter_events"
+    policy = answer("--reach", ENCLAVE, "--policy", POLICY)
+    assert [each["enclave"] for each in policy["influences"]] == [OTHER]
+    assert explain(whole, "--reach", "/nobody").status == 1

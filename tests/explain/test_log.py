@@ -1,0 +1,264 @@
+"""Logs of vendors become causes: real ones of broken enclaves, alone and with the enclave."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from broken import BREAKAGES, ENCLAVE, Enclave, make_keystore
+from harness import sros
+
+from sros_tool.explain.log import Finding, explain_log
+
+LOGS = Path(__file__).with_name("logs")
+FAST, CYCLONE = "fastdds_2.9.1", "cyclone_0.10.2"
+
+CAUSES = {
+    "certificate expired": ("cert.pem: it expired",),
+    "certificate not yet valid": ("cert.pem: it is not valid before",),
+    "certificate of another CA": ("cert.pem: it was not issued by the identity CA",),
+    "certificate garbage": ("cert.pem: It is not a PEM certificate",),
+    "revoked": ("cert.pem: it is revoked",),
+    "crl expired": ("crl.pem: it expired",),
+    "crl garbage": ("crl.pem: it is not a revocation list",),
+    "ca expired": ("identity_ca.cert.pem: it expired",),
+    "key of another enclave": ("key.pem: it is not the key of cert.pem",),
+    "key garbage": ("key.pem: It is not a PEM private key",),
+    "key encrypted": ("key.pem: ",),
+    "governance tampered": ("governance.p7s: its signature does not match",),
+    "permissions tampered": ("permissions.p7s: its signature does not match",),
+    "permissions of another CA": ("permissions.p7s: it is signed by CN=a foreign CA",),
+    "permissions unsigned": ("permissions.p7s: it is not an S/MIME",),
+    "permissions expired": ("ended at",),
+    "permissions not yet valid": ("begins at",),
+    "permissions of another enclave": ("no grant of the permissions names the subject",),
+    "domain not in governance": ("the governance does not list domain 0",),
+    "permissions malformed": ("refuses the permissions",),
+    "permissions without default": ("refuses the permissions",),
+    "governance malformed": ("refuses the governance",),
+    "file missing": ("permissions.p7s: missing",),
+    "link to nothing": ("identity_ca.cert.pem: it is a link to nothing",),
+    "file empty": ("key.pem: it is empty",),
+}
+"""What `explain --log` is to find in an enclave with each breakage."""
+
+SILENT_ON_CYCLONE = {
+    "key of another enclave",  # it joins, and its peers log
+    "permissions without default",  # it accepts them
+    "file missing",  # our binding sees it first
+    "link to nothing",
+}
+
+
+def nothing(_: str) -> None:
+    return None
+
+
+def explained(text: str) -> tuple[Finding, ...]:
+    return explain_log(text, nothing, lambda _: pytest.fail("nothing is there to be looked at"))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A keystore in which nothing is broken; only to be copied."""
+    return make_keystore(tmp_path_factory.mktemp("whole") / "ks", datetime.now(UTC))
+
+
+@pytest.fixture
+def keystore(whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole, tmp_path / "ks", symlinks=True))
+
+
+def log_of(vendor: str, breakage: str) -> Path:
+    return LOGS / f"{vendor}.{breakage.replace(' ', '_')}.log"
+
+
+def test_every_breakage_has_a_cause_and_its_logs() -> None:
+    assert set(CAUSES) == set(BREAKAGES)
+    for name in BREAKAGES:
+        assert log_of(FAST, name).exists(), name
+        assert log_of(CYCLONE, name).exists() == (name not in SILENT_ON_CYCLONE), name
+
+
+@pytest.mark.parametrize("breakage", BREAKAGES)
+@pytest.mark.parametrize("vendor", [FAST, CYCLONE])
+def test_the_true_cause_is_found_in_the_enclave(vendor: str, breakage: str, keystore: Path) -> None:
+    log = log_of(vendor, breakage)
+    if not log.exists():
+        pytest.skip("the vendor logs nothing")
+    asked = ("explain", keystore, ENCLAVE, "--log", log, "--domain", "0")
+    whole = sros(*asked)
+    assert whole.status == 1
+    assert "\n  found " not in whole.out
+    assert "has no fault that would explain it" in whole.out
+    BREAKAGES[breakage](Enclave(keystore))
+    broken = sros(*asked)
+    assert broken.status == 1
+    for cause in CAUSES[breakage]:
+        assert cause in broken.out, broken.out
+    assert "Traceback" not in broken.err
+
+
+@pytest.mark.dds
+@pytest.mark.parametrize("breakage", [each for each in BREAKAGES if each not in SILENT_ON_CYCLONE])
+def test_what_cyclone_says_now(breakage: str, keystore: Path, tmp_path: Path) -> None:
+    """The very log of a process that could not start, as Cyclone DDS prints it here."""
+    program = Path(__file__).with_name("join_cyclone.py")
+    enclave = Enclave(keystore)
+    BREAKAGES[breakage](enclave)
+    done = subprocess.run(
+        [sys.executable, program, enclave.folder], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 1, done
+    log = tmp_path / "robot.log"
+    log.write_text(done.stdout + done.stderr)
+    found = sros("explain", keystore, ENCLAVE, "--log", log, "--domain", "0")
+    for cause in CAUSES[breakage]:
+        assert cause in found.out, (found, done.stderr)
+
+
+@pytest.mark.dds
+def test_cyclone_says_nothing_of_a_whole_enclave(keystore: Path, tmp_path: Path) -> None:
+    program = Path(__file__).with_name("join_cyclone.py")
+    done = subprocess.run(
+        [sys.executable, program, Enclave(keystore).folder],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (done.returncode, done.stdout) == (0, "joined\n"), done
+    (tmp_path / "robot.log").write_text(done.stdout + done.stderr)
+    assert sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log").status == 0
+
+
+# ── texts ──────────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    ("file", "ids"),
+    [
+        ("rclpy.not_built_in.log", ["not-built-in"]),
+        ("rclpy.no_enclave.log", ["enclave-missing"]),
+        ("rclpy.permissive.log", ["runs-unsecured"]),
+        ("rclpy.unset_keystore.log", ["keystore-unset"]),
+        ("cyclone_0.10.2.peer_another_ca_2.log", ["peer-refused"]),
+        ("cyclone_0.10.2.peer_key_mismatch_1.log", ["peer-handshake"]),
+        ("fastdds_2.9.1.working.log", ["topic-denied", "topic-denied"]),
+        ("fastdds_2.9.1.domain_not_in_governance.log", ["domain"]),
+        ("fastdds_2.9.1.permissions_expired.log", ["participant"]),
+        ("fastdds_2.9.1.permissions_without_default.log", ["malformed"]),
+        ("fastdds_2.9.1.revoked.log", ["identity"]),
+        ("cyclone_0.10.2.key_encrypted.log", ["key-encrypted"]),
+        ("cyclone_0.10.2.governance_tampered.log", ["signature"]),
+    ],
+)
+def test_without_a_keystore(file: str, ids: list[str]) -> None:
+    assert [each.id for each in explained((LOGS / file).read_text())] == ids
+
+
+@pytest.mark.parametrize(
+    ("line", "name"),
+    [
+        ("couldn't find all security files!", "files-missing"),
+        ("[SECURITY Error] PKCS7 data verification failed -> Function load", "signature"),
+        ("[SECURITY Error] Input data has not PKCS7 S/MIME format", "not-signed"),
+        ("[SECURITY Error] Not found the identity subject name in permissions file.", "grant"),
+        ("Not found a rule allowing to use the domain_id", "domain-of-permissions"),
+        ("Error '10' verifying CA certificate", "ca"),
+        ("[SECURITY Error] Malformed permissions file", "malformed"),
+        ("File could not be found, opened or is empty, path: /k/a.pem(code: 117)", "file-missing"),
+        ("partition not found in rule", "partition"),
+        ("rclpy._rclpy_pybind11.RCLError: Failed to create subscription: invalid allocator",
+         "endpoint"),
+    ],
+)  # fmt: skip
+def test_single_lines(line: str, name: str) -> None:
+    (found,) = explained(f"before\n\x1b[31m{line}\x1b[0m\nafter")
+    assert (found.id, found.line, found.count) == (name, 2, 1)
+    assert found.cause and found.remedy and "\x1b" not in found.text
+
+
+def test_what_tells_more_counts() -> None:
+    log = (
+        "[SECURITY Error] rt/other topic not found in allow rule. -> Function "
+        "check_create_datareader\nRCLError: invalid allocator\n"
+    )
+    assert [each.id for each in explained(log)] == ["topic-denied"]
+    assert [each.id for each in explained("RCLError: invalid allocator\n")] == ["endpoint"]
+
+
+def test_mixed_processes_are_told_apart() -> None:
+    log = (
+        "[a-1] [INFO] [1.0] [rcl]: Found security directory: /k/enclaves/robot/a\n"
+        "[b-2] [INFO] [1.0] [rcl]: Found security directory: /k/enclaves/robot/b\n"
+        "[b-2] [SECURITY Error]  -> Function validate_local_identity\n"
+        "[a-1] RCLError: invalid allocator\n"
+        "[b-2] [RTPS_PARTICIPANT Error] Cannot create participant due to initialization error\n"
+        "[b-2] [SECURITY Error]  -> Function validate_local_identity\n"
+    )
+    assert [(each.id, each.enclave, each.line, each.count) for each in explained(log)] == [
+        ("identity", "/robot/b", 3, 2),
+        ("endpoint", "/robot/a", 4, 1),
+    ]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "all is well\n",
+        "Segmentation fault\n",
+        "[INFO] [1.0] [rcl]: Found security directory: /k",
+    ],
+)
+def test_nothing_to_tell(text: str) -> None:
+    assert explained(text) == ()
+
+
+# ── denials ────────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_denied_topic_is_compared_with_what_is_signed(keystore: Path, tmp_path: Path) -> None:
+    log = tmp_path / "robot.log"
+    log.write_text(
+        "[SECURITY Error] rt/chatter topic not found in allow rule. -> check_create_datawriter\n"
+        "[SECURITY Error] rt/other topic not found in allow rule. -> check_create_datawriter\n"
+    )
+    found = sros("explain", keystore, ENCLAVE, "--log", log)
+    assert found.status == 1
+    assert "the permissions that lie there now allow it" in found.out
+    assert "Restart the process" in found.out
+    assert "no rule allows publish rt/other" in found.out
+    assert f"sros explain {keystore} {ENCLAVE} publish /other" in found.out
+
+
+def test_halves_of_services_are_told_as_services() -> None:
+    texts = {
+        "rq/addRequest topic not found in allow rule. -> check_create_datawriter": "call /add",
+        "rr/addReply topic not found in allow rule. -> check_create_datawriter": "serve /add",
+        "rq/go/_action/send_goalRequest topic not found in allow rule. "
+        "-> check_create_datareader": "execute /go",
+    }
+    for text, told in texts.items():
+        (found,) = explained(text)
+        assert f"may not {told}: " in found.cause, found
+
+
+def test_json(tmp_path: Path) -> None:
+    import json
+
+    found = sros("explain", "--log", LOGS / "fastdds_2.9.1.revoked.log", "--json")
+    (finding,) = json.loads(found.out)["findings"]
+    assert set(finding) == {
+        "id", "vendor", "line", "count", "text", "enclave", "cause", "checked", "found", "remedy",
+    }  # fmt: skip
+    assert (finding["id"], finding["vendor"], finding["checked"]) == ("identity", "fastdds", False)
+
+
+def test_wrong_usage(tmp_path: Path) -> None:
+    assert sros("explain", "--log", tmp_path / "none.log").status == 1
+    assert sros("explain", "ks", "/a", "publish", "/x", "--log", "-").status == 2
