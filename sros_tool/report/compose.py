@@ -97,7 +97,7 @@ def overlay(first: Source, second: Source, kind: str, context: Context = Context
     ]
     known = Known(rights[0] | rights[1])
     sides = [edges_of(each, known, context.common) for each in rights]
-    edges = _marked(*sides, neutral_denials=kind == "use")
+    edges = _marked(*sides)
     normal = [folded(each) for each in rights]
     stated = {
         right: Mark.BOTH
@@ -105,21 +105,17 @@ def overlay(first: Source, second: Source, kind: str, context: Context = Context
         else (Mark.FIRST if right in normal[0] else Mark.SECOND)
         for right in normal[0] | normal[1]
     }
-    picture = _picture((first, second), edges, stated, known, context)
+    unseen: frozenset[str] = frozenset()
     if kind == "use":
-        differences = _unused(edges)
-        unseen = {each.enclave for each in rights[0]} - {each.enclave for each in rights[1]}
-        findings = tuple(
-            Finding("view.never-observed", "note", f"{path} was not observed at all.", "", path)
-            for path in sorted(unseen)
-        )
-    else:
-        differences, findings = _changed(rights[0], rights[1]), ()
+        unseen = frozenset(each.enclave for each in rights[0] - rights[1])
+        unseen -= {each.enclave for each in rights[1]}
+        edges = [_neutral(edge, unseen) for edge in edges]
+    picture = _picture((first, second), edges, stated, known, context)
     return replace(
         picture,
         overlay=OVERLAYS[kind],
-        differences=differences,
-        findings=(*picture.findings, *findings),
+        differences=_unused(edges) if kind == "use" else _changed(*rights),
+        enclaves=tuple(replace(e, observed=e.path not in unseen) for e in picture.enclaves),
     )
 
 
@@ -204,7 +200,7 @@ def _enclaves(
 # ── one over the other ─────────────────────────────────────────────────────────────────────
 
 
-def _marked(first: Iterable[Edge], second: Iterable[Edge], *, neutral_denials: bool) -> list[Edge]:
+def _marked(first: Iterable[Edge], second: Iterable[Edge]) -> list[Edge]:
     """The edges of both sides, each with where it stands."""
     sides = [{_identity(edge): edge for edge in side} for side in (first, second)]
     found = []
@@ -215,11 +211,16 @@ def _marked(first: Iterable[Edge], second: Iterable[Edge], *, neutral_denials: b
             by = tuple(sorted({*one.by, *other.by})) if one.by and other.by else ()
             found.append(replace(one, by=by))
         elif one:
-            neutral = neutral_denials and one.qualifier is not ALLOW
-            found.append(one if neutral else replace(one, mark=Mark.FIRST))
+            found.append(replace(one, mark=Mark.FIRST))
         elif other:
             found.append(replace(other, mark=Mark.SECOND))
     return found
+
+
+def _neutral(edge: Edge, unseen: frozenset[str]) -> Edge:
+    """A denial is never observed, and of an enclave that was not observed nothing is known."""
+    neutral = edge.qualifier is not ALLOW or edge.enclave in unseen
+    return replace(edge, mark=Mark.BOTH) if neutral else edge
 
 
 def _identity(edge: Edge) -> tuple[object, ...]:

@@ -111,7 +111,8 @@ class Enclave:
     """An enclave with what is known of it; ``group`` is its host or its namespace.
 
     ``subject``, ``issuer``, ``serial`` and ``key`` describe its certificate, "" without one.
-    ``problems`` keep a process from running in it.
+    ``problems`` keep a process from running in it.  Where use is laid over what is allowed, one
+    that was not ``observed`` at all is neither used nor unused.
     """
 
     path: str
@@ -123,6 +124,7 @@ class Enclave:
     serial: str = ""
     key: str = ""
     problems: tuple[str, ...] = ()
+    observed: bool = True
 
 
 @dataclass(frozen=True, slots=True, order=True)

@@ -20,7 +20,6 @@ SIDE_WIDTH, NAMES_WIDTH, GUTTER = 184, 330, 110
 LINE, PAD, SMALL = 16, 7, 14
 _GAP, _LEAD, _TOP, _MARGIN = 9.0, 24.0, 34.0, 14
 _SIDE_LETTERS, _NAMES_LETTERS = 20, 35
-_MANY = 8
 _LEAST_LINES, _MOST_LINES = 8, 0.3
 _MOST_ENCLAVES = 40
 
@@ -174,6 +173,7 @@ class _Placing:
         self._members = members
         self._everybody = everybody
         self._groups = {each.path: each.group for each in picture.enclaves}
+        self._unseen = {each.path for each in picture.enclaves if not each.observed}
         bundles = fold(picture.names, edges, owner)
         self._looking = _onlookers(bundles)
         self._tags = {side: chr(ord("A") + n) for n, side in enumerate(self._looking)}
@@ -257,6 +257,7 @@ class _Placing:
             label = node.removeprefix(group) or node
         if first and (own := self._own.get(node)):
             notes += own_text(own)
+        notes += ["never observed"] if node in self._unseen else []
         notes += [
             f"{reach} {counted(self._looking[node, right], 'name')}: see {tag}"
             for (other, right), tag in self._tags.items()
@@ -279,7 +280,7 @@ class _Placing:
         )
 
     def _names_card(self, number: int, bundle: Bundle) -> Card:
-        titles, notes = names_title(bundle, _MANY)
+        titles, notes = names_title(bundle)
         lines = tuple(line for title in titles for line in wrapped(title, _NAMES_LETTERS))
         drawn = {tie.node for tie in bundle.ties}
         if len(self._everybody[bundle.kind, bundle.names[0]] - drawn):

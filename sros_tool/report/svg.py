@@ -41,7 +41,7 @@ letter-spacing:.06em}
 .first{stroke:var(--first);stroke-width:2.25;marker-end:url(#to1)}
 .second{stroke:var(--second);stroke-width:2.25;marker-end:url(#to2)}
 .deny{stroke:var(--deny);stroke-width:1.75;marker-end:url(#no)}
-.tip{fill:var(--line)}.tip1{fill:var(--first)}.tip2{fill:var(--second)}
+.tip{fill:var(--line)}.tip1{fill:var(--paper);stroke:var(--first);stroke-width:1.2}.tip2{fill:var(--second)}
 .cross{fill:var(--paper);stroke:var(--deny);stroke-width:1.6}
 .glyph{fill:none;stroke:var(--soft);stroke-width:1.4}
 .lock{fill:none;stroke-width:1.4}.lock-encrypt{stroke:var(--encrypt)}.lock-sign{stroke:var(--sign)}\
@@ -49,13 +49,14 @@ letter-spacing:.06em}
 .tag{font:700 11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:var(--soft)}
 .mark1{fill:var(--first);font-weight:700}.mark2{fill:var(--second);font-weight:700}
 """
+_USE = "svg{--second:var(--deny)}\n"  # what is used and not allowed is no good news
 _MARKERS = """\
 <marker id="to" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8" \
 markerUnits="userSpaceOnUse" orient="auto"><path class="tip" d="M0 0.5L8 4L0 7.5z"/></marker>
 <marker id="to1" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="9" markerHeight="9" \
-markerUnits="userSpaceOnUse" orient="auto"><path class="tip1" d="M0 0.5L8 4L0 7.5z"/></marker>
+markerUnits="userSpaceOnUse" orient="auto"><path class="tip1" d="M1 1L7 4L1 7z"/></marker>
 <marker id="to2" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="9" markerHeight="9" \
-markerUnits="userSpaceOnUse" orient="auto"><path class="tip2" d="M0 0.5L8 4L0 7.5z"/></marker>
+markerUnits="userSpaceOnUse" orient="auto"><path class="tip2" d="M0 4L4 0L8 4L4 8z"/></marker>
 <marker id="no" viewBox="0 0 14 14" refX="13" refY="7" markerWidth="14" markerHeight="14" \
 markerUnits="userSpaceOnUse" orient="0"><path class="cross" d="M7 1.5a5.5 5.5 0 1 0 .01 0z\
 M3.2 10.8L10.8 3.2"/></marker>"""
@@ -77,12 +78,13 @@ LOCKS = {
 def render_svg(picture: Picture, scene: Scene) -> str:
     """The scene as an SVG document; the same scene gives the same bytes."""
     legend = list(_legend(picture, scene))
+    used = _USE if picture.overlay and picture.overlay.kind == "use" else ""
     height = scene.height + _HEAD + 16 + 20 * len(legend)
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {scene.width} {height}" '
         f'width="{scene.width}" height="{height}" role="img">',
         f"<title>{escape(picture.title)}: who may do what</title>",
-        f"<style>{_STYLE}</style>",
+        f"<style>{_STYLE}{used}</style>",
         f"<defs>{_MARKERS}</defs>",
         f'<rect class="paper" width="{scene.width}" height="{height}"/>',
         f'<text class="title" x="14" y="26">{escape(picture.title)}</text>',

@@ -41,6 +41,9 @@ OWN = "own:"
 SENDERS, LISTENERS = "may send", "may receive"
 
 
+_MOST, _SHOWN = 8, 4  # so many names stand on a card, and of more than these so many
+
+
 def counted(number: int, thing: str) -> str:
     """As ``1 topic`` and ``2 topics``."""
     return f"{number} {thing}{'' if number == 1 else 's'}"
@@ -53,17 +56,15 @@ def own_text(own: Mapping[str, int]) -> list[str]:
     return [*lines, ", ".join(found[2:])] if found[2:] else lines
 
 
-def names_title(bundle: Bundle, most: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What stands on the card of a bundle: names or the wildcards for them, and small notes."""
-    kind = KIND_NAMES[bundle.kind]
-    names = bundle.names
-    expressions = sorted({each for tie in bundle.ties for each in tie.by})
-    if len(names) > most and expressions and all(tie.by for tie in bundle.ties):
-        reached = f"reaches {counted(len(names), kind)}"
-        return tuple(expressions[:most]), (reached,)
-    if len(names) <= most:
+    kind, names = KIND_NAMES[bundle.kind], bundle.names
+    if len(names) <= _MOST:
         return names, ()
-    return names[: most - 1], (f"and {len(names) - most + 1} {kind}s more",)
+    expressions = sorted({each for tie in bundle.ties for each in tie.by})
+    if expressions and all(tie.by for tie in bundle.ties):
+        return tuple(expressions[:_MOST]), (f"reaches {counted(len(names), kind)}",)
+    return names[:_SHOWN], (f"and {len(names) - _SHOWN} more {kind}s",)
 
 
 def wrapped(text: str, letters: int) -> tuple[str, ...]:

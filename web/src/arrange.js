@@ -7,6 +7,7 @@ import { KINDS, counted, sends } from "./words.js";
 const SIZES = { letter: 7.4, smallLetter: 6.2, line: 16, small: 14, pad: 7 };
 export const MOST_BUNDLES = 160;
 const MOST_NAMES = 8;
+const SHOWN_NAMES = 4;
 
 // As the drawing on paper cuts names: after a slash or an underscore, where one is near.
 export function wrapped(text, letters) {
@@ -40,7 +41,7 @@ export function enclaveCard(id, path, notes = []) {
 }
 
 export function namesCard(id, bundle, notes = []) {
-  const shown = bundle.names.slice(0, bundle.names.length > MOST_NAMES ? MOST_NAMES - 1 : MOST_NAMES);
+  const shown = bundle.names.slice(0, bundle.names.length > MOST_NAMES ? SHOWN_NAMES : MOST_NAMES);
   const rest = bundle.names.length - shown.length;
   const card = {
     id,
@@ -49,7 +50,7 @@ export function namesCard(id, bundle, notes = []) {
     level: bundle.protection.level,
     members: bundle.names,
     lines: shown.flatMap((name) => wrapped(name, 35)),
-    notes: [...(rest ? [`and ${counted(rest, KINDS[bundle.kind])} more`] : []), ...notes],
+    notes: [...(rest ? [`and ${rest} more ${KINDS[bundle.kind]}s`] : []), ...notes],
     tags: "",
   };
   return { ...card, width: widthOf(card, 62, 130), height: height(card) };
@@ -88,7 +89,14 @@ export function columns(bundles) {
       links.push(linkOf(...ends, bundle, ties));
     }
   });
-  const scene = arranged([...cards.values()], links);
+  // All as wide as the widest, so that the columns have straight edges.
+  const all = [...cards.values()];
+  for (const names of [true, false]) {
+    const column = all.filter((card) => (card.role === "names") === names);
+    const width = Math.max(0, ...column.map((card) => card.width));
+    for (const card of column) card.width = width;
+  }
+  const scene = arranged(all, links);
   return { ...scene, heads: heads(scene.cards) };
 }
 
@@ -105,33 +113,44 @@ export function heads(cards) {
   return found;
 }
 
-// What flows to a name, or from it, so many hops far.
+// What flows to a name, or from it, so many hops far.  Names by which information goes between
+// the very same enclaves stand on one card.
 export function flowScene({ start, hops, steps }, upstream, most) {
-  const cards = new Map([["n0", { ...namesCard("n0", start), chosen: true }]]);
-  const ids = new Map([[start, "n0"]]);
-  const links = new Map();
+  const ends = new Map();
   for (const { hop, bundle, tie, near } of steps) {
     if (hop > most || (!near && hop === most)) continue;
-    if (!ids.has(bundle)) {
-      const id = `n${ids.size}`;
-      ids.set(bundle, id);
-      cards.set(id, namesCard(id, bundle));
-    }
-    const id = `e${tie.enclave}`;
-    if (!cards.has(id)) {
-      cards.set(id, enclaveCard(id, tie.enclave, [counted(hops.get(tie.enclave), "hop")]));
-    }
-    const ends = near === upstream ? [id, ids.get(bundle)] : [ids.get(bundle), id];
-    const key = ends.join(" ");
-    if (!links.has(key)) links.set(key, linkOf(...ends, bundle, [tie]));
-    else links.get(key).rights = [...new Set([...links.get(key).rights, tie.right])].sort();
+    if (!ends.has(bundle)) ends.set(bundle, { near: new Map(), far: new Map() });
+    // Near is where the flow comes from, seen from the name that was asked for.
+    const side = ends.get(bundle)[near ? "far" : "near"];
+    if (!side.has(tie.enclave)) side.set(tie.enclave, []);
+    side.get(tie.enclave).push(tie);
   }
-  // A name that nobody uses on its far side, within these hops, leads nowhere.
-  const far = (link) => (upstream ? link.target : link.source);
-  const reached = new Set(["n0", ...[...links.values()].map(far)]);
-  const leads = (id) => id[0] !== "n" || reached.has(id);
-  const kept = [...links.values()].filter((link) => leads(link.source) && leads(link.target));
-  return arranged([...cards.values()].filter((card) => leads(card.id)), kept);
+  const merged = new Map();
+  for (const [bundle, { near, far }] of ends) {
+    if (bundle !== start && !far.size) continue; // nobody uses it on its far side
+    const kind = [bundle.kind, bundle.protection.level];
+    const key = bundle === start ? "start" : JSON.stringify([kind, [...near.keys()].sort(), [...far.keys()].sort()]);
+    if (!merged.has(key)) merged.set(key, { bundle: { ...bundle, names: [] }, near, far });
+    merged.get(key).bundle.names.push(...bundle.names);
+  }
+  if (!merged.has("start")) merged.set("start", { bundle: start, near: new Map(), far: new Map() });
+  const cards = [];
+  const links = [];
+  [...merged].forEach(([key, { bundle, near, far }], number) => {
+    const id = `n${number}`;
+    cards.push({ ...namesCard(id, bundle), chosen: key === "start" });
+    for (const [side, before] of [[far, upstream], [near, !upstream]]) {
+      for (const [path, ties] of side) {
+        const pair = before ? [`e${path}`, id] : [id, `e${path}`];
+        links.push(linkOf(...pair, bundle, ties));
+      }
+    }
+  });
+  const used = new Set(links.flatMap((link) => [link.source, link.target]));
+  for (const [path, hop] of hops) {
+    if (used.has(`e${path}`)) cards.push(enclaveCard(`e${path}`, path, [counted(hop, "hop")]));
+  }
+  return arranged(cards, links);
 }
 
 function arranged(cards, links) {

@@ -17,8 +17,8 @@ const LOCKS = {
 };
 const TIPS = [
   ["to", "tip", "M0 0.5L8 4L0 7.5z", 8, 7, "auto"],
-  ["to1", "tip1", "M0 0.5L8 4L0 7.5z", 8, 7, "auto"],
-  ["to2", "tip2", "M0 0.5L8 4L0 7.5z", 8, 7, "auto"],
+  ["to1", "tip1", "M1 1L7 4L1 7z", 8, 7, "auto"],
+  ["to2", "tip2", "M0 4L4 0L8 4L4 8z", 8, 7, "auto"],
   ["no", "cross", "M7 1.5a5.5 5.5 0 1 0 .01 0zM3.2 10.8L10.8 3.2", 14, 13, "0"],
 ];
 const horizontal = linkHorizontal().x((point) => point[0]).y((point) => point[1]);

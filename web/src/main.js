@@ -55,8 +55,9 @@ function showMap() {
   state.shown = scene;
   state.drawing = drawScene(byId("map"), scene, { overlay: model.overlay, problems, choose });
   byId("legend").replaceChildren(...legend(scene, model.overlay, { el, svg }));
-  const summary = scene.title === "Overview" || scene.shown
-    ? `${counted(model.enclaves.length, "enclave")}, ${counted(scene.shown, "name")}${scene.hidden ? `; ${scene.hidden} are not in this view` : ""}`
+  const left = scene.id === "essential" ? "that only every node needs are left out" : "are not in this view";
+  const summary = scene.shown
+    ? `${counted(model.enclaves.length, "enclave")}, ${counted(scene.shown, "name")}${scene.hidden ? `; ${scene.hidden} more ${left}` : ""}`
     : scene.title;
   byId("summary").textContent = scene.cards.length ? summary : "Nothing fits.";
   byId("back").hidden = !(state.flow || filtering());
@@ -69,7 +70,7 @@ function showMap() {
 function zoom(step) {
   const { width } = state.shown;
   const room = byId("canvas").clientWidth - 2;
-  if (step === 0) state.zoom = Math.min(1.15, Math.max(0.55, room / width));
+  if (step === 0) state.zoom = Math.min(1.15, Math.max(0.72, room / width));
   else state.zoom = Math.min(2.5, Math.max(0.3, state.zoom * (step > 0 ? 1.2 : 1 / 1.2)));
   byId("map").setAttribute("width", Math.round(width * state.zoom));
   byId("map").setAttribute("height", Math.round(state.shown.height * state.zoom));
@@ -84,7 +85,7 @@ function light() {
   }[chosen.type];
   // In a flow everything belongs to what was asked for.
   const found = state.drawing.highlight(state.flow ? null : belongs);
-  if (found) state.drawing.card(belongs)?.scrollIntoView({ block: "nearest", inline: "nearest" });
+  if (found || state.flow) state.drawing.card(belongs ?? ((card) => card.chosen))?.scrollIntoView({ block: "nearest", inline: "nearest" });
 }
 
 // ── choosing ─────────────────────────────────────────────────────────────────────────────────
@@ -249,6 +250,7 @@ function start() {
   options("filter-direction", [any("both directions"), ["send", "may send"], ["receive", "may receive"], ["deny", "denied"]]);
   const levels = [...new Set(model.bundles.map((bundle) => bundle.protection.level))];
   options("filter-protection", [any("every protection"), ...levels.map((level) => [level, LEVELS[level]])]);
+  document.body.dataset.overlay = model.overlay?.kind ?? "";
   byId("mark-label").hidden = !model.overlay;
   if (model.overlay) {
     options("filter-mark", [any("all rights"), ["first", model.overlay.first], ["second", model.overlay.second], ["both", "on both sides"]]);

@@ -1,0 +1,241 @@
+"""The verb that draws who may do what: as a page, SVG, DOT, Mermaid or JSON."""
+
+from __future__ import annotations
+
+import tempfile
+from datetime import UTC
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from sros_tool.cli.common import (
+    PATH,
+    SeveralValues,
+    complete_template,
+    dry_run_option,
+    now,
+)
+from sros_tool.cli.policy import check_output, force_option, save
+from sros_tool.errors import UsageError
+
+if TYPE_CHECKING:
+    from datetime import datetime
+
+    from sros_tool.checks.kind import Finding as Checked
+    from sros_tool.report.picture import Finding, Picture
+
+FORMATS = ("html", "svg", "dot", "mermaid", "json")
+_ENDINGS = {".htm": "html", ".mmd": "mermaid", ".gv": "dot"}
+
+
+class _SeveralObserved(SeveralValues):
+    several = ("--observed",)
+
+
+@click.command(
+    "view",
+    cls=_SeveralObserved,
+    epilog="""\b
+Examples:
+  $ sros view keystore -o robot.html --open
+  wrote 'robot.html'
+  $ sros view policies/mobile_robot.xml --format svg -o mobile_robot.svg
+  $ sros view robot.xml --observed learned.xml -o use.html
+  $ sros view old.xml new.xml -o change.html
+  $ sros view robot.xml keystore -o drift.html""",
+)
+@click.argument("sources", metavar="SOURCE...", type=PATH, nargs=-1, required=True)
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(FORMATS),
+    help="What to write. [default: by the ending of FILE, else html]",
+)
+@click.option(
+    "-o", "--output", type=PATH, metavar="FILE", help="Write to FILE, and not to standard output."
+)
+@click.option("--open", "show", is_flag=True, help="Show what was written, in the browser.")
+@click.option(
+    "--observed",
+    multiple=True,
+    type=PATH,
+    metavar="OBSERVED...",
+    help="What was observed, to lay over SOURCE: policies or JSON by generate_policy.",
+)
+@click.option(
+    "--template",
+    metavar="TEMPLATE",
+    help="Show policies with the protection of this keystore template.",
+    shell_complete=complete_template,
+)
+@click.option(
+    "--host",
+    "hosts",
+    multiple=True,
+    metavar="HOST=ENCLAVE",
+    help="Group ENCLAVE, and what is below it, by the host that it runs on.",
+)
+@click.option("--all", "everything", is_flag=True, help="Draw also what every node needs.")
+@click.option("--graphviz", is_flag=True, help="Let Graphviz place the SVG.")
+@force_option
+@dry_run_option
+def view(
+    sources: tuple[Path, ...],
+    form: str | None,
+    output: Path | None,
+    show: bool,
+    observed: tuple[Path, ...],
+    template: str | None,
+    hosts: tuple[str, ...],
+    everything: bool,
+    graphviz: bool,
+    force: bool,
+    dry_run: bool,
+) -> None:
+    """Draw who may do what in SOURCE, or in two of them laid over each other.
+
+    A SOURCE is a policy file, a keystore (what was really signed), the folder of an enclave, its
+    permissions, or what `sros generate_policy --json` has printed. Two sources are compared: two
+    policies as before and after, a policy and a keystore for drift, and with --observed what is
+    allowed with what is used.
+
+    The page is one file that needs no network. No format holds a key or a path of this machine.
+    """
+    moment = now()
+    written = _format(form, output, graphviz)
+    if output:
+        check_output(output, force=force or dry_run)
+    picture = _picture(sources, observed, template, hosts, moment)
+    document = _rendered(picture, written, everything, graphviz, moment)
+    if dry_run:
+        click.echo(f"would write {output or 'to standard output'}: {len(document)} characters")
+        return
+    if show and output is None:
+        output = Path(tempfile.mkdtemp(prefix="sros-view-")) / f"view.{written}"
+    if output is None:
+        click.echo(document, nl=False)
+        return
+    click.echo(save(output, document.encode()), err=True)
+    if show:
+        click.launch(output.absolute().as_uri())
+
+
+def _format(form: str | None, output: Path | None, graphviz: bool) -> str:
+    ending = output.suffix.lower() if output else ""
+    found = form or _ENDINGS.get(ending, ending.removeprefix("."))
+    if found not in FORMATS:
+        found = "html"
+    if graphviz and found != "svg":
+        raise UsageError("--graphviz is for SVG only", "", "Add --format svg, or leave it out.")
+    return found
+
+
+def _picture(
+    sources: tuple[Path, ...],
+    observed: tuple[Path, ...],
+    template: str | None,
+    hosts: tuple[str, ...],
+    moment: datetime,
+) -> Picture:
+    from dataclasses import replace
+
+    from sros_tool.report.compose import Context, compose, overlay, union
+    from sros_tool.report.sources import common_rights, read_source, template_governance
+    from sros_tool.report.sources import with_findings as added
+
+    if len(sources) > 2 or (observed and len(sources) > 1):
+        raise UsageError(
+            "at most two sources can be laid over each other",
+            "",
+            "Name one SOURCE and --observed, or two.",
+        )
+    read = [added(read_source(path, now=moment), path, _checked(path, moment)) for path in sources]
+    if template:
+        governance = template_governance(template)
+        read = [each if each.governance else replace(each, governance=governance) for each in read]
+    context = Context(common_rights(), _hosts(hosts))
+    if observed:
+        seen = union([read_source(path, now=moment) for path in observed])
+        return overlay(read[0], seen, "use", context)
+    if len(read) == 1:
+        return compose(read[0], context)
+    kinds = [each.origin.kind for each in read]
+    if kinds[1] == "observation":
+        return overlay(read[0], read[1], "use", context)
+    if kinds[0] == kinds[1]:
+        return overlay(read[0], read[1], "change", context)
+    # Drift is told from the policy, whichever was named first.
+    first, second = sorted(read, key=lambda each: each.origin.kind != "policy")
+    return overlay(first, second, "drift", context)
+
+
+def _checked(path: Path, moment: datetime) -> list[Finding]:
+    """What `sros check` finds there; of permissions or an enclave alone, what it can."""
+    from sros_tool.checks.targets import Circumstances, path_findings
+    from sros_tool.errors import SrosError
+    from sros_tool.report.picture import Finding
+
+    try:
+        zone = moment.astimezone().tzinfo
+        found = path_findings(path, Circumstances(moment, zone or UTC))
+    except SrosError:
+        return []
+    return [
+        Finding(each.id, each.severity.word, _told(each), each.remedy, _enclave(each))
+        for each in found
+    ]
+
+
+def _told(finding: Checked) -> str:
+    """Where it was found, by no more than the base name of a file, and what."""
+    place = f"{Path(finding.file).name}:{finding.line}: " if finding.line else ""
+    if not place and not _enclave(finding) and finding.subject:
+        place = f"{finding.subject}: "
+    return f"{place}{finding.text}"
+
+
+def _enclave(finding: Checked) -> str:
+    """The enclave that it is about, or ""."""
+    return finding.subject if finding.subject.startswith("/") else ""
+
+
+def _hosts(words: tuple[str, ...]) -> dict[str, str]:
+    found = {}
+    for word in words:
+        host, equals, enclave = word.partition("=")
+        if not equals or not host or not enclave.startswith("/"):
+            raise UsageError(
+                f"{word!r} does not say which enclave runs where",
+                "",
+                "Write --host arm=/robot/arm.",
+            )
+        found[enclave.rstrip("/") or "/"] = host
+    return found
+
+
+def _rendered(
+    picture: Picture, form: str, everything: bool, graphviz: bool, moment: datetime
+) -> str:
+    from sros_tool.report.scene import scenes_of
+
+    if form == "json":
+        from sros_tool.report.as_json import render_json
+
+        return render_json(picture)
+    scenes = scenes_of(picture)
+    if form == "html":
+        from sros_tool.report.page import render_page
+
+        return render_page(picture, scenes, moment)
+    scene = next((each for each in scenes if everything and each.id == "all"), scenes[0])
+    if form == "svg" and not graphviz:
+        from sros_tool.report.svg import render_svg
+
+        return render_svg(picture, scene)
+    from sros_tool.report.graphs import graphviz_svg, render_dot, render_mermaid
+
+    if form == "mermaid":
+        return render_mermaid(picture, scene)
+    dot = render_dot(picture, scene)
+    return graphviz_svg(dot) if graphviz else dot
