@@ -52,6 +52,8 @@ class Grant:
     not_after: str
     rules: tuple[Rule, ...]
     default_allow: bool = False
+    default_empty: bool = False
+    """Its ``<default>`` is there without a word, over which one vendor crashes."""
 
     @property
     def validity(self) -> Window:

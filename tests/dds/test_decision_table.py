@@ -338,6 +338,16 @@ ROWS = [
     Row("an empty topic before it", one(allow(publish("", "rt/a"))), "yes refused refused crash"),
     Row("an empty topic behind it", one(allow(publish("rt/a", ""))), "yes refused refused yes"),
     Row(
+        "an empty default behind the rule",
+        permissions(grant(allow(A), default="<default/>")),
+        "refused refused refused yes",
+    ),
+    Row(
+        "an empty default that is asked for",
+        permissions(grant(allow(B), default="<default/>")),
+        "refused refused refused crash",
+    ),
+    Row(
         "an empty list of topics",
         one(allow("<publish><topics/></publish>")),
         "refused refused refused no",

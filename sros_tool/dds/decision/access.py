@@ -7,13 +7,14 @@ from datetime import UTC, datetime, tzinfo
 
 from sros_tool.dds.decision.answers import Decision, Outcome, Refusal, Verb
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
-from sros_tool.dds.decision.domains import holds_for
 from sros_tool.dds.decision.governed import Governed
 from sros_tool.dds.decision.grants import choose_grant
-from sros_tool.dds.decision.rights import EMPTY_TOPIC, Rights, Verdict
+from sros_tool.dds.decision.joining import decide_join
+from sros_tool.dds.decision.rights import Rights, Verdict, rules_for
 from sros_tool.dds.decision.vendors import TRAITS, Vendor
+from sros_tool.dds.decision.wording import verdict_text
 from sros_tool.dds.governance import Governance, Protection, TopicRule
-from sros_tool.dds.permissions import Grant, Permissions, Rule
+from sros_tool.dds.permissions import Grant, Permissions
 
 _TOPIC_NAME = re.compile(r"[A-Za-z_/][A-Za-z0-9_/]*\Z")
 _ENDPOINTS = (Verb.PUBLISH, Verb.SUBSCRIBE)
@@ -40,23 +41,16 @@ class Access:
 
         ``zone`` is the host's time zone.  No error is raised: what is wrong is answered.
         """
-        self._vendor = vendor
         self._traits = TRAITS[vendor]
         self._domain = domain
         self._governed = Governed(self._traits, governance, domain)
-        self._grant_index: int | None = None
-        self._grant: Grant | None = None
-        self._crash_at: int | None = None
+        self._grant: int | None = None
         chosen = choose_grant(self._traits, permissions, subject, at=at, zone=zone)
         if isinstance(chosen, Refusal):
             self._join = chosen.decision()
             return
-        self._grant_index, self._grant = chosen, permissions.grants[chosen]
-        own = list(enumerate(self._grant.rules))
-        local = self._on_domain(own)
-        self._allows_domain = any(rule.allow for _, rule in local)
-        self._join = self._decide_join(self._grant)
-        self._prepare(own, local)
+        self._grant = chosen
+        self._prepare(permissions.grants[chosen])
 
     @classmethod
     def of_documents(
@@ -95,63 +89,17 @@ class Access:
         """Whether a reader of ``topic`` can be created and hears."""
         return self._endpoint(Verb.SUBSCRIBE, topic, partitions)
 
-    # ── preparing ──────────────────────────────────────────────────────────────────────────
-
-    def _on_domain(self, rules: list[tuple[int, Rule]]) -> list[tuple[int, Rule]]:
-        """The rules for the domain, up to the one over whose domains the vendor crashes."""
-        found = []
-        for index, rule in rules:
-            holds = holds_for(self._traits.open_range, rule.domains, self._domain)
-            if holds is None:
-                self._crash_at = index
-                break
-            if holds:
-                found.append((index, rule))
-        return found
-
-    def _prepare(self, own: list[tuple[int, Rule]], local: list[tuple[int, Rule]]) -> None:
+    def _prepare(self, grant: Grant) -> None:
         traits = self._traits
-        checked = local if traits.filters_own_domain else own
-        self._own = {verb: Rights(traits, checked, verb.value) for verb in _ENDPOINTS}
-        self._peers = self._own
+        rules, otherwise = rules_for(traits, grant, self._domain)
+        joining = decide_join(traits, self._governed, grant, rules, otherwise, self._domain)
+        self._join = self._answer(joining.outcome, joining.reason, joining.text)
+        self._peers = {verb: Rights(traits, rules, otherwise, verb) for verb in _ENDPOINTS}
+        self._own = self._peers
         if not traits.filters_own_domain:
-            self._peers = {verb: Rights(traits, local, verb.value) for verb in _ENDPOINTS}
-        self._either = Rights(traits, local, "publish", "subscribe")
-
-    def _decide_join(self, grant: Grant) -> Decision:
-        traits, rule = self._traits, self._governed.rule
-        where = f"domain {self._domain}"
-        if traits.always_needs_allow_rule and not any(each.allow for each in grant.rules):
-            return self._refused("no-rule", "the grant has no allow rule, so nothing starts")
-        if rule is None:
-            text = f"the governance does not list {where}"
-            if traits.needs_domain_rule:
-                return self._refused("domain-not-in-governance", text)
-            text += "; the participant starts, but no endpoint can be created"
-            return self._answer(Outcome.ALLOWED, "domain-not-in-governance", text)
-        if (
-            traits.refuses_open_rtps
-            and rule.allow_unauthenticated_participants
-            and rule.rtps_protection_kind is not Protection.NONE
-        ):
-            return self._refused(
-                "unauthenticated-with-rtps-protection",
-                "the governance lets unauthenticated participants in and protects RTPS",
-            )
-        if not rule.enable_join_access_control:
-            return self._answer(
-                Outcome.ALLOWED, "unrestricted", f"joining {where} is not access controlled"
-            )
-        if self._allows_domain:
-            return self._answer(Outcome.ALLOWED, "allow-rule", f"an allow rule holds on {where}")
-        missing = f"no allow rule of the grant holds on {where}"
-        if traits.always_needs_allow_rule or not self._governed.all_controlled():
-            return self._answer(Outcome.PEER_DENIES, "no-rule", missing)
-        if self._crash_at is not None:
-            return self._crash(self._crash_at)
-        if traits.honours_default and grant.default_allow:
-            return self._answer(Outcome.ALLOWED, "default", "the grant's default is ALLOW")
-        return self._refused("no-rule", missing)
+            everywhere = list(enumerate(grant.rules))
+            self._own = {verb: Rights(traits, everywhere, otherwise, verb) for verb in _ENDPOINTS}
+        self._either = Rights(traits, rules, otherwise, *_ENDPOINTS)
 
     # ── answering ──────────────────────────────────────────────────────────────────────────
 
@@ -164,82 +112,31 @@ class Access:
             return self._answer(Outcome.DENIED, "invalid-name", f"{topic!r} is no name for a topic")
         rule = self._governed.topic_rule(topic)
         if rule is None:
-            if self._governed.rule is None:
-                reason, what = "domain-not-in-governance", f"does not list domain {self._domain}"
-            else:
-                reason, what = "no-topic-rule", f"has no topic rule for {topic}"
-            return self._answer(Outcome.DENIED, reason, f"the governance {what}")
-        if traits.crashes_on_empty_expressions and not rule.topic_expression.strip():
-            text = "a topic rule of the governance is without its expression, over which it crashes"
-            return self._answer(Outcome.CRASHES, EMPTY_TOPIC, text)
-        controlled = (
-            rule.enable_write_access_control
-            if verb is Verb.PUBLISH
-            else rule.enable_read_access_control
-        )
-        if (
-            traits.creates_topics
-            and rule.enable_write_access_control
-            and rule.enable_read_access_control
-        ):
+            return self._without_topic_rule(topic)
+        if traits.crashes_on_empty_texts and not rule.topic_expression.strip():
+            text = "a topic rule of the governance is empty, over which the process crashes"
+            return self._answer(Outcome.CRASHES, "empty-topic", text)
+        writes, reads = rule.enable_write_access_control, rule.enable_read_access_control
+        asked = f"{verb} {topic}"
+        if traits.creates_topics and writes and reads:
             verdict = self._either.ask_topic(topic)
-            if not self._permits(verdict):
-                return self._verdict(verb, topic, verdict, rule, Outcome.DENIED)
-        if not controlled:
+            if not verdict.allowed:
+                return self._verdict(verdict, asked, rule)
+        if not (writes if verb is Verb.PUBLISH else reads):
             if join.outcome is Outcome.PEER_DENIES and not self._in_the_open(rule):
-                return self._peer_denies_all(rule)
-            return self._answer(
-                Outcome.ALLOWED,
-                "unrestricted",
-                f"the governance leaves {verb.value} {topic} open to everybody",
-                topic_rule=rule,
-            )
+                return self._peers_refuse(rule)
+            text = f"the governance leaves {asked} open to everybody"
+            return self._answer(Outcome.ALLOWED, "unrestricted", text, topic_rule=rule)
         verdict = self._own[verb].ask(topic, partitions)
-        if not self._permits(verdict):
-            return self._verdict(verb, topic, verdict, rule, Outcome.DENIED)
+        if not verdict.allowed:
+            return self._verdict(verdict, asked, rule)
         if join.outcome is Outcome.PEER_DENIES:
-            return self._peer_denies_all(rule)
+            return self._peers_refuse(rule)
         if self._peers is not self._own:
             remote = self._peers[verb].ask(topic, partitions)
             if not remote.allowed:
-                return self._verdict(verb, topic, remote, rule, Outcome.PEER_DENIES)
-        return self._verdict(verb, topic, verdict, rule, Outcome.ALLOWED)
-
-    def _permits(self, verdict: Verdict) -> bool:
-        if verdict.rule is not None or not self._traits.honours_default:
-            return verdict.allowed
-        # Past the last rule before a crash, only the crash is certain.
-        return self._crash_at is None and self._grant is not None and self._grant.default_allow
-
-    def _verdict(
-        self, verb: Verb, topic: str, verdict: Verdict, rule: TopicRule, outcome: Outcome
-    ) -> Decision:
-        if verdict.rule is None and self._crash_at is not None:
-            return self._crash(self._crash_at)
-        if verdict.reason == EMPTY_TOPIC and verdict.rule is not None:
-            text = f"rule {verdict.rule + 1} has a <topic> without text, over which it crashes"
-            return self._answer(Outcome.CRASHES, EMPTY_TOPIC, text, verdict.rule)
-        asked = f"{verb.value} {topic}"
-        number = f"rule {verdict.rule + 1}" if verdict.rule is not None else ""
-        reason = verdict.reason
-        match reason:
-            case "allow-rule":
-                text = f"{number} allows {asked} by {verdict.expression}"
-            case "deny-rule":
-                text = f"{number} denies {asked} by {verdict.expression}"
-            case "partition":
-                text = f"{number} names {verdict.expression}, but not the partitions of {asked}"
-            case _ if outcome is Outcome.PEER_DENIES:
-                text = f"no rule for domain {self._domain} allows {asked}, and peers see to that"
-            case _ if self._traits.honours_default:
-                reason = "default"
-                word = "ALLOW" if outcome is Outcome.ALLOWED else "DENY"
-                text = f"no rule names {asked}, and the grant's default is {word}"
-            case _:
-                text = f"no rule allows {asked}"
-        return self._answer(
-            outcome, reason, text, verdict.rule, verdict.expression, topic_rule=rule
-        )
+                return self._verdict(remote, asked, rule, by_peers=True)
+        return self._verdict(verdict, asked, rule)
 
     def _in_the_open(self, rule: TopicRule) -> bool:
         """Whether even participants that refuse each other exchange the topic."""
@@ -253,42 +150,39 @@ class Access:
             and rule.data_protection_kind is Protection.NONE
         )
 
-    def _peer_denies_all(self, rule: TopicRule) -> Decision:
-        return self._answer(
-            Outcome.PEER_DENIES,
-            "peer-refuses-participant",
-            f"no allow rule of the grant holds on domain {self._domain}, so peers refuse it",
-            topic_rule=rule,
-        )
+    def _without_topic_rule(self, topic: str) -> Decision:
+        if self._governed.rule is None:
+            text = f"the governance does not list domain {self._domain}"
+            return self._answer(Outcome.DENIED, "domain-not-in-governance", text)
+        text = f"the governance has no topic rule for {topic}"
+        return self._answer(Outcome.DENIED, "no-topic-rule", text)
 
-    def _refused(self, reason: str, text: str) -> Decision:
-        return self._answer(Outcome.REFUSED, reason, text)
+    def _peers_refuse(self, rule: TopicRule) -> Decision:
+        text = f"no allow rule of the grant holds on domain {self._domain}, so peers refuse it"
+        return self._answer(Outcome.PEER_DENIES, "peer-refuses-participant", text, topic_rule=rule)
 
-    def _crash(self, rule: int) -> Decision:
-        return self._answer(
-            Outcome.CRASHES,
-            "open-range",
-            f"rule {rule + 1} has a range of domains without <min>, over which it crashes",
-            rule,
-        )
+    def _verdict(
+        self, verdict: Verdict, asked: str, topic_rule: TopicRule, *, by_peers: bool = False
+    ) -> Decision:
+        text = verdict_text(verdict, asked, self._domain, by_peers=by_peers)
+        outcome = Outcome.PEER_DENIES if by_peers else verdict.outcome
+        return self._answer(outcome, verdict.reason, text, verdict, topic_rule)
 
     def _answer(
         self,
         outcome: Outcome,
         reason: str,
         text: str,
-        rule: int | None = None,
-        expression: str | None = None,
-        *,
+        verdict: Verdict | None = None,
         topic_rule: TopicRule | None = None,
     ) -> Decision:
         return Decision(
             outcome,
             reason,
             f"{self._traits.title}: {text}.",
-            self._grant_index,
-            rule,
-            expression,
+            self._grant,
+            verdict.rule if verdict else None,
+            verdict.expression if verdict else None,
             topic_rule,
         )
 

@@ -87,8 +87,8 @@ def read_governance(xml: bytes) -> Governance:
 def read_permissions(xml: bytes) -> Permissions:
     """Its permissions; raises `UnreadableError`.
 
-    A ``<topic>`` without text is "", a rule without domains has a range without ends: over both it
-    crashes once it comes to them.
+    A ``<topic>`` without text is "", a rule without domains has a range without ends, and a
+    ``<default>`` may be empty: over each it crashes once it comes to it.
     """
     dds = _Node.root(xml, _PERMISSIONS, _IGNORED)
     parent = dds.last("permissions")
@@ -264,8 +264,16 @@ def _grant(node: _Node) -> Grant:
         raise UnreadableError("a <grant> lacks its <subject_name> or its <validity>")
     rules = tuple(_rule(each) for each in node.all("allow_rule", "deny_rule"))
     default = node.last("default")
-    allow = default is not None and default.text == "ALLOW"
-    return Grant(node.attribute or "", subject.text, begin.text, end.text, rules, allow)
+    word = None if default is None else default.text
+    return Grant(
+        name=node.attribute or "",
+        subject=subject.text,
+        not_before=begin.text,
+        not_after=end.text,
+        rules=rules,
+        default_allow=word == "ALLOW",
+        default_empty=word == "",
+    )
 
 
 def _rule(node: _Node) -> Rule:

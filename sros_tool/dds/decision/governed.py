@@ -26,7 +26,7 @@ class Governed:
         )
 
     def topic_rule(self, topic: str) -> TopicRule | None:
-        """The first rule whose expression matches; a crash if it is without one."""
+        """The first rule whose expression matches; where one is empty, the vendor may crash."""
         position = self._topics.first(topic)
         return None if position is None else self._topic_rules[position]
 

@@ -1,28 +1,34 @@
-"""The rules of a grant for one domain, asked for a topic and partitions."""
+"""The rules of a grant, asked for a topic and partitions."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from sros_tool.dds.decision.answers import Outcome
+from sros_tool.dds.decision.domains import holds_for
 from sros_tool.dds.decision.matching import Expressions, matches
 from sros_tool.dds.decision.vendors import DenyPartitions, Style, Traits
-from sros_tool.dds.permissions import Criteria, Rule
+from sros_tool.dds.permissions import Criteria, Grant, Rule
 
 DEFAULT_PARTITION = ("",)
+Numbered = tuple[int, Rule]
+"""A rule with its index in the grant."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the rules say: ``allowed``, why, and by which rule and expression (None: by none)."""
+    """What the rules say: ALLOWED, DENIED or CRASHES, why, by which rule and expression."""
 
-    allowed: bool
+    outcome: Outcome
     reason: str
     rule: int | None = None
     expression: str | None = None
 
-
-NO_RULE = Verdict(False, "no-rule")
+    @property
+    def allowed(self) -> bool:
+        """Whether they say yes."""
+        return self.outcome is Outcome.ALLOWED
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,20 +40,46 @@ class _Entry:
     expression: str
     partitions: tuple[str, ...]
 
-    @property
-    def crashes(self) -> bool:
-        return not self.expression
+    def verdict(self, *, fits: bool) -> Verdict:
+        if not self.expression:
+            return Verdict(Outcome.CRASHES, "empty-topic", self.rule)
+        if not self.allow:
+            return Verdict(Outcome.DENIED, "deny-rule", self.rule, self.expression)
+        if not fits:
+            return Verdict(Outcome.DENIED, "partition", self.rule, self.expression)
+        return Verdict(Outcome.ALLOWED, "allow-rule", self.rule, self.expression)
 
 
-EMPTY_TOPIC = "empty-topic"
-"""The reason of a verdict that is a crash."""
+def rules_for(traits: Traits, grant: Grant, domain: int) -> tuple[list[Numbered], Verdict]:
+    """The rules of the grant for ``domain``, and the verdict where none of them matches."""
+    found: list[Numbered] = []
+    for index, rule in enumerate(grant.rules):
+        holds = holds_for(traits.open_range, rule.domains, domain)
+        if holds is None:
+            return found, Verdict(Outcome.CRASHES, "open-range", index)
+        if holds:
+            found.append((index, rule))
+    return found, last_word(traits, grant)
+
+
+def last_word(traits: Traits, grant: Grant) -> Verdict:
+    """The verdict where no rule matches."""
+    if not traits.honours_default:
+        return Verdict(Outcome.DENIED, "no-rule")
+    if traits.crashes_on_empty_texts and grant.default_empty:
+        return Verdict(Outcome.CRASHES, "empty-default")
+    return Verdict(Outcome.ALLOWED if grant.default_allow else Outcome.DENIED, "default")
 
 
 class Rights:
-    """The rules of one verb in their order, or with both verbs those on which a topic rests."""
+    """Rules in their order, for one verb, or for both where only the topic is asked for."""
 
-    def __init__(self, traits: Traits, rules: Iterable[tuple[int, Rule]], *verbs: str) -> None:
+    def __init__(
+        self, traits: Traits, rules: Iterable[Numbered], otherwise: Verdict, *verbs: str
+    ) -> None:
+        """``otherwise`` is the verdict where no rule matches."""
         self._traits = traits
+        self._otherwise = otherwise
         self._entries: list[_Entry] = []
         for index, rule in rules:
             criteria = tuple(each for verb in verbs for each in getattr(rule, verb))
@@ -57,6 +89,7 @@ class Rights:
                 self._entries += [
                     _Entry(index, rule.allow, trimmed(traits, expression), weighed)
                     for expression in each.topics
+                    if trimmed(traits, expression) or traits.crashes_on_empty_texts
                 ]
         texts = (stand_in(traits, entry.expression) for entry in self._entries)
         self._topics = Expressions(traits.style, texts)
@@ -66,24 +99,17 @@ class Rights:
         wanted = partitions or DEFAULT_PARTITION
         for position in self._topics.matching(topic):
             entry = self._entries[position]
-            if entry.crashes:
-                return Verdict(False, EMPTY_TOPIC, entry.rule)
             fits = self._fits(entry, wanted)
-            if fits or self._traits.topic_decides:
-                reason = ("allow-rule" if fits else "partition") if entry.allow else "deny-rule"
-                return Verdict(reason == "allow-rule", reason, entry.rule, entry.expression)
-        return NO_RULE
+            if fits or self._traits.topic_decides or not entry.expression:
+                return entry.verdict(fits=fits)
+        return self._otherwise
 
     def ask_topic(self, topic: str) -> Verdict:
         """The verdict on a topic in itself, whatever the partitions."""
         position = self._topics.first(topic)
         if position is None:
-            return NO_RULE
-        entry = self._entries[position]
-        if entry.crashes:
-            return Verdict(False, EMPTY_TOPIC, entry.rule)
-        reason = "allow-rule" if entry.allow else "deny-rule"
-        return Verdict(entry.allow, reason, entry.rule, entry.expression)
+            return self._otherwise
+        return self._entries[position].verdict(fits=True)
 
     def _fits(self, entry: _Entry, wanted: tuple[str, ...]) -> bool:
         style, named = self._traits.style, entry.partitions
@@ -101,7 +127,7 @@ def _named(style: Style, expressions: tuple[str, ...], partition: str) -> bool:
 def stand_in(traits: Traits, text: str) -> str:
     """An expression that matches every name, for one over which the vendor crashes."""
     text = trimmed(traits, text)
-    return text or "*" if traits.crashes_on_empty_expressions else text
+    return text or "*" if traits.crashes_on_empty_texts else text
 
 
 def trimmed(traits: Traits, text: str) -> str:

@@ -108,8 +108,8 @@ class Traits:
     """The first rule whose topic matches decides, and then its partitions must fit."""
     deny_partitions: DenyPartitions = DenyPartitions.ANY
     honours_default: bool = True
-    crashes_on_empty_expressions: bool = False
-    """An expression without text ends the process once matching comes to it."""
+    crashes_on_empty_texts: bool = False
+    """An expression or a default without text ends the process once a decision comes to it."""
     creates_topics: bool = False
     """A topic is created before its endpoint, and needs a right in either direction."""
     always_needs_allow_rule: bool = False
@@ -155,7 +155,7 @@ TRAITS = {
         moments=Moments.CYCLONE,
         open_range=OpenRange.CRASHES,
         deny_partitions=DenyPartitions.ALL,
-        crashes_on_empty_expressions=True,
+        crashes_on_empty_texts=True,
         creates_topics=True,
         shares_open_topics=True,
     ),
