@@ -14,6 +14,7 @@ from sros_tool.cli.common import (
     keystore_from_environment,
     now,
     print_json,
+    print_notes,
     print_plan,
 )
 from sros_tool.cli.keystore import progress_bar
@@ -141,6 +142,7 @@ def rotate_ca(
         print_plan(root, step.changes)
     else:
         _say(step, rotation_status(root, now=now()), together=finish, same_key=same_key)
+    print_notes(step.notes)
 
 
 def _say(step: RotationStep, status: RotationStatus, *, together: bool, same_key: bool) -> None:

@@ -18,6 +18,7 @@ from sros_tool.keystore.ledger import Entry, document_entry
 from sros_tool.keystore.parallel import Progress
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Transaction
+from sros_tool.notes import Note
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import issued_by, load_certificate, subject_text
 from sros_tool.xml import read_bytes
@@ -33,6 +34,14 @@ class Turn:
     new: Authority
 
 
+@dataclass(frozen=True, slots=True)
+class Reissued:
+    """What the ledger is told, and remarks."""
+
+    entries: tuple[Entry, ...]
+    notes: tuple[Note, ...]
+
+
 def reissue(
     transaction: Transaction,
     names: Sequence[str],
@@ -41,14 +50,15 @@ def reissue(
     template: Template,
     now: datetime,
     progress: Progress | None = None,
-) -> list[Entry]:
+) -> Reissued:
     """Stage what the CAs in turn have to issue: certificates, governance and permissions.
 
     Keys, subjects and rights stay.  What a CA that is not in turn has issued is left as it is, so
     its key is not needed.  Raises `KeystoreError` for an enclave that is not of the old CA.
     """
     work = _Reissuer(transaction, identity, permissions, template, now)
-    return [*work.governance(names), *work.enclaves(names, progress)]
+    entries = (*work.governance(names), *work.enclaves(names, progress))
+    return Reissued(entries, work.notes)
 
 
 class _Reissuer:
@@ -72,6 +82,7 @@ class _Reissuer:
         )
         self._now = now
         self._policies = policies_of(transaction.root)
+        self.notes = self._issuance.notes
 
     def governance(self, names: Sequence[str]) -> list[Entry]:
         """Sign the keystore's governance anew, as it is, and that of enclaves with a copy."""

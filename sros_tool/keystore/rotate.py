@@ -23,6 +23,7 @@ from sros_tool.keystore.rotation import RETIRED, Rotation, Stage, read_rotation
 from sros_tool.keystore.succession import Rotator
 from sros_tool.keystore.successor import check_later
 from sros_tool.keystore.transaction import Change, Transaction, tidy
+from sros_tool.notes import Note
 from sros_tool.pki.certificates import issue_ca, pem, same_key
 from sros_tool.validity import Span, window
 
@@ -41,6 +42,7 @@ class RotationStep:
     enclaves: tuple[str, ...]
     changes: tuple[Change, ...]
     kept_elsewhere: tuple[str, ...] = ()
+    notes: tuple[Note, ...] = ()
 
 
 def rotate_ca(
@@ -81,6 +83,7 @@ def rotate_ca(
         names,
         tuple(transaction.changes),
         tuple(work.kept_elsewhere),
+        work.notes,
     )
 
 

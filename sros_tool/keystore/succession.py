@@ -27,12 +27,14 @@ from sros_tool.keystore.rotation import (
     ROTATION,
     Rotation,
     Stage,
+    lists_confusable,
     render_rotation,
     retired_key,
 )
 from sros_tool.keystore.successor import Successor, begin, check_later, resume
 from sros_tool.keystore.template import Template, render_template
 from sros_tool.keystore.transaction import Transaction
+from sros_tool.notes import Note
 from sros_tool.pki.certificates import digest, pem
 from sros_tool.validity import Span, window
 from sros_tool.xml import read_bytes
@@ -42,7 +44,7 @@ class Rotator:
     """Does one stage in one transaction.
 
     ``replacements`` are the CAs that it is about, and ``kept_elsewhere`` the places of old keys
-    that do not lie in the keystore and are left there.
+    that do not lie in the keystore and are left there.  ``notes`` are remarks on what was issued.
     """
 
     def __init__(
@@ -66,6 +68,7 @@ class Rotator:
         self._entries: list[Entry] = []
         self.replacements = list(rotation.replacements)
         self.kept_elsewhere: list[str] = []
+        self.notes: tuple[Note, ...] = ()
 
     def go(
         self,
@@ -116,7 +119,7 @@ class Rotator:
     def _distribute(self, turns: list[Successor], names: Sequence[str]) -> None:
         for each in turns:
             bundle = b"".join(map(pem, (*each.old, each.new.certificate)))
-            if IDENTITY in each.roles and (old := read_crl(self._root)):
+            if self._takes_crl(each) and (old := read_crl(self._root)):
                 bundle += self._empty_crl(each.new, old.number + 1)
             write_bundle(self._transaction, each.file, each.roles, bundle, names)
         self._write_state(Stage.DISTRIBUTE)
@@ -130,8 +133,12 @@ class Rotator:
     def _lacks_crl(self, turns: list[Successor]) -> bool:
         """Whether something was revoked since the new identity CA was distributed."""
         return (self._root / CRL).exists() and any(
-            IDENTITY in each.roles and not carried_crl(self._root, each.file) for each in turns
+            self._takes_crl(each) and not carried_crl(self._root, each.file) for each in turns
         )
+
+    def _takes_crl(self, each: Successor) -> bool:
+        """Whether the list of a new CA can be distributed before that CA issues."""
+        return IDENTITY in each.roles and not lists_confusable(each.old[0], each.new.certificate)
 
     def _reissue(
         self,
@@ -142,9 +149,11 @@ class Rotator:
     ) -> None:
         of = {role: each.turn() for each in turns for role in each.roles}
         identity, permissions = of.get(IDENTITY), of.get(PERMISSIONS)
-        self._entries += reissue(
+        done = reissue(
             self._transaction, names, identity, permissions, self._template, self._now, progress
         )
+        self._entries += done.entries
+        self.notes = done.notes
         self.replacements = []
         for each in turns:
             trusted = (each.new.certificate, *(each.old if stage is Stage.REISSUE else ()))

@@ -1,0 +1,52 @@
+"""What all verbs that issue share: what ends early with its CA says so, whoever issues it."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from sros_tool.keystore import create_enclaves, create_keystore
+from sros_tool.keystore.request import create_request
+from sros_tool.keystore.rotate import rotate_ca
+from sros_tool.keystore.signing import sign_request
+from sros_tool.keystore.template import load_template
+from sros_tool.notes import Note
+
+NOW = datetime(2026, 6, 1, tzinfo=UTC)
+LATE = NOW + timedelta(days=1800)  # the CAs of production live for 1825 days
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    create_keystore(tmp_path / "ks", template=load_template("production"), now=NOW)
+    create_enclaves(tmp_path / "ks", ["/a"], now=NOW)
+    return tmp_path / "ks"
+
+
+def early(notes: tuple[Note, ...]) -> list[str]:
+    return [each.text for each in notes if each.id == "keystore.ends-with-ca"]
+
+
+def test_what_is_answered_late_ends_with_its_ca(root: Path, tmp_path: Path) -> None:
+    made = create_request(tmp_path / "robot", "/r")
+    data = made.file.read_bytes()
+    assert len(early(sign_request(root, data, now=LATE).notes)) == 2
+    assert not early(sign_request(root, data, now=NOW, renew=True).notes)
+
+
+@pytest.mark.parametrize(("days", "said"), [(90, 2), (300, 1), (2000, 0)])
+def test_what_a_short_lived_ca_reissues_ends_with_it(days: int, said: int, root: Path) -> None:
+    """Certificates last 365 days, permissions 180."""
+    done = rotate_ca(root, finish=True, validity=timedelta(days=days), now=NOW)
+    assert len(early(done.notes)) == said
+
+
+def test_a_loss_of_days_in_years_is_not_worth_a_word(tmp_path: Path) -> None:
+    """In development all of it lasts ten years, and is made one after the other."""
+    root = tmp_path / "ks"
+    create_keystore(root, template=load_template("development"), now=NOW)
+    for days, said in ((0, 0), (30, 0), (60, 2)):
+        notes = create_enclaves(root, [f"/e{days}"], now=NOW + timedelta(days=days)).notes
+        assert len(early(notes)) == said
