@@ -6,7 +6,6 @@ import os
 import re
 import stat
 from collections.abc import Iterator
-from functools import lru_cache
 from pathlib import Path
 
 from sros_tool.checks.keystores.opened import OpenedKeystore
@@ -126,7 +125,7 @@ _KNOWN_ANYWHERE = re.compile(
 def check_files(keystore: OpenedKeystore) -> Iterator[Finding]:
     """Every file, folder and link of a keystore, without reading what DDS reads."""
     root = os.fspath(keystore.root)
-    real_root = os.path.realpath(root)
+    links = _Links(root)
     keys = {os.path.join(root, ENCLAVES, name[1:], "key.pem") for name in keystore.names}
     keys |= {os.path.join(root, ENCLAVES, "key.pem")}
     home = keystore.is_home
@@ -137,13 +136,13 @@ def check_files(keystore: OpenedKeystore) -> Iterator[Finding]:
             text = "an interrupted transaction waits to be completed or undone"
             yield INTERRUPTED.found(root, text, os.path.join(parent, STAGE))
         for name in folders:
-            yield from _folder(os.path.join(parent, name), root, home)
+            yield from _folder(os.path.join(parent, name), root, home, links)
         inside = os.path.relpath(parent, root)
         for name in sorted(files):
             path = os.path.join(parent, name)
             info = os.lstat(path)
             if stat.S_ISLNK(info.st_mode):
-                yield from _link(Path(path), real_root)
+                yield from links.check(Path(path))
                 continue
             yield from _mode(path, info.st_mode)
             if path in keys:
@@ -154,10 +153,10 @@ def check_files(keystore: OpenedKeystore) -> Iterator[Finding]:
                 yield from _other(path, inside, info, home)
 
 
-def _folder(path: str, root: str, home: bool) -> Iterator[Finding]:
+def _folder(path: str, root: str, home: bool, links: _Links) -> Iterator[Finding]:
     mode = os.lstat(path).st_mode
     if stat.S_ISLNK(mode):
-        yield from _link(Path(path), os.path.realpath(root))
+        yield from links.check(Path(path))
         return
     yield from _mode(path, mode)
     inside = Path(path).relative_to(root)
@@ -178,30 +177,38 @@ def _key_mode(path: str, mode: int) -> Iterator[Finding]:
         yield KEY_READABLE.found(path, text, path, remedy=f"Run `chmod 600 '{path}'`.")
 
 
-def _link(link: Path, real_root: str) -> Iterator[Finding]:
-    target, shown = link.readlink(), str(link)
-    if not link.exists():
-        # That an enclave lacks what it needs is told of the enclave.
-        if not (link.name in REQUIRED_FILES and ENCLAVES in link.parts):
-            yield LINK_DANGLING.found(shown, f"it leads to '{target}'", shown)
-        return
-    if target.is_absolute():
-        yield LINK_ABSOLUTE.found(shown, f"it leads to '{target}'", shown)
-    real = _real(link, target)
-    if real != real_root and not real.startswith(real_root + os.sep):
-        yield LINK_OUTSIDE.found(shown, f"it leads to '{real}'", shown)
+class _Links:
+    """Looks where links lead; most lead into one of few folders, whose real path is kept."""
 
+    def __init__(self, root: str) -> None:
+        self._real_root = os.path.realpath(root)
+        self._folders: dict[Path, str] = {}
 
-_real_folder = lru_cache(maxsize=64)(os.path.realpath)
+    def check(self, link: Path) -> Iterator[Finding]:
+        """What is wrong with one link."""
+        target, shown = link.readlink(), str(link)
+        if not link.exists():
+            # That an enclave lacks what it needs is told of the enclave.
+            if not (link.name in REQUIRED_FILES and ENCLAVES in link.parts):
+                yield LINK_DANGLING.found(shown, f"it leads to '{target}'", shown)
+            return
+        if target.is_absolute():
+            yield LINK_ABSOLUTE.found(shown, f"it leads to '{target}'", shown)
+        real = self._end_of(link, target)
+        if real != self._real_root and not real.startswith(self._real_root + os.sep):
+            yield LINK_OUTSIDE.found(shown, f"it leads to '{real}'", shown)
 
+    def _end_of(self, link: Path, target: Path) -> str:
+        """Where a link leads in the end.
 
-def _real(link: Path, target: Path) -> str:
-    """Where a link leads in the end; most lead into one of few folders.
-
-    The folder of the link is a real one, so its path can be shortened before it is followed.
-    """
-    end = Path(os.path.normpath(link.parent / target))
-    return os.path.realpath(link) if end.is_symlink() else f"{_real_folder(end.parent)}/{end.name}"
+        The folder of the link is a real one, so its path can be shortened before it is followed.
+        """
+        end = Path(os.path.normpath(link.parent / target))
+        if end.is_symlink():
+            return os.path.realpath(link)
+        if end.parent not in self._folders:
+            self._folders[end.parent] = os.path.realpath(end.parent)
+        return f"{self._folders[end.parent]}/{end.name}"
 
 
 def _other(path: str, inside: str, info: os.stat_result, home: bool) -> Iterator[Finding]:

@@ -1,0 +1,355 @@
+"""How each finding about keystores comes about: one way to break a sound one for each id."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Callable
+from datetime import timedelta, timezone
+
+from bench import DAY, Bench, name_of, new_key
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from sros_tool.pki.keys import key_pem
+from sros_tool.policy import read_policy
+
+Break = Callable[[Bench], object]
+CASES: dict[str, Break] = {}
+
+
+def case(*ids: str) -> Callable[[Break], Break]:
+    def add(work: Break) -> Break:
+        for each in ids:
+            assert each not in CASES, each
+            CASES[each] = work
+        return work
+
+    return add
+
+
+def at(bench: Bench, days: float) -> None:
+    bench.options["now"] = bench.now + days * DAY
+
+
+IS_CA = (x509.BasicConstraints(True, None), True)
+
+# ── files ──────────────────────────────────────────────────────────────────────────────────
+
+CASES |= {
+    "keystore.key-readable": lambda b: b.path("enclaves/base/key.pem").chmod(0o640),
+    "keystore.world-writable": lambda b: b.path("public/identity_ca.cert.pem").chmod(0o646),
+    "keystore.folder-open": lambda b: b.path("private").chmod(0o755),
+    "keystore.link-dangling": lambda b: b.path("public/old.cert.pem").symlink_to("gone.pem"),
+    "keystore.transaction-left": lambda b: b.path(".sros-transaction").mkdir(),
+    "keystore.unknown-file": lambda b: b.path("notes.txt").write_text("call Bob"),
+    "keystore.stray-key": lambda b: shutil.copy(
+        b.path("enclaves/base/key.pem"), b.path("enclaves/base/key.pem.bak")
+    ),
+    "keystore.ca-key-on-robot": lambda b: (b.export() / "ca.key.pem").write_bytes(
+        key_pem(new_key())
+    ),
+}
+
+
+@case("keystore.link-absolute")
+def _(bench: Bench) -> None:
+    bench.unlink("enclaves/base/governance.p7s").symlink_to(bench.path("enclaves/governance.p7s"))
+
+
+@case("keystore.link-outside")
+def _(bench: Bench) -> None:
+    shutil.copy(bench.path("enclaves/governance.p7s"), bench.root.with_name("elsewhere.p7s"))
+    bench.unlink("enclaves/base/governance.p7s").symlink_to("../../../elsewhere.p7s")
+
+
+# ── authorities ────────────────────────────────────────────────────────────────────────────
+
+CASES |= {
+    "keystore.file-unreadable": lambda b: b.path("ledger.jsonl").write_text("nonsense\n"),
+    "keystore.one-authority": lambda b: b.trust("permissions", b.authority("identity")),
+    "keystore.ca-ends-soon": lambda b: at(b, 5 * 365 - 89),
+    "keystore.ca-expired": lambda b: at(b, 5 * 365 + 1),
+    "keystore.ca-missing": lambda b: b.unlink("public/permissions_ca.cert.pem"),
+    "keystore.ca-key-mismatch": lambda b: b.path("private/identity_ca.key.pem").write_bytes(
+        key_pem(new_key())
+    ),
+    "keystore.ca-key-plain": lambda b: b.path("private/identity_ca.key.pem").write_bytes(
+        key_pem(b.key("identity"))
+    ),
+    "keystore.not-a-ca": lambda b: b.trust("identity", b.new_authority()[0]),
+    "keystore.ca-extensions": lambda b: b.trust("identity", b.new_authority(IS_CA)[0]),
+    "portable.intermediate": lambda b: b.trust(
+        "identity",
+        b.new_authority(IS_CA, issuer=(b.authority("identity").subject, b.key("identity")))[0],
+    ),
+    "portable.key-algorithm": lambda b: b.trust(
+        "identity", b.new_authority(IS_CA, curve=ec.SECP384R1())[0]
+    ),
+    "portable.signature-hash": lambda b: b.trust(
+        "identity", b.new_authority(IS_CA, digest=hashes.SHA384())[0]
+    ),
+    "keystore.revocation-list-ends": lambda b: b.revoke(end=b.now + 29 * DAY),
+    "keystore.revocation-list-issuer": lambda b: b.revoke(by=b.foreign()),
+}
+
+# ── what DDS refuses ───────────────────────────────────────────────────────────────────────
+
+CASES |= {
+    "enclave.file-missing": lambda b: b.unlink("enclaves/base/permissions.p7s"),
+    "enclave.link-dangling": lambda b: b.unlink("public/identity_ca.cert.pem"),
+    "enclave.file-unreadable": lambda b: b.unlink("enclaves/base/key.pem").mkdir(),
+    "enclave.file-empty": lambda b: b.path("enclaves/base/key.pem").write_bytes(b""),
+    "enclave.certificate-malformed": lambda b: b.path("enclaves/base/cert.pem").write_text("x"),
+    "enclave.certificate-expired": lambda b: at(b, 366),
+    "enclave.certificate-not-yet-valid": lambda b: at(b, -2),
+    "enclave.ca-expired": lambda b: at(b, 5 * 365 + 1),
+    "enclave.ca-not-yet-valid": lambda b: at(b, -2),
+    "enclave.certificate-issuer": lambda b: b.issue(by=b.foreign()),
+    "enclave.key-malformed": lambda b: b.path("enclaves/base/key.pem").write_text("x"),
+    "enclave.key-encrypted": lambda b: b.path("enclaves/base/key.pem").write_bytes(
+        key_pem(new_key(), "secret")
+    ),
+    "enclave.key-mismatch": lambda b: b.path("enclaves/base/key.pem").write_bytes(
+        key_pem(new_key())
+    ),
+    "enclave.crl-malformed": lambda b: b.path("enclaves/base/crl.pem").write_text("x"),
+    "enclave.crl-issuer": lambda b: b.revoke(by=b.foreign()),
+    "enclave.crl-not-yet-valid": lambda b: b.revoke(begin=b.now + DAY),
+    "enclave.crl-expired": lambda b: b.revoke(begin=b.now - 9 * DAY, end=b.now - DAY),
+    "enclave.revoked": lambda b: b.revoke(b.certificate().serial_number),
+    "enclave.not-signed": lambda b: b.path("enclaves/base/permissions.p7s").write_text(
+        b.document("enclaves/base/permissions.p7s")
+    ),
+    "enclave.signature": lambda b: _tamper(b, "enclaves/base/permissions.p7s"),
+    "enclave.governance-malformed": lambda b: b.governance(("domain_access_rules>", "rules>")),
+    "enclave.permissions-malformed": lambda b: b.permissions(("<default>DENY</default>", "")),
+    "enclave.governance-domain": lambda b: b.options.update(domain=7),
+    "enclave.permissions-expired": lambda b: at(b, 181),
+    "enclave.permissions-not-yet-valid": lambda b: b.permissions(
+        ("<not_before>", "<not_before>2027-01-01T00:00:00Z</not_before><!--"),
+        ("</not_before>\n", "</not_before>-->\n"),
+    ),
+    "enclave.permissions-subject": lambda b: shutil.copy(
+        b.path("enclaves/arm/permissions.p7s"), b.path("enclaves/base/permissions.p7s")
+    ),
+}
+
+
+@case("enclave.permissions-domain")
+def _(bench: Bench) -> None:
+    bench.permissions(("<id>0</id>", "<id>5</id>"))
+    bench.options["domain"] = 0
+
+
+@case("enclave.permissions-local-time")
+def _(bench: Bench) -> None:
+    at(bench, -1 + 0.2)
+    bench.options["zone"] = timezone(timedelta(hours=-8))
+
+
+def _tamper(bench: Bench, file: str) -> None:
+    data = bench.path(file).read_bytes()
+    assert b"rosout" in data
+    bench.path(file).write_bytes(data.replace(b"rosout", b"rosoot"))
+
+
+# ── enclaves ───────────────────────────────────────────────────────────────────────────────
+
+CASES |= {
+    "enclave.ends-soon": lambda b: at(b, 151),
+    "enclave.outlives-ca": lambda b: b.issue(after=b.now + 9999 * DAY),
+    "enclave.permissions-outlive": lambda b: b.issue(after=b.now + 40 * DAY),
+    "enclave.name-mismatch": lambda b: b.issue(subject=name_of(("CN", "/other"), ("OU", "1f"))),
+    "enclave.certificate-is-ca": lambda b: b.issue(is_ca=True),
+    "enclave.subject-not-unique": lambda b: b.issue(subject=name_of(("CN", "/base"))),
+    "keystore.allow-everything": lambda b: b.permissions(
+        ("<topic>ros_discovery_info</topic>", "<topic>*</topic>")
+    ),
+    "enclave.xml-differs": lambda b: b.permissions(("rosout", "rosoot"), xml=False),
+    "enclave.crl-missing": lambda b: b.revoke(linked=False),
+}
+
+
+@case("enclave.long-permissions")
+def _(bench: Bench) -> None:
+    bench.issue(subject=name_of(("CN", "/base")), after=bench.now + 3000 * DAY)
+    year = bench.now.year
+    text = bench.document("enclaves/base/permissions.p7s")
+    end = text[text.index("<not_after>") : text.index("</not_after>")]
+    bench.permissions((end, f"<not_after>{year + 8}-01-01T00:00:00Z"))
+
+
+@case("enclave.waits-for-answer")
+def _(bench: Bench) -> None:
+    folder = bench.path("enclaves/new")
+    folder.mkdir(mode=0o700)
+    shutil.copy(bench.path("enclaves/base/key.pem"), folder / "key.pem")
+    (folder / "request.pem").write_text("a request")
+
+
+# ── permissions documents ──────────────────────────────────────────────────────────────────
+
+ALLOW = "      <allow_rule>"
+DENY_ALL = """      <deny_rule>
+        <domains><id>0</id></domains>
+        <publish><topics><topic>rt/*</topic></topics></publish>
+      </deny_rule>
+"""
+SECOND = """      <allow_rule>
+        <domains><id>0</id></domains>
+        <publish><topics><topic>rt/extra</topic></topics></publish>
+      </allow_rule>
+      <default>"""
+
+
+def _second_grant(text: str) -> str:
+    begin, end = text.index("    <grant"), text.index("</grant>") + len("</grant>\n")
+    return text[:end] + text[begin:end] + text[end:]
+
+
+def _many_topics(text: str) -> str:
+    topics = "".join(f"<topic>rt/{'long_' * 8}{index}</topic>" for index in range(1500))
+    return text.replace("<topics>", f"<topics>{topics}", 1)
+
+
+CASES |= {
+    "portable.several-grants": lambda b: b.sign("enclaves/base/permissions.p7s", _second_grant),
+    "portable.default-allow": lambda b: b.permissions(("<default>DENY", "<default>ALLOW")),
+    "portable.several-allow-rules": lambda b: b.permissions(("      <default>", SECOND)),
+    "portable.partitions": lambda b: b.permissions(
+        ("</topics>", "</topics><partitions><partition>left</partition></partitions>")
+    ),
+    "portable.domain-range": lambda b: b.permissions(
+        ("<id>0</id>", "<id_range><min>0</min></id_range>")
+    ),
+    "portable.grant-name": lambda b: b.permissions(('<grant name="/base">', "<grant>")),
+    "portable.subject": lambda b: b.permissions(("CN=/base", "CN = /base")),
+    "portable.time-format": lambda b: b.permissions(("Z</not_after>", "+00:00</not_after>")),
+    "portable.validity-window": lambda b: at(b, -1 + 0.4),
+    "portable.character-class": lambda b: b.permissions(("rt/rosout<", "rt/[^a]osout<")),
+    "portable.character-set": lambda b: b.permissions(("rt/rosout<", "rt/[rs]osout<")),
+    "portable.document-size": lambda b: b.sign("enclaves/base/permissions.p7s", _many_topics),
+    "portable.deny-blocks-topic": lambda b: b.permissions(
+        (ALLOW, DENY_ALL.replace("publish", "subscribe").replace("rt/*", "rt/rosout") + ALLOW)
+    ),
+    "permissions.deny-without-effect": lambda b: b.permissions(
+        ("      <default>", DENY_ALL + "      <default>")
+    ),
+    "permissions.unreachable-rule": lambda b: b.permissions((ALLOW, DENY_ALL + ALLOW)),
+    "enclave.permissions-domains": lambda b: b.permissions(("<id>0</id>", "<id>0</id><id>1</id>")),
+    "portable.vendors-differ": lambda b: b.permissions(("<default>DENY", "<default>ALLOW")),
+}
+
+# ── governance ─────────────────────────────────────────────────────────────────────────────
+
+TOPIC_RULE = "          <topic_expression>*</topic_expression>"
+
+
+def _narrow_rule_last(text: str) -> str:
+    begin = text.index("        <topic_rule>")
+    end = text.index("</topic_rule>") + len("</topic_rule>\n")
+    rule = text[begin:end].replace("<topic_expression>*<", "<topic_expression>rt/a<")
+    return text[:end] + rule + text[end:]
+
+
+CASES |= {
+    "governance.unauthenticated": lambda b: b.governance(
+        ("participants>false", "participants>true")
+    ),
+    "governance.no-join-control": lambda b: b.governance(
+        ("join_access_control>true", "join_access_control>false")
+    ),
+    "governance.no-access-control": lambda b: b.governance(
+        ("read_access_control>true", "read_access_control>false")
+    ),
+    "governance.no-encryption": lambda b: b.governance(("ENCRYPT", "SIGN")),
+    "governance.no-authenticity": lambda b: b.governance(("ENCRYPT", "NONE")),
+    "governance.discovery-open": lambda b: b.governance(
+        ("<discovery_protection_kind>ENCRYPT", "<discovery_protection_kind>NONE")
+    ),
+    "governance.liveliness-open": lambda b: b.governance(
+        ("<liveliness_protection_kind>ENCRYPT", "<liveliness_protection_kind>NONE")
+    ),
+    "governance.no-topic-rule": lambda b: b.governance(
+        (TOPIC_RULE, TOPIC_RULE.replace(">*<", ">rt/*<"))
+    ),
+    "governance.unreachable-rule": lambda b: b.sign("enclaves/governance.p7s", _narrow_rule_last),
+    "governance.domain-range": lambda b: b.governance(
+        ("<id>0</id>", "<id_range><max>3</max></id_range>")
+    ),
+    "governance.xml-differs": lambda b: b.path("enclaves/governance.xml").write_text("<dds/>"),
+}
+
+
+@case("governance.differs")
+def _(bench: Bench) -> None:
+    own = bench.path("enclaves/base/governance.p7s")
+    data = own.read_bytes()
+    bench.governance(("ENCRYPT", "SIGN"))
+    own.unlink()
+    own.write_bytes(data)
+
+
+# ── the ledger, and policies ───────────────────────────────────────────────────────────────
+
+
+@case("keystore.serial-twice")
+def _(bench: Bench) -> None:
+    bench.issue("base")
+    bench.issue("arm")
+
+
+@case("keystore.key-twice")
+def _(bench: Bench) -> None:
+    key = new_key()
+    bench.issue("base", key=key, serial=1)
+    bench.issue("arm", key=key, serial=2)
+
+
+@case("enclave.old-permissions")
+def _(bench: Bench) -> None:
+    path = bench.path("enclaves/base/permissions.p7s")
+    before = path.read_bytes()
+    bench.permissions(("rosout", "rosoot"))
+    ledger = bench.path("ledger.jsonl")
+    lines = ledger.read_text().splitlines()
+    old, new = (hashlib.sha256(data).hexdigest() for data in (before, path.read_bytes()))
+    entry = next(line for line in lines if old in line)
+    ledger.write_text("\n".join([*lines, entry.replace(old, new)]) + "\n")
+    path.write_bytes(before)
+    bench.path("enclaves/base/permissions.xml").write_text(
+        bench.document("enclaves/base/permissions.p7s")
+    )
+
+
+@case("portable.enclave-names")
+def _(bench: Bench) -> None:
+    bench.issue("base", subject=name_of(("CN", "/base")))
+    os.rename(bench.path("enclaves/arm"), bench.path("enclaves/base/arm"))
+    for name, target in {
+        "identity_ca.cert.pem": "../../../public/identity_ca.cert.pem",
+        "permissions_ca.cert.pem": "../../../public/permissions_ca.cert.pem",
+        "governance.p7s": "../../governance.p7s",
+    }.items():
+        bench.unlink(f"enclaves/base/arm/{name}").symlink_to(target)
+
+
+def _policy(bench: Bench, *changes: tuple[str, str]) -> None:
+    text = bench.root.with_name("policy.xml").read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    file = bench.root.with_name("changed.xml")
+    file.write_text(text)
+    bench.options["policies"] = (read_policy(file),)
+
+
+CASES |= {
+    "keystore.not-in-ledger": lambda b: b.issue(),
+    "enclave.stale-permissions": lambda b: _policy(b, ("status", "state")),
+    "enclave.not-in-policy": lambda b: _policy(b, ('path="/arm"', 'path="/other"')),
+    "keystore.enclave-missing": lambda b: _policy(b, ('path="/arm"', 'path="/other"')),
+}

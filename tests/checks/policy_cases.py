@@ -1,0 +1,93 @@
+"""Each finding about policies: groups of a node that bring it about, and a twin that does not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Case:
+    """The content of a profile with the finding, and one like it without; ``ns`` of the node.
+
+    ``line`` is where it is found, counted from the first line of the content.
+    """
+
+    id: str
+    bad: str
+    good: str
+    line: int | None = 1
+    ns: str = "/"
+    basics: bool = True
+
+
+def topics(right: str, *names: str, qualifier: str = "ALLOW") -> str:
+    items = "".join(f"<topic>{name}</topic>" for name in names)
+    return f'<topics {right}="{qualifier}">{items}</topics>'
+
+
+def services(right: str, *names: str, qualifier: str = "ALLOW") -> str:
+    items = "".join(f"<service>{name}</service>" for name in names)
+    return f'<services {right}="{qualifier}">{items}</services>'
+
+
+def deny(right: str, *names: str) -> str:
+    return topics(right, *names, qualifier="DENY")
+
+
+PARAMETERS = (
+    "~/describe_parameters",
+    "~/get_parameter_types",
+    "~/get_parameters",
+    "~/list_parameters",
+    "~/set_parameters",
+    "~/set_parameters_atomically",
+)
+TYPES = "~/get_type_description"
+LOG = topics("publish", "/rosout")
+EVENTS = topics("publish", "/parameter_events")
+BASICS = f"{LOG}{EVENTS}{services('reply', TYPES, *PARAMETERS)}"
+GOAL = "dock/_action/send_goal"
+MANY = tuple(f"{'very_' * 8}long_{index}" for index in range(1200))
+
+CASES = [
+    Case("policy.contradiction", f"{topics('publish', 'a')}\n{deny('publish', 'a')}",
+         f"{topics('publish', '/x/*')}\n{deny('publish', '/x/a')}"),
+    Case("policy.unreachable-rule", f"{topics('publish', '/x/a')}\n{deny('publish', '/x/*')}",
+         f"{topics('publish', '/x/*')}\n{deny('publish', '/x/a')}"),
+    Case("policy.deny-without-effect", deny("publish", "a"),
+         f"{topics('publish', '/x/*')}\n{deny('publish', '/x/a')}"),
+    Case("policy.redundant-rule", topics("publish", "/x/*", "/x/a"),
+         topics("publish", "/x/*", "/y/a")),
+    Case("policy.action-in-part", services("request", GOAL),
+         '<actions call="ALLOW"><action>dock</action></actions>'),
+    Case("policy.no-type-description", f"{LOG}{EVENTS}{services('reply', *PARAMETERS)}", BASICS,
+         line=0, basics=False),
+    Case("policy.no-rosout", f"{EVENTS}{services('reply', TYPES, *PARAMETERS)}", BASICS,
+         line=0, basics=False),
+    Case("policy.no-parameter-events", f"{LOG}{services('reply', TYPES, *PARAMETERS)}", BASICS,
+         line=0, basics=False),
+    Case("policy.no-parameter-services", f"{LOG}{EVENTS}{services('reply', TYPES)}", BASICS,
+         line=0, basics=False),
+    Case("policy.relative-global-name", topics("publish", "rosout"), topics("publish", "/rosout"),
+         ns="/arm"),
+    Case("policy.name-never-matches", topics("publish", "/x/[0-9]*"), topics("publish", "/x/a?")),
+    Case("policy.dds-name", topics("publish", "rt/scan"), topics("publish", "rta/scan")),
+    Case("policy.wrong-kind", services("request", "/tf"), services("request", "/tf2")),
+    Case("policy.everything", topics("publish", "/*"), topics("publish", "/x/*")),
+    Case("policy.wide-wildcard", topics("publish", "/cam*"), topics("publish", "/cam/*")),
+    Case("policy.reads-everything", topics("subscribe", "/*"), topics("subscribe", "/x/*")),
+    Case("policy.sets-all-parameters", services("request", "/*/set_parameters"),
+         services("request", "/*/get_parameters")),
+    Case("policy.sets-clock", topics("publish", "/clock"), topics("subscribe", "/clock")),
+    Case("policy.no-counterpart", topics("subscribe", "a"),
+         f"{topics('subscribe', 'a')}{topics('publish', 'a')}"),
+    Case("policy.several-profiles",
+         '</profile></profiles><profiles><profile ns="/" node="m">' + BASICS,
+         '</profile><profile ns="/" node="m">' + BASICS, line=None),
+    Case("portable.document-size", topics("publish", *MANY), topics("publish", *MANY[:100]),
+         line=None),
+    Case("portable.deny-blocks-topic", f"{topics('publish', 'a')}{deny('subscribe', 'a')}",
+         f"{topics('publish', '/x/*')}{deny('publish', '/x/a')}", line=None),
+    Case("portable.character-set", topics("publish", "/x/[ab]"), topics("publish", "/x/?"),
+         line=None),
+]  # fmt: skip

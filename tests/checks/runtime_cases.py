@@ -1,0 +1,111 @@
+"""How each finding about the runtime comes about: what is changed in a sound setting."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import timedelta
+
+from bench import Bench
+
+from sros_tool.checks.runtimes.setting import Process, Setting
+
+Change = Callable[[Setting, Bench], Setting]
+
+ENABLE, STRATEGY = "ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY"
+KEYSTORE, ENCLAVE = "ROS_SECURITY_KEYSTORE", "ROS_SECURITY_ENCLAVE_OVERRIDE"
+DOMAIN, RMW = "ROS_DOMAIN_ID", "RMW_IMPLEMENTATION"
+UNSECURED = {DOMAIN: "0"}
+
+
+def sound_setting(bench: Bench) -> Setting:
+    """A host on which everything is as `sros env` sets it, with a node and the daemon running."""
+    environment = {
+        KEYSTORE: str(bench.root),
+        ENABLE: "true",
+        STRATEGY: "Enforce",
+        ENCLAVE: "/base",
+        DOMAIN: "0",
+        RMW: "rmw_fastrtps_cpp",
+        "ROS_DISTRO": "jazzy",
+        "ROS_VERSION": "2",
+        "ROS_PYTHON_VERSION": "3",
+        "ROS_LOG_DIR": "/var/log/ros",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "SUBNET",
+        "ROS_SECURITY_LOG_FILE": "/var/log/ros/security.log",
+        "PATH": "/usr/bin",
+    }
+    started = bench.now + timedelta(hours=1)
+    node = Process(7, ("/usr/bin/talker", "--ros-args"), environment, started)
+    daemon = Process(8, ("python3", "-c", "from ros2cli.daemon import main"), environment, started)
+    rmws = ("rmw_fastrtps_cpp", "rmw_cyclonedds_cpp", "rmw_zenoh_cpp")
+    return Setting(environment, started, processes=(node, daemon), rmws=rmws)
+
+
+def having(**variables: str | None) -> Change:
+    """Variables set, or with None unset."""
+
+    def change(setting: Setting, _: Bench) -> Setting:
+        environment = {**setting.environment, **variables}
+        return replace(setting, environment={n: v for n, v in environment.items() if v is not None})
+
+    return change
+
+
+def running(index: int, **variables: str | None) -> Change:
+    """The same for one of the processes."""
+
+    def change(setting: Setting, bench: Bench) -> Setting:
+        process = setting.processes[index]
+        alone = replace(setting, environment=process.environment)
+        changed = replace(process, environment=having(**variables)(alone, bench).environment)
+        processes = list(setting.processes)
+        processes[index] = changed
+        return replace(setting, processes=tuple(processes))
+
+    return change
+
+
+def _written_in_the_future(setting: Setting, bench: Bench) -> Setting:
+    moment = (setting.now + timedelta(days=3)).timestamp()
+    os.utime(bench.path("ledger.jsonl"), (moment, moment))
+    return setting
+
+
+def _written_since(setting: Setting, bench: Bench) -> Setting:
+    moment = (setting.now + timedelta(minutes=1)).timestamp()
+    os.utime(bench.path("enclaves/base/permissions.p7s"), (moment, moment))
+    return setting
+
+
+def _without_ca_keys(setting: Setting, bench: Bench) -> Setting:
+    return having(**{KEYSTORE: str(bench.export())})(setting, bench)
+
+
+CASES: dict[str, Change] = {
+    "runtime.enable-misspelt": having(**{ENABLE: "True"}),
+    "runtime.not-enabled": having(**{ENABLE: None}),
+    "runtime.variable-misspelt": having(ROS_SECURTY_ENABLE="true"),
+    "runtime.strategy-misspelt": having(**{STRATEGY: "enforce"}),
+    "runtime.not-enforced": having(**{STRATEGY: None}),
+    "runtime.keystore-unset": having(**{KEYSTORE: None}),
+    "runtime.keystore-not-found": having(**{KEYSTORE: "/nowhere/at/all"}),
+    "runtime.keystore-relative": having(**{KEYSTORE: "keystore"}),
+    "runtime.enclave-not-found": having(**{ENCLAVE: "/bass"}),
+    "runtime.enclave-unset": having(**{ENCLAVE: None}),
+    "runtime.domain-malformed": having(**{DOMAIN: "010"}),
+    "runtime.domain-not-governed": having(**{DOMAIN: "7"}),
+    "runtime.ca-key-present": lambda setting, bench: having(**{KEYSTORE: str(bench.root)})(
+        setting, bench
+    ),
+    "runtime.rmw-not-installed": having(**{RMW: "rmw_connextdds"}),
+    "runtime.rmw-without-security": having(**{RMW: "rmw_zenoh_cpp"}),
+    "runtime.clock-behind": _written_in_the_future,
+    "runtime.daemon-unsecured": running(1, **{ENABLE: None}),
+    "runtime.daemon-differs": running(1, **{ENCLAVE: "/arm"}),
+    "runtime.process-unsecured": running(0, **{ENABLE: None}),
+    "runtime.process-outdated": _written_since,
+    "runtime.mixed-vendors": running(0, **{RMW: "rmw_cyclonedds_cpp"}),
+}
+SOUND: Change = _without_ca_keys

@@ -1,0 +1,39 @@
+"""Each finding about keystores comes about where it should, and not in a sound keystore."""
+
+from __future__ import annotations
+
+import pytest
+from bench import Bench
+from keystore_cases import CASES
+
+from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.policy import read_policy
+
+
+def ids(bench: Bench) -> set[str]:
+    options = {"now": bench.now, **bench.options}
+    return {each.id for each in keystore_findings(bench.checked, **options)}
+
+
+def test_nothing_in_a_sound_keystore(bench: Bench) -> None:
+    assert ids(bench) == set()
+    bench.options["policies"] = (read_policy(bench.root.with_name("policy.xml")),)
+    bench.options["domain"] = 0
+    assert ids(bench) == set()
+
+
+def test_nothing_in_a_sound_export(bench: Bench) -> None:
+    bench.export()
+    assert ids(bench) == set()
+
+
+def test_nothing_in_a_sound_list(bench: Bench) -> None:
+    bench.revoke(99)
+    assert ids(bench) <= {"keystore.not-in-ledger"}
+
+
+@pytest.mark.parametrize("expected", CASES)
+def test_found(expected: str, bench: Bench) -> None:
+    assert expected not in ids(bench)
+    CASES[expected](bench)
+    assert expected in ids(bench)

@@ -1,0 +1,152 @@
+"""Each finding about policies comes about where it should, at its line, and not in its twin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from harness import with_includes
+from policy_cases import BASICS, CASES, Case, deny, services, topics
+
+from sros_tool.checks.kind import WARNING, Finding
+from sros_tool.checks.policies.files import policy_file_findings
+from sros_tool.resources import policies_dir
+
+FOUND_OTHERWISE = {
+    "policy.malformed",
+    "policy.duplicate-enclave",
+    "policy.include-fallback",
+    "policy.redundant-include",
+    "portable.enclave-names",
+}
+"""These are about more than the content of one profile; they have tests of their own here."""
+HEAD = 3
+
+
+def policy(*enclaves: str) -> str:
+    return f'<policy version="0.2.0"><enclaves>\n{"".join(enclaves)}</enclaves></policy>'
+
+
+def enclave(content: str, path: str = "/a", ns: str = "/", *, basics: bool = True) -> str:
+    shared = BASICS if basics else ""
+    return (
+        f'<enclave path="{path}"><profiles>\n<profile ns="{ns}" node="n">\n{content}\n{shared}'
+        "</profile></profiles></enclave>\n"
+    )
+
+
+def findings(folder: Path, text: str) -> list[Finding]:
+    file = folder / "policy.xml"
+    file.write_text(text)
+    return list(policy_file_findings(file))
+
+
+def ids(folder: Path, text: str) -> set[str]:
+    return {each.id for each in findings(folder, text)}
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.id)
+def test_found_and_not_found(case: Case, tmp_path: Path) -> None:
+    bad = findings(tmp_path, policy(enclave(case.bad, ns=case.ns, basics=case.basics)))
+    (found, *_) = [each for each in bad if each.id == case.id]
+    assert found.file == str(tmp_path / "policy.xml")
+    assert found.subject == "/a"
+    if case.line is not None:
+        assert found.line == HEAD + case.line
+    good = policy(enclave(case.good, ns=case.ns, basics=case.basics))
+    assert case.id not in ids(tmp_path, good)
+
+
+def test_a_name_that_is_too_long(tmp_path: Path) -> None:
+    for length, found in ((247, False), (248, True)):
+        text = policy(enclave(topics("publish", "/" + "x" * (length - 1))))
+        assert ("policy.name-never-matches" in ids(tmp_path, text)) == found
+
+
+def test_a_denial_reaches_the_other_nodes_of_the_process(tmp_path: Path) -> None:
+    other = f'</profile><profile ns="/" node="m">{BASICS}{deny("publish", "/rosout")}'
+    (found, *_) = [
+        each for each in findings(tmp_path, policy(enclave(other))) if each.id == "policy.no-rosout"
+    ]
+    assert "node /n may not publish /rosout" in found.text
+
+
+@pytest.mark.parametrize("kind", ["publish", "subscribe"])
+def test_hidden_nodes_are_tools_and_need_nothing(kind: str, tmp_path: Path) -> None:
+    text = policy(enclave(topics(kind, "/x/a"), basics=False))
+    assert "policy.no-rosout" in ids(tmp_path, text)
+    hidden = text.replace('node="n"', 'node="_n"')
+    assert not [
+        each
+        for each in ids(tmp_path, hidden)
+        if each.startswith("policy.no-") and each != "policy.no-counterpart"
+    ]
+
+
+def test_wildcards_give_what_a_node_needs(tmp_path: Path) -> None:
+    every = topics("publish", "/*") + services("reply", "/*")
+    assert "policy.no-rosout" not in ids(tmp_path, policy(enclave(every, basics=False)))
+
+
+def test_enclave_names(tmp_path: Path) -> None:
+    text = policy(enclave("", "/robot"), enclave("", "/robot/admin"))
+    assert "portable.enclave-names" in ids(tmp_path, text)
+    twin = text.replace("/robot/admin", "/robot_admin")
+    assert "portable.enclave-names" not in ids(tmp_path, twin)
+
+
+def test_malformed(tmp_path: Path) -> None:
+    good = policy(enclave(topics("publish", "a")))
+    assert ids(tmp_path, good) == set()
+    (found,) = findings(tmp_path, good.replace("<topic>a<", "<topic>a b<"))
+    assert (found.id, found.line) == ("policy.malformed", HEAD + 1)
+    assert "white space" in found.text
+    assert ids(tmp_path, "<policy") == {"policy.malformed"}
+    assert ids(tmp_path, "") == {"policy.malformed"}
+
+
+def test_duplicate_enclaves(tmp_path: Path) -> None:
+    twice = policy(enclave(""), enclave(topics("publish", "x")))
+    found = findings(tmp_path, twice)
+    assert [(each.id, each.line) for each in found] == [("policy.duplicate-enclave", 6)]
+    assert ids(tmp_path, policy(enclave(""), enclave("", "/b"))) == set()
+
+
+INCLUDE = '<xi:include href="{}" xpointer="xpointer(/profile/*)">{}</xi:include>'
+
+
+def test_includes(tmp_path: Path) -> None:
+    (tmp_path / "inner.xml").write_text(f"<profile>{topics('publish', 'x')}</profile>")
+    outer = f"<profile>{INCLUDE.format('inner.xml', '')}</profile>"
+    (tmp_path / "outer.xml").write_text(
+        with_includes(outer).replace(
+            "<profile>", '<profile xmlns:xi="http://www.w3.org/2001/XInclude">'
+        )
+    )
+
+    def of(*includes: str) -> set[str]:
+        return ids(tmp_path, with_includes(policy(enclave("".join(includes)))))
+
+    inner, outer = INCLUDE.format("inner.xml", ""), INCLUDE.format("outer.xml", "")
+    assert of(inner) == set()
+    assert of(outer) == set()
+    assert of(inner, outer) == {"policy.redundant-include"}
+    assert of(inner, inner) == {"policy.redundant-include"}
+    gone = f"<xi:fallback>{topics('publish', 'y')}</xi:fallback>"
+    assert of(INCLUDE.format("gone.xml", gone)) == {"policy.include-fallback"}
+    assert of(INCLUDE.format("inner.xml", gone)) == set()
+    missing = ids(tmp_path, with_includes(policy(enclave(INCLUDE.format("gone.xml", "")))))
+    assert missing == {"policy.malformed"}
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        each
+        for each in sorted(policies_dir().rglob("*.xml"))
+        if "<policy" in each.read_text() and each.stem != "everything"
+    ],
+    ids=lambda path: path.stem,
+)
+def test_nothing_in_the_policies_of_sros(path: Path) -> None:
+    assert [each for each in policy_file_findings(path) if each.severity >= WARNING] == []

@@ -1,0 +1,226 @@
+"""Every kind of finding is data that is complete, and has a test that brings it about."""
+
+from __future__ import annotations
+
+import json
+import re
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import keystore_cases
+import policy_cases
+import pytest
+import runtime_cases
+import test_policy_findings
+from bench import Bench
+from harness import sros
+
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Severity
+from sros_tool.checks.registry import KINDS, Selection
+from sros_tool.dds.decision import Vendor
+from sros_tool.errors import UsageError
+
+
+def test_every_finding_has_a_test_that_brings_it_about() -> None:
+    """Each of these tables is run by a test that sees the finding, and does not see it before."""
+    tested = {
+        *(case.id for case in policy_cases.CASES),
+        *test_policy_findings.FOUND_OTHERWISE,
+        *keystore_cases.CASES,
+        *runtime_cases.CASES,
+    }
+    assert tested == set(KINDS)
+    assert len(KINDS) >= 50
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.id)
+def test_kinds_are_complete(kind: Any) -> None:
+    assert re.fullmatch(
+        r"(policy|keystore|enclave|permissions|governance|portable|runtime)\."
+        r"[a-z0-9]+(-[a-z0-9]+)*",
+        kind.id,
+    )
+    assert kind.title
+    assert not kind.title.endswith(".")
+    for text in (kind.why, kind.source, kind.remedy):
+        assert text.endswith((".", ")")), text
+        assert "  " not in text
+    assert set(kind.vendors) <= {str(each) for each in Vendor}
+
+
+def test_list() -> None:
+    lines = sros("check", "--list").ok().out.splitlines()
+    assert len(lines) == len(KINDS)
+    listed = json.loads(sros("check", "--list", "--json", "--include", "policy.*").ok().out)
+    assert {each["id"] for each in listed} == {i for i in KINDS if i.startswith("policy.")}
+    assert set(listed[0]) == {
+        "id", "severity", "title", "why", "source", "remedy", "vendors",
+    }  # fmt: skip
+
+
+ONE, OTHER = KINDS["keystore.one-authority"], KINDS["portable.grant-name"]
+
+
+@pytest.mark.parametrize(
+    ("selection", "wanted"),
+    [
+        (Selection(), {ONE, OTHER}),
+        (Selection(include=("keystore.*",)), {ONE}),
+        (Selection(exclude=("keystore.one-authority",)), {OTHER}),
+        (Selection(include=("keystore.*",), exclude=("*.one-*",)), set()),
+        (Selection(vendor="cyclonedds"), {ONE}),
+        (Selection(vendor="fastdds"), {ONE, OTHER}),
+        (Selection(severity=ERROR), set()),
+    ],
+)
+def test_selection(selection: Selection, wanted: set[Any]) -> None:
+    found = [ONE.found("x", "y"), OTHER.found("x", "y")]
+    assert {each.kind for each in selection.choose(found).shown} == wanted
+
+
+def test_what_was_accepted_is_named_and_does_not_count() -> None:
+    found = [ONE.found("x", "y", accepted="template sros2")]
+    chosen = Selection().choose(found)
+    assert (chosen.shown, len(chosen.accepted)) == ((), 1)
+    assert not chosen.fails(WARNING)
+    assert Selection(strict=True).choose(found).fails(WARNING)
+    shown = Selection(severity=NOTE).choose(found)
+    assert [each.severity for each in shown.shown] == [NOTE]
+    assert shown.fails(NOTE)
+    assert not shown.fails(WARNING)
+
+
+def test_an_id_that_there_is_not() -> None:
+    with pytest.raises(UsageError):
+        Selection(include=("policy.nonsense",))
+
+
+def test_groups_stand_for_their_kinds() -> None:
+    kinds = [k for k in KINDS.values() if Selection(include=("enclave.not-loadable",)).wants(k)]
+    assert len(kinds) > 20
+    assert all(kind.severity is Severity.ERROR for kind in kinds)
+
+
+# ── the command line ───────────────────────────────────────────────────────────────────────
+
+
+def test_text_json_and_status(bench: Bench) -> None:
+    sros("check", bench.root).ok()
+    bench.path("enclaves/base/key.pem").chmod(0o644)
+    ended = sros("check", bench.root)
+    assert ended.status == 1
+    assert "enclaves/base/key.pem: error: " in ended.out
+    assert "1 error" in ended.err
+    told = json.loads(sros("check", bench.root, "--json").out)
+    assert told["counts"] == {"error": 1, "warning": 0, "note": 0, "hidden": 0}
+    (finding,) = told["findings"]
+    assert set(finding) == {
+        "id", "severity", "subject", "file", "line", "text", "remedy", "source", "accepted",
+    }  # fmt: skip
+    assert finding["file"] == str(bench.path("enclaves/base/key.pem"))
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "shown"),
+    [
+        ((), 1, True),
+        (("--fail-on", "error"), 0, True),
+        (("--fail-on", "never"), 0, True),
+        (("--severity", "error"), 0, False),
+        (("--exclude", "keystore.folder-open"), 0, False),
+        (("--include", "keystore.*"), 1, True),
+        (("--severity", "note", "--fail-on", "note"), 1, True),
+    ],
+)
+def test_thresholds(options: tuple[str, ...], status: int, shown: bool, bench: Bench) -> None:
+    bench.path("private").chmod(0o755)
+    ended = sros("check", bench.root, *options)
+    assert ended.status == status
+    assert ("keystore.folder-open" in ended.out) == shown
+
+
+def test_it_finds_out_what_a_path_is(bench: Bench, tmp_path: Path) -> None:
+    bench.path("enclaves/base/key.pem").write_bytes(b"")
+    policy = bench.root.with_name("policy.xml")
+    for target in (bench.root, bench.path("enclaves/base"), bench.path("enclaves/base/cert.pem")):
+        assert "enclave.file-empty" in sros("check", target).out
+    for target in (policy, policy.parent / "policy.xml"):
+        assert "policy.no-type-description" in sros("check", target).out
+    assert "enclave.file-empty" not in sros("check", bench.path("enclaves/arm")).out
+    both = sros("check", policy, bench.root).out
+    assert "enclave.file-empty" in both
+    assert "policy.no-type-description" in both
+    (tmp_path / "policies").mkdir()
+    (tmp_path / "policies/one.xml").write_text(policy.read_text())
+    (tmp_path / "policies/part.xml").write_text("<profile/>")
+    assert "policies/one.xml:1: error" in sros("check", "policies", cwd=tmp_path).out
+    (tmp_path / "empty").mkdir()
+    for wrong in ("gone", "empty"):
+        assert sros("check", wrong, cwd=tmp_path).status == 1
+        assert "Unable to check" in sros("check", wrong, cwd=tmp_path).err
+
+
+def test_the_runtime_and_the_keystore_it_names(bench: Bench) -> None:
+    env = {"ROS_SECURITY_ENABLE": "True", "ROS_SECURITY_KEYSTORE": str(bench.root)}
+    ended = sros("check", env=env)
+    assert ended.status == 1
+    assert "runtime.enable-misspelt" in ended.out
+    bench.path("enclaves/arm/key.pem").write_bytes(b"")
+    assert "enclave.file-empty" in sros("check", env=env).out
+    assert "enclave.file-empty" not in sros("check", "runtime", env=env).out
+
+
+def test_at_domain_and_policy(bench: Bench) -> None:
+    assert "enclave.certificate-expired" in sros("check", bench.root, "--at", "2099-01-01").out
+    assert "enclave.governance-domain" in sros("check", bench.root, "--domain", "9").out
+    policy = bench.root.with_name("policy.xml")
+    sros("check", bench.root, "--policy", policy).ok()
+    policy.write_text(policy.read_text().replace("status", "state"))
+    assert "enclave.stale-permissions" in sros("check", bench.root, "--policy", policy).out
+    for wrong in (("--at", "soon"), ("--domain", "x"), ("--domain", ""), ("runtime", bench.root)):
+        assert sros("check", *wrong).status == 2
+
+
+def test_sarif(bench: Bench) -> None:
+    """The properties that SARIF 2.1.0 requires, and those that code hosts need."""
+    policy = bench.root.with_name("policy.xml")
+    folder = policy.parent
+    log = json.loads(sros("check", "policy.xml", "ks", "--sarif", cwd=folder).out)
+    assert log["version"] == "2.1.0"
+    assert log["$schema"].endswith("sarif-2.1.0.json")
+    (run,) = log["runs"]
+    driver = run["tool"]["driver"]
+    assert driver["name"] == "sros"
+    rules = driver["rules"]
+    assert [each["id"] for each in rules] == list(KINDS)
+    for rule in rules:
+        assert rule["defaultConfiguration"]["level"] in ("error", "warning", "note")
+        assert all(rule[each]["text"] for each in ("shortDescription", "fullDescription", "help"))
+    assert run["results"]
+    for result in run["results"]:
+        assert rules[result["ruleIndex"]]["id"] == result["ruleId"]
+        assert result["level"] in ("error", "warning", "note")
+        assert result["message"]["text"]
+        (location,) = result["locations"]
+        place = location["physicalLocation"]
+        assert place["artifactLocation"]["uri"] == "policy.xml"
+        assert place["region"]["startLine"] >= 1
+        assert place["artifactLocation"]["uriBaseId"] in run["originalUriBaseIds"]
+
+
+def test_sarif_shows_what_was_accepted_as_suppressed(tmp_path: Path) -> None:
+    sros("create_keystore", tmp_path / "ks", "--template", "sros2").ok()
+    log = json.loads(sros("check", "ks", "--sarif", cwd=tmp_path).ok().out)
+    (result,) = [r for r in log["runs"][0]["results"] if r["ruleId"] == "keystore.one-authority"]
+    assert result["suppressions"][0]["justification"] == "template sros2"
+    uri = result["locations"][0]["physicalLocation"]["artifactLocation"]["uri"]
+    assert (tmp_path / uri).exists()
+
+
+def test_now_is_passed_in() -> None:
+    """Only the command line asks the clock."""
+    folder = Path(__file__).parents[2] / "sros_tool/checks"
+    for file in folder.rglob("*.py"):
+        assert "now(" not in file.read_text().replace("datetime.now(UTC)", "now("), file
+    assert datetime.now(UTC)

@@ -1,0 +1,108 @@
+"""Each finding about the runtime comes about where it should, and not in a sound setting."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from zoneinfo import ZoneInfo
+
+import pytest
+from bench import DAY, Bench
+from runtime_cases import CASES, ENCLAVE, KEYSTORE, SOUND, having, sound_setting
+
+from sros_tool.checks.runtimes.runtime import runtime_findings
+from sros_tool.checks.runtimes.setting import Setting, running_processes
+
+
+def ids(setting: Setting) -> set[str]:
+    return {each.id for each in runtime_findings(setting)}
+
+
+@pytest.fixture
+def sound_one(bench: Bench) -> Setting:
+    """A host whose keystore is an export, without keys of CAs."""
+    setting = SOUND(sound_setting(bench), bench)
+    processes = [replace(each, environment=setting.environment) for each in setting.processes]
+    return replace(setting, processes=tuple(processes))
+
+
+def test_nothing_in_a_sound_setting(sound_one: Setting) -> None:
+    assert ids(sound_one) == set()
+
+
+def test_nothing_without_any_security() -> None:
+    setting = Setting({"PATH": "/usr/bin", "ROS_DISTRO": "jazzy"}, datetime.now(UTC))
+    assert ids(setting) == set()
+
+
+@pytest.mark.parametrize("expected", CASES)
+def test_found(expected: str, sound_one: Setting, bench: Bench, tmp_path: Path) -> None:
+    assert expected not in ids(sound_one)
+    setting = sound_one
+    if expected in ("runtime.clock-behind", "runtime.process-outdated"):
+        bench.root = Path(sound_one.environment[KEYSTORE])
+        (bench.root / "ledger.jsonl").touch()
+        begin = sound_one.now.timestamp() - 9
+        for path in bench.root.rglob("*"):
+            os.utime(path, (begin, begin))
+        assert expected not in ids(sound_one)
+    assert expected in ids(CASES[expected](setting, bench))
+
+
+def test_what_keeps_the_enclave_from_loading_is_found_too(sound_one: Setting) -> None:
+    root = Path(sound_one.environment[KEYSTORE])
+    (root / "enclaves/base/permissions.p7s").unlink()
+    (found,) = runtime_findings(sound_one)
+    assert found.id == "enclave.file-missing"
+    assert "permissions.p7s" in found.text
+
+
+def test_a_robot_whose_clock_is_behind(sound_one: Setting) -> None:
+    behind = replace(sound_one, now=sound_one.now - 400 * DAY)
+    assert "enclave.certificate-not-yet-valid" in ids(behind)
+
+
+@pytest.mark.parametrize(("zone", "found"), [("America/Los_Angeles", True), ("UTC", False)])
+def test_the_time_zone_of_the_host(zone: str, found: bool, sound_one: Setting) -> None:
+    """Twenty hours before it was signed is within the back-dating, in UTC."""
+    early = replace(sound_one, now=sound_one.now - timedelta(hours=20), zone=ZoneInfo(zone))
+    assert ("enclave.permissions-local-time" in ids(early)) == found
+
+
+def test_an_rmw_that_was_tried(sound_one: Setting) -> None:
+    tried = replace(sound_one, insecure_rmws={"rmw_fastrtps_cpp": "no security libraries"})
+    (found,) = runtime_findings(tried)
+    assert (found.id, found.text) == ("runtime.rmw-without-security", "no security libraries")
+    other = replace(sound_one, insecure_rmws={"rmw_cyclonedds_cpp": "no plugins"})
+    assert ids(other) == set()
+
+
+@pytest.mark.parametrize("name", ["ROS_SECURITY_ROOT_DIRECTORY", "ros_security_enable"])
+def test_variables_of_old_and_in_small_letters(name: str, sound_one: Setting, bench: Bench) -> None:
+    assert ids(having(**{name: "x"})(sound_one, bench)) == {"runtime.variable-misspelt"}
+
+
+def test_real_processes_are_read() -> None:
+    environment = {**os.environ, ENCLAVE: "/sros_test_of_processes"}
+    command = [sys.executable, "-c", "import time; time.sleep(60)"]
+    before = datetime.now(UTC) - timedelta(seconds=2)
+    child = subprocess.Popen(command, env=environment)
+    try:
+        deadline = time.monotonic() + 10
+        found = None
+        while time.monotonic() < deadline and not (found and found.environment.get(ENCLAVE)):
+            found = next((each for each in running_processes() if each.pid == child.pid), None)
+            time.sleep(0.05)
+        assert found is not None
+        assert found.environment[ENCLAVE] == "/sros_test_of_processes"
+        assert found.command[1] == "-c"
+        assert before < found.started < datetime.now(UTC) + timedelta(seconds=2)
+        assert os.getpid() not in {each.pid for each in running_processes()}
+    finally:
+        child.kill()
+        child.wait()
