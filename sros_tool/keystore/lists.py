@@ -22,7 +22,7 @@ from sros_tool.keystore.bundle import authority_files, carried_crl, certificates
 from sros_tool.keystore.keyring import Keyring
 from sros_tool.keystore.layout import CRL, IDENTITY, REVOKED
 from sros_tool.keystore.ledger import Entry, document_entry
-from sros_tool.keystore.rotation import Replacement, Stage, read_rotation
+from sros_tool.keystore.rotation import Replacement, Stage, lists_confusable, read_rotation
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Transaction
 from sros_tool.pki.certificates import (
@@ -190,6 +190,8 @@ class Lists:
         certificates = certificates_of(self._root, file)
         wanted = replaced.new if coming else replaced.old
         (other,) = [each for each in certificates if digest(each) == wanted]
+        if coming and lists_confusable(certificates[0], other):
+            return None  # who trusts both CAs has to be restarted with all others anyway
         old = carried_crl(self._root, file)
         try:
             authority = self._open(other, replaced, coming=coming)

@@ -6,10 +6,12 @@ import shutil
 from datetime import UTC, datetime
 from pathlib import Path
 
+import made_by_ros2
 import pytest
-from test_life_on_dds import HEARD, Ask, Question, ask, copy, make, open_template, probe
+from test_life_on_dds import DOMAIN, HEARD, Ask, Question, ask, copy, make, open_template, probe
 
 from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.renew import renew
 from sros_tool.keystore.revoke import revoke
 from sros_tool.keystore.rotate import rotate_ca
 from sros_tool.keystore.rotation import Stage
@@ -111,3 +113,32 @@ def test_without_the_old_key_it_takes_effect_with_the_end_of_the_rotation(
     assert hears(ask, root, **old, **new, **friend) == expected
     rotate_ca(root, Stage.RETIRE, now=now())
     assert hears(ask, root, **old, **new, **friend) == expected | {"old": False}
+
+
+def test_the_keystore_of_ros2(ask: Ask, tmp_path: Path) -> None:
+    """Its CA has no key identifier and the name of the next, so openssl may take one for the other.
+
+    All are restarted after each stage, as `rotate_ca` says for it; `renew` and `revoke` work, too.
+    """
+    root = tmp_path / "ks"
+    made_by_ros2.make(root, TALKER, LISTENER, LOST, "/other", now=now(), domain=DOMAIN)
+    friend = {"friend": (root, TALKER)}
+    thieves = {"before": (copy(root, "before"), LOST)}
+    assert hears(ask, root, **friend, **thieves) == {"friend": True, "before": True}
+    renew(root, [TALKER], now=now())
+    revoke(root, ["/other"], now=now())
+    assert hears(ask, root, **friend, **thieves) == {"friend": True, "before": True}
+    rotate_ca(root, Stage.DISTRIBUTE, now=now())
+    assert hears(ask, root, **friend, **thieves) == {"friend": True, "before": True}
+    rotate_ca(root, Stage.REISSUE, now=now())
+    thieves["reissued"] = (copy(root, "reissued"), LOST)
+    mixed = with_earlier_identity(thieves["reissued"][0], thieves["before"][0], "mixed")
+    thieves["mixed"] = (mixed, LOST)
+    heard = hears(ask, root, **friend, **thieves)
+    assert heard["friend"]
+    assert heard["reissued"]
+    assert not revoke(root, [LOST], now=now()).remarks
+    silent = dict.fromkeys(thieves, False)
+    assert hears(ask, root, **friend, **thieves) == {"friend": True, **silent}
+    rotate_ca(root, Stage.RETIRE, now=now())
+    assert hears(ask, root, **friend, **thieves) == {"friend": True, **silent}

@@ -1,0 +1,148 @@
+"""Renewing, revoking and rotating a keystore that ros2/sros2 made, without settings or ledger."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from harness import certificate, check_enclave_whole, remains, snapshot, sros
+from made_by_ros2 import make
+
+from sros_tool.keystore import list_enclaves
+from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.history import Status, history
+from sros_tool.keystore.lists import read_lists
+from sros_tool.keystore.rotation import rotation_status
+from sros_tool.keystore.verify import check_enclave
+
+NOW = datetime.now(UTC).replace(microsecond=0)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    make(tmp_path / "ks", "/a", "/b/c", "/d", now=NOW)
+    return tmp_path / "ks"
+
+
+def check(root: Path, *names: str) -> None:
+    """Every enclave can be loaded, and openssl agrees."""
+    assert not remains(root.parent)
+    assert list_enclaves(root) == names
+    crl = root / "public/identity_ca.crl.pem"
+    for name in names:
+        folder = enclave_path(root, name)
+        assert not check_enclave(folder, now=datetime.now(UTC), domain=0).problems, name
+        (folder / "key.pem").chmod(0o600)  # ros2/sros2 leaves it open
+        check_enclave_whole(folder)
+        words = ["verify", "-CAfile", folder / "identity_ca.cert.pem"]
+        if crl.exists():
+            words += ["-crl_check", "-CRLfile", folder / "crl.pem"]
+        openssl(*words, folder / "cert.pem")
+        for document in ("permissions", "governance"):
+            words = ["smime", "-verify", "-text", "-in", folder / f"{document}.p7s"]
+            openssl(*words, "-CAfile", folder / "permissions_ca.cert.pem")
+
+
+def openssl(*words: object) -> None:
+    done = subprocess.run(["openssl", *map(str, words)], capture_output=True, text=True)
+    assert done.returncode == 0, (words, done.stderr)
+
+
+def test_it_is_one_that_works(root: Path) -> None:
+    check(root, "/a", "/b/c", "/d")
+    assert not (root / "sros.toml").exists()
+    assert not (root / "ledger.jsonl").exists()
+
+
+@pytest.mark.parametrize("new_key", [False, True])
+def test_renewing(new_key: bool, root: Path) -> None:
+    before = {name: enclave_path(root, name) for name in ("/a", "/b/c")}
+    old = {name: certificate(path / "cert.pem") for name, path in before.items()}
+    sros("renew", root, "/b/c", *["--new-key"] * new_key).ok()
+    check(root, "/a", "/b/c", "/d")
+    assert certificate(before["/a"] / "cert.pem") == old["/a"]
+    new = certificate(before["/b/c"] / "cert.pem")
+    assert new.serial_number != old["/b/c"].serial_number
+    assert new.subject == old["/b/c"].subject
+    assert (new.public_key() != old["/b/c"].public_key()) is new_key
+    sros("renew", root, "--all-expiring", "20y").ok()
+    check(root, "/a", "/b/c", "/d")
+    # The ledger begins with what sros issued; everything else is named.
+    found = history(root, now=NOW)
+    assert {item.entry.enclave for item in found.items} == {"/a", "/b/c", "/d"}
+    assert found.unexplained == ("enclaves/governance.p7s", "public/ca.cert.pem")
+
+
+def test_revoking(root: Path, tmp_path: Path) -> None:
+    stolen = Path(shutil.copytree(enclave_path(root, "/d"), tmp_path / "stolen"))
+    sros("revoke", root, "/d", "--reason", "key_compromise").ok()
+    check(root, "/a", "/b/c")
+    (crl,) = read_lists(root)
+    assert [each.serial for each in crl.revoked] == [certificate(stolen / "cert.pem").serial_number]
+    shutil.copy(root / "public/identity_ca.crl.pem", stolen / "crl.pem")
+    found = [str(each) for each in check_enclave(stolen, now=datetime.now(UTC)).problems]
+    assert found == ["cert.pem: it is revoked by crl.pem"]
+    sros("crl", root, "--refresh").ok()
+    check(root, "/a", "/b/c")
+    assert len(read_lists(root)[0].revoked) == 1
+    revoked = {each.entry.what for each in history(root, now=NOW).items if each.entry.serial}
+    assert revoked == {"revocation"}  # the certificate was issued before there was a ledger
+
+
+def test_rotating_with_a_revocation_in_every_stage(root: Path) -> None:
+    old = certificate(root / "public/ca.cert.pem")
+    names = ["/a", "/b/c", "/d"]
+    for number, stage in enumerate(("distribute", "reissue", "retire")):
+        sros("rotate_ca", root, "--to", stage).ok()
+        check(root, *names)
+        sros("create_enclave", root, f"/new{number}").ok()
+        sros("renew", root, "/a").ok()
+        check(root, *names, f"/new{number}")
+        sros("revoke", root, f"/new{number}").ok()
+        check(root, *names)
+    (state,) = rotation_status(root, now=NOW).authorities
+    assert state.standing == "issuing"
+    assert state.serial != f"{old.serial_number:x}"
+    assert len(list((root / "public").glob("*_ca.cert.pem"))) == 2
+    assert all(path.is_symlink() for path in (root / "public").glob("*_ca.cert.pem"))
+    assert (root / "private/ca.key.pem").stat().st_mode & 0o777 == 0o600
+    found = history(root, now=NOW)
+    assert found.unexplained == (f"retired/{old.serial_number:x}.cert.pem",)
+    assert {each.status for each in found.items if each.entry.what == "ca"} == {Status.CURRENT}
+    sros("revoke", root, "/d").ok()
+    check(root, "/a", "/b/c")
+
+
+def test_no_list_is_distributed_that_may_be_taken_for_another(root: Path) -> None:
+    """Fast DDS would start no process: the old CA has the new one's name, and no identifier."""
+    sros("revoke", root, "/d").ok()
+    sros("rotate_ca", root, "--to", "distribute").ok()
+    sros("create_enclave", root, "/e").ok()
+    sros("revoke", root, "/e").ok()
+    assert b"X509 CRL" not in (root / "public/ca.cert.pem").read_bytes()
+    assert len(read_lists(root)) == 1
+    sros("rotate_ca", root, "--to", "reissue").ok()
+    new, old = read_lists(root)
+    assert not new.revoked
+    assert len(old.revoked) == 2  # whoever trusts the old CA still asks this one
+
+
+def test_all_stages_at_once(root: Path) -> None:
+    sros("revoke", root, "/d").ok()
+    sros("rotate_ca", root, "--finish").ok()
+    check(root, "/a", "/b/c")
+
+
+def test_a_dry_run_of_each_changes_nothing(root: Path) -> None:
+    before = snapshot(root)
+    for words in (
+        ("renew", root, "/a"),
+        ("revoke", root, "/a"),
+        ("crl", root, "--refresh"),
+        ("rotate_ca", root, "--next"),
+    ):
+        assert sros(*words, "--dry-run").ok().out, words
+    assert snapshot(root) == before
