@@ -51,3 +51,33 @@ def test_what_nothing_protects_is_shared_with_those_that_were_refused(
     free = free.replace("<metadata_protection_kind>ENCRYPT", "<metadata_protection_kind>NONE")
     govern = governance(free, topic_rule(), rtps=rtps)
     assert outcome(vendor, ELSEWHERE, govern, "rt/open") is expected
+
+
+def test_a_date_that_cannot_be_read_in_any_grant() -> None:
+    """Fast DDS reads all dates first; Cyclone DDS only those of the grant that it takes."""
+    broken = grant(allow(publish("*")), subject="CN=/other", begin="tomorrow")
+    perms = permissions(grant(allow(publish("*"))), broken)
+    fast = Access.of_documents(Vendor.FAST_2_9, governance(), perms, SUBJECT, domain=42, at=NOW)
+    assert isinstance(fast, Access)
+    assert fast.join().reason == "malformed"
+    assert outcome(Vendor.CYCLONE, perms, governance(), "rt/a") is Outcome.ALLOWED
+
+
+def test_a_list_without_partitions_is_not_the_default_partition() -> None:
+    empty = publish("rt/a").replace("</publish>", "<partitions></partitions></publish>")
+    perms = permissions(grant(allow(empty, publish("rt/b"))))
+    assert outcome(Vendor.CYCLONE, perms, governance(), "rt/b") is Outcome.ALLOWED
+    assert outcome(Vendor.CYCLONE, perms, governance(), "rt/a") is Outcome.DENIED
+
+
+def test_peers_honour_a_default_of_allow() -> None:
+    perms = permissions(grant(default="<default>ALLOW</default>"))
+    govern = governance(topic_rule("rt/open", read=False), topic_rule())
+    assert outcome(Vendor.CYCLONE, perms, govern, "rt/a") is Outcome.ALLOWED
+    denied = permissions(grant(default="<default>DENY</default>"))
+    assert outcome(Vendor.CYCLONE, denied, govern, "rt/a") is Outcome.DENIED
+
+
+@pytest.mark.parametrize("vendor", [Vendor.CYCLONE, Vendor.FAST_2_9])
+def test_blanks_before_the_declaration(vendor: Vendor) -> None:
+    assert outcome(vendor, b"\n " + EVERYTHING, governance(), "rt/a") is Outcome.ALLOWED

@@ -183,7 +183,7 @@ def take_part(library: CycloneLibrary, case: Case, say: Callable[[Report], None]
         met = [False] * len(made)
         until = time.monotonic() + case["seconds"]
         while not all(met) and time.monotonic() < until:
-            met = [seen or meets(api, *each) for seen, each in zip(met, made, strict=True)]
+            met = [meets(api, *each) or seen for seen, each in zip(met, made, strict=True)]
             time.sleep(0.02)
         say({"answers": met})
         while True:  # the reader of the other side may still wait

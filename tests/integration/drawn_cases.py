@@ -72,7 +72,7 @@ def moments(draw: st.DrawFn, now: datetime) -> tuple[str, str]:
 
 @st.composite
 def _moment(draw: st.DrawFn, now: datetime, hours: tuple[int, ...]) -> str:
-    at = now + timedelta(hours=draw(st.sampled_from(hours)))
+    at = now + timedelta(hours=draw(st.sampled_from(hours)), minutes=20)
     offset = draw(st.sampled_from(("", "Z", "Z", "+09:00", "-08:00", "+05:30", "+00:00")))
     if offset not in ("", "Z"):
         hour, minute = (int(part) for part in offset.split(":"))

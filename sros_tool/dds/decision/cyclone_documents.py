@@ -35,6 +35,8 @@ BLANKS = " \t\v\r\n"
 _MARK = b"\xef\xbb\xbf"
 _SCHEMA_ATTRIBUTES = ("xmlns:xsi", "xsi:nonamespaceschemalocation")
 _IGNORED = ("relay", "value", "name", "tag", "data_tags")
+_NOTHING = "["
+"""An expression that nothing matches: a set that does not end."""
 _INTEGER = re.compile(r"[+-]?(?:0[xX][0-9a-fA-F]+|0[0-7]*|[1-9]\d*)\Z", re.ASCII)
 
 # What may stand in what; without an entry, only text may.
@@ -288,5 +290,8 @@ def _criteria(node: _Node) -> Criteria:
     topics, partitions = node.last("topics"), node.last("partitions")
     return Criteria(
         tuple(each.text for each in topics.all("topic")) if topics else (),
-        tuple(each.text for each in partitions.all("partition")) if partitions else (),
+        # A list of no partitions is not the default one: nothing lies in it.
+        tuple(each.text for each in partitions.all("partition")) or (_NOTHING,)
+        if partitions
+        else (),
     )

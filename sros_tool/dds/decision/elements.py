@@ -23,12 +23,15 @@ class UnreadableError(Exception):
 
 
 def root_of(xml: bytes) -> etree._Element:
-    """The root with its comments; raises `UnreadableError` if it is no well-formed XML."""
+    """The root with its comments; raises `UnreadableError` if it is no well-formed XML.
+
+    The vendors let blanks stand before the XML declaration.
+    """
     parser = etree.XMLParser(
         remove_pis=True, resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False
     )
     try:
-        root: etree._Element = etree.fromstring(xml, parser)
+        root: etree._Element = etree.fromstring(xml.lstrip(), parser)
     except (etree.XMLSyntaxError, ValueError) as error:
         raise UnreadableError(f"it is not well-formed XML ({error})") from error
     return root

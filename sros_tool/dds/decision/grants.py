@@ -17,11 +17,14 @@ def choose_grant(
     """The index of the grant, or why there is none."""
     now = at.timestamp()
     outdated: Refusal | None = None
-    for index, grant in enumerate(permissions.grants):
-        granted = grant.subject.strip() if traits.trims_texts else grant.subject
-        state = _state(traits, index, grant, now, zone)
-        if isinstance(state, Refusal) and state.reason == "malformed":
+    states = [
+        _state(traits, index, grant, now, zone) for index, grant in enumerate(permissions.grants)
+    ]
+    for state in states:
+        if state and state.reason == "malformed":  # of whomever it is
             return state
+    for index, (grant, state) in enumerate(zip(permissions.grants, states, strict=True)):
+        granted = grant.subject.strip() if traits.trims_texts else grant.subject
         if not same_subject(traits.subjects, granted, subject):
             continue
         if state is None:

@@ -52,7 +52,8 @@ def decide_join(
     if any(each.allow for _, each in rules):
         return Joining(Outcome.ALLOWED, "allow-rule", f"an allow rule holds on {where}")
     missing = f"no allow rule of the grant holds on {where}"
-    if traits.always_needs_allow_rule or not governed.all_controlled():
+    opened = not governed.all_controlled() and otherwise.outcome is not Outcome.ALLOWED
+    if traits.always_needs_allow_rule or opened:
         return Joining(Outcome.PEER_DENIES, "no-rule", f"{missing}, so peers refuse it")
     if otherwise.outcome is Outcome.DENIED:
         return Joining(Outcome.REFUSED, "no-rule", missing)
