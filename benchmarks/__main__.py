@@ -16,6 +16,7 @@ from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
+from benchmarks.checking import checking
 from benchmarks.deciding import deciding
 from benchmarks.floor import make_enclaves, sizes_of
 from benchmarks.inputs import enclaves_policy, topics_policy
@@ -56,6 +57,8 @@ def main() -> int:
         rows += _memory(folder, options.enclaves)
         rows += [Row(name, taken, None, limit, kept) for name, taken, limit, kept in observing()]
         rows += [Row(*figure) for figure in deciding()]
+        checked = checking(folder, options.enclaves, RULES, options.rounds)
+        rows += [Row(name, taken, None, limit, kept) for name, taken, limit, kept in checked]
         rows += _renewal(folder, options.renew) if options.renew else []
     print(f"Python {platform.python_version()}, {os.cpu_count()} cores, medians")
     print(f"{'task':58} {'sros':>9} {'floor':>9} {'ratio':>6}  limit")
