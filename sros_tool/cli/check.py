@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -148,8 +149,6 @@ def _circumstances(
     from sros_tool.validity import parse_iso
 
     present = now()
-    zone = present.astimezone().tzinfo
-    assert zone is not None
     if moment is not None:
         try:
             present = parse_iso(moment)
@@ -159,6 +158,8 @@ def _circumstances(
             ) from error
     if domain == "":
         raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
+    zone = present.astimezone().tzinfo  # with the offset that holds at that moment
+    assert zone is not None
     wanted = None if domain is None else domain_from({DOMAIN: domain})
     return Circumstances(present, zone, wanted, tuple(read_policy(each) for each in policies))
 
@@ -196,16 +197,24 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
 
 
 def _runtime(at: Circumstances) -> list[Finding]:
+    environment = dict(os.environ)
+    if at.domain is not None:
+        environment["ROS_DOMAIN_ID"] = str(at.domain)
+    return findings_here(environment, at.now, {})
+
+
+def findings_here(
+    environment: Mapping[str, str], moment: datetime, insecure_rmws: Mapping[str, str]
+) -> list[Finding]:
+    """What is found in an environment on this machine; `insecure_rmws` were tried before."""
     from sros_tool.checks.runtimes.runtime import runtime_findings
     from sros_tool.checks.runtimes.setting import Setting, running_processes
     from sros_tool.runtime.stacks import rmw_implementations
 
-    environment = dict(os.environ)
-    if at.domain is not None:
-        environment["ROS_DOMAIN_ID"] = str(at.domain)
-    rmws = rmw_implementations(environment)
-    processes = tuple(running_processes())
-    return runtime_findings(Setting(environment, at.now, at.zone, processes, rmws))
+    zone = moment.astimezone().tzinfo
+    assert zone is not None
+    rmws, processes = rmw_implementations(environment), tuple(running_processes())
+    return runtime_findings(Setting(environment, moment, zone, processes, rmws, insecure_rmws))
 
 
 def _shown(finding: Finding) -> Finding:
@@ -221,10 +230,7 @@ def _shown(finding: Finding) -> Finding:
 
 def _print_text(chosen: Chosen, _selection: Selection) -> None:
     for each in chosen.shown:
-        click.echo(f"{each.place}: {each.severity.word}: {each.kind.title} [{each.id}]")
-        subject = f"{each.subject}: " if each.subject not in (each.file, each.place) else ""
-        click.echo(f"    {subject}{each.text}{_by(each)}")
-        click.echo(f"    {each.remedy}")
+        click.echo("\n".join(finding_lines(each)))
     for choice in dict.fromkeys(each.accepted for each in chosen.accepted):
         kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
         told = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
@@ -232,8 +238,12 @@ def _print_text(chosen: Chosen, _selection: Selection) -> None:
     click.echo(_summary(chosen), err=True)
 
 
-def _by(finding: Finding) -> str:
-    return f" (chosen by the {finding.accepted})" if finding.accepted else ""
+def finding_lines(finding: Finding) -> list[str]:
+    """A finding for people: where and what, why here, and what to do."""
+    head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"
+    told = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
+    by = f" (chosen by the {finding.accepted})" if finding.accepted else ""
+    return [head, f"    {told}{finding.text}{by}", f"    {finding.remedy}"]
 
 
 def _summary(chosen: Chosen) -> str:

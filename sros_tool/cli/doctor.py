@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 
 import click
 
@@ -32,12 +33,25 @@ def doctor(as_json: bool) -> None:
     Each is tried, in a process of its own and in an enclave made for the purpose; a name or a
     version says nothing about how it was built. Also warns of misspelt ROS_SECURITY_* values.
     """
+    from sros_tool.checks.kind import WARNING
+    from sros_tool.cli.check import finding_lines, findings_here
     from sros_tool.demo.doctor import diagnosis_text, examine
 
-    diagnosis = examine(os.environ, now())
+    moment = now()
+    diagnosis = examine(os.environ, moment)
+    insecure = {
+        stack.rmw: stack.evidence
+        for stack in diagnosis.stacks
+        if stack.rmw and stack.enforces is False
+    }
+    findings = findings_here(os.environ, moment, insecure)
     if as_json:
-        print_json(diagnosis.as_json())
+        shown = [each.as_json() for each in findings]
+        print_json({**diagnosis.as_json(), "findings": shown})
     else:
-        click.echo(diagnosis_text(diagnosis))
+        click.echo(diagnosis_text(replace(diagnosis, warnings=())))
+        for each in findings:
+            if each.severity >= WARNING:
+                click.echo("\n".join(("", *finding_lines(each))))
     if not diagnosis.enforces:
         sys.exit(1)

@@ -1,0 +1,42 @@
+"""``sros doctor`` says what is wrong in the environment, beside which DDS enforces security."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from bench import Bench
+from harness import sros
+
+from sros_tool.demo import doctor
+from sros_tool.demo.doctor import Diagnosis
+from sros_tool.runtime.stacks import Stack
+
+RMW = Stack("rclpy", "rmw", "Fast DDS", "2.14", "", True, False, "no security", "", "rmw_x")
+CYCLONE = Stack("Cyclone DDS", "cyclone", "Cyclone DDS", "0.10", "", True, True, "it refused")
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_findings(as_json: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "examine", lambda *_: Diagnosis((RMW, CYCLONE), ()))
+    env = {
+        "ROS_SECURITY_ENABLE": "true",
+        "ROS_SECURITY_STRATEGY": "Enforce",
+        "ROS_SECURITY_KEYSTORE": str(bench.root),
+        "ROS_SECURITY_ENCLAVE_OVERRIDE": "/base",
+        "RMW_IMPLEMENTATION": "rmw_y",
+    }
+    flags = ("--json",) if as_json else ()
+
+    def said() -> str:
+        out = sros("doctor", *flags, env=env).ok().out
+        return " ".join(e["id"] for e in json.loads(out)["findings"]) if as_json else out
+
+    sound = said()
+    assert "runtime.rmw-without-security" not in sound
+    assert "enclave." not in sound
+    env["RMW_IMPLEMENTATION"] = "rmw_x"
+    bench.path("enclaves/base/cert.pem").write_text("")
+    broken = said()
+    assert "runtime.rmw-without-security" in broken
+    assert "enclave.file-empty" in broken
