@@ -71,6 +71,7 @@ def pattern(expression: str, topic: str, answers: str) -> Row:
     return Row(f"{expression!r} for {topic}", one(allow(publish(expression))), answers, topic)
 
 
+EVERYWHERE = publish("*", partitions=("*",))
 IN_P1 = publish("rt/a", partitions=("p1",))
 TWO_LISTS = (
     "<publish><topics><topic>rt/a</topic></topics><topics><topic>rt/b</topic></topics></publish>"
@@ -159,12 +160,24 @@ ROWS = [
         "rt/b",
         partitions=("p1",),
     ),
-    # Cyclone DDS asks of a denial that it names every partition, and else looks on.
     Row(
-        "denied in p1, all else allowed in p1: in p1 and p2",
-        one(deny(IN_P1), allow(publish("*", partitions=("*",)))),
+        "denied in p1, all else allowed everywhere: in p1 and p2",
+        one(deny(IN_P1), allow(EVERYWHERE)),
         "no no no no",
         partitions=("p1", "p2"),
+    ),
+    Row(
+        "denied in p1, all else allowed everywhere: in p2",
+        one(allow(subscribe("rt/a")), deny(IN_P1), allow(EVERYWHERE)),
+        "yes no no yes",
+        partitions=("p2",),
+    ),
+    # Cyclone DDS takes a denial without partitions for one of the default partition.
+    Row(
+        "denied, all else allowed everywhere: in p2",
+        one(allow(subscribe("rt/a")), deny(A), allow(EVERYWHERE)),
+        "no no no yes",
+        partitions=("p2",),
     ),
     Row(
         "denied in p1, then everything: in p2",
@@ -337,6 +350,11 @@ ROWS = [
     ),
     Row("an empty topic before it", one(allow(publish("", "rt/a"))), "yes refused refused crash"),
     Row("an empty topic behind it", one(allow(publish("rt/a", ""))), "yes refused refused yes"),
+    Row(
+        "an empty topic behind one that matches in other partitions",
+        one(allow(publish("rt/a", "", partitions=("p1",)))),
+        "no refused refused no",
+    ),
     Row(
         "an empty default behind the rule",
         permissions(grant(allow(A), default="<default/>")),

@@ -168,6 +168,9 @@ def _number(node: _Node) -> int:
     sign, digits = ("-", node.text[1:]) if node.text[0] == "-" else ("", node.text.lstrip("+"))
     octal = len(digits) > 1 and digits[0] == "0" and digits[1] not in "xX"
     number = int(sign + digits, 8 if octal else 0)
+    if not -(2**63) <= number < 2**63:
+        raise UnreadableError(f"<{node.tag}> holds {number}, which is far too large")
+    number = (number + 2**31) % 2**32 - 2**31  # it keeps 32 bits, and looks at the range then
     if not 0 <= number <= MAX_DOMAIN:
         raise UnreadableError(f"<{node.tag}> holds {number}, which is above {MAX_DOMAIN}")
     return number

@@ -35,6 +35,7 @@ class Verdict:
 class _Entry:
     """One ``<topic>`` of a rule; ``partitions`` are those that the vendor weighs with it."""
 
+    criteria: int
     rule: int
     allow: bool
     expression: str
@@ -81,13 +82,15 @@ class Rights:
         self._traits = traits
         self._otherwise = otherwise
         self._entries: list[_Entry] = []
+        count = 0
         for index, rule in rules:
             criteria = tuple(each for verb in verbs for each in getattr(rule, verb))
             for each in criteria:
+                count += 1
                 # Fast DDS weighs the partitions of all criteria of a rule together.
                 weighed = _partitions(traits, rule, criteria if traits.topic_decides else (each,))
                 self._entries += [
-                    _Entry(index, rule.allow, trimmed(traits, expression), weighed)
+                    _Entry(count, index, rule.allow, trimmed(traits, expression), weighed)
                     for expression in each.topics
                     if trimmed(traits, expression) or traits.crashes_on_empty_texts
                 ]
@@ -97,8 +100,12 @@ class Rights:
     def ask(self, topic: str, partitions: tuple[str, ...]) -> Verdict:
         """The verdict on an endpoint of ``topic`` in ``partitions`` (none: the default one)."""
         wanted = partitions or DEFAULT_PARTITION
+        passed = 0
         for position in self._topics.matching(topic):
             entry = self._entries[position]
+            if entry.criteria == passed:
+                continue  # the first topic of some criteria that matches is the only one looked at
+            passed = entry.criteria
             fits = self._fits(entry, wanted)
             if fits or self._traits.topic_decides or not entry.expression:
                 return entry.verdict(fits=fits)
@@ -113,8 +120,10 @@ class Rights:
 
     def _fits(self, entry: _Entry, wanted: tuple[str, ...]) -> bool:
         style, named = self._traits.style, entry.partitions
-        if entry.allow or self._traits.deny_partitions is DenyPartitions.ALL:
-            return wanted == named or all(_named(style, named, each) for each in wanted)
+        if entry.allow:
+            if wanted is DEFAULT_PARTITION is named:
+                return True
+            return all(_named(style, named, each) for each in wanted)
         if self._traits.deny_partitions is DenyPartitions.IGNORED:
             return True
         return any(_named(style, named, each) for each in wanted)
@@ -137,7 +146,9 @@ def trimmed(traits: Traits, text: str) -> str:
 
 def _partitions(traits: Traits, rule: Rule, criteria: tuple[Criteria, ...]) -> tuple[str, ...]:
     """The partitions that ``criteria`` of ``rule`` name; without any, what the vendor implies."""
-    everywhere = not rule.allow and traits.deny_partitions is DenyPartitions.ANY
+    everywhere = not rule.allow and traits.deny_partitions is DenyPartitions.ANY_OR_ALL
     implied = ("*",) if everywhere else DEFAULT_PARTITION
+    if implied is DEFAULT_PARTITION and not any(each.partitions for each in criteria):
+        return DEFAULT_PARTITION
     found = [text for each in criteria for text in each.partitions or implied]
     return tuple(dict.fromkeys(trimmed(traits, text) for text in found))

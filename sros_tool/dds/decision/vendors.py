@@ -78,12 +78,12 @@ class OpenRange(Enum):
 class DenyPartitions(Enum):
     """Which partitions of an endpoint a deny rule must name to hold for it."""
 
-    ANY = auto()
-    """One of them; a deny rule without partitions holds for all."""
-    ALL = auto()
-    """All of them; a deny rule without partitions holds for the default one only."""
+    ANY_OR_ALL = auto()
+    """One of them; without partitions the rule holds for all."""
+    ANY_OR_DEFAULT = auto()
+    """One of them; without partitions the rule holds for the default one only (Cyclone DDS)."""
     IGNORED = auto()
-    """None: a deny rule holds whatever its partitions."""
+    """None: a deny rule holds whatever its partitions (Fast DDS)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +106,7 @@ class Traits:
     """Rules for other domains do not count for the own participant (they never do for peers)."""
     topic_decides: bool = False
     """The first rule whose topic matches decides, and then its partitions must fit."""
-    deny_partitions: DenyPartitions = DenyPartitions.ANY
+    deny_partitions: DenyPartitions = DenyPartitions.ANY_OR_ALL
     honours_default: bool = True
     crashes_on_empty_texts: bool = False
     """An expression or a default without text ends the process once a decision comes to it."""
@@ -154,7 +154,7 @@ TRAITS = {
         subjects=Subjects.SUBSET,
         moments=Moments.CYCLONE,
         open_range=OpenRange.CRASHES,
-        deny_partitions=DenyPartitions.ALL,
+        deny_partitions=DenyPartitions.ANY_OR_DEFAULT,
         crashes_on_empty_texts=True,
         creates_topics=True,
         shares_open_topics=True,
