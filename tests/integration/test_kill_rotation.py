@@ -1,0 +1,138 @@
+"""Rotating CAs, and revoking in between, stopped at random moments: the same end state."""
+
+from __future__ import annotations
+
+import random
+import signal
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from harness import check_enclave_whole, remains
+from test_kill import Server
+from test_kill_life import DIED, copy, in_child
+
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore import create_enclaves, create_keystore, filesystem, list_enclaves
+from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.history import history
+from sros_tool.keystore.lists import read_lists
+from sros_tool.keystore.revoke import revoke
+from sros_tool.keystore.rotate import rotate_ca
+from sros_tool.keystore.rotation import Stage, read_rotation, rotation_status
+from sros_tool.keystore.template import load_template
+from sros_tool.keystore.verify import check_enclave
+
+NOW = datetime.now(UTC)
+LATER = NOW + timedelta(hours=1)
+KILLS = 12
+STAGES = (Stage.DISTRIBUTE, Stage.REISSUE, Stage.RETIRE)
+
+State = tuple[tuple[str, ...], str, tuple[tuple[str, int], ...], tuple[int, ...]]
+
+
+@pytest.fixture
+def life(tmp_path: Path) -> Path:
+    root = tmp_path / "ks"
+    create_keystore(root, template=load_template("production"), now=NOW)
+    create_enclaves(root, ["/a", "/b", "/c", "/x/y"], now=NOW)
+    revoke(root, ["/c"], now=NOW)
+    return root
+
+
+def see(root: Path) -> State:
+    """Check what must hold at any moment; enclaves, stage, who is on which CA, and the lists."""
+    names = []
+    for name in list_enclaves(root):
+        folder = enclave_path(root, name)
+        if (folder / "cert.pem").exists():
+            check_enclave_whole(folder)
+            assert not check_enclave(folder, now=LATER).problems, name
+            names.append(name)
+    for path in (*root.glob("private/*.pem"), *root.glob("retired/*.key.pem")):
+        # One that is on its way out may be a link to nothing for a moment.
+        assert not path.exists() or path.stat().st_mode & 0o777 == 0o600, path
+    lists = tuple(len(each.revoked) for each in read_lists(root))
+    on = tuple(
+        (each.standing, each.enclaves) for each in rotation_status(root, now=LATER).authorities
+    )
+    return tuple(names), str(read_rotation(root).stage), on, lists
+
+
+def settled(root: Path) -> State:
+    """As `see`, when all is done: nothing is left behind, and the ledger knows everything."""
+    assert not remains(root.parent)
+    assert not history(root, now=LATER).unexplained
+    return see(root)
+
+
+def revoke_once(root: Path) -> None:
+    """As a person does: who runs it again is told when it was done already."""
+    try:
+        revoke(root, ["/b"], now=LATER)
+    except KeystoreError as error:
+        assert "does not exist" in str(error)
+
+
+@pytest.mark.parametrize("stage", STAGES[:2])
+def test_death_at_every_step_of_revoking_between_stages(
+    stage: Stage, life: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two lists change, and the file of the CAs: all at one moment."""
+    monkeypatch.setattr(filesystem, "flush_file_system", lambda _: None)
+    for each in STAGES[: STAGES.index(stage) + 1]:
+        rotate_ca(life, each, now=NOW)
+    before = settled(life)
+    work = tmp_path / "work" / "ks"
+    work.parent.mkdir()
+    copy(life, work)
+    status, steps = in_child(lambda: revoke_once(work))
+    assert status == 0
+    expected = settled(work)
+    outcomes = set()
+    for step in range(1, steps + 1):
+        copy(life, work)
+        assert in_child(lambda: revoke_once(work), step) == (DIED, 0), step
+        now = see(work)
+        assert now in (before, expected), step
+        outcomes.add(now == before)
+        revoke_once(work)
+        assert settled(work) == expected
+    assert outcomes == {True, False}
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    serving = Server()
+    yield serving
+    serving.close()
+
+
+def test_every_stage_killed_at_random_moments(server: Server, life: Path, tmp_path: Path) -> None:
+    work = tmp_path / "work" / "ks"
+    work.parent.mkdir()
+    moments = random.Random(8)
+    killed = done = 0
+    for stage in STAGES:
+        before = settled(life)
+        copy(life, work)
+        started = time.monotonic()
+        assert server.run("rotate_ca", work, "--to", stage) == 0
+        duration = time.monotonic() - started
+        expected = settled(work)
+        for _ in range(KILLS):
+            copy(life, work)
+            pause = moments.uniform(0, 1.1 * duration)
+            status = server.run("rotate_ca", work, "--to", stage, kill_after=pause)
+            assert status in (0, -signal.SIGKILL)
+            killed += status != 0
+            now = see(work)
+            assert now in (before, expected), stage
+            done += now == expected
+            assert server.run("rotate_ca", work, "--to", stage) == 0
+            assert settled(work) == expected, stage
+        rotate_ca(life, stage, now=NOW)
+    assert killed > KILLS
+    assert done

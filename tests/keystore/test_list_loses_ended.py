@@ -1,0 +1,74 @@
+"""A revocation list loses what has ended, once it was on a list after its end (RFC 5280, 3.3)."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from harness import certificate
+
+from sros_tool.keystore import create_enclaves, create_keystore
+from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.history import Status, history
+from sros_tool.keystore.ledger import LEDGER, read_ledger
+from sros_tool.keystore.lists import read_crl
+from sros_tool.keystore.revoke import refresh_crl, revoke
+from sros_tool.keystore.template import load_template
+
+NOW = datetime(2026, 6, 1, tzinfo=UTC)
+DAY = timedelta(days=1)
+
+
+def listed(root: Path) -> set[int]:
+    crl = read_crl(root)
+    assert crl
+    return {each.serial for each in crl.revoked}
+
+
+def made(root: Path) -> tuple[Path, int]:
+    """A keystore in which /a, whose certificate lives for 100 days, was revoked on the 10th."""
+    template = replace(load_template("production"), certificate_validity=100 * DAY)
+    create_keystore(root, template=template, now=NOW)
+    create_enclaves(root, ["/a", "/b"], now=NOW)
+    serial = certificate(enclave_path(root, "/a") / "cert.pem").serial_number
+    revoke(root, ["/a"], now=NOW + 10 * DAY)
+    return root, serial
+
+
+@pytest.mark.parametrize("ledger", [True, False])
+def test_it_stays_until_it_was_on_a_list_after_its_end(ledger: bool, tmp_path: Path) -> None:
+    root, serial = made(tmp_path / "ks")
+    if not ledger:  # as ros2/sros2 leaves it; then the certificate that was put away tells
+        (root / LEDGER).unlink()
+    for days, there in ((50, True), (99, True), (110, True), (120, False), (130, False)):
+        refresh_crl(root, now=NOW + days * DAY)
+        assert (serial in listed(root)) is there, days
+
+
+def test_revoking_another_drops_it_too_and_the_ledger_keeps_it(tmp_path: Path) -> None:
+    root, serial = made(tmp_path / "ks")
+    refresh_crl(root, now=NOW + 110 * DAY)
+    late = NOW + 120 * DAY
+    create_enclaves(root, ["/late"], now=late)
+    other = certificate(enclave_path(root, "/late") / "cert.pem").serial_number
+    revoke(root, ["/late"], now=late)
+    assert serial not in listed(root)
+    assert other in listed(root)
+    assert f"{serial:x}" in {each.serial for each in read_ledger(root) if each.what == "revocation"}
+    (found,) = [
+        item
+        for item in history(root, now=late).items
+        if item.entry.serial == f"{serial:x}" and item.entry.what == "certificate"
+    ]
+    assert found.status is Status.REVOKED
+
+
+def test_of_what_nobody_knows_the_end_stays(tmp_path: Path) -> None:
+    root, serial = made(tmp_path / "ks")
+    (root / LEDGER).unlink()
+    (root / f"revoked/{serial:x}/cert.pem").unlink()
+    for days in (110, 120, 130):
+        refresh_crl(root, now=NOW + days * DAY)
+    assert serial in listed(root)
