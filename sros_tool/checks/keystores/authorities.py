@@ -241,16 +241,20 @@ def _key(keystore: OpenedKeystore, role: str, certificate: x509.Certificate) -> 
 
 def _one_for_both(keystore: OpenedKeystore) -> Iterator[Finding]:
     found = [chain[0] for chain in keystore.authorities.values()]
-    if len(found) == 2 and found[0].public_key() == found[1].public_key():
-        text = f"{subject_text(found[0].subject)} does both jobs"
-        settings = keystore.settings
-        chosen = settings is not None and not settings.separate_authorities
-        yield ONE_AUTHORITY.found(
-            "the CAs",
-            text,
-            keystore.shown(ca_certificate(IDENTITY)),
-            accepted=f"template {settings.name}" if settings and chosen else "",
+    if len(found) == 2:
+        yield from one_for_both(
+            keystore, found[0], found[1], keystore.shown(ca_certificate(IDENTITY))
         )
+
+
+def one_for_both(
+    keystore: OpenedKeystore, identity: x509.Certificate, permissions: x509.Certificate, file: str
+) -> Iterator[Finding]:
+    """Whether one CA does both jobs."""
+    if identity.public_key() == permissions.public_key():
+        text = f"{subject_text(identity.subject)} does both jobs"
+        accepted = keystore.accepts(lambda settings: not settings.separate_authorities)
+        yield ONE_AUTHORITY.found("the CAs", text, file, accepted=accepted)
 
 
 def _revocation_list(keystore: OpenedKeystore) -> Iterator[Finding]:

@@ -7,7 +7,7 @@ from datetime import datetime, timedelta
 
 from cryptography import x509
 
-from sros_tool.checks.keystores.authorities import key_findings
+from sros_tool.checks.keystores.authorities import key_findings, one_for_both
 from sros_tool.checks.keystores.loading import check_loading
 from sros_tool.checks.keystores.opened import OpenedEnclave
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
@@ -129,6 +129,11 @@ def check_enclave(enclave: OpenedEnclave) -> Iterator[Finding]:
         yield from _ends(enclave, certificate, grant)
     if grant:
         yield from _rights(enclave, grant)
+    state = enclave.state
+    if not enclave.keystore.is_home and state.identity_ca and state.permissions_ca:
+        file = enclave.file("identity_ca.cert.pem")
+        cas = (state.identity_ca, state.permissions_ca)
+        yield from one_for_both(enclave.keystore, *cas, file)
     yield from _copies(enclave)
 
 
@@ -187,7 +192,7 @@ def _ends_soon(window: Window, now: datetime) -> bool:
 
 
 def _rights(enclave: OpenedEnclave, grant: Grant) -> Iterator[Finding]:
-    file, settings = enclave.file("permissions.p7s"), enclave.keystore.settings
+    file, keystore = enclave.file("permissions.p7s"), enclave.keystore
     allowed = [rule for rule in grant.rules if rule.allow]
     wide = [
         {topic for criteria in criterias for topic in criteria.topics} & _EVERY_TOPIC
@@ -197,16 +202,14 @@ def _rights(enclave: OpenedEnclave, grant: Grant) -> Iterator[Finding]:
         )
     ]
     if all(wide) or (grant.default_allow and not any(not rule.allow for rule in grant.rules)):
-        chosen = settings is not None and settings.default_permissions == "everything"
-        accepted = f"template {settings.name}" if settings and chosen else ""
+        accepted = keystore.accepts(lambda s: s.default_permissions == "everything")
         text = "it may publish and subscribe every topic"
         yield EVERYTHING.found(enclave.name, text, file, accepted=accepted)
     unique = "," in grant.subject or "+" in grant.subject
     window = grant.validity
     length = window.not_after - window.not_before
     if length > _LONG and not unique:
-        chosen = settings is not None and _is_as_long(settings.permissions_validity, length)
-        accepted = f"template {settings.name}" if settings and chosen else ""
+        accepted = keystore.accepts(lambda s: _is_as_long(s.permissions_validity, length))
         text = f"they are valid from {iso(window.not_before)} to {iso(window.not_after)}"
         yield LONG_PERMISSIONS.found(enclave.name, text, file, accepted=accepted)
 

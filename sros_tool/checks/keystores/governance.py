@@ -149,7 +149,8 @@ def governance_findings(
     keystore: OpenedKeystore, governance: Governance, file: str
 ) -> Iterator[Finding]:
     """What a governance document leaves open; ``file`` is where it stands."""
-    accepted = _chosen(keystore, governance)
+    domains = governance.domains().closed()
+    accepted = keystore.accepts(lambda s: governance == governance_for(s.protection, domains))
     for rule in governance.domain_access_rules:
         subject = f"domain {rule.domains}"
         for kind, text in (*_domain_rule(rule), *_topic_rules(rule)):
@@ -157,15 +158,6 @@ def governance_findings(
         for problem in domain_problems(rule.domains):
             yield DOMAIN_RANGE.found(subject, f"the range {problem}", file)
     yield from _copy(keystore)
-
-
-def _chosen(keystore: OpenedKeystore, governance: Governance) -> str:
-    """The template, if the governance is just what it asks for."""
-    settings = keystore.settings
-    if settings is None:
-        return ""
-    expected = governance_for(settings.protection, governance.domains().closed())
-    return f"template {settings.name}" if governance == expected else ""
 
 
 def _domain_rule(rule: DomainRule) -> Iterator[tuple[Kind, str]]:

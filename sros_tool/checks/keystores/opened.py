@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
@@ -65,6 +66,15 @@ class OpenedKeystore:
     def is_home(self) -> bool:
         """Whether it has a place for CAs; else it was exported for a robot."""
         return any((self.root / part).exists() for part in (PUBLIC, PRIVATE, SETTINGS))
+
+    def accepts(self, chosen: Callable[[Template], bool]) -> str:
+        """Who accepted what was ``chosen``: a template, or the keystore of which this is an export.
+
+        "" where nobody did, by its settings, or in a keystore of ros2/sros2, which has none.
+        """
+        if self.settings:
+            return f"template {self.settings.name}" if chosen(self.settings) else ""
+        return "" if self.is_home else "keystore that it was exported from"
 
     def shown(self, path: str | Path) -> str:
         """A path below the root as it is told."""
