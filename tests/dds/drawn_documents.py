@@ -228,6 +228,8 @@ class _Draw:
         default = f"<default>{'ALLOW' if self.seldom(0.2) else 'DENY'}</default>"
         if self.odd == "no default":
             default = ""
+        if self.odd == "empty default":
+            default = "<default></default>"
         if self.odd == "spaced default":
             default = default.replace(">A", "> A").replace(">D", "> D")
         body = [f"<subject_name>{self.granted()}</subject_name>", self.validity(), *rules, default]
@@ -360,6 +362,8 @@ class _Draw:
             return f"<id_range><min>{max(domain - 3, 0)}</min><max>240</max></id_range>"
         if self.odd == "hexadecimal":
             return f"<id>{domain:#x}</id>"
+        if self.odd == "wide id":
+            return f"<id>{2**32 + domain}</id>"
         if self.odd == "empty id":
             return "<id></id>"
         if self.odd == "spaced id":
@@ -396,6 +400,7 @@ _ODDITIES = (
     "spaced flag",
     "spaced governance",
     "no default",
+    "empty default",
     "spaced default",
     "default first",
     "validity first",
@@ -425,5 +430,6 @@ _ODDITIES = (
     "big max",
     "hexadecimal",
     "empty id",
+    "wide id",
     "spaced id",
 )

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from lxml import etree
 
 from sros_tool.dds.decision import (
+    REASONS,
     Access,
     Decision,
     Outcome,
@@ -47,7 +48,7 @@ def decisions(vendor: Vendor, case: Case) -> list[Decision]:
 @given(cases(), st.sampled_from(Vendor))
 def test_every_question_has_an_answer_with_its_reason(case: Case, vendor: Vendor) -> None:
     for answer in decisions(vendor, case):
-        assert answer.reason
+        assert answer.reason in REASONS
         assert answer.text.startswith(vendor.title)
         assert answer.text.endswith(".")
         if answer.reason in ("allow-rule", "deny-rule") and answer.expression is not None:

@@ -5,11 +5,12 @@ Cyclone DDS 0.10.2 really do; OpenDDS and Connext are as documented.
 """
 
 from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import Decision, Outcome, Refusal, Verb
+from sros_tool.dds.decision.answers import REASONS, Decision, Outcome, Refusal, Verb
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
 from sros_tool.dds.decision.vendors import TRAITS, Traits, Vendor
 
 __all__ = [
+    "REASONS",
     "TRAITS",
     "Access",
     "Decision",

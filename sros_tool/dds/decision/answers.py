@@ -39,9 +39,9 @@ class Outcome(StrEnum):
 class Decision:
     """An outcome and what decided it.
 
-    ``reason`` is a stable word for programs, ``text`` a sentence for people.  ``grant`` is an
-    index in the permissions, ``rule`` one in the grant, ``expression`` the ``<topic>`` that
-    matched, ``topic_rule`` what the governance says of the topic.
+    ``reason`` is a stable word for programs (one of `REASONS`), ``text`` a sentence for people.
+    ``grant`` is an index in the permissions, ``rule`` one in the grant, ``expression`` the
+    ``<topic>`` that matched, ``topic_rule`` what the governance says of the topic.
     """
 
     outcome: Outcome
@@ -51,6 +51,29 @@ class Decision:
     rule: int | None = None
     expression: str | None = None
     topic_rule: TopicRule | None = None
+
+
+REASONS = {
+    "allow-rule": "an allow rule matches",
+    "deny-rule": "a deny rule matches",
+    "partition": "the rule that decides does not name the partitions",
+    "default": "no rule matches, and the default of the grant counts",
+    "no-rule": "no rule allows it, and no default counts",
+    "unrestricted": "the governance does not control this access",
+    "no-topic-rule": "no topic rule of the governance matches the topic",
+    "domain-not-in-governance": "no domain rule of the governance lists the domain",
+    "peer-refuses-participant": "peers do not accept the participant on this domain",
+    "no-grant": "no grant names the subject",
+    "not-yet-valid": "the grant of the subject begins later",
+    "expired": "the grant of the subject has ended",
+    "malformed": "the vendor does not accept a document",
+    "unauthenticated-with-rtps-protection": "the governance contradicts itself",
+    "invalid-name": "the vendor does not accept the name of the topic",
+    "open-range": "a range of domains without <min> ends the process",
+    "empty-topic": "an expression without text ends the process",
+    "empty-default": "a default without text ends the process",
+}
+"""Every reason and its meaning."""
 
 
 @dataclass(frozen=True, slots=True)
