@@ -161,14 +161,23 @@ def fastdds_oracle(folder: Path) -> Path:
     return program
 
 
-def ask_fastdds(workshop: Workshop, cases: Sequence[Case], *, at_once: int = 2) -> list[Reply]:
-    """What Fast DDS does with each case; a process answers many, and a new one follows a crash."""
+def ask_fastdds(
+    workshop: Workshop,
+    cases: Sequence[Case],
+    *,
+    at_once: int = 2,
+    seconds: float = MATCH_SECONDS,
+) -> list[Reply]:
+    """What Fast DDS does with each case; a process answers many, and a new one follows a crash.
+
+    A match is waited for so many seconds.
+    """
     program = fastdds_oracle(workshop.root)
-    lines = [_line(workshop, case) for case in cases]
+    lines = [_line(workshop, case, seconds) for case in cases]
     return _spread(lines, at_once, lambda some: _ask_one_program(program, some))
 
 
-def _line(workshop: Workshop, case: Case) -> str:
+def _line(workshop: Workshop, case: Case, seconds: float) -> str:
     peer = ["-", "-"]
     if case.peer:
         documents = workshop.documents(case.governance, PEER_PERMISSIONS)
@@ -180,7 +189,7 @@ def _line(workshop: Workshop, case: Case) -> str:
         case.domain,
         case.zone,
         *peer,
-        int(MATCH_SECONDS * 1000),
+        int(seconds * 1000),
         *questions,
     ]
     return "\t".join(map(str, fields))
@@ -193,7 +202,7 @@ def _ask_one_program(program: Path, lines: Sequence[str]) -> list[Reply]:
     replies: list[Reply] = []
     while len(replies) < len(lines):
         rest = lines[len(replies) :]
-        limit = 60 + len(rest) * (MATCH_SECONDS + 1)
+        limit = 60 + len(rest) * (4 * MATCH_SECONDS + 1)
         done = subprocess.run(
             command, input="\n".join(rest) + "\n", capture_output=True, text=True, timeout=limit
         )
@@ -212,9 +221,16 @@ def _reply(line: str) -> Reply:
 # ── Cyclone DDS ────────────────────────────────────────────────────────────────────────────
 
 
-def ask_cyclone(workshop: Workshop, cases: Sequence[Case], *, at_once: int = 2) -> list[Reply]:
+def ask_cyclone(
+    workshop: Workshop,
+    cases: Sequence[Case],
+    *,
+    at_once: int = 2,
+    seconds: float = MATCH_SECONDS,
+) -> list[Reply]:
     """What Cyclone DDS does with each case; every participant is a process of its own."""
-    return _spread([_record(workshop, case) for case in cases], at_once, ask_cyclone_records)
+    records = [_record(workshop, case, seconds) for case in cases]
+    return _spread(records, at_once, ask_cyclone_records)
 
 
 def ask_cyclone_records(records: Sequence[dict[str, Any]]) -> list[Reply]:
@@ -229,7 +245,7 @@ def ask_cyclone_records(records: Sequence[dict[str, Any]]) -> list[Reply]:
     return [Reply(each["end"], tuple(each["answers"]), each["log"]) for each in replies]
 
 
-def _record(workshop: Workshop, case: Case) -> dict[str, Any]:
+def _record(workshop: Workshop, case: Case, seconds: float) -> dict[str, Any]:
     peer = None
     if case.peer:
         documents = workshop.documents(case.governance, PEER_PERMISSIONS)
@@ -242,7 +258,7 @@ def _record(workshop: Workshop, case: Case) -> dict[str, Any]:
         "zone": case.zone,
         "questions": [(each.verb, each.topic, each.partitions) for each in case.questions],
         "peer": peer,
-        "seconds": MATCH_SECONDS,
+        "seconds": seconds,
     }
 
 
