@@ -72,8 +72,8 @@ _TOPICS = "".join(
 
 def make(root: Path, *names: str, now: datetime, domain: int = 0) -> None:
     """Make the keystore with some enclaves, as ``ros2 security`` would have at ``now``."""
-    for folder in ("public", "private", "enclaves"):
-        (root / folder).mkdir(parents=True)
+    for part in ("public", "private", "enclaves"):
+        (root / part).mkdir(parents=True)
     authority, key = _certificate("sros2CA", now)
     _write(root / "public/ca.cert.pem", authority, root / "private/ca.key.pem", key)
     for role in ("permissions", "identity"):
