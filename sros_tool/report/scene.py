@@ -236,7 +236,9 @@ class _Placing:
     def _cards(self) -> Iterable[Card]:
         sides = {end for key in self._ties for end in key[:2] if end[0] in "sl"}
         sides |= {f"{'s' if SENDS[right] else 'l'}{node}" for node, right in self._looking}
-        idle = set(self._members) - {side[1:] for side in sides}
+        # Of a group, all enclaves are shown; of its surroundings, only who has to do with it.
+        inner = {node for node in self._members if not node.startswith(":")}
+        idle = (inner or set(self._members)) - {side[1:] for side in sides}
         sides |= {f"s{node}" for node in idle}
         for side in sorted(sides):
             first = side[0] == "s" or f"s{side[1:]}" not in sides

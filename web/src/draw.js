@@ -38,15 +38,14 @@ export function linkText(link, overlay) {
     .join(", ");
 }
 
+// What a card is called: what it is, what stands on it, and all that it stands for.
 function cardText(card, problems) {
-  const what = {
-    enclave: `enclave ${card.members[0]}`,
-    group: `group ${card.lines.join("").replaceAll(" ", "")}`,
-    names: `${KINDS[card.kind]} ${card.members.slice(0, 3).join(", ")}`,
-  }[card.role];
-  const more = card.role === "names" && card.members.length > 3 ? " and more" : "";
-  const level = card.role === "names" ? `, ${LEVELS[card.level]}` : "";
-  return `${what}${more}${level}${problems ? `, ${problems} problems` : ""}`;
+  const what = card.role === "names" ? KINDS[card.kind] : card.role;
+  const seen = [...card.lines, ...card.notes].map((text) => text.trim());
+  const marks = [...[...card.tags].reverse(), ...(problems ? ["!"] : [])];
+  const level = card.role === "names" ? LEVELS[card.level] : problems ? "has problems" : "";
+  const more = card.members.length > 3 ? "and more" : "";
+  return [what, ...seen, ...marks, level, ...card.members.slice(0, 3), more].filter(Boolean).join(" ");
 }
 
 // `choose(card)` is called for a card that was clicked, or chosen by Enter or the space bar.
@@ -178,16 +177,16 @@ function drawCard(group, card, problems) {
   }
   let y = 19;
   for (const text of card.lines) {
-    group.append("text").attr("x", names ? 32 : 12).attr("y", y).text(text);
+    group.append("text").attr("x", names ? 32 : 12).attr("y", y).text(`${text} `);
     y += 16;
   }
   for (const text of card.notes) {
-    group.append("text").attr("class", "small").attr("x", names ? 32 : 12).attr("y", y - 1).text(text);
+    group.append("text").attr("class", "small").attr("x", names ? 32 : 12).attr("y", y - 1).text(`${text} `);
     y += 14;
   }
   [...card.tags].reverse().forEach((tag, number) => {
     const x = card.width - (LOCKS[card.level] ? 32 : 12) - 18 * number;
-    group.append("text").attr("class", "tag").attr("x", x).attr("y", 19).attr("text-anchor", "end").text(tag);
+    group.append("text").attr("class", "tag").attr("x", x).attr("y", 19).attr("text-anchor", "end").text(`${tag} `);
   });
   if (problems) {
     group.append("circle").attr("class", "alarm").attr("cx", card.width - 14).attr("cy", 14).attr("r", 7);

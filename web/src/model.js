@@ -25,7 +25,11 @@ export class Model {
       for (const tie of bundle.ties) this.tiesOf.get(tie.enclave).push({ tie, bundle });
     }
     this.names = data.bundles.flatMap((bundle) =>
-      bundle.names.map((name) => ({ kind: bundle.kind, name, bundle })),
+      bundle.names.map((name) => ({
+        kind: bundle.kind,
+        name,
+        common: bundle.ties.every((tie) => tie.common),
+      })),
     );
     this.names.sort((a, b) => (a.name < b.name ? -1 : a.name > b.name ? 1 : 0));
     this.namespaces = [...new Set(this.names.flatMap(({ name }) => prefixes(name)))].sort();
@@ -35,18 +39,15 @@ export class Model {
     return this.bundleOf.get(`${kind} ${name}`);
   }
 
-  // What a person types, as enclaves and names that hold it; those that begin with it come first.
+  // What a person types, as enclaves and names that hold it, the nearest first; names that only
+  // every node needs come last.
   search(text, most) {
     const wanted = text.trim().toLowerCase();
     if (!wanted) return { enclaves: [], names: [], more: 0 };
-    const rank = (name) => {
-      const at = name.toLowerCase().indexOf(wanted);
-      return at < 0 ? -1 : Math.min(at, 2);
-    };
     const found = (list, nameOf) =>
       list
-        .map((each) => [rank(nameOf(each)), each])
-        .filter(([place]) => place >= 0)
+        .map((each) => [nearness(nameOf(each).toLowerCase(), wanted) + (each.common ? 9 : 0), each])
+        .filter(([rank]) => rank < 99)
         .sort((a, b) => a[0] - b[0])
         .map(([, each]) => each);
     const enclaves = found(this.enclaves, (each) => each.path);
@@ -127,6 +128,14 @@ export class Model {
     }
     return { start, hops, steps };
   }
+}
+
+function nearness(name, wanted) {
+  if (name === wanted || name === `/${wanted}`) return 0;
+  if (!name.includes(wanted)) return 99;
+  if (name.startsWith(wanted) || name.startsWith(`/${wanted}`)) return 1;
+  if (name.slice(name.lastIndexOf("/") + 1).startsWith(wanted)) return 2;
+  return name.includes(`/${wanted}`) ? 3 : 4;
 }
 
 function prefixes(name) {

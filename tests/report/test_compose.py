@@ -1,0 +1,146 @@
+"""Pictures of two sources, groups, and protection."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pictures import edge, group, mobile_robot, source_of
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.policy.minimize import minimize
+from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
+from sros_tool.policy.reader import read_policy
+from sros_tool.report.compose import Context, compose, group_of, overlay
+from sros_tool.report.picture import Level as Shown
+from sros_tool.report.picture import Mark
+from sros_tool.report.protection import protection_of
+from sros_tool.translate import governance_for
+
+
+def test_before_and_after_are_marked_and_listed(tmp_path: Path) -> None:
+    before = source_of(tmp_path, {"/a": group("topics", "publish", "/x", "/gone")}, "old.xml")
+    after = source_of(tmp_path, {"/a": group("topics", "publish", "/x", "/new")}, "new.xml")
+    picture = overlay(before, after, "change")
+    marks = {e.name: e.mark for e in picture.edges}
+    assert marks == {"/x": Mark.BOTH, "/gone": Mark.FIRST, "/new": Mark.SECOND}
+    assert [(d.mark, d.text) for d in picture.differences] == [
+        (Mark.FIRST, "/a ALLOW publish topic /gone"),
+        (Mark.SECOND, "/a ALLOW publish topic /new"),
+    ]
+    assert picture.title == "old.xml and new.xml"
+
+
+def test_a_wildcard_that_became_names_is_a_difference_though_nothing_moved(tmp_path: Path) -> None:
+    before = source_of(tmp_path, {"/a": group("topics", "publish", "/*")}, "old.xml")
+    after = source_of(tmp_path, {"/a": group("topics", "publish", "/x")}, "new.xml")
+    picture = overlay(before, after, "change")
+    assert edge(picture, "/a", "publish", "/x").mark is Mark.BOTH
+    assert {d.text: d.covered for d in picture.differences} == {
+        "/a ALLOW publish topic /*": (),
+        "/a ALLOW publish topic /x": ("publish topic /*",),
+    }
+
+
+def test_over_privilege_stands_out_and_agrees_with_minimize_policy(tmp_path: Path) -> None:
+    allowed = {
+        "/talker": group("topics", "publish", "/chatter", "/status", "/log*")
+        + group("topics", "subscribe", "/secret", qualifier="DENY"),
+        "/idle": group("topics", "publish", "/other"),
+    }
+    used = {"/talker": group("topics", "publish", "/chatter", "/cmd_vel", "/log1")}
+    first, second = source_of(tmp_path, allowed), source_of(tmp_path, used, "seen.xml")
+    picture = overlay(first, second, "use")
+    marks = {(e.enclave, e.name): e.mark for e in picture.edges}
+    assert marks == {
+        ("/talker", "/chatter"): Mark.BOTH,
+        ("/talker", "/log1"): Mark.BOTH,
+        ("/talker", "/status"): Mark.FIRST,
+        ("/talker", "/cmd_vel"): Mark.SECOND,
+        ("/talker", "/secret"): Mark.BOTH,  # a denial is never observed
+        ("/idle", "/other"): Mark.BOTH,  # nothing is known of it
+    }
+    assert {e.path: e.observed for e in picture.enclaves} == {"/talker": True, "/idle": False}
+    use = minimize(read_policy(tmp_path / "policy.xml"), second.rights).uses[0]
+    talker = [e for e in picture.edges if e.enclave == "/talker" and e.name != "/secret"]
+    assert use.allowed_pairs == sum(e.mark is not Mark.SECOND for e in talker)
+    assert use.observed_pairs == sum(e.mark is Mark.BOTH for e in talker)
+
+
+def test_only_what_both_sides_can_speak_of_is_compared(tmp_path: Path) -> None:
+    both = {"/a": group("topics", "publish", "/x"), "/b": group("topics", "publish", "/y")}
+    policy = source_of(tmp_path, both)
+    enclave = source_of(tmp_path, {"/a": group("topics", "publish", "/x")}, "a.xml")
+    from dataclasses import replace
+
+    picture = overlay(policy, replace(enclave, scope=frozenset({"/a"})), "drift")
+    assert {e.enclave for e in picture.edges} == {"/a"}
+    assert not picture.differences
+
+
+@pytest.mark.parametrize(
+    ("enclave", "group"),
+    [
+        ("/robot/arm/camera", "wrist"),
+        ("/robot/arm", "wrist"),
+        ("/robot/base", "brain"),
+        ("/other/lidar", "/other"),
+        ("/alone", "/"),
+    ],
+)
+def test_enclaves_are_grouped_by_host_or_else_by_namespace(enclave: str, group: str) -> None:
+    assert group_of(enclave, {"/robot": "brain", "/robot/arm": "wrist"}) == group
+
+
+def test_protection_is_the_weakest_of_the_topics_behind_a_name() -> None:
+    open_topics = TopicProtection(data=Level.NONE, metadata=Level.NONE, read_access_control=False)
+    signed = TopicProtection(data=Level.NONE, metadata=Level.SIGN)
+    domain = DomainProtection(
+        rtps=Level.NONE,
+        named=(
+            NamedProtection("topics", "/camera/*", open_topics),
+            NamedProtection("topics", "/dock/_action/status", signed),
+        ),
+    )
+    governance = governance_for(domain, DomainSet.of((0, 0)))
+    shown = {
+        name: protection_of(governance, kind, name)
+        for kind, name in (
+            ("topics", "/camera/image"),
+            ("topics", "/scan"),
+            ("topics", "/*"),
+            ("actions", "/dock"),
+            ("services", "/camera/set"),
+        )
+    }
+    assert {name: each.level for name, each in shown.items()} == {
+        "/camera/image": Shown.NONE,
+        "/scan": Shown.ENCRYPT,
+        "/*": Shown.NONE,  # some of it
+        "/dock": Shown.SIGN,  # of its eight topics one
+        "/camera/set": Shown.ENCRYPT,
+    }
+    assert not shown["/camera/image"].read_control
+    assert shown["/camera/image"].write_control
+
+
+def test_what_protects_whole_messages_protects_every_topic() -> None:
+    domain = DomainProtection(
+        rtps=Level.ENCRYPT_WITH_ORIGIN_AUTHENTICATION,
+        default=TopicProtection(data=Level.NONE, metadata=Level.NONE),
+    )
+    governance = governance_for(domain, DomainSet.of((0, 0)))
+    assert protection_of(governance, "topics", "/x").level is Shown.ENCRYPT
+    assert protection_of(None, "topics", "/x").level is Shown.UNKNOWN
+
+
+def test_hosts_reach_the_picture(tmp_path: Path) -> None:
+    source = source_of(tmp_path, {"/robot/arm": group("topics", "publish", "/x")})
+    picture = compose(source, Context(hosts={"/robot/arm": "wrist"}))
+    assert picture.enclaves[0].group == "wrist"
+
+
+def test_everything_is_sorted() -> None:
+    picture = mobile_robot()
+    assert list(picture.names) == sorted(picture.names, key=lambda n: (n.kind, n.name))
+    assert [e.path for e in picture.enclaves] == sorted(e.path for e in picture.enclaves)

@@ -1,0 +1,144 @@
+"""Every format: the same bytes each time, whole, and nothing of keys or of this machine in it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from harness import sros
+from lxml import etree
+from pictures import HOSTILE, MOBILE_ROBOT, hostile_permissions, mobile_robot
+
+from sros_tool.report.as_json import render_json
+from sros_tool.report.graphs import render_dot, render_mermaid
+from sros_tool.report.scene import scenes_of
+from sros_tool.report.svg import render_svg
+
+pytest_plugins = ["browsing"]
+
+FORMATS = ("html", "svg", "dot", "mermaid", "json")
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize("form", ["svg", "dot", "mermaid", "json"])
+def test_two_runs_write_the_same_bytes(form: str, robot_keystore: Path) -> None:
+    found = set()
+    for seed in ("1", "2"):
+        command = [sys.executable, "-m", "sros_tool", "view", str(robot_keystore), "--format", form]
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            check=True,
+            env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": str(REPOSITORY)},
+        )
+        assert len(done.stdout) > 5000
+        found.add(done.stdout)
+    assert len(found) == 1
+
+
+def test_the_picture_of_the_readme_is_what_its_command_writes(tmp_path: Path) -> None:
+    shown = REPOSITORY / "docs" / "mobile_robot.svg"
+    sros("view", MOBILE_ROBOT, "-o", tmp_path / "mobile_robot.svg").ok()
+    assert (tmp_path / "mobile_robot.svg").read_bytes() == shown.read_bytes()
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_no_key_and_no_path_of_the_machine_is_in_it(form: str, robot_keystore: Path) -> None:
+    shown = sros("view", robot_keystore, "--format", form).ok().out
+    keys = [*robot_keystore.rglob("*key.pem")]
+    assert len(keys) >= 15
+    for path in keys:
+        lines = path.read_text().splitlines()[1:-1]
+        assert lines
+        for line in lines:
+            assert line not in shown, path
+    assert "PRIVATE KEY" not in shown
+    for place in (robot_keystore.parent, Path.home(), REPOSITORY):
+        assert str(place) not in shown
+    assert "robot-keys" in shown
+
+
+def test_a_broken_keystore_is_drawn_all_the_same(robot_keystore: Path, tmp_path: Path) -> None:
+    root = tmp_path / "broken-keys"
+    shutil.copytree(robot_keystore, root, symlinks=True)
+    camera = root / "enclaves" / "mobile_robot" / "camera"
+    (camera / "key.pem").unlink()
+    (camera / "key.pem").symlink_to(tmp_path / "elsewhere" / "key.pem")
+    (camera / "permissions.p7s").write_bytes(b"nonsense")
+    value = json.loads(sros("view", root, "--format", "json").ok().out)
+    found = next(e for e in value["enclaves"] if e["path"] == "/mobile_robot/camera")
+    assert any("key.pem" in problem for problem in found["problems"])
+    assert any(f["severity"] == "error" for f in value["findings"])
+    assert str(tmp_path) not in json.dumps(value)
+
+
+def test_svg_is_whole_xml_without_anything_that_runs_or_loads(tmp_path: Path) -> None:
+    path = tmp_path / "hostile.xml"
+    path.write_text(hostile_permissions())
+    shown = sros("view", path, "--format", "svg", "--all").ok().out
+    root = etree.fromstring(shown.encode())
+    names = {etree.QName(element).localname for element in root.iter(etree.Element)}
+    assert names <= {"svg", "title", "style", "defs", "marker", "path", "rect", "text", "g"}
+    attributes = {name for element in root.iter(etree.Element) for name in element.attrib}
+    assert not any(name.startswith("on") or "href" in name for name in attributes)
+    texts = "".join(root.itertext())
+    assert HOSTILE[0] in texts  # as text, and all of it
+
+
+def test_dot_can_hold_any_name(tmp_path: Path) -> None:
+    path = tmp_path / "hostile.xml"
+    path.write_text(hostile_permissions())
+    shown = sros("view", path, "--format", "dot").ok().out
+    # Outside of quoted strings nothing is left of the names.
+    plain = re.sub(r'"(?:[^"\\]|\\.)*"', "", shown)
+    assert re.fullmatch(r"[\w\s\[\]{}=,.;#>/-]*", plain), plain
+    if shutil.which("dot"):
+        subprocess.run(["dot", "-Tsvg"], input=shown, text=True, check=True, capture_output=True)
+
+
+def test_mermaid_holds_no_letter_of_markup_in_a_label(tmp_path: Path) -> None:
+    path = tmp_path / "hostile.xml"
+    path.write_text(hostile_permissions())
+    shown = sros("view", path, "--format", "mermaid").ok().out
+    for label in re.findall(r'"([^"]*)"', shown):
+        assert re.fullmatch(r"(?:<br/>|#\d+;|[A-Za-z0-9 /_.,:+-])*", label), label
+
+
+def test_json_is_complete() -> None:
+    picture = mobile_robot()
+    value = json.loads(render_json(picture))
+    assert len(value["edges"]) == len(picture.edges)
+    scan = [e for e in value["edges"] if e["name"] == "/scan" and e["right"] == "publish"]
+    assert [(e["enclave"], e["direction"], e["qualifier"]) for e in scan] == [
+        ("/mobile_robot/lidar", "to the name", "ALLOW")
+    ]
+    assert set(value) >= {"enclaves", "names", "validities", "findings", "overlay", "origins"}
+
+
+def test_graphs_hold_every_card_and_link_once() -> None:
+    picture = mobile_robot()
+    scene = scenes_of(picture)[0]
+    nodes = {card.id if card.role == "names" else card.id[1:] for card in scene.cards}
+    dot = render_dot(picture, scene)
+    assert dot.count(" -> ") == len(scene.links)
+    assert len(re.findall(r"^ +\"[^\"]+\" \[label", dot, re.M)) == len(nodes)
+    mermaid = render_mermaid(picture, scene)
+    assert mermaid.count('|"') == len(scene.links)
+    assert "DENY subscribe" in dot and "DENY subscribe" in mermaid
+    assert "arrowhead=tee" in dot and "--x" in mermaid
+
+
+def test_svg_draws_every_name_of_the_scene() -> None:
+    picture = mobile_robot()
+    scene = scenes_of(picture)[0]
+    root = etree.fromstring(render_svg(picture, scene).encode())
+    texts = {element.text for element in root.iter("{*}text")}
+    for card in scene.cards:
+        assert set(card.lines) <= texts
+        assert set(card.notes) <= texts

@@ -1,0 +1,395 @@
+"""The page in a real browser: from disk, without a network, by mouse and by keyboard."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from harness import sros
+from pictures import HOSTILE, MOBILE_ROBOT, group, hostile_permissions, large_policy
+
+from sros_tool.explain.flow import OF_EVERY_NODE, Network
+from sros_tool.policy.reader import read_policy
+from sros_tool.policy.rights import policy_rights
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+pytest_plugins = ["browsing"]
+
+pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+SIZES = {"desk": (1440, 900), "phone": (390, 844)}
+
+
+@contextmanager
+def opened(browser: Browser, path: Path, **options: Any) -> Iterator[Page]:
+    """The page, opened from disk; afterwards nothing may have failed, or have been asked for."""
+    said: list[str] = []
+    asked: list[str] = []
+    page = browser.new_page(**{"viewport": {"width": 1440, "height": 900}, **options})
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    try:
+        page.goto(path.as_uri())
+        page.wait_for_selector("body[data-ready]")
+        yield page
+        assert not said
+        assert set(asked) == {path.as_uri()}
+    finally:
+        page.close()
+
+
+@pytest.fixture(scope="module")
+def robot_page(robot_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("page") / "robot.html"
+    sros("view", robot_keystore, "-o", path).ok()
+    return path
+
+
+def details(page: Page) -> str:
+    return page.inner_text("#details")
+
+
+def texts(page: Page, selector: str) -> set[str]:
+    return {text.strip() for text in page.locator(selector).all_text_contents()}
+
+
+def lines(page: Page) -> int:
+    return page.locator("#map path.link").count()
+
+
+def test_search_finds_enclaves_and_names_and_shows_who_may_do_what(
+    browser: Browser, robot_page: Path
+) -> None:
+    with opened(browser, robot_page) as page:
+        page.fill("#search", "velocity_m")
+        assert "/mobile_robot/velocity_mux" in page.inner_text("#results button >> nth=0")
+        page.fill("#search", "cmd_vel")
+        found = page.locator("#results button").all_inner_texts()
+        assert [each.split("\n")[-1] for each in found] == [
+            "/cmd_vel",
+            "/cmd_vel_nav",
+            "/cmd_vel_teleop",
+        ]
+        page.click("#results button:has-text('/cmd_vel') >> nth=0")
+        text = details(page)
+        assert "May publish (1)" in text and "/mobile_robot/velocity_mux" in text
+        assert "May listen (3)" in text and "/mobile_robot/base" in text
+        assert "encrypted" in text
+        page.fill("#search", "no such thing")
+        assert "Nothing is called so." in page.inner_text("#results")
+
+
+def test_an_enclave_tells_its_rights_certificate_validity_and_findings(
+    browser: Browser, robot_page: Path
+) -> None:
+    with opened(browser, robot_page) as page:
+        page.click("#map .card.enclave:has-text('recorder')")
+        text = details(page)
+        for wanted in (
+            "/mobile_robot/recorder",
+            "CN=/mobile_robot/recorder",
+            "days left",
+            "Denied: subscribe (3)",
+            "/front_camera/image_raw",
+            "by /*",
+            "subscribe /* reaches",
+        ):
+            assert wanted in text, wanted
+        # What has nothing to do with it fades.
+        assert page.locator("#map .card.faded").count() > 10
+        page.keyboard.press("Escape")
+        assert page.locator("#details").is_hidden()
+        assert page.locator("#map .faded").count() == 0
+
+
+def test_filters_leave_what_fits(browser: Browser, robot_page: Path) -> None:
+    with opened(browser, robot_page) as page:
+        everything = lines(page)
+        page.select_option("#filter-enclave", "/mobile_robot/velocity_mux")
+        few = lines(page)
+        assert 0 < few < everything
+        assert texts(page, "#map .card.names") == {
+            "/cmd_vel",
+            "/cmd_vel_nav",
+            "/cmd_vel_teleop",
+            "/emergency_stop",
+            "/diagnostics",
+        }
+        page.select_option("#filter-direction", "send")
+        assert 0 < lines(page) < few
+        page.select_option("#filter-protection", "encrypt")
+        assert lines(page) > 0
+        page.click("#back")
+        assert lines(page) == everything
+        page.select_option("#filter-namespace", "/front_camera")
+        shown = " ".join(texts(page, "#map .card.names"))
+        assert "/front_camera/image_raw" in shown and "/scan" not in shown
+        page.select_option("#filter-direction", "deny")
+        assert page.locator("#map path.link.deny").count() == lines(page) > 0
+
+
+@pytest.mark.parametrize(
+    "name", ["/cmd_vel", "/scan", "/navigate_to_pose", "/lifecycle_manager/is_active"]
+)
+@pytest.mark.parametrize("upstream", [True, False], ids=["reaches it", "is reached"])
+def test_the_flow_agrees_with_the_one_that_explain_follows(
+    browser: Browser, robot_page: Path, name: str, upstream: bool
+) -> None:
+    network = Network(policy_rights(read_policy(MOBILE_ROBOT)), without=OF_EVERY_NODE)
+    hops = [hop for enclave in network.enclaves for hop in network.hops(enclave)]
+    distance = {(hop.source if upstream else hop.target): 1 for hop in hops if hop.name == name}
+    for enclave in list(distance):
+        reach = network.reach(enclave)
+        for other, path in (reach.learns_from if upstream else reach.influences).items():
+            distance[other] = min(distance.get(other, 99), 1 + len(path))
+    assert len(distance) > 1
+    with opened(browser, robot_page) as page:
+        page.fill("#search", name)
+        page.keyboard.press("Enter")
+        assert page.inner_text("#details h2") == name
+        page.click("text=What reaches it" if upstream else "text=What it reaches")
+        summary = page.inner_text("#summary")
+        found = re.search(r"(\d+) enclaves? can .* within 2 hops(?:, (\d+) over)?", summary)
+        assert found, summary
+        assert int(found[1]) == sum(hops <= 2 for hops in distance.values())
+        assert int(found[2] or found[1]) == len(distance)
+
+
+def test_hops_can_be_added_up_to_all(browser: Browser, robot_page: Path) -> None:
+    with opened(browser, robot_page) as page:
+        page.fill("#search", "/cmd_vel")
+        page.keyboard.press("Enter")
+        page.click("text=What reaches it")
+        assert "4 enclaves can reach /cmd_vel within 2 hops" in page.inner_text("#summary")
+        assert page.locator("#map .card.enclave").count() == 4
+        page.click("#hops-less")
+        assert page.locator("#map .card.enclave").count() == 1
+        for _ in range(6):
+            page.click("#hops-more")
+        assert page.locator("#map .card.enclave").count() == 13
+        page.click("#back")
+        assert page.locator("#hops").is_hidden()
+
+
+def test_the_timeline_holds_everything_that_ends(browser: Browser, robot_page: Path) -> None:
+    with opened(browser, robot_page) as page:
+        page.click("#tab-timeline")
+        text = page.inner_text("#timeline")
+        assert "identity CA" in text and "permissions CA" in text and "revocation list" in text
+        assert page.locator("#timeline tbody tr").count() == 13 + 13 + 2 + 1
+        ends = page.locator("#timeline time").all_inner_texts()
+        assert ends == sorted(ends)
+        page.click("#timeline button:has-text('/mobile_robot/camera') >> nth=0")
+        assert page.locator("#panel-map").is_visible()
+        assert "/mobile_robot/camera" in details(page)
+
+
+def test_what_ended_is_seen_on_the_day_on_which_one_looks(
+    browser: Browser, robot_page: Path
+) -> None:
+    with opened(browser, robot_page) as page:
+        page.click("#tab-timeline")
+        assert page.locator("#timeline .chip.error").count() == 0
+        page.clock.install(time="2039-01-01T00:00:00Z")
+        page.reload()
+        page.wait_for_selector("body[data-ready]")
+        page.click("#tab-timeline")
+        assert page.locator("#timeline .chip.error").count() >= 26
+
+
+def test_everything_can_be_done_with_the_keyboard(browser: Browser, robot_page: Path) -> None:
+    with opened(browser, robot_page) as page:
+        page.keyboard.press("/")
+        page.keyboard.type("teleop")
+        page.keyboard.press("ArrowDown")
+        page.keyboard.press("Enter")
+        assert page.evaluate("document.activeElement.textContent") == "/mobile_robot/teleop"
+        page.keyboard.press("Escape")
+        assert "card" in page.evaluate("document.activeElement.getAttribute('class')")
+        first = page.evaluate("document.activeElement.getAttribute('aria-label')")
+        page.keyboard.press("ArrowDown")
+        second = page.evaluate("document.activeElement.getAttribute('aria-label')")
+        page.keyboard.press("ArrowRight")
+        third = page.evaluate("document.activeElement.getAttribute('aria-label')")
+        assert first.startswith("enclave ") and second.startswith("enclave ") and first != second
+        assert third.startswith(("topic ", "service ", "action "))
+        page.keyboard.press("Enter")
+        assert page.locator("#details").is_visible()
+        page.keyboard.press("Escape")
+        page.focus("#tab-map")
+        page.keyboard.press("ArrowRight")
+        assert page.locator("#panel-timeline").is_visible()
+        page.keyboard.press("ArrowRight")
+        assert page.locator("#panel-findings").is_visible()
+
+
+def test_tab_leads_through_every_control_and_out_of_the_map(
+    browser: Browser, robot_page: Path
+) -> None:
+    with opened(browser, robot_page) as page:
+        seen = []
+        for _ in range(20):
+            page.keyboard.press("Tab")
+            seen.append(
+                page.evaluate("document.activeElement.id || document.activeElement.tagName")
+            )
+        wanted = ["theme", "print", "tab-map", "search", "filter-enclave", "zoom-in", "canvas", "g"]
+        # One stop for all cards, where the arrow keys do the rest; then the page begins again.
+        assert [each for each in seen if each in wanted][: len(wanted)] == wanted
+        assert seen[seen.index("g") + 1] not in ("g", "canvas")
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_axe_finds_nothing(browser: Browser, robot_page: Path, built: Path, size: str) -> None:
+    axe = (built / "node_modules/axe-core/axe.min.js").read_text()
+    viewport = dict(zip(("width", "height"), SIZES[size], strict=True))
+    with opened(browser, robot_page, viewport=viewport) as page:
+        page.evaluate(axe)
+
+        def check(where: str, **options: object) -> None:
+            options = {"resultTypes": ["violations"], **options}
+            result = page.evaluate("options => axe.run(document, options)", options)
+            found = [
+                (each["id"], each["nodes"][0]["html"][:150], each["nodes"][0]["failureSummary"])
+                for each in result["violations"]
+            ]
+            assert not found, (where, found)
+            assert any(each["id"] == "color-contrast" for each in result["passes"])
+
+        def check_contrast(where: str) -> None:
+            for theme in ("light", "dark"):
+                page.select_option("#theme", theme)
+                check(f"{where}, {theme}", runOnly=["color-contrast"])
+
+        check("map")
+        check_contrast("map")
+        page.fill("#search", "cmd_vel")
+        page.click("#results button >> nth=0")
+        page.fill("#search", "cmd_vel")
+        check("search and details")
+        check_contrast("search and details")
+        page.click("#tab-timeline")
+        check("timeline")
+        check_contrast("timeline")
+        page.click("#tab-findings")
+        check("findings")
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_no_text_leaves_its_card_and_nothing_is_wider_than_the_window(
+    browser: Browser, robot_page: Path, size: str
+) -> None:
+    width, height = SIZES[size]
+    outside = """() => [...document.querySelectorAll('#map .card')].filter(card => {
+        const box = card.querySelector('rect').getBoundingClientRect();
+        return [...card.querySelectorAll('text')].some(text => {
+            const inner = text.getBoundingClientRect();
+            return inner.right > box.right + 1 || inner.bottom > box.bottom + 1;
+        });
+    }).map(card => card.textContent)"""
+    with opened(browser, robot_page, viewport={"width": width, "height": height}) as page:
+        for scene in ("0", "1"):
+            page.evaluate("document.querySelectorAll('.fold').forEach(f => f.open = true)")
+            page.select_option("#scene", scene)
+            assert page.evaluate(outside) == []
+        page.select_option("#filter-enclave", "/mobile_robot/planner")
+        assert page.evaluate(outside) == []
+        for tab in ("map", "timeline", "findings"):
+            page.click(f"#tab-{tab}")
+            wide = page.evaluate("document.documentElement.scrollWidth")
+            assert wide <= width, tab
+
+
+def test_names_cannot_run_script(browser: Browser, tmp_path: Path) -> None:
+    source = tmp_path / "<img src=x onerror=window.broken=9>.xml"
+    source.write_text(hostile_permissions())
+    path = tmp_path / "page.html"
+    sros("view", source, "-o", path).ok()
+    with opened(browser, path) as page:
+        for text in HOSTILE:
+            page.fill("#search", text[:40])
+            buttons = page.locator("#results button")
+            assert buttons.count() >= 2, text  # the enclave, and names
+            for number in range(buttons.count()):
+                page.fill("#search", text[:40])
+                buttons.nth(number).click()
+                assert text in (page.locator("#details h2").text_content() or "")
+                if page.locator("text=What reaches it").count():
+                    page.click("text=What reaches it")
+                    page.click("#back")
+        for tab in ("timeline", "findings", "map"):
+            page.click(f"#tab-{tab}")
+        assert page.evaluate("window.broken") is None
+        assert page.locator("img, #map script, body > script + script + script").count() == 0
+
+
+def test_the_policy_of_the_page_stops_what_the_escaping_would_miss(
+    browser: Browser, robot_page: Path, tmp_path: Path
+) -> None:
+    broken = tmp_path / "broken.html"
+    hole = "<script>window.broken=1</script><img src=x onerror=window.broken=2></body>"
+    broken.write_text(robot_page.read_text().replace("</body>", hole))
+    page = browser.new_page()
+    page.goto(broken.as_uri())
+    page.wait_for_selector("body[data-ready]")
+    assert page.evaluate("window.broken") is None
+    page.close()
+
+
+def test_a_hundred_enclaves_and_a_thousand_names_open_fast(
+    browser: Browser, tmp_path: Path
+) -> None:
+    source, path = tmp_path / "large.xml", tmp_path / "large.html"
+    source.write_text(large_policy(10, 10, 10))
+    sros("view", source, "-o", path).ok()
+    assert path.stat().st_size < 2_000_000
+    taken = []
+    for _ in range(3):  # whatever else runs on the machine
+        begin = time.perf_counter()
+        with opened(browser, path) as page:
+            taken.append(time.perf_counter() - begin)
+            assert page.locator("#map .card.group").count() >= 10
+            page.click("#map .card.group >> nth=2")
+            assert page.locator("#map .card.enclave").count() >= 10
+            page.fill("#search", "/robot7/part3/t4")
+            page.keyboard.press("Enter")
+            assert "/robot7/part3" in details(page)
+    assert min(taken) < 2, taken
+
+
+def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -> None:
+    from harness import policy_text
+
+    allowed = group("topics", "publish", "/x", "/unused") + group("topics", "subscribe", "/z*")
+    used = group("topics", "publish", "/x", "/forbidden") + group("topics", "subscribe", "/z1")
+    (tmp_path / "robot.xml").write_text(policy_text({"/a": allowed}))
+    (tmp_path / "seen.xml").write_text(policy_text({"/a": used}))
+    path = tmp_path / "use.html"
+    sros("view", tmp_path / "robot.xml", "--observed", tmp_path / "seen.xml", "-o", path).ok()
+    with opened(browser, path) as page:
+        assert page.locator("#map path.link.first").count() == 1
+        assert page.locator("#map path.link.second").count() == 1
+        page.select_option("#filter-mark", "first")
+        assert lines(page) == 1
+        assert "/unused" in texts(page, "#map .card.names").pop()
+        page.click("#map .card.enclave")
+        assert "allowed 3, observed 2" in details(page)
+        page.click("#tab-differences")
+        text = page.inner_text("#differences")
+        assert "allowed, never observed" in text and "observed, not allowed" in text
+
+
+def test_it_prints_every_part(browser: Browser, robot_page: Path) -> None:
+    with opened(browser, robot_page) as page:
+        page.emulate_media(media="print")
+        for part in ("#map", "#timeline", "#findings"):
+            assert page.locator(part).is_visible(), part
+        assert page.locator("#search").is_hidden()
+        assert len(page.pdf()) > 20_000

@@ -1,0 +1,121 @@
+"""A scene tells of every name, overlaps nowhere, and stays readable when there is much."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import pytest
+from pictures import group, large_policy, mobile_robot, picture_of
+
+from sros_tool.policy.reader import read_policy
+from sros_tool.policy.rights import policy_rights
+from sros_tool.report.compose import Source, compose, overlay
+from sros_tool.report.picture import Origin, Picture
+from sros_tool.report.scene import Scene, scenes_of
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory: pytest.TempPathFactory) -> Picture:
+    path = tmp_path_factory.mktemp("large") / "large.xml"
+    path.write_text(large_policy(10, 10, 10))
+    return compose(Source(Origin("large.xml", "policy"), policy_rights(read_policy(path))))
+
+
+def check(scene: Scene) -> None:
+    """Cards do not overlap, stay on the paper, and links end at the edges of their cards."""
+    for column in range(3):
+        cards = sorted((c for c in scene.cards if c.column == column), key=lambda c: c.y)
+        for above, below in itertools.pairwise(cards):
+            assert above.y + above.height < below.y, (above, below)
+    for card in scene.cards:
+        assert card.y >= 0 and card.x >= 0
+        assert card.y + card.height <= scene.height and card.x + card.width <= scene.width
+    boxes = {card.id: card for card in scene.cards}
+    for link in scene.links:
+        source, target = boxes[link.source], boxes[link.target]
+        assert source.column + 1 == target.column
+        assert source.y <= link.y1 <= source.y + source.height
+        assert target.y <= link.y2 <= target.y + target.height
+
+
+def test_every_name_is_drawn_counted_or_left_out_once() -> None:
+    picture = mobile_robot()
+    for scene in scenes_of(picture):
+        check(scene)
+        drawn = [name for card in scene.cards if card.role == "names" for name in card.members]
+        notes = [note for card in scene.cards for note in card.notes if "own:" in note]
+        counted = sum(
+            int(word) for note in notes for word in note.replace(",", "").split() if word.isdigit()
+        )
+        further = [
+            note
+            for card in scene.cards
+            if any("own:" in other for other in card.notes)
+            for note in card.notes
+            if note.split()[-1].startswith("action") and "own:" not in note
+        ]
+        counted += sum(int(note.split()[0]) for note in further)
+        assert len(drawn) == len({(c.kind, n) for c in scene.cards for n in c.members if c.kind})
+        assert len(drawn) + counted == scene.shown
+        assert scene.shown + scene.hidden == len(picture.names)
+
+
+def test_the_one_who_reads_everything_is_told_by_a_letter_and_its_denial_by_a_line() -> None:
+    scene = scenes_of(mobile_robot())[0]
+    assert [(o.enclave, o.right) for o in scene.onlookers] == [
+        ("/mobile_robot/recorder", "subscribe")
+    ]
+    recorder = "l/mobile_robot/recorder"
+    assert [str(link.qualifier) for link in scene.links if recorder == link.target] == ["DENY"]
+    tagged = {name for card in scene.cards if "A" in card.tags for name in card.members}
+    assert "/cmd_vel" in tagged
+    assert "/front_camera/image_raw" not in tagged
+
+
+def test_an_enclave_with_few_wildcards_keeps_its_lines(tmp_path: Path) -> None:
+    picture = picture_of(
+        tmp_path,
+        {
+            "/a": group("topics", "publish", *(f"/t{n}" for n in range(5))),
+            "/b": group("topics", "subscribe", "/*"),
+        },
+    )
+    scene = scenes_of(picture)[0]
+    assert not scene.onlookers
+    assert len(scene.links) == 2  # five topics with the same rights are one card
+
+
+def test_a_hundred_enclaves_are_folded_into_their_groups(large: Picture) -> None:
+    assert len(large.enclaves) == 101
+    assert len(large.names) == 1000
+    scenes = scenes_of(large)
+    for scene in scenes:
+        check(scene)
+        assert len(scene.cards) < 60, scene.id
+    overview, *groups = scenes
+    assert {c.members for c in overview.cards if c.role == "group" and len(c.members) > 1} == {
+        tuple(f"/robot{r}/part{p}" for p in range(10)) for r in range(10)
+    }
+    assert [scene.title for scene in groups] == ["/fleet", *(f"/robot{r}" for r in range(10))]
+    inside = next(scene for scene in groups if scene.title == "/robot4")
+    enclaves = {c.members[0] for c in inside.cards if c.role == "enclave"}
+    assert enclaves == {f"/robot4/part{p}" for p in range(10)}
+    outside = {c.lines[0] for c in inside.cards if c.role == "group"}
+    assert outside == {"/fleet", "/robot3", "/robot5"}
+
+
+def test_what_differs_is_never_folded_into_an_enclave(tmp_path: Path) -> None:
+    from pictures import source_of
+
+    old = source_of(tmp_path, {"/a": group("topics", "publish", "/x", "/own")}, "old.xml")
+    new = source_of(tmp_path, {"/a": group("topics", "publish", "/own")}, "new.xml")
+    scene = scenes_of(overlay(old, new, "change"))[0]
+    assert [c.members for c in scene.cards if c.kind] == [("/x",)]
+
+
+def test_an_empty_policy_has_a_picture(tmp_path: Path) -> None:
+    picture = picture_of(tmp_path, {"/a": ""})
+    scene = scenes_of(picture)[0]
+    check(scene)
+    assert not scene.links
