@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sros_tool.cli.common import complete_template, json_option, now, print_json
+from sros_tool.cli.common import PATH, complete_template, json_option, now, print_json
 
 if TYPE_CHECKING:
     from sros_tool.demo.model import Scenario
@@ -52,7 +52,13 @@ Exit status: 0 if every row is as expected (or skipped with its reason), 1 if no
     metavar="WORD",
     help="Only rows and attacks with WORD in their name; can be repeated.",
 )
-@click.option("--topic", default="/chatter", show_default=True, help="ROS topic to talk on.")
+@click.option(
+    "--keystore",
+    type=PATH,
+    metavar="ROOT",
+    help="Attack a copy of this keystore (with --scenario attacks); it is only read.",
+)
+@click.option("--topic", help="ROS topic to talk on.  [default: /chatter]")
 @click.option(
     "--domain",
     type=int,
@@ -62,9 +68,8 @@ Exit status: 0 if every row is as expected (or skipped with its reason), 1 if no
 )
 @click.option(
     "--template",
-    default="production",
-    show_default=True,
-    help="Keystore template: a name or a TOML file.",
+    default="",
+    help="Keystore template: a name or a TOML file.  [default: production]",
     shell_complete=complete_template,
 )
 @click.option(
@@ -80,17 +85,32 @@ Exit status: 0 if every row is as expected (or skipped with its reason), 1 if no
     metavar="DIR",
     help="Leave keystores, reports and logs in DIR.",
 )
+@click.option(
+    "--summary",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.md",
+    help="Write a page for a reviewer, in Markdown.",
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.svg",
+    help="Draw what security costs (with --scenario governance).",
+)
 @json_option
 def demo(
     backend: str,
     scenarios: tuple[str, ...],
     list_them: bool,
     only: tuple[str, ...],
-    topic: str,
+    keystore: Path | None,
+    topic: str | None,
     domain: int,
     template: str,
     network: str,
     keep: Path | None,
+    summary: Path | None,
+    plot: Path | None,
     as_json: bool,
 ) -> None:
     """Show on a real DDS that nobody hears secured nodes, or gets in, without permission.
@@ -98,6 +118,7 @@ def demo(
     Makes two keystores from the talker and listener policy, starts talkers and listeners with and
     without them, and compares what was expected with what happened. Takes about ten seconds.
     """
+    from sros_tool.atomic import replace_file
     from sros_tool.demo.program import DemoOptions, run_demo
     from sros_tool.demo.scenarios import SCENARIOS, choose_scenarios
     from sros_tool.demo.table import demo_table
@@ -109,14 +130,24 @@ def demo(
     options = DemoOptions(
         scenarios=choose_scenarios(scenarios),
         only=only,
-        template=load_template(template),
+        keystore=keystore,
+        template=load_template(template) if template else None,
         backend=backend,
         topic=topic,
         domain=domain,
         network=network,
         keep=keep,
     )
-    result = run_demo(options, now(), _progress)
+    moment = now()
+    result = run_demo(options, moment, _progress)
+    if plot is not None and result.cost is not None:
+        from sros_tool.demo.plot import cost_plot
+
+        replace_file(plot, cost_plot(result.cost).encode())
+    if summary is not None:
+        from sros_tool.demo.summary import summary_page
+
+        replace_file(summary, summary_page(result, moment).encode())
     if as_json:
         print_json(result.as_json())
     else:

@@ -50,7 +50,7 @@ class Backend:
     @property
     def rows_at_once(self) -> int:
         """How many rows run at the same time: an rclpy node costs some 0.6 s of CPU to start."""
-        return 4 if self.name == RCLPY else 12
+        return 4 if self.name == RCLPY else 16
 
     @property
     def vendor(self) -> Condition | None:

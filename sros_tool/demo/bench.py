@@ -19,7 +19,7 @@ from sros_tool.dds.permissions import (
 )
 from sros_tool.keystore.authority import Authorities, load_authorities
 from sros_tool.keystore.enclave import enclave_path
-from sros_tool.keystore.keyring import IN_KEYSTORE
+from sros_tool.keystore.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.open import load_settings
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, pem
@@ -36,7 +36,7 @@ class Bench:
     """``root`` is the copy that is worked on, ``foreign`` another keystore with the same names.
 
     ``cast`` has the enclave of each part; ``topic`` is the ROS topic that attackers are after,
-    ``domain`` one of the keystore's.
+    ``domain`` one of the keystore's; ``keyring`` says where the keys of the copy's CAs are.
     """
 
     root: Path
@@ -45,15 +45,20 @@ class Bench:
     topic: str
     domain: int
     now: datetime
+    keyring: Keyring = IN_KEYSTORE
 
     def folder(self, part: str) -> Path:
         """The folder of the enclave that plays a part.  Raises `KeyError`."""
         return enclave_path(self.root, self.cast[part])
 
     def authorities(self, root: Path | None = None) -> Authorities:
-        """The CAs, with their keys.  Raises `SrosError` where the keys are not there."""
+        """The CAs, with their keys, of the copy or of another keystore.
+
+        Raises `SrosError` where the keys are not there.
+        """
+        keyring = IN_KEYSTORE if root else self.keyring
         root = root or self.root
-        return load_authorities(root, load_settings(root), IN_KEYSTORE, self.now)
+        return load_authorities(root, load_settings(root), keyring, self.now)
 
     def put(self, part: str, name: str, data: bytes) -> None:
         """Replace a file of an enclave; a link is replaced, not followed."""

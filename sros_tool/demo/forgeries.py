@@ -80,7 +80,7 @@ def _revoke(bench: Bench, part: str) -> None:
     """Revoke an enclave, and issue it anew for the same subject, as its owner would go on."""
     folder = bench.folder(part)
     before = {name: bench.read(part, name) for name in REQUIRED_FILES}
-    revoke(bench.root, [bench.cast[part]], now=bench.now)
+    revoke(bench.root, [bench.cast[part]], now=bench.now, keyring=bench.keyring)
     folder.mkdir(mode=0o700, exist_ok=True)
     for name, data in before.items():
         bench.put(part, name, data)
@@ -225,7 +225,7 @@ def _signed_by_the_ca(bench: Bench) -> None:
 
 def _old_permissions_after_renewal(bench: Bench) -> None:
     old = bench.sign(_wanted(bench))
-    renew(bench.root, [bench.cast["guest"]], now=bench.now)
+    renew(bench.root, [bench.cast["guest"]], now=bench.now, keyring=bench.keyring)
     bench.put("guest", PERMISSIONS, old)
 
 
@@ -331,18 +331,26 @@ def _open_default(template: Template) -> Template:
     return replace(template, default_permissions=EVERYTHING)
 
 
-def in_clear(template: Template) -> Template:
-    """A template with access control and without any protection of messages."""
-    topics = TopicProtection(Level.NONE, Level.NONE, discovery=False, liveliness=False)
-    protection = replace(
-        template.protection,
-        rtps=Level.NONE,
-        discovery=Level.NONE,
-        liveliness=Level.NONE,
-        default=topics,
-        named=(),
-    )
-    return replace(template, protection=protection)
+def protected(level: Level) -> Callable[[Template], Template]:
+    """Templates with access control, and with messages protected by that level everywhere."""
+    discovered = level is not Level.NONE
+
+    def change(template: Template) -> Template:
+        topics = TopicProtection(level, level, discovery=discovered, liveliness=discovered)
+        protection = replace(
+            template.protection,
+            rtps=level,
+            discovery=level,
+            liveliness=level,
+            default=topics,
+            named=(),
+        )
+        return replace(template, protection=protection)
+
+    return change
+
+
+in_clear = protected(Level.NONE)
 
 
 FORGERIES: Mapping[str, Forge] = {
@@ -387,4 +395,7 @@ REMOVALS: Mapping[str, Removal] = {
     "in clear": Removal(_as_it_is, in_clear),
     "strangers allowed": Removal(_weaker_governance),
     "file missing, permissive": Removal(_file_missing),
+    "protection none": Removal(_as_it_is, in_clear),
+    "protection sign": Removal(_as_it_is, protected(Level.SIGN)),
+    "protection encrypt": Removal(_as_it_is, protected(Level.ENCRYPT)),
 }

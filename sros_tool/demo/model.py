@@ -249,7 +249,8 @@ class Scenario:
     """Rows that belong together, and the policy that their enclaves live by.
 
     ``cast`` gives the enclave of each part.  ``policy`` makes the policy for the topic of the
-    demo.  ``measured`` adds the cost of security.
+    demo.  ``measured`` names the protection kinds whose cost is measured; one with
+    ``any_keystore`` can be played in a keystore of the user's.
     """
 
     name: str
@@ -258,4 +259,5 @@ class Scenario:
     cast: Mapping[str, str] = field(default_factory=dict)
     policy: Callable[[str], Policy] | None = None
     unpermitted: tuple[str, ...] = ()
-    measured: bool = False
+    measured: tuple[str, ...] = ()
+    any_keystore: bool = False

@@ -8,6 +8,7 @@ from typing import Final
 
 from sros_tool.errors import UsageError
 from sros_tool.policy import Enclave, Group, Policy, Profile, read_policy
+from sros_tool.policy.model import ALLOW, Profiles
 from sros_tool.resources import policies_dir
 
 DEFAULT_TOPIC: Final = "/chatter"
@@ -22,6 +23,7 @@ GUEST: Final = "/talker_listener/guest"
 GUEST_TOPIC: Final = "/guest_book"
 SERVICE: Final = "/add_two_ints"
 ACTION: Final = "/fibonacci"
+COST_TOPICS: Final = ("/cost_ping", "/cost_pong")
 
 _ROS_TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
 _LONGEST_TOPIC = 200
@@ -80,6 +82,35 @@ def attacked_policy(topic: str) -> Policy:
     service = shipped_policy("add_two_ints.xml").enclaves
     allowed = tuple(each for each in talking.enclaves if not each.path.endswith(_WITHOUT))
     return replace(talking, enclaves=(*allowed, *guests, *service))
+
+
+def shipped_service_policy(_topic: str) -> Policy:
+    """The shipped policy of a service; it has no use for the topic."""
+    return shipped_policy("add_two_ints.xml")
+
+
+def shipped_action_policy(_topic: str) -> Policy:
+    """The shipped policy of an action; it has no use for the topic."""
+    return shipped_policy("fibonacci.xml")
+
+
+def composed_policy(topic: str) -> Policy:
+    """The shipped policy of a container, and of nodes outside that it speaks with."""
+    talking = talking_policy(topic)
+    container = (with_topic(each, topic) for each in shipped_policy("composition.xml").enclaves)
+    service = shipped_service_policy(topic).enclaves
+    return replace(talking, enclaves=(*talking.enclaves, *container, *service))
+
+
+def measured_policy(topic: str) -> Policy:
+    """The talker and listener, and two enclaves whose nodes send messages to and fro."""
+    talking = talking_policy(topic)
+    rights = (("publish", ALLOW), ("subscribe", ALLOW))
+    ends = tuple(
+        Enclave(path, (Profiles((Profile("/", "cost", (Group("topics", rights, COST_TOPICS),)),)),))
+        for path in ("/cost/ping", "/cost/pong")
+    )
+    return replace(talking, enclaves=(*talking.enclaves, *ends))
 
 
 def with_topic(enclave: Enclave, topic: str | None) -> Enclave:

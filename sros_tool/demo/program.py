@@ -6,7 +6,7 @@ import json
 import shutil
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -16,21 +16,25 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
-from sros_tool.demo.backend import AUTO, Backend, choose_backend
+from sros_tool.demo.backend import AUTO, CYCLONE, Backend, choose_backend
 from sros_tool.demo.conditions import conditions
-from sros_tool.demo.isolated import run_isolated
-from sros_tool.demo.model import Row, Scenario
+from sros_tool.demo.cost import UNSECURED, CostResult, Effort, measure_cost
+from sros_tool.demo.given import GivenKeystore, open_given
+from sros_tool.demo.isolated import Tell, run_isolated
+from sros_tool.demo.model import Identity, Row, Scenario
 from sros_tool.demo.policies import DEFAULT_TOPIC, check_topic
 from sros_tool.demo.result import DemoResult, ScenarioResult
 from sros_tool.demo.runner import Limits, Plan, run_plan
 from sros_tool.demo.scenarios.isolation import ISOLATION
 from sros_tool.demo.scenery import Scenery, Setting, build_scenery
-from sros_tool.errors import UsageError
-from sros_tool.keystore.template import Template
+from sros_tool.errors import UnavailableError, UsageError
+from sros_tool.keystore.template import Template, load_template
 from sros_tool.runtime.netns import Isolation, try_isolation
 
 DEFAULT_DOMAIN = 80
 """The rows take this domain and those after it: below 102, where Linux hands out no port."""
+
+DEFAULT_TEMPLATE = "production"
 
 HOST = "host"
 """The choice to stay in the network of the machine."""
@@ -40,21 +44,22 @@ HOST = "host"
 class DemoOptions:
     """What was asked for; ``keep`` is the folder to leave everything in, if any.
 
-    ``only`` leaves those rows whose names contain one of its words.
+    ``keystore`` is one of the user's, to be attacked in a copy.  Without a ``template`` it is the
+    one of that keystore, or production; without a ``topic``, one that fits.  ``only`` leaves those
+    rows whose names contain one of its words.
     """
 
-    template: Template
+    template: Template | None = None
     backend: str = AUTO
-    topic: str = DEFAULT_TOPIC
+    topic: str | None = None
     domain: int = DEFAULT_DOMAIN
     network: str = AUTO
     keep: Path | None = None
     scenarios: tuple[Scenario, ...] = (ISOLATION,)
+    keystore: Path | None = None
     only: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)
-
-
-Tell = Callable[[str], None]
+    effort: Effort = field(default_factory=Effort)
 
 
 def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
@@ -63,58 +68,97 @@ def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
     Raises `UsageError` before anything is made, `UnavailableError` where no DDS enforces
     security, and what making a keystore raises.
     """
-    topic = check_topic(options.topic)
+    given = _given(options)
+    template = options.template or (given.template if given else load_template(DEFAULT_TEMPLATE))
+    topic = options.topic
+    topic = check_topic((given.topic if given else DEFAULT_TOPIC) if topic is None else topic)
     scenarios = [_chosen(scenario, options) for scenario in options.scenarios]
-    domains = [_domains(scenario, options) for scenario in scenarios]
     isolation = _isolation(options.network)
+    domains = [_domains(scenario, options, given, isolation) for scenario in scenarios]
     results: list[ScenarioResult] = []
-    backend: Backend | None = None
     with _ended_by_signals(), _folder(options.keep) as folder:
+        tell("looking for a DDS that enforces security")
+        backend = _find_backend(options.backend, folder, topic, now)
         for scenario, places in zip(scenarios, domains, strict=True):
             under = folder if len(scenarios) == 1 else folder / scenario.name
-            spanned = DomainSet.of((places[0], places[-1]))
-            setting = Setting(topic, spanned, options.template, now)
-            scenery = build_scenery(under, scenario, setting)
-            if backend is None:
-                tell("looking for a DDS that enforces security")
-                backend = choose_backend(options.backend, scenery.probe(topic, places[0]))
+            spanned = given.domains if given else DomainSet.of((places[0], places[-1]))
+            setting = Setting(topic, spanned, template, now)
+            scenery = build_scenery(under, scenario, setting, given)
             tell(
                 f"{scenario.name}: running {len(scenario.rows)} rows on {backend.name}"
                 f" ({backend.dds}): {backend.why}"
             )
-            holding = conditions(backend, options.template, topic)
+            holding = conditions(backend, template, topic)
             scenario = replace(scenario, rows=tuple(row.under(holding) for row in scenario.rows))
-            plan = _plan(options, scenario, places, backend, scenery, topic, under, isolation)
+            plan = Plan(
+                rows=scenario.rows,
+                domains=places,
+                backend=backend,
+                scenery=scenery,
+                topic=topic,
+                folder=under / "rows",
+                limits=options.limits,
+                own_networks=isolation.isolated,
+            )
             rows = run_isolated(partial(run_plan, plan), isolation, tell)
-            results.append(ScenarioResult(scenario.name, scenario.title, tuple(rows)))
-        assert backend is not None
-        result = DemoResult(backend, topic, isolation, options.template.name, tuple(results))
+            cost = None
+            if scenario.measured and backend.name == CYCLONE:
+                cost = run_isolated(
+                    partial(
+                        _measure, scenario, scenery, places[0], under, options.effort, isolation
+                    ),
+                    isolation,
+                    tell,
+                )
+            elif scenario.measured:
+                tell("the cost of security is not measured: that needs --backend cyclone")
+            results.append(ScenarioResult(scenario.name, scenario.title, tuple(rows), cost))
+        result = DemoResult(backend, topic, isolation, template.name, tuple(results))
         if options.keep is not None:
             text = json.dumps(result.as_json(), indent=2) + "\n"
             (folder / "result.json").write_text(text, encoding="utf-8")
     return result
 
 
-def _plan(
-    options: DemoOptions,
+def _find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend:
+    """Try what is here in a keystore that is made for that, and removed again."""
+    with TemporaryDirectory(dir=folder, prefix="probe-") as place:
+        domains = DomainSet.of((DEFAULT_DOMAIN, DEFAULT_DOMAIN))
+        setting = Setting(topic, domains, load_template(DEFAULT_TEMPLATE), now)
+        probed = build_scenery(Path(place), replace(ISOLATION, rows=()), setting)
+        return choose_backend(wish, probed.probe(topic, DEFAULT_DOMAIN))
+
+
+def _measure(
     scenario: Scenario,
-    domains: tuple[int, ...],
-    backend: Backend,
     scenery: Scenery,
-    topic: str,
+    domain: int,
     folder: Path,
+    effort: Effort,
     isolation: Isolation,
-) -> Plan:
-    return Plan(
-        rows=scenario.rows,
-        domains=domains,
-        backend=backend,
-        scenery=scenery,
-        topic=topic,
-        folder=folder / "rows",
-        limits=options.limits,
-        own_networks=isolation.isolated,
-    )
+    tell: Tell,
+) -> CostResult:
+    kinds = {UNSECURED: (Identity(), Identity())}
+    for kind in scenario.measured:
+        label = f"protection {kind}"
+        kinds[kind] = (Identity(label, "pong"), Identity(label, "ping"))
+    place = folder / "cost"
+    return measure_cost(kinds, scenery, domain, place, effort, tell, own_network=isolation.isolated)
+
+
+def _given(options: DemoOptions) -> GivenKeystore | None:
+    """The keystore of the user's.  Raises `UsageError` where a scenario needs one of its own."""
+    if options.keystore is None:
+        return None
+    for scenario in options.scenarios:
+        if not scenario.any_keystore:
+            raise UsageError(
+                f"the scenario {scenario.name} cannot be played in a keystore of yours",
+                "It needs enclaves with rights of its own.",
+                "Use --keystore with --scenario attacks alone.",
+            )
+    topic = "" if options.topic is None else check_topic(options.topic)
+    return open_given(options.keystore, topic, options.scenarios[0])
 
 
 def _chosen(scenario: Scenario, options: DemoOptions) -> Scenario:
@@ -128,7 +172,18 @@ def _asked_for(row: Row, options: DemoOptions) -> bool:
     return any(word.lower() in f"{row.attack} {row.name}".lower() for word in options.only)
 
 
-def _domains(scenario: Scenario, options: DemoOptions) -> tuple[int, ...]:
+def _domains(
+    scenario: Scenario, options: DemoOptions, given: GivenKeystore | None, isolation: Isolation
+) -> tuple[int, ...]:
+    """A domain for each row; a given keystore has its own, which networks of their own part."""
+    if given is not None:
+        if not isolation.isolated:
+            raise UnavailableError(
+                "cannot attack a keystore here",
+                f"Its rows need network namespaces of their own, and there is {isolation.reason}.",
+                "Run it as root, or where unprivileged user namespaces are allowed.",
+            )
+        return (next(iter(given.domains)),) * len(scenario.rows)
     last = MAX_DOMAIN - len(scenario.rows) + 1
     if not 0 <= options.domain <= last:
         raise UsageError(

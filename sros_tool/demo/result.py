@@ -25,6 +25,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sros_tool.demo.backend import Backend
+from sros_tool.demo.cost import CostResult
 from sros_tool.demo.verdict import RowResult
 from sros_tool.runtime.netns import Isolation
 
@@ -36,6 +37,7 @@ class ScenarioResult:
     name: str
     title: str
     rows: tuple[RowResult, ...]
+    cost: CostResult | None = None
 
     @property
     def as_expected(self) -> bool:
@@ -49,7 +51,7 @@ class ScenarioResult:
             "title": self.title,
             "as_expected": self.as_expected,
             "rows": [{**row.as_json(), "scenario": self.name} for row in self.rows],
-            "cost": None,
+            "cost": self.cost.as_json() if self.cost else None,
         }
 
 
@@ -67,6 +69,11 @@ class DemoResult:
     def rows(self) -> tuple[RowResult, ...]:
         """The rows of all scenarios."""
         return tuple(row for scenario in self.scenarios for row in scenario.rows)
+
+    @property
+    def cost(self) -> CostResult | None:
+        """What security costs, where that was measured."""
+        return next((each.cost for each in self.scenarios if each.cost is not None), None)
 
     @property
     def as_expected(self) -> bool:

@@ -31,6 +31,7 @@ _AFTER_ENOUGH = 2.0
 _AFTER_REPLAY = 2.0
 _BRIEFEST = 1.0
 _LONGEST_PAUSE = 0.5
+_ROUNDS = 2
 _SECONDS_TO_END = 2.0
 
 
@@ -151,7 +152,7 @@ class _Stage:
 
     def _start(self, index: int, party: Party, domain: int, folder: Path) -> PartyProcess:
         plan, row = self._plan, self._plan.rows[index]
-        topic = _topic_of(party, plan.topic)
+        topic = plan.scenery.topic(party, plan.topic)
         options = ["--topic", topic, "--period", str(plan.period)]
         text = self._text(index, party)
         if party.role in SPEAKING:
@@ -159,7 +160,7 @@ class _Stage:
         if party.role is Role.OBSERVER:
             for other in row.parties:
                 if other.role is Role.TALKER and other.aside:
-                    options += ["--also", _topic_of(other, plan.topic)]
+                    options += ["--also", plan.scenery.topic(other, plan.topic)]
         environment = base_environment(os.environ)
         secured = bool(party.identity.keystore)
         denied = any(
@@ -238,9 +239,11 @@ class _Stage:
         await _end_softly([talker])
         await asyncio.sleep(_GRACE)
         started = time.monotonic()
-        for before, each in zip([*packets[:1], *packets], packets, strict=False):
-            await asyncio.sleep(min(each.time - before.time, _LONGEST_PAUSE))
-            tap.send(each.packet)
+        # Twice, since the listener may take from the first round only who there is to hear.
+        for _ in range(_ROUNDS):
+            for before, each in zip([*packets[:1], *packets], packets, strict=False):
+                await asyncio.sleep(min(each.time - before.time, _LONGEST_PAUSE))
+                tap.send(each.packet)
         await asyncio.sleep(_AFTER_REPLAY)
         return Replay(len(packets), started)
 
@@ -252,11 +255,6 @@ async def _end_softly(processes: Collection[PartyProcess]) -> None:
     latest = time.monotonic() + _SECONDS_TO_END
     while time.monotonic() < latest and not all(process.gone for process in processes):
         await asyncio.sleep(_TICK)
-
-
-def _topic_of(party: Party, topic: str) -> str:
-    name = party.topic or topic
-    return f"{name}_in_the_open" if party.aside else name
 
 
 def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, PartyProcess]) -> bool:

@@ -10,10 +10,12 @@ from pathlib import Path
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.bench import Bench, copy_keystore
 from sros_tool.demo.forgeries import FORGERIES, REMOVALS
-from sros_tool.demo.model import FOREIGN, OWN, Identity, Scenario
-from sros_tool.demo.policies import DENIED_TOPIC
+from sros_tool.demo.given import GivenKeystore
+from sros_tool.demo.model import FOREIGN, OWN, Identity, Party, Scenario
+from sros_tool.demo.policies import DENIED_TOPIC, SERVICE
 from sros_tool.errors import SrosError
 from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.keyring import IN_KEYSTORE
 from sros_tool.keystore.template import Template
 from sros_tool.runtime.environment import DOMAIN, secured_environment
 from sros_tool.runtime.stacks import ProbeEnclave
@@ -27,13 +29,22 @@ class Scenery:
     """Where the keystores are, by label, and which enclave plays which part.
 
     ``missing`` has the reason for which a keystore could not be made; ``casts`` the parts of
-    those keystores that have other enclaves than the rest.
+    those keystores that have other enclaves than the rest; ``services`` the name of the service
+    in the keystores in which it has another one.
     """
 
     keystores: Mapping[str, Path]
     cast: Mapping[str, str] = field(default_factory=dict)
     missing: Mapping[str, str] = field(default_factory=dict)
     casts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    services: Mapping[str, str] = field(default_factory=dict)
+
+    def topic(self, party: Party, topic: str) -> str:
+        """The ROS name that a party speaks on, where the topic of the demo is ``topic``."""
+        name = party.topic or topic
+        if name == SERVICE:
+            name = self.services.get(party.identity.keystore, name)
+        return f"{name}_in_the_open" if party.aside else name
 
     def enclave(self, identity: Identity) -> str:
         """The enclave of an identity.  Raises `KeyError` where nobody plays its part."""
@@ -77,16 +88,28 @@ class Setting:
     now: datetime
 
 
-def build_scenery(folder: Path, scenario: Scenario, setting: Setting) -> Scenery:
+def build_scenery(
+    folder: Path, scenario: Scenario, setting: Setting, given: GivenKeystore | None = None
+) -> Scenery:
     """Create the keystores of a scenario in ``folder``: its own, a stranger's, and forged ones.
+
+    Its own is a copy of the one that is ``given``, if any.
 
     Raises what the keystore raises: `KeystoreError` and `OSError` among them; a forgery that
     cannot be made, only leaves out the rows in which it is used.
     """
     keystores = {OWN: folder / "keystore", FOREIGN: folder / "another_keystore"}
-    for root in keystores.values():
-        make_keystore(root, scenario, setting)
-    return _with_forgeries(Scenery(keystores, scenario.cast), folder, scenario, setting)
+    make_keystore(keystores[FOREIGN], scenario, setting)
+    if given is None:
+        make_keystore(keystores[OWN], scenario, setting)
+        scenery = Scenery(keystores, scenario.cast)
+    else:
+        given.copy(keystores[OWN])
+        of_its_own = {OWN, *FORGERIES}
+        casts = dict.fromkeys(of_its_own, given.cast)
+        services = dict.fromkeys(of_its_own, given.service or SERVICE)
+        scenery = Scenery(keystores, scenario.cast, casts=casts, services=services)
+    return _with_forgeries(scenery, folder, scenario, setting, given)
 
 
 def make_keystore(root: Path, scenario: Scenario, setting: Setting) -> None:
@@ -99,11 +122,16 @@ def make_keystore(root: Path, scenario: Scenario, setting: Setting) -> None:
 
 
 def _with_forgeries(
-    scenery: Scenery, folder: Path, scenario: Scenario, setting: Setting
+    scenery: Scenery,
+    folder: Path,
+    scenario: Scenario,
+    setting: Setting,
+    given: GivenKeystore | None,
 ) -> Scenery:
     """The scenery with the forged keystores that the rows of the scenario ask for."""
     keystores, missing = dict(scenery.keystores), dict(scenery.missing)
     asked = {party.identity.keystore for row in scenario.rows for party in row.parties}
+    asked |= {f"protection {kind}" for kind in scenario.measured}
     for label in sorted(asked - set(keystores) - {""}):
         root = folder / "forged" / label.replace(" ", "_").replace(",", "")
         bench = Bench(
@@ -113,6 +141,7 @@ def _with_forgeries(
             setting.topic,
             next(iter(setting.domains)),
             setting.now,
+            given.keyring() if given and label in FORGERIES else IN_KEYSTORE,
         )
         try:
             if label in FORGERIES:

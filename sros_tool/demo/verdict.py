@@ -16,6 +16,13 @@ from sros_tool.demo.model import STATUS_OF, Claim, Party, Relation, Role, Row, S
 from sros_tool.runtime.events import Event, Kind, Stage
 from sros_tool.runtime.security_log import endpoint_refusal, missing_security, participant_refusal
 
+_NOISE = re.compile(
+    r"(?:candidate|adjusted)_guid: \S+ |Remote secure participant \S+ not allowed\. ?"
+    r"|[0-9A-F]{16}:error:[0-9A-F]+:[\w ]+:|:\.\./\S+\.c:\d+|\[\w+\] failed: "
+    r"|validate_local_identity: |Error\. (?=Error|validate)"
+)
+"""Of Cyclone DDS and OpenSSL: numbers, and places in their sources."""
+
 
 @dataclass(frozen=True)
 class WireCount:
@@ -237,7 +244,7 @@ def _judge_replay(
     return Finding(
         status,
         f"{claim.subject} heard {again} messages in {replay.packets} packets of the"
-        f" {claim.talker} that were sent again after it had left",
+        f" {claim.talker} that were sent again, twice, after it had left",
     )
 
 
@@ -327,6 +334,7 @@ def _speaks_of(line: str, topic: str) -> bool:
 
 
 def _refused(name: str, stage: Stage | None, reason: str) -> Finding:
+    reason = _NOISE.sub("", reason)
     if stage is Stage.ENDPOINT:
         return Finding(Status.REFUSED, f"{name}: {reason}")
     return Finding(Status.NOT_LET_IN, f"{name} was refused before it came to the topic: {reason}")

@@ -33,6 +33,7 @@ _Value = TypeVar("_Value")
 STRING_TYPE = "std_msgs::msg::dds_::String_"
 
 _NOT_ALLOWED_BY_SECURITY = -13
+_ANY_STATE = 0x7F
 _BUILTIN_PUBLICATIONS = 0x7FFF0000 + 3
 _KEEP_LAST, _RELIABLE, _XCDR1 = 0, 1, 0
 _STRING_OPS = (ctypes.c_uint32 * 3)(0x01 << 24 | 0x05 << 16, 0, 0)
@@ -98,7 +99,7 @@ class Participant:
 
     def reader(self, topic: str) -> Reader:
         """A reliable reader of strings on the DDS topic ``topic`` ("rt/chatter")."""
-        return Reader(self._library, self._endpoint("reader", topic))
+        return Reader(self._library, self._endpoint("reader", topic), self.handle)
 
     def publications(self) -> tuple[Publication, ...]:
         """The writers that this participant knows of, its own among them, sorted."""
@@ -190,9 +191,25 @@ class Writer:
 class Reader:
     """Reads strings; made by `Participant.reader`."""
 
-    def __init__(self, library: CycloneLibrary, handle: int) -> None:
+    def __init__(self, library: CycloneLibrary, handle: int, participant: int) -> None:
         self._library = library
+        self._participant = participant
+        self._waitset = 0
         self.handle = handle
+
+    def wait(self, seconds: float) -> bool:
+        """Sleep until there is something to take, but no longer than ``seconds``."""
+        api = self._library.api
+        if not self._waitset:
+            condition = api.dds_create_readcondition(self.handle, _ANY_STATE)
+            waitset = api.dds_create_waitset(self._participant)
+            if condition < 0 or waitset < 0:
+                raise DdsError(
+                    "cannot wait", describe_return(self._library, min(condition, waitset))
+                )
+            api.dds_waitset_attach(waitset, condition, 0)
+            self._waitset = waitset
+        return bool(api.dds_waitset_wait(self._waitset, None, 0, int(seconds * 1e9)) > 0)
 
     def take(self) -> tuple[str, ...]:
         """The messages that have come since the last call, oldest first."""

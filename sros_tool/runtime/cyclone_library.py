@@ -156,6 +156,13 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
         ctypes.c_int32,
         [_ENTITY, ctypes.c_void_p, ctypes.c_size_t],
     ),
+    "dds_create_waitset": (_ENTITY, [_ENTITY]),
+    "dds_create_readcondition": (_ENTITY, [_ENTITY, ctypes.c_uint32]),
+    "dds_waitset_attach": (ctypes.c_int32, [_ENTITY, _ENTITY, ctypes.c_ssize_t]),
+    "dds_waitset_wait": (
+        ctypes.c_int32,
+        [_ENTITY, ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int64],
+    ),
     "dds_delete": (ctypes.c_int32, [_ENTITY]),
     "dds_set_log_sink": (None, [_LOG_SINK, ctypes.c_void_p]),
 }

@@ -8,6 +8,7 @@ import pytest
 
 from sros_tool.demo.forgeries import FORGERIES, REMOVALS
 from sros_tool.demo.model import DENIALS, FOREIGN, OWN, Condition, Row, Status
+from sros_tool.demo.scenarios import SCENARIOS
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.demo.scenery import Scenery
 
@@ -62,7 +63,8 @@ def test_its_identities_can_be_made(row: Row) -> None:
 
 
 def test_every_forgery_is_used() -> None:
-    used = {party.identity.keystore for row in ROWS for party in row.parties}
+    rows = [row for scenario in SCENARIOS for row in scenario.rows]
+    used = {party.identity.keystore for row in rows for party in row.parties}
     assert set(FORGERIES) | set(REMOVALS) <= used
 
 

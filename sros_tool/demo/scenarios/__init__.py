@@ -5,11 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sros_tool.demo.model import Scenario
+from sros_tool.demo.scenarios.actions import ACTIONS
 from sros_tool.demo.scenarios.attacks import ATTACKS
+from sros_tool.demo.scenarios.composition import COMPOSITION
+from sros_tool.demo.scenarios.governance import GOVERNANCE
 from sros_tool.demo.scenarios.isolation import ISOLATION
+from sros_tool.demo.scenarios.services import SERVICES
 from sros_tool.errors import UsageError
 
-SCENARIOS: tuple[Scenario, ...] = (ISOLATION, ATTACKS)
+SCENARIOS: tuple[Scenario, ...] = (
+    ISOLATION,
+    SERVICES,
+    ACTIONS,
+    COMPOSITION,
+    ATTACKS,
+    GOVERNANCE,
+)
 DEFAULT_SCENARIO = ISOLATION.name
 ALL = "all"
 

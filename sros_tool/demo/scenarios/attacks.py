@@ -747,4 +747,5 @@ ATTACKS = Scenario(
     },
     attacked_policy,
     unpermitted=("/talker_listener/newcomer",),
+    any_keystore=True,
 )

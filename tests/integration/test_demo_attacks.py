@@ -1,0 +1,160 @@
+"""The attacks over a real DDS: all of them in a sound keystore, and some in weak ones."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from harness import snapshot, sros
+from test_demo_run import processes_with, start
+from weak_keystores import WEAKNESSES, make_weak
+
+from sros_tool.demo.isolated import run_isolated
+from sros_tool.demo.network import RowNetwork
+from sros_tool.demo.scenarios.attacks import ATTACKS
+from sros_tool.errors import UnavailableError
+from sros_tool.runtime.cyclone_library import load_cyclone
+from sros_tool.runtime.netns import try_isolation
+
+pytestmark = pytest.mark.dds
+
+ISOLATION = try_isolation()
+needs_isolation = pytest.mark.skipif(not ISOLATION.isolated, reason=ISOLATION.reason)
+CONTROLS = ("identity of another CA", "permissions edited", "an unsecured node injects")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _needs_cyclone() -> None:
+    try:
+        load_cyclone.cache_clear()
+        load_cyclone()
+    except UnavailableError as error:
+        pytest.skip(str(error))
+
+
+def demo(*arguments: str, folder: Path) -> subprocess.Popen[str]:
+    return start("demo", "--backend", "cyclone", "--scenario", "attacks", *arguments, folder=folder)
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], int, Path]:
+    folder = tmp_path_factory.mktemp("attacks")
+    summary = folder / "summary.md"
+    temporary = folder / "tmp"
+    temporary.mkdir()
+    process = demo("--json", "--summary", str(summary), folder=temporary)
+    output, errors = process.communicate(timeout=170)
+    assert not errors
+    assert not list(temporary.iterdir())
+    return json.loads(output), process.returncode, summary
+
+
+def test_every_attack_ends_as_expected(shown: tuple[dict[str, Any], int, Path]) -> None:
+    result, status, _ = shown
+    assert not [row for row in result["rows"] if not row["as_expected"]]
+    assert status == 0
+    assert [row["name"] for row in result["rows"]] == [row.name for row in ATTACKS.rows]
+    skipped = {row["name"]: row["detail"] for row in result["rows"] if row["observed"] == "skipped"}
+    if ISOLATION.isolated and os.geteuid() == 0:
+        assert not skipped
+    observed = {row["name"]: row["observed"] for row in result["rows"]}
+    assert observed["packets of an unsecured talker sent again"] in ("heard again", "skipped")
+    assert observed["packets of a secured talker sent again"] in ("not heard again", "skipped")
+    assert observed["permissions signed by the enclave itself"] == "not let in"
+    assert observed["permissions signed by the enclave itself, one CA"] == "heard"
+    open_doors = {row["name"] for row in result["rows"] if row["open_because"]}
+    assert "old permissions put back" in open_doors
+    assert all(row["remedy"] for row in result["rows"] if row["open_because"])
+
+
+@needs_isolation
+def test_a_weakness_makes_its_rows_fail_and_no_others(tmp_path: Path) -> None:
+    """All keystores at once: rows mostly wait."""
+    running: dict[str, subprocess.Popen[str]] = {}
+    for name, weakness in WEAKNESSES.items():
+        folder = tmp_path / name.replace(" ", "_")
+        root = make_weak(folder, weakness, datetime.now(UTC))
+        before = snapshot(root)
+        words = [word for row in (*weakness.broken, *CONTROLS) for word in ("--only", row)]
+        running[name] = demo(
+            *("--template", "production", "--keystore", str(root), "--json", *words), folder=folder
+        )
+        assert snapshot(root) == before
+    for name, process in running.items():
+        output, errors = process.communicate(timeout=120)
+        assert not errors
+        assert process.returncode == 1
+        rows = json.loads(output)["rows"]
+        wrong = {row["name"]: row["observed"] for row in rows if not row["as_expected"]}
+        skipped = {row["name"] for row in rows if row["observed"] == "skipped"}
+        if skipped:
+            assert skipped == {"identity copied by another user of the robot"}
+            assert os.geteuid() != 0
+            continue
+        assert set(wrong) == WEAKNESSES[name].broken, (name, rows)
+        assert set(wrong.values()) <= {"heard", "answered", "readable"}
+        assert {row["name"] for row in rows} >= set(CONTROLS)
+
+
+@needs_isolation
+def test_interrupted_attacks_leave_nothing(tmp_path: Path) -> None:
+    process = demo(folder=tmp_path)
+    deadline = time.monotonic() + 60
+    while len(list(tmp_path.glob("sros-demo-*/rows/row_*/*.jsonl"))) < 10:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert "Traceback" not in errors
+    assert list(tmp_path.iterdir()) == []
+    assert not processes_with(str(tmp_path))
+
+
+def _networks() -> Iterator[int]:
+    for link in Path("/proc").glob("[0-9]*/ns/net"):
+        try:
+            yield link.stat().st_ino
+        except OSError:
+            continue
+
+
+@needs_isolation
+def test_the_network_of_a_row_ends_with_it() -> None:
+    def work(_tell: Any) -> tuple[int, int, bool, bool]:
+        here = Path("/proc/self/ns/net").stat().st_ino
+        network = RowNetwork(own=True)
+        with network.entered():
+            there = Path("/proc/thread-self/ns/net").stat().st_ino
+            child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+        network.close()
+        alive = there in set(_networks())
+        child.communicate(b"\n")
+        same = Path("/proc/thread-self/ns/net").stat().st_ino == here
+        return here, there, alive and same, there in set(_networks())
+
+    here, there, alive, left = run_isolated(work, ISOLATION, print)
+    assert here != there
+    assert alive
+    assert not left
+
+
+def test_a_keystore_in_which_nobody_talks(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    assert sros("create_keystore", root, "--template", "production").status == 0
+    assert sros("create_enclave", root, "/a", "/b").status == 0
+    ended = sros("demo", "--scenario", "attacks", "--keystore", root)
+    assert ended.status == 1
+    assert "no two enclaves" in ended.err
+    ended = sros("demo", "--keystore", root)
+    assert ended.status == 2
+    assert "isolation" in ended.err
