@@ -117,6 +117,8 @@ def test_the_standard_reads_what_its_schema_allows(document: str) -> None:
         root = etree.fromstring(xml)
         if any(not grant.xpath("allow_rule|deny_rule") for grant in root.iter("grant")):
             continue  # the schema in use here asks for a rule where that of the standard does not
+        if any(len(each.text or "") > 9 for each in root.iter("id")):
+            continue  # sros reads no such numbers
         for moment in (*root.iter("not_before"), *root.iter("not_after")):
             moment.text = (moment.text or "").strip()  # libxml2 forgets to collapse blanks
         valid = schema.validate(root)

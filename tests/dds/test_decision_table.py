@@ -268,6 +268,16 @@ ROWS = [
     Row("from 40 on, permissions", one(allow(A, domains=OPEN_END)), "yes peer peer refused"),
     Row("up to 50, permissions", one(allow(A, domains=OPEN_TOP)), "yes yes yes crash"),
     Row(
+        "a rule, then one up to 50",
+        one(allow(A), deny(B, domains=OPEN_TOP)),
+        "yes yes yes crash",
+    ),
+    Row(
+        "two rules, then one up to 50",
+        one(allow(A), allow(B), deny(B, domains=OPEN_TOP)),
+        "yes yes yes yes",
+    ),
+    Row(
         "up to 240, permissions",
         one(allow(A, domains="<id_range><min>40</min><max>240</max></id_range>")),
         "yes yes yes refused",
