@@ -8,6 +8,7 @@ from fnmatch import fnmatchcase
 
 from sros_tool.checks.keystores import (
     authorities,
+    certificates,
     documents,
     enclaves,
     governance,
@@ -23,8 +24,8 @@ from sros_tool.errors import UsageError
 
 _MODULES = (
     files, rules, nodes, naming, portability,
-    keystore_files, authorities, loading, enclaves, documents, governance, issued, vendors,
-    variables, host,
+    keystore_files, authorities, certificates, loading, enclaves, documents, governance, issued,
+    vendors, variables, host,
 )  # fmt: skip
 
 KINDS: Mapping[str, Kind] = by_id(

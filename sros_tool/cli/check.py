@@ -16,12 +16,10 @@ from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
-    from sros_tool.checks.registry import Chosen, Selection
     from sros_tool.checks.targets import Circumstances
 
 _FAMILIES = ("policy", "keystore", "runtime")
 _LEVELS = click.Choice(["note", "warning", "error"])
-_SCHEMA = 1
 
 
 @click.command(
@@ -113,6 +111,7 @@ def check(
     """
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import Selection
+    from sros_tool.cli.findings import SHOW, print_list
 
     family, paths = _family(targets)
     if needs_renewal is not None:
@@ -121,12 +120,12 @@ def check(
     selection = Selection(include, exclude, Severity[severity.upper()], strict, vendor or "")
     form = "json" if as_json else "sarif" if as_sarif else form
     if as_list:
-        _print_list(selection, form)
+        print_list(selection, form)
         return 0
     at = _circumstances(domain, moment, policies)
     found = [_shown(each) for each in _findings(family, paths, at)]
     chosen = selection.choose(found)
-    {"json": _print_json, "sarif": _print_sarif, "text": _print_text}[form](chosen, selection)
+    SHOW[form](chosen, selection)
     return 1 if fail_on != "never" and chosen.fails(Severity[fail_on.upper()]) else 0
 
 
@@ -223,72 +222,6 @@ def _shown(finding: Finding) -> Finding:
     if path.is_absolute() and path.is_relative_to(Path.cwd()):
         return replace(finding, file=str(path.relative_to(Path.cwd())))
     return finding
-
-
-# ── showing ────────────────────────────────────────────────────────────────────────────────
-
-
-def _print_text(chosen: Chosen, _selection: Selection) -> None:
-    for each in chosen.shown:
-        click.echo("\n".join(finding_lines(each)))
-    for choice in dict.fromkeys(each.accepted for each in chosen.accepted):
-        kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
-        told = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
-        click.echo(f"accepted, as the {choice} chose it: {told}")
-    click.echo(_summary(chosen), err=True)
-
-
-def finding_lines(finding: Finding) -> list[str]:
-    """A finding for people: where and what, why here, and what to do."""
-    head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"
-    told = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
-    by = f" (chosen by the {finding.accepted})" if finding.accepted else ""
-    return [head, f"    {told}{finding.text}{by}", f"    {finding.remedy}"]
-
-
-def _summary(chosen: Chosen) -> str:
-    counts = _counts(chosen)
-    told = [f"{number} {word}{'s' * (number != 1)}" for word, number in counts.items() if number]
-    number = chosen.hidden
-    hidden = f" (not shown: {number} note{'s' * (number != 1)}, --severity note)" if number else ""
-    return f"{', '.join(told) or 'nothing found'}{hidden}"
-
-
-def _counts(chosen: Chosen) -> dict[str, int]:
-    words = [each.severity.word for each in chosen.shown]
-    return {word: words.count(word) for word in ("error", "warning", "note")}
-
-
-def _print_json(chosen: Chosen, _selection: Selection) -> None:
-    print_json(
-        {
-            "version": _SCHEMA,
-            "findings": [each.as_json() for each in chosen.shown],
-            "accepted": [each.as_json() for each in chosen.accepted],
-            "counts": {**_counts(chosen), "hidden": chosen.hidden},
-        }
-    )
-
-
-def _print_sarif(chosen: Chosen, selection: Selection) -> None:
-    from sros_tool import __version__
-    from sros_tool.checks.registry import select_kinds
-    from sros_tool.checks.sarif import sarif
-
-    kinds, findings = select_kinds(selection), (*chosen.shown, *chosen.accepted)
-    print_json(sarif(findings, kinds, version=__version__, base=Path.cwd()))
-
-
-def _print_list(selection: Selection, form: str) -> None:
-    from sros_tool.checks.registry import select_kinds
-
-    kinds = list(select_kinds(selection))
-    if form != "text":
-        print_json([each.as_json() for each in kinds])
-        return
-    width = max((len(each.id) for each in kinds), default=0)
-    for each in kinds:
-        click.echo(f"{each.id:{width}}  {each.severity.word:7}  {each.title}")
 
 
 def _needs_renewal(root: Path, text: str, as_json: bool) -> int:

@@ -34,7 +34,8 @@ def doctor(as_json: bool) -> None:
     version says nothing about how it was built. Also warns of misspelt ROS_SECURITY_* values.
     """
     from sros_tool.checks.kind import WARNING
-    from sros_tool.cli.check import finding_lines, findings_here
+    from sros_tool.cli.check import findings_here
+    from sros_tool.cli.findings import finding_lines
     from sros_tool.demo.doctor import diagnosis_text, examine
 
     moment = now()

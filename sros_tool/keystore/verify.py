@@ -267,7 +267,10 @@ class _Check:
             self._fault(name, text, "permissions-subject")
             return
         grant = grants[0]
-        self._valid_now(name, grant.validity, "permissions")
+        try:
+            self._valid_now(name, grant.validity, "permissions")
+        except SrosError as error:  # it ends before it begins
+            self._fault(name, error.what, "permissions-malformed")
         rules = [rule for rule in grant.rules if rule.allow]
         if domain is not None and not any(domain in rule.domains.closed() for rule in rules):
             text = f"no rule of it allows anything in domain {domain}"

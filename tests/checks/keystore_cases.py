@@ -69,6 +69,8 @@ def _(bench: Bench) -> None:
 
 CASES |= {
     "keystore.file-unreadable": lambda b: b.path("ledger.jsonl").write_text("nonsense\n"),
+    "keystore.settings-missing": lambda b: b.unlink("sros.toml"),
+    "keystore.ledger-missing": lambda b: b.unlink("ledger.jsonl"),
     "keystore.one-authority": lambda b: b.trust("permissions", b.authority("identity")),
     "keystore.ca-ends-soon": lambda b: at(b, 5 * 365 - 89),
     "keystore.ca-expired": lambda b: at(b, 5 * 365 + 1),

@@ -7,15 +7,23 @@ from datetime import timedelta
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
-from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
+from sros_tool.checks.keystores.certificates import authority_findings
 from sros_tool.checks.keystores.opened import OpenedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.errors import SrosError
-from sros_tool.keystore.layout import CRL, IDENTITY, PERMISSIONS, ca_certificate, ca_key
+from sros_tool.keystore.layout import (
+    CRL,
+    IDENTITY,
+    PERMISSIONS,
+    SETTINGS,
+    ca_certificate,
+    ca_key,
+)
+from sros_tool.keystore.ledger import LEDGER
 from sros_tool.pki.certificates import same_key, subject_text, validity_of
 from sros_tool.pki.crl import signed_by
-from sros_tool.pki.keys import algorithm, load_key
+from sros_tool.pki.keys import load_key
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
@@ -73,53 +81,26 @@ CA_KEY_PLAIN = Kind(
     NOTE,
     "the key of a CA lies in the keystore without a passphrase",
     "Who copies the folder can make any enclave with any rights.",
-    "ros2/sros2 issues 282 and 319; NIST SP 800-57 part 1, 5.3.",
+    "ros2/sros2 issue 282; NIST SP 800-57 part 1, 6 (protection of keys).",
     "Make keystores with --encrypt-ca-keys or with keys on a token, or keep private/ offline.",
 )
-NOT_A_CA = Kind(
-    "keystore.not-a-ca",
-    ERROR,
-    "a CA certificate that does not say that it is one",
-    "OpenSSL refuses chains over it.",
-    "RFC 5280, 4.2.1.9 and 4.2.1.3 (BasicConstraints, KeyUsage keyCertSign).",
-    "Replace it with `sros rotate_ca ROOT`.",
-)
-CA_EXTENSIONS = Kind(
-    "keystore.ca-extensions",
-    NOTE,
-    "a CA certificate without key identifiers or key usage",
-    "Fast DDS checks strictly, and refuses it as soon as an intermediate CA is in play. CAs of "
-    "ros2/sros2 are so.",
-    "RFC 5280, 4.2.1.1 to 4.2.1.3; openssl verify -x509_strict.",
-    "Replace it with `sros rotate_ca ROOT`, if intermediates are to come.",
-)
-INTERMEDIATE = Kind(
-    "portable.intermediate",
+SETTINGS_MISSING = Kind(
+    "keystore.settings-missing",
     WARNING,
-    "a CA that is not self-signed",
-    "Cyclone DDS takes a self-signed identity CA only. The permissions CA has to sign documents "
-    "itself; no vendor follows its chain.",
-    "Cyclone DDS 0.10.2, Fast DDS 2.14.5; measured.",
-    "Use a root for robots of its own, unless all run Fast DDS.",
-    vendors=("cyclonedds",),
+    "a keystore of sros without its settings",
+    "What is added later follows ros2/sros2: an enclave without a policy may do everything, for "
+    "ten years.",
+    "sros: sros.toml holds the choices that a keystore was made by.",
+    "Restore sros.toml from a backup.",
 )
-KEY_ALGORITHM = Kind(
-    "portable.key-algorithm",
+LEDGER_MISSING = Kind(
+    "keystore.ledger-missing",
     WARNING,
-    "a key that not every vendor takes",
-    "Cyclone DDS takes EC prime256v1 and RSA of exactly 2048 bits; Ed25519 fails in the handshake "
-    "of Fast DDS.",
-    "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10.2, Fast DDS 2.14.5; measured.",
-    "Use EC prime256v1, as sros does.",
-)
-SIGNATURE_HASH = Kind(
-    "portable.signature-hash",
-    WARNING,
-    "a certificate that is not signed with SHA-256",
-    "Fast DDS rejects SHA-384 in a CA.",
-    "Fast DDS 2.14.5 (PKIDH.cpp); measured.",
-    "Issue it with SHA-256, as sros does.",
-    vendors=("fastdds",),
+    "a keystore of sros without its ledger",
+    "Permissions that were replaced, and certificates from elsewhere, cannot be told from those "
+    "that are meant.",
+    "sros: ledger.jsonl lists everything that was issued.",
+    "Restore ledger.jsonl from a backup.",
 )
 CRL_ENDS = Kind(
     "keystore.revocation-list-ends",
@@ -139,8 +120,8 @@ CRL_ISSUER = Kind(
 )
 
 KINDS = by_id(
-    UNREADABLE, ONE_AUTHORITY, CA_ENDS, CA_EXPIRED, CA_MISSING, CA_MISMATCH, CA_KEY_PLAIN, NOT_A_CA,
-    CA_EXTENSIONS, INTERMEDIATE, KEY_ALGORITHM, SIGNATURE_HASH, CRL_ENDS, CRL_ISSUER,
+    UNREADABLE, ONE_AUTHORITY, CA_ENDS, CA_EXPIRED, CA_MISSING, CA_MISMATCH, CA_KEY_PLAIN,
+    SETTINGS_MISSING, LEDGER_MISSING, CRL_ENDS, CRL_ISSUER,
 )  # fmt: skip
 
 _SOON = timedelta(days=90)
@@ -159,6 +140,7 @@ def check_authorities(keystore: OpenedKeystore) -> Iterator[Finding]:
             if role not in keystore.authorities and path not in unread:
                 text = f"there is no certificate of the {role} CA"
                 yield CA_MISSING.found(f"{role} CA", text, keystore.shown(path))
+    yield from _records(keystore)
     told: set[bytes] = set()
     for role, chain in keystore.authorities.items():
         fingerprint = chain[0].fingerprint(hashes.SHA256())
@@ -169,20 +151,13 @@ def check_authorities(keystore: OpenedKeystore) -> Iterator[Finding]:
     yield from _revocation_list(keystore)
 
 
-def key_findings(
-    certificate: x509.Certificate, subject: str, file: str, *, what: str = "it has"
-) -> Iterator[Finding]:
-    """Whether every vendor takes the key and the signature of a certificate."""
-    key = certificate.public_key()
-    fits = (isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name == "secp256r1") or (
-        isinstance(key, rsa.RSAPublicKey) and key.key_size == 2048
-    )
-    if not fits:
-        yield KEY_ALGORITHM.found(subject, f"{what} a key of {algorithm(key)}", file)
-    digest = certificate.signature_hash_algorithm
-    if not isinstance(digest, hashes.SHA256):
-        name = digest.name.upper() if digest else "no digest"
-        yield SIGNATURE_HASH.found(subject, f"{what} a signature with {name}", file)
+def _records(keystore: OpenedKeystore) -> Iterator[Finding]:
+    """Keystores of ros2/sros2 have neither settings nor a ledger, those of sros have both."""
+    settings, ledger = ((keystore.root / name).exists() for name in (SETTINGS, LEDGER))
+    if ledger and not settings:
+        yield SETTINGS_MISSING.found("settings", f"there is no {SETTINGS}", str(keystore.root))
+    if settings and not ledger:
+        yield LEDGER_MISSING.found("ledger", f"there is no {LEDGER}", str(keystore.root))
 
 
 def _authority(
@@ -196,29 +171,8 @@ def _authority(
         yield CA_EXPIRED.found(subject, f"{name} is valid from {begin} to {end}", file)
     elif validity.not_after - keystore.now < _SOON:
         yield CA_ENDS.found(subject, f"{name} ends at {end}", file)
-    if certificate.issuer != certificate.subject:
-        issuer = subject_text(certificate.issuer)
-        yield INTERMEDIATE.found(subject, f"{name} is issued by {issuer}", file)
-    yield from key_findings(certificate, subject, file, what=f"{name} has")
-    yield from _extensions(certificate, subject, name, file)
+    yield from authority_findings(certificate, subject, file)
     yield from _key(keystore, role, certificate)
-
-
-def _extensions(
-    certificate: x509.Certificate, subject: str, name: str, file: str
-) -> Iterator[Finding]:
-    extensions = certificate.extensions
-    present = {type(each.value): each.value for each in extensions}
-    constraints = present.get(x509.BasicConstraints)
-    usage = present.get(x509.KeyUsage)
-    is_ca = isinstance(constraints, x509.BasicConstraints) and constraints.ca
-    may_sign = not isinstance(usage, x509.KeyUsage) or usage.key_cert_sign
-    if not (is_ca and may_sign):
-        yield NOT_A_CA.found(subject, f"{name} may not issue certificates", file)
-    wanted = (x509.KeyUsage, x509.SubjectKeyIdentifier, x509.AuthorityKeyIdentifier)
-    missing = [kind.__name__ for kind in wanted if kind not in present]
-    if missing:
-        yield CA_EXTENSIONS.found(subject, f"{name} lacks {', '.join(missing)}", file)
 
 
 def _key(keystore: OpenedKeystore, role: str, certificate: x509.Certificate) -> Iterator[Finding]:
@@ -226,10 +180,9 @@ def _key(keystore: OpenedKeystore, role: str, certificate: x509.Certificate) -> 
     if not path.exists():
         return  # it is kept elsewhere
     try:
-        pem = read_bytes(path, "key")
-        if b"ENCRYPTED" in pem:
-            return
-        key = load_key(pem, f"'{path}'")
+        key = load_key(read_bytes(path, "key"), f"'{path}'", _locked)
+    except _LockedError:
+        return
     except SrosError as error:
         yield UNREADABLE.found(f"{role} CA key", f"{error.what}. {error.why}", str(path))
         return
@@ -237,6 +190,14 @@ def _key(keystore: OpenedKeystore, role: str, certificate: x509.Certificate) -> 
     if not same_key(certificate, key):
         text = f"'{path.name}' is not the key of '{ca_certificate(role)}'"
         yield CA_MISMATCH.found(f"{role} CA", text, str(path))
+
+
+class _LockedError(Exception):
+    """A key has a passphrase, so nothing can be said about it."""
+
+
+def _locked() -> str:
+    raise _LockedError
 
 
 def _one_for_both(keystore: OpenedKeystore) -> Iterator[Finding]:

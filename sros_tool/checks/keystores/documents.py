@@ -48,7 +48,7 @@ PARTITIONS = Kind(
     "partitions in a rule",
     "Fast DDS ignores them in denials, and denies where an allow rule matches the topic and not "
     "the partition; Cyclone DDS goes on searching. ROS 2 uses the default partition only.",
-    "DDS-Security 1.1, 9.4.1.3.2.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Leave partitions out.",
 )
 DOMAIN_RANGE = Kind(
@@ -57,7 +57,7 @@ DOMAIN_RANGE = Kind(
     "a range of domains that vendors read differently",
     "Without <max> it means one domain alone; without <min> Cyclone DDS crashes; domains above 230 "
     "it refuses.",
-    "DDS-Security 1.1, 9.4.1.3.2.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write <id>, or <min> and <max> up to 230.",
 )
 GRANT_NAME = Kind(
@@ -121,7 +121,7 @@ NO_EFFECT = Kind(
     ERROR,
     "a deny rule behind an allow rule for the same topic",
     "The first rule that matches decides, so the denial takes nothing away.",
-    "DDS-Security 1.1, 9.4.1.3.2.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Put deny rules first, as sros does.",
 )
 UNREACHABLE = Kind(
@@ -129,7 +129,7 @@ UNREACHABLE = Kind(
     WARNING,
     "a topic of a rule that an earlier rule decides",
     "The first rule that matches decides, so this one is never reached.",
-    "DDS-Security 1.1, 9.4.1.3.2.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Remove it, or put the narrower rule first.",
 )
 DOMAINS = Kind(

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import datetime, timedelta
+from pathlib import Path
 
 from cryptography import x509
 
-from sros_tool.checks.keystores.authorities import key_findings, one_for_both
+from sros_tool.checks.keystores.authorities import one_for_both
+from sros_tool.checks.keystores.certificates import key_findings
 from sros_tool.checks.keystores.loading import check_loading
 from sros_tool.checks.keystores.opened import OpenedEnclave
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.dds.permissions import Grant
+from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import REQUEST
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
-from sros_tool.validity import BACKDATE, Span, Window, iso
+from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
+from sros_tool.xml import read_bytes
 
 ENDS_SOON = Kind(
     "enclave.ends-soon",
@@ -95,7 +99,7 @@ CRL_MISSING = Kind(
     ERROR,
     "an enclave without the revocation list of its keystore",
     "Its node goes on talking to enclaves that were revoked.",
-    "rmw_dds_common (crl.pem), since ROS 2 Galactic.",
+    "rmw_dds_common (crl.pem), since 2021.",
     "Run `sros crl ROOT --refresh`, and export the enclave again.",
 )
 WAITS = Kind(
@@ -138,12 +142,15 @@ def check_enclave(enclave: OpenedEnclave) -> Iterator[Finding]:
 
 
 def grant_of(enclave: OpenedEnclave) -> Grant | None:
-    """The grant that is for the certificate of the enclave."""
+    """The grant that is for the certificate of the enclave, if it is valid at any time."""
     state = enclave.state
     if not (state.certificate and state.permissions):
         return None
     subject = subject_text(state.certificate.subject)
-    return next((each for each in state.permissions.grants if each.subject == subject), None)
+    grant = next((each for each in state.permissions.grants if each.subject == subject), None)
+    if grant is None or parse_iso(grant.not_after) <= parse_iso(grant.not_before):
+        return None
+    return grant
 
 
 def _certificate(enclave: OpenedEnclave, certificate: x509.Certificate) -> Iterator[Finding]:
@@ -221,7 +228,7 @@ def _is_as_long(chosen: Span, length: timedelta) -> bool:
 
 def _copies(enclave: OpenedEnclave) -> Iterator[Finding]:
     xml, signed = enclave.folder / "permissions.xml", enclave.state.permissions_document
-    if signed and xml.is_file() and _plain(xml.read_bytes()) != _plain(signed):
+    if signed and xml.is_file() and plain_file(xml) != plain(signed):
         text = "permissions.xml is not what permissions.p7s holds"
         yield XML_DIFFERS.found(enclave.name, text, enclave.file("permissions.xml"))
     if enclave.keystore.crl and not (enclave.folder / "crl.pem").exists():
@@ -229,5 +236,14 @@ def _copies(enclave: OpenedEnclave) -> Iterator[Finding]:
         yield CRL_MISSING.found(enclave.name, text, str(enclave.folder))
 
 
-def _plain(document: bytes) -> bytes:
+def plain(document: bytes) -> bytes:
+    """A document as it is compared: line ends, and space around it, do not count."""
     return document.replace(b"\r\n", b"\n").strip()
+
+
+def plain_file(path: Path) -> bytes:
+    """The same of a file; b"" where it cannot be read."""
+    try:
+        return plain(read_bytes(path, "file"))
+    except SrosError:
+        return b""

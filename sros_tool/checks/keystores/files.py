@@ -95,7 +95,7 @@ CA_KEY_ON_ROBOT = Kind(
     ERROR,
     "the key of a CA among what was exported for a robot",
     "Who breaks into the robot can make any enclave, with any rights.",
-    "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 5.3.",
+    "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
     "Delete it there; if strangers had access, replace the CA (`sros rotate_ca`).",
 )
 UNKNOWN_FILE = Kind(

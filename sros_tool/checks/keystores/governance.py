@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from sros_tool.checks.keystores.documents import domain_problems
+from sros_tool.checks.keystores.enclaves import plain, plain_file
 from sros_tool.checks.keystores.opened import OpenedEnclave, OpenedKeystore
 from sros_tool.checks.kind import ERROR, WARNING, Finding, Kind, by_id
 from sros_tool.dds.governance import DomainRule, Governance, Protection, TopicRule
+from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import GOVERNANCE_XML
 from sros_tool.pki import smime
 from sros_tool.policy.patterns import covers
@@ -22,7 +24,7 @@ UNAUTHENTICATED = Kind(
     "participants without an identity may join",
     "Whatever no rule of a topic protects, they may read and write. Where whole messages are "
     "protected, Fast DDS 2.14 refuses the document.",
-    f"{_GOVERNANCE}.4.1 (allow_unauthenticated_participants); measured.",
+    f"{_GOVERNANCE} (allow_unauthenticated_participants); measured.",
     "Set it to false.",
 )
 NO_JOIN_CONTROL = Kind(
@@ -31,7 +33,7 @@ NO_JOIN_CONTROL = Kind(
     "whoever is authenticated may join, whatever its permissions",
     "The permissions of a participant are not asked when it joins; vendors then decide "
     "differently on one without any.",
-    f"{_GOVERNANCE}.4.2 (enable_join_access_control); Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
+    f"{_GOVERNANCE} (enable_join_access_control); Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
     "Set enable_join_access_control to true.",
 )
 NO_ACCESS_CONTROL = Kind(
@@ -39,7 +41,7 @@ NO_ACCESS_CONTROL = Kind(
     WARNING,
     "topics that everybody in the domain may read or write",
     "Permissions are not asked for these topics, so a policy for them does nothing.",
-    f"{_GOVERNANCE}.6 (enable_read_access_control, enable_write_access_control).",
+    f"{_GOVERNANCE} (enable_read_access_control, enable_write_access_control).",
     _TEMPLATE,
 )
 NO_ENCRYPTION = Kind(
@@ -47,7 +49,7 @@ NO_ENCRYPTION = Kind(
     WARNING,
     "topics whose payload can be read on the wire",
     "Neither the payload, nor the submessage, nor the whole message is encrypted.",
-    f"{_GOVERNANCE}.6 (data_protection_kind, metadata_protection_kind, rtps_protection_kind).",
+    f"{_GOVERNANCE} (data_protection_kind, metadata_protection_kind, rtps_protection_kind).",
     _TEMPLATE,
 )
 NOT_AUTHENTIC = Kind(
@@ -55,7 +57,7 @@ NOT_AUTHENTIC = Kind(
     ERROR,
     "topics whose messages anybody can forge",
     "Nothing is signed: neither payload, nor submessage, nor the whole message.",
-    f"{_GOVERNANCE}.6.",
+    f"{_GOVERNANCE} (rtps, metadata and data protection kinds).",
     _TEMPLATE,
 )
 DISCOVERY_OPEN = Kind(
@@ -63,7 +65,7 @@ DISCOVERY_OPEN = Kind(
     WARNING,
     "discovery without protection",
     "Who listens learns every node, topic and type, and who writes can make up others.",
-    f"{_GOVERNANCE}.4.3 (discovery_protection_kind, enable_discovery_protection).",
+    f"{_GOVERNANCE} (discovery_protection_kind, enable_discovery_protection).",
     _TEMPLATE,
 )
 LIVELINESS_OPEN = Kind(
@@ -71,7 +73,7 @@ LIVELINESS_OPEN = Kind(
     WARNING,
     "liveliness without protection",
     "A stranger can keep a dead writer alive in the eyes of its readers.",
-    f"{_GOVERNANCE}.4.4 (liveliness_protection_kind, enable_liveliness_protection).",
+    f"{_GOVERNANCE} (liveliness_protection_kind, enable_liveliness_protection).",
     _TEMPLATE,
 )
 NO_TOPIC_RULE = Kind(
@@ -80,7 +82,7 @@ NO_TOPIC_RULE = Kind(
     "topics for which there is no rule",
     "Where no topic rule matches, the endpoint cannot be made; without a rule for "
     "ros_discovery_info no node of ROS 2 starts.",
-    f"{_GOVERNANCE}.5; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+    f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Put a rule for * last.",
 )
 UNREACHABLE = Kind(
@@ -88,7 +90,7 @@ UNREACHABLE = Kind(
     WARNING,
     "a topic rule that an earlier one hides",
     "The first rule that matches a topic decides.",
-    f"{_GOVERNANCE}.5; Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
+    f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
     "Put narrower rules first, as sros does.",
 )
 DOMAIN_RANGE = Kind(
@@ -105,7 +107,7 @@ DIFFERS = Kind(
     ERROR,
     "enclaves with different governance",
     "Nodes that protect a topic differently do not match, and say nothing about it.",
-    "DDS-Security 1.1, 8.4.2.9 (protection attributes of both sides must agree).",
+    "DDS-Security 1.1, 8.4 (the protection attributes of both sides must agree).",
     "Replace the copy by a link to the governance of the keystore, or export the enclave again.",
 )
 XML_DIFFERS = Kind(
@@ -138,7 +140,7 @@ def check_governance(enclave: OpenedEnclave, *, alone: bool) -> Iterator[Finding
     file = enclave.file("governance.p7s")
     if alone:
         own, common = enclave.state.files["governance.p7s"], enclave.keystore.governance
-        if common and own != common and _document(own) != _document(common):
+        if common and own != common and _content(own) != _content(common):
             text = f"'{file}' is not the governance of the keystore"
             yield DIFFERS.found(enclave.name, text, file)
         return
@@ -216,14 +218,14 @@ def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[Kind, str]
 
 def _copy(keystore: OpenedKeystore) -> Iterator[Finding]:
     xml, signed = keystore.root / GOVERNANCE_XML, keystore.governance
-    if signed and xml.is_file() and _plain(xml.read_bytes()) != _document(signed):
+    if signed and xml.is_file() and plain_file(xml) != _content(signed):
         text = "governance.xml is not what governance.p7s holds"
         yield XML_DIFFERS.found("governance", text, str(xml))
 
 
-def _document(message: bytes) -> bytes:
-    return _plain(smime.parse(message).document)
-
-
-def _plain(document: bytes) -> bytes:
-    return document.replace(b"\r\n", b"\n").strip()
+def _content(message: bytes) -> bytes:
+    """What is signed; b"" where that cannot be read, which is told elsewhere."""
+    try:
+        return plain(smime.parse(message).document)
+    except SrosError:
+        return b""

@@ -34,7 +34,7 @@ KEY_TWICE = Kind(
     ERROR,
     "two enclaves with the same key",
     "Who has one of them is the other one, too.",
-    "NIST SP 800-57 part 1, 5.2; DDS-Security 1.1, 9.3.1.",
+    "RFC 5280, 4.1.2.6 (the subject is the holder of the key); DDS-Security 1.1, 9.3.",
     "Run `sros renew ROOT NAME --new-key` for one of them.",
 )
 UNEXPLAINED = Kind(

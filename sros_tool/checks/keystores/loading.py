@@ -75,7 +75,7 @@ KINDS = by_id(
         "certificate-issuer",
         "a certificate that another CA issued",
         "Its own node refuses it; Fast DDS with an empty reason.",
-        "DDS-Security 1.1, 9.3.2; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+        "DDS-Security 1.1, 9.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
         "Restore the certificate that belongs to this keystore, or make the enclave anew.",
     ),
     _kind("key-malformed", "a private key that cannot be read",

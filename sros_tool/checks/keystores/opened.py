@@ -22,7 +22,7 @@ from sros_tool.keystore.layout import (
     SETTINGS,
     ca_certificate,
 )
-from sros_tool.keystore.ledger import Entry, read_ledger
+from sros_tool.keystore.ledger import LEDGER, Entry, read_ledger
 from sros_tool.keystore.open import load_settings
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.verify import EnclaveState
@@ -118,7 +118,9 @@ def open_keystore(
     try:
         ledger = read_ledger(root)
     except SrosError as error:
-        unread.append(Unread("ledger.jsonl", error))
+        unread.append(Unread(LEDGER, error))
+    except OSError as error:
+        unread.append(Unread(LEDGER, SrosError("the ledger cannot be read", f"{error.strerror}.")))
     try:
         if (root / CRL).exists():
             crl = load_crl(read_bytes(root / CRL, "revocation list"), f"'{root / CRL}'")

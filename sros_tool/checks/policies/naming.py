@@ -51,7 +51,7 @@ WIDE = Kind(
     WARNING,
     "a wildcard wider than a namespace",
     "* crosses slashes, so the rule reaches nodes and namespaces that were not thought of.",
-    "DDS-Security 1.1, 9.4.1.3.2.3 (POSIX fnmatch, in which * also matches a slash).",
+    "DDS-Security 1.1, 9.4.1.3 (POSIX fnmatch, in which * also matches a slash).",
     "Begin it with a whole namespace, as in /arm/*, or end it with a whole name.",
 )
 READS_EVERYTHING = Kind(

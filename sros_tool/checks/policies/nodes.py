@@ -27,7 +27,7 @@ NO_TYPE_DESCRIPTION = Kind(
     ERROR,
     "a node that may not offer ~/get_type_description",
     "Nodes of Jazzy offer this service, and one that is denied it ends as soon as it starts.",
-    "ROS 2 Jazzy, rclcpp 28 and rclpy 7 (node type descriptions interface); REP-2011.",
+    "ROS 2 Jazzy, rclcpp 28 and rclpy 7 (node type descriptions interface); REP-2016.",
     f'Allow <services reply="ALLOW"><service>~/get_type_description</service></services>. '
     f"{_INCLUDE}",
 )

@@ -14,7 +14,7 @@ from sros_tool.policy.rights import Rules, parts
 
 _ORDER = (
     "sros signs the denials of an enclave before its permissions, as ros2/sros2 does, and the "
-    "first rule that matches decides (DDS-Security 1.1, 9.4.1.3.2.3)."
+    "first rule that matches decides (DDS-Security 1.1, 9.4.1.3)."
 )
 
 CONTRADICTION = Kind(
@@ -40,7 +40,7 @@ NO_EFFECT = Kind(
     "a denial of what nothing allows",
     "What no rule allows is denied anyway. The denial takes nothing away, and on Cyclone DDS it "
     "can close the other direction of the topic.",
-    "DDS-Security 1.1, 9.4.1.3.2.3 (the default is DENY); Cyclone DDS 0.10.2 refuses a topic of "
+    "DDS-Security 1.1, 9.4.1.3 (the default is DENY); Cyclone DDS 0.10.2 refuses a topic of "
     "which one direction is denied.",
     "Remove the denial.",
 )

@@ -61,7 +61,7 @@ PROCESS_UNSECURED = Kind(
     WARNING,
     "a node that runs without security beside secured ones",
     "It and the secured nodes do not see each other.",
-    "DDS-Security 1.1, 8.4.2.4 (allow_unauthenticated_participants is false).",
+    "DDS-Security 1.1, 9.4.1.2 (allow_unauthenticated_participants is false).",
     "Start it with `sros run ROOT NAME -- COMMAND...`.",
 )
 PROCESS_OUTDATED = Kind(

@@ -124,7 +124,7 @@ CA_KEY_HERE = Kind(
     NOTE,
     "nodes run with the keystore that has the keys of the CAs",
     "Who breaks into a node can make any enclave, with any rights.",
-    "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 5.3.",
+    "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6.",
     "Run them with an export (`sros distribute_key`), and keep the keystore elsewhere.",
 )
 

@@ -1,0 +1,104 @@
+"""What vendors ask of certificates: algorithms, extensions, and no intermediate CA."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
+
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.pki.certificates import subject_text
+from sros_tool.pki.keys import algorithm
+
+NOT_A_CA = Kind(
+    "keystore.not-a-ca",
+    ERROR,
+    "a CA certificate that does not say that it is one",
+    "OpenSSL refuses chains over it.",
+    "RFC 5280, 4.2.1.9 and 4.2.1.3 (BasicConstraints, KeyUsage keyCertSign).",
+    "Replace it with `sros rotate_ca ROOT`.",
+)
+CA_EXTENSIONS = Kind(
+    "keystore.ca-extensions",
+    NOTE,
+    "a CA certificate without key identifiers or key usage",
+    "Fast DDS checks strictly, and refuses it as soon as an intermediate CA is in play. CAs of "
+    "ros2/sros2 are so.",
+    "RFC 5280, 4.2.1.1 to 4.2.1.3; openssl verify -x509_strict.",
+    "Replace it with `sros rotate_ca ROOT`, if intermediates are to come.",
+)
+INTERMEDIATE = Kind(
+    "portable.intermediate",
+    WARNING,
+    "a CA that is not self-signed",
+    "Cyclone DDS takes a self-signed identity CA only. The permissions CA has to sign documents "
+    "itself; no vendor follows its chain.",
+    "Cyclone DDS 0.10.2, Fast DDS 2.14.5; measured.",
+    "Use a root for robots of its own, unless all run Fast DDS.",
+    vendors=("cyclonedds",),
+)
+KEY_ALGORITHM = Kind(
+    "portable.key-algorithm",
+    WARNING,
+    "a key that not every vendor takes",
+    "Cyclone DDS takes EC prime256v1 and RSA of exactly 2048 bits; Ed25519 fails in the handshake "
+    "of Fast DDS.",
+    "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10.2, Fast DDS 2.14.5; measured.",
+    "Use EC prime256v1, as sros does.",
+)
+SIGNATURE_HASH = Kind(
+    "portable.signature-hash",
+    WARNING,
+    "a certificate that is not signed with SHA-256",
+    "Fast DDS rejects SHA-384 in a CA.",
+    "Fast DDS 2.14.5 (PKIDH.cpp); measured.",
+    "Issue it with SHA-256, as sros does.",
+    vendors=("fastdds",),
+)
+
+KINDS = by_id(NOT_A_CA, CA_EXTENSIONS, INTERMEDIATE, KEY_ALGORITHM, SIGNATURE_HASH)
+
+
+def authority_findings(certificate: x509.Certificate, subject: str, file: str) -> Iterator[Finding]:
+    """Whether every vendor takes the certificate of a CA."""
+    name = subject_text(certificate.subject)
+    if certificate.issuer != certificate.subject:
+        issuer = subject_text(certificate.issuer)
+        yield INTERMEDIATE.found(subject, f"{name} is issued by {issuer}", file)
+    yield from key_findings(certificate, subject, file, what=f"{name} has")
+    yield from _extensions(certificate, subject, name, file)
+
+
+def key_findings(
+    certificate: x509.Certificate, subject: str, file: str, *, what: str = "it has"
+) -> Iterator[Finding]:
+    """Whether every vendor takes the key and the signature of a certificate."""
+    key = certificate.public_key()
+    fits = (isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name == "secp256r1") or (
+        isinstance(key, rsa.RSAPublicKey) and key.key_size == 2048
+    )
+    if not fits:
+        yield KEY_ALGORITHM.found(subject, f"{what} a key of {algorithm(key)}", file)
+    digest = certificate.signature_hash_algorithm
+    if not isinstance(digest, hashes.SHA256):
+        name = digest.name.upper() if digest else "no digest"
+        yield SIGNATURE_HASH.found(subject, f"{what} a signature with {name}", file)
+
+
+def _extensions(
+    certificate: x509.Certificate, subject: str, name: str, file: str
+) -> Iterator[Finding]:
+    extensions = certificate.extensions
+    present = {type(each.value): each.value for each in extensions}
+    constraints = present.get(x509.BasicConstraints)
+    usage = present.get(x509.KeyUsage)
+    is_ca = isinstance(constraints, x509.BasicConstraints) and constraints.ca
+    may_sign = not isinstance(usage, x509.KeyUsage) or usage.key_cert_sign
+    if not (is_ca and may_sign):
+        yield NOT_A_CA.found(subject, f"{name} may not issue certificates", file)
+    wanted = (x509.KeyUsage, x509.SubjectKeyIdentifier, x509.AuthorityKeyIdentifier)
+    missing = [kind.__name__ for kind in wanted if kind not in present]
+    if missing:
+        yield CA_EXTENSIONS.found(subject, f"{name} lacks {', '.join(missing)}", file)
