@@ -11,7 +11,7 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import Permissions, parse_permissions
+from sros_tool.dds.permissions import parse_permissions
 from sros_tool.dds.portable import document_notes
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.authority import Authorities
@@ -27,6 +27,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
 )
 from sros_tool.keystore.parallel import Progress
+from sros_tool.keystore.proof import FEW, proven
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Transaction
 from sros_tool.notes import Note
@@ -41,8 +42,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.keys import generate_key, key_pem, load_key
 from sros_tool.policy.model import Enclave
-from sros_tool.translate import permissions_for
-from sros_tool.validity import Window, iso
+from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
 
@@ -79,6 +79,7 @@ class Registrar:
         self._domains = domains
         self._now = now
         self._has_crl = (transaction.root / CRL).exists()
+        self._few = False
         self.notes: list[Note] = []
         self.entries = self._issuance.entries
 
@@ -86,6 +87,7 @@ class Registrar:
         self, wanted: Sequence[tuple[str, Enclave | None]], progress: Progress | None
     ) -> dict[str, Fate]:
         """Make or complete each enclave; with a policy, give it those permissions."""
+        self._few = len(wanted) <= FEW
 
         def work(item: tuple[str, Enclave | None]) -> tuple[Fate, list[Note]]:
             notes: list[Note] = []
@@ -205,12 +207,7 @@ class Registrar:
                     "ros2/sros2 makes a grant of each, of which DDS reads only the first.",
                 )
             )
-
-        def make(subject: str, validity: Window) -> Permissions:
-            return permissions_for(
-                enclave, subject=subject, validity=validity, domains=self._domains
-            )
-
+        make = proven(enclave, self._domains, ask=self._few)
         permissions, message = self._issuance.permissions(name, certificate, make, enclave.digest)
         notes += document_notes(name, permissions, len(message))
 

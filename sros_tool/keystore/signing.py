@@ -10,7 +10,6 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import Permissions
 from sros_tool.dds.portable import document_notes, name_notes
 from sros_tool.errors import KeystoreError, PkiError, PolicyError, SrosError
 from sros_tool.keystore.answer import SEAL, Answer, check_answer, seal
@@ -33,6 +32,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, append, document_entry
 from sros_tool.keystore.open import check_domain, load_governance, load_settings
+from sros_tool.keystore.proof import proven
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Change, Transaction, tidy
 from sros_tool.names import check_enclave_name
@@ -42,8 +42,7 @@ from sros_tool.pki.certificates import subject_text as text_of
 from sros_tool.pki.keys import load_key
 from sros_tool.pki.requests import SigningRequest, key_digest, load_request
 from sros_tool.policy.model import Enclave, Policy
-from sros_tool.translate import permissions_for
-from sros_tool.validity import Window, iso
+from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
 
@@ -264,11 +263,7 @@ class _Signer:
                 )
             return renewed(old.grant), policies_of(self._root).get(old.digest, "")
         meant = enclave or default_enclave(self._template.default_permissions, name)
-
-        def make(subject: str, validity: Window) -> Permissions:
-            return permissions_for(meant, subject=subject, validity=validity, domains=self._domains)
-
-        return make, meant.digest
+        return proven(meant, self._domains, ask=True), meant.digest
 
     def _certificate(self, name: str) -> x509.Certificate:
         path = self._root / enclave_folder(name) / "cert.pem"

@@ -15,7 +15,7 @@ from sros_tool.names import is_expression
 from sros_tool.policy.patterns import ANY, matches, pieces
 
 _LETTERS = ascii_letters + digits + "_/"
-_MOST_STATES = 50_000
+_MOST_STATES = 5_000
 _START, _SLASH, _TOKEN = range(3)
 """Where in a ROS name one is: nowhere yet, behind a "/", or within one of its parts."""
 

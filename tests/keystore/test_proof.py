@@ -1,0 +1,232 @@
+"""Permissions are proven to say what their policy says; nothing is written where they do not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from drawn_policies import policies
+from harness import policy_text, publish, snapshot, sros
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sros_tool.dds.decision import Vendor
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, parse_permissions
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore import proof
+from sros_tool.keystore.proof import (
+    differences,
+    prove,
+    signed_expressions,
+    stated_expressions,
+    telling_topics,
+)
+from sros_tool.pki import smime
+from sros_tool.policy import Enclave, Policy, Qualifier, read_policy
+from sros_tool.policy.patterns import matches
+from sros_tool.policy.rights import Rules, policy_rights
+from sros_tool.resources import policies_dir
+from sros_tool.translate import permissions_for
+from sros_tool.validity import Window
+
+NOW = datetime(2026, 11, 21, tzinfo=UTC)
+DOMAINS = DomainSet.parse("0,10-19")
+WINDOW = Window(NOW, NOW + timedelta(days=90))
+ASKED = (Vendor.STANDARD, Vendor.FAST, Vendor.FAST_2_9)
+FILES = sorted(policies_dir().glob("*.xml")) + sorted(policies_dir().glob("defaults/*.xml"))
+
+
+def permissions_of(enclave: Enclave) -> Permissions:
+    return permissions_for(enclave, subject="CN=/x", validity=WINDOW, domains=DOMAINS)
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_the_policies_that_ship(file: Path) -> None:
+    for enclave in read_policy(file).enclaves:
+        made = permissions_of(enclave)
+        assert signed_expressions(made, DOMAINS) == stated_expressions(enclave)
+        assert differences(enclave, made, DOMAINS, ASKED) == []
+
+
+@settings(max_examples=30, deadline=None)
+@given(policies())
+def test_whatever_compares_equal_is_decided_equally(policy: Policy) -> None:
+    """The step from equal sets to equal decisions, on the engine, for policies of every kind."""
+    for enclave in policy.enclaves:
+        made = permissions_of(enclave)
+        assert signed_expressions(made, DOMAINS) == stated_expressions(enclave)
+        assert differences(enclave, made, DOMAINS, ASKED) == []
+
+
+@settings(max_examples=30, deadline=None)
+@given(policies())
+def test_what_is_stated_is_what_the_rights_of_the_policy_say(policy: Policy) -> None:
+    """The DDS names of the proof are those of the translation, by the policy's own meaning."""
+    rules = Rules(policy_rights(policy))
+    for enclave in policy.enclaves:
+        stated = stated_expressions(enclave)
+        for topic in telling_topics(stated.all()):
+            if topic.startswith("rt/") and len(topic) > 3:
+                for verb in ("publish", "subscribe"):
+                    allowed = rules.allow(enclave.path, verb, topic[2:])
+                    assert stated.allow(verb, topic) == allowed, (verb, topic)
+
+
+# ── what is wrong is found ─────────────────────────────────────────────────────────────────
+
+
+def of_text(groups: str, tmp_path: Path) -> Enclave:
+    file = tmp_path / "p.xml"
+    file.write_text(policy_text({"/x": groups}))
+    return read_policy(file).enclaves[0]
+
+
+GROUPS = (
+    '<topics publish="ALLOW" subscribe="DENY"><topic>/a</topic><topic>/b/*</topic></topics>'
+    '<topics publish="DENY"><topic>/b/secret</topic></topics>'
+    '<services request="ALLOW"><service>/add</service></services>'
+    '<actions execute="ALLOW"><action>/go</action></actions>'
+)
+
+
+def only_grant(made: Permissions, change: Callable[[Grant], Grant]) -> Permissions:
+    return Permissions((change(made.grants[0]),))
+
+
+def rules(change: Callable[[tuple[Rule, ...]], tuple[Rule, ...]]) -> Callable[[Grant], Grant]:
+    return lambda grant: replace(grant, rules=change(grant.rules))
+
+
+def topics(rule: Rule, side: str, change: Callable[[tuple[str, ...]], tuple[str, ...]]) -> Rule:
+    (criteria,) = getattr(rule, side)
+    return replace(rule, **{side: (Criteria(change(criteria.topics)),)})  # type: ignore[arg-type]
+
+
+WRONG: dict[str, Callable[[Grant], Grant]] = {
+    "denials behind permissions": rules(lambda r: r[::-1]),
+    "denials lost": rules(lambda r: r[1:]),
+    "permissions lost": rules(lambda r: (r[0], replace(r[1], publish=()))),
+    "a topic more": rules(lambda r: (r[0], topics(r[1], "publish", lambda t: (*t, "rt/more")))),
+    "a wildcard more": rules(lambda r: (r[0], topics(r[1], "publish", lambda t: (*t, "rt/*")))),
+    "a topic less": rules(lambda r: (r[0], topics(r[1], "publish", lambda t: t[1:]))),
+    "directions swapped": rules(
+        lambda r: (r[0], replace(r[1], publish=r[1].subscribe, subscribe=r[1].publish))
+    ),
+    "allowed turned into denied": rules(lambda r: (r[0], replace(r[1], allow=False))),
+    "half a service": rules(
+        lambda r: (
+            r[0],
+            topics(r[1], "subscribe", lambda t: tuple(x for x in t if x != "rr/addReply")),
+        )
+    ),
+    "a domain less": rules(lambda r: tuple(replace(x, domains=DomainSet.parse("0")) for x in r)),
+    "default ALLOW": lambda grant: replace(grant, default_allow=True),
+    "in a partition": rules(
+        lambda r: (r[0], replace(r[1], publish=(replace(r[1].publish[0], partitions=("p",)),)))
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG)
+@pytest.mark.parametrize("ask", [False, True])
+def test_what_is_wrong_is_found(wrong: str, ask: bool, tmp_path: Path) -> None:
+    enclave = of_text(GROUPS, tmp_path)
+    made = permissions_of(enclave)
+    prove(enclave, made, DOMAINS, ask=ask)
+    changed = only_grant(made, WRONG[wrong])
+    with pytest.raises(KeystoreError, match="would not be what the policy says"):
+        prove(enclave, changed, DOMAINS, ask=ask)
+
+
+def test_another_form_that_means_the_same_is_accepted(tmp_path: Path) -> None:
+    enclave = of_text(publish("/a", "/b"), tmp_path)
+    made = permissions_of(enclave)
+
+    def split(all_rules: tuple[Rule, ...]) -> tuple[Rule, ...]:
+        (rule,) = all_rules
+        (criteria,) = rule.publish
+        one = replace(rule, publish=(Criteria(criteria.topics[:1]),))
+        deny_nothing = replace(rule, allow=False, publish=(Criteria(("rt/nobody",)),), subscribe=())
+        return (one, deny_nothing, replace(rule, publish=(Criteria(criteria.topics[1:]),)))
+
+    changed = only_grant(made, rules(split))
+    assert signed_expressions(changed, DOMAINS) is None
+    prove(enclave, changed, DOMAINS)
+
+
+def test_telling_topics() -> None:
+    found = telling_topics(["rt/a", "rt/b/*", "rt/*/c", "rq/*Request"])
+    assert "rt/a" in found
+    assert "rt/b/c" in found
+    for wanted, others in (
+        ("rt/b/*", ["rt/*/c"]),
+        ("rt/*/c", ["rt/b/*"]),
+        ("rq/*Request", []),
+    ):
+        assert any(
+            matches(wanted, name) and not any(matches(each, name) for each in others)
+            for name in found
+        ), wanted
+    known = ["rt/a", "rt/b/*", "rt/*/c", "rq/*Request"]
+    assert any(not any(matches(each, name) for each in known) for name in found)
+
+
+@given(st.lists(st.sampled_from(["rt/a", "rt/*", "rt/a*", "rt/?", "rt/[ab]", "*"]), max_size=4))
+def test_a_wildcard_is_told_apart_from_all_others(expressions: list[str]) -> None:
+    found = telling_topics(expressions)
+    for one in {each for each in expressions if "*" in each}:
+        assert any(matches(one, name) for name in found)
+
+
+# ── where it is used ───────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("count", [1, 6])
+def test_nothing_is_written_where_it_does_not_hold(
+    count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A translation that loses denials, or allows more than was said, does not reach the disk."""
+    policy = tmp_path / "robot.xml"
+    groups = '<topics publish="ALLOW"><topic>/a/*</topic></topics>'
+    groups += '<topics publish="DENY"><topic>/a/secret</topic></topics>'
+    policy.write_text(policy_text({f"/robot{number}": groups for number in range(count)}))
+    keystore = tmp_path / "ks"
+    sros("create_keystore", keystore).ok()
+    before = snapshot(keystore)
+
+    def forgetful(enclave: Enclave, **rest: object) -> Permissions:
+        made = permissions_for(enclave, **rest)  # type: ignore[arg-type]
+        kept = tuple(rule for rule in made.grants[0].rules if rule.allow)
+        return Permissions((replace(made.grants[0], rules=kept),))
+
+    def greedy(enclave: Enclave, **rest: object) -> Permissions:
+        made = permissions_for(enclave, **rest)  # type: ignore[arg-type]
+        all_rules = made.grants[0].rules
+        wide = topics(all_rules[-1], "publish", lambda t: (*t, "rt/*"))
+        return Permissions((replace(made.grants[0], rules=(*all_rules[:-1], wide)),))
+
+    for wrong in (forgetful, greedy):
+        monkeypatch.setattr(proof, "permissions_for", wrong)
+        found = sros("generate_artifacts", "-k", keystore, "-p", policy)
+        assert found.status == 1
+        assert "would not be what the policy says" in found.err
+        assert "rt/" in found.err
+        assert snapshot(keystore) == before
+    monkeypatch.undo()
+    sros("generate_artifacts", "-k", keystore, "-p", policy).ok()
+
+
+def test_what_is_signed_is_what_was_proven(tmp_path: Path) -> None:
+    policy = tmp_path / "robot.xml"
+    policy.write_text(policy_text({"/robot": GROUPS}))
+    sros("create_keystore", tmp_path / "ks").ok()
+    sros("generate_artifacts", "-k", tmp_path / "ks", "-p", policy).ok()
+    signed = smime.parse((tmp_path / "ks/enclaves/robot/permissions.p7s").read_bytes())
+    made = parse_permissions(signed.document)
+    (enclave,) = read_policy(policy).enclaves
+    assert differences(enclave, made, DomainSet.parse("0"), ASKED) == []
+    assert Qualifier.DENY in {right.qualifier for right in policy_rights(read_policy(policy))}
