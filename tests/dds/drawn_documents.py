@@ -15,6 +15,19 @@ from datetime import datetime, timedelta, timezone
 from random import Random
 
 from decision_documents import NOW
+from drawn_words import (
+    DOMAINS,
+    NEAR,
+    ODD_TOPICS,
+    ODDITIES,
+    PARTITION_EXPRESSIONS,
+    PARTITIONS,
+    SETS,
+    SUBJECTS,
+    TOPICS,
+    WILDCARDS,
+    ZONES,
+)
 from hypothesis import strategies as st
 
 from sros_tool.dds.decision import Verb
@@ -32,52 +45,6 @@ class Case:
     domain: int
     zone: str
     questions: tuple[Question, ...]
-
-
-SUBJECTS = ("CN=/t", "CN=/t/u", "CN=/robot,O=x", "CN=/t,OU=5f3a", "CN=plain")
-"""Every subject that is drawn, for identities that are made once (RFC 4514)."""
-
-ZONES = ("UTC", "America/Los_Angeles", "Asia/Tokyo", "Europe/Berlin", "Asia/Kolkata")
-DOMAINS = (42, 0, 7, 41, 200)
-TOPICS = (
-    "rt/a",
-    "rt/b",
-    "rt/c",
-    "rt/s",
-    "rt/a/b",
-    "rt/ab",
-    "rt/a1",
-    "rq/aRequest",
-    "rr/aReply",
-    "ros_discovery_info",
-)
-ODD_TOPICS = ("rt/b-x", "*", "rt/*", "rt/a?", "rt/[ab]")
-WILDCARDS = (
-    "*",
-    "rt/*",
-    "*a*",
-    "rt/?",
-    "rt/a*",
-    "r?/a*",
-    "rt/*/b",
-    "rt/**",
-    "rq/*Request",
-)
-SETS = (
-    "rt/[a-c]",
-    "rt/[!a]",
-    "rt/[^a]",
-    "rt/a[[:digit:]]",
-    "rt/[ab]",
-    "rt/[ab]-x",
-    "rt/[abc",
-    "rt/[a-]*",
-    "rt[/]a",
-    "rt/[]a]",
-)
-PARTITIONS = ("p1", "p2", "q")
-PARTITION_EXPRESSIONS = ("p1", "p2", "p*", "*", "", "[pq]?")
-_NEAR = (-20, -12, -10, -8, -6, -4, -1, 0, 2, 5, 7, 9, 11, 14)
 
 
 def documents(seed: int, count: int, *, now: datetime = NOW) -> Iterator[Case]:
@@ -113,7 +80,7 @@ class _Draw:
         self.domain = random.choice(DOMAINS) if random.random() < 0.3 else 42
         self.subject = random.choice(SUBJECTS)
         # One oddity at most, so that what decides is clear.
-        self.odd = "" if portable or random.random() < 0.75 else random.choice(_ODDITIES)
+        self.odd = "" if portable or random.random() < 0.75 else random.choice(ODDITIES)
 
     def chance(self, probability: float) -> bool:
         return self.random.random() < probability
@@ -272,9 +239,9 @@ class _Draw:
         end = self.moment(self.random.choice((24 * 30, 24 * 4000)))
         if self.seldom(0.3):
             if self.chance(0.5):
-                begin = self.moment(self.random.choice(_NEAR))
+                begin = self.moment(self.random.choice(NEAR))
             else:
-                end = self.moment(self.random.choice(_NEAR))
+                end = self.moment(self.random.choice(NEAR))
         if self.odd == "date only":
             begin = begin[:10]
         if self.odd == "end without time":
@@ -386,50 +353,3 @@ class _Draw:
                 f"<id_range><min>0</min><max>{max(domain, 1)}</max></id_range>",
             )
         )
-
-
-_ODDITIES = (
-    "comment",
-    "comment behind permissions",
-    "comment behind domain_access_rules",
-    "governance order",
-    "missing kind",
-    "unknown in governance",
-    "no topic rules",
-    "TRUE",
-    "spaced flag",
-    "spaced governance",
-    "no default",
-    "empty default",
-    "spaced default",
-    "default first",
-    "validity first",
-    "unknown in grant",
-    "unknown behind default",
-    "no name",
-    "attribute",
-    "spaced subject",
-    "date only",
-    "end without time",
-    "far end",
-    "fraction",
-    "short date",
-    "spaced date",
-    "no domains",
-    "unknown in rule",
-    "empty criteria",
-    "capitals",
-    "two topics lists",
-    "empty topics list",
-    "empty topic",
-    "unknown in criteria",
-    "data tags",
-    "empty partitions",
-    "spaced topic",
-    "max only",
-    "big max",
-    "hexadecimal",
-    "empty id",
-    "wide id",
-    "spaced id",
-)
