@@ -144,7 +144,7 @@ def create_permission(
     check_enclave_name(name)
     if not dry_run:
         tidy(root)
-    _check_keystore(root)
+    check_keystore(root)
     if name not in set(enclave_names(root)):
         raise KeystoreError(
             f"enclave {name} does not exist in keystore '{root}'",
@@ -195,14 +195,14 @@ def generate_artifacts(
         _check_typo(root)
         _check_free(root)
     else:
-        _check_keystore(root)
+        check_keystore(root)
         create = None
     return _produce(root, wanted, now, domain, keyring, dry_run, progress, create, domains)
 
 
 def list_enclaves(root: Path) -> tuple[str, ...]:
     """The names of the enclaves of a keystore, sorted; `KeystoreError` if it is none."""
-    _check_keystore(root)
+    check_keystore(root)
     return tuple(enclave_names(root))
 
 
@@ -293,7 +293,8 @@ def write_governance(
 # ── what is checked first ──────────────────────────────────────────────────────────────────
 
 
-def _check_keystore(root: Path) -> None:
+def check_keystore(root: Path) -> None:
+    """Raise `KeystoreError` if ``root`` is no keystore."""
     if not is_keystore(root):
         raise KeystoreError(
             f"'{root}' is not a valid keystore",

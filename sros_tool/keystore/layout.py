@@ -70,6 +70,12 @@ def is_keystore(root: Path) -> bool:
     )
 
 
+def has_enclave(root: Path, name: str) -> bool:
+    """Whether the keystore has an enclave of that name, without a look at all the others."""
+    folder = f"{root}/{enclave_folder(name)}"
+    return os.path.lexists(f"{folder}/cert.pem") or os.path.lexists(f"{folder}/key.pem")
+
+
 def enclave_names(root: Path) -> Iterator[str]:
     """The names of the enclaves in the keystore: every folder that holds a key, sorted."""
     top = os.fspath(root / ENCLAVES)

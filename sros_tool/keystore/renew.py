@@ -9,10 +9,10 @@ from pathlib import Path
 
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.authority import Authorities, load_authorities
-from sros_tool.keystore.create import list_enclaves
+from sros_tool.keystore.create import check_keystore, list_enclaves
 from sros_tool.keystore.issuance import Issuance, policies_of, renewed
 from sros_tool.keystore.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.layout import enclave_folder
+from sros_tool.keystore.layout import enclave_folder, has_enclave
 from sros_tool.keystore.ledger import Entry, append, read_ledger
 from sros_tool.keystore.lifetime import (
     Standing,
@@ -92,16 +92,16 @@ def renew(
     """
     if not dry_run:
         tidy(root)
-    existing = list_enclaves(root)
+    check_keystore(root)
     for name in names:
-        check_enclave_name(name)
-        if name not in existing:
+        if not has_enclave(root, check_enclave_name(name)):
             raise KeystoreError(f"enclave {name} does not exist in keystore '{root}'")
     with Transaction(root, dry_run=dry_run) as transaction:
         template = load_settings(root)
         authorities = load_authorities(root, template, keyring, now)
         work = _Renewer(transaction, authorities, template, now, new_key)
         chosen = dict.fromkeys(names, None)
+        existing = list_enclaves(root) if expiring or revoke_old else ()
         if expiring is not None:
             chosen |= {name: expiring for name in existing if name not in chosen}
         replaced = work.renew_all(list(chosen.items()), progress)
