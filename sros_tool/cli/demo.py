@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -97,6 +98,12 @@ Exit status: 0 if every row is as expected (or skipped with its reason), 1 if no
     metavar="FILE.svg",
     help="Draw what security costs (with --scenario governance).",
 )
+@click.option(
+    "--report",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.html",
+    help="Write all of it as one page, with the plots of what security costs.",
+)
 @json_option
 def demo(
     backend: str,
@@ -111,6 +118,7 @@ def demo(
     keep: Path | None,
     summary: Path | None,
     plot: Path | None,
+    report: Path | None,
     as_json: bool,
 ) -> None:
     """Show on a real DDS that nobody hears secured nodes, or gets in, without permission.
@@ -144,6 +152,8 @@ def demo(
         from sros_tool.demo.plot import cost_plot
 
         replace_file(plot, cost_plot(result.cost).encode())
+    if report is not None:
+        _write_report(report, result.as_json(), keep)
     if summary is not None:
         from sros_tool.demo.summary import summary_page
 
@@ -163,6 +173,16 @@ def _list(scenarios: Sequence[Scenario], as_json: bool) -> None:
     width = max(len(scenario.name) for scenario in scenarios)
     for scenario in scenarios:
         click.echo(f"{scenario.name:<{width}}  {len(scenario.rows):>3} rows  {scenario.title}")
+
+
+def _write_report(report: Path, result: dict[str, Any], keep: Path | None) -> None:
+    """The page, which says nothing of where on this machine things were."""
+    from sros_tool.atomic import replace_file
+    from sros_tool.report.demo_page import render_demo_page, without_places
+
+    places = [Path.home(), Path.cwd(), Path(tempfile.gettempdir()), *([keep] if keep else [])]
+    told = without_places(result, [str(place.absolute()) for place in places])
+    replace_file(report, render_demo_page(told).encode())
 
 
 def _progress(line: str) -> None:

@@ -1,0 +1,131 @@
+"""Writes the demo and the attack demo as a page: what was tried, expected and seen, and by what.
+
+It takes the JSON of ``sros demo --json`` (`sros_tool.demo.result`) as a value.  The page has no
+script; it opens from disk, and can be printed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from html import escape
+from itertools import groupby
+from typing import Any
+
+from sros_tool.report.cost_plot import cost_section
+from sros_tool.report.page import asset, document
+
+Json = Mapping[str, Any]
+SKIPPED = "skipped"
+
+
+def render_demo_page(result: Json) -> str:
+    """The result of a demo as an HTML document."""
+    body = "\n".join((_head(result), *map(_scenario, result["scenarios"])))
+    title = f"sros demo on {result['dds']}"
+    return document(title, f"<main>{body}</main>", asset("demo.css"))
+
+
+def without_places(value: Any, places: Sequence[str]) -> Any:
+    """``value`` with every text in it told without these folders of the machine."""
+    if isinstance(value, str):
+        for place in sorted(places, key=len, reverse=True):
+            value = value.replace(place, "…") if len(place) > 1 else value
+        return value
+    if isinstance(value, Mapping):
+        return {key: without_places(each, places) for key, each in value.items()}
+    if isinstance(value, Sequence):
+        return [without_places(each, places) for each in value]
+    return value
+
+
+def _sentence(text: str) -> str:
+    return escape(f"{text[:1].upper()}{text[1:].rstrip('.')}.") if text else ""
+
+
+def _head(result: Json) -> str:
+    rows = result["rows"]
+    good = sum(bool(row["as_expected"]) for row in rows)
+    skipped = sum(row["observed"] == SKIPPED for row in rows)
+    opened = sum(bool(row.get("open_because")) for row in rows)
+    where = "in a network of its own" if result["own_network"] else "in the network of the machine"
+    facts = [
+        f"{escape(result['dds'])}, nodes by {escape(result['backend'])}",
+        f"topic <code>{escape(result['topic'])}</code>",
+        f"keystore template {escape(result['template'])}",
+        where,
+    ]
+    tiles = [
+        ("good" if good == len(rows) else "error", f"{good} of {len(rows)}", "rows as expected"),
+        ("", str(sum(bool(row.get("defence_removed")) for row in rows)), "with a defence removed"),
+        ("warning" if opened else "", str(opened), "doors known to be open"),
+        ("", str(skipped), "skipped"),
+    ]
+    shown = "".join(
+        f'<li class="tile {kind}"><b>{number}</b> {text}</li>'
+        for kind, number, text in tiles
+        if number != "0"
+    )
+    why = f'<p class="soft">{escape(result["why"])}</p>' if result.get("why") else ""
+    return (
+        f"<header><h1>What was tried, and what came of it</h1><p>{', '.join(facts)}.</p>{why}"
+        f'<ul class="tiles">{shown}</ul></header>'
+    )
+
+
+def _scenario(scenario: Json) -> str:
+    rows = scenario["rows"]
+    good = sum(bool(row["as_expected"]) for row in rows)
+    parts = [f"<section><h2>{escape(scenario['title'])}</h2>"]
+    if rows:
+        told = f"{escape(scenario['name'])}: {good} of {len(rows)} rows as expected"
+        parts += [f'<p class="soft">{told}</p>', _table(rows)]
+    if scenario.get("cost"):
+        parts.append(cost_section(scenario["cost"]))
+    return "\n".join((*parts, "</section>"))
+
+
+def _table(rows: Sequence[Json]) -> str:
+    lines = [
+        '<table class="rows"><thead><tr><th scope="col"><span class="hidden">Result</span></th>'
+        '<th scope="col">Tried</th><th scope="col">Expected</th><th scope="col">Seen</th>'
+        '<th scope="col">Mechanism</th></tr></thead>'
+    ]
+    for attack, found in groupby(rows, key=lambda row: row.get("attack", "")):
+        lines.append("<tbody>")
+        if attack:
+            heading = f'<th colspan="5" scope="rowgroup">{escape(attack)}</th>'
+            lines.append(f'<tr class="attack">{heading}</tr>')
+        lines += [line for row in found for line in _row(row)]
+        lines.append("</tbody>")
+    return "\n".join((*lines, "</table>"))
+
+
+def _row(row: Json) -> Iterator[str]:
+    if row["observed"] == SKIPPED:
+        mark = '<span class="chip">skipped</span>'
+    elif row["as_expected"]:
+        mark = '<span class="chip good">ok</span>'
+    else:
+        mark = '<span class="chip error">differs</span>'
+    tried = escape(row["name"])
+    if removed := row.get("defence_removed"):
+        tried += f' <span class="chip">without {escape(removed)}</span>'
+    mechanism = escape(row["mechanism"])
+    if because := row.get("open_because"):
+        mechanism += (
+            f'<p><span class="chip warning">known to be open</span> {_sentence(because)} '
+            f"{_sentence(row.get('remedy', ''))}</p>"
+        )
+    seconds = f" ({row['seconds']:g} s)" if row.get("seconds") else ""
+    if row.get("detail"):
+        mechanism += (
+            f"<details><summary>what was counted{seconds}</summary>"
+            f"{escape(row['detail'])}</details>"
+        )
+    yield (
+        f'<tr class="{"" if row["as_expected"] else "wrong"}"><td>{mark}</td>'
+        f'<th scope="row" data-label="Tried">{tried}</th>'
+        f'<td data-label="Expected">{escape(row["expected"])}</td>'
+        f'<td data-label="Seen">{escape(row["observed"])}</td>'
+        f'<td data-label="Mechanism">{mechanism}</td></tr>'
+    )

@@ -1,0 +1,151 @@
+"""The page of a demo: every row, and what it costs; names in it stay names."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from lxml import html
+from pictures import HOSTILE
+
+from sros_tool.report.demo_page import render_demo_page, without_places
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser
+
+pytest_plugins = ["browsing"]
+KINDS = ("unsecured", "signed", "encrypted")
+
+
+def row(name: str, **values: Any) -> dict[str, Any]:
+    given = {
+        "name": name,
+        "expected": "not heard",
+        "observed": "not heard",
+        "as_expected": True,
+        "mechanism": "who cannot authenticate is sent nothing",
+        "detail": "heard 0 of 50; control: heard 50 of 50",
+        "domain": 80,
+        "seconds": 5.0,
+        "attack": "",
+        "defence_removed": "",
+        "open_because": "",
+        "remedy": "",
+        "scenario": "attacks",
+    }
+    return {**given, **values}
+
+
+def result(*rows: dict[str, Any], cost: dict[str, Any] | None = None) -> dict[str, Any]:
+    scenario = {"name": "attacks", "title": "every way in", "as_expected": True, "cost": cost}
+    return {
+        "backend": "cyclone",
+        "dds": "Cyclone DDS 0.10.2",
+        "why": "",
+        "template": "production",
+        "topic": "/chatter",
+        "own_network": True,
+        "network_reason": "",
+        "as_expected": all(each["as_expected"] for each in rows),
+        "scenarios": [{**scenario, "rows": list(rows)}],
+        "rows": list(rows),
+    }
+
+
+COST = {
+    "kinds": list(KINDS),
+    "payloads": [64, 1024, 1048576],
+    "note": "medians of several rounds",
+    "first_message": [{"kind": k, "seconds": 0.2, "ratio": 1.5} for k in KINDS],
+    "measurements": [
+        {
+            "kind": kind,
+            "payload": size,
+            "latency_us": 50.5 + size / 1000,
+            "messages_per_s": 1000.0,
+            "megabytes_per_s": size / 1000,
+            "latency_ratio": 1.25,
+            "throughput_ratio": 0.75,
+        }
+        for kind in KINDS
+        for size in (64, 1024, 1048576)
+    ],
+}
+
+
+def test_every_row_is_told_with_what_came_of_it() -> None:
+    page = render_demo_page(
+        result(
+            row("an unsecured node listens", attack="joining"),
+            row(
+                "the same, strangers allowed",
+                attack="joining",
+                defence_removed="the refusal of strangers",
+                expected="heard",
+                observed="heard",
+            ),
+            row("names read", attack="looking", open_because="names are in clear", remedy="none"),
+            row("something else", observed="heard", as_expected=False),
+            row("not here", observed="skipped"),
+        )
+    )
+    rows = html.fromstring(page).xpath("//table[@class='rows']//tr[td]")
+    told = [" ".join(" ".join(each.itertext()).split()) for each in rows]
+    assert len(told) == 5
+    assert told[0].startswith("ok an unsecured node listens not heard not heard who cannot")
+    assert "without the refusal of strangers heard heard" in told[1]
+    assert "known to be open Names are in clear. None." in told[2]
+    assert told[3].startswith("differs something else not heard heard")
+    assert told[4].startswith("skipped")
+    assert "4 of 5" in page and "heard 0 of 50; control" in page
+    attacks = html.fromstring(page).xpath("//tr[@class='attack']")
+    assert [each.text_content() for each in attacks] == ["joining", "looking"]
+
+
+def test_costs_are_drawn_and_told() -> None:
+    tree = html.fromstring(render_demo_page(result(row("x"), cost=COST)))
+    plots = tree.xpath("//figure/svg")
+    assert len(plots) == 2
+    for plot in plots:
+        assert len(plot.xpath(".//polyline")) == len(KINDS)
+        assert len(plot.xpath(".//path/title")) == 9
+    latency = plots[0].xpath(".//polyline")[0].get("points").split()
+    heights = [float(point.split(",")[1]) for point in latency]
+    assert heights == sorted(heights, reverse=True)  # larger payloads take longer
+    cells = [" ".join(c.itertext()) for c in tree.xpath("//table[@class='costs']//td")]
+    assert "0.20 s (1.5)" in cells and "50.564 (1.25) 0.064 (0.75)" in cells
+
+
+def test_no_place_of_the_machine_is_told() -> None:
+    value = {"a": ["in /home/me/ks/log", 3], "b": {"c": "/home/me"}, "d": None}
+    assert without_places(value, ["/home/me", "/"]) == {
+        "a": ["in …/ks/log", 3],
+        "b": {"c": "…"},
+        "d": None,
+    }
+
+
+@pytest.mark.browser
+@pytest.mark.xdist_group("browser")
+def test_it_opens_from_disk_and_runs_nothing(browser: Browser, built: Path, tmp_path: Path) -> None:
+    rows = [row(text, mechanism=text, attack=text, detail=text) for text in HOSTILE]
+    path = tmp_path / "demo.html"
+    path.write_text(render_demo_page(result(*rows, cost=COST)))
+    said: list[str] = []
+    page = browser.new_page()
+    page.on("console", lambda message: said.append(message.text))
+    page.goto(path.as_uri())
+    assert not said
+    shown = page.locator("tbody th[scope=row]").all_text_contents()
+    assert shown == [*HOSTILE, *KINDS]
+    assert page.evaluate("window.broken") is None
+    page.evaluate((built / "node_modules/axe-core/axe.min.js").read_text())
+    for scheme in ("light", "dark"):
+        page.emulate_media(color_scheme=scheme)
+        found = page.evaluate("axe.run(document)")["violations"]
+        assert [each["id"] for each in found] == []
+    for width in (1280, 390):
+        page.set_viewport_size({"width": width, "height": 800})
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.close()
