@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
+from functools import lru_cache
 
 from sros_tool.dds.decision import (
     TRAITS,
@@ -32,6 +33,9 @@ _WORST = (
 )
 _UNTOLD_LOCALLY = {(Vendor.CYCLONE, "key-mismatch")}
 """What a vendor does not notice itself, but every peer does."""
+
+# All enclaves of a keystore have the same governance.
+_governance_as = lru_cache(maxsize=16)(read_governance_as)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +116,7 @@ class Judge:
             untold = all((self._vendor, each.code) in _UNTOLD_LOCALLY for each in material.problems)
             outcome = Outcome.PEER_DENIES if untold else Outcome.REFUSED
             return Decision(outcome, first.code, f"{self._vendor.title}: {first}.")
-        governance = read_governance_as(self._vendor, material.governance)
+        governance = _governance_as(self._vendor, material.governance)
         if isinstance(governance, Refusal):
             return replace(governance.decision(), reason="governance-malformed")
         self._governance = governance

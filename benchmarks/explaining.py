@@ -1,0 +1,74 @@
+"""Asking every enclave of a keystore at once: who may do something, and whom one can influence."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+from benchmarks.inputs import enclaves_policy
+
+Figure = tuple[str, float, str, bool]
+"""What was measured, seconds, the limit, and whether it is kept."""
+
+
+def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Figure]:
+    """Seconds of ``sros explain --who`` and ``--reach``, and of proving what is signed."""
+    from sros_tool.dds.decision import Vendor
+    from sros_tool.dds.domains import DomainSet
+    from sros_tool.explain.answer import Setting
+    from sros_tool.explain.flow import Network
+    from sros_tool.explain.question import ask
+    from sros_tool.explain.who import who
+    from sros_tool.keystore import create_keystore, generate_artifacts
+    from sros_tool.keystore.proof import prove
+    from sros_tool.keystore.rights import load_rights
+    from sros_tool.keystore.template import load_template
+    from sros_tool.policy import read_policy
+    from sros_tool.translate import permissions_for
+    from sros_tool.validity import window
+
+    now = datetime.now(UTC)
+    root, file = folder / "explained", folder / "explained.xml"
+    file.write_text(enclaves_policy(enclaves, rules))
+    policy = read_policy(file)
+    template = load_template("production")
+    create_keystore(root, template=template, now=now)
+    generate_artifacts(root, policies=[policy], now=now)
+    domains = DomainSet.parse("0")
+    validity = window(now, template.permissions_validity)
+    signed = [
+        permissions_for(each, subject="CN=/x", validity=validity, domains=domains)
+        for each in policy.enclaves
+    ]
+
+    def ask_all() -> None:
+        question = ask("publish", "/robot7/topic_0")
+        found = who(root, question, Vendor.FAST, lambda _: Setting(0, now), at=now)
+        assert [each.enclave for each in found if each.outcome.ok] == ["/robot7/part"]
+
+    def follow() -> None:
+        Network(load_rights(root).rights).reach("/robot7/part")
+
+    def prove_all() -> None:
+        for each, permissions in zip(policy.enclaves, signed, strict=True):
+            prove(each, permissions, domains)
+
+    measured = (
+        (f"sros explain --who: {enclaves} enclaves asked", ask_all, 2.0),
+        (f"sros explain --reach among {enclaves} enclaves", follow, 2.0),
+        (f"proving that permissions of {enclaves} say what policies say", prove_all, 0.15),
+    )
+    figures = []
+    for name, work, limit in measured:
+        taken = statistics.median(_seconds(work) for _ in range(rounds))
+        figures.append((name, taken, f"{limit:g} s", taken < limit))
+    return figures
+
+
+def _seconds(work: Callable[[], object]) -> float:
+    begin = time.perf_counter()
+    work()
+    return time.perf_counter() - begin
