@@ -44,7 +44,7 @@ from sros_tool.validity import Window
 _NOBODY = 65534
 _DAY, _MINUTE = timedelta(days=1), timedelta(minutes=1)
 STOLEN = "/stolen"
-"""Where a copy of the talker's enclave from before its revocation is kept."""
+"""Where a copy of an enclave from before its revocation is kept."""
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,23 @@ def _guest_revoked(bench: Bench) -> None:
     _revoke(bench, "guest")
 
 
-def _revocation_not_delivered(bench: Bench) -> None:
-    before = {name: bench.read("talker", name) for name in REQUIRED_FILES}
-    _revoke(bench, "talker")
+def _not_delivered_of_the_talker(bench: Bench) -> None:
+    _revocation_not_delivered(bench, "talker")
+
+
+def _not_delivered_of_the_guest(bench: Bench) -> None:
+    """The copy has permissions from before rights were taken away."""
+    now = bench.read("guest", PERMISSIONS)
+    _signed_by_the_ca(bench)
+    before = bench.read("guest", PERMISSIONS)
+    bench.put("guest", PERMISSIONS, now)
+    _revocation_not_delivered(bench, "guest")
+    (enclave_path(bench.root, STOLEN) / PERMISSIONS).write_bytes(before)
+
+
+def _revocation_not_delivered(bench: Bench, part: str) -> None:
+    before = {name: bench.read(part, name) for name in REQUIRED_FILES}
+    _revoke(bench, part)
     copy = enclave_path(bench.root, STOLEN)
     copy.mkdir(mode=0o700)
     for name, data in before.items():
@@ -380,7 +394,8 @@ FORGERIES: Mapping[str, Forge] = {
 REMOVALS: Mapping[str, Removal] = {
     "made": Removal(_as_it_is),
     "in date": Removal(_in_date),
-    "revocation not delivered": Removal(_revocation_not_delivered),
+    "revocation not delivered": Removal(_not_delivered_of_the_talker),
+    "guest's revocation not delivered": Removal(_not_delivered_of_the_guest),
     "keys readable for all": Removal(_readable_for_all),
     "signed by the CA": Removal(_signed_by_the_ca),
     "guest may do everything": Removal(_every_topic("guest")),

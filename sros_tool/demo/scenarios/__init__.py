@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
+from sros_tool.demo.custom import read_scenario
 from sros_tool.demo.model import Scenario
 from sros_tool.demo.scenarios.actions import ACTIONS
 from sros_tool.demo.scenarios.attacks import ATTACKS
@@ -26,12 +28,18 @@ ALL = "all"
 
 
 def choose_scenarios(names: Sequence[str]) -> tuple[Scenario, ...]:
-    """The scenarios of those names, in order; none is the default.  Raises `UsageError`."""
+    """The scenarios of those names or files, in order; none is the default.
+
+    Raises `UsageError` and, for a file, `DocumentError`.
+    """
     if ALL in names:
         return SCENARIOS
     known = {scenario.name: scenario for scenario in SCENARIOS}
     chosen = []
     for name in dict.fromkeys(names or (DEFAULT_SCENARIO,)):
+        if name.endswith(".toml"):
+            chosen.append(read_scenario(Path(name)))
+            continue
         if name not in known:
             raise UsageError(
                 f"there is no scenario {name!r}",
