@@ -1,0 +1,110 @@
+"""Scenario files of users: what they say, and the line of what is not understood."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from harness import policy_text, publish, sros
+
+from sros_tool.demo.custom import read_scenario
+from sros_tool.demo.model import OWN, UNSECURED, Identity, Relation, Role, Status
+from sros_tool.errors import DocumentError
+
+GOOD = """title = "who sees the camera"
+policy = "robot.xml"
+
+[[party]]
+name = "camera"
+role = "talker"
+enclave = "/arm/camera"
+topic = "/image"
+
+[[party]]
+name = "viewer"
+role = "listener"
+enclave = "/arm/viewer"
+topic = "/image"
+
+[[party]]
+name = "spy"
+role = "listener"
+topic = "/image"
+
+[[row]]
+name = "the viewer sees"
+claims = ["viewer hears camera"]
+
+[[row]]
+name = "a spy does not"
+claims = ["spy does not hear camera"]
+controls = ["viewer hears camera"]
+because = "it has no keys"
+"""
+HEARS = '<topics subscribe="ALLOW"><topic>/image</topic></topics>'
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    policy = policy_text({"/arm/camera": publish("/image"), "/arm/viewer": HEARS})
+    (tmp_path / "robot.xml").write_text(policy)
+    return tmp_path
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "mine.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_good_file(folder: Path) -> None:
+    scenario = read_scenario(write(folder, GOOD))
+    assert (scenario.name, scenario.title) == ("mine", "who sees the camera")
+    first, second = scenario.rows
+    assert first.expected is Status.HEARD
+    assert [party.name for party in first.parties] == ["camera", "viewer"]
+    assert second.expected is Status.NOT_HEARD
+    assert second.mechanism == "it has no keys"
+    camera, _, spy = second.parties
+    assert camera.identity == Identity(OWN, "/arm/camera")
+    assert (camera.role, camera.topic) == (Role.TALKER, "/image")
+    assert spy.identity == UNSECURED
+    assert second.controls[0].relation is Relation.HEARS
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "line", "told"),
+    [
+        ('role = "talker"', 'role = "singer"', 6, "'singer' is not a role"),
+        ('"/arm/viewer"', '"/arm/vewer"', 13, "did you mean /arm/viewer?"),
+        ('topic = "/image"', 'topic = "a b"', 8, "not a topic name"),
+        ('name = "viewer"', 'name = "camera"', 11, "two parties"),
+        ("viewer hears camera", "viewer hears camra", 23, "no party 'camra'"),
+        ("viewer hears camera", "viewer likes camera", 23, "is not a claim"),
+        ("viewer hears camera", "camera hears viewer", 23, "a talker cannot do that"),
+        ('controls = ["viewer hears camera"]\n', "", 27, "a crash would look the same"),
+        ("because", "becuase", 29, "'becuase' is not a key"),
+        ('policy = "robot.xml"', 'policy = "other.xml"', 2, "other.xml"),
+        ('policy = "robot.xml"\n', "", 1, "no policy"),
+        ('claims = ["viewer hears camera"]\n', "", 22, "has no claims"),
+        ('name = "the viewer sees"', "name = 3", 22, "3, not a text"),
+    ],
+)
+def test_what_is_wrong_is_told_with_its_line(
+    folder: Path, old: str, new: str, line: int, told: str
+) -> None:
+    assert old in GOOD
+    with pytest.raises(DocumentError) as caught:
+        read_scenario(write(folder, GOOD.replace(old, new)))
+    assert f"line {line}: " in str(caught.value)
+    assert told in str(caught.value)
+
+
+def test_broken_toml_and_missing_files(folder: Path) -> None:
+    ended = sros("demo", "--scenario", write(folder, "a = = 1\n"))
+    assert ended.status == 1
+    assert "line" in ended.err
+    ended = sros("demo", "--scenario", folder / "none.toml")
+    assert ended.status == 1
+    assert "none.toml" in ended.err
+    assert "Traceback" not in ended.err
