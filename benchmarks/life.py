@@ -1,10 +1,17 @@
-"""Renewing many enclaves, beside its floor: the same cryptography and files, with nothing else."""
+"""Renewing many enclaves, beside its floor: the same cryptography and files, with nothing else.
+
+Part of the cryptography is to verify what is replaced: the new certificate takes over the key of
+the old one, and the new permissions the rights of the old ones.  Without the two signatures,
+whoever can write to an enclave's folder would have any key certified, and any rights signed.  The
+floor is measured with that and without it.
+"""
 
 from __future__ import annotations
 
 import os
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -13,8 +20,17 @@ from benchmarks.floor import sizes_of
 RENEWED = ("cert.pem", "permissions.p7s", "permissions.xml")
 
 
-def measure_renewal(folder: Path, count: int) -> tuple[float, float]:
-    """Seconds that it takes to renew ``count`` enclaves of a keystore, and the floor of that."""
+@dataclass(frozen=True)
+class Renewal:
+    """Seconds for so many enclaves: of sros, of the floor, and of the floor without its checks."""
+
+    taken: float
+    floor: float
+    unchecked: float
+
+
+def measure_renewal(folder: Path, count: int) -> Renewal:
+    """Renew ``count`` enclaves of a keystore, and replace as many files of the same sizes."""
     from sros_tool.keystore import create_enclaves, create_keystore
     from sros_tool.keystore.renew import renew
     from sros_tool.keystore.template import load_template
@@ -26,20 +42,26 @@ def measure_renewal(folder: Path, count: int) -> tuple[float, float]:
     create_enclaves(root, names, now=now)
     sizes = sizes_of(root / "enclaves/robot0/part")
     files = [(name, size) for name, size in sizes if name in RENEWED and isinstance(size, int)]
-    place = folder / "renewal floor"
-    for index in range(count):
-        (place / str(index)).mkdir(parents=True)
-        for name, size in files:
-            (place / str(index) / name).write_bytes(b"o" * size)
+    places = [folder / "renewal floor", folder / "renewal floor, unchecked"]
+    for place in places:
+        for index in range(count):
+            (place / str(index)).mkdir(parents=True)
+            for name, size in files:
+                (place / str(index) / name).write_bytes(b"o" * size)
     os.sync()
     taken = _seconds(lambda: renew(root, names, now=now + timedelta(days=1)))
-    return taken, _seconds(lambda: replace_files(place, files, count))
+    floor, unchecked = (
+        _seconds(lambda place=place, check=check: replace_files(place, files, count, check=check))  # type: ignore[misc]
+        for place, check in zip(places, (True, False), strict=True)
+    )
+    return Renewal(taken, floor, unchecked)
 
 
-def replace_files(folder: Path, files: list[tuple[str, int]], count: int) -> None:
+def replace_files(folder: Path, files: list[tuple[str, int]], count: int, *, check: bool) -> None:
     """Per enclave: a certificate for a key that exists, one signature, and files replaced.
 
-    One flush makes all of it last, and comes before the first file gets its name.
+    With ``check``, the two files that tell the key and the rights are read, and two signatures
+    verified.  One flush makes all of it last, and comes before the first file gets its name.
     """
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec
@@ -50,15 +72,22 @@ def replace_files(folder: Path, files: list[tuple[str, int]], count: int) -> Non
 
     key = generate_key()
     validity = window(datetime.now(UTC), timedelta(days=365))
-    issuer = Issuer(issue_ca(key, common_name("floor"), validity), key)
-    public = generate_key().public_key()
+    authority = issue_ca(key, common_name("floor"), validity)
+    issuer, public = Issuer(authority, key), generate_key().public_key()
     name, algorithm = common_name("/floor/enclave"), ec.ECDSA(hashes.SHA256())
+    old, signed = issuer.issue(name, public, validity), key.sign(b"x" * 200, algorithm)
     payload = {file: b"x" * size for file, size in files}
     spare = "{}/.{}.new".format
     for index in range(count):
+        place = os.path.join(folder, str(index))
+        if check:
+            for file in ("cert.pem", "permissions.p7s"):
+                with open(os.path.join(place, file), "rb", buffering=0) as there:
+                    there.readall()
+            old.verify_directly_issued_by(authority)
+            authority.public_key().verify(signed, b"x" * 200, algorithm)  # type: ignore[union-attr, arg-type, call-arg]
         pem(issuer.issue(name, public, validity))
         key.sign(b"x" * 200, algorithm)
-        place = os.path.join(folder, str(index))
         for file, _ in files:
             handle = os.open(spare(place, file), os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
             os.write(handle, payload[file])
