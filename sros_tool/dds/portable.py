@@ -6,7 +6,7 @@ and on Cyclone DDS 0.10.2.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
 from itertools import combinations
 
@@ -33,8 +33,20 @@ _CONSEQUENCES = {
 }
 
 
-def outside(permissions: Permissions, signed_bytes: int) -> Iterator[tuple[str, str]]:
-    """What of a document lies outside of the profile: the id of the remark, and a clause."""
+def either_matches(one: str, other: str) -> bool:
+    """Whether one expression means the other; two that only share some names are not seen."""
+    return fnmatchcase(one, other) or fnmatchcase(other, one)
+
+
+def outside(
+    permissions: Permissions,
+    signed_bytes: int,
+    share: Callable[[str, str], bool] = either_matches,
+) -> Iterator[tuple[str, str]]:
+    """What of a document lies outside of the profile: the id of the remark, and a clause.
+
+    ``share`` tells whether two expressions mean a name in common.
+    """
     if signed_bytes >= MAX_SIGNED_BYTES:
         yield "portable.document-size", f"the signed permissions have {signed_bytes} bytes"
     for grant in permissions.grants:
@@ -45,6 +57,7 @@ def outside(permissions: Permissions, signed_bytes: int) -> Iterator[tuple[str, 
                 [t for r in denied for t in _topics(getattr(r, direction))],
                 {t for r in denied for t in _topics(getattr(r, other))},
                 [t for r in allowed for t in _topics(getattr(r, other))],
+                share,
             )
             if blocked:
                 kept_from = "subscribing" if other == "subscribe" else "publishing"
@@ -63,13 +76,14 @@ def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:
     return tuple(topic for each in criteria for topic in each.topics)
 
 
-def _blocked(denied: list[str], denied_too: set[str], allowed: list[str]) -> list[str]:
+def _blocked(
+    denied: list[str], denied_too: set[str], allowed: list[str], share: Callable[[str, str], bool]
+) -> list[str]:
     """The denied expressions that share a name with one allowed in the other direction."""
     return [
         expression
         for expression in denied
-        if expression not in denied_too
-        and any(fnmatchcase(a, expression) or fnmatchcase(expression, a) for a in allowed)
+        if expression not in denied_too and any(share(expression, each) for each in allowed)
     ]
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from harness import with_includes
-from policy_cases import BASICS, CASES, Case, deny, services, topics
+from policy_cases import BASICS, CASES, TYPES, Case, deny, services, topics
 
 from sros_tool.checks.kind import WARNING, Finding
 from sros_tool.checks.policies.files import policy_file_findings
@@ -81,6 +81,19 @@ def test_hidden_nodes_are_tools_and_need_nothing(kind: str, tmp_path: Path) -> N
         for each in ids(tmp_path, hidden)
         if each.startswith("policy.no-") and each != "policy.no-counterpart"
     ]
+
+
+def test_listeners_of_transforms_have_no_parameters(tmp_path: Path) -> None:
+    text = policy(enclave(topics("publish", "/rosout") + services("reply", TYPES), basics=False))
+    assert "policy.no-parameter-events" in ids(tmp_path, text)
+    listener = text.replace('node="n"', 'node="transform_listener_impl_*"')
+    assert ids(tmp_path, listener) == set()
+
+
+def test_a_node_that_lacks_everything_lacks_its_parameters_too(tmp_path: Path) -> None:
+    found = ids(tmp_path, policy(enclave(topics("publish", "a"), basics=False)))
+    assert "policy.no-parameter-services" in found
+    assert "policy.without-parameters" not in found
 
 
 def test_wildcards_give_what_a_node_needs(tmp_path: Path) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from sros_tool.checks.kind import ERROR, Finding, Kind, by_id
+from sros_tool.checks.kind import ERROR, NOTE, Finding, Kind, by_id
 from sros_tool.checks.policies.stated import CheckedPolicy
 from sros_tool.names import expand
 from sros_tool.policy.model import Enclave, Profile
@@ -50,10 +50,20 @@ NO_PARAMETER_EVENTS = Kind(
 NO_PARAMETER_SERVICES = Kind(
     "policy.no-parameter-services",
     ERROR,
-    "a node that may not offer its parameter services",
-    "Every node offers them unless it was made without, and fails at its start where it may not.",
+    "a node that may not offer all of its parameter services",
+    "Every node offers all six unless it was made without, and fails at its start where it may "
+    "not.",
     "ROS 2 Jazzy, rclcpp 28 (ParameterService) and rclpy 7 (start_parameter_services).",
     f'Allow <services reply="ALLOW"> with ~/get_parameters and the others. {_INCLUDE}',
+)
+NO_PARAMETERS = Kind(
+    "policy.without-parameters",
+    NOTE,
+    "a node that may offer no parameter service at all",
+    "It has everything else that it needs, so it may well have been made without parameters; "
+    "otherwise it fails at its start.",
+    "ROS 2 Jazzy, rclcpp 28 (NodeOptions) and rclpy 7 (start_parameter_services).",
+    f"If it has parameters, let it offer them. {_INCLUDE}",
 )
 RELATIVE_GLOBAL = Kind(
     "policy.relative-global-name",
@@ -66,8 +76,9 @@ RELATIVE_GLOBAL = Kind(
 )
 
 KINDS = by_id(
-    NO_TYPE_DESCRIPTION, NO_ROSOUT, NO_PARAMETER_EVENTS, NO_PARAMETER_SERVICES, RELATIVE_GLOBAL
-)
+    NO_TYPE_DESCRIPTION, NO_ROSOUT, NO_PARAMETER_EVENTS, NO_PARAMETER_SERVICES, NO_PARAMETERS,
+    RELATIVE_GLOBAL,
+)  # fmt: skip
 
 _GLOBAL = ("rosout", "parameter_events", "clock")
 _BASICS = (
@@ -76,6 +87,9 @@ _BASICS = (
     (NO_PARAMETER_EVENTS, "publish", ("/parameter_events",)),
     (NO_PARAMETER_SERVICES, "reply", tuple(f"~/{name}" for name in PARAMETER_SERVICES)),
 )
+_LISTENER = "transform_listener_impl_"
+"""Begins the names of the nodes that tf2_ros makes; they have no parameters, and no events."""
+_OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
 
 
 def check_nodes(checked: CheckedPolicy) -> Iterator[Finding]:
@@ -96,9 +110,17 @@ def check_nodes(checked: CheckedPolicy) -> Iterator[Finding]:
 
 def _basics(checked: CheckedPolicy, enclave: Enclave, profile: Profile) -> Iterator[Finding]:
     node = expand("~", profile.ns, profile.node)
+    listener = profile.node.startswith(_LISTENER)
+    lacks_others = False
     for kind, right, names in _BASICS:
+        if listener and kind not in _OF_LISTENERS:
+            continue
         wanted = (expand(name, profile.ns, profile.node) for name in names)
         missing = [name for name in wanted if not checked.rules.allow(enclave.path, right, name)]
-        if missing:
-            text = f"node {node} may not {right} {', '.join(missing)}"
-            yield kind.found(enclave.path, text, profile.source.file, profile.source.line)
+        if not missing:
+            continue
+        if kind is NO_PARAMETER_SERVICES and len(missing) == len(names) and not lacks_others:
+            kind = NO_PARAMETERS
+        lacks_others = True
+        text = f"node {node} may not {right} {', '.join(missing)}"
+        yield kind.found(enclave.path, text, profile.source.file, profile.source.line)

@@ -13,6 +13,7 @@ from sros_tool.dds.portable import mistaken_names, outside, some_pairs
 from sros_tool.keystore.measure import Scale, right_bytes
 from sros_tool.pki.certificates import common_name, subject_text
 from sros_tool.policy.model import Enclave, Policy
+from sros_tool.policy.patterns import overlap
 from sros_tool.policy.rights import policy_rights
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
@@ -96,7 +97,7 @@ def outside_findings(
     permissions: Permissions, signed_bytes: int, subject: str, file: str, line: int | None = None
 ) -> Iterator[Finding]:
     """What of a permissions document lies outside of the portable profile."""
-    for identity, fact in outside(permissions, signed_bytes):
+    for identity, fact in outside(permissions, signed_bytes, overlap):
         yield KINDS[identity].found(subject, fact, file, line)
 
 
