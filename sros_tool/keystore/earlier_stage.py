@@ -1,4 +1,4 @@
-"""Recovers transactions that sros up to 0.1 left behind: their stage held trees of folders.
+"""Recovers transactions that an earlier sros left behind: their stage held trees of folders.
 
 ``new`` and ``old`` had the paths of the keystore, ``removed`` listed what was to go, and ``live``
 led to ``old`` until the moment of the change, then to ``new``.

@@ -15,6 +15,7 @@ import hashlib
 import json
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -34,6 +35,22 @@ class Move(NamedTuple):
     path: str
     before: str | None
     after: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One file that a transaction creates or replaces; ``path`` is relative to the keystore."""
+
+    action: str
+    path: str
+
+
+@dataclass(frozen=True, slots=True)
+class Staged:
+    """What was staged since some moment, for the process that shares its work with this one."""
+
+    changes: tuple[Change, ...]
+    moves: tuple[Move, ...]
 
 
 def number(path: str) -> str:

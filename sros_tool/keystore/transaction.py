@@ -19,7 +19,6 @@ import secrets
 import shutil
 import stat
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -33,7 +32,9 @@ from sros_tool.keystore.stage import (
     ADDED,
     AFTER,
     STAGE,
+    Change,
     Move,
+    Staged,
     number,
     seen_from_stage,
     turn,
@@ -41,22 +42,6 @@ from sros_tool.keystore.stage import (
 )
 
 __all__ = ["STAGE", "Change", "Staged", "Transaction", "recover", "tidy"]
-
-
-@dataclass(frozen=True, slots=True)
-class Change:
-    """One file that a transaction creates or replaces; ``path`` is relative to the keystore."""
-
-    action: str
-    path: str
-
-
-@dataclass(frozen=True, slots=True)
-class Staged:
-    """What was staged since some moment, for the process that shares its work with this one."""
-
-    changes: tuple[Change, ...]
-    moves: tuple[Move, ...]
 
 
 class Transaction:

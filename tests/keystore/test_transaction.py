@@ -703,7 +703,7 @@ def made_up_stage(keystore: Path, live: str, moves: list[list[str | None]]) -> N
 
 @pytest.mark.parametrize("committed", [False, True])
 def test_what_an_earlier_version_left_is_recovered(committed: bool, keystore: Path) -> None:
-    """sros 0.1 staged trees; this is what it looked like on both sides of the change."""
+    """An earlier sros staged trees; this is what it looked like on both sides of the change."""
     stage, a = keystore / STAGE, keystore / "enclaves/a"
     before = snapshot(keystore)
     new = {"enclaves/a/cert.pem": b"new", "enclaves/x/cert.pem": b"x", "ledger.jsonl": b"new"}
