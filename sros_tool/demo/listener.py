@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from sros_tool.demo.options import node_options, split_ros_args
+from sros_tool.demo.options import NodeOptions, node_options, split_ros_args
 from sros_tool.demo.ros_node import run_ros_node
 from sros_tool.runtime.events import EventWriter, Kind
 
@@ -18,20 +18,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = node_options("sros_tool.demo.listener", "Log what is heard on a topic.", own)
 
     def build(node: Any, events: EventWriter) -> None:
-        from std_msgs.msg import String
-
-        heard = 0
-
-        def hear(message: Any) -> None:
-            nonlocal heard
-            heard += 1
-            node.get_logger().info(f"I heard: '{message.data}'")
-            events.report(Kind.HEARD, message.data, count=heard)
-
-        # rclpy keeps subscriptions alive through the node.
-        node.create_subscription(String, options.topic, hear, 10)
+        listen(node, options, events)
 
     return run_ros_node("listener", options, [sys.argv[0], *arguments], build)
+
+
+def listen(node: Any, options: NodeOptions, events: EventWriter) -> None:
+    """Give a node the subscription."""
+    from std_msgs.msg import String
+
+    heard = 0
+
+    def hear(message: Any) -> None:
+        nonlocal heard
+        heard += 1
+        node.get_logger().info(f"I heard: '{message.data}'")
+        events.report(Kind.HEARD, message.data, count=heard)
+
+    # rclpy keeps subscriptions alive through the node.
+    node.create_subscription(String, options.topic, hear, 10)
 
 
 if __name__ == "__main__":

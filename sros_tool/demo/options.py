@@ -42,6 +42,7 @@ def option_parser(program: str, description: str) -> argparse.ArgumentParser:
     parser.add_argument(
         "--text", default=DEFAULT_TEXT, help="what a talker says before the number (%(default)s)"
     )
+    parser.add_argument("--server", default="", help="what the server of an action client says")
     parser.add_argument(
         "--report", type=Path, metavar="FILE", help="append what happens to FILE as JSON lines"
     )

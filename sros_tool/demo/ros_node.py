@@ -1,4 +1,4 @@
-"""Run one ordinary rclpy node: start, report, spin, and end quietly on Ctrl-C or SIGTERM."""
+"""Run ordinary rclpy nodes: start, report, spin, and end quietly on Ctrl-C or SIGTERM."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from sros_tool.runtime.events import EventWriter, Kind, Stage
 _LOG_FLUSH_SECONDS = 0.3
 """Fast DDS logs from a thread of its own: a process that ends at once loses the reason."""
 
-Build = Callable[[Any, EventWriter], None]
-"""Adds a node's publishers, subscriptions and timers."""
+Build = Callable[[Any, EventWriter], Sequence[Any] | None]
+"""Adds a node's publishers, subscriptions and timers; returns further nodes of the process."""
 
 
 def run_ros_node(name: str, options: NodeOptions, arguments: Sequence[str], build: Build) -> int:
@@ -29,35 +29,41 @@ def run_ros_node(name: str, options: NodeOptions, arguments: Sequence[str], buil
         import rclpy
     except ImportError as error:
         return _fail(name, error, Stage.IMPORT, events)
-    stage, node = Stage.PARTICIPANT, None
+    stage = Stage.PARTICIPANT
+    nodes: list[Any] = []
     try:
         rclpy.init(args=list(arguments))
-        node = rclpy.create_node(name)
+        nodes.append(rclpy.create_node(name))
         stage = Stage.ENDPOINT
-        build(node, events)
+        nodes += build(nodes[0], events) or ()
         stage = Stage.RUNNING
         events.report(Kind.READY)
-        _spin(node)
+        _spin(nodes)
     except KeyboardInterrupt:
         pass
+    except ImportError as error:
+        return _fail(name, error, Stage.IMPORT, events)
     except Exception as error:
         return _fail(name, error, stage, events)
     finally:
         # Leaves the domain, and nothing in shared memory; what is half made may well complain.
         with suppress(Exception):
-            if node is not None:
+            for node in nodes:
                 node.destroy_node()
             rclpy.try_shutdown()
     events.report(Kind.DONE)
     return 0
 
 
-def _spin(node: Any) -> None:
+def _spin(nodes: Sequence[Any]) -> None:
     import rclpy
-    from rclpy.executors import ExternalShutdownException
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
+    executor = SingleThreadedExecutor()
+    for node in nodes:
+        executor.add_node(node)
     try:
-        rclpy.spin(node)
+        executor.spin()
     except ExternalShutdownException:
         pass
     except Exception:

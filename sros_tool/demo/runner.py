@@ -157,6 +157,9 @@ class _Stage:
         text = self._text(index, party)
         if party.role in SPEAKING:
             options += ["--text", text]
+        if party.role is Role.ACTION_CLIENT:
+            servers = [each for each in row.parties if each.role is Role.ACTION_SERVER]
+            options += ["--server", self._text(index, servers[0])] if len(servers) == 1 else []
         if party.role is Role.OBSERVER:
             for other in row.parties:
                 if other.role is Role.TALKER and other.aside:

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from sros_tool.demo.options import node_options, split_ros_args
+from sros_tool.demo.options import NodeOptions, node_options, split_ros_args
 from sros_tool.demo.ros_node import run_ros_node
 from sros_tool.runtime.events import EventWriter, Kind
 
@@ -18,22 +18,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = node_options("sros_tool.demo.talker", "Publish a greeting, again and again.", own)
 
     def build(node: Any, events: EventWriter) -> None:
-        from std_msgs.msg import String
-
-        publisher = node.create_publisher(String, options.topic, 10)
-        sent = 0
-
-        def speak() -> None:
-            nonlocal sent
-            sent += 1
-            text = f"{options.text}: {sent}"
-            node.get_logger().info(f"Publishing: '{text}'")
-            publisher.publish(String(data=text))
-            events.report(Kind.SENT, text, count=sent)
-
-        node.create_timer(options.period, speak)
+        talk(node, options, events)
 
     return run_ros_node("talker", options, [sys.argv[0], *arguments], build)
+
+
+def talk(node: Any, options: NodeOptions, events: EventWriter) -> None:
+    """Give a node the publisher, and a timer that uses it."""
+    from std_msgs.msg import String
+
+    publisher = node.create_publisher(String, options.topic, 10)
+    sent = 0
+
+    def speak() -> None:
+        nonlocal sent
+        sent += 1
+        text = f"{options.text}: {sent}"
+        node.get_logger().info(f"Publishing: '{text}'")
+        publisher.publish(String(data=text))
+        events.report(Kind.SENT, text, count=sent)
+
+    node.create_timer(options.period, speak)
 
 
 if __name__ == "__main__":

@@ -156,7 +156,7 @@ def _observe(record: RowRecord) -> Finding:
     if record.skipped:
         return Finding(Status.SKIPPED, record.skipped)
     for party in record.row.parties:
-        lost = _lost_observer(party, record.parties[party.name])
+        lost = _lost_import(party, record.parties[party.name])
         if lost:
             return Finding(Status.SKIPPED, lost)
     claims = [(claim, _judge_claim(claim, record)) for claim in record.row.claims]
@@ -179,12 +179,13 @@ def _observe(record: RowRecord) -> Finding:
     return Finding(record.row.expected, "; ".join(details))
 
 
-def _lost_observer(party: Party, record: PartyRecord) -> str:
-    """Why the observer, which is the only one that always needs rclpy, could not be loaded."""
-    if party.role is not Role.OBSERVER:
+def _lost_import(party: Party, record: PartyRecord) -> str:
+    """Why a node could not be loaded that needs what is not everywhere: rclpy, or an interface."""
+    if party.role in (Role.TALKER, Role.LISTENER):
         return ""
     failed = (e.text for e in record.events if e.kind is Kind.FAILED and e.stage is Stage.IMPORT)
-    return next((f"rclpy cannot be loaded here: {text}" for text in failed), "")
+    what = "rclpy" if party.role is Role.OBSERVER else f"the {party.role}"
+    return next((f"{what} cannot be loaded here: {text}" for text in failed), "")
 
 
 def _judge_claim(claim: Claim, record: RowRecord) -> Finding:

@@ -1,0 +1,48 @@
+"""The attacks: every way in that is known, each with a control, and once without its defence.
+
+An attacker is an intruder in the row.  The control of a row that expects a closed door is the
+rightful talker, whom the same listener hears at the same time.  A row with ``removed`` shows the
+same attack succeed where the defence is gone: an attack that never works would prove nothing.
+"""
+
+from __future__ import annotations
+
+from sros_tool.demo.model import Row, Scenario
+from sros_tool.demo.policies import GUEST, SERVICE, attacked_policy
+from sros_tool.demo.scenarios.attacks import (
+    governance,
+    identities,
+    permissions,
+    rights,
+    strangers,
+    variables,
+    wire,
+)
+
+ROWS: tuple[Row, ...] = (
+    *wire.ROWS,
+    *strangers.ROWS,
+    *rights.ROWS,
+    *identities.ROWS,
+    *permissions.ROWS,
+    *governance.ROWS,
+    *variables.ROWS,
+)
+
+ATTACKS = Scenario(
+    "attacks",
+    "every known way in, tried; and each again without the defence that closes it",
+    ROWS,
+    {
+        "talker": "/talker_listener/talker",
+        "listener": "/talker_listener/listener",
+        "guest": GUEST,
+        "admin": f"{GUEST}/admin",
+        "server": f"{SERVICE}/server",
+        "client": f"{SERVICE}/client",
+        "newcomer": "/talker_listener/newcomer",
+    },
+    attacked_policy,
+    unpermitted=("/talker_listener/newcomer",),
+    any_keystore=True,
+)

@@ -1,0 +1,136 @@
+"""Attacks by an enclave that does more than it was given."""
+
+from __future__ import annotations
+
+from sros_tool.demo.model import (
+    OWN,
+    Case,
+    Condition,
+    Identity,
+    Row,
+    Status,
+)
+from sros_tool.demo.scenarios.attacks.kinds import injection, listening, served, with_service
+
+ROWS: tuple[Row, ...] = (
+    injection(
+        "an enclave publishes a topic that it was not given",
+        Identity(OWN, "guest"),
+        Status.REFUSED,
+        "its signed permissions do not allow the topic",
+        attack="an enclave publishes a topic",
+    ),
+    injection(
+        "an enclave publishes a topic, wildcard permissions",
+        Identity("guest may do everything", "guest"),
+        Status.HEARD,
+        "permissions for * allow every topic",
+        attack="an enclave publishes a topic",
+        removed="least privilege",
+        victims="guest may do everything",
+    ),
+    listening(
+        "an enclave hears a topic that it was not given",
+        Identity(OWN, "guest"),
+        Status.REFUSED,
+        "its signed permissions do not allow the topic",
+        attack="an enclave hears a topic",
+    ),
+    listening(
+        "an enclave hears a topic, wildcard permissions",
+        Identity("guest may do everything", "guest"),
+        Status.HEARD,
+        "permissions for * allow every topic",
+        attack="an enclave hears a topic",
+        removed="least privilege",
+        victims="guest may do everything",
+    ),
+    injection(
+        "a listener publishes",
+        Identity(OWN, "listener"),
+        Status.REFUSED,
+        "its signed permissions allow the topic in the other direction only",
+        attack="a listener publishes",
+    ),
+    injection(
+        "a listener publishes, wildcard permissions",
+        Identity("listener may do everything", "listener"),
+        Status.HEARD,
+        "permissions for * allow both directions",
+        attack="a listener publishes",
+        removed="least privilege",
+        victims="listener may do everything",
+    ),
+    listening(
+        "a talker listens",
+        Identity(OWN, "talker"),
+        Status.REFUSED,
+        "its signed permissions allow the topic in the other direction only",
+        attack="a talker listens",
+    ),
+    listening(
+        "a talker listens, wildcard permissions",
+        Identity("talker may do everything", "talker"),
+        Status.HEARD,
+        "permissions for * allow both directions",
+        attack="a talker listens",
+        removed="least privilege",
+        victims="talker may do everything",
+    ),
+    with_service(
+        "an enclave calls a service that it was not given",
+        Identity(OWN, "guest"),
+        Status.REFUSED,
+        "its signed permissions allow neither the request nor the reply",
+        attack="an enclave calls a service",
+    ),
+    with_service(
+        "an enclave calls a service, wildcard permissions",
+        Identity("guest may do everything", "guest"),
+        Status.ANSWERED,
+        "permissions for * allow every service",
+        attack="an enclave calls a service",
+        removed="least privilege",
+        victims="guest may do everything",
+    ),
+    served(
+        "a client poses as the server",
+        Identity(OWN, "client"),
+        Status.REFUSED,
+        "its signed permissions allow to ask, not to reply",
+        attack="a client poses as the server",
+    ),
+    served(
+        "a client poses as the server, wildcard permissions",
+        Identity("client may do everything", "client"),
+        Status.ANSWERED,
+        "permissions for * allow to reply as well",
+        attack="a client poses as the server",
+        removed="least privilege",
+        victims="client may do everything",
+    ),
+    injection(
+        "an enclave without a policy publishes",
+        Identity(OWN, "newcomer"),
+        Status.REFUSED,
+        "the template gives an enclave without a policy no topic of the robot",
+        attack="an enclave without a policy",
+        cases=(
+            Case(
+                (Condition.OPEN_DEFAULT,),
+                Status.HEARD,
+                "the template lets an enclave without a policy do everything",
+                "give every enclave a policy, or use the template production",
+            ),
+        ),
+    ),
+    injection(
+        "an enclave without a policy publishes, open default",
+        Identity("open default", "newcomer"),
+        Status.HEARD,
+        "an enclave without a policy may do everything",
+        attack="an enclave without a policy",
+        removed="the template's denial of what no policy allows",
+        victims="open default",
+    ),
+)

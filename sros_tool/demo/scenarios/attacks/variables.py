@@ -1,0 +1,94 @@
+"""Attacks on the files and variables that a process is started with."""
+
+from __future__ import annotations
+
+from sros_tool.demo.model import (
+    OWN,
+    Claim,
+    Identity,
+    Party,
+    Relation,
+    Role,
+    Row,
+    Status,
+)
+
+_ENABLE, _STRATEGY = "ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY"
+_PERMISSIVE = (_STRATEGY, "Permissive")
+
+
+def _in_the_open(
+    name: str,
+    identity: Identity,
+    expected: Status,
+    mechanism: str,
+    *,
+    attack: str,
+    removed: str = "",
+    open_because: str = "",
+    remedy: str = "",
+) -> Row:
+    """Whether a talker that should be secured is heard by an unsecured listener."""
+    parties = (
+        Party("misled talker", Role.TALKER, identity, intruder=True),
+        Party("unsecured listener", Role.LISTENER),
+        Party("unsecured talker", Role.TALKER),
+    )
+    claim = Claim(Relation.HEARS, "unsecured listener", "misled talker").expecting(expected)
+    return Row(
+        name,
+        expected,
+        mechanism,
+        parties,
+        (claim,),
+        (Claim(Relation.HEARS, "unsecured listener", "unsecured talker"),),
+        brief=True,
+        attack=attack,
+        removed=removed,
+        open_because=open_because,
+        remedy=remedy,
+    )
+
+
+ROWS: tuple[Row, ...] = (
+    _in_the_open(
+        "a file of the enclave missing, Enforce",
+        Identity("file missing", "talker"),
+        Status.NOT_LET_IN,
+        "with Enforce, a node without all of its files does not start",
+        attack="a file of the enclave missing",
+    ),
+    _in_the_open(
+        "a file of the enclave missing, Permissive",
+        Identity("file missing, permissive", "talker", (_PERMISSIVE,)),
+        Status.HEARD,
+        "with Permissive, it runs unsecured, and everybody hears it",
+        attack="a file of the enclave missing",
+        removed="ROS_SECURITY_STRATEGY=Enforce",
+    ),
+    _in_the_open(
+        "variables spelt right",
+        Identity(OWN, "talker"),
+        Status.NOT_HEARD,
+        "the talker runs secured, and sends strangers nothing",
+        attack="misspelt security variables",
+    ),
+    *(
+        _in_the_open(
+            f"{variable}={value}{' and a file missing' if variable == _STRATEGY else ''}",
+            Identity(
+                "file missing" if variable == _STRATEGY else OWN, "talker", ((variable, value),)
+            ),
+            Status.HEARD,
+            mechanism,
+            attack="misspelt security variables",
+            open_because="rcl takes every other spelling for no, and a node says nothing about it",
+            remedy="start nodes with `sros run`, which sets the variables; `sros doctor` finds"
+            " misspelt ones",
+        )
+        for variable, value, mechanism in (
+            (_ENABLE, "True", "anything but 'true' is off: the talker runs unsecured"),
+            (_STRATEGY, "enforce", "anything but 'Enforce' is permissive: it runs unsecured"),
+        )
+    ),
+)
