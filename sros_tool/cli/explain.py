@@ -9,23 +9,55 @@ from typing import TYPE_CHECKING
 import click
 
 from sros_tool.cli.common import (
+    KEYSTORE_VARIABLE,
     PATH,
     complete_keystore_and_enclave,
     json_option,
-    keystore_from_environment,
     print_json,
     print_notes,
 )
-from sros_tool.cli.explain_case import Place, case_of
-from sros_tool.errors import KeystoreError, UsageError
+from sros_tool.cli.explain_case import Place, case_of, vendor_of
+from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
-    from sros_tool.dds.decision import Vendor
+    from click.shell_completion import CompletionItem
+
     from sros_tool.explain.case import Explanation
     from sros_tool.notes import Note
 
 _VENDORS = ("standard", "fastdds", "fastdds-2.9", "cyclonedds", "opendds", "connext")
 _WORDS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply", "join")
+
+
+def _complete_words(
+    ctx: click.Context, parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem | str]:
+    """Completes the keystore, then its enclaves, then what they could do."""
+    from sros_tool.keystore.layout import is_keystore
+
+    given: tuple[str, ...] = ctx.params.get("words") or ()
+    named = bool(given) and is_keystore(Path(given[0]))
+    rest = given[1:] if named else given
+    if len(rest) == (0 if ctx.params.get("who") else 1):
+        return [word for word in _WORDS if word.startswith(incomplete)]
+    if rest:
+        return []
+    if named or ctx.params.get("keystore"):
+        return _complete_enclave(ctx, parameter, incomplete)
+    return complete_keystore_and_enclave(ctx, parameter, incomplete)
+
+
+def _complete_enclave(
+    ctx: click.Context, _parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem | str]:
+    """Completes the enclaves of the keystore that is named, or else of the environment's."""
+    from sros_tool.keystore.layout import enclave_names, is_keystore
+
+    given: tuple[str, ...] = ctx.params.get("words") or ()
+    named = ctx.params.get("keystore") or (given[0] if given else "")
+    root = Path(named or os.environ.get(KEYSTORE_VARIABLE, ""))
+    names = enclave_names(root) if is_keystore(root) else ()
+    return [name for name in names if name.startswith(incomplete)]
 
 
 @click.command(
@@ -48,7 +80,7 @@ Example:
     "words",
     metavar="[ROOT] [ENCLAVE] [publish|subscribe|call|serve|execute|join [NAME]]",
     nargs=-1,
-    shell_complete=complete_keystore_and_enclave,
+    shell_complete=_complete_words,
 )
 @click.option(
     "--type", "kind", type=click.Choice(["topic", "service", "action"]), help="What NAME is."
@@ -81,6 +113,7 @@ Example:
 @click.option(
     "--reach",
     metavar="ENCLAVE",
+    shell_complete=_complete_enclave,
     help="Say whom this enclave can influence and learn from, over any number of hops.",
 )
 @click.option(
@@ -125,10 +158,14 @@ def explain(
 
         return show_log(log, root, rest, Place(moment, domain, time_zone), as_json=as_json)
     if reach:
-        return _reach(reach, root, rest, policy, infrastructure, as_json)
+        from sros_tool.cli.explain_all import show_reach
+
+        return show_reach(reach, root, rest, policy, infrastructure, as_json)
     place = Place(moment, domain, time_zone)
     if who:
-        return _who(root, rest, kind, vendor, place, as_json)
+        from sros_tool.cli.explain_all import show_who
+
+        return show_who(root, rest, kind, vendor, place, as_json)
     return _one(root, rest, kind, policy, vendor, all_vendors, place, as_json)
 
 
@@ -182,7 +219,7 @@ def _one(
         )
     question = ask(rest[1], rest[2] if len(rest) > 2 else "", kind)
     case = case_of(root, rest[0], policy, place)
-    chosen, why = _vendor(vendor)
+    chosen, why = vendor_of(vendor)
     wanted = list(Vendor) if all_vendors else [chosen]
     found = [explain_case(case, question, each) for each in wanted]
     answer = next(each.answer for each in found if each.answer.vendor is chosen)
@@ -202,16 +239,6 @@ def _one(
             notes.append(_note("explain.vendors-differ", differences(measured) + "."))
     print_notes(notes)
     return 0 if answer.allowed else 1
-
-
-def _vendor(name: str | None) -> tuple[Vendor, str]:
-    from sros_tool.dds.decision import Vendor
-    from sros_tool.explain.vendor import vendor_here
-
-    if name:
-        return Vendor(name), "as asked"
-    choice = vendor_here(os.environ)
-    return choice.vendor, choice.why
 
 
 def _provenance_notes(found: Explanation, policy: Path | None) -> list[Note]:
@@ -234,84 +261,3 @@ def _note(name: str, text: str) -> Note:
     from sros_tool.notes import Note
 
     return Note(name, text)
-
-
-# ── who, and reach ─────────────────────────────────────────────────────────────────────────
-
-
-def _keystore(root: Path | None) -> Path:
-    from sros_tool.keystore.create import list_enclaves
-
-    found = root or keystore_from_environment()
-    list_enclaves(found)
-    return found
-
-
-def _who(
-    root: Path | None,
-    rest: tuple[str, ...],
-    kind: str | None,
-    vendor: str | None,
-    place: Place,
-    as_json: bool,
-) -> int:
-    from sros_tool.cli.explanation import who_json, who_lines
-    from sros_tool.explain.question import ask
-    from sros_tool.explain.who import who
-
-    if not 1 <= len(rest) <= 2:
-        raise UsageError(
-            "--who takes what is to be done, and a name", "", "As in publish /cmd_vel."
-        )
-    question = ask(rest[0], rest[1] if len(rest) > 1 else "", kind)
-    chosen, why = _vendor(vendor)
-    found = who(_keystore(root), question, chosen, place.setting, at=place.at)
-    if as_json:
-        print_json(
-            {
-                "question": str(question),
-                "vendor": chosen.value,
-                "vendor_why": why,
-                "enclaves": [who_json(each) for each in found],
-            }
-        )
-    else:
-        for line in who_lines(found):
-            click.echo(line)
-        click.echo(f"{question}, on {chosen.title} ({why})", err=True)
-    return 0 if any(each.outcome.ok for each in found) else 1
-
-
-def _reach(
-    enclave: str,
-    root: Path | None,
-    rest: tuple[str, ...],
-    policy: Path | None,
-    infrastructure: bool,
-    as_json: bool,
-) -> int:
-    from sros_tool.cli.explanation import reach_json, reach_lines
-    from sros_tool.explain.flow import OF_EVERY_NODE, Network
-    from sros_tool.keystore.rights import load_rights
-
-    if rest:
-        raise UsageError("--reach takes one enclave, and no question")
-    source = load_rights(root or policy or keystore_from_environment())
-    without = () if infrastructure else OF_EVERY_NODE
-    network = Network(source.rights, without=without)
-    if enclave not in network.enclaves:
-        raise KeystoreError(
-            f"enclave {enclave} has no rights in '{source.path}'",
-            f"There are {', '.join(network.enclaves[:5]) or 'none'}.",
-        )
-    reach = network.reach(enclave)
-    if as_json:
-        print_json({"path": str(source.path), "left_out": list(without), **reach_json(reach)})
-    else:
-        for line in reach_lines(reach):
-            click.echo(line)
-    print_notes(source.notes)
-    if without and not as_json:
-        told = f"left out: {', '.join(without)}, which every node writes and reads"
-        click.echo(f"{told} (--infrastructure counts it)", err=True)
-    return 0

@@ -11,6 +11,7 @@ from sros_tool.cli.common import keystore_from_environment, now
 from sros_tool.errors import KeystoreError, UsageError
 
 if TYPE_CHECKING:
+    from sros_tool.dds.decision import Vendor
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.answer import Setting
     from sros_tool.explain.case import Case
@@ -168,3 +169,14 @@ def _planned(stated: Enclave, root: Path | None, place: Place) -> Material:
     return from_policy(
         stated, governance_for(protection, DomainSet.of((domain, domain))), at=place.at
     )
+
+
+def vendor_of(name: str | None) -> tuple[Vendor, str]:
+    """The vendor of an option, or else of this machine, and why it is that one."""
+    from sros_tool.dds.decision import Vendor
+    from sros_tool.explain.vendor import vendor_here
+
+    if name:
+        return Vendor(name), "as asked"
+    choice = vendor_here(os.environ)
+    return choice.vendor, choice.why

@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from sros_tool.explain.answer import Answer, PartAnswer
     from sros_tool.explain.case import Case, Explanation
     from sros_tool.explain.change import Change
-    from sros_tool.explain.flow import Path as FlowPath
-    from sros_tool.explain.flow import Reach
-    from sros_tool.explain.who import Standing
 
 _ADDITION = "allow.xml"
 _WIDTH = 10
@@ -278,73 +275,3 @@ def _change_json(change: Change) -> dict[str, Any]:
             for each in change.edits
         ],
     }
-
-
-# ── who, and reach ─────────────────────────────────────────────────────────────────────────
-
-
-def who_lines(found: Sequence[Standing]) -> Iterator[str]:
-    """The enclaves that may, by which wildcard, and how many may not."""
-    able = [each for each in found if each.outcome.ok]
-    for each in able:
-        yield each.enclave + (f"  by the wildcard {each.wildcard}" if each.wildcard else "")
-    broken = [each for each in found if each.outcome in ("refused", "crashes")]
-    for each in broken:
-        yield f"  not now: {each.enclave}  {each.text.partition(': ')[2]}"
-    yield f"{len(able)} of {len(found)} enclaves may"
-
-
-def who_json(each: Standing) -> dict[str, Any]:
-    """How one enclave stands to a question."""
-    return {
-        "enclave": each.enclave,
-        "allowed": each.outcome.ok,
-        "outcome": each.outcome.value,
-        "reason": each.reason,
-        "expression": each.expression or None,
-        "wildcard": each.wildcard or None,
-    }
-
-
-def reach_lines(reach: Reach) -> Iterator[str]:
-    """Whom an enclave influences and learns from, each with a shortest path."""
-    from sros_tool.explain.flow import path_text
-
-    for what, paths in (
-        ("can influence", reach.influences),
-        ("can learn from", reach.learns_from),
-    ):
-        count = f"{len(paths)} enclave{'' if len(paths) == 1 else 's'}"
-        yield f"{reach.enclave} {what} {count}"
-        for _, path in sorted(paths.items(), key=lambda item: (len(item[1]), item[0])):
-            yield f"  {path_text(path)}"
-
-
-def reach_json(reach: Reach) -> dict[str, Any]:
-    """Whom an enclave influences and learns from, with the hops of a shortest path."""
-    return {
-        "enclave": reach.enclave,
-        "influences": _paths_json(reach.influences),
-        "learns_from": _paths_json(reach.learns_from),
-    }
-
-
-def _paths_json(paths: dict[str, FlowPath]) -> list[dict[str, Any]]:
-    return [
-        {
-            "enclave": enclave,
-            "path": [
-                {
-                    "from": hop.source,
-                    "to": hop.target,
-                    "kind": hop.kind,
-                    "right": hop.right,
-                    "name": hop.name,
-                    "said": hop.said,
-                    "heard": hop.heard,
-                }
-                for hop in path
-            ],
-        }
-        for enclave, path in sorted(paths.items())
-    ]

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -367,3 +370,34 @@ def test_reach(whole: Path) -> None:
     policy = answer("--reach", ENCLAVE, "--policy", POLICY)
     assert [each["enclave"] for each in policy["influences"]] == [OTHER]
     assert explain(whole, "--reach", "/nobody").status == 1
+
+
+# ── completion ─────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("{ks} /", [ENCLAVE, OTHER]),
+        ("{ks} /a p", ["publish"]),
+        ("{ks} /a publish /", []),
+        ("/a s", ["subscribe", "serve"]),
+        ("--keystore {ks} /talker_listener/t", [ENCLAVE]),
+        ("--reach /talker_listener/l", [OTHER]),
+        ("{ks} --who s", ["subscribe", "serve"]),
+    ],
+)
+def test_completion(line: str, offered: list[str], whole: Path) -> None:
+    words = f"sros explain {line.format(ks=whole)}"
+    environment = {
+        **os.environ,
+        "ROS_SECURITY_KEYSTORE": str(whole) if "{ks}" not in line else "",
+        "_SROS_COMPLETE": "bash_complete",
+        "COMP_WORDS": words,
+        "COMP_CWORD": str(len(words.split()) - 1),
+    }
+    script = "from sros_tool.cli import main; main()"
+    ended = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True
+    )
+    assert set(ended.stdout.split()) == {f"plain,{each}" for each in offered}, ended

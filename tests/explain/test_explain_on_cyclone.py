@@ -1,0 +1,93 @@
+"""What `sros explain` says of Cyclone DDS is what Cyclone DDS does, for a sample of the policies.
+
+One process for each enclave asks for topics that the policy allows, and for such that it denies.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from harness import sros
+
+from sros_tool.cli.common import now
+from sros_tool.dds.decision import Vendor
+from sros_tool.explain.answer import Judge, Setting
+from sros_tool.explain.material import from_folder
+from sros_tool.explain.question import Part, Question, ask
+from sros_tool.keystore import create_keystore, generate_artifacts
+from sros_tool.keystore.template import load_template
+from sros_tool.policy import read_policy
+from sros_tool.resources import policies_dir
+
+pytestmark = pytest.mark.dds
+
+QUESTIONS = {
+    "talker_listener": {
+        "/talker_listener/talker": [("publish", "/chatter"), ("subscribe", "/chatter")],
+        "/talker_listener/listener": [("subscribe", "/chatter"), ("publish", "/chatter")],
+    },
+    "add_two_ints": {
+        "/add_two_ints/server": [("serve", "/add_two_ints"), ("call", "/add_two_ints")],
+        "/add_two_ints/client": [("call", "/add_two_ints"), ("serve", "/add_two_ints")],
+    },
+    "fibonacci": {
+        "/fibonacci/server": [("execute", "/fibonacci"), ("call", "/fibonacci")],
+        "/fibonacci/client": [("call", "/fibonacci"), ("execute", "/fibonacci")],
+    },
+    "mobile_robot": {
+        "/mobile_robot/recorder": [
+            ("subscribe", "/scan"),
+            ("subscribe", "/front_camera/image_raw"),
+            ("publish", "/scan"),
+        ],
+        "/mobile_robot/velocity_mux": [("publish", "/cmd_vel"), ("publish", "/cmd_vel_nav")],
+    },
+}
+
+
+@pytest.mark.parametrize("policy", QUESTIONS)
+def test_cyclone_does_as_told(policy: str, tmp_path: Path) -> None:
+    keystore = tmp_path / "ks"
+    file = policies_dir() / f"{policy}.xml"
+    create_keystore(keystore, template=load_template("production"), now=now())
+    generate_artifacts(keystore, policies=[read_policy(file)], now=now())
+    program = Path(__file__).with_name("ask_endpoints.py")
+    seen = set()
+    for enclave, asked in QUESTIONS[policy].items():
+        folder = keystore / "enclaves" / enclave[1:]
+        questions = [_question(policy, *words) for words in asked]
+        parts = [part for each in questions for part in each.parts]
+        done = subprocess.run(
+            [sys.executable, program, folder],
+            input=json.dumps([[part.verb.value, part.topic] for part in parts]),
+            capture_output=True,
+            text=True,
+            timeout=60,
+        )
+        assert done.returncode == 0, done.stderr
+        allowed = dict(zip(map(_key, parts), json.loads(done.stdout), strict=True))
+        for question, words in zip(questions, asked, strict=True):
+            expected = all(allowed[_key(part)] for part in question.parts)
+            kind = ("--type", question.type)
+            found = sros("explain", keystore, enclave, *words, *kind, "--vendor", "cyclonedds")
+            assert found.status == (0 if expected else 1), (found, allowed)
+            seen.add(expected)
+        setting = Setting(0, now())
+        judge = Judge(Vendor.CYCLONE, from_folder(enclave, folder, at=now()), setting)
+        for question in questions:
+            for each in judge.answer(question).parts:
+                assert each.part is not None
+                assert each.decision.outcome.ok == allowed[_key(each.part)], each
+    assert seen == {True, False}
+
+
+def _question(policy: str, word: str, name: str) -> Question:
+    return ask(word, name, "action" if policy == "fibonacci" else None)
+
+
+def _key(part: Part) -> tuple[str, str]:
+    return part.verb.value, part.topic
