@@ -49,6 +49,9 @@ def test_what_nothing_protects_is_shared_with_those_that_were_refused(
 ) -> None:
     free = topic_rule("rt/open", read=False, write=False, data=data)
     free = free.replace("<metadata_protection_kind>ENCRYPT", "<metadata_protection_kind>NONE")
+    hidden = governance(free, topic_rule(), rtps=rtps)
+    assert outcome(vendor, ELSEWHERE, hidden, "rt/open") is Outcome.PEER_DENIES
+    free = free.replace("<enable_discovery_protection>true", "<enable_discovery_protection>false")
     govern = governance(free, topic_rule(), rtps=rtps)
     assert outcome(vendor, ELSEWHERE, govern, "rt/open") is expected
 
@@ -81,3 +84,13 @@ def test_peers_honour_a_default_of_allow() -> None:
 @pytest.mark.parametrize("vendor", [Vendor.CYCLONE, Vendor.FAST_2_9])
 def test_blanks_before_the_declaration(vendor: Vendor) -> None:
     assert outcome(vendor, b"\n " + EVERYTHING, governance(), "rt/a") is Outcome.ALLOWED
+
+
+@pytest.mark.parametrize(
+    ("subject", "fits"),
+    [("CN=/t,", True), ("CN=/t,,O=x", True), (",CN=/t", False), ("CN=/t,O=x", False)],
+)
+def test_fast_dds_stops_at_an_empty_part_of_a_subject(subject: str, fits: bool) -> None:
+    perms = permissions(grant(allow(publish("rt/a")), subject=subject))
+    expected = Outcome.ALLOWED if fits else Outcome.REFUSED
+    assert outcome(Vendor.FAST_2_9, perms, governance(), "rt/a") is expected

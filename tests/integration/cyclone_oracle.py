@@ -44,6 +44,7 @@ REFUSALS = {-13: "denied", -3: "invalid"}
 
 Case = dict[str, Any]
 Report = dict[str, Any]
+IGNORE_OWN_PARTICIPANT = 1  # a reader and a writer of one process would else meet each other
 
 
 def main() -> None:
@@ -63,6 +64,8 @@ def declare(api: Any) -> None:
     strings = ctypes.POINTER(ctypes.c_char_p)
     api.dds_qset_partition.argtypes = [ctypes.c_void_p, ctypes.c_uint32, strings]
     api.dds_qset_partition.restype = None
+    api.dds_qset_ignorelocal.argtypes = [ctypes.c_void_p, ctypes.c_int]
+    api.dds_qset_ignorelocal.restype = None
     for name in ("dds_create_publisher", "dds_create_subscriber"):
         getattr(api, name).argtypes = [ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p]
         getattr(api, name).restype = ctypes.c_int32
@@ -234,8 +237,12 @@ def open_end(
             api.dds_qset_partition(qos, len(partitions), names)
         make = api.dds_create_publisher if writes else api.dds_create_subscriber
         group = make(participant, qos, None)
+    if group < 0:
+        return int(group)
     create = api.dds_create_writer if writes else api.dds_create_reader
-    return int(group if group < 0 else create(group, topics[topic], None, None))
+    with qos_of(api) as qos:
+        api.dds_qset_ignorelocal(qos, IGNORE_OWN_PARTICIPANT)
+        return int(create(group, topics[topic], qos, None))
 
 
 def meets(api: Any, verb: str, end: int) -> bool:

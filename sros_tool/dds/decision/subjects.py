@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from itertools import takewhile
 
 from sros_tool.dds.decision.vendors import Subjects
 
@@ -29,7 +30,8 @@ def _whole_attributes(granted: str, certified: str) -> bool:
 
 
 def _stripped(name: str) -> list[str]:
-    return [part.strip(" ") for part in name.split(",")] if name else []
+    # It stops at the first part that is empty: what stands behind two commas does not count.
+    return [part.strip(" ") for part in takewhile(bool, name.split(","))]
 
 
 def _any_order(granted: str, certified: str) -> bool:
