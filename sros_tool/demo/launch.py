@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from sros_tool.demo.capture import udp_ports
-from sros_tool.demo.verdict import PartyRecord
+from sros_tool.demo.records import PartyRecord
 from sros_tool.runtime.events import Event, EventReader, Kind
 from sros_tool.runtime.netns import end_with_parent
 from sros_tool.runtime.security_log import plain_text

@@ -26,7 +26,7 @@ from typing import Any
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.cost import CostResult
-from sros_tool.demo.verdict import RowResult
+from sros_tool.demo.records import RowResult
 from sros_tool.runtime.netns import Isolation
 
 

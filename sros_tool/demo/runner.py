@@ -19,8 +19,9 @@ from sros_tool.demo.isolated import ENDING_SIGNALS
 from sros_tool.demo.launch import PartyProcess, base_environment
 from sros_tool.demo.model import DENIALS, SPEAKING, Claim, Party, Relation, Role, Row, Wire
 from sros_tool.demo.network import RowNetwork
+from sros_tool.demo.records import Replay, RowRecord, RowResult
 from sros_tool.demo.scenery import Scenery
-from sros_tool.demo.verdict import Replay, RowRecord, RowResult, judge_row
+from sros_tool.demo.verdict import judge_row
 from sros_tool.demo.wiretap import Wiretap
 from sros_tool.runtime.events import Kind
 

@@ -6,8 +6,8 @@ from collections.abc import Iterable, Sequence
 from datetime import datetime
 
 from sros_tool.demo.model import Status
+from sros_tool.demo.records import RowResult
 from sros_tool.demo.result import DemoResult
-from sros_tool.demo.verdict import RowResult
 from sros_tool.validity import iso
 
 

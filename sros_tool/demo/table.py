@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from sros_tool.demo.cost import cost_table
 from sros_tool.demo.model import Status
+from sros_tool.demo.records import RowResult
 from sros_tool.demo.result import DemoResult, ScenarioResult
-from sros_tool.demo.verdict import RowResult
 
 _INDENT = " " * 6
 

@@ -6,8 +6,8 @@ import asyncio
 from collections.abc import Collection, Mapping
 
 from sros_tool.demo.capture import Capture, Kept
+from sros_tool.demo.records import WireCount
 from sros_tool.demo.replay import Injector, packets_of
-from sros_tool.demo.verdict import WireCount
 
 _CERTIFICATE = "-----BEGIN CERTIFICATE-----"
 

@@ -14,9 +14,9 @@ from sros_tool.demo.model import Role, Status
 from sros_tool.demo.options import split_ros_args
 from sros_tool.demo.policies import check_topic, talking_policy
 from sros_tool.demo.program import DemoOptions, run_demo
+from sros_tool.demo.records import RowResult
 from sros_tool.demo.result import DemoResult, ScenarioResult
 from sros_tool.demo.table import demo_table
-from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.netns import Isolation

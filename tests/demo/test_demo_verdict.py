@@ -7,8 +7,9 @@ from collections.abc import Iterable
 import pytest
 
 from sros_tool.demo.model import Row, Status
+from sros_tool.demo.records import PartyRecord, RowRecord, RowResult, WireCount
 from sros_tool.demo.scenarios.isolation import ROWS
-from sros_tool.demo.verdict import PartyRecord, RowRecord, RowResult, WireCount, judge_row
+from sros_tool.demo.verdict import judge_row
 from sros_tool.runtime.events import Event, Kind, Stage
 
 WINDOW = (100.0, 105.0)

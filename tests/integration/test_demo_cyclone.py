@@ -14,7 +14,7 @@ import pytest
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.model import UNSECURED, Identity
 from sros_tool.demo.scenarios.isolation import ISOLATION, LISTENER, TALKER, TALKER_DENIED
-from sros_tool.demo.scenery import Scenery, build_scenery
+from sros_tool.demo.scenery import Scenery, Setting, build_scenery
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.cyclone_library import load_cyclone
@@ -59,7 +59,8 @@ def _needs_cyclone() -> None:
 def keystores(tmp_path_factory: pytest.TempPathFactory) -> Scenery:
     folder = tmp_path_factory.mktemp("keystores")
     domains, template = DomainSet.of((DOMAIN, DOMAIN)), load_template("production")
-    return build_scenery(folder, ISOLATION, "/chatter", domains, template, datetime.now(UTC))
+    setting = Setting("/chatter", domains, template, datetime.now(UTC))
+    return build_scenery(folder, ISOLATION, setting)
 
 
 @pytest.fixture

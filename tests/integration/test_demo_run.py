@@ -17,10 +17,10 @@ import pytest
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.isolated import run_isolated
 from sros_tool.demo.model import UNSECURED, Row, Status
+from sros_tool.demo.records import RowResult
 from sros_tool.demo.runner import Limits, Plan, run_plan
 from sros_tool.demo.scenarios.isolation import ROWS
 from sros_tool.demo.scenery import Scenery
-from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.runtime.cyclone_library import load_cyclone
 from sros_tool.runtime.netns import try_isolation
