@@ -13,6 +13,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 
+from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem
 from sros_tool.policy import read_policy
 
@@ -232,6 +233,7 @@ CASES |= {
     "portable.time-format": lambda b: b.permissions(("Z</not_after>", "+00:00</not_after>")),
     "portable.validity-window": lambda b: at(b, -1 + 0.4),
     "portable.character-class": lambda b: b.permissions(("rt/rosout<", "rt/[^a]osout<")),
+    "portable.empty-topic": lambda b: b.permissions(("rt/rosout<", "<")),
     "portable.character-set": lambda b: b.permissions(("rt/rosout<", "rt/[rs]osout<")),
     "portable.document-size": lambda b: b.sign("enclaves/base/permissions.p7s", _many_topics),
     "portable.deny-blocks-topic": lambda b: b.permissions(
@@ -296,6 +298,14 @@ def _(bench: Bench) -> None:
 
 
 # ── the ledger, and policies ───────────────────────────────────────────────────────────────
+
+
+@case("keystore.authorities-differ")
+def _(bench: Bench) -> None:
+    authority = bench.foreign()
+    bench.issue("base", by=authority)
+    path = bench.unlink("enclaves/base/identity_ca.cert.pem")
+    path.write_bytes(pem(authority[0]))
 
 
 @case("keystore.serial-twice")

@@ -7,6 +7,7 @@ from bench import Bench
 from keystore_cases import CASES
 
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.pki.certificates import pem
 from sros_tool.policy import read_policy
 
 
@@ -30,6 +31,14 @@ def test_nothing_in_a_sound_export(bench: Bench) -> None:
 def test_nothing_in_a_sound_list(bench: Bench) -> None:
     bench.revoke(99)
     assert ids(bench) <= {"keystore.not-in-ledger"}
+
+
+def test_exported_enclaves_of_two_keystores(bench: Bench) -> None:
+    robot = bench.export()
+    assert "keystore.authorities-differ" not in ids(bench)
+    authority, _ = bench.foreign()
+    (robot / "enclaves/arm/permissions_ca.cert.pem").write_bytes(pem(authority))
+    assert "keystore.authorities-differ" in ids(bench)
 
 
 @pytest.mark.parametrize("expected", CASES)

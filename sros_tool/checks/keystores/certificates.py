@@ -43,17 +43,17 @@ KEY_ALGORITHM = Kind(
     "portable.key-algorithm",
     WARNING,
     "a key that not every vendor takes",
-    "Cyclone DDS takes EC prime256v1 and RSA of exactly 2048 bits; Ed25519 fails in the handshake "
-    "of Fast DDS.",
-    "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10.2, Fast DDS 2.14.5; measured.",
+    "Cyclone DDS takes EC prime256v1 and RSA of exactly 2048 bits alone. Fast DDS takes larger "
+    "ones of both kinds too, but no Ed25519, which fails in its handshake.",
+    "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5; measured.",
     "Use EC prime256v1, as sros does.",
 )
 SIGNATURE_HASH = Kind(
     "portable.signature-hash",
     WARNING,
     "a certificate that is not signed with SHA-256",
-    "Fast DDS rejects SHA-384 in a CA.",
-    "Fast DDS 2.14.5 (PKIDH.cpp); measured.",
+    "Fast DDS refuses SHA-384 in a CA and in an enclave's certificate; Cyclone DDS takes it.",
+    "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp), Cyclone DDS 0.10.2; measured.",
     "Issue it with SHA-256, as sros does.",
     vendors=("fastdds",),
 )

@@ -116,6 +116,14 @@ CHARACTER_CLASS = Kind(
     "Fast DDS 2.14.5 (fnmatch), Cyclone DDS 0.10.2; measured.",
     "Use * or ?, or write the names out.",
 )
+EMPTY_TOPIC = Kind(
+    "portable.empty-topic",
+    ERROR,
+    "a <topic> without text",
+    "Cyclone DDS crashes as soon as it comes to it; Fast DDS refuses the document.",
+    "Cyclone DDS 0.10.2 (a fault in create_topic), Fast DDS 2.9.1; measured.",
+    "Remove it.",
+)
 NO_EFFECT = Kind(
     "permissions.deny-without-effect",
     ERROR,
@@ -143,7 +151,8 @@ DOMAINS = Kind(
 
 KINDS = by_id(
     SEVERAL_GRANTS, DEFAULT_ALLOW, ALLOW_RULES, PARTITIONS, DOMAIN_RANGE, GRANT_NAME, SUBJECT,
-    TIME_FORMAT, TIME_WINDOW, LOCAL_TIME, CHARACTER_CLASS, NO_EFFECT, UNREACHABLE, DOMAINS,
+    TIME_FORMAT, TIME_WINDOW, LOCAL_TIME, CHARACTER_CLASS, EMPTY_TOPIC, NO_EFFECT, UNREACHABLE,
+    DOMAINS,
 )  # fmt: skip
 
 _MOMENT = re.compile(r"(\d{4})-\d\d-\d\dT\d\d:\d\d:\d\dZ\Z")
@@ -200,6 +209,8 @@ def _form(grant: Grant, name: str, file: str) -> Iterator[Finding]:
     criteria = [each for rule in grant.rules for each in (*rule.publish, *rule.subscribe)]
     if any(each.partitions for each in criteria):
         yield PARTITIONS.found(name, "its rules name partitions", file)
+    if any(not topic.strip() for each in criteria for topic in each.topics):
+        yield EMPTY_TOPIC.found(name, "it names a topic without a name", file)
     odd = sorted({t for each in criteria for t in each.topics if _is_odd(t)})
     if odd:
         yield CHARACTER_CLASS.found(name, f"it says {', '.join(map(repr, odd[:3]))}", file)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TypeVar
 
 from cryptography.hazmat.primitives import hashes, serialization
@@ -16,7 +17,9 @@ from sros_tool.checks.keystores.opened import OpenedEnclave, OpenedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.checks.policies.portability import ENCLAVE_NAMES
 from sros_tool.dds.portable import mistaken_names, some_pairs
-from sros_tool.keystore.layout import enclave_folder
+from sros_tool.errors import SrosError
+from sros_tool.keystore.layout import ROLES, enclave_folder
+from sros_tool.keystore.trust import fingerprints
 from sros_tool.policy.diff import compare
 from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.translate import grant_rights
@@ -79,13 +82,31 @@ NOT_IN_KEYSTORE = Kind(
     "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`.",
 )
 
+AUTHORITIES_DIFFER = Kind(
+    "keystore.authorities-differ",
+    ERROR,
+    "enclaves that do not trust the same CAs",
+    "Their nodes never talk to each other, and neither Fast DDS nor Cyclone DDS says why.",
+    "DDS-Security 1.1, 9.3; Fast DDS 2.9.1, Cyclone DDS 0.10.2; measured.",
+    "Export the enclave again from the keystore of the others, or make it anew there.",
+)
+
 KINDS = by_id(
-    SERIAL_TWICE, KEY_TWICE, UNEXPLAINED, OLD_PERMISSIONS, STALE, NOT_IN_POLICY, NOT_IN_KEYSTORE
+    AUTHORITIES_DIFFER,
+    SERIAL_TWICE,
+    KEY_TWICE,
+    UNEXPLAINED,
+    OLD_PERMISSIONS,
+    STALE,
+    NOT_IN_POLICY,
+    NOT_IN_KEYSTORE,
 )
 
 Key = TypeVar("Key")
 
 _MANY = 3
+AUTHORITIES = ("identity_ca.cert.pem", "permissions_ca.cert.pem")
+"""The files of an enclave that say whom it trusts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +121,7 @@ class Traits:
     permissions: str
     governance: str
     unique: bool
+    trusted: tuple[frozenset[str], ...]
 
 
 def traits_of(enclave: OpenedEnclave) -> Traits | None:
@@ -122,7 +144,17 @@ def traits_of(enclave: OpenedEnclave) -> Traits | None:
         if enclave.state.governance and not enclave.keystore.governance
         else "",
         len(certificate.subject.rdns) > 1,
+        tuple(_trusted(enclave.state.files.get(name, b"")) for name in AUTHORITIES),
     )
+
+
+@lru_cache(maxsize=8)
+def _trusted(data: bytes) -> frozenset[str]:
+    """The certificates in the file of a CA; nothing where it cannot be read, which is told."""
+    try:
+        return fingerprints(data)
+    except SrosError:
+        return frozenset()
 
 
 def check_issued(keystore: OpenedKeystore, all_traits: Sequence[Traits]) -> Iterator[Finding]:
@@ -138,6 +170,7 @@ def check_issued(keystore: OpenedKeystore, all_traits: Sequence[Traits]) -> Iter
     if pairs:
         text = f"Cyclone DDS takes {some_pairs(pairs)}"
         yield ENCLAVE_NAMES.found(pairs[0][0], text, str(keystore.root))
+    yield from _trust(keystore, all_traits)
     yield from _exported_governance(keystore, all_traits)
     yield from _ledger(keystore, all_traits)
     if keystore.policies:
@@ -151,6 +184,27 @@ def _twice(pairs: Iterable[tuple[Key, str]]) -> Iterator[tuple[Key, list[str]]]:
     for key, name in pairs:
         found[key].append(name)
     return ((key, names) for key, names in found.items() if len(names) > 1)
+
+
+def _trust(keystore: OpenedKeystore, all_traits: Sequence[Traits]) -> Iterator[Finding]:
+    """Enclaves that have no CA in common; while one is replaced, each trusts the old and the new.
+
+    The CAs of the keystore are the right ones; in an export, those of most enclaves.
+    """
+    for index, (role, file) in enumerate(zip(ROLES, AUTHORITIES, strict=True)):
+        everyone = [each for each in all_traits if each.trusted[index]]
+        if not everyone:
+            continue
+        usual, _ = Counter(each.trusted[index] for each in everyone).most_common(1)[0]
+        others = "the others"
+        if chain := keystore.authorities.get(role):
+            usual = frozenset(each.fingerprint(hashes.SHA256()).hex() for each in chain)
+            others = "the keystore"
+        for each in everyone:
+            if not each.trusted[index] & usual:
+                place = f"{keystore.root}/{enclave_folder(each.name)}/{file}"
+                text = f"{file} is of another CA than that of {others}"
+                yield AUTHORITIES_DIFFER.found(each.name, text, place)
 
 
 def _exported_governance(

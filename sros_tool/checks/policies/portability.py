@@ -22,8 +22,9 @@ DOCUMENT_SIZE = Kind(
     "portable.document-size",
     ERROR,
     "signed permissions of 64 KB or more",
-    "The handshake carries them, and breaks: the node starts, and hears nobody.",
-    "ros2/sros2 issue 228; Fast DDS and Cyclone DDS, measured.",
+    "The handshake carries them. Fast DDS 2.9.1 aborts the process over it, others start and hear "
+    "nobody; Cyclone DDS 0.10.2 takes them.",
+    "ros2/sros2 issue 228; Fast DDS 2.9.1 (SecurityManager.cpp), Cyclone DDS 0.10.2; measured.",
     "Use wildcards (`sros minimize_policy` proposes them), or split the enclave.",
 )
 DENY_BLOCKS = Kind(
