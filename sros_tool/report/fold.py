@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from sros_tool.policy.model import Qualifier
+from sros_tool.policy.model import ALLOW, Qualifier
 from sros_tool.policy.rights import RIGHT_ORDER
 from sros_tool.report.picture import KINDS, SENDS, Edge, Mark, Name, Protection
 
@@ -31,12 +31,16 @@ class Tie:
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """Names of one kind and protection, sorted, and the ties that each of them has."""
+    """Names of one kind and protection, sorted, and the ties that each of them has.
+
+    Of a ``partial`` bundle, each tie is to some of the names only.
+    """
 
     kind: str
     protection: Protection
     names: tuple[str, ...]
     ties: tuple[Tie, ...]
+    partial: bool = False
 
 
 def fold(
@@ -68,6 +72,27 @@ def fold(
         for (kind, protection, found), members in bundles.items()
     )
     return tuple(sorted(folded, key=lambda each: (KINDS.index(each.kind), each.names)))
+
+
+def coarsened(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
+    """Bundles joined where the same nodes send, whoever listens; what is lost is who hears which.
+
+    Denials and differences stay apart: they are what one looks for.
+    """
+    found: dict[tuple[object, ...], list[Bundle]] = defaultdict(list)
+    for bundle in bundles:
+        plain = all(t.qualifier is ALLOW and t.mark is Mark.BOTH for t in bundle.ties)
+        senders = frozenset((tie.node, tie.right) for tie in bundle.ties if tie.sends)
+        apart = None if plain and senders else bundle.ties
+        found[bundle.kind, bundle.protection, senders, apart].append(bundle)
+    return tuple(_joined(each) for each in found.values())
+
+
+def _joined(bundles: Sequence[Bundle]) -> Bundle:
+    ties = sorted({tie for bundle in bundles for tie in bundle.ties}, key=_order)
+    names = sorted(name for bundle in bundles for name in bundle.names)
+    partial = any(bundle.ties != bundles[0].ties for bundle in bundles)
+    return Bundle(bundles[0].kind, bundles[0].protection, tuple(names), tuple(ties), partial)
 
 
 def _order(tie: Tie) -> tuple[int, str, str, tuple[str, ...], tuple[str, ...], str, bool]:

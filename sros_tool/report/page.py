@@ -17,9 +17,10 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.fold import Bundle, fold
-from sros_tool.report.picture import Picture
+from sros_tool.report.picture import Enclave, Picture
 from sros_tool.report.scene import Scene
 from sros_tool.validity import iso
 
@@ -89,10 +90,7 @@ def _data(picture: Picture, scenes: tuple[Scene, ...]) -> dict[str, Any]:
     """The picture as the script wants it: names by bundles, which is much shorter than edges."""
     return {
         "overlay": asdict(picture.overlay) if picture.overlay else None,
-        "enclaves": [
-            {**asdict(each), "statements": [_said(s) for s in map(asdict, each.statements)]}
-            for each in picture.enclaves
-        ],
+        "enclaves": [_enclave(each) for each in picture.enclaves],
         "bundles": [_bundle(each) for each in fold(picture.names, picture.edges)],
         "scenes": [_scene(each) for each in scenes],
         "differences": [asdict(each) for each in picture.differences],
@@ -101,26 +99,39 @@ def _data(picture: Picture, scenes: tuple[Scene, ...]) -> dict[str, Any]:
     }
 
 
+def _enclave(enclave: Enclave) -> dict[str, Any]:
+    """An enclave; of its rights as written only the wildcards, for the others are names."""
+    wild = [_said(asdict(each)) for each in enclave.statements if is_expression(each.name)]
+    return {**asdict(enclave), "statements": wild}
+
+
 def _said(value: dict[str, Any]) -> dict[str, Any]:
     value["deny"] = value.pop("qualifier") is not ALLOW
     return value
 
 
 def _bundle(bundle: Bundle) -> dict[str, Any]:
-    ties = []
-    for tie in bundle.ties:
-        value = _said(asdict(tie))
-        value["enclave"] = value.pop("node")
-        ties.append(value)
+    ties = [_said(asdict(tie)) for tie in bundle.ties]
+    for tie in ties:
+        tie["enclave"] = tie.pop("node")
     return {
         "kind": bundle.kind,
         "names": bundle.names,
         "protection": asdict(bundle.protection),
-        "ties": ties,
+        "ties": _table(ties),
     }
 
 
 def _scene(scene: Scene) -> dict[str, Any]:
     value = asdict(scene)
-    value["links"] = [_said(link) for link in value["links"]]
+    value["cards"] = _table(value["cards"])
+    value["links"] = _table([_said(link) for link in value["links"]])
     return value
+
+
+def _table(rows: list[dict[str, Any]]) -> list[list[Any]]:
+    """Rows with the same keys: first the keys, then the values of each row."""
+    if not rows:
+        return []
+    keys = list(rows[0])
+    return [keys, *([row[key] for key in keys] for row in rows)]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 from sros_tool.policy.model import ALLOW, Qualifier
 from sros_tool.report.columns import Item, heights, ordered
-from sros_tool.report.fold import Bundle, Tie, fold
+from sros_tool.report.fold import Bundle, Tie, coarsened, fold
 from sros_tool.report.picture import SENDS, Edge, Level, Mark, Picture
 from sros_tool.report.wording import COMMON, REACHES, counted, names_title, own_text, wrapped
 
@@ -21,7 +21,7 @@ LINE, PAD, SMALL = 16, 7, 14
 _GAP, _LEAD, _TOP, _MARGIN = 9.0, 24.0, 34.0, 14
 _SIDE_LETTERS, _NAMES_LETTERS = 20, 35
 _LEAST_LINES, _MOST_LINES = 8, 0.3
-_MOST_ENCLAVES = 40
+_MOST_ENCLAVES, _MOST_BUNDLES = 40, 80
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,6 +184,8 @@ class _Placing:
                 self._own[alone][bundle.kind] += len(bundle.names)
             else:
                 self._bundles.append(bundle)
+        if len(self._bundles) > _MOST_BUNDLES:
+            self._bundles = list(coarsened(self._bundles))
         self._ties: dict[tuple[str, str, Qualifier, bool, Mark], set[str]] = defaultdict(set)
         for number, bundle in enumerate(self._bundles):
             for tie in bundle.ties:

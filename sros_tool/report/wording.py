@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from sros_tool.report.fold import Bundle
 from sros_tool.report.picture import Level
@@ -59,12 +59,26 @@ def own_text(own: Mapping[str, int]) -> list[str]:
 def names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What stands on the card of a bundle: names or the wildcards for them, and small notes."""
     kind, names = KIND_NAMES[bundle.kind], bundle.names
+    if bundle.partial:
+        return (f"{_common_place(names)}/…",), (
+            f"{counted(len(names), kind)}; a line is for some of them",
+        )
     if len(names) <= _MOST:
         return names, ()
     expressions = sorted({each for tie in bundle.ties for each in tie.by})
     if expressions and all(tie.by for tie in bundle.ties):
         return tuple(expressions[:_MOST]), (f"reaches {counted(len(names), kind)}",)
     return names[:_SHOWN], (f"and {len(names) - _SHOWN} more {kind}s",)
+
+
+def _common_place(names: Sequence[str]) -> str:
+    """The namespace that all names are in, "" for the root."""
+    found = []
+    for parts in zip(*(name.split("/")[:-1] for name in names), strict=False):
+        if len(set(parts)) > 1:
+            break
+        found.append(parts[0])
+    return "/".join(found)
 
 
 def wrapped(text: str, letters: int) -> tuple[str, ...]:

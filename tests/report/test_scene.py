@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from pictures import group, large_policy, mobile_robot, picture_of
 
+from sros_tool.policy.model import DENY
 from sros_tool.policy.reader import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.compose import Source, compose, overlay
@@ -103,6 +104,27 @@ def test_a_hundred_enclaves_are_folded_into_their_groups(large: Picture) -> None
     assert enclaves == {f"/robot4/part{p}" for p in range(10)}
     outside = {c.lines[0] for c in inside.cards if c.role == "group"}
     assert outside == {"/fleet", "/robot3", "/robot5"}
+
+
+def test_what_cannot_be_folded_is_joined_by_its_senders_and_says_so(tmp_path: Path) -> None:
+    # Every name is heard by a set of listeners of its own, so that no two are alike.
+    heard: dict[str, list[str]] = {f"/l{bit}": [] for bit in range(7)}
+    for number in range(1, 120):
+        for bit in range(7):
+            if number >> bit & 1:
+                heard[f"/l{bit}"].append(f"/ns/t{number}")
+    said = {"/s": group("topics", "publish", *(f"/ns/t{n}" for n in range(1, 120)))}
+    said |= {path: group("topics", "subscribe", *names) for path, names in heard.items()}
+    said["/l0"] += group("topics", "subscribe", "/ns/t2", qualifier="DENY")
+    scene = scenes_of(picture_of(tmp_path, said))[0]
+    check(scene)
+    cards = [card for card in scene.cards if card.kind]
+    assert sorted(len(card.members) for card in cards) == [1, 118]
+    joined = max(cards, key=lambda card: len(card.members))
+    assert joined.lines == ("/ns/…",)
+    assert joined.notes == ("118 topics; a line is for some of them",)
+    denied = [link for link in scene.links if link.qualifier is DENY]
+    assert [(link.source != joined.id, link.target) for link in denied] == [(True, "l/l0")]
 
 
 def test_what_differs_is_never_folded_into_an_enclave(tmp_path: Path) -> None:

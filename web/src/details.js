@@ -129,7 +129,7 @@ export function enclaveDetails(model, path, act) {
     parts.push(section(`${title} (${names.length})`, longList(items)));
   }
   if (common) parts.push(el("p", { class: "soft", text: "And what every node needs to start." }));
-  const written = enclave.statements.filter((each) => /[*?[]/.test(each.name));
+  const written = enclave.statements;
   if (written.length) {
     const items = written.map((each) =>
       el(

@@ -54,6 +54,7 @@ export function drawScene(node, scene, { overlay, problems, choose }) {
   root.selectAll("*").remove();
   root
     .attr("viewBox", `0 0 ${scene.width} ${scene.height}`)
+    .classed("dense", scene.links.length > 200)
     .attr("role", "group")
     .attr("aria-label", "Map of who may do what");
   root

@@ -17,6 +17,11 @@ export const sends = (tie) => SENDS.has(tie.right);
 export class Model {
   constructor(data) {
     Object.assign(this, data);
+    for (const bundle of data.bundles) bundle.ties = rowsOf(bundle.ties);
+    for (const scene of data.scenes) {
+      scene.cards = rowsOf(scene.cards);
+      scene.links = rowsOf(scene.links);
+    }
     this.enclave = new Map(data.enclaves.map((each) => [each.path, each]));
     this.bundleOf = new Map();
     this.tiesOf = new Map(data.enclaves.map((each) => [each.path, []]));
@@ -128,6 +133,11 @@ export class Model {
     }
     return { start, hops, steps };
   }
+}
+
+// A table as it stands in the page: first the keys, then the values of each row.
+function rowsOf([keys = [], ...rows]) {
+  return rows.map((row) => Object.fromEntries(keys.map((key, at) => [key, row[at]])));
 }
 
 function nearness(name, wanted) {
