@@ -1,0 +1,132 @@
+"""What is shown of a result: JSON, the page for a reviewer, the cost as table and plot."""
+
+from __future__ import annotations
+
+import json
+from datetime import UTC, datetime
+from xml.etree import ElementTree
+
+from sros_tool.demo.backend import Backend
+from sros_tool.demo.cost import CostResult, Measurement, cost_table, payload_text
+from sros_tool.demo.model import Status
+from sros_tool.demo.plot import cost_plot
+from sros_tool.demo.records import RowResult
+from sros_tool.demo.result import DemoResult, ScenarioResult
+from sros_tool.demo.summary import summary_page
+from sros_tool.demo.table import demo_table
+from sros_tool.runtime.netns import Isolation
+
+NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
+COST = CostResult(
+    ("unsecured", "encrypt"),
+    (64, 1024 * 1024),
+    {"unsecured": 0.1, "encrypt": 0.25},
+    (
+        Measurement("unsecured", 64, 40e-6, 50_000.0),
+        Measurement("encrypt", 64, 100e-6, 20_000.0),
+        Measurement("unsecured", 1024 * 1024, 2e-3, 500.0),
+        Measurement("encrypt", 1024 * 1024, 6e-3, 100.0),
+    ),
+)
+CLOSED = RowResult(
+    "edited", Status.NOT_LET_IN, Status.NOT_LET_IN, "a signature", "seen", 1, attack="forged"
+)
+TWIN = RowResult(
+    "signed", Status.HEARD, Status.HEARD, "m", "seen", 1, attack="forged", removed="the signature"
+)
+OPEN = RowResult(
+    "put back",
+    Status.HEARD,
+    Status.HEARD,
+    "m",
+    "seen",
+    1,
+    attack="old",
+    open_because="nothing revokes it",
+    remedy="renew",
+)
+
+
+def result(*rows: RowResult, cost: CostResult | None = None) -> DemoResult:
+    scenario = ScenarioResult("attacks", "every way in", rows, cost)
+    backend = Backend("cyclone", "Cyclone DDS 0.10.2", "a test")
+    return DemoResult(backend, "/chatter", Isolation(True), "production", (scenario,))
+
+
+def test_json_says_what_the_module_describes() -> None:
+    shown = json.loads(json.dumps(result(CLOSED, TWIN, OPEN, cost=COST).as_json()))
+    assert shown["as_expected"] is True
+    assert shown["scenarios"][0]["rows"] == shown["rows"]
+    closed, twin, open_ = shown["rows"]
+    assert (closed["scenario"], closed["attack"]) == ("attacks", "forged")
+    assert (twin["defence_removed"], closed["defence_removed"]) == ("the signature", "")
+    assert (open_["open_because"], open_["remedy"]) == ("nothing revokes it", "renew")
+    cost = shown["scenarios"][0]["cost"]
+    assert cost["first_message"][1] == {"kind": "encrypt", "seconds": 0.25, "ratio": 2.5}
+    assert cost["measurements"][1] == {
+        "kind": "encrypt",
+        "payload": 64,
+        "latency_us": 100.0,
+        "messages_per_s": 20000.0,
+        "megabytes_per_s": 1.28,
+        "latency_ratio": 2.5,
+        "throughput_ratio": 0.4,
+    }
+
+
+def test_a_known_open_door_is_named_and_no_failure() -> None:
+    shown = result(CLOSED, TWIN, OPEN)
+    text = demo_table(shown)
+    assert shown.as_expected
+    assert "open  put back" in text
+    assert "nothing revokes it; to do: renew" in text
+    assert text.endswith("3 of 3 rows as expected, 1 of them known to be open.")
+
+
+def test_a_door_that_is_open_and_should_not_be_is_a_failure() -> None:
+    bad = RowResult("edited", Status.NOT_LET_IN, Status.HEARD, "m", "was heard", 1, attack="x")
+    shown = result(bad, OPEN)
+    assert not shown.as_expected
+    assert "FAIL  edited" in demo_table(shown)
+    page = summary_page(shown, NOW)
+    assert "**1 of 2 rows not as expected" in page
+    assert "- **edited**: expected not let in, observed heard. was heard" in page
+
+
+def test_a_door_that_was_known_to_be_open_and_is_closed_is_told() -> None:
+    """Perhaps the vendor has closed it: then the expectation is to be changed."""
+    closed = RowResult(
+        "put back", Status.HEARD, Status.NOT_HEARD, "m", "d", 1, attack="a", open_because="o"
+    )
+    assert not result(closed).as_expected
+    assert "FAIL  put back" in demo_table(result(closed))
+
+
+def test_the_page_for_a_reviewer() -> None:
+    page = summary_page(result(CLOSED, TWIN, OPEN, cost=COST), NOW)
+    assert "2026-01-02T03:04:05Z" in page
+    assert "template `production`" in page
+    assert (
+        "| edited | not let in | not let in | a signature | heard without the signature |" in page
+    )
+    assert "| put back | heard | heard | nothing revokes it | renew |" in page
+    assert "| 1 MiB | encrypt | 6000 µs | 3.00 | 104.86 MB/s | 0.20 |" in page
+
+
+def test_the_cost_on_a_terminal_and_as_a_plot() -> None:
+    text = "\n".join(cost_table(COST))
+    assert "encrypt             0.250 s    2.50" in text
+    assert "ctypes" in text
+    plot = ElementTree.fromstring(cost_plot(COST))
+    lines = [each for each in plot.iter() if each.tag.endswith("polyline")]
+    assert len(lines) == 4
+    first = [tuple(map(float, point.split(","))) for point in lines[0].get("points", "").split()]
+    assert first[0][0] < first[1][0]
+    assert first[0][1] > first[1][1]  # more latency is higher up
+    assert "encrypt" in cost_plot(COST)
+
+
+def test_payloads_for_people() -> None:
+    assert [payload_text(size) for size in (64, 1024, 16384, 1048576)] == [
+        *("64 B", "1 KiB", "16 KiB", "1 MiB")
+    ]
