@@ -140,6 +140,9 @@ def _read_domain_rule(element: etree._Element) -> DomainRule:
     domains, topics = element.find("domains"), element.find("topic_access_rules")
     if element.tag != "domain_rule" or domains is None or topics is None:
         raise DocumentError("a <domain_rule> lacks its <domains> or its <topic_access_rules>")
+    for topic in topics:
+        if topic.tag != "topic_rule":
+            raise DocumentError(f"<topic_access_rules> holds an unknown element <{tag_of(topic)}>")
     rules = tuple(TopicRule(**_read_fields(topic, _TOPIC_FIELDS)) for topic in topics)
     return DomainRule(
         domains=read_domains(domains),

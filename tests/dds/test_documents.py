@@ -148,3 +148,14 @@ def test_any_bytes_are_a_document_or_an_error(data: bytes) -> None:
     for parse in (parse_permissions, parse_governance):
         with pytest.raises(DocumentError):
             parse(data)
+
+
+def test_governance_with_something_else_in_place_of_a_topic_rule() -> None:
+    """Both vendors refuse it."""
+    rule = TopicRule("*", True, True, True, True, Protection.NONE, Protection.NONE)
+    kinds = (Protection.NONE,) * 3
+    domain = DomainRule(DomainSet.of((0, 0)), False, True, *kinds, (rule,))
+    good = render_governance(Governance((domain,)))
+    assert parse_governance(good)
+    with pytest.raises(DocumentError, match="topic_role"):
+        parse_governance(good.replace(b"topic_rule>", b"topic_role>"))

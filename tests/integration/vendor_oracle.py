@@ -36,7 +36,7 @@ from sros_tool.runtime.netns import end_with_parent, enter_isolation
 enter_isolation()
 os.execv(sys.argv[1], sys.argv[1:])
 """
-CYCLONE, FASTDDS = "cyclonedds", "fastdds"
+
 MATCH_SECONDS = 2.5
 """How long a match is waited for; those that come take a tenth of a second."""
 
@@ -260,6 +260,45 @@ def _record(workshop: Workshop, case: Case, seconds: float) -> dict[str, Any]:
         "peer": peer,
         "seconds": seconds,
     }
+
+
+# ── whole enclaves ─────────────────────────────────────────────────────────────────────────
+
+Pair = tuple[Path, Path, str]
+"""Two enclaves' folders and the host's time zone: whether the first publishes to the second."""
+
+
+def ask_fastdds_folders(
+    pairs: Sequence[Pair], topic: str, program_folder: Path, *, domain: int = 0
+) -> list[Reply]:
+    """What Fast DDS does with each pair of enclaves."""
+    program = fastdds_oracle(program_folder)
+    lines = [
+        f"{own}\t{own}\t{domain}\t{zone}\t{peer}\t{peer}\t{int(MATCH_SECONDS * 1000)}"
+        f"\tpublish\x1f{topic}"
+        for own, peer, zone in pairs
+    ]
+    return _spread(lines, 6, lambda some: _ask_one_program(program, some))
+
+
+def ask_cyclone_folders(
+    pairs: Sequence[Pair], topic: str, whole: Path, *, domain: int = 0
+) -> list[Reply]:
+    """What Cyclone DDS does with each pair of enclaves; ``whole`` is one that lacks nothing."""
+    records = [
+        {
+            "whole": str(whole),
+            "identity": str(own),
+            "documents": str(own),
+            "domain": domain,
+            "zone": zone,
+            "questions": [("publish", topic, ())],
+            "peer": [str(peer), str(peer)],
+            "seconds": MATCH_SECONDS,
+        }
+        for own, peer, zone in pairs
+    ]
+    return _spread(records, 6, ask_cyclone_records)
 
 
 def _spread(items: Sequence[Any], at_once: int, ask: Any) -> list[Reply]:

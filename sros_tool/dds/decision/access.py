@@ -146,7 +146,10 @@ class Access:
             and domain is not None
             and domain.rtps_protection_kind is Protection.NONE
             and not (rule.enable_read_access_control or rule.enable_write_access_control)
-            and not rule.enable_discovery_protection
+            and not (
+                rule.enable_discovery_protection
+                and domain.discovery_protection_kind is not Protection.NONE
+            )
             and rule.metadata_protection_kind is Protection.NONE
             and rule.data_protection_kind is Protection.NONE
         )

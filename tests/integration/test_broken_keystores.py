@@ -1,0 +1,114 @@
+"""Every broken keystore: vendors show it late or not at all, `sros check` says it beforehand."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+from bench import SECRET, Bench
+from broken_keystores import HARMLESS, MATCHED, MORE, ROWS, Breakage
+from harness import policy_text, publish, sros
+from vendor_oracle import Pair, Reply, ask_cyclone_folders, ask_fastdds_folders
+
+pytestmark = [pytest.mark.dds, pytest.mark.xdist_group("broken_keystores")]
+
+CONTROL = Breakage("nothing", lambda bench: None, MATCHED, MATCHED, "")
+ALL = (CONTROL, *HARMLESS, *ROWS, *MORE)
+HEARS = '<topics subscribe="ALLOW"><topic>/chatter</topic></topics>'
+BASICS = publish("/rosout", "/parameter_events")
+
+
+@pytest.fixture(scope="module")
+def sound(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A keystore in which nothing is to be found, beside its policy."""
+    folder = tmp_path_factory.mktemp("sound")
+    policy = {"/base": BASICS + publish("/chatter"), "/arm": BASICS + HEARS}
+    (folder / "policy.xml").write_text(policy_text(policy))
+    root, env = folder / "ks", {"SROS_CA_PASSPHRASE": SECRET}
+    words = ("--template", "production", "--encrypt-ca-keys")
+    sros("create_keystore", root, *words, env=env).ok()
+    sros("generate_artifacts", "-k", root, "-p", folder / "policy.xml", env=env).ok()
+    return root
+
+
+@pytest.fixture(scope="module")
+def broken(sound: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Bench]:
+    """A keystore for each way to break it."""
+    made = {}
+    for each in ALL:
+        folder = tmp_path_factory.mktemp("broken")
+        shutil.copytree(sound, folder / "ks", symlinks=True)
+        shutil.copy(sound.with_name("policy.xml"), folder)
+        made[each.name] = Bench(folder / "ks", datetime.now(UTC).replace(microsecond=0))
+        each.work(made[each.name])
+    return made
+
+
+def pairs(sound: Path, broken: dict[str, Bench]) -> list[Pair]:
+    """The broken enclave and the one that listens, which is sound unless both are concerned."""
+    return [
+        (
+            broken[each.name].path("enclaves/base"),
+            (broken[each.name].root if each.shared else sound) / "enclaves/arm",
+            each.zone,
+        )
+        for each in ALL
+    ]
+
+
+def test_what_cyclone_does(sound: Path, broken: dict[str, Bench]) -> None:
+    whole = sound / "enclaves/arm"
+    replies = ask_cyclone_folders(pairs(sound, broken), "rt/chatter", whole)
+    compare({each.name: (each.cyclone, each.cyclone_says) for each in ALL}, replies)
+
+
+def test_what_fast_dds_does(
+    sound: Path, broken: dict[str, Bench], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    program_folder = tmp_path_factory.mktemp("oracle")
+    replies = ask_fastdds_folders(pairs(sound, broken), "rt/chatter", program_folder)
+    compare({each.name: (each.fast, each.fast_says) for each in ALL}, replies)
+
+
+def compare(expected: dict[str, tuple[str, str]], replies: Sequence[Reply]) -> None:
+    wrong = []
+    for (name, (answer, says)), reply in zip(expected.items(), replies, strict=True):
+        observed = reply.answers[0] if reply.end == "joined" else reply.end
+        if observed != answer or says not in reply.log:
+            wrong.append(f"{name}: {reply}, and not {answer}, {says!r}")
+    assert not wrong, "\n".join(wrong)
+    assert expected[CONTROL.name][0] == MATCHED
+
+
+def findings(bench: Bench, zone: str) -> set[str]:
+    """What `sros check` finds, on a host in that time zone, and the exit status that it gives."""
+    policy = bench.root.with_name("policy.xml")
+    words = ("check", "keystore", bench.root, "--domain", "0", "--policy", policy, "--json")
+    before = os.environ.get("TZ")
+    try:
+        os.environ["TZ"] = zone
+        time.tzset()
+        ended = sros(*words)
+    finally:
+        os.environ.pop("TZ") if before is None else os.environ.update(TZ=before)
+        time.tzset()
+    found = {each["id"] for each in json.loads(ended.out)["findings"]}
+    assert ended.status == (1 if found else 0), ended
+    return found
+
+
+@pytest.mark.parametrize("each", [*ROWS, *MORE], ids=lambda each: each.name)
+def test_check_names_the_cause(each: Breakage, broken: dict[str, Bench]) -> None:
+    assert each.finding in findings(broken[each.name], each.zone)
+
+
+@pytest.mark.parametrize("each", [CONTROL, *HARMLESS], ids=lambda each: each.name)
+def test_check_finds_nothing_in_what_works(each: Breakage, broken: dict[str, Bench]) -> None:
+    # What the keystore did not sign itself is remarked on, whatever it says.
+    assert findings(broken[each.name], each.zone) <= {"keystore.not-in-ledger"}
