@@ -22,7 +22,9 @@ from sros_tool.errors import UsageError
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
-    from sros_tool.explain.case import Explanation
+    from sros_tool.dds.decision import Vendor
+    from sros_tool.explain.case import Case, Explanation
+    from sros_tool.explain.question import Question
     from sros_tool.notes import Note
 
 _VENDORS = ("standard", "fastdds", "fastdds-2.9", "cyclonedds", "opendds", "connext")
@@ -176,6 +178,10 @@ def _split(
 
     ``verb`` is the place of what is to be done, where no keystore is named.
     """
+    from sros_tool.keystore.layout import is_keystore
+
+    if keystore is not None and words and is_keystore(Path(words[0])):
+        raise UsageError(f"two keystores are named, '{words[0]}' and '{keystore}'")
     if keystore is not None or not words or _is_word(words, verb):
         return keystore, words
     if _is_word(words, verb + 1) or Path(words[0]).is_dir():
@@ -232,7 +238,7 @@ def _one(
         lines = table_lines(case, found) if all_vendors else lines_of(case, found[0], why, policy)
         for line in lines:
             click.echo(line)
-    notes = list(_provenance_notes(found[0], policy))
+    notes = [*_provenance_notes(found[0], policy), *_other_type(case, question, kind, chosen)]
     if not all_vendors:
         measured = [explain_case(case, question, v) for v in (Vendor.FAST, Vendor.CYCLONE)]
         if measured[0].answer.outcome is not measured[1].answer.outcome:
@@ -255,6 +261,21 @@ def _provenance_notes(found: Explanation, policy: Path | None) -> list[Note]:
         case _:
             return []
     return [_note(f"explain.policy-{found.provenance}", text)]
+
+
+def _other_type(case: Case, question: Question, kind: str | None, vendor: Vendor) -> list[Note]:
+    """A remark where a service was asked for that the enclave knows as an action."""
+    from sros_tool.explain.answer import Judge
+    from sros_tool.explain.question import ask
+
+    if question.word != "call" or kind:
+        return []
+    judge = Judge(vendor, case.material, case.setting)
+    action = ask("call", question.name, "action")
+    if judge.answer(question).allowed or not judge.answer(action).allowed:
+        return []
+    text = f"it may {action}: add --type action if that is what {question.name} is."
+    return [_note("explain.an-action", text)]
 
 
 def _note(name: str, text: str) -> Note:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from datetime import datetime, tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from sros_tool.explain.case import Case
     from sros_tool.explain.material import Material
     from sros_tool.policy.model import Enclave
+
+_YEARS = 1970, 2999
 
 
 class Place:
@@ -44,14 +47,17 @@ def _moment(text: str | None) -> datetime:
     if text is None:
         return now()
     try:
-        return parse_iso(text)
+        moment = parse_iso(text)
+        if _YEARS[0] <= moment.year <= _YEARS[1]:
+            return moment
     except ValueError:
-        try:
+        with suppress(UsageError):
             return now() + parse_duration(text)
-        except UsageError as error:
-            raise UsageError(
-                f"--at {text!r} is no moment", "", "Write 2027-06-01T12:00:00Z, or 90d from now."
-            ) from error
+    raise UsageError(
+        f"--at {text!r} is no moment",
+        f"It is neither a date of {_YEARS[0]} to {_YEARS[1]} nor a duration.",
+        "Write 2027-06-01T12:00:00Z, or 90d from now.",
+    )
 
 
 def _domain(text: str | None) -> int | None:

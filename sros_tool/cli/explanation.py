@@ -41,6 +41,10 @@ def lines_of(case: Case, found: Explanation, why: str, policy: Path | None) -> I
     if found.wildcard:
         yield _row("wildcard", f"{found.wildcard} stands for more than this name")
     yield from (_row("from", str(each)) for each in found.origins)
+    if found.recorded and policy is None and decision.rule is not None:
+        yield _row(
+            "from", f"a policy file with the digest {found.recorded[:12]}; name it by --policy"
+        )
     if answer.allowed:
         yield _row("protected", ", ".join(_protection_words(answer)))
     elif found.who_denies:
@@ -190,6 +194,7 @@ def explanation_json(case: Case, found: Explanation, policy: Path | None) -> dic
         "rule": _rule_json(answer),
         "wildcard": found.wildcard or None,
         "policy": _policy_json(found, policy),
+        "policy_sha256": found.recorded or None,
         "protection": _protection_json(answer),
         "until": iso(answer.until) if answer.until else None,
         "until_file": answer.until_file or None,

@@ -11,9 +11,10 @@ from sros_tool.errors import SrosError
 from sros_tool.explain.answer import Answer, Judge, Setting
 from sros_tool.explain.change import Change, smallest_change
 from sros_tool.explain.material import Material
-from sros_tool.explain.origin import Origin, Provenance, origins, provenance
+from sros_tool.explain.origin import Origin, Provenance, origins, provenance, recorded_policy
 from sros_tool.explain.question import Question
 from sros_tool.explain.remedy import remedy
+from sros_tool.keystore.ledger import LEDGER
 from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW, DENY, Enclave
 from sros_tool.policy.rights import Right, profile_rights
@@ -40,6 +41,7 @@ class Explanation:
     ``wildcard`` is the expression of a rule that allows or denies by a wildcard, or "".
     ``change`` is what a policy would have to say, ``remedy`` what to do where that is no matter
     of the policy.  ``sign`` says that the policy file, as it is now, would allow it once signed.
+    ``recorded`` is the SHA-256 of the policy that the permissions were made from, where known.
     """
 
     answer: Answer
@@ -50,6 +52,7 @@ class Explanation:
     change: Change | None = None
     remedy: str = ""
     sign: bool = False
+    recorded: str = ""
 
 
 def explain(case: Case, question: Question, vendor: Vendor) -> Explanation:
@@ -69,6 +72,9 @@ def explain(case: Case, question: Question, vendor: Vendor) -> Explanation:
         change,
         "" if answer.allowed or change or sign else _remedy(case, decision),
         sign,
+        recorded_policy(case.root, case.material.signed)
+        if case.root and (case.root / LEDGER).exists()
+        else "",
     )
 
 

@@ -13,6 +13,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, render_governance
 from sros_tool.dds.permissions import render_permissions
 from sros_tool.errors import SrosError
+from sros_tool.keystore.layout import REQUEST
 from sros_tool.keystore.verify import EnclaveState, Problem, check_enclave
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
@@ -60,6 +61,9 @@ class Material:
 def from_folder(name: str, folder: Path, *, at: datetime) -> Material:
     """What lies in the folder of an enclave, as it is at a moment."""
     state = check_enclave(folder, now=at)
+    passed_over = _LEFT_TO_THE_VENDOR
+    if (folder / REQUEST).exists() and not (folder / "key.pem").exists():
+        passed_over = _LEFT_TO_THE_VENDOR | {"file-missing key.pem"}  # it is on the robot
     governance = b""
     with suppress(SrosError):
         governance = _document(state.files.get("governance.p7s", b""))
@@ -70,7 +74,11 @@ def from_folder(name: str, folder: Path, *, at: datetime) -> Material:
         state.permissions_document,
         state.domains(),
         state.files.get("permissions.p7s", b""),
-        tuple(each for each in state.problems if each.code not in _LEFT_TO_THE_VENDOR),
+        tuple(
+            each
+            for each in state.problems
+            if each.code not in passed_over and f"{each.code} {each.file}" not in passed_over
+        ),
         tuple(_ends(state, folder)),
     )
 

@@ -55,6 +55,7 @@ _BY_WORD = {
     "no-grant": _SIGN,
     "malformed": _VENDOR,
     "open-range": _VENDOR,
+    "empty-topic": _VENDOR,
     "governance-malformed": _GOVERNANCE,
     "governance-domain": _DOMAIN,
     "domain-not-in-governance": _DOMAIN,

@@ -214,7 +214,7 @@ def test_json_of_one_answer(whole: Path) -> None:
         "enclave", "question", "domain", "at", "time_zone", "vendor", "vendor_title", "vendor_why",
         "documented_only", "allowed", "outcome", "reason", "text", "denied_by", "rule", "wildcard",
         "policy", "protection", "until", "until_file", "problems", "parts", "remedy", "change",
-        "commands",
+        "commands", "policy_sha256",
     } == set(told)  # fmt: skip
     assert told["rule"] == {
         "grant": 0,
@@ -312,6 +312,8 @@ def test_access_control_that_is_off_is_told(tmp_path: Path) -> None:
         (["/a", "execute", "/x", "--type", "service"], "nobody can execute a service"),
         (["/a", "join", "/x"], "join takes neither"),
         (["/a", "publish", "/x", "--at", "soon"], "--at 'soon' is no moment"),
+        (["/a", "publish", "/x", "--at", "9999-12-31"], "is no moment"),
+        (["/a", "publish", "/x", "--at", "0001-01-01"], "is no moment"),
         (["--who", "publish", "/x", "--reach", "/a"], "exclude each other"),
         ([], "no keystore is named"),
     ],
@@ -329,6 +331,39 @@ def test_call_is_of_a_service_unless_said_otherwise(whole: Path) -> None:
     assert action["question"]["right"] == "call"
     assert len(action["parts"]) == 8
     assert answer(whole, ENCLAVE, "request", "/go")["question"]["right"] == "request"
+
+
+def test_an_action_that_was_taken_for_a_service(tmp_path: Path) -> None:
+    policy = policies_dir() / "fibonacci.xml"
+    asked = ("/fibonacci/client", "call", "/fibonacci", "--policy", policy)
+    found = explain(*asked)
+    assert found.status == 1
+    assert "note [explain.an-action]" in found.err
+    as_action = explain(*asked, "--type", "action")
+    assert (as_action.status, as_action.err) == (0, "")
+    assert explain(*asked, "--type", "service").err == ""
+    assert "an-action" not in explain("/fibonacci/server", *asked[1:]).err
+
+
+def test_a_key_that_stays_on_its_robot(keystore: Path, tmp_path: Path) -> None:
+    sros("create_request", "/arm", tmp_path / "robot").ok()
+    request = tmp_path / "robot/enclaves/arm/request.pem"
+    sros("sign_request", keystore, request, "-o", tmp_path / "a.tar.gz").ok()
+    assert not (keystore / "enclaves/arm/key.pem").exists()
+    assert explain(keystore, "/arm", "publish", "/chatter").status == 0
+    assert "/arm" in explain(keystore, "--who", "publish", "/chatter").out
+    (keystore / "enclaves/arm/request.pem").unlink()
+    missing = explain(keystore, "/arm", "publish", "/chatter")
+    assert missing.status == 1 and "key.pem: missing" in missing.out
+
+
+def test_the_policy_that_is_not_named_is_told_by_its_digest(whole: Path) -> None:
+    digest = read_policy(POLICY).enclaves[0].digest
+    found = explain(whole, ENCLAVE, "publish", "/chatter")
+    assert f"digest {digest[:12]}" in found.out
+    assert answer(whole, ENCLAVE, "publish", "/chatter")["policy_sha256"] == digest
+    named = explain(whole, ENCLAVE, "publish", "/chatter", "--policy", POLICY)
+    assert digest[:12] not in named.out
 
 
 # ── who, and reach ─────────────────────────────────────────────────────────────────────────

@@ -1,0 +1,90 @@
+"""Questions in ROS terms become the DDS endpoints that a node opens, and nothing else is asked."""
+
+from __future__ import annotations
+
+import re
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+import sros_tool.dds.decision as decision
+import sros_tool.keystore.verify as verify
+from sros_tool.dds.decision import Verb
+from sros_tool.errors import UsageError
+from sros_tool.explain.question import TYPES, WORDS, ask
+from sros_tool.explain.remedy import known_words, remedy
+from sros_tool.names import dds_names
+
+MEANT = {
+    ("publish", "topic"): "publish",
+    ("subscribe", "topic"): "subscribe",
+    ("call", "service"): "request",
+    ("request", "service"): "request",
+    ("serve", "service"): "reply",
+    ("reply", "service"): "reply",
+    ("call", "action"): "call",
+    ("execute", "action"): "execute",
+}
+
+
+@pytest.mark.parametrize(("word", "kind"), [*product(WORDS, TYPES)])
+def test_every_combination(word: str, kind: str) -> None:
+    if (word, kind) not in MEANT:
+        with pytest.raises(UsageError):
+            ask(word, "/x", kind)
+        return
+    question = ask(word, "/x", kind)
+    assert question.right == MEANT[word, kind]
+    names = dds_names(question.right, "/x")
+    assert tuple(p.topic for p in question.parts if p.verb is Verb.PUBLISH) == names.publish
+    assert tuple(p.topic for p in question.parts if p.verb is Verb.SUBSCRIBE) == names.subscribe
+    assert all(bool(part.role) == (kind != "topic") for part in question.parts)
+
+
+@pytest.mark.parametrize(
+    ("word", "kind"),
+    [("publish", "topic"), ("call", "service"), ("serve", "service"), ("execute", "action")],
+)
+def test_the_type_that_is_meant_without_saying(word: str, kind: str) -> None:
+    assert ask(word, "/x") == ask(word, "/x", kind)
+
+
+def test_joining_needs_no_endpoint() -> None:
+    assert ask("join").parts == ()
+    assert str(ask("join")) == "join the domain"
+    assert str(ask("call", "/add")) == "call service /add"
+
+
+def test_parts_of_an_action_have_names() -> None:
+    roles = {part.role for part in ask("execute", "/go").parts}
+    assert {"send_goal requests", "send_goal replies", "feedback", "status"} <= roles
+
+
+def sources(module: object) -> str:
+    folder = Path(str(getattr(module, "__file__", "")))
+    files = folder.parent.glob("*.py") if folder.name == "__init__.py" else [folder]
+    return "\n".join(file.read_text() for file in files)
+
+
+def test_every_fault_of_an_enclave_has_a_remedy() -> None:
+    codes = set(re.findall(r'"((?:[a-z]+-)+[a-z]+|revoked|signature)"', sources(verify)))
+    assert {"key-mismatch", "crl-expired", "revoked", "file-missing"} <= codes
+    assert codes <= known_words()
+
+
+def test_every_reason_of_a_decision_is_of_the_policy_or_has_a_remedy() -> None:
+    of_the_policy = {"unrestricted", "allow-rule", "deny-rule", "no-rule", "default"}
+    found = re.findall(
+        r'(?:Refusal|_refused|_answer|Decision)\(\s*(?:Outcome\.\w+,\s*)?"([a-z-]+)"',
+        sources(decision),
+    )
+    assert {"no-grant", "expired", "domain-not-in-governance"} <= set(found)
+    assert set(found) - of_the_policy <= known_words()
+
+
+def test_remedies_name_the_keystore_and_the_enclave() -> None:
+    assert remedy("expired", "ks", "/a") == "Renew it: `sros renew ks /a`."
+    assert remedy("no-rule", "ks", "/a") == ""
+    for word in known_words():
+        assert "{" not in remedy(word, "ks", "/a")
