@@ -78,7 +78,7 @@ class Selection:
         if self.strict:
             wanted = [replace(each, accepted="") for each in wanted]
         shown = [each for each in wanted if each.severity >= self.severity]
-        shown.sort(key=lambda each: (-each.severity, each.kind.family))
+        shown.sort(key=lambda each: (-each.severity, each.file, each.line or 0))
         hidden = [each for each in wanted if each.severity < self.severity]
         accepted = [each for each in hidden if each.accepted and each.kind.severity > NOTE]
         return Chosen(tuple(shown), tuple(accepted), len(hidden) - len(accepted))

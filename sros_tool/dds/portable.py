@@ -26,7 +26,7 @@ def document_notes(what: str, permissions: Permissions, signed_bytes: int) -> It
 _CONSEQUENCES = {
     "portable.document-size": f"; from {MAX_SIGNED_BYTES} on, the DDS handshake breaks and the "
     "node hears nobody. Use wildcards, or split the enclave.",
-    "portable.deny-blocks-topic": " there on Cyclone DDS, which refuses the topic as a whole; Fast "
+    "portable.deny-blocks-topic": " on Cyclone DDS, which refuses the topic as a whole; Fast "
     "DDS allows it. What no rule allows is denied anyway, so the denial may be needless.",
     "portable.character-set": ". Vendors read plain sets alike, but only * and ? are part of the "
     "portable profile.",
@@ -64,7 +64,7 @@ def outside(
                 yield (
                     "portable.deny-blocks-topic",
                     f"denying to {direction} {_some(blocked)} also keeps the enclave from "
-                    f"{kept_from}",
+                    f"{kept_from} there",
                 )
         sets = [t for r in grant.rules for c in (*r.publish, *r.subscribe) for t in c.topics]
         sets = sorted({topic for topic in sets if "[" in topic})

@@ -50,7 +50,7 @@ def test_weaknesses_of_single_files(tmp_path: Path) -> None:
     (root / "enclaves/a/key.pem").chmod(0o644)
     assert ids(root) == ["keystore.key-readable"]
     (root / "enclaves/b/cert.pem").unlink()
-    assert ids(root) == ["enclave.file-missing", "keystore.key-readable"]
+    assert ids(root) == ["keystore.key-readable", "enclave.file-missing"]
     words = ("check", root, "--json", "--include", "enclave.not-loadable")
     found = json.loads(sros(*words).out)["findings"]
     assert [each["id"] for each in found] == ["enclave.file-missing"]

@@ -13,7 +13,7 @@ from zoneinfo import ZoneInfo
 
 import pytest
 from bench import DAY, Bench
-from runtime_cases import CASES, ENCLAVE, KEYSTORE, SOUND, having, sound_setting
+from runtime_cases import CASES, DOMAIN, ENCLAVE, KEYSTORE, SOUND, having, sound_setting
 
 from sros_tool.checks.runtimes.runtime import runtime_findings
 from sros_tool.checks.runtimes.setting import Setting, running_processes
@@ -60,6 +60,13 @@ def test_what_keeps_the_enclave_from_loading_is_found_too(sound_one: Setting) ->
     (found,) = runtime_findings(sound_one)
     assert found.id == "enclave.file-missing"
     assert "permissions.p7s" in found.text
+
+
+def test_the_domain_is_told_whatever_the_enclave(bench: Bench) -> None:
+    setting = sound_setting(bench)
+    assert not ids(setting) - {"runtime.ca-key-present"}
+    wrong = having(**{DOMAIN: "7", ENCLAVE: "/nobody"})(setting, bench)
+    assert ids(wrong) >= {"runtime.domain-not-governed", "runtime.enclave-not-found"}
 
 
 def test_a_robot_whose_clock_is_behind(sound_one: Setting) -> None:

@@ -173,7 +173,7 @@ def _mode(path: str, mode: int) -> Iterator[Finding]:
 
 def _key_mode(path: str, mode: int) -> Iterator[Finding]:
     if mode & 0o077:
-        text = f"others can read the private key '{path}' (mode {stat.S_IMODE(mode):04o})"
+        text = f"its mode is {stat.S_IMODE(mode):04o}"
         yield KEY_READABLE.found(path, text, path, remedy=f"Run `chmod 600 '{path}'`.")
 
 

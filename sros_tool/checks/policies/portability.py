@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
@@ -83,7 +84,8 @@ def check_portability(checked: CheckedPolicy) -> Iterator[Finding]:
             domains=_DOMAINS,
         )
         size = _signed_bytes(enclave)
-        yield from outside_findings(permissions, size, enclave.path, source.file, source.line)
+        for found in outside_findings(permissions, size, enclave.path, source.file, source.line):
+            yield _at_denial(found, checked) if found.kind is DENY_BLOCKS else found
         if len(enclave.profiles) > 1:
             text = f"it has {len(enclave.profiles)} <profiles>"
             yield SEVERAL_PROFILES.found(enclave.path, text, source.file, source.line)
@@ -92,6 +94,13 @@ def check_portability(checked: CheckedPolicy) -> Iterator[Finding]:
         first = checked.policy.enclave(pairs[0][0])
         line = first.source.line if first else None
         yield ENCLAVE_NAMES.found(pairs[0][0], text, checked.policy.file, line)
+
+
+def _at_denial(found: Finding, checked: CheckedPolicy) -> Finding:
+    """``found``, at the first denial of its enclave."""
+    denials = (s for s in checked.statements if s.right.enclave == found.subject and not s.allows)
+    source = next(denials).source
+    return replace(found, file=source.file, line=source.line)
 
 
 def outside_findings(

@@ -74,7 +74,7 @@ def check_rules(checked: CheckedPolicy) -> Iterator[Finding]:
         if each.allows:
             yield from _permission(each, checked.rules)
         elif not checked.rules.meeting(each.right._replace(qualifier=ALLOW)):
-            yield each.found(NO_EFFECT, f"{each.right} takes nothing away: nothing allows it")
+            yield each.found(NO_EFFECT, f"nothing allows to {each.right.told()}")
     yield from _redundant(checked)
 
 

@@ -9,10 +9,21 @@ from pathlib import Path
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.checks.runtimes.setting import Setting
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
 from sros_tool.keystore.enclave import enclave_path
-from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ca_key, enclave_names, is_keystore
+from sros_tool.keystore.layout import (
+    GOVERNANCE_P7S,
+    IDENTITY,
+    PERMISSIONS,
+    ca_key,
+    enclave_names,
+    is_keystore,
+)
+from sros_tool.pki import smime
 from sros_tool.runtime.environment import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
+from sros_tool.xml import read_bytes
 
 _RCL = "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy."
 _ENV = '`eval "$(sros env ROOT NAME)"` sets all of them.'
@@ -195,6 +206,11 @@ def _spelling(environment: Mapping[str, str]) -> Iterator[Finding]:
 
 def _enclave(setting: Setting, root: Path, domain: int | None) -> Iterator[Finding]:
     names, wanted = set(enclave_names(root)), setting.environment.get(ENCLAVE, "")
+    governed = _governed(root)
+    if governed and domain is not None and domain not in governed:
+        text = f"the governance of '{root}' is for domain {governed}, not for {domain}"
+        yield DOMAIN_NOT_GOVERNED.found(DOMAIN, text)
+        domain = None  # this is said
     for role in (IDENTITY, PERMISSIONS):
         if (root / ca_key(role)).exists():
             yield CA_KEY_HERE.found(KEYSTORE, f"'{root / ca_key(role)}' is there")
@@ -214,6 +230,15 @@ def _enclave(setting: Setting, root: Path, domain: int | None) -> Iterator[Findi
             yield DOMAIN_NOT_GOVERNED.found(DOMAIN, each.text, each.file)
         else:
             yield each
+
+
+def _governed(root: Path) -> DomainSet | None:
+    """The domains that the governance of a keystore names, as far as it can be read."""
+    try:
+        signed = smime.parse(read_bytes(root / GOVERNANCE_P7S, "governance document"))
+        return parse_governance(signed.document).domains().closed()
+    except SrosError:  # told of the enclave; an export has a copy in each
+        return None
 
 
 def _value(environment: Mapping[str, str], name: str) -> str:
