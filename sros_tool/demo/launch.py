@@ -125,6 +125,12 @@ class PartyProcess:
         self._asked = True
         with suppress(ProcessLookupError):
             self._process.terminate()
+            self._process.send_signal(signal.SIGCONT)
+
+    def hold(self) -> None:
+        """Stop the process where it is; `end` still ends it."""
+        with suppress(ProcessLookupError):
+            self._process.send_signal(signal.SIGSTOP)
 
     @property
     def gone(self) -> bool:

@@ -38,6 +38,8 @@ class Status(StrEnum):
     NOT_HEARD = "not heard"
     HEARD_AGAIN = "heard again"
     NOT_HEARD_AGAIN = "not heard again"
+    DECEIVED = "deceived"
+    NOT_DECEIVED = "not deceived"
     ANSWERED = "answered"
     NOT_ANSWERED = "not answered"
     REFUSED = "refused"
@@ -64,6 +66,7 @@ class Relation(StrEnum):
 
     HEARS = "hears"
     HEARS_AGAIN = "hears replayed packets of"
+    BELIEVES = "believes changed packets of"
     IS_ANSWERED = "is answered by"
     IS_REFUSED = "is refused"
     STARTS = "starts"
@@ -76,6 +79,8 @@ STATUS_OF: dict[tuple[Relation, bool], Status] = {
     (Relation.HEARS, False): Status.NOT_HEARD,
     (Relation.HEARS_AGAIN, True): Status.HEARD_AGAIN,
     (Relation.HEARS_AGAIN, False): Status.NOT_HEARD_AGAIN,
+    (Relation.BELIEVES, True): Status.DECEIVED,
+    (Relation.BELIEVES, False): Status.NOT_DECEIVED,
     (Relation.IS_ANSWERED, True): Status.ANSWERED,
     (Relation.IS_ANSWERED, False): Status.NOT_ANSWERED,
     (Relation.IS_REFUSED, True): Status.REFUSED,
@@ -196,10 +201,10 @@ class Row:
 
     ``mechanism`` says in a clause what brings the expected outcome about; ``wire`` asks for a
     capture of the packets; ``replay`` names the party whose packets are sent again after it has
-    left.  A ``brief`` row ends as soon as it is decided.  The first of ``cases`` that fits
-    replaces the outcome.  ``attack`` names the attack to which the row belongs; with ``removed``
-    it shows that attack without the defence that ``removed`` names.  ``open_because`` and
-    ``remedy`` are as in `Case`.
+    left, ``forge`` the one in whose name changed packets are sent.  A ``brief`` row ends as soon
+    as it is decided.  The first of ``cases`` that fits replaces the outcome.  ``attack`` names the
+    attack to which the row belongs; with ``removed`` it shows that attack without the defence that
+    ``removed`` names.  ``open_because`` and ``remedy`` are as in `Case`.
     """
 
     name: str
@@ -210,6 +215,7 @@ class Row:
     controls: tuple[Claim, ...] = ()
     wire: bool = False
     replay: str = ""
+    forge: str = ""
     brief: bool = False
     cases: tuple[Case, ...] = ()
     attack: str = ""
@@ -217,6 +223,11 @@ class Row:
     open_because: str = ""
     remedy: str = ""
     skipped: str = ""
+
+    @property
+    def tapped(self) -> bool:
+        """Whether its packets are looked at."""
+        return bool(self.wire or self.replay or self.forge)
 
     def party(self, name: str) -> Party:
         """The party of that name.  Raises `KeyError`."""

@@ -72,7 +72,7 @@ def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
     template = options.template or (given.template if given else load_template(DEFAULT_TEMPLATE))
     topic = options.topic
     topic = check_topic((given.topic if given else DEFAULT_TOPIC) if topic is None else topic)
-    scenarios = [_chosen(scenario, options) for scenario in options.scenarios]
+    scenarios = _chosen(options)
     isolation = _isolation(options.network)
     domains = [_domains(scenario, options, given, isolation) for scenario in scenarios]
     results: list[ScenarioResult] = []
@@ -161,11 +161,22 @@ def _given(options: DemoOptions) -> GivenKeystore | None:
     return open_given(options.keystore, topic, options.scenarios[0])
 
 
-def _chosen(scenario: Scenario, options: DemoOptions) -> Scenario:
-    """The scenario with the rows that were asked for."""
+def _chosen(options: DemoOptions) -> tuple[Scenario, ...]:
+    """The scenarios with the rows that were asked for.  Raises `UsageError` where none is left."""
     if not options.only:
-        return scenario
-    return replace(scenario, rows=tuple(row for row in scenario.rows if _asked_for(row, options)))
+        return options.scenarios
+    chosen = tuple(
+        replace(scenario, rows=rows)
+        for scenario in options.scenarios
+        if (rows := tuple(row for row in scenario.rows if _asked_for(row, options)))
+    )
+    if not chosen:
+        raise UsageError(
+            f"no row has {' or '.join(map(repr, options.only))} in its name",
+            f"The scenarios are {', '.join(each.name for each in options.scenarios)}.",
+            "See the names without --only.",
+        )
+    return chosen
 
 
 def _asked_for(row: Row, options: DemoOptions) -> bool:

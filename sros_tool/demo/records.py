@@ -26,10 +26,15 @@ class WireCount:
 
 @dataclass(frozen=True)
 class Replay:
-    """How many captured packets were sent again, and from when on (CLOCK_MONOTONIC)."""
+    """How many captured packets were sent again or changed, and when (CLOCK_MONOTONIC)."""
 
     packets: int
     time: float
+
+
+def forged_text(text: str) -> str:
+    """What is said in the name of a talker that says ``text``; of the same length."""
+    return text.swapcase()
 
 
 @dataclass(frozen=True)

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Collection, Sequence
+from typing import Literal
 
 from sros_tool.demo.capture import Kept
+
+_RTPS_HEADER, _DATA = 20, 0x15
+_NUMBER = 20
+"""From the head of a DATA submessage to the low half of its sequence number."""
 
 
 class Injector:
@@ -30,6 +35,31 @@ class Injector:
 def packets_of(kept: Sequence[Kept], ports: Collection[int]) -> list[Kept]:
     """The captured packets that were sent from one of the ports, in order."""
     return [each for each in kept if each.source in ports]
+
+
+def with_other_words(packet: bytes, words: str, others: str, step: int) -> bytes | None:
+    """An RTPS packet that says something else of the same length, ``step`` messages later.
+
+    The sequence number of the DATA submessage that holds ``words`` is raised, so that a reader
+    takes it for the writer's next one (RTPS 2.3 §9.4.5.3).  None where no words are readable.
+    """
+    start = (packet[0] & 0x0F) * 4 + 8
+    position = start + _RTPS_HEADER
+    changed = bytearray(packet)
+    while position + 4 <= len(packet):
+        kind, flags = packet[position], packet[position + 1]
+        order: Literal["little", "big"] = "little" if flags & 1 else "big"
+        length = int.from_bytes(packet[position + 2 : position + 4], order)
+        end = position + 4 + length if length else len(packet)
+        place = packet.find(words.encode(), position, end)
+        if kind == _DATA and place >= 0:
+            number = slice(position + _NUMBER, position + _NUMBER + 4)
+            raised = int.from_bytes(packet[number], order) + step
+            changed[number] = raised.to_bytes(4, order)
+            changed[place : place + len(others.encode())] = others.encode()
+            return bytes(changed)
+        position = end
+    return None
 
 
 def without_checksum(packet: bytes) -> bytes:

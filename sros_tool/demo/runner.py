@@ -19,7 +19,8 @@ from sros_tool.demo.isolated import ENDING_SIGNALS
 from sros_tool.demo.launch import PartyProcess, base_environment
 from sros_tool.demo.model import DENIALS, SPEAKING, Claim, Party, Relation, Role, Row, Wire
 from sros_tool.demo.network import RowNetwork
-from sros_tool.demo.records import Replay, RowRecord, RowResult
+from sros_tool.demo.records import Replay, RowRecord, RowResult, forged_text
+from sros_tool.demo.replay import with_other_words
 from sros_tool.demo.scenery import Scenery
 from sros_tool.demo.verdict import judge_row
 from sros_tool.demo.wiretap import Wiretap
@@ -33,6 +34,8 @@ _AFTER_REPLAY = 2.0
 _BRIEFEST = 1.0
 _LONGEST_PAUSE = 0.5
 _ROUNDS = 2
+_FORGED = 5
+_AFTER_FORGERY = 1.0
 _SECONDS_TO_END = 2.0
 
 
@@ -108,7 +111,7 @@ class _Stage:
 
     def _why_skipped(self, row: Row) -> str:
         handshake = any(claim.wire is not Wire.TEXT for claim in row.claims)
-        if (handshake or row.replay) and not self._plan.own_networks:
+        if (handshake or row.replay or row.forge) and not self._plan.own_networks:
             return "it needs a network namespace of its own"
         return row.skipped or self._plan.scenery.problem(each.identity for each in row.parties)
 
@@ -121,7 +124,7 @@ class _Stage:
         network = RowNetwork(own=self._plan.own_networks)
         try:
             with network.entered():
-                if row.wire or row.replay:
+                if row.tapped:
                     tap = self._listen_in(index)
                     if tap.problem:
                         return RowRecord(row, domain, skipped=tap.problem)
@@ -133,6 +136,8 @@ class _Stage:
             replay = None
             if tap and row.replay and window:
                 replay = await self._replay(processes[row.replay], tap)
+            if tap and row.forge and window:
+                replay = await self._forge(processes[row.forge], tap)
         finally:
             try:
                 await _end_softly(processes.values())
@@ -149,7 +154,7 @@ class _Stage:
         row = self._plan.rows[index]
         texts = {party.name: self._text(index, party) for party in row.parties}
         topic = f"rt{self._plan.topic}"
-        return Wiretap(texts, topic, replayed=bool(row.replay))
+        return Wiretap(texts, topic, replayed=bool(row.replay or row.forge))
 
     def _start(self, index: int, party: Party, domain: int, folder: Path) -> PartyProcess:
         plan, row = self._plan, self._plan.rows[index]
@@ -174,7 +179,10 @@ class _Stage:
         )
         backend = plan.backend
         environment |= backend.environment(
-            party.role, wire=bool(row.wire or row.replay), denied=denied, secured=secured
+            party.role,
+            wire=bool(row.wire or row.replay or row.forge),
+            denied=denied,
+            secured=secured,
         )
         environment |= plan.scenery.environment(party.identity, domain)
         command = [*backend.command(party.role, secured=secured), *options]
@@ -251,6 +259,23 @@ class _Stage:
         await asyncio.sleep(_AFTER_REPLAY)
         return Replay(len(packets), started)
 
+    async def _forge(self, talker: PartyProcess, tap: Wiretap) -> Replay:
+        """Hold a talker, and go on in its name with packets that say something else."""
+        talker.hold()
+        await asyncio.sleep(_GRACE)
+        packets = [each.packet for each in tap.packets(talker.ports())]
+        words, others = talker.text, forged_text(talker.text)
+        last = next((p for p in reversed(packets) if with_other_words(p, words, others, 1)), None)
+        started = time.monotonic()
+        sent = 0
+        for step in range(1, _FORGED + 1) if last else ():
+            changed = with_other_words(last or b"", words, others, step)
+            if changed is not None:
+                tap.send(changed)
+                sent += 1
+        await asyncio.sleep(_AFTER_FORGERY)
+        return Replay(sent, started)
+
 
 async def _end_softly(processes: Collection[PartyProcess]) -> None:
     """Let the processes end by themselves, for a while; they log and report until then."""
@@ -263,7 +288,7 @@ async def _end_softly(processes: Collection[PartyProcess]) -> None:
 
 def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, PartyProcess]) -> bool:
     """Whether a claim needs time to pass: nothing must happen, and something still could."""
-    if claim.holds or claim.relation is Relation.HEARS_AGAIN:
+    if claim.holds or claim.relation in (Relation.HEARS_AGAIN, Relation.BELIEVES):
         return False
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
     return claim.denied not in DENIALS or all(processes[name].running for name in names)

@@ -10,7 +10,7 @@ import re
 import signal
 
 from sros_tool.demo.model import STATUS_OF, Claim, Party, Relation, Role, Status, Wire
-from sros_tool.demo.records import Finding, PartyRecord, RowRecord, RowResult
+from sros_tool.demo.records import Finding, PartyRecord, RowRecord, RowResult, forged_text
 from sros_tool.runtime.events import Event, Kind, Stage
 from sros_tool.runtime.security_log import endpoint_refusal, missing_security, participant_refusal
 
@@ -94,6 +94,8 @@ def _judge_claim(claim: Claim, record: RowRecord) -> Finding:
     talker = record.parties[claim.talker]
     if claim.relation is Relation.HEARS_AGAIN:
         return _judge_replay(claim, record, subject, talker)
+    if claim.relation is Relation.BELIEVES:
+        return _judge_forgery(claim, record, subject, talker)
     if claim.relation is Relation.IS_ANSWERED:
         return _judge_answers(claim, record, subject, talker)
     sent = {e.text for e in talker.events if e.kind is Kind.SENT and _inside(e, record)}
@@ -136,6 +138,21 @@ def _judge_replay(
         status,
         f"{claim.subject} heard {again} messages in {replay.packets} packets of the"
         f" {claim.talker} that were sent again, twice, after it had left",
+    )
+
+
+def _judge_forgery(
+    claim: Claim, record: RowRecord, listener: PartyRecord, talker: PartyRecord
+) -> Finding:
+    replay = record.replay
+    if replay is None or not replay.packets:
+        return Finding(Status.UNDECIDED, "no packet of the talker could be read and changed")
+    mark = forged_text(talker.text)
+    believed = sum(1 for e in listener.events if e.kind is Kind.HEARD and e.text.startswith(mark))
+    return Finding(
+        STATUS_OF[Relation.BELIEVES, believed > 0],
+        f"{claim.subject} heard {believed} of {replay.packets} messages that the {claim.talker}"
+        " never sent",
     )
 
 

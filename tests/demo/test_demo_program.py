@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from harness import sros
 
 from sros_tool.demo import backend as backends
 from sros_tool.demo.backend import Backend, choose_backend
@@ -173,3 +175,37 @@ def test_the_table_shows_reasons_and_a_summary() -> None:
     assert text.endswith("1 of 3 rows as expected, 1 skipped, 1 not as expected.")
     assert not result.as_expected
     assert result.as_json()["rows"][1]["as_expected"] is False
+
+
+def test_rows_that_nobody_has_are_refused() -> None:
+    options = DemoOptions(load_template("production"), only=("no such row",))
+    with pytest.raises(UsageError, match="no row has 'no such row'"):
+        run_demo(options, NOW, print)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (("--scenario", "nothing"), "no scenario 'nothing'"),
+        (("--summary", "no/such/folder/x.md"), "Its folder does not exist"),
+        (("--plot", "x.svg"), "nothing to plot"),
+        (("--keystore", "x"), "isolation cannot be played"),
+        (("--topic", ""), "not a topic name"),
+    ],
+)
+def test_wrong_usage_is_told_before_anything_runs(
+    arguments: tuple[str, ...], told: str, tmp_path: Path
+) -> None:
+    ended = sros("demo", *arguments, cwd=tmp_path)
+    assert ended.status == 2
+    assert told in ended.err
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_list_of_scenarios() -> None:
+    text = sros("demo", "--list").ok().out
+    assert [line.split()[0] for line in text.splitlines()] == [
+        *("isolation", "services", "actions", "composition", "attacks", "governance")
+    ]
+    shown = json.loads(sros("demo", "--list", "--json").ok().out)
+    assert shown[0]["rows"] == 11

@@ -41,10 +41,32 @@ def _row(kind: str) -> Row:
     )
 
 
+def _changed(kind: str, expected: Status, mechanism: str) -> Row:
+    label = f"protection {kind}"
+    return Row(
+        f"changed packets under {kind}",
+        expected,
+        mechanism,
+        (
+            Party("talker", Role.TALKER, Identity(label, "talker")),
+            Party("listener", Role.LISTENER, Identity(label, "listener")),
+        ),
+        (Claim(Relation.BELIEVES, "listener", "talker").expecting(expected),),
+        (Claim(Relation.HEARS, "listener", "talker"),),
+        forge="talker",
+        brief=True,
+    )
+
+
+_CHANGES = (
+    _changed("none", Status.DECEIVED, "nothing proves that the packet is the talker's"),
+    _changed("sign", Status.NOT_DECEIVED, "its code does not fit a changed packet"),
+)
+
 GOVERNANCE = Scenario(
     "governance",
     "the same talk without protection, signed and encrypted: on the wire, and its cost",
-    tuple(_row(kind) for kind in KINDS),
+    (*(_row(kind) for kind in KINDS), *_CHANGES),
     {
         "talker": "/talker_listener/talker",
         "listener": "/talker_listener/listener",

@@ -1,0 +1,108 @@
+"""Keystores and scenarios of users, over a real DDS."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from harness import policy_text, publish, snapshot, sros
+from test_demo_attacks import _needs_cyclone, needs_isolation
+
+from sros_tool.demo.given import open_given
+from sros_tool.demo.scenarios.attacks import ATTACKS
+from sros_tool.errors import SrosError
+from sros_tool.resources import policies_dir
+
+__all__ = ["_needs_cyclone"]  # a fixture of the other module, used here
+
+pytestmark = pytest.mark.dds
+
+HEARS = '<topics subscribe="ALLOW"><topic>/image</topic></topics>'
+
+
+@pytest.fixture
+def robot(tmp_path: Path) -> Path:
+    root = tmp_path / "robot"
+    sros("create_keystore", root, "--template", "production").ok()
+    sros("generate_artifacts", "-k", root, "-p", policies_dir() / "mobile_robot.xml").ok()
+    return root
+
+
+def test_who_plays_which_part_in_a_robot(robot: Path, tmp_path: Path) -> None:
+    given = open_given(robot, "/cmd_vel", ATTACKS)
+    assert given.topic == "/cmd_vel"
+    assert given.cast["talker"] == "/mobile_robot/velocity_mux"
+    assert given.cast["listener"] == "/mobile_robot/base"
+    assert given.cast["guest"] not in (given.cast["talker"], given.cast["listener"])
+    assert {"server", "client"} <= set(given.cast)
+    assert given.template.unique_subject
+    given.copy(tmp_path / "copy")
+    copied = set(snapshot(tmp_path / "copy"))
+    assert not [path for path in copied if "ca.key" in path]
+    talker = "enclaves/mobile_robot/velocity_mux/key.pem"
+    assert copied >= {talker, "public/identity_ca.cert.pem", "enclaves/governance.p7s"}
+    assert "enclaves/mobile_robot/teleop/key.pem" not in copied or "/mobile_robot/teleop" in (
+        given.cast.values()
+    )
+    with pytest.raises(SrosError, match="no two enclaves"):
+        open_given(robot, "/no_such_topic", ATTACKS)
+
+
+@needs_isolation
+def test_a_robot_without_the_keys_of_its_authorities(robot: Path) -> None:
+    """What needs a signature of the CA is skipped with the reason; the rest is tried."""
+    shutil.move(robot / "private", robot.parent / "offline")
+    before = snapshot(robot)
+    words = ("was not given", "old permissions put back", "permissions edited", "key of another")
+    only = [argument for word in words for argument in ("--only", word)]
+    ended = sros(
+        *("demo", "--backend", "cyclone", "--scenario", "attacks", "--keystore", robot),
+        *("--topic", "/cmd_vel", "--json", *only),
+    )
+    assert ended.status == 0, ended
+    assert snapshot(robot) == before
+    rows = {row["name"]: row for row in json.loads(ended.out)["rows"]}
+    assert rows["permissions edited"]["observed"] == "not let in"
+    assert rows["an enclave publishes a topic that it was not given"]["observed"] == "refused"
+    assert rows["certificate with the key of another enclave"]["observed"] == "not heard"
+    skipped = rows["old permissions put back"]
+    assert skipped["observed"] == "skipped"
+    assert "the key of the" in skipped["detail"]
+    assert all(row["as_expected"] for row in rows.values())
+
+
+SCENARIO = """policy = "robot.xml"
+party = [
+    { name = "camera", role = "talker", enclave = "/arm/camera", topic = "/image" },
+    { name = "viewer", role = "listener", enclave = "/arm/viewer", topic = "/image" },
+    { name = "stranger", role = "talker", enclave = "/arm/viewer", topic = "/image" },
+    { name = "spy", role = "listener", topic = "/image" },
+]
+
+[[row]]
+name = "a spy does not see the camera"
+claims = ["spy does not hear camera"]
+controls = ["viewer hears camera"]
+
+[[row]]
+name = "a viewer does not send images"
+claims = ["stranger is refused"]
+controls = ["viewer starts"]
+
+[[row]]
+name = "what is wrong is told"
+claims = ["stranger starts"]
+"""
+
+
+def test_a_scenario_of_a_user(tmp_path: Path) -> None:
+    policy = policy_text({"/arm/camera": publish("/image"), "/arm/viewer": HEARS})
+    (tmp_path / "robot.xml").write_text(policy)
+    (tmp_path / "mine.toml").write_text(SCENARIO)
+    ended = sros("demo", "--backend", "cyclone", "--scenario", tmp_path / "mine.toml", "--json")
+    shown = json.loads(ended.out)
+    assert [row["observed"] for row in shown["rows"]] == ["not heard", "refused", "refused"]
+    assert [row["as_expected"] for row in shown["rows"]] == [True, True, False]
+    assert ended.status == 1
