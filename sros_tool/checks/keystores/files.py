@@ -30,7 +30,7 @@ KEY_READABLE = Kind(
     "a private key that others can read",
     "Who reads it is that enclave, or with the key of a CA any enclave. Neither rcl nor DDS looks "
     "at modes, and ros2/sros2 makes keys with 0644.",
-    "ros2/sros2 0.13; ros2-security contract: file modes are checked by nobody.",
+    "ros2/sros2 0.13; rcl 9, Fast DDS 2.14.5 and Cyclone DDS 0.10.2 check no modes.",
     "Run `chmod 600` on it. If strangers had access, revoke the enclave.",
 )
 WORLD_WRITABLE = Kind(
