@@ -97,7 +97,7 @@ def overlay(first: Source, second: Source, kind: str, context: Context = Context
     ]
     known = Known(rights[0] | rights[1])
     sides = [edges_of(each, known, context.common) for each in rights]
-    edges = _marked(*sides)
+    edges = _marked(*sides, allowed_by=kind == "use")
     normal = [folded(each) for each in rights]
     stated = {
         right: Mark.BOTH
@@ -200,16 +200,19 @@ def _enclaves(
 # ── one over the other ─────────────────────────────────────────────────────────────────────
 
 
-def _marked(first: Iterable[Edge], second: Iterable[Edge]) -> list[Edge]:
-    """The edges of both sides, each with where it stands."""
+def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) -> list[Edge]:
+    """The edges of both sides, each with where it stands.
+
+    What both have is reached by a wildcard only if both say so; with ``allowed_by``, if the first
+    does: what was observed always has a name of its own.
+    """
     sides = [{_identity(edge): edge for edge in side} for side in (first, second)]
     found = []
     for key in {**sides[0], **sides[1]}:
         one, other = sides[0].get(key), sides[1].get(key)
         if one and other:
-            # What either side says by its own name is not reached by a wildcard alone.
-            by = tuple(sorted({*one.by, *other.by})) if one.by and other.by else ()
-            found.append(replace(one, by=by))
+            both = tuple(sorted({*one.by, *other.by})) if one.by and other.by else ()
+            found.append(one if allowed_by else replace(one, by=both))
         elif one:
             found.append(replace(one, mark=Mark.FIRST))
         elif other:
@@ -233,20 +236,33 @@ def _changed(first: frozenset[Right], second: frozenset[Right]) -> tuple[Differe
         Difference(
             Mark.FIRST if sign == "-" else Mark.SECOND,
             str(right),
-            tuple(each.told() for each in difference.covered.get(right, ())),
+            tuple(
+                f"the other has it by {each.told()}" for each in difference.covered.get(right, ())
+            ),
         )
         for sign, right in difference.lines()
     )
 
 
 def _unused(edges: Iterable[Edge]) -> tuple[Difference, ...]:
-    """What was allowed and never observed, without what every node needs; and the other way."""
+    """What was allowed and never observed, without what every node needs; and the other way.
+
+    What wildcards reach is counted: a recorder of everything would fill pages.
+    """
+    found: dict[tuple[Mark, Right], tuple[str, ...]] = {}
+    reached: dict[Right, list[bool]] = defaultdict(list)
+    for edge in sorted(edges, key=_edge_order):
+        for name in edge.by:
+            right = Right(edge.enclave, edge.qualifier, edge.right, name)
+            reached[right].append(edge.mark is Mark.FIRST and not edge.common)
+        if edge.mark is not Mark.BOTH and not edge.common and not edge.by:
+            right = Right(edge.enclave, edge.qualifier, edge.right, edge.name)
+            found[edge.mark, right] = ()
+    for right, unused in reached.items():
+        if any(unused):
+            told = f"{sum(unused)} of the {len(unused)} names that it reaches were never observed"
+            found[Mark.FIRST, right] = (told,)
     return tuple(
-        Difference(
-            edge.mark,
-            str(Right(edge.enclave, edge.qualifier, edge.right, edge.name)),
-            tuple(f"{edge.right} {each}" for each in edge.by),
-        )
-        for edge in sorted(edges, key=_edge_order)
-        if edge.mark is not Mark.BOTH and not edge.common
+        Difference(mark, str(right), notes)
+        for (mark, right), notes in sorted(found.items(), key=lambda each: order(each[0][1]))
     )

@@ -175,11 +175,15 @@ class Overlay:
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """A right as written that only one side has; ``covered`` are the other's wildcards for it."""
+    """A right that only one side has; ``notes`` say more of it.
+
+    Of a change, the wildcards by which the other side has it all the same; of use, how many of the
+    names that a wildcard reaches were never observed.
+    """
 
     mark: Mark
     text: str
-    covered: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

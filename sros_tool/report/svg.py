@@ -40,7 +40,7 @@ letter-spacing:.06em}
 .sign{stroke-dasharray:9 3}.none{stroke-dasharray:2 3}
 .first{stroke:var(--first);stroke-width:2.25;marker-end:url(#to1)}
 .second{stroke:var(--second);stroke-width:2.25;marker-end:url(#to2)}
-.deny{stroke:var(--deny);stroke-width:1.75;marker-end:url(#no)}
+.deny{stroke:var(--deny);stroke-width:1.75;stroke-opacity:1;marker-end:url(#no)}
 .tip{fill:var(--line)}.tip1{fill:var(--paper);stroke:var(--first);stroke-width:1.2}.tip2{fill:var(--second)}
 .cross{fill:var(--paper);stroke:var(--deny);stroke-width:1.6}
 .glyph{fill:none;stroke:var(--soft);stroke-width:1.4}
@@ -171,11 +171,11 @@ def _card(card: Card) -> Iterable[str]:
         f'<rect width="{card.width}" height="{card.height}" rx="6"/>'
     )
     if names:
-        yield (f'<path class="glyph" transform="translate(10 11)" d="{GLYPHS[card.kind]}"/>')
+        yield (f'<path class="glyph" transform="translate(10 9)" d="{GLYPHS[card.kind]}"/>')
         if lock := LOCKS.get(card.level):
             yield (
                 f'<path class="lock lock-{card.level.value}" '
-                f'transform="translate({card.width - 23} 11)" d="{lock}"/>'
+                f'transform="translate({card.width - 23} 8)" d="{lock}"/>'
             )
     x, y = (32 if names else 12), PAD + 12
     for line in card.lines:

@@ -36,9 +36,9 @@ def test_a_wildcard_that_became_names_is_a_difference_though_nothing_moved(tmp_p
     after = source_of(tmp_path, {"/a": group("topics", "publish", "/x")}, "new.xml")
     picture = overlay(before, after, "change")
     assert edge(picture, "/a", "publish", "/x").mark is Mark.BOTH
-    assert {d.text: d.covered for d in picture.differences} == {
+    assert {d.text: d.notes for d in picture.differences} == {
         "/a ALLOW publish topic /*": (),
-        "/a ALLOW publish topic /x": ("publish topic /*",),
+        "/a ALLOW publish topic /x": ("the other has it by publish topic /*",),
     }
 
 
@@ -65,6 +65,24 @@ def test_over_privilege_stands_out_and_agrees_with_minimize_policy(tmp_path: Pat
     talker = [e for e in picture.edges if e.enclave == "/talker" and e.name != "/secret"]
     assert use.allowed_pairs == sum(e.mark is not Mark.SECOND for e in talker)
     assert use.observed_pairs == sum(e.mark is Mark.BOTH for e in talker)
+
+
+def test_what_a_wildcard_reaches_and_nobody_used_is_counted(tmp_path: Path) -> None:
+    topics = [f"/t{n}" for n in range(6)]
+    allowed = {"/w": group("topics", "publish", *topics), "/r": group("topics", "subscribe", "/*")}
+    used = {
+        "/w": group("topics", "publish", *topics[1:]),
+        "/r": group("topics", "subscribe", "/t1", "/t2"),
+    }
+    picture = overlay(source_of(tmp_path, allowed), source_of(tmp_path, used, "seen.xml"), "use")
+    assert [(d.mark, d.text, d.notes) for d in picture.differences] == [
+        (
+            Mark.FIRST,
+            "/r ALLOW subscribe topic /*",
+            ("4 of the 6 names that it reaches were never observed",),
+        ),
+        (Mark.FIRST, "/w ALLOW publish topic /t0", ()),
+    ]
 
 
 def test_only_what_both_sides_can_speak_of_is_compared(tmp_path: Path) -> None:

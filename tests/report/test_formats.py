@@ -44,7 +44,8 @@ def test_two_runs_write_the_same_bytes(form: str, robot_keystore: Path) -> None:
 
 def test_the_picture_of_the_readme_is_what_its_command_writes(tmp_path: Path) -> None:
     shown = REPOSITORY / "docs" / "mobile_robot.svg"
-    sros("view", MOBILE_ROBOT, "-o", tmp_path / "mobile_robot.svg").ok()
+    command = ("view", MOBILE_ROBOT, "--template", "production", "-o")
+    sros(*command, tmp_path / "mobile_robot.svg").ok()
     assert (tmp_path / "mobile_robot.svg").read_bytes() == shown.read_bytes()
 
 

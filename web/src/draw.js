@@ -172,7 +172,7 @@ function drawCard(group, card, problems) {
       group
         .append("path")
         .attr("class", `lock lock-${card.level}`)
-        .attr("transform", `translate(${card.width - 23} 9)`)
+        .attr("transform", `translate(${card.width - 23} 8)`)
         .attr("d", LOCKS[card.level]);
     }
   }

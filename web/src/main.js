@@ -233,7 +233,7 @@ function fillLists() {
       el("span", { class: `chip ${each.mark}`, text: markText(model.overlay, each.mark) }),
       " ",
       el("code", { text: each.text }),
-      each.covered.length ? el("span", { class: "soft", text: ` reached by ${each.covered.join(", ")}` }) : null,
+      each.notes.length ? el("span", { class: "soft", text: ` (${each.notes.join("; ")})` }) : null,
     ),
   );
   const same = el("p", { class: "soft", text: "There is no difference." });
