@@ -1,0 +1,104 @@
+"""The ways to sign a document with openssl: which of them the vendors take, and sros with them."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from decision_documents import allow, grant, permissions, publish
+from vendor_oracle import (
+    PEER,
+    PEER_PERMISSIONS,
+    Reply,
+    Workshop,
+    ask_cyclone_folders,
+    ask_fastdds_folders,
+)
+from vendor_rows import OPEN
+
+from sros_tool.errors import PkiError
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import pem
+from sros_tool.pki.keys import key_pem
+
+pytestmark = pytest.mark.dds
+
+FORMS = {
+    "-text": ("smime -sign -text", True),
+    "-text, opaque": ("smime -sign -text -nodetach", True),
+    "cms -text": ("cms -sign -text", True),
+    "-text, SHA-1": ("smime -sign -text -md sha1", True),
+    "-text, SHA-512": ("smime -sign -text -md sha512", True),
+    "without -text": ("smime -sign", False),
+    "-text -binary": ("smime -sign -text -binary", False),
+    "-text -nocerts": ("smime -sign -text -nocerts", False),
+}
+"""By a name: how openssl signs, and whether both vendors take it.
+
+Fast DDS 2.14.5 takes -nocerts, which 2.9.1 and Cyclone DDS 0.10.2 refuse.
+"""
+
+READ_BY_SROS = {"-text", "cms -text", "-text, SHA-1", "-text, SHA-512"}
+
+
+@pytest.fixture(scope="module")
+def workshop(tmp_path_factory: pytest.TempPathFactory) -> Workshop:
+    return Workshop(tmp_path_factory.mktemp("workshop"))
+
+
+@pytest.fixture(scope="module")
+def enclaves(workshop: Workshop) -> dict[str, Path]:
+    """An enclave for each form, whose permissions are signed like that."""
+    document = permissions(grant(allow(publish("rt/a"), domains="<id>0</id>")))
+    signer, key = workshop.root / "signer.pem", workshop.root / "signer.key"
+    signer.write_bytes(pem(workshop.authorities["permissions"]))
+    key.write_bytes(key_pem(workshop.keys["permissions"]))
+    (workshop.root / "permissions.xml").write_bytes(document)
+    made = {}
+    for number, (name, (way, _)) in enumerate(FORMS.items()):
+        made[name] = enclave(workshop, f"form {number}", "CN=/t", document)
+        files = ["-signer", signer, "-inkey", key, "-in", workshop.root / "permissions.xml"]
+        out = made[name] / "permissions.p7s"
+        out.unlink()
+        command = ["openssl", *way.split(), *map(str, files), "-out", str(out)]
+        subprocess.run(command, check=True, capture_output=True)
+    return made
+
+
+def enclave(workshop: Workshop, name: str, subject: str, document: bytes) -> Path:
+    folder = Path(shutil.copytree(workshop.identity(subject), workshop.root / name))
+    shutil.copytree(workshop.documents(OPEN, document), folder, dirs_exist_ok=True)
+    return folder
+
+
+@pytest.mark.parametrize("vendor", ["Cyclone DDS", "Fast DDS"])
+def test_what_the_vendors_take(
+    vendor: str, workshop: Workshop, enclaves: dict[str, Path], tmp_path: Path
+) -> None:
+    peer = enclave(workshop, f"peer for {vendor}", PEER, PEER_PERMISSIONS)
+    pairs = [(enclaves[name], peer, "UTC") for name in FORMS]
+    replies: list[Reply] = (
+        ask_cyclone_folders(pairs, "rt/a", peer)
+        if vendor == "Cyclone DDS"
+        else ask_fastdds_folders(pairs, "rt/a", workshop.root)
+    )
+    taken = {
+        name: reply.answers == ("matched",) for name, reply in zip(FORMS, replies, strict=True)
+    }
+    assert taken == {name: expected for name, (_, expected) in FORMS.items()}, replies
+
+
+@pytest.mark.parametrize("name", FORMS)
+def test_sros_takes_nothing_that_a_vendor_refuses(
+    name: str, workshop: Workshop, enclaves: dict[str, Path]
+) -> None:
+    data = (enclaves[name] / "permissions.p7s").read_bytes()
+    try:
+        smime.parse(data).verify(workshop.authorities["permissions"])
+    except PkiError:
+        assert name not in READ_BY_SROS
+    else:
+        assert name in READ_BY_SROS
+        assert FORMS[name][1]
