@@ -14,6 +14,7 @@ import pytest
 from decision_documents import (
     NOW,
     allow,
+    criteria,
     deny,
     governance,
     grant,
@@ -108,6 +109,23 @@ ROWS = [
         "yes yes yes no",
         "rt/s",
         READER,
+    ),
+    Row(
+        "relaying denied, reading allowed",
+        one(deny(criteria("relay", "rt/a")), allow(subscribe("rt/a"))),
+        "yes peer peer yes",
+        verb=READER,
+    ),
+    Row(
+        "relaying denied, writing allowed",
+        one(deny(criteria("relay", "rt/a")), allow(A)),
+        "yes yes yes yes",
+    ),
+    Row(
+        "relaying denied behind reading",
+        one(allow(subscribe("rt/a")), deny(criteria("relay", "rt/a"))),
+        "yes yes yes yes",
+        verb=READER,
     ),
     Row("denied elsewhere", one(deny(A, domains=THERE), allow(A)), "yes no no yes"),
     Row("allowed elsewhere", one(allow(A, domains=THERE), allow(B)), "no peer peer no"),

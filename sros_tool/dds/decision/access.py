@@ -99,6 +99,9 @@ class Access:
         if not traits.filters_own_domain:
             everywhere = list(enumerate(grant.rules))
             self._own = {verb: Rights(traits, everywhere, otherwise, verb) for verb in _ENDPOINTS}
+        if traits.relays_count_for_readers:
+            readers = Rights(traits, rules, otherwise, Verb.SUBSCRIBE, "relay")
+            self._peers = {**self._peers, Verb.SUBSCRIBE: readers}
         self._either = Rights(traits, rules, otherwise, *_ENDPOINTS)
 
     # ── answering ──────────────────────────────────────────────────────────────────────────

@@ -84,11 +84,12 @@ class Rights:
         self._otherwise = otherwise
         self._entries: list[_Entry] = []
         count = 0
-        for index, rule in rules:
-            criteria = tuple(each for verb in verbs for each in getattr(rule, verb))
+        for index, rule, criteria in (
+            (index, rule, getattr(rule, verb)) for index, rule in rules for verb in verbs
+        ):
             for each in criteria:
                 count += 1
-                # Fast DDS weighs the partitions of all criteria of a rule together.
+                # Fast DDS weighs the partitions of all criteria of a verb in a rule together.
                 weighed = _partitions(traits, rule, criteria if traits.topic_decides else (each,))
                 self._entries += [
                     _Entry(count, index, rule.allow, trimmed(traits, expression), weighed)

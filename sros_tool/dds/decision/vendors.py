@@ -104,6 +104,8 @@ class Traits:
     open_range: OpenRange = OpenRange.OPEN
     filters_own_domain: bool = True
     """Rules for other domains do not count for the own participant (they never do for peers)."""
+    relays_count_for_readers: bool = False
+    """Peers weigh ``<relay>`` for a reader, behind the ``<subscribe>`` of the same rule."""
     topic_decides: bool = False
     """The first rule whose topic matches decides, and then its partitions must fit."""
     deny_partitions: DenyPartitions = DenyPartitions.ANY_OR_ALL
@@ -130,6 +132,7 @@ _FAST = Traits(
     passes_over_outdated_grants=True,
     open_range=OpenRange.SINGLE,
     filters_own_domain=False,
+    relays_count_for_readers=True,
     topic_decides=True,
     deny_partitions=DenyPartitions.IGNORED,
     honours_default=False,
