@@ -47,7 +47,6 @@ letter-spacing:.06em}
 .lock{fill:none;stroke-width:1.4}.lock-encrypt{stroke:var(--encrypt)}.lock-sign{stroke:var(--sign)}\
 .lock-none{stroke:var(--open)}
 .tag{font:700 11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:var(--soft)}
-.mark1{fill:var(--first);font-weight:700}.mark2{fill:var(--second);font-weight:700}
 """
 _USE = "svg{--second:var(--deny)}\n"  # what is used and not allowed is no good news
 _MARKERS = """\

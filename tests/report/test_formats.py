@@ -17,7 +17,7 @@ from pictures import HOSTILE, MOBILE_ROBOT, hostile_permissions, mobile_robot
 
 from sros_tool.report.as_json import render_json
 from sros_tool.report.graphs import render_dot, render_mermaid
-from sros_tool.report.scene import scenes_of
+from sros_tool.report.scenes import scenes_of
 from sros_tool.report.svg import render_svg
 
 pytest_plugins = ["browsing"]

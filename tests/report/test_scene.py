@@ -13,7 +13,8 @@ from sros_tool.policy.reader import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.compose import Source, compose, overlay
 from sros_tool.report.picture import Origin, Picture
-from sros_tool.report.scene import Scene, scenes_of
+from sros_tool.report.scene import Scene
+from sros_tool.report.scenes import scenes_of
 
 
 @pytest.fixture(scope="module")

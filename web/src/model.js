@@ -157,7 +157,7 @@ function prefixes(name) {
   return found;
 }
 
-// The rights of an enclave that carry no information: what only says who may listen is not told.
+// Ties with their bundles by what they allow or deny, such as "publish" and "DENY subscribe".
 export function byRight(ties) {
   const groups = new Map();
   for (const each of ties) {
