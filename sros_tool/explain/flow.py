@@ -9,14 +9,15 @@ Nothing here reads files: rights go in, ways come out.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import defaultdict, deque
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Container, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
 from sros_tool.names import dds_names, is_expression
 from sros_tool.policy.model import DENY
-from sros_tool.policy.patterns import matches, overlap
+from sros_tool.policy.patterns import literal_prefix, matches, overlap
 from sros_tool.policy.rights import Right
 from sros_tool.policy.witness import common_name
 
@@ -89,29 +90,44 @@ class _End:
 
 
 class _Side:
-    """The ends of all enclaves in one direction: all that write, or all that read."""
+    """The ends of all enclaves in one direction: all that write, or all that read.
 
-    def __init__(self) -> None:
+    They are found by their exact topics, and by what stands before their first wildcard.
+    """
+
+    def __init__(self, ends: Iterable[_End]) -> None:
         self.of: dict[str, list[_End]] = defaultdict(list)
-        self._all: list[_End] = []
         self._exact: dict[str, list[_End]] = defaultdict(list)
-        self._wild: list[_End] = []
-
-    def add(self, end: _End) -> None:
-        self.of[end.enclave].append(end)
-        self._all.append(end)
-        if is_expression(end.topic):
-            self._wild.append(end)
-        else:
-            self._exact[end.topic].append(end)
+        self._wild: dict[str, list[_End]] = defaultdict(list)
+        for end in ends:
+            self.of[end.enclave].append(end)
+            if is_expression(end.topic):
+                self._wild[literal_prefix(end.topic)].append(end)
+            else:
+                self._exact[end.topic].append(end)
+        self._topics = sorted(self._exact)
+        self._prefixes = sorted(self._wild)
 
     def meeting(self, topic: str) -> Iterator[_End]:
         """The ends that might share a name with a topic or wildcard."""
-        if is_expression(topic):
-            yield from self._all
-        else:
+        prefix = literal_prefix(topic)
+        if prefix == topic:
             yield from self._exact.get(topic, ())
-            yield from self._wild
+        else:
+            for name in _starting(self._topics, prefix):
+                yield from self._exact[name]
+        for longer in _starting(self._prefixes, prefix):
+            yield from self._wild[longer]
+        for length in range(len(prefix)):
+            yield from self._wild.get(prefix[:length], ())
+
+
+def _starting(ordered: list[str], prefix: str) -> Iterator[str]:
+    """The texts of a sorted list that start with ``prefix``."""
+    for index in range(bisect_left(ordered, prefix), len(ordered)):
+        if not ordered[index].startswith(prefix):
+            return
+        yield ordered[index]
 
 
 _Used = set[tuple[str, tuple[str, ...]]]
@@ -124,7 +140,7 @@ class Network:
     """
 
     def __init__(self, rights: Iterable[Right], *, without: Collection[str] = ()) -> None:
-        self._sides = {"publish": _Side(), "subscribe": _Side()}
+        ends: dict[str, list[_End]] = {"publish": [], "subscribe": []}
         denied: dict[tuple[str, str], set[str]] = defaultdict(set)
         allowed: dict[tuple[str, str], set[str]] = defaultdict(set)
         for right in rights:
@@ -137,7 +153,8 @@ class Network:
             for topic in sorted(topics, key=_plain_first):
                 met = tuple(each for each in outside if overlap(each, topic))
                 if topic not in met:
-                    self._sides[direction].add(_End(enclave, topic, met))
+                    ends[direction].append(_End(enclave, topic, met))
+        self._sides = {direction: _Side(found) for direction, found in ends.items()}
 
     @property
     def enclaves(self) -> tuple[str, ...]:
@@ -146,7 +163,7 @@ class Network:
 
     def hops(self, enclave: str) -> Iterator[Hop]:
         """Every way by which information leaves an enclave, one hop far, itself left out."""
-        return self._steps(enclave, True, set())
+        return self._steps(enclave, True, set(), {enclave})
 
     def reach(self, enclave: str) -> Reach:
         """What an enclave can influence and learn from over any number of hops."""
@@ -158,7 +175,7 @@ class Network:
         queue = deque([start])
         while queue:
             here = queue.popleft()
-            for hop in self._steps(here, forward, used):
+            for hop in self._steps(here, forward, used, paths):
                 there = hop.target if forward else hop.source
                 if there not in paths:
                     paths[there] = (*paths[here], hop) if forward else (hop, *paths[here])
@@ -166,8 +183,13 @@ class Network:
         del paths[start]
         return paths
 
-    def _steps(self, enclave: str, forward: bool, used: _Used) -> Iterator[Hop]:
-        """The hops out of an enclave, or into it, but for ends whose like was ``used`` already."""
+    def _steps(
+        self, enclave: str, forward: bool, used: _Used, known: Container[str]
+    ) -> Iterator[Hop]:
+        """The hops out of an enclave, or into it, from or to others than the ``known``.
+
+        Ends whose like was ``used`` already lead nowhere new, and are left out.
+        """
         directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
         own, others = (self._sides[direction] for direction in directions)
         for end in own.of.get(enclave, ()):
@@ -176,7 +198,7 @@ class Network:
                 continue
             used.add(like)
             for other in others.meeting(end.topic):
-                if other.enclave != enclave and (name := _shared(end, other)):
+                if other.enclave not in known and (name := _shared(end, other)):
                     yield _hop(end, other, name) if forward else _hop(other, end, name)
 
 
