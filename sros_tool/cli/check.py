@@ -116,7 +116,8 @@ def check(
     family, paths = _family(targets)
     if needs_renewal is not None:
         root = paths[0] if paths else keystore_from_environment()
-        return _needs_renewal(root, needs_renewal, as_json)
+        at = _circumstances(domain, moment, ())
+        return _needs_renewal(root, needs_renewal, at.now, as_json)
     selection = Selection(include, exclude, Severity[severity.upper()], strict, vendor or "")
     form = "json" if as_json else "sarif" if as_sarif else form
     if as_list:
@@ -213,7 +214,8 @@ def findings_here(
     zone = moment.astimezone().tzinfo
     assert zone is not None
     rmws, processes = rmw_implementations(environment), tuple(running_processes())
-    return runtime_findings(Setting(environment, moment, zone, processes, rmws, insecure_rmws))
+    setting = Setting(environment, moment, zone, processes, rmws, insecure_rmws, now())
+    return runtime_findings(setting)
 
 
 def _shown(finding: Finding) -> Finding:
@@ -224,11 +226,11 @@ def _shown(finding: Finding) -> Finding:
     return finding
 
 
-def _needs_renewal(root: Path, text: str, as_json: bool) -> int:
+def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> int:
     from sros_tool.keystore.lifetime import describe_lifetime, parse_threshold, survey
     from sros_tool.validity import iso
 
-    threshold, moment = parse_threshold(text), now()
+    threshold = parse_threshold(text)
     found, unreadable = survey(root)
     due = [each for each in found if each.due(threshold, moment)]
     if as_json:

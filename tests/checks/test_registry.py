@@ -178,6 +178,12 @@ def test_at_domain_and_policy(bench: Bench) -> None:
     sros("check", bench.root, "--policy", policy).ok()
     policy.write_text(policy.read_text().replace("status", "state"))
     assert "enclave.stale-permissions" in sros("check", bench.root, "--policy", policy).out
+    env = {"ROS_SECURITY_ENABLE": "true", "ROS_SECURITY_KEYSTORE": str(bench.root)}
+    earlier = sros("check", "runtime", "--at", "2020-01-01", env=env).out
+    assert "runtime.clock-behind" not in earlier
+    due = ("check", "keystore", bench.root, "--needs-renewal", "30d")
+    sros(*due).ok()
+    assert "/base" in sros(*due, "--at", "2099-01-01").out
     for wrong in (("--at", "soon"), ("--domain", "x"), ("--domain", ""), ("runtime", bench.root)):
         assert sros("check", *wrong).status == 2
 

@@ -122,8 +122,9 @@ def _clock(setting: Setting) -> Iterator[Finding]:
              for each in Path(root).glob(name)]  # fmt: skip
     newest = max((each.stat().st_mtime for each in files if each.exists()), default=0.0)
     written = datetime.fromtimestamp(newest, UTC)
-    if written > setting.now + _TOLERANCE:
-        text = f"it is {iso(setting.now)}, and '{root}' was written at {iso(written)}"
+    clock = setting.clock or setting.now
+    if written > clock + _TOLERANCE:
+        text = f"it says {iso(clock)}, and '{root}' was written at {iso(written)}"
         yield CLOCK_BEHIND.found("clock", text)
 
 

@@ -30,6 +30,7 @@ class Process:
 class Setting:
     """What checks of the runtime look at.
 
+    ``clock`` is what the clock of the host says, where ``now`` is another moment.
     ``rmws`` are the installed RMWs; ``insecure_rmws`` those that were tried and do not enforce
     security, with what was seen.  ``zone`` is that of the host.
     """
@@ -40,6 +41,7 @@ class Setting:
     processes: tuple[Process, ...] = ()
     rmws: tuple[str, ...] = ()
     insecure_rmws: Mapping[str, str] = field(default_factory=dict)
+    clock: datetime | None = None
 
 
 def running_processes(proc: Path = Path("/proc")) -> Iterator[Process]:
