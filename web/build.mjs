@@ -1,4 +1,5 @@
-// Builds sros_tool/report/assets: one script, one style sheet, and the licences of what is in them.
+// Builds into sros_tool/report/assets the script, the style sheets, and the licences of what is in
+// them; view.html there is written by hand.
 
 import { build } from "esbuild";
 import { readFileSync, readdirSync, writeFileSync } from "node:fs";
@@ -19,8 +20,6 @@ const { metafile } = await build({
   metafile: true,
 });
 await build({ ...common, entryPoints: ["src/view.css", "src/demo.css"], outdir: out });
-
-writeFileSync(join(out, "view.html"), readFileSync(join(here, "src/view.html"), "utf8"));
 
 const packages = new Set();
 for (const input of Object.keys(metafile.inputs)) {

@@ -52,6 +52,7 @@ Examples:
     type=click.Choice(FORMATS),
     help="What to write. [default: by the ending of FILE, else html]",
 )
+@click.option("--json", "as_json", is_flag=True, help="The same as --format json.")
 @click.option(
     "-o", "--output", type=PATH, metavar="FILE", help="Write to FILE, and not to standard output."
 )
@@ -83,6 +84,7 @@ Examples:
 def view(
     sources: tuple[Path, ...],
     form: str | None,
+    as_json: bool,
     output: Path | None,
     show: bool,
     observed: tuple[Path, ...],
@@ -103,7 +105,7 @@ def view(
     The page is one file that needs no network. No format holds a key or a path of this machine.
     """
     moment = now()
-    written = _format(form, output, graphviz)
+    written = _format("json" if as_json else form, output, graphviz)
     if output:
         check_output(output, force=force or dry_run)
     picture = _picture(sources, observed, template, hosts, moment)
@@ -182,22 +184,16 @@ def _checked(path: Path, moment: datetime) -> list[Finding]:
     except SrosError:
         return []
     return [
-        Finding(each.id, each.severity.word, _told(each), each.remedy, _enclave(each))
+        Finding(each.id, each.severity.word, _told(each), each.remedy, each.subject)
         for each in found
     ]
 
 
 def _told(finding: Checked) -> str:
-    """Where it was found, by no more than the base name of a file, and what."""
-    place = f"{Path(finding.file).name}:{finding.line}: " if finding.line else ""
-    if not place and not _enclave(finding) and finding.subject:
-        place = f"{finding.subject}: "
-    return f"{place}{finding.text}"
-
-
-def _enclave(finding: Checked) -> str:
-    """The enclave that it is about, or ""."""
-    return finding.subject if finding.subject.startswith("/") else ""
+    """What was found, with the line of a file, of which no more than the base name is told."""
+    if not finding.line:
+        return finding.text
+    return f"{Path(finding.file).name}:{finding.line}: {finding.text}"
 
 
 def _hosts(words: tuple[str, ...]) -> dict[str, str]:
@@ -217,7 +213,7 @@ def _hosts(words: tuple[str, ...]) -> dict[str, str]:
 def _rendered(
     picture: Picture, form: str, everything: bool, graphviz: bool, moment: datetime
 ) -> str:
-    from sros_tool.report.scene import scenes_of
+    from sros_tool.report.scenes import scenes_of
 
     if form == "json":
         from sros_tool.report.as_json import render_json

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Set
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -74,8 +74,12 @@ def read_source(path: Path, *, now: datetime) -> Source:
 
 
 def with_findings(source: Source, path: Path, findings: Iterable[Finding]) -> Source:
-    """``source``, which lies at ``path``, with more findings, which then name no other place."""
-    found = tuple(_without_paths(each, path) for each in findings)
+    """``source``, which lies at ``path``, with more findings, which then name no other place.
+
+    A finding is of an enclave only if the source has one of that name.
+    """
+    known = {each.path for each in source.enclaves} | {each.enclave for each in source.rights}
+    found = tuple(_without_paths(_placed(each, known), path) for each in findings)
     return replace(source, findings=tuple(dict.fromkeys((*source.findings, *found))))
 
 
@@ -223,6 +227,12 @@ def _authorities(root: Path) -> Iterator[Validity]:
 
 
 # ── nothing of the machine ─────────────────────────────────────────────────────────────────
+
+
+def _placed(finding: Finding, known: Set[str]) -> Finding:
+    if not finding.enclave or finding.enclave in known:
+        return finding
+    return replace(finding, enclave="", text=f"{finding.enclave}: {finding.text}")
 
 
 def _without_paths(finding: Finding, path: Path) -> Finding:

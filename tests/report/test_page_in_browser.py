@@ -6,16 +6,21 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
 from harness import sros
-from pictures import HOSTILE, MOBILE_ROBOT, group, hostile_permissions, large_policy
+from pictures import HOSTILE, MOBILE_ROBOT, NOW, group, hostile_permissions, large_policy
 
 from sros_tool.explain.flow import OF_EVERY_NODE, Network
 from sros_tool.policy.reader import read_policy
 from sros_tool.policy.rights import policy_rights
+from sros_tool.report.compose import Source, compose
+from sros_tool.report.page import render_page
+from sros_tool.report.picture import Origin, Validity
+from sros_tool.report.scenes import scenes_of
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -189,6 +194,32 @@ def test_the_timeline_holds_everything_that_ends(browser: Browser, robot_page: P
         page.click("#timeline button:has-text('/mobile_robot/camera') >> nth=0")
         assert page.locator("#panel-map").is_visible()
         assert "/mobile_robot/camera" in details(page)
+
+
+def test_what_ends_at_the_same_moment_is_one_row_where_there_is_much(
+    browser: Browser, tmp_path: Path
+) -> None:
+    source = tmp_path / "large.xml"
+    source.write_text(large_policy(10, 10, 2))
+    picture = compose(Source(Origin("large", "keystore"), policy_rights(read_policy(source))))
+    paths = [enclave.path for enclave in picture.enclaves]
+    begin, end = "2026-01-01T00:00:00Z", "2036-01-01T00:00:00Z"
+    validities = [
+        Validity(end, begin, kind, p, p) for kind in ("certificate", "permissions") for p in paths
+    ]
+    validities[0] = replace(validities[0], not_after="2035-01-01T00:00:00Z")
+    picture = replace(picture, validities=tuple(sorted(validities)))
+    path = tmp_path / "large.html"
+    path.write_text(render_page(picture, scenes_of(picture), NOW))
+    with opened(browser, path) as page:
+        page.click("#tab-timeline")
+        rows = [
+            each.split("\n")[0] for each in page.locator("#timeline tbody tr").all_inner_texts()
+        ]
+        assert len(rows) == 3
+        assert f"certificate {paths[0]}" in rows[0].replace("\t", " ")
+        assert "certificate of 100 enclaves" in rows[1]
+        assert "permissions of 101 enclaves" in rows[2]
 
 
 def test_what_ended_is_seen_on_the_day_on_which_one_looks(
