@@ -11,6 +11,7 @@ from sros_tool.dds.governance import (
     render_governance,
 )
 from sros_tool.demo.bench import GOVERNANCE, Bench
+from sros_tool.errors import DocumentError
 
 
 def _weak(bench: Bench) -> bytes:
@@ -49,9 +50,11 @@ def governance_edited(bench: Bench) -> None:
     """As `_weak`, written over the signed document."""
     signed = bench.read("listener", GOVERNANCE)
     kept = bench.governance().replace(b"\r\n", b"\n")
-    crlf, weak = (text.replace(b"\n", b"\r\n") for text in (kept, _weak(bench)))
-    edited = signed.replace(crlf, weak)
-    assert edited != signed
+    # The comment changes also what is as weak already.
+    weak = _weak(bench) + b"<!-- edited -->\n"
+    edited = signed.replace(kept.replace(b"\n", b"\r\n"), weak.replace(b"\n", b"\r\n"))
+    if edited == signed:
+        raise DocumentError("the signed governance cannot be edited", "Its XML is not found in it.")
     bench.put("listener", GOVERNANCE, edited)
 
 

@@ -15,6 +15,7 @@ from sros_tool.demo.bench import (
     Bench,
     Forge,
 )
+from sros_tool.errors import DocumentError
 from sros_tool.keystore.renew import renew
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import pem
@@ -34,7 +35,10 @@ def edited(bench: Bench) -> None:
     signed = bench.read("guest", PERMISSIONS)
     topic = f"<topics>\r\n            <topic>{bench.dds_topic}</topic>".encode()
     edited = re.sub(rb"(<publish>\s*)<topics>", lambda found: found[1] + topic, signed, count=1)
-    assert edited != signed
+    if edited == signed:
+        raise DocumentError(
+            "the signed permissions cannot be edited", "They allow to publish nothing."
+        )
     bench.put("guest", PERMISSIONS, edited)
 
 

@@ -173,8 +173,10 @@ class Condition(StrEnum):
     SHARED_SUBJECTS = "subjects without a part of their own"
     OPEN_DEFAULT = "an enclave without a policy may do everything"
     IN_CLEAR = "payload is not encrypted"
-    STRANGERS = "unauthenticated participants are allowed"
-    OPEN_DISCOVERY = "discovery is not encrypted"
+    STRANGERS = "unauthenticated participants are allowed, and the topic is not protected"
+    STRANGERS_SEE = "unauthenticated participants are allowed, and discovery is not protected"
+    UNCONTROLLED = "access to the topic is not controlled"
+    OPEN_JOIN = "joining the domain is not controlled"
     CYCLONE = "Cyclone DDS 0.10"
     FAST = "Fast DDS"
 
@@ -232,6 +234,11 @@ class Row:
     def party(self, name: str) -> Party:
         """The party of that name.  Raises `KeyError`."""
         return {party.name: party for party in self.parties}[name]
+
+    @property
+    def place(self) -> str:
+        """The ROS name that its claim is about: "" is the topic of the demo."""
+        return self.party(self.claims[0].subject).topic
 
     def under(self, conditions: frozenset[Condition]) -> Row:
         """The row as it must end where those conditions hold."""

@@ -88,8 +88,11 @@ def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
                 f"{scenario.name}: running {len(scenario.rows)} rows on {backend.name}"
                 f" ({backend.dds}): {backend.why}"
             )
-            holding = conditions(backend, template, topic)
-            scenario = replace(scenario, rows=tuple(row.under(holding) for row in scenario.rows))
+            rows = tuple(
+                row.under(conditions(backend, template, _dds_topic(row, topic)))
+                for row in scenario.rows
+            )
+            scenario = replace(scenario, rows=rows)
             plan = Plan(
                 rows=scenario.rows,
                 domains=places,
@@ -100,7 +103,7 @@ def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
                 limits=options.limits,
                 own_networks=isolation.isolated,
             )
-            rows = run_isolated(partial(run_plan, plan), isolation, tell)
+            shown = run_isolated(partial(run_plan, plan), isolation, tell)
             cost = None
             if scenario.measured and backend.name == CYCLONE:
                 cost = run_isolated(
@@ -112,7 +115,7 @@ def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
                 )
             elif scenario.measured:
                 tell("the cost of security is not measured: that needs --backend cyclone")
-            results.append(ScenarioResult(scenario.name, scenario.title, tuple(rows), cost))
+            results.append(ScenarioResult(scenario.name, scenario.title, tuple(shown), cost))
         result = DemoResult(backend, topic, isolation, template.name, tuple(results))
         if options.keep is not None:
             text = json.dumps(result.as_json(), indent=2) + "\n"
@@ -177,6 +180,11 @@ def _chosen(options: DemoOptions) -> tuple[Scenario, ...]:
             "See the names without --only.",
         )
     return chosen
+
+
+def _dds_topic(row: Row, topic: str) -> str:
+    """The DDS topic whose protection decides a row; of a service, that of its requests."""
+    return f"rq{row.place}Request" if row.place else f"rt{topic}"
 
 
 def _asked_for(row: Row, options: DemoOptions) -> bool:

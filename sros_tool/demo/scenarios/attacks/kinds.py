@@ -11,6 +11,7 @@ from sros_tool.demo.model import (
     OWN,
     Case,
     Claim,
+    Condition,
     Identity,
     Party,
     Relation,
@@ -21,6 +22,24 @@ from sros_tool.demo.model import (
 from sros_tool.demo.policies import SERVICE
 
 ATTACKER = "attacker"
+
+_LET_IN = (
+    "the template lets unauthenticated participants in, and protects nothing",
+    "leave out allow_unauthenticated_participants, and encrypt",
+)
+_UNCONTROLLED = (
+    "the template does not control access to this topic",
+    "leave read_access_control and write_access_control on",
+)
+
+
+def open_to(success: Status, expected: Status) -> tuple[Case, ...]:
+    """The cases in which a template leaves open what is expected to be closed."""
+    if expected is Status.REFUSED:
+        return (Case((Condition.UNCONTROLLED,), success, *_UNCONTROLLED),)
+    if expected is success or expected is Status.NOT_LET_IN:
+        return ()
+    return (Case((Condition.STRANGERS,), success, *_LET_IN),)
 
 
 def injection(
@@ -63,7 +82,7 @@ def injection(
         (Claim(Relation.HEARS, "listener", ATTACKER).expecting(expected),),
         tuple(controls),
         brief=True,
-        cases=cases,
+        cases=(*cases, *open_to(Status.HEARD, expected)),
         attack=attack,
         removed=removed,
         open_because=open_because,
@@ -103,7 +122,7 @@ def listening(
         (Claim(Relation.HEARS, ATTACKER, "talker").expecting(expected),),
         (Claim(Relation.HEARS, "listener", "talker"),),
         brief=True,
-        cases=cases,
+        cases=(*cases, *open_to(Status.HEARD, expected)),
         attack=attack,
         removed=removed,
     )
@@ -168,6 +187,7 @@ def with_service(
         (Claim(Relation.IS_ANSWERED, ATTACKER, "server").expecting(expected),),
         (Claim(Relation.IS_ANSWERED, "client", "server"),),
         brief=True,
+        cases=() if removed else open_to(Status.ANSWERED, expected),
         attack=attack,
         removed=removed,
     )
@@ -197,6 +217,7 @@ def served(
         (Claim(Relation.IS_ANSWERED, "client", ATTACKER).expecting(expected),),
         () if removed else (Claim(Relation.IS_ANSWERED, "client", "server"),),
         brief=True,
+        cases=() if removed else open_to(Status.ANSWERED, expected),
         attack=attack,
         removed=removed,
     )

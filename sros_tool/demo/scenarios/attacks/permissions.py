@@ -210,6 +210,13 @@ ROWS: tuple[Row, ...] = (
         attack="permissions for another domain",
         cases=(
             Case(
+                (Condition.OPEN_JOIN, Condition.UNCONTROLLED),
+                Status.HEARD,
+                "the template controls neither who joins nor who uses the topic",
+                "leave join_access_control and the access control of topics on",
+            ),
+            Case((Condition.OPEN_JOIN,), Status.REFUSED),
+            Case(
                 (Condition.FAST,),
                 Status.NOT_HEARD,
                 mechanism="Fast DDS lets it start; its peers find no rule for the domain",

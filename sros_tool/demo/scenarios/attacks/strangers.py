@@ -13,13 +13,6 @@ from sros_tool.demo.model import (
 )
 from sros_tool.demo.scenarios.attacks.kinds import injection, listening, looking
 
-_STRANGERS = Case(
-    (Condition.STRANGERS,),
-    Status.HEARD,
-    "the template lets unauthenticated participants in",
-    "leave out allow_unauthenticated_participants, or protect the topic",
-)
-
 ROWS: tuple[Row, ...] = (
     listening(
         "an unsecured node listens",
@@ -27,7 +20,6 @@ ROWS: tuple[Row, ...] = (
         Status.NOT_HEARD,
         "who cannot authenticate gets no keys, and is sent nothing",
         attack="an unsecured node listens",
-        cases=(_STRANGERS,),
     ),
     listening(
         "an unsecured node listens, strangers allowed",
@@ -46,7 +38,7 @@ ROWS: tuple[Row, ...] = (
         attack="an unsecured node lists topics",
         cases=(
             Case(
-                (Condition.STRANGERS,),
+                (Condition.STRANGERS_SEE,),
                 Status.VISIBLE,
                 "the template lets unauthenticated participants in",
                 "leave out allow_unauthenticated_participants",
@@ -68,7 +60,6 @@ ROWS: tuple[Row, ...] = (
         Status.NOT_HEARD,
         "a listener in a closed domain ignores a talker that cannot authenticate",
         attack="an unsecured node injects",
-        cases=(_STRANGERS,),
     ),
     injection(
         "an unsecured node injects, strangers allowed",

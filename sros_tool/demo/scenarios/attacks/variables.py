@@ -12,6 +12,7 @@ from sros_tool.demo.model import (
     Row,
     Status,
 )
+from sros_tool.demo.scenarios.attacks.kinds import open_to
 
 _ENABLE, _STRATEGY = "ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY"
 _PERMISSIVE = (_STRATEGY, "Permissive")
@@ -43,6 +44,7 @@ def _in_the_open(
         (claim,),
         (Claim(Relation.HEARS, "unsecured listener", "unsecured talker"),),
         brief=True,
+        cases=open_to(Status.HEARD, expected),
         attack=attack,
         removed=removed,
         open_because=open_because,

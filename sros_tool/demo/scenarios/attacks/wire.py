@@ -15,6 +15,7 @@ from sros_tool.demo.model import (
     Status,
     Wire,
 )
+from sros_tool.demo.scenarios.attacks.kinds import open_to
 
 ROWS: tuple[Row, ...] = (
     Row(
@@ -65,6 +66,7 @@ ROWS: tuple[Row, ...] = (
         (Claim(Relation.HEARS, "listener", "talker"),),
         replay="talker",
         brief=True,
+        cases=open_to(Status.HEARD_AGAIN, Status.NOT_HEARD_AGAIN),
         attack="replay of captured packets",
     ),
     Row(
