@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -88,6 +90,13 @@ def keystore_from_environment() -> Path:
     return Path(root)
 
 
+def ros_domain() -> int | None:
+    """The domain of $ROS_DOMAIN_ID, or None where it is not set."""
+    from sros_tool.runtime.environment import domain_from
+
+    return domain_from(os.environ)
+
+
 def split_root(words: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
     """Take the keystore from the front of the arguments, or else from the environment.
 
@@ -149,3 +158,13 @@ def complete_template(
     from sros_tool.keystore.template import template_names
 
     return [name for name in template_names() if name.startswith(incomplete)]
+
+
+@contextmanager
+def progress_bar(total: int) -> Iterator[Callable[[str], None] | None]:
+    """A progress bar on a terminal, where there is enough to wait for."""
+    if total < 50 or not sys.stderr.isatty():
+        yield None
+        return
+    with click.progressbar(length=total, label="signing", file=sys.stderr) as bar:
+        yield lambda _name: bar.update(1)

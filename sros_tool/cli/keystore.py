@@ -1,11 +1,7 @@
-"""The verbs that make keystores, add to them, list them, and export from them."""
+"""The verbs that add enclaves and permissions to a keystore, and list what it has."""
 
 from __future__ import annotations
 
-import os
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,203 +19,15 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     print_plan,
+    progress_bar,
+    ros_domain,
     split_root,
 )
 from sros_tool.cli.secrets import keyring
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
-    from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore import Result
-    from sros_tool.keystore.template import Template
-
-
-def _ros_domain() -> int | None:
-    from sros_tool.runtime.environment import domain_from
-
-    return domain_from(os.environ)
-
-
-@click.command(
-    "create_keystore",
-    epilog="""\b
-Example:
-  $ sros create_keystore keystore
-  created keystore 'keystore' for domain 0
-    template development: encrypted and authenticated; every enclave may do everything until it
-    gets a policy
-    identity CA and permissions CA: separate, valid for 3650d; certificates 3650d, permissions 3650d
-    identity CA SHA-256 5fe417aaed47cccd3f4a6b3e8e94db185bfc8e1003ee5b8c8a4cb3dc1dc9a4e6
-    permissions CA SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91a0f5ac3e5ef1b0c4e47
-  $ sros create_keystore fleet --template production --domain 10-19""",
-)
-@click.argument("root", type=PATH)
-@click.option(
-    "--template",
-    "template_name",
-    default="development",
-    show_default=True,
-    metavar="NAME|FILE",
-    help="The choices to make it by: development, production, sros2, or a TOML file.",
-    shell_complete=complete_template,
-)
-@click.option(
-    "--domain",
-    metavar="IDS",
-    help="The ROS domains it is for, as 0 or 0,7 or 10-19. [default: $ROS_DOMAIN_ID, or 0]",
-)
-@click.option(
-    "--ca-layout",
-    type=click.Choice(["separate", "single"]),
-    help="Two CAs, for identities and permissions, or one for both.",
-)
-@click.option(
-    "--ca-validity",
-    metavar="SPAN",
-    help="How long the CAs last: 5y, until 2031-01-01, or from 2026-12-01/5y.",
-)
-@click.option("--validity", metavar="SPAN", help="The same for certificates.")
-@click.option("--permissions-validity", metavar="SPAN", help="The same for permissions.")
-@click.option(
-    "--identity-ca",
-    type=PATH,
-    help="The certificate of an existing identity CA, with its chain; needs --identity-key.",
-)
-@click.option("--permissions-ca", type=PATH, help="The same for the permissions CA.")
-@click.option(
-    "--identity-key",
-    metavar="URI",
-    help="Where the key of the identity CA is, or is to be made: file:PATH or pkcs11:...",
-)
-@click.option("--permissions-key", metavar="URI", help="The same for the permissions CA.")
-@click.option(
-    "--encrypt-ca-keys", is_flag=True, help="Protect new CA keys in files by a passphrase."
-)
-@dry_run_option
-def create_keystore(
-    root: Path | None,
-    template_name: str,
-    domain: str | None,
-    ca_layout: str | None,
-    ca_validity: str | None,
-    validity: str | None,
-    permissions_validity: str | None,
-    identity_ca: Path | None,
-    permissions_ca: Path | None,
-    identity_key: str | None,
-    permissions_key: str | None,
-    encrypt_ca_keys: bool,
-    dry_run: bool,
-) -> None:
-    """Create a keystore in the folder ROOT, by the choices of a template.
-
-    Passphrases of CA keys come from a prompt, from $SROS_CA_PASSPHRASE or from the file
-    $SROS_CA_PASSPHRASE_FILE; the PIN of a token from a prompt or $SROS_PKCS11_PIN.
-    """
-    from sros_tool.dds.domains import DomainSet
-    from sros_tool.keystore import create_keystore as create
-
-    root = root or keystore_from_environment()
-    ros_domain = _ros_domain() if domain is None else None
-    domains = DomainSet.parse(domain, "--domain") if domain is not None else None
-    if ros_domain is not None:
-        domains = DomainSet.of((ros_domain, ros_domain))
-    template = _choices(template_name, ca_layout, ca_validity, validity, permissions_validity)
-    result = create(
-        root,
-        template=template,
-        domains=domains,
-        now=now(),
-        keyring=keyring(identity_key, permissions_key, encrypt=encrypt_ca_keys),
-        imported=_imported({"identity": identity_ca, "permissions": permissions_ca}),
-        dry_run=dry_run,
-    )
-    print_notes(result.notes)
-    if dry_run:
-        print_plan(root, result.changes)
-        return
-    _say_new_keystore(root, template, result.domains)
-    _say_what_is_open(template)
-
-
-def _choices(
-    name: str,
-    ca_layout: str | None,
-    ca_validity: str | None,
-    validity: str | None,
-    permissions_validity: str | None,
-) -> Template:
-    from dataclasses import replace
-    from datetime import timedelta
-
-    from sros_tool.keystore.template import load_template
-    from sros_tool.validity import parse_span
-
-    template = load_template(name)
-    if ca_layout:
-        template = replace(template, separate_authorities=ca_layout == "separate")
-    if ca_validity is not None:
-        template = replace(template, authority_validity=parse_span(ca_validity))
-    if validity is not None:
-        span, permissions = parse_span(validity), template.permissions_validity
-        template = replace(template, certificate_validity=span)
-        if not isinstance(span, timedelta):
-            template = replace(template, permissions_validity=span)
-        elif isinstance(permissions, timedelta):
-            template = replace(template, permissions_validity=min(span, permissions))
-    if permissions_validity is not None:
-        template = replace(template, permissions_validity=parse_span(permissions_validity))
-    return template
-
-
-def _imported(files: dict[str, Path | None]) -> dict[str, bytes]:
-    from sros_tool.xml import read_bytes
-
-    return {
-        role: read_bytes(path, "CA certificate") for role, path in files.items() if path is not None
-    }
-
-
-def _say_new_keystore(root: Path, template: Template, domains: DomainSet) -> None:
-    from sros_tool.keystore.authority import load_ca_certificate
-    from sros_tool.keystore.layout import ROLES
-    from sros_tool.pki.certificates import digest
-    from sros_tool.validity import span_text
-
-    layout = (
-        "identity CA and permissions CA: separate"
-        if template.separate_authorities
-        else "one CA for identity and permissions"
-    )
-    click.echo(f"created keystore '{root}' for domain {domains}")
-    click.echo(f"  template {template.name}: {template.description}")
-    click.echo(
-        f"  {layout}, valid for {span_text(template.authority_validity)}; certificates "
-        f"{span_text(template.certificate_validity)}, permissions "
-        f"{span_text(template.permissions_validity)}"
-    )
-    # By these, those who get something from here know whose it is.
-    for role in ROLES if template.separate_authorities else ROLES[:1]:
-        name = f"{role} CA" if template.separate_authorities else "CA"
-        click.echo(f"  {name} SHA-256 {digest(load_ca_certificate(root, role))}")
-
-
-def _say_what_is_open(template: Template) -> None:
-    from sros_tool.keystore.template import EVERYTHING
-
-    if template.default_permissions == EVERYTHING:
-        click.echo(
-            "still open: a new enclave may publish, subscribe and call everything; "
-            "`sros create_permission` closes it with a policy, `--template production` from the "
-            "start.",
-            err=True,
-        )
-    if not template.separate_authorities:
-        click.echo(
-            "still open: with one CA for both jobs, Cyclone DDS 0.10.2 and Fast DDS 2.9.1 let an "
-            "enclave sign its own permissions; `--ca-layout separate` closes it.",
-            err=True,
-        )
 
 
 @click.command(
@@ -253,7 +61,7 @@ def create_enclave(words: tuple[str, ...], dry_run: bool) -> None:
             root,
             names,
             now=now(),
-            domain=_ros_domain(),
+            domain=ros_domain(),
             keyring=keyring(),
             dry_run=dry_run,
             progress=step,
@@ -290,7 +98,7 @@ def create_permission(words: tuple[str, ...], dry_run: bool) -> None:
         name,
         read_policy(PATH.convert(file, None, None)),
         now=now(),
-        domain=_ros_domain(),
+        domain=ros_domain(),
         keyring=keyring(),
         dry_run=dry_run,
     )
@@ -342,6 +150,7 @@ def generate_artifacts(
 
     Permissions that a policy states replace those that an enclave has.
     """
+    from sros_tool.cli.create_keystore import say_new_keystore
     from sros_tool.keystore import generate_artifacts as generate
     from sros_tool.keystore.template import load_template
     from sros_tool.policy import read_policy
@@ -360,7 +169,7 @@ def generate_artifacts(
             enclaves=enclaves,
             policies=policies,
             now=now(),
-            domain=_ros_domain(),
+            domain=ros_domain(),
             create=template,
             keyring=keyring(),
             dry_run=dry_run,
@@ -368,18 +177,8 @@ def generate_artifacts(
         )
     if result.new_keystore and not dry_run:
         click.echo(f"'{root}' is not a valid keystore, creating new keystore", err=True)
-        _say_new_keystore(root, template, result.domains)
+        say_new_keystore(root, template, result.domains)
     _show(result, dry_run)
-
-
-@contextmanager
-def progress_bar(total: int) -> Iterator[Callable[[str], None] | None]:
-    """A progress bar on a terminal, where there is enough to wait for."""
-    if total < 50 or not sys.stderr.isatty():
-        yield None
-        return
-    with click.progressbar(length=total, label="signing", file=sys.stderr) as bar:
-        yield lambda _name: bar.update(1)
 
 
 def _show(result: Result, dry_run: bool) -> None:

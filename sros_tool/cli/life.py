@@ -17,9 +17,9 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     print_plan,
+    progress_bar,
     split_root,
 )
-from sros_tool.cli.keystore import progress_bar
 from sros_tool.cli.secrets import keyring
 from sros_tool.errors import UsageError
 

@@ -22,7 +22,7 @@ class Verb:
 
 FAMILIES: dict[str, dict[str, Verb]] = {
     "Keystore": {
-        "create_keystore": Verb("keystore", "Create a keystore."),
+        "create_keystore": Verb("create_keystore", "Create a keystore."),
         "create_enclave": Verb("keystore", "Create enclaves in a keystore.", ("create_key",)),
         "create_permission": Verb("keystore", "Give an enclave the permissions of a policy."),
         "generate_artifacts": Verb("keystore", "Create enclaves and permissions from policies."),

@@ -16,8 +16,8 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     print_plan,
+    progress_bar,
 )
-from sros_tool.cli.keystore import progress_bar
 from sros_tool.cli.secrets import keyring
 from sros_tool.errors import UsageError
 
