@@ -33,6 +33,11 @@ def test_nothing_in_a_sound_list(bench: Bench) -> None:
     assert ids(bench) <= {"keystore.not-in-ledger"}
 
 
+def test_permissions_of_another_enclave_are_no_earlier_ones(bench: Bench) -> None:
+    CASES["enclave.permissions-subject"](bench)
+    assert "enclave.old-permissions" not in ids(bench)
+
+
 def test_exported_enclaves_of_two_keystores(bench: Bench) -> None:
     robot = bench.export()
     assert "keystore.authorities-differ" not in ids(bench)

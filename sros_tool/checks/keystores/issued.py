@@ -223,9 +223,10 @@ def _ledger(keystore: OpenedKeystore, all_traits: Sequence[Traits]) -> Iterator[
     if not keystore.ledger:
         return
     known = {entry.sha256 for entry in keystore.ledger}
-    latest = {
-        entry.enclave: entry.sha256 for entry in keystore.ledger if entry.what == "permissions"
-    }
+    signed: dict[str, list[str]] = defaultdict(list)
+    for entry in keystore.ledger:
+        if entry.what == "permissions":
+            signed[entry.enclave].append(entry.sha256)
     for each in all_traits:
         place = f"{keystore.root}/{enclave_folder(each.name)}"
         for file, digest in (
@@ -235,8 +236,7 @@ def _ledger(keystore: OpenedKeystore, all_traits: Sequence[Traits]) -> Iterator[
             if digest and digest not in known:
                 text = f"{file} is not in the ledger"
                 yield UNEXPLAINED.found(each.name, text, f"{place}/{file}")
-        newest = latest.get(each.name)
-        if newest and each.permissions in known and each.permissions != newest:
+        if each.permissions in signed[each.name] and each.permissions != signed[each.name][-1]:
             text = "the ledger has permissions that were signed later"
             yield OLD_PERMISSIONS.found(each.name, text, f"{place}/permissions.p7s")
 
