@@ -118,6 +118,11 @@ def rules() -> list[Row]:
     )
     in_p1 = criteria("publish", "rt/a", partitions=("p1",))
     two_lists = a.replace("</publish>", "") + b.replace("<publish>", "")
+    everywhere = allow(criteria("publish", "*", partitions=("*",)))
+    denied_default = permissions(grant(deny(a), everywhere))
+    denied_in_p1 = permissions(grant(deny(in_p1), everywhere))
+    # With reading free Cyclone DDS asks about endpoints only, not about the topic before them.
+    readable = governance(domain_rule(topic_rule(read=False)))
     only_denied = permissions(grant(deny(b), default=ALLOW))
     rows = [
         ("allowed", ask(permissions(grant(allow(a)))), YES, YES),
@@ -203,6 +208,41 @@ def rules() -> list[Row]:
             ask(permissions(grant(allow(criteria("publish", "rt/a", ""))))),
             REFUSED,
             YES,
+        ),
+        (
+            "relaying denied, then reading allowed: reading",
+            ask(
+                permissions(
+                    grant(deny(criteria("relay", "rt/a")), allow(criteria("subscribe", "rt/a")))
+                ),
+                verb="subscribe",
+            ),
+            PEER_DENIES,
+            YES,
+        ),
+        (
+            "deny without partitions, then everything: in a partition",
+            ask(denied_default, partitions=("p2",), governed=readable),
+            NO,
+            YES,
+        ),
+        (
+            "deny without partitions, then everything: in none",
+            ask(denied_default, governed=readable),
+            NO,
+            NO,
+        ),
+        (
+            "deny in a partition, then everything: in another, topics free",
+            ask(denied_in_p1, partitions=("p2",), governed=readable),
+            NO,
+            YES,
+        ),
+        (
+            "deny in a partition, then everything: there and in another, topics free",
+            ask(denied_in_p1, partitions=("p1", "p2"), governed=readable),
+            NO,
+            NO,
         ),
         ("a grant without a name", ask(permissions(grant(allow(a), name=""))), REFUSED, YES),
         ("an unknown element", ask(permissions(grant(allow(a), "<extra/>"))), REFUSED, REFUSED),
@@ -327,6 +367,9 @@ def governances() -> list[Row]:
     def topics(*rules: str, join: bool = True) -> bytes:
         return governance(domain_rule("".join(rules), join=join))
 
+    elsewhere = permissions(grant(allow(criteria("publish", "rt/x"), domains="<id>7</id>")))
+    free = topic_rule(read=False, write=False, data="NONE")
+    free = free.replace("<metadata_protection_kind>ENCRYPT", "<metadata_protection_kind>NONE")
     opened = topics(topic_rule("rt/open", read=False, write=False), topic_rule())
     shut = topics(topic_rule(), topic_rule("rt/open", read=False, write=False))
     some = topics(topic_rule("rt/open", read=False, write=False), topic_rule("rt/a"))
@@ -336,6 +379,23 @@ def governances() -> list[Row]:
         Row("a topic without a rule", ask(a, "rt/z", governed=some), NO, NO),
         Row("a topic named *", ask(b, "*", governed=opened), YES, INVALID),
         Row("a topic named rt/op*", ask(b, "rt/op*", governed=opened), YES, INVALID),
+        Row(
+            "refused by peers, a topic without protection",
+            ask(elsewhere, governed=topics(free)),
+            PEER_DENIES,
+            YES,
+        ),
+        Row(
+            "refused by peers, a topic with protection",
+            ask(
+                elsewhere,
+                governed=topics(free, join=True).replace(
+                    b"data_protection_kind>NONE", b"data_protection_kind>SIGN"
+                ),
+            ),
+            PEER_DENIES,
+            PEER_DENIES,
+        ),
         Row("no topic rules", ask(a, governed=topics()), REFUSED, REFUSED),
         Row(
             "strangers, and messages signed",
