@@ -2,48 +2,33 @@
 
 from __future__ import annotations
 
-import difflib
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from types import MappingProxyType
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import parse_governance, render_governance
 from sros_tool.dds.portable import name_notes
-from sros_tool.errors import KeystoreError, PolicyError, UsageError
+from sros_tool.errors import KeystoreError, PolicyError
 from sros_tool.keystore.authority import (
-    Authorities,
-    Authority,
-    create_authorities,
     load_authorities,
 )
 from sros_tool.keystore.enclave import Fate, Registrar
+from sros_tool.keystore.founding import NOTHING, check_free, check_typo, write_keystore
 from sros_tool.keystore.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
     ENCLAVES,
-    GOVERNANCE_P7S,
-    GOVERNANCE_XML,
-    PRIVATE,
-    PUBLIC,
-    SETTINGS,
     enclave_names,
     is_keystore,
 )
-from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
+from sros_tool.keystore.ledger import append
 from sros_tool.keystore.open import check_domain, load_governance, load_settings
 from sros_tool.keystore.parallel import Progress
-from sros_tool.keystore.template import Template, render_template
+from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction import Change, Transaction, tidy
 from sros_tool.names import check_enclave_name
 from sros_tool.notes import Note
 from sros_tool.policy.model import Enclave, Policy
-from sros_tool.translate import governance_for
-from sros_tool.validity import window
-
-_NOTHING: Mapping[str, bytes] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +58,7 @@ def create_keystore(
     domains: DomainSet | None = None,
     now: datetime,
     keyring: Keyring = IN_KEYSTORE,
-    imported: Mapping[str, bytes] = _NOTHING,
+    imported: Mapping[str, bytes] = NOTHING,
     dry_run: bool = False,
 ) -> Result:
     """Make a new keystore for ``domains`` (default: 0) by the choices of ``template``.
@@ -84,11 +69,11 @@ def create_keystore(
     """
     if not dry_run:
         tidy(root)
-    _check_free(root)
+    check_free(root)
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
-        _check_free(root)  # another process may have been faster
+        check_free(root)  # another process may have been faster
         domains = domains or DomainSet.of((0, 0))
-        authorities, entries = _write_keystore(
+        authorities, entries = write_keystore(
             transaction, template, domains, keyring, now, imported
         )
         append(transaction, entries)
@@ -192,8 +177,8 @@ def generate_artifacts(
     if not dry_run:
         tidy(root)
     if not is_keystore(root) and create is not None:
-        _check_typo(root)
-        _check_free(root)
+        check_typo(root)
+        check_free(root)
     else:
         check_keystore(root)
         create = None
@@ -223,11 +208,11 @@ def _produce(
     fresh = create is not None
     with Transaction(root, fresh=fresh, dry_run=dry_run) as transaction:
         if create is not None:
-            _check_free(root)  # another process may have been faster
+            check_free(root)  # another process may have been faster
             template = create
             domains = domains or DomainSet.of((0 if domain is None else domain,) * 2)
             check_domain(domains, domain, root)
-            authorities, entries = _write_keystore(transaction, template, domains, keyring, now)
+            authorities, entries = write_keystore(transaction, template, domains, keyring, now)
             existing: tuple[str, ...] = ()
         else:
             template = load_settings(root)
@@ -255,44 +240,6 @@ def _produce(
     )
 
 
-def _write_keystore(
-    transaction: Transaction,
-    template: Template,
-    domains: DomainSet,
-    keyring: Keyring,
-    now: datetime,
-    imported: Mapping[str, bytes] = _NOTHING,
-) -> tuple[Authorities, list[Entry]]:
-    for span in (template.certificate_validity, template.permissions_validity):
-        window(now, span)  # what could not issue anything is no keystore
-    authorities = create_authorities(transaction, template, keyring, now, imported)
-    distinct = dict.fromkeys((authorities.identity, authorities.permissions))
-    entries = [certificate_entry(now, "ca", each.certificate) for each in distinct]
-    message = write_governance(transaction, authorities.permissions, template, domains)
-    entries.append(document_entry(now, "governance", message))
-    transaction.write(
-        SETTINGS,
-        b"# The choices by which sros made this keystore; what is added later follows them.\n"
-        + render_template(keyring.remembered(template)).encode(),
-    )
-    return authorities, entries
-
-
-def write_governance(
-    transaction: Transaction, authority: Authority, template: Template, domains: DomainSet
-) -> bytes:
-    """Stage the governance document of a keystore, with its readable form; the signed one."""
-    governance = governance_for(template.protection, domains)
-    document = render_governance(governance)
-    message = authority.sign(document, governance, parse_governance, "the governance document")
-    transaction.write(GOVERNANCE_XML, document)
-    transaction.write(GOVERNANCE_P7S, message)
-    return message
-
-
-# ── what is checked first ──────────────────────────────────────────────────────────────────
-
-
 def check_keystore(root: Path) -> None:
     """Raise `KeystoreError` if ``root`` is no keystore."""
     if not is_keystore(root):
@@ -301,40 +248,3 @@ def check_keystore(root: Path) -> None:
             "It does not exist." if not root.exists() else f"It has no {ENCLAVES} folder in use.",
             f"Make one with `sros create_keystore {root}`.",
         )
-
-
-def _check_free(root: Path) -> None:
-    if is_keystore(root):
-        raise KeystoreError(
-            f"keystore '{root}' already exists",
-            "",
-            "Nothing was changed. Add to it with `sros create_enclave`, or choose another path.",
-        )
-    if root.resolve() == Path("/"):
-        raise KeystoreError("the root of the file system is no place for a keystore")
-    if os.path.lexists(root) and not root.is_dir():
-        raise KeystoreError(f"'{root}' is in the way", "It is not a folder.")
-    remains = [part for part in (PUBLIC, PRIVATE, ENCLAVES) if (root / part).exists()]
-    if remains:
-        raise KeystoreError(
-            f"'{root}' holds parts of a keystore already",
-            f"There are {', '.join(remains)}; a new CA beside them would lock out every enclave "
-            "that trusts the old one.",
-            "Restore what is missing, or choose another path.",
-        )
-
-
-def _check_typo(root: Path) -> None:
-    """Refuse to make a keystore whose name is all but that of one beside it."""
-    try:
-        beside = [p.name for p in root.absolute().parent.iterdir() if p.is_dir()]
-    except OSError:
-        return
-    close = difflib.get_close_matches(root.name, beside, n=3, cutoff=0.5)
-    for name in close:
-        if is_keystore(root.absolute().parent / name):
-            raise UsageError(
-                f"'{root}' does not exist, and '{name}' beside it is a keystore",
-                "This may be a typing error, so no second keystore is made.",
-                f"Name '{root.with_name(name)}', or run `sros create_keystore {root}` first.",
-            )
