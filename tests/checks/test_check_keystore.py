@@ -7,10 +7,13 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from harness import sros
+from harness import policy_text, publish, sros
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.registry import Selection
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import load_certificate
+from sros_tool.pki.keys import load_key
 
 NOW = datetime.now(UTC)
 
@@ -74,3 +77,39 @@ def test_a_key_on_its_robot_is_no_fault(tmp_path: Path) -> None:
     assert ids(root) == []
     (root / "enclaves/arm/cert.pem").write_text("nonsense")
     assert set(ids(root)) == {"enclave.certificate-malformed"}
+
+
+def test_permissions_that_were_replaced_and_put_back(tmp_path: Path) -> None:
+    """Their signature holds, and DDS takes them: only the ledger knows that they are old."""
+    root, policy = tmp_path / "ks", tmp_path / "policy.xml"
+    sros("create_keystore", root, "--template", "production").ok()
+    policy.write_text(policy_text({"/a": publish("rosout", "wide")}))
+    sros("generate_artifacts", "-k", root, "-p", policy).ok()
+    files = [root / "enclaves/a" / name for name in ("permissions.p7s", "permissions.xml")]
+    before = [file.read_bytes() for file in files]
+    policy.write_text(policy_text({"/a": publish("rosout")}))
+    sros("create_permission", root, "/a", policy).ok()
+    assert ids(root) == []
+    for file, data in zip(files, before, strict=True):
+        file.write_bytes(data)
+    assert ids(root) == ["enclave.old-permissions"]
+    shown = sros("check", root, "--policy", policy).out
+    assert "enclave.stale-permissions" in shown
+    assert "+ ALLOW publish topic /wide" in shown
+
+
+def test_permissions_that_an_enclave_signed_for_itself(tmp_path: Path) -> None:
+    """With one CA for both jobs DDS takes them; what sros says is that no CA has signed them."""
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", "sros2").ok()
+    sros("create_enclave", root, "/a").ok()
+    folder = root / "enclaves/a"
+    certificate = load_certificate((folder / "cert.pem").read_bytes(), "")
+    key = load_key((folder / "key.pem").read_bytes(), "")
+    document = (folder / "permissions.xml").read_bytes()
+    (folder / "permissions.p7s").write_bytes(smime.sign(document, certificate, key))
+    ended = sros("check", root)
+    assert ended.status == 1
+    assert "it is signed by CN=/a, not by the permissions CA" in ended.out
+    assert "keystore.one-authority" in ended.out
+    assert "enclave.signature" in ended.out
