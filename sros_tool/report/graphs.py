@@ -11,12 +11,12 @@ from sros_tool.errors import UnavailableError
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.picture import Level, Mark, Picture
 from sros_tool.report.scene import Card, Link, Scene
-from sros_tool.report.wording import KIND_NAMES, LEVEL_NAMES
+from sros_tool.report.wording import KIND_NAMES, LEVEL_NAMES, ONLOOKERS
 
 _DOT_STYLES = {"encrypt": "solid", "sign": "dashed", "none": "dotted", "unknown": "solid"}
 _COLOURS = {Mark.BOTH: "#5d7590", Mark.FIRST: "#a34a00", Mark.SECOND: "#176b3a"}
 _DENIED = "#b3261e"
-_MERMAID_ARROWS = {"encrypt": "-->", "sign": "-->", "none": "-.->", "unknown": "-->"}
+_MERMAID_ARROWS = {"encrypt": "==>", "sign": "-->", "none": "-.->", "unknown": "-->"}
 _WAIT = 60
 
 
@@ -29,12 +29,15 @@ def render_dot(picture: Picture, scene: Scene) -> str:
         '  edge [fontname="sans-serif", fontsize=9, color="#5d7590"]',
     ]
     cards = _once(scene)
-    for number, (title, members) in enumerate(_clusters(scene, cards).items()):
+    clusters = _clusters(cards)
+    for number, (title, members) in enumerate(clusters.items()):
         lines.append(f"  subgraph cluster_{number} {{ label={_quoted(title)}; style=rounded")
-        lines += [f"    {_dot_node(key, cards[key])}" for key in members]
+        lines += [f"    {_dot_node(scene, key, cards[key])}" for key in members]
         lines.append("  }")
-    lines += [f"  {_dot_node(key, card)}" for key, card in cards.items() if card.role == "names"]
-    lines += [f"  {_dot_node(key, card)}" for key, card in cards.items() if card.role == "group"]
+    inside = {key for members in clusters.values() for key in members}
+    lines += [
+        f"  {_dot_node(scene, key, card)}" for key, card in cards.items() if key not in inside
+    ]
     lines += [f"  {_dot_edge(picture, link)}" for link in scene.links]
     return "\n".join((*lines, "}", ""))
 
@@ -42,14 +45,15 @@ def render_dot(picture: Picture, scene: Scene) -> str:
 def render_mermaid(picture: Picture, scene: Scene) -> str:
     """The scene as a Mermaid flowchart."""
     cards = _once(scene)
+    clusters = _clusters(cards)
     lines = ["---", f"title: {_yaml(picture.title)}", "---", "flowchart LR"]
-    for number, (title, members) in enumerate(_clusters(scene, cards).items()):
+    for number, (title, members) in enumerate(clusters.items()):
         lines.append(f'  subgraph g{number}["{_entities(title)}"]')
-        lines += [f'    {_id(key)}("{_label(cards[key])}")' for key in members]
+        lines += [f"    {_mermaid_node(scene, key, cards[key])}" for key in members]
         lines.append("  end")
-    for key, card in cards.items():
-        if card.role != "enclave":
-            lines.append(f'  {_id(key)}["{_label(card)}"]')
+    inside = {key for members in clusters.values() for key in members}
+    for key in [key for key in cards if key not in inside]:
+        lines.append(f"  {_mermaid_node(scene, key, cards[key])}")
     styles: dict[str, list[int]] = defaultdict(list)
     for number, link in enumerate(scene.links):
         arrow = _MERMAID_ARROWS[link.level.value] if link.qualifier is ALLOW else "--x"
@@ -90,12 +94,13 @@ def _once(scene: Scene) -> Mapping[str, Card]:
     return found
 
 
-def _clusters(scene: Scene, cards: Mapping[str, Card]) -> dict[str, list[str]]:
+def _clusters(cards: Mapping[str, Card]) -> dict[str, list[str]]:
+    """The enclaves by their groups; none where there is but one, which would say nothing."""
     found: dict[str, list[str]] = defaultdict(list)
     for key, card in cards.items():
         if card.role == "enclave":
             found[card.group].append(key)
-    return dict(sorted(found.items()))
+    return dict(sorted(found.items())) if len(found) > 1 else {}
 
 
 def _key(card: str) -> str:
@@ -103,11 +108,14 @@ def _key(card: str) -> str:
     return card if card[0] == "n" else f"e{card[1:]}"
 
 
-def _texts(card: Card) -> Iterable[str]:
+def _texts(scene: Scene, card: Card) -> Iterable[str]:
     if card.kind:
         yield KIND_NAMES[card.kind] + _protected(card)
     yield from card.members if len(card.members) <= len(card.lines) else card.lines
     yield from card.notes
+    for each in scene.onlookers:
+        if each.tag in card.tags:
+            yield f"{each.tag}: {ONLOOKERS[each.right]} {each.enclave.removeprefix(':')}"
 
 
 def _protected(card: Card) -> str:
@@ -129,8 +137,8 @@ def _link_label(picture: Picture, link: Link) -> str:
 # ── DOT ────────────────────────────────────────────────────────────────────────────────────
 
 
-def _dot_node(key: str, card: Card) -> str:
-    label = _quoted("\n".join(_texts(card))).replace("\n", r"\l")
+def _dot_node(scene: Scene, key: str, card: Card) -> str:
+    label = _quoted("\n".join(_texts(scene, card))).replace("\n", r"\l")
     label = label[:-1] + r'\l"' if r"\l" in label else label
     shape = ", style=filled, fillcolor=white, shape=note" if card.role == "names" else ""
     return f"{_quoted(key)} [label={label}{shape}]"
@@ -155,8 +163,13 @@ def _quoted(text: str) -> str:
 # ── Mermaid ────────────────────────────────────────────────────────────────────────────────
 
 
-def _label(card: Card) -> str:
-    return "<br/>".join(map(_entities, _texts(card)))
+def _mermaid_node(scene: Scene, key: str, card: Card) -> str:
+    around = '["{}"]' if card.role == "names" else '("{}")'
+    return _id(key) + around.format(_label(scene, card))
+
+
+def _label(scene: Scene, card: Card) -> str:
+    return "<br/>".join(map(_entities, _texts(scene, card)))
 
 
 def _end(card: str) -> str:
