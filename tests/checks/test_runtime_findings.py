@@ -13,7 +13,7 @@ from zoneinfo import ZoneInfo
 
 import pytest
 from bench import DAY, Bench
-from runtime_cases import CASES, DOMAIN, ENCLAVE, KEYSTORE, SOUND, having, sound_setting
+from runtime_cases import CASES, DOMAIN, ENCLAVE, KEYSTORE, SOUND, having, running, sound_setting
 
 from sros_tool.checks.runtimes.runtime import runtime_findings
 from sros_tool.checks.runtimes.setting import Setting, running_processes
@@ -60,6 +60,12 @@ def test_what_keeps_the_enclave_from_loading_is_found_too(sound_one: Setting) ->
     (found,) = runtime_findings(sound_one)
     assert found.id == "enclave.file-missing"
     assert "permissions.p7s" in found.text
+
+
+def test_the_daemon_of_another_domain_is_not_asked(sound_one: Setting, bench: Bench) -> None:
+    unsecured = running(1, ROS_SECURITY_ENABLE=None)(sound_one, bench)
+    assert ids(unsecured) == {"runtime.daemon-unsecured"}
+    assert ids(running(1, ROS_DOMAIN_ID="3")(unsecured, bench)) == set()
 
 
 def test_the_domain_is_told_whatever_the_enclave(bench: Bench) -> None:

@@ -51,7 +51,7 @@ DAEMON_UNSECURED = Kind(
 DAEMON_OTHER = Kind(
     "runtime.daemon-differs",
     WARNING,
-    "the daemon of ros2 runs with another keystore, enclave or domain",
+    "the daemon of ros2 runs with another keystore or enclave",
     "`ros2 topic list` and others ask it, and show what that enclave sees.",
     "ros2cli 0.32 (daemon); it keeps the environment in which it was started.",
     "Run `ros2 daemon stop`.",
@@ -134,7 +134,8 @@ def _processes(setting: Setting) -> Iterator[Finding]:
     for process in setting.processes:
         environment = process.environment
         if _is_daemon(process):
-            if secured_here:
+            # Each domain has a daemon of its own; commands ask that of theirs.
+            if secured_here and _domain(environment) == _domain(setting.environment):
                 yield from _daemon(process, setting.environment)
         elif is_secured(environment):
             rmws.setdefault(environment.get(RMW) or DEFAULT_RMW, []).append(process.told)
@@ -156,7 +157,7 @@ def _daemon(process: Process, wanted: Mapping[str, str]) -> Iterator[Finding]:
         return
     differing = [
         name
-        for name in (KEYSTORE, ENCLAVE, DOMAIN)
+        for name in (KEYSTORE, ENCLAVE)
         if process.environment.get(name, "") != wanted.get(name, "")
     ]
     if differing:
