@@ -29,7 +29,7 @@ pytestmark = pytest.mark.dds
 
 ISOLATION = try_isolation()
 needs_isolation = pytest.mark.skipif(not ISOLATION.isolated, reason=ISOLATION.reason)
-CONTROLS = ("identity of another CA", "permissions edited", "an unsecured node injects")
+CONTROLS = ("permissions unsigned", "permissions edited", "an unsecured node injects")
 
 
 @pytest.fixture(scope="module", autouse=True)
