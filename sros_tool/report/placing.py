@@ -28,7 +28,7 @@ from sros_tool.report.wording import COMMON, REACHES, counted, names_title, own_
 _GAP, _LEAD, _TOP, _MARGIN = 9.0, 24.0, 34.0, 14
 _SIDE_LETTERS, _NAMES_LETTERS = 20, 35
 _LEAST_LINES, _MOST_LINES, _MOST_ONLOOKERS = 8, 0.3, 26
-_MOST_BUNDLES = 80
+_FEW_BUNDLES, _MOST_BUNDLES = 24, 80
 
 
 class Placing:
@@ -56,7 +56,8 @@ class Placing:
         self._own: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
         self._bundles: list[Bundle] = []
         for bundle in bundles:
-            if alone := self._alone(bundle):
+            alone = self._alone(bundle) if len(bundles) > _FEW_BUNDLES else ""
+            if alone:
                 self._own[alone][bundle.kind] += len(bundle.names)
             else:
                 self._bundles.append(bundle)

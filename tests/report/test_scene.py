@@ -6,7 +6,7 @@ import itertools
 from pathlib import Path
 
 import pytest
-from pictures import group, large_policy, mobile_robot, picture_of
+from pictures import group, large_policy, mobile_robot, picture_of, source_of
 
 from sros_tool.policy.model import DENY
 from sros_tool.policy.reader import read_policy
@@ -128,13 +128,25 @@ def test_what_cannot_be_folded_is_joined_by_its_senders_and_says_so(tmp_path: Pa
     assert [(link.source != joined.id, link.target) for link in denied] == [(True, "l/l0")]
 
 
-def test_what_differs_is_never_folded_into_an_enclave(tmp_path: Path) -> None:
-    from pictures import source_of
+def test_what_one_enclave_has_alone_is_drawn_where_there_is_little(tmp_path: Path) -> None:
+    own = {"/a": group("topics", "publish", "/x") + group("topics", "subscribe", "/y")}
+    scene = scenes_of(picture_of(tmp_path, own))[0]
+    assert [card.members for card in scene.cards if card.kind] == [("/x",), ("/y",)]
+    assert not [note for card in scene.cards for note in card.notes]
 
-    old = source_of(tmp_path, {"/a": group("topics", "publish", "/x", "/own")}, "old.xml")
-    new = source_of(tmp_path, {"/a": group("topics", "publish", "/own")}, "new.xml")
+
+def test_what_differs_is_never_folded_into_an_enclave(tmp_path: Path) -> None:
+    def said(*more: str) -> dict[str, str]:
+        return {
+            f"/e{n}": group("topics", "publish", f"/own{n}", *(more if n == 3 else ()))
+            for n in range(30)
+        }
+
+    old = source_of(tmp_path, said("/x"), "old.xml")
+    new = source_of(tmp_path, said(), "new.xml")
     scene = scenes_of(overlay(old, new, "change"))[0]
     assert [c.members for c in scene.cards if c.kind] == [("/x",)]
+    assert sum("own: 1 topic" in card.notes for card in scene.cards) == 30
 
 
 def test_an_empty_policy_has_a_picture(tmp_path: Path) -> None:
