@@ -257,26 +257,34 @@ class _Narrowing:
         """The pairs of a right and a known name that ``rights`` allow and nothing denies."""
         rights = folded(rights)
         found: set[Pair] = set()
-        wild: set[str] = set()
+        wild = False
         for right in rights:
             if is_expression(right.name):
-                wild.add(right.right)
+                wild = True
                 matched = self._names.matched(right.kind, right.name)
                 found.update((right.right, name) for name in matched)
             else:
                 found.add((right.right, right.name))
-        path = self._enclave.path
-        for action, needs in (("call", "request"), ("execute", "reply")):
-            if needs in wild:  # wildcards of services and topics can mean actions
-                rules = Rules(rights)
-                found.update(
-                    (action, name)
-                    for name in self._names.of(KIND_OF[action])
-                    if rules.cover(Right(path, ALLOW, action, name))
-                )
+        if wild:  # wildcards of services and topics can mean actions, or the rest of one
+            found = self._with_actions(found, Rules(rights))
         if not self._denied:
             return found
-        return {pair for pair in found if not self._rules.meeting(Right(path, DENY, *pair))}
+        return {
+            pair
+            for pair in found
+            if not self._rules.meeting(Right(self._enclave.path, DENY, *pair))
+        }
+
+    def _with_actions(self, found: set[Pair], rules: Rules) -> set[Pair]:
+        """The pairs, with every action that ``rules`` mean as a whole told as that alone."""
+        told = set(found)
+        for action in ("call", "execute"):
+            for name in self._names.of(KIND_OF[action]):
+                whole = Right(self._enclave.path, ALLOW, action, name)
+                if rules.cover(whole):
+                    told.difference_update((part.right, part.name) for part in parts(whole))
+                    told.add((action, name))
+        return told
 
 
 def _for_nodes(enclave: Enclave, common: Sequence[Group]) -> Iterator[Right]:

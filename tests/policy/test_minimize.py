@@ -68,6 +68,12 @@ def test_between_what_was_observed_and_what_was_allowed(
     assert policy_rights(again.policy) == policy_rights(result.policy)
 
 
+def test_an_action_that_rests_on_names_and_a_wildcard_counts_once() -> None:
+    before = policy(group("topics", "/x /*", "publish") + group("services", "/x /*", "reply"))
+    found = use(before, "publish /*", "execute /x")
+    assert found.observed_pairs <= found.remaining_pairs <= found.allowed_pairs
+
+
 NARROWINGS = {
     "unused": (group("topics", "/x /y", "publish"), ["publish /x"],
                group("topics", "/x", "publish")),
