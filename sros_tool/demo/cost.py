@@ -34,8 +34,8 @@ from sros_tool.runtime.netns import end_with_parent
 UNSECURED = "unsecured"
 PAYLOADS = (64, 1024, 16 * 1024, 256 * 1024, 1024 * 1024)
 NOTE = (
-    "medians of several rounds; latency is half a round trip, throughput is of bursts that are"
-    " waited for; both ends are Python with ctypes, whose overhead is in all numbers alike and"
+    "medians; latency is half a round trip, throughput is that of bursts which are waited for;"
+    " both ends are Python with ctypes, whose overhead is in all numbers alike and"
     " makes the ratios smaller than those of nodes in C++; the numbers of payloads that do not fit"
     " into the buffer of a socket scatter"
 )

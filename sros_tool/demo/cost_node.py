@@ -83,8 +83,8 @@ def _measure(
     found = []
     for size in sizes:
         latency = _latency(writer, reader, size, seconds)
-        messages, spent = _throughput(writer, reader, size, seconds)
-        found.append({"size": size, "latency": latency, "rate": messages / spent})
+        rate = _throughput(writer, reader, size, seconds)
+        found.append({"size": size, "latency": latency, "rate": rate})
     return {"first": first, "sizes": found}
 
 
@@ -100,18 +100,18 @@ def _latency(writer: Writer, reader: Reader, size: int, seconds: float) -> float
     return statistics.median(times) / 2
 
 
-def _throughput(writer: Writer, reader: Reader, size: int, seconds: float) -> tuple[int, float]:
-    """How many messages arrived, and in how many seconds; each burst is waited for."""
+def _throughput(writer: Writer, reader: Reader, size: int, seconds: float) -> float:
+    """Messages per second in the median burst; each burst is waited for."""
     burst = max(1, min(_BURST, _BURST_BYTES // size))
     texts = [*["b".ljust(size, "x")] * (burst - 1), "l".ljust(size, "x")]
-    start = time.monotonic()
-    messages = 0
-    while time.monotonic() - start < seconds:
+    times: list[float] = []
+    end = time.monotonic() + seconds
+    while (start := time.monotonic()) < end or not times:
         for text in texts:
             writer.write(text)
         _await(reader)
-        messages += burst
-    return messages, time.monotonic() - start
+        times.append(time.monotonic() - start)
+    return burst / statistics.median(times)
 
 
 def _await(reader: Reader) -> None:

@@ -56,7 +56,7 @@ def choose_loadable(environment: Mapping[str, str], enclave: str = "/") -> Secur
     lacking = [name for name in ENCLAVE_FILES if folder and not (folder / name).is_file()]
     if not lacking:
         return choice
-    why = f"couldn't find all security files! {folder} has no {', '.join(lacking)}."
+    why = f"couldn't find all security files! The enclave has no {', '.join(lacking)}."
     if environment.get(STRATEGY) == "Enforce":
         raise SrosError("cannot start a secured process", why, "Make the enclave again.")
     return SecurityChoice(None, f"running without security, as {STRATEGY} is not 'Enforce'. {why}")
