@@ -14,6 +14,8 @@ from sros_tool.checks.policies.files import policy_file_findings
 from sros_tool.errors import KeystoreError
 from sros_tool.resources import policies_dir
 
+pytest_plugins = ["sound_keystore"]
+
 ROUNDS = 120
 
 

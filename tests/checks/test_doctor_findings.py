@@ -12,6 +12,8 @@ from sros_tool.demo import doctor
 from sros_tool.demo.doctor import Diagnosis
 from sros_tool.runtime.stacks import Stack
 
+pytest_plugins = ["sound_keystore"]
+
 RMW = Stack("rclpy", "rmw", "Fast DDS", "2.14", "", True, False, "no security", "", "rmw_x")
 CYCLONE = Stack("Cyclone DDS", "cyclone", "Cyclone DDS", "0.10", "", True, True, "it refused")
 

@@ -10,6 +10,8 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.pki.certificates import pem
 from sros_tool.policy import read_policy
 
+pytest_plugins = ["sound_keystore"]
+
 
 def ids(bench: Bench) -> set[str]:
     options = {"now": bench.now, **bench.options}

@@ -21,6 +21,8 @@ from sros_tool.checks.registry import KINDS, Selection
 from sros_tool.dds.decision import Vendor
 from sros_tool.errors import UsageError
 
+pytest_plugins = ["sound_keystore"]
+
 
 def test_every_finding_has_a_test_that_brings_it_about() -> None:
     """Each of these tables is run by a test that sees the finding, and does not see it before."""

@@ -18,6 +18,8 @@ from runtime_cases import CASES, DOMAIN, ENCLAVE, KEYSTORE, SOUND, having, runni
 from sros_tool.checks.runtimes.runtime import runtime_findings
 from sros_tool.checks.runtimes.setting import Setting, running_processes
 
+pytest_plugins = ["sound_keystore"]
+
 
 def ids(setting: Setting) -> set[str]:
     return {each.id for each in runtime_findings(setting)}
