@@ -17,6 +17,15 @@ if TYPE_CHECKING:
     from sros_tool.demo.model import Scenario
 
 
+def _complete_scenario(
+    _context: click.Context, _parameter: click.Parameter, incomplete: str
+) -> list[str]:
+    from sros_tool.demo.scenarios import ALL, SCENARIOS
+
+    names = [ALL, *(scenario.name for scenario in SCENARIOS)]
+    return [name for name in names if name.startswith(incomplete)]
+
+
 @click.command(
     "demo",
     epilog="""\b
@@ -49,6 +58,7 @@ reason), 1 if not.""",
     "scenarios",
     multiple=True,
     metavar="NAME",
+    shell_complete=_complete_scenario,
     help="What to show: a name of --list, `all`, or a TOML file of yours; can be repeated.",
 )
 @click.option("--list", "list_them", is_flag=True, help="List the scenarios.")
