@@ -73,6 +73,8 @@ def show_reach(
     from sros_tool.explain.flow import OF_EVERY_NODE, Network
     from sros_tool.keystore.rights import load_rights
 
+    if root is None and len(rest) == 1:
+        root, rest = Path(rest[0]), ()
     if rest:
         raise UsageError("--reach takes one enclave, and no question")
     source = load_rights(root or policy or keystore_from_environment())

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sros_tool.cli.policy import right_json
+from sros_tool.names import is_expression
 from sros_tool.validity import iso
 
 if TYPE_CHECKING:
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from sros_tool.explain.answer import Answer, PartAnswer
     from sros_tool.explain.case import Case, Explanation
     from sros_tool.explain.change import Change
+    from sros_tool.policy.model import Source
 
 _ADDITION = "allow.xml"
 _WIDTH = 10
@@ -40,7 +42,9 @@ def lines_of(case: Case, found: Explanation, why: str, policy: Path | None) -> I
         yield _row("rule", f"{what} of grant {answer.grant.name}: {decision.expression}")
     if found.wildcard:
         yield _row("wildcard", f"{found.wildcard} stands for more than this name")
-    yield from (_row("from", str(each)) for each in found.origins)
+    for each in found.origins:
+        said = f"{each.qualifier.value} {each.right} {each.name}"
+        yield _row("from", f"{_shown(each.source)}: {said}")
     if found.recorded and policy is None and decision.rule is not None:
         yield _row(
             "from", f"a policy file with the digest {found.recorded[:12]}; name it by --policy"
@@ -56,6 +60,13 @@ def lines_of(case: Case, found: Explanation, why: str, policy: Path | None) -> I
 
 def _row(label: str, text: str) -> str:
     return f"  {label:{_WIDTH}}{text}"
+
+
+def _shown(source: Source) -> str:
+    """Where something stands, relative to here if it lies below."""
+    here = Path.cwd()
+    file = Path(source.file)
+    return f"{file.relative_to(here) if file.is_relative_to(here) else file}:{source.line}"
 
 
 def _reason(decision: Decision) -> str:
@@ -109,12 +120,15 @@ def _change_lines(change: Change) -> Iterator[str]:
     for edit in change.edits:
         group = edit.xml.partition(" ")[0].removeprefix("<") if edit.xml else "group"
         if edit.xml:
-            yield f"    at {edit.source}, let the <{group}> read"
+            yield f"    at {_shown(edit.source)}, let the <{group}> read"
             yield from (f"      {line}" for line in edit.xml.splitlines())
         else:
-            yield f"    remove the group at {edit.source}"
+            yield f"    remove the group at {_shown(edit.source)}"
     if change.lift and not change.edits:
         yield from (f"    remove: {right.qualifier} {right.told()}" for right in change.lift)
+    for right in change.lift:
+        if is_expression(right.name):
+            yield f"    which lifts the denial of everything else in {right.name}, too"
     if change.document:
         yield f"    save as {_ADDITION}"
         yield from (f"      {line}" for line in change.document.splitlines())
