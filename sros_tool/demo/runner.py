@@ -7,10 +7,11 @@ long for silence as for sound; only a brief row in which nobody has to be silent
 from __future__ import annotations
 
 import asyncio
+import math
 import os
 import time
 import uuid
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,8 +20,8 @@ from sros_tool.demo.isolated import ENDING_SIGNALS
 from sros_tool.demo.launch import PartyProcess, base_environment
 from sros_tool.demo.model import DENIALS, SPEAKING, Claim, Party, Relation, Role, Row, Wire
 from sros_tool.demo.network import RowNetwork
-from sros_tool.demo.records import Replay, RowRecord, RowResult, forged_text
-from sros_tool.demo.replay import with_other_words
+from sros_tool.demo.onlooker import end_softly, forge_packets, replay_packets
+from sros_tool.demo.records import RowRecord, RowResult
 from sros_tool.demo.scenery import Scenery
 from sros_tool.demo.verdict import judge_row
 from sros_tool.demo.wiretap import Wiretap
@@ -30,23 +31,21 @@ _TICK = 0.05
 _GRACE = 0.3
 _ENOUGH_MESSAGES = 3
 _AFTER_ENOUGH = 2.0
-_AFTER_REPLAY = 2.0
 _BRIEFEST = 1.0
-_LONGEST_PAUSE = 0.5
-_ROUNDS = 2
-_FORGED = 5
-_AFTER_FORGERY = 1.0
-_SECONDS_TO_END = 2.0
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Seconds: to start in, the shortest and longest window, and for all rows together."""
+    """Seconds: to start in, the shortest and longest window, and for all rows together.
+
+    ``wave`` is for as many rows as run at once; many rows have more than ``total``.
+    """
 
     start: float = 20.0
     window: float = 5.0
     longest_window: float = 15.0
     total: float = 50.0
+    wave: float = 25.0
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,9 @@ class _Stage:
         self._finished = 0
 
     async def run(self) -> list[RowResult]:
-        self._end = time.monotonic() + self._plan.limits.total
+        plan = self._plan
+        waves = math.ceil(len(plan.rows) / plan.backend.rows_at_once)
+        self._end = time.monotonic() + max(plan.limits.total, waves * plan.limits.wave)
         loop, task = asyncio.get_running_loop(), asyncio.current_task()
         assert task is not None
         for number in ENDING_SIGNALS:
@@ -135,12 +136,12 @@ class _Stage:
             wire = tap.count(ports) if tap and row.wire else {}
             replay = None
             if tap and row.replay and window:
-                replay = await self._replay(processes[row.replay], tap)
+                replay = await replay_packets(processes[row.replay], tap)
             if tap and row.forge and window:
-                replay = await self._forge(processes[row.forge], tap)
+                replay = await forge_packets(processes[row.forge], tap)
         finally:
             try:
-                await _end_softly(processes.values())
+                await end_softly(processes.values())
             finally:
                 for process in processes.values():
                     process.end()
@@ -244,46 +245,6 @@ class _Stage:
             topic = processes[claim.talker].topic
             return any(event.publishers.get(topic) for event in events)
         return True
-
-    async def _replay(self, talker: PartyProcess, tap: Wiretap) -> Replay:
-        """Let a talker leave, then send again what it had sent, at the pace of the original."""
-        packets = tap.packets(talker.ports())
-        await _end_softly([talker])
-        await asyncio.sleep(_GRACE)
-        started = time.monotonic()
-        # Twice, since the listener may take from the first round only who there is to hear.
-        for _ in range(_ROUNDS):
-            for before, each in zip([*packets[:1], *packets], packets, strict=False):
-                await asyncio.sleep(min(each.time - before.time, _LONGEST_PAUSE))
-                tap.send(each.packet)
-        await asyncio.sleep(_AFTER_REPLAY)
-        return Replay(len(packets), started)
-
-    async def _forge(self, talker: PartyProcess, tap: Wiretap) -> Replay:
-        """Hold a talker, and go on in its name with packets that say something else."""
-        talker.hold()
-        await asyncio.sleep(_GRACE)
-        packets = [each.packet for each in tap.packets(talker.ports())]
-        words, others = talker.text, forged_text(talker.text)
-        last = next((p for p in reversed(packets) if with_other_words(p, words, others, 1)), None)
-        started = time.monotonic()
-        sent = 0
-        for step in range(1, _FORGED + 1) if last else ():
-            changed = with_other_words(last or b"", words, others, step)
-            if changed is not None:
-                tap.send(changed)
-                sent += 1
-        await asyncio.sleep(_AFTER_FORGERY)
-        return Replay(sent, started)
-
-
-async def _end_softly(processes: Collection[PartyProcess]) -> None:
-    """Let the processes end by themselves, for a while; they log and report until then."""
-    for process in processes:
-        process.ask_to_end()
-    latest = time.monotonic() + _SECONDS_TO_END
-    while time.monotonic() < latest and not all(process.gone for process in processes):
-        await asyncio.sleep(_TICK)
 
 
 def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, PartyProcess]) -> bool:
