@@ -88,8 +88,9 @@ def test_what_is_kept(shown: tuple[dict[str, Any], int, Path]) -> None:
         assert key.stat().st_mode & 0o777 == 0o600
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("after", ["at once", "while rows run"])
+@pytest.mark.parametrize(
+    ("number", "after"), [(signal.SIGINT, "at once"), (signal.SIGTERM, "while rows run")]
+)
 def test_an_interrupted_demo_leaves_nothing(
     number: signal.Signals, after: str, tmp_path: Path
 ) -> None:

@@ -65,10 +65,6 @@ WEAKNESSES: Mapping[str, Weakness] = {
     "files open to all users": Weakness(
         frozenset({"identity copied by another user of the robot"}), forge=_open_modes
     ),
-    "an enclave without a policy may do everything": Weakness(
-        frozenset({"an enclave without a policy publishes"}),
-        lambda template: replace(template, default_permissions="everything"),
-    ),
 }
 
 
