@@ -21,13 +21,13 @@ from drawn_cases import cases as drawn_cases
 from drawn_documents import documents
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from vendor_oracle import (
-    MATCH_SECONDS,
     Case,
     Question,
     Reply,
     Workshop,
     ask_cyclone,
     ask_fastdds,
+    with_patience,
 )
 from vendor_rows import CRASHES, REFUSED, rows
 
@@ -37,7 +37,6 @@ pytestmark = pytest.mark.dds
 
 COUNT = int(os.environ.get("SROS_DIFFERENTIAL", "250"))
 SEED = int(os.environ.get("SROS_DIFFERENTIAL_SEED", "1"))
-SLOW = 4 * MATCH_SECONDS
 Draw = Callable[[int, int, datetime], list[Case]]
 ASK = {Vendor.FAST_2_9: ask_fastdds, Vendor.CYCLONE: ask_cyclone}
 
@@ -188,20 +187,11 @@ def test_drawn_documents(vendor: Vendor, draw: Draw, workshop: Workshop) -> None
 
 
 def ask(vendor: Vendor, workshop: Workshop, asked: list[Case], at: datetime) -> list[Reply]:
-    """The replies; where one disagrees about a match it is asked for again, and waited for longer.
-
-    On a busy machine a match may come late; what is really refused stays so.
-    """
-    replies = ASK[vendor](workshop, asked, at_once=6)
-    doubted = [
-        place
-        for place, (case, reply) in enumerate(zip(asked, replies, strict=True))
-        if "unmatched" in reply.answers and any(disagreements(vendor, case, reply, at))
-    ]
-    again = ASK[vendor](workshop, [asked[each] for each in doubted], at_once=1, seconds=SLOW)
-    for place, reply in zip(doubted, again, strict=True):
-        replies[place] = reply
-    return replies
+    return with_patience(
+        lambda some, seconds: ASK[vendor](workshop, some, at_once=6, seconds=seconds),
+        asked,
+        lambda place, reply: any(disagreements(vendor, asked[place], reply, at)),
+    )
 
 
 # ── comparing ──────────────────────────────────────────────────────────────────────────────
