@@ -71,23 +71,29 @@ def _write_governance(
 def check_free(root: Path) -> None:
     """Raise `KeystoreError` where something is in the way of a new keystore."""
     if is_keystore(root):
-        raise KeystoreError(
-            f"keystore '{root}' already exists",
-            "",
-            "Nothing was changed. Add to it with `sros create_enclave`, or choose another path.",
-        )
+        raise _exists(root)
     if root.resolve() == Path("/"):
         raise KeystoreError("the root of the file system is no place for a keystore")
     if os.path.lexists(root) and not root.is_dir():
         raise KeystoreError(f"'{root}' is in the way", "It is not a folder.")
     remains = [part for part in (PUBLIC, PRIVATE, ENCLAVES) if (root / part).exists()]
     if remains:
+        if is_keystore(root):  # another process has completed it between the two looks
+            raise _exists(root)
         raise KeystoreError(
             f"'{root}' holds parts of a keystore already",
             f"There are {', '.join(remains)}; a new CA beside them would lock out every enclave "
             "that trusts the old one.",
             "Restore what is missing, or choose another path.",
         )
+
+
+def _exists(root: Path) -> KeystoreError:
+    return KeystoreError(
+        f"keystore '{root}' already exists",
+        "",
+        "Nothing was changed. Add to it with `sros create_enclave`, or choose another path.",
+    )
 
 
 def check_typo(root: Path) -> None:
