@@ -1,0 +1,138 @@
+"""README's floors hold: who imports whom, where rclpy may be, and how long a module is."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PROJECT = Path(__file__).parents[1]
+PACKAGE = PROJECT / "sros_tool"
+
+FLOORS = {
+    1: {"__init__", "errors", "notes", "names", "validity", "xml", "atomic", "resources"},
+    2: {"pki", "policy", "dds"},
+    3: {"translate"},
+    4: {"keystore", "graph", "runtime"},
+    5: {"checks", "explain", "demo", "report"},
+    6: {"cli"},
+    7: {"__main__"},
+}
+FLOOR_OF = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
+
+# Where a process of its own runs the nodes of rclpy. Nothing else may need ROS.
+ROS_ROOMS = {"graph", "demo"}
+ROS_MODULES = {"runtime/probe_child.py"}
+
+LONGEST = 300
+# Each a single thing that does not part well: a file format, and the prototypes of a C library.
+LONGER = {"keystore/template.py": 310, "runtime/cyclone_library.py": 330}
+
+
+def imported(source: str, module: tuple[str, ...]) -> Iterator[tuple[int, str]]:
+    """Line and absolute name of each import in the text of `module`; also inside functions."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, name.name) for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            above = module[: len(module) - node.level] if node.level else ()
+            origin = ".".join((*above, *([node.module] if node.module else [])))
+            yield from ((node.lineno, f"{origin}.{name.name}") for name in node.names)
+
+
+def misplaced(source: str, path: str) -> list[str]:
+    """Imports that the module `path`, relative to the package, may not have."""
+    parts = ("sros_tool", *Path(path).with_suffix("").parts)
+    room = parts[1]
+    found = []
+    for line, name in imported(source, parts):
+        first, *rest = name.split(".")
+        if first == "rclpy" and room not in ROS_ROOMS and path not in ROS_MODULES:
+            found.append(f"{path}:{line} imports rclpy")
+        if first != "sros_tool" or not rest or rest[0] == room or rest[0] == "__version__":
+            continue
+        # Rooms on one floor do not know each other, but for the small modules at the bottom.
+        if FLOOR_OF[rest[0]] >= FLOOR_OF[room] and FLOOR_OF[room] != 1:
+            found.append(f"{path}:{line} imports {name}, which is not below it")
+        elif FLOOR_OF[rest[0]] > FLOOR_OF[room]:
+            found.append(f"{path}:{line} imports {name}, which is above it")
+    return found
+
+
+MODULES = sorted(str(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py"))
+
+
+def test_every_room_has_a_floor() -> None:
+    assert {Path(module).with_suffix("").parts[0] for module in MODULES} == set(FLOOR_OF)
+
+
+def test_nothing_imports_from_above_or_beside() -> None:
+    assert [
+        line for module in MODULES for line in misplaced((PACKAGE / module).read_text(), module)
+    ] == []
+
+
+@pytest.mark.parametrize(
+    ("source", "path", "found"),
+    [
+        ("from sros_tool.errors import SrosError", "policy/model.py", []),
+        ("from sros_tool.policy.reader import read", "policy/model.py", []),
+        ("from .reader import read", "policy/model.py", []),
+        ("from sros_tool import translate", "keystore/enclave.py", []),
+        ("import rclpy.node", "demo/ros_node.py", []),
+        (
+            "from sros_tool.keystore.layout import Keystore",
+            "policy/model.py",
+            ["sros_tool.keystore.layout.Keystore"],
+        ),
+        (
+            "def late():\n    import sros_tool.cli.program",
+            "demo/runner.py",
+            ["sros_tool.cli.program"],
+        ),
+        ("from ..cli import program", "demo/runner.py", ["sros_tool.cli.program"]),
+        ("from sros_tool import dds", "policy/model.py", ["sros_tool.dds"]),
+        ("from sros_tool.pki import keys", "errors.py", ["sros_tool.pki.keys"]),
+        ("import rclpy", "runtime/stacks.py", ["rclpy"]),
+        ("from rclpy.node import Node", "cli/observing.py", ["rclpy"]),
+    ],
+)
+def test_the_search_sees_what_is_misplaced_and_only_that(
+    source: str, path: str, found: list[str]
+) -> None:
+    lines = misplaced(source, path)
+    assert len(lines) == len(found)
+    assert all(name in line for line, name in zip(lines, found, strict=True))
+
+
+def test_the_modules_that_may_need_ros_are_the_ones_that_do() -> None:
+    users = {
+        module
+        for module in MODULES
+        for _, name in imported((PACKAGE / module).read_text(), ("sros_tool", *Path(module).parts))
+        if name.split(".")[0] == "rclpy"
+    }
+    assert not ROS_MODULES - users
+    assert {Path(module).parts[0] for module in users - ROS_MODULES} == ROS_ROOMS
+
+
+def test_a_module_is_as_long_as_one_thing() -> None:
+    lengths = {module: len((PACKAGE / module).read_text().splitlines()) for module in MODULES}
+    assert [
+        f"{module}: {length} lines"
+        for module, length in lengths.items()
+        if length > LONGER.get(module, LONGEST)
+    ] == []
+    assert [module for module in LONGER if lengths[module] <= LONGEST] == []
+
+
+def test_the_readme_tells_the_same_floors() -> None:
+    rows = re.findall(r"^\| ([1-6]) \| (.+?) \|", (PROJECT / "README.md").read_text(), re.MULTILINE)
+    told = {
+        room.removesuffix("/").removesuffix(".py"): int(floor)
+        for floor, rooms in rows
+        for room in re.findall(r"`([^`]+)`", rooms)
+    }
+    assert len(told) > 10
+    assert {room: floor for room, floor in told.items() if FLOOR_OF.get(room) != floor} == {}
