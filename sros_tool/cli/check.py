@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from sros_tool.cli.common import PATH, json_option, keystore_from_environment, now, print_json
+from sros_tool.cli.common import (
+    PATH,
+    domain_of,
+    json_option,
+    keystore_from_environment,
+    moment_of,
+    now,
+    print_json,
+)
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
@@ -32,7 +40,7 @@ Example:
       Allow <topics publish="ALLOW"><topic>/rosout</topic></topics>. ...
   1 error
   $ sros check keystore keystore --needs-renewal 30d || sros renew keystore --all-expiring 30d
-  $ sros check keystore --policy robot.xml --sarif > findings.sarif
+  $ sros check keystore keystore --policy robot.xml --sarif > findings.sarif
 
 \b
 What the template of a keystore chose openly is accepted: it counts as a note, and is named in one
@@ -71,7 +79,9 @@ line. --strict lets it count. Exit status: 1 if something of the level of --fail
     help="All nodes run this DDS; leave out what concerns others.",
 )
 @click.option("--domain", metavar="ID", help="The domain that enclaves have to join.")
-@click.option("--at", "moment", metavar="MOMENT", help="As if it were then, such as 2027-06-01.")
+@click.option(
+    "--at", "moment", metavar="MOMENT", help="As if it were then: 2027-06-01, or 90d from now."
+)
 @click.option(
     "--format",
     "form",
@@ -115,6 +125,8 @@ def check(
 
     family, paths = _family(targets)
     if needs_renewal is not None:
+        if family not in ("", "keystore") or len(paths) > 1:
+            raise UsageError("--needs-renewal looks at one keystore")
         root = paths[0] if paths else keystore_from_environment()
         at = _circumstances(domain, moment, ())
         return _needs_renewal(root, needs_renewal, at.now, as_json)
@@ -144,24 +156,11 @@ def _circumstances(
     domain: str | None, moment: str | None, policies: Sequence[Path]
 ) -> Circumstances:
     from sros_tool.checks.targets import Circumstances
+    from sros_tool.cli.zone import local_zone
     from sros_tool.policy import read_policy
-    from sros_tool.runtime.environment import DOMAIN, domain_from
-    from sros_tool.validity import parse_iso
 
-    present = now()
-    if moment is not None:
-        try:
-            present = parse_iso(moment)
-        except ValueError as error:
-            raise UsageError(
-                f"{moment!r} is not a moment", "", "Write for example 2027-06-01T12:00:00Z."
-            ) from error
-    if domain == "":
-        raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
-    zone = present.astimezone().tzinfo  # with the offset that holds at that moment
-    assert zone is not None
-    wanted = None if domain is None else domain_from({DOMAIN: domain})
-    return Circumstances(present, zone, wanted, tuple(read_policy(each) for each in policies))
+    read = tuple(read_policy(each) for each in policies)
+    return Circumstances(moment_of(moment), local_zone(os.environ), domain_of(domain), read)
 
 
 def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[Finding]:
@@ -209,10 +208,10 @@ def findings_here(
     """What is found in an environment on this machine; `insecure_rmws` were tried before."""
     from sros_tool.checks.runtimes.runtime import runtime_findings
     from sros_tool.checks.runtimes.setting import Setting, running_processes
+    from sros_tool.cli.zone import local_zone
     from sros_tool.runtime.stacks import rmw_implementations
 
-    zone = moment.astimezone().tzinfo
-    assert zone is not None
+    zone = local_zone(environment)
     rmws, processes = rmw_implementations(environment), tuple(running_processes())
     setting = Setting(environment, moment, zone, processes, rmws, insecure_rmws, now())
     return runtime_findings(setting)

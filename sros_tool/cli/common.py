@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -45,6 +45,41 @@ PATH = NamedPath()
 def now() -> datetime:
     """The present moment: the only place where the command line asks the clock."""
     return datetime.now(UTC)
+
+
+_YEARS = 1970, 2999
+
+
+def moment_of(text: str | None) -> datetime:
+    """The moment that ``--at`` names: a date, or a duration from now; the present one by default.
+
+    Raises `UsageError`.
+    """
+    from sros_tool.validity import parse_duration, parse_iso
+
+    if text is None:
+        return now()
+    try:
+        moment = parse_iso(text)
+        if _YEARS[0] <= moment.year <= _YEARS[1]:
+            return moment
+    except ValueError:
+        with suppress(UsageError):
+            return now() + parse_duration(text)
+    raise UsageError(
+        f"--at {text!r} is no moment",
+        f"It is neither a date of {_YEARS[0]} to {_YEARS[1]} nor a duration.",
+        "Write 2027-06-01, 2027-06-01T12:00:00Z, or 90d from now.",
+    )
+
+
+def domain_of(text: str | None) -> int | None:
+    """The domain that ``--domain`` names, or None without the option.  Raises `UsageError`."""
+    from sros_tool.runtime.environment import DOMAIN, domain_from
+
+    if text == "":
+        raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
+    return None if text is None else domain_from({DOMAIN: text})
 
 
 def json_option(function: Decorated) -> Decorated:

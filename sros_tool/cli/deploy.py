@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import sys
-from contextlib import suppress
-from datetime import datetime
 from pathlib import Path
 
 import click
@@ -12,9 +10,11 @@ import click
 from sros_tool.cli.common import (
     PATH,
     complete_keystore_and_enclave,
+    domain_of,
     dry_run_option,
     json_option,
     keystore_from_environment,
+    moment_of,
     now,
     print_json,
     print_plan,
@@ -143,7 +143,7 @@ Example:
 )
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
 @click.option("--domain", metavar="ID", help="Ask also whether it may join this ROS domain.")
-@click.option("--at", metavar="MOMENT", help="Ask for this moment, such as 2027-06-01.")
+@click.option("--at", metavar="MOMENT", help="As if it were then: 2027-06-01, or 90d from now.")
 @json_option
 def verify(folder: Path | None, domain: str | None, at: str | None, as_json: bool) -> int:
     """On a robot: say whether the enclaves in DIR, or the enclave DIR, can be used as they are.
@@ -153,14 +153,10 @@ def verify(folder: Path | None, domain: str | None, at: str | None, as_json: boo
     all is well.
     """
     from sros_tool.keystore.arrival import verify_arrival
-    from sros_tool.runtime.environment import DOMAIN, domain_from
     from sros_tool.validity import iso
 
     folder = folder or keystore_from_environment()
-    if domain == "":
-        raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
-    wanted = domain_from({DOMAIN: domain}) if domain else None
-    moment = _moment(at) if at is not None else now()
+    wanted, moment = domain_of(domain), moment_of(at)
     arrival = verify_arrival(folder, now=moment, domain=wanted)
     if as_json:
         print_json({**arrival.describe(), "at": iso(moment), "domain": wanted})
@@ -176,13 +172,3 @@ def verify(folder: Path | None, domain: str | None, at: str | None, as_json: boo
         if not finding.enclave:
             click.echo(f"{finding.file}: {finding.text}")
     return 1 if arrival.findings else 0
-
-
-def _moment(text: str) -> datetime:
-    from sros_tool.validity import parse_iso
-
-    with suppress(ValueError):
-        return parse_iso(text)
-    raise UsageError(
-        f"--at {text!r} is no moment", "", "Write for example 2027-06-01 or 2027-06-01T12:00:00Z."
-    )

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-from contextlib import suppress
-from datetime import datetime, tzinfo
+from datetime import tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sros_tool.cli.common import keystore_from_environment, now
-from sros_tool.errors import KeystoreError, UsageError
+from sros_tool.cli.common import domain_of, keystore_from_environment, moment_of, ros_domain
+from sros_tool.errors import KeystoreError
 
 if TYPE_CHECKING:
     from sros_tool.dds.decision import Vendor
@@ -19,15 +18,13 @@ if TYPE_CHECKING:
     from sros_tool.explain.material import Material
     from sros_tool.policy.model import Enclave
 
-_YEARS = 1970, 2999
-
 
 class Place:
     """The options that say where and when."""
 
     def __init__(self, moment: str | None, domain: str | None, zone: str | None) -> None:
-        self.at = _moment(moment)
-        self._domain = _domain(domain)
+        self.at = moment_of(moment)
+        self._domain = ros_domain() if domain is None else domain_of(domain)
         self._zone = _zone(zone)
 
     def setting(self, domains: DomainSet | None) -> Setting:
@@ -39,33 +36,6 @@ class Place:
         if chosen is None:
             chosen = choose_domain(domains, None, Path()) if domains else 0
         return Setting(chosen, self.at, self._zone)
-
-
-def _moment(text: str | None) -> datetime:
-    from sros_tool.validity import parse_duration, parse_iso
-
-    if text is None:
-        return now()
-    try:
-        moment = parse_iso(text)
-        if _YEARS[0] <= moment.year <= _YEARS[1]:
-            return moment
-    except ValueError:
-        with suppress(UsageError):
-            return now() + parse_duration(text)
-    raise UsageError(
-        f"--at {text!r} is no moment",
-        f"It is neither a date of {_YEARS[0]} to {_YEARS[1]} nor a duration.",
-        "Write 2027-06-01T12:00:00Z, or 90d from now.",
-    )
-
-
-def _domain(text: str | None) -> int | None:
-    from sros_tool.runtime.environment import DOMAIN, domain_from
-
-    if text == "":
-        raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
-    return domain_from(os.environ if text is None else {DOMAIN: text})
 
 
 def _zone(name: str | None) -> tzinfo:

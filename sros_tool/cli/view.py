@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
-from datetime import UTC
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -175,12 +175,12 @@ def _picture(
 def _checked(path: Path, moment: datetime) -> list[Finding]:
     """What `sros check` finds there; of permissions or an enclave alone, what it can."""
     from sros_tool.checks.targets import Circumstances, path_findings
+    from sros_tool.cli.zone import local_zone
     from sros_tool.errors import SrosError
     from sros_tool.report.picture import Finding
 
     try:
-        zone = moment.astimezone().tzinfo
-        found = path_findings(path, Circumstances(moment, zone or UTC))
+        found = path_findings(path, Circumstances(moment, local_zone(os.environ)))
     except SrosError:
         return []
     return [

@@ -5,14 +5,20 @@ from __future__ import annotations
 import json
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from zoneinfo import ZoneInfo
 
 import pytest
 from harness import policy_text, publish, sros
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.registry import Selection
+from sros_tool.dds.decision import Access, Vendor
+from sros_tool.keystore.create import create_enclaves, create_keystore
+from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.template import load_template
+from sros_tool.keystore.verify import check_enclave
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import load_certificate
+from sros_tool.pki.certificates import load_certificate, subject_text
 from sros_tool.pki.keys import load_key
 
 NOW = datetime.now(UTC)
@@ -113,3 +119,26 @@ def test_permissions_that_an_enclave_signed_for_itself(tmp_path: Path) -> None:
     assert "it is signed by CN=/a, not by the permissions CA" in ended.out
     assert "keystore.one-authority" in ended.out
     assert "enclave.signature" in ended.out
+
+
+@pytest.mark.parametrize(("hours", "found"), [(6.5, True), (7.5, True), (8.5, False)])
+def test_local_time_is_standard_time_in_summer_too(
+    hours: float, found: bool, tmp_path: Path
+) -> None:
+    """Fast DDS calls mktime without daylight saving: 8 hours in Los Angeles, not 7, in July."""
+    root, signed = tmp_path / "ks", datetime(2026, 7, 10, tzinfo=UTC)
+    create_keystore(root, template=load_template("production"), now=signed)
+    create_enclaves(root, ["/a"], now=signed)
+    at = signed - timedelta(days=1) + timedelta(hours=hours)
+    zone = ZoneInfo("America/Los_Angeles")
+    state = check_enclave(enclave_path(root, "/a"), now=at)
+    assert state.governance and state.permissions and state.certificate
+    subject = subject_text(state.certificate.subject)
+    fast, cyclone = (
+        Access(vendor, state.governance, state.permissions, subject, domain=0, at=at, zone=zone)
+        for vendor in (Vendor.FAST, Vendor.CYCLONE)
+    )
+    assert cyclone.join().outcome.ok
+    assert fast.join().outcome.ok is not found
+    told = {each.id for each in keystore_findings(root, now=at, zone=zone)}
+    assert ("enclave.permissions-local-time" in told) is found

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
+from math import isfinite
 
 from sros_tool.checks.keystores.enclaves import grant_of
 from sros_tool.checks.keystores.opened import OpenedEnclave
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.checks.policies.portability import outside_findings
+from sros_tool.dds.decision.moments import read_moment
+from sros_tool.dds.decision.vendors import Moments
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.permissions import Criteria, Grant, Rule
 from sros_tool.policy.patterns import covers, overlap
@@ -225,15 +228,21 @@ def _times(enclave: OpenedEnclave, grant: Grant, file: str) -> Iterator[Finding]
     if not window.contains(now):
         return
     text = f"they are valid from {grant.not_before} to {grant.not_after}"
-    offset = enclave.keystore.zone.utcoffset(
-        now.astimezone(enclave.keystore.zone).replace(tzinfo=None)
-    ) or timedelta(0)
-    # Fast DDS takes the digits for local time, so the window moves by the offset of the zone.
-    if not window.not_before <= now + offset <= window.not_after:
-        local = iso(now + offset).removesuffix("Z").replace("T", " ")
-        yield LOCAL_TIME.found(enclave.name, f"{text}, and here it is {local}", file)
+    begin, end = (
+        read_moment(Moments.LOCAL, each, enclave.keystore.zone)
+        for each in (grant.not_before, grant.not_after)
+    )
+    if begin is None or end is None:
+        return  # which is told by the form of the dates
+    if not begin <= int(now.timestamp()) <= end:
+        here = f"in {enclave.keystore.zone} Fast DDS takes that for {_utc(begin)} to {_utc(end)}"
+        yield LOCAL_TIME.found(enclave.name, f"{text}, and {here}", file)
     elif now - _WEST < window.not_before or now + _EAST > window.not_after:
         yield TIME_WINDOW.found(enclave.name, f"{text}, and now it is {iso(now)}", file)
+
+
+def _utc(seconds: float) -> str:
+    return iso(datetime.fromtimestamp(seconds, UTC)) if isfinite(seconds) else "never"
 
 
 def _order(grant: Grant, name: str, file: str) -> Iterator[Finding]:
