@@ -51,13 +51,15 @@ def show_who(
                 "question": str(question),
                 "vendor": chosen.value,
                 "vendor_why": why,
+                "documented_only": chosen.documented_only,
                 "enclaves": [_who_json(each) for each in found],
             }
         )
     else:
         for line in _who_lines(found):
             click.echo(line)
-        click.echo(f"{question}, on {chosen.title} ({why})", err=True)
+        documented = ", as documented" if chosen.documented_only else ""
+        click.echo(f"{question}, on {chosen.title} ({why}{documented})", err=True)
     return 0 if any(each.outcome.ok for each in found) else 1
 
 

@@ -30,7 +30,8 @@ def lines_of(case: Case, found: Explanation, why: str, policy: Path | None) -> I
     decision = answer.deciding.decision
     name, vendor = case.material.enclave, answer.vendor.title
     said = f"yes: {name} may" if answer.allowed else f"no: {name} may not"
-    yield f"{said} {answer.question}, on {vendor} ({why})"
+    documented = ", as documented" if answer.vendor.documented_only else ""
+    yield f"{said} {answer.question}, on {vendor} ({why}{documented})"
     yield _row("why", _reason(decision))
     if len(answer.problems) > 1:
         yield from (_row("and", str(each)) for each in answer.problems[1:])

@@ -208,6 +208,15 @@ def test_the_vendor_of_this_machine(whole: Path) -> None:
     assert answer(*asked, "--vendor", "opendds")["documented_only"] is True
 
 
+def test_a_vendor_that_was_never_measured_is_marked(whole: Path) -> None:
+    asked = (whole, ENCLAVE, "publish", "/chatter")
+    who = (whole, "--who", "publish", "/chatter")
+    for vendor, marked in (("connext", True), ("opendds", True), ("fastdds", False)):
+        assert ("as documented" in explain(*asked, "--vendor", vendor).ok().out) is marked
+        assert ("as documented" in explain(*who, "--vendor", vendor).ok().err) is marked
+        assert answer(*who, "--vendor", vendor)["documented_only"] is marked
+
+
 def test_json_of_one_answer(whole: Path) -> None:
     told = answer(whole, ENCLAVE, "publish", "/chatter", "--policy", POLICY, "--domain", "0")
     assert {
@@ -315,6 +324,12 @@ def test_access_control_that_is_off_is_told(tmp_path: Path) -> None:
         (["/a", "publish", "/x", "--at", "9999-12-31"], "is no moment"),
         (["/a", "publish", "/x", "--at", "0001-01-01"], "is no moment"),
         (["--who", "publish", "/x", "--reach", "/a"], "exclude each other"),
+        (["--reach", "/a", "--vendor", "fastdds"], "--reach takes no --vendor"),
+        (["--reach", "/a", "--at", "90d"], "--reach takes no --at"),
+        (["--who", "publish", "/x", "--all-vendors"], "--who takes no --all-vendors"),
+        (["--who", "publish", "/x", "--policy", "p.xml"], "--who takes no --policy"),
+        (["--log", "-", "--policy", "p.xml"], "--log takes no --policy"),
+        (["/a", "publish", "/x", "--infrastructure"], "goes with --reach only"),
         ([], "no keystore is named"),
     ],
 )
