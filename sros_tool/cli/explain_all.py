@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from sros_tool.explain.flow import Path as FlowPath
     from sros_tool.explain.flow import Reach
     from sros_tool.explain.who import Standing
+    from sros_tool.keystore.rights import RightsSource
 
 
 def _keystore(root: Path | None) -> Path:
@@ -81,7 +82,7 @@ def show_reach(
         raise UsageError("--reach takes one enclave, and no question")
     source = load_rights(root or policy or keystore_from_environment())
     without = () if infrastructure else OF_EVERY_NODE
-    network = Network(source.rights, without=without)
+    network = Network(source.rights, without=without, **_opened(source))
     if enclave not in network.enclaves:
         raise KeystoreError(
             f"enclave {enclave} has no rights in '{source.path}'",
@@ -98,6 +99,20 @@ def show_reach(
         told = f"left out: {', '.join(without)}, which every node writes and reads"
         click.echo(f"{told} (--infrastructure counts it)", err=True)
     return 0
+
+
+def _opened(source: RightsSource) -> dict[str, Any]:
+    """What everybody in a keystore may do, because its governance does not control access."""
+    if source.kind != "keystore":
+        return {}
+    from sros_tool.explain.unguarded import unguarded
+    from sros_tool.keystore.layout import enclave_names
+    from sros_tool.keystore.open import governance_of
+
+    return {
+        "unguarded": unguarded(governance_of(source.path)),
+        "everybody": enclave_names(source.path),
+    }
 
 
 # ── telling ───────────────────────────────────────────────────────────────────────────────

@@ -128,18 +128,12 @@ def _planned(stated: Enclave, root: Path | None, place: Place) -> Material:
     """What the policy would give, under the governance of the keystore or of a new one."""
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.material import from_policy
-    from sros_tool.keystore.open import load_governance
+    from sros_tool.keystore.open import governance_of
     from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
     from sros_tool.translate import governance_for
 
     if root is not None:
-        from sros_tool.keystore.layout import PERMISSIONS, ca_certificate
-        from sros_tool.pki.certificates import load_certificate
-        from sros_tool.xml import read_bytes
-
-        path = root / ca_certificate(PERMISSIONS)
-        authority = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
-        return from_policy(stated, load_governance(root, authority), at=place.at)
+        return from_policy(stated, governance_of(root), at=place.at)
     domain = place.setting(None).domain
     protection = load_template(DEFAULT_TEMPLATE).protection
     return from_policy(

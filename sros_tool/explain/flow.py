@@ -14,7 +14,9 @@ from collections import defaultdict, deque
 from collections.abc import Collection, Container, Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import product
 
+from sros_tool.explain.unguarded import Unguarded
 from sros_tool.names import dds_names, is_expression
 from sros_tool.policy.model import DENY
 from sros_tool.policy.patterns import literal_prefix, matches, overlap
@@ -136,10 +138,18 @@ _Used = set[tuple[str, tuple[str, ...]]]
 class Network:
     """All enclaves of a system, connected by what they may say and hear.
 
-    ``without`` are topics (ROS names) that do not count.
+    ``without`` are topics (ROS names) that do not count.  What is ``unguarded`` all of
+    ``everybody`` may do, whatever the rights say.
     """
 
-    def __init__(self, rights: Iterable[Right], *, without: Collection[str] = ()) -> None:
+    def __init__(
+        self,
+        rights: Iterable[Right],
+        *,
+        without: Collection[str] = (),
+        unguarded: Iterable[Unguarded] = (),
+        everybody: Iterable[str] = (),
+    ) -> None:
         ends: dict[str, list[_End]] = {"publish": [], "subscribe": []}
         denied: dict[tuple[str, str], set[str]] = defaultdict(set)
         allowed: dict[tuple[str, str], set[str]] = defaultdict(set)
@@ -154,6 +164,11 @@ class Network:
                 met = tuple(each for each in outside if overlap(each, topic))
                 if topic not in met:
                     ends[direction].append(_End(enclave, topic, met))
+        for each, enclave in product(dict.fromkeys(unguarded), everybody):
+            outside = sorted({*each.without, *ignored})
+            met = tuple(other for other in outside if overlap(other, each.topic))
+            if each.topic not in met:
+                ends[each.direction].append(_End(enclave, each.topic, met))
         self._sides = {direction: _Side(found) for direction, found in ends.items()}
 
     @property

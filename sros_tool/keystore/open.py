@@ -9,9 +9,10 @@ from cryptography import x509
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.errors import KeystoreError, SrosError
-from sros_tool.keystore.layout import GOVERNANCE_P7S, SETTINGS
+from sros_tool.keystore.layout import GOVERNANCE_P7S, PERMISSIONS, SETTINGS, ca_certificate
 from sros_tool.keystore.template import Template, load_template, read_template
 from sros_tool.pki import smime
+from sros_tool.pki.certificates import load_certificate
 from sros_tool.xml import read_bytes
 
 
@@ -34,6 +35,12 @@ def load_governance(root: Path, authority: x509.Certificate) -> Governance:
             error.why,
             error.remedy or f"Restore '{path}' from a backup; every enclave depends on it.",
         ) from error
+
+
+def governance_of(root: Path) -> Governance:
+    """The governance that DDS loads, by the permissions CA that lies in the keystore."""
+    path = root / ca_certificate(PERMISSIONS)
+    return load_governance(root, load_certificate(read_bytes(path, "certificate"), f"'{path}'"))
 
 
 def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:

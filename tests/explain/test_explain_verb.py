@@ -306,6 +306,13 @@ def test_access_control_that_is_off_is_told(tmp_path: Path) -> None:
     found = explain(tmp_path / "ks", ENCLAVE, "publish", "/anything")
     assert found.status == 0
     assert "ACCESS CONTROL OFF for writing" in found.out
+    # What it may do so, it also reaches: the listener has no right to publish.
+    reach = explain(tmp_path / "ks", "--reach", OTHER)
+    assert f"{OTHER} -publish /chatter-> {ENCLAVE}" not in reach.out  # who does not read it
+    by = f"{ENCLAVE} -publish /chatter-> {OTHER}"
+    assert by in reach.out
+    reached = answer(tmp_path / "ks", "--reach", OTHER)["influences"]
+    assert {each["enclave"] for each in reached} == {ENCLAVE}
 
 
 @pytest.mark.parametrize(

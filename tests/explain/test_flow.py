@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sros_tool.explain.flow import OF_EVERY_NODE, Network, path_text
+from sros_tool.explain.unguarded import Unguarded
 from sros_tool.policy.model import ALLOW, DENY
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, Rules
@@ -172,3 +173,17 @@ def test_against_the_closure_over_every_name(found: list[Right]) -> None:
                 assert rules.allow(hop.source, "publish", hop.name), path_text(path)
                 assert rules.allow(hop.target, "subscribe", hop.name), path_text(path)
                 assert matches(hop.said, hop.name) and matches(hop.heard, hop.name)
+
+
+def test_what_the_governance_leaves_open_carries_for_everybody() -> None:
+    found = rights("/a subscribe /x", "/b publish /y", "/b !publish /x")
+    assert Network(found).reach("/b").influences == {}
+    open_x = Unguarded("publish", "rt/*", ("rt/guarded/*",))
+    network = Network(found, unguarded=[open_x], everybody=["/a", "/b"])
+    assert path_text(network.reach("/b").influences["/a"]) == "/b -publish /x-> /a"
+    guarded = rights("/a subscribe /guarded/x")
+    assert Network(guarded, unguarded=[open_x], everybody=["/b"]).reach("/b").influences == {}
+    log = rights("/a subscribe /parameter_events")
+    everyone = {"unguarded": [open_x], "everybody": ["/b"]}
+    assert set(Network(log, **everyone).reach("/b").influences) == {"/a"}
+    assert Network(log, without=OF_EVERY_NODE, **everyone).reach("/b").influences == {}
