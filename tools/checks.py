@@ -49,7 +49,7 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
         cores = len(os.sched_getaffinity(0))
         parts = {
             "tests": ["-m", "not dds", "-n", str(cores)],
-            "tests on a real DDS": ["-m", "dds", "-n", str(2 * cores), "--dist", "loadgroup"],
+            "tests on a real DDS": ["-m", "dds", "-n", str(2 * cores), "--dist", "loadscope"],
         }
         for name, words in parts.items():
             report = VENV / f"{name.replace(' ', '-')}.xml"
