@@ -106,6 +106,28 @@ def test_the_search_sees_what_is_misplaced_and_only_that(
     assert all(name in line for line, name in zip(lines, found, strict=True))
 
 
+CLOCKS = {"datetime.now", "datetime.utcnow", "datetime.today", "date.today", "time.time"}
+CLOCK_ROOM = {"cli/common.py", "cli/zone.py"}
+"""`now`, and the offset of a machine whose zone has no name."""
+
+
+def clocks(source: str) -> list[int]:
+    """The lines that ask what time it is."""
+    return [
+        node.lineno
+        for node in ast.walk(ast.parse(source))
+        if isinstance(node, ast.Attribute)
+        and f"{ast.unparse(node.value).rpartition('.')[2]}.{node.attr}" in CLOCKS
+    ]
+
+
+def test_only_the_command_line_asks_the_clock() -> None:
+    found = {module for module in MODULES if clocks((PACKAGE / module).read_text())}
+    assert found == CLOCK_ROOM
+    assert clocks("import datetime\nnow = datetime.datetime.now") == [2]
+    assert clocks("time.monotonic(); now()") == []
+
+
 def test_the_modules_that_may_need_ros_are_the_ones_that_do() -> None:
     users = {
         module

@@ -17,6 +17,7 @@ from sros_tool.cli.common import (
     print_notes,
 )
 from sros_tool.cli.explain_case import Place, case_of, vendor_of
+from sros_tool.cli.explain_options import refuse_ignored
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
@@ -155,7 +156,7 @@ def explain(
     if sum((who, bool(reach), log is not None)) > 1:
         raise UsageError("--who, --reach and --log exclude each other")
     mode = "--who" if who else "--reach" if reach else "--log" if log is not None else ""
-    _refuse_ignored(mode)
+    refuse_ignored(mode)
     root, rest = _split(words, keystore, verb=0 if who else 1)
     if log is not None:
         from sros_tool.cli.explain_log import show_log
@@ -171,26 +172,6 @@ def explain(
 
         return show_who(root, rest, kind, vendor, place, as_json)
     return _one(root, rest, kind, policy, vendor, all_vendors, place, as_json)
-
-
-_IGNORED = {
-    "": ("infrastructure",),
-    "--who": ("infrastructure", "policy", "all_vendors"),
-    "--reach": ("kind", "vendor", "all_vendors", "moment", "domain", "time_zone"),
-    "--log": ("infrastructure", "kind", "policy", "vendor", "all_vendors"),
-}
-"""The options that have no meaning in each way of asking, by the names of their parameters."""
-
-
-def _refuse_ignored(mode: str) -> None:
-    """Raise `UsageError` for an option that would change nothing."""
-    context = click.get_current_context()
-    for parameter in context.command.params:
-        name = parameter.name or ""
-        if name in _IGNORED[mode] and context.params[name]:
-            option = parameter.opts[0]
-            said = f"{mode} takes no {option}" if mode else f"{option} goes with --reach only"
-            raise UsageError(said, "", "Leave it out.")
 
 
 def _split(
