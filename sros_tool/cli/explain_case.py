@@ -87,6 +87,7 @@ def signed_material(
     from sros_tool.explain.material import from_folder
     from sros_tool.keystore.create import list_enclaves
     from sros_tool.keystore.enclave import enclave_path
+    from sros_tool.keystore.missing import no_such_enclave
 
     if root is None:
         folder = Path(name)
@@ -103,12 +104,7 @@ def signed_material(
         return from_folder(name, enclave_path(root, name), at=place.at)
     if planned:
         return None
-    raise KeystoreError(
-        f"enclave {name} does not exist in keystore '{root}'",
-        f"It has {', '.join(names[:5]) or 'none'}"
-        f"{f' and {len(names) - 5} more' if len(names) > 5 else ''}.",
-        f"Make it with `sros create_enclave {root} {name}`.",
-    )
+    raise no_such_enclave(root, name, names)
 
 
 def _is_enclave(folder: Path) -> bool:

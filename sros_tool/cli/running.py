@@ -120,6 +120,7 @@ def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict
     """
     from sros_tool.keystore.create import list_enclaves
     from sros_tool.keystore.enclave import enclave_path
+    from sros_tool.keystore.missing import no_such_enclave
     from sros_tool.keystore.verify import check_enclave
     from sros_tool.names import check_enclave_name
     from sros_tool.runtime.environment import (
@@ -135,12 +136,7 @@ def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict
     check_enclave_name(name)
     names = list_enclaves(root)
     if name not in names:
-        raise KeystoreError(
-            f"enclave {name} does not exist in keystore '{root}'",
-            f"It has {', '.join(names[:5]) or 'none'}"
-            f"{f' and {len(names) - 5} more' if len(names) > 5 else ''}.",
-            f"Make it with `sros create_enclave {root} {name}`.",
-        )
+        raise no_such_enclave(root, name, names)
     folder = enclave_path(root, name)
     state = check_enclave(folder, now=now())
     domains = state.domains()

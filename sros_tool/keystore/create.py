@@ -22,6 +22,7 @@ from sros_tool.keystore.layout import (
     is_keystore,
 )
 from sros_tool.keystore.ledger import append
+from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.open import check_domain, load_governance, load_settings
 from sros_tool.keystore.parallel import Progress
 from sros_tool.keystore.template import Template
@@ -130,12 +131,9 @@ def create_permission(
     if not dry_run:
         tidy(root)
     check_keystore(root)
-    if name not in set(enclave_names(root)):
-        raise KeystoreError(
-            f"enclave {name} does not exist in keystore '{root}'",
-            "",
-            f"Make it with `sros create_enclave {root} {name}`.",
-        )
+    existing = set(enclave_names(root))
+    if name not in existing:
+        raise no_such_enclave(root, name, existing)
     enclave = policy.enclave(name)
     if enclave is None:
         there = ", ".join(each.path for each in policy.enclaves)

@@ -20,6 +20,7 @@ from sros_tool.keystore.layout import (
     REQUIRED_FILES,
     enclave_folder,
 )
+from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.transaction import Change, Transaction
 from sros_tool.keystore.trust import check_same_authority
 from sros_tool.keystore.verify import check_enclave
@@ -125,11 +126,7 @@ def collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]
     for name in names:
         check_enclave_name(name)
         if name not in existing:
-            raise KeystoreError(
-                f"enclave {name} does not exist in keystore '{root}'",
-                "",
-                f"Make it with `sros create_enclave {root} {name}`.",
-            )
+            raise no_such_enclave(root, name, existing)
         if _born_elsewhere(root, name):
             raise KeystoreError(
                 f"the key of enclave {name} is not in keystore '{root}'",

@@ -25,6 +25,7 @@ from sros_tool.keystore.lifetime import (
     refuse,
 )
 from sros_tool.keystore.lists import Lists
+from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.open import load_settings
 from sros_tool.keystore.parallel import Progress
 from sros_tool.keystore.revoke import link_everywhere, still_valid
@@ -95,7 +96,7 @@ def renew(
     check_keystore(root)
     for name in names:
         if not has_enclave(root, check_enclave_name(name)):
-            raise KeystoreError(f"enclave {name} does not exist in keystore '{root}'")
+            raise no_such_enclave(root, name, list_enclaves(root))
     with Transaction(root, dry_run=dry_run) as transaction:
         template = load_settings(root)
         authorities = load_authorities(root, template, keyring, now)

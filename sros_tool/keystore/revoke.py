@@ -22,6 +22,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, append, read_ledger
 from sros_tool.keystore.lists import Lists, read_crl
+from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.open import load_settings
 from sros_tool.keystore.transaction import Change, Transaction, tidy
 from sros_tool.names import check_enclave_name
@@ -139,7 +140,7 @@ def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
     for name in names:
         check_enclave_name(name)
         if name not in existing:
-            raise KeystoreError(f"enclave {name} does not exist in keystore '{root}'")
+            raise no_such_enclave(root, name, existing)
     return existing
 
 
