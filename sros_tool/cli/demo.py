@@ -173,9 +173,9 @@ def demo(
     moment = now()
     result = run_demo(options, moment, _progress)
     if plot is not None and result.cost is not None:
-        from sros_tool.demo.plot import cost_plot
+        from sros_tool.report.cost_plot import cost_picture
 
-        replace_file(plot, cost_plot(result.cost).encode())
+        replace_file(plot, cost_picture(result.cost.as_json()).encode())
     if report is not None:
         _write_report(report, result.as_json(), keep)
     if summary is not None:

@@ -1,4 +1,4 @@
-"""Draws what security costs into a page: latency and throughput over the payload, and a table.
+"""Draws what security costs: latency and throughput over the payload, as a plot or on a page.
 
 Both axes are logarithmic.  Kinds of protection are told apart by the shape of their points and by
 colour.  It takes the JSON that `sros_tool.demo.cost` describes.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from html import escape
+from textwrap import wrap
 from typing import Any
 
 Json = Mapping[str, Any]
@@ -22,6 +23,21 @@ _SHAPES = (
 )
 """What stands for the kinds in turn: a circle, a square, a rhombus, two triangles."""
 
+_PLOTS = (
+    ("Latency in µs, over the payload", "latency_us"),
+    ("Throughput in MB/s, over the payload", "megabytes_per_s"),
+)
+_COLOURS = ("#1b1b1b", "#0072b2", "#b8860b", "#00795a", "#a3497e")
+"""After Okabe and Ito: told apart by those who do not see all colours."""
+
+_STYLE = (
+    ".grid{stroke:#ddd;fill:none}"
+    + "".join(
+        f".k{number}{{fill:{colour};stroke:{colour}}}" for number, colour in enumerate(_COLOURS)
+    )
+    + ".line{fill:none;stroke-width:2}"
+)
+
 
 def cost_section(cost: Json) -> str:
     """The plots and the table, as markup."""
@@ -33,10 +49,7 @@ def cost_section(cost: Json) -> str:
     )
     plots = "".join(
         f"<figure><figcaption>{title}</figcaption>{_plot(cost, field, title)}</figure>"
-        for title, field in (
-            ("Latency in µs, over the payload", "latency_us"),
-            ("Throughput in MB/s, over the payload", "megabytes_per_s"),
-        )
+        for title, field in _PLOTS
     )
     return (
         f'<h3>What it costs</h3><ul class="kinds">{legend}</ul><div class="plots">{plots}</div>'
@@ -44,19 +57,50 @@ def cost_section(cost: Json) -> str:
     )
 
 
+def cost_picture(cost: Json) -> str:
+    """The plots as an SVG document of its own."""
+    kinds, note = cost["kinds"], wrap(cost["note"], 120)
+    across, below = _LEFT + _WIDTH + 48, _TOP + _HEIGHT + 84
+    width, height = 2 * across, below + 30 + 24 * len(kinds) + 16 * len(note)
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{width}" '
+        f'height="{height}" font-family="sans-serif" font-size="12" role="img">',
+        f"<title>What security costs</title><style>{_STYLE}</style>",
+        f'<rect width="{width}" height="{height}" fill="white"/>',
+    ]
+    for number, (title, field) in enumerate(_PLOTS):
+        left = number * across
+        parts.append(f'<text x="{left + _LEFT}" y="20" font-weight="bold">{title}</text>')
+        parts.append(_plot(cost, field, title, f'x="{left}" y="30" {_size()} '))
+    for number, kind in enumerate(kinds):
+        y = below + 24 * number
+        first = next((e["seconds"] for e in cost["first_message"] if e["kind"] == kind), None)
+        told = f"{kind}: first message after {first:.2f} s" if first is not None else kind
+        parts.append(f'<path class="k{number}" transform="translate({_LEFT} {y - 4})"')
+        parts.append(f'd="{_shape(number)}"/><text x="{_LEFT + 14}" y="{y}">{escape(told)}</text>')
+    for number, line in enumerate(note):
+        y = below + 24 * len(kinds) + 16 * number
+        parts.append(f'<text x="{_LEFT}" y="{y}" fill="#555">{escape(line)}</text>')
+    return "\n".join([*parts, "</svg>"]) + "\n"
+
+
+def _size() -> str:
+    return f'width="{_LEFT + _WIDTH + 8}" height="{_TOP + _HEIGHT + 30}"'
+
+
 def _shape(number: int) -> str:
     return _SHAPES[number % len(_SHAPES)]
 
 
 def payload_text(size: int) -> str:
-    """As ``64 B``, ``16 kB``, ``1 MB``."""
-    for unit, step in (("MB", 1 << 20), ("kB", 1 << 10)):
+    """As ``64 B``, ``16 KiB``, ``1 MiB``."""
+    for unit, step in (("MiB", 1 << 20), ("KiB", 1 << 10)):
         if size >= step:
             return f"{size / step:g} {unit}"
     return f"{size} B"
 
 
-def _plot(cost: Json, field: str, title: str) -> str:
+def _plot(cost: Json, field: str, title: str, place: str = "") -> str:
     values = [each[field] for each in cost["measurements"] if each[field] > 0]
     if not values:
         return ""
@@ -88,7 +132,7 @@ def _plot(cost: Json, field: str, title: str) -> str:
         ]
     width, height = _LEFT + _WIDTH + 8, _TOP + _HEIGHT + 30
     return (
-        f'<svg viewBox="0 0 {width} {height}" role="img" aria-label="{title}">'
+        f'<svg {place}viewBox="0 0 {width} {height}" role="img" aria-label="{title}">'
         f"{''.join(lines)}</svg>"
     )
 

@@ -9,11 +9,11 @@ from xml.etree import ElementTree
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.cost import CostResult, Measurement, cost_table, payload_text
 from sros_tool.demo.model import Status
-from sros_tool.demo.plot import cost_plot
 from sros_tool.demo.records import RowResult
 from sros_tool.demo.result import DemoResult, ScenarioResult
 from sros_tool.demo.summary import summary_page
 from sros_tool.demo.table import demo_table
+from sros_tool.report import cost_plot
 from sros_tool.runtime.netns import Isolation
 
 NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
@@ -117,16 +117,20 @@ def test_the_cost_on_a_terminal_and_as_a_plot() -> None:
     text = "\n".join(cost_table(COST))
     assert "encrypt             0.250 s    2.50" in text
     assert "ctypes" in text
-    plot = ElementTree.fromstring(cost_plot(COST))
+    drawn = cost_plot.cost_picture(COST.as_json())
+    plot = ElementTree.fromstring(drawn)
     lines = [each for each in plot.iter() if each.tag.endswith("polyline")]
     assert len(lines) == 4
     first = [tuple(map(float, point.split(","))) for point in lines[0].get("points", "").split()]
     assert first[0][0] < first[1][0]
     assert first[0][1] > first[1][1]  # more latency is higher up
-    assert "encrypt" in cost_plot(COST)
+    assert "encrypt: first message after 0.25 s" in drawn
+    assert "ctypes" in drawn
 
 
 def test_payloads_for_people() -> None:
     assert [payload_text(size) for size in (64, 1024, 16384, 1048576)] == [
         *("64 B", "1 KiB", "16 KiB", "1 MiB")
     ]
+    for size in (1, 64, 1023, 1024, 16384, 262144, 1048576):
+        assert cost_plot.payload_text(size) == payload_text(size)
