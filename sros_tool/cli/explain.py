@@ -56,7 +56,7 @@ def _complete_enclave(
     """Completes the enclaves of the keystore that is named, or else of the environment's."""
     from sros_tool.keystore.layout import enclave_names, is_keystore
 
-    given: tuple[str, ...] = ctx.params.get("words") or ()
+    given = ctx.params.get("words") or ctx.args  # args, where an option still lacks its value
     named = ctx.params.get("keystore") or (given[0] if given else "")
     root = Path(named or os.environ.get(KEYSTORE_VARIABLE, ""))
     names = enclave_names(root) if is_keystore(root) else ()

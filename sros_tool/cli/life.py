@@ -119,6 +119,15 @@ def _say_replaced(result: Renewal) -> None:
         click.echo(remark, err=True)
 
 
+def _complete_reason(
+    _ctx: click.Context, _parameter: click.Parameter, incomplete: str
+) -> list[str]:
+    """Completes the reasons of RFC 5280, written as RFC 5280 writes them."""
+    from sros_tool.pki.crl import REASONS
+
+    return [each for each in REASONS if each.startswith(incomplete)]
+
+
 @click.command(
     "revoke",
     epilog="""\b
@@ -137,6 +146,7 @@ Example:
 @click.option(
     "--reason",
     default="unspecified",
+    shell_complete=_complete_reason,
     show_default=True,
     help="Why, in a word of RFC 5280, such as key_compromise, superseded, cessation_of_operation.",
 )

@@ -122,9 +122,8 @@ def _checked(name: str, word: str, kind: str) -> str:
         remedy = "Ask for one name, as it shows in the running robot."
     elif not problem and not name.startswith("/"):
         problem = "It is relative to a node, and an enclave may hold nodes of many namespaces."
-        remedy = (
-            f"Write /{name.removeprefix('~').lstrip('/') or 'NAME'}, or /NAMESPACE/... in full."
-        )
+        own = f"/NODE/{name[1:].lstrip('/') or 'NAME'}"
+        remedy = f"Write {own if name.startswith('~') else f'/{name}'}, or /NAMESPACE/... in full."
     elif not problem and name == "/":
         problem = "It is a namespace."
     if problem:

@@ -441,6 +441,7 @@ def test_reach(whole: Path) -> None:
         ("/a s", ["subscribe", "serve"]),
         ("--keystore {ks} /talker_listener/t", [ENCLAVE]),
         ("--reach /talker_listener/l", [OTHER]),
+        ("{ks} --reach /talker_listener/l", [OTHER]),
         ("{ks} --who s", ["subscribe", "serve"]),
     ],
 )

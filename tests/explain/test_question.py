@@ -88,3 +88,12 @@ def test_remedies_name_the_keystore_and_the_enclave() -> None:
     assert remedy("no-rule", "ks", "/a") == ""
     for word in known_words():
         assert "{" not in remedy(word, "ks", "/a")
+
+
+@pytest.mark.parametrize(
+    ("name", "remedy"), [("cmd_vel", "Write /cmd_vel,"), ("~/state", "Write /NODE/state,")]
+)
+def test_a_relative_name_is_refused_with_the_full_one(name: str, remedy: str) -> None:
+    with pytest.raises(UsageError) as refused:
+        ask("publish", name)
+    assert refused.value.remedy.startswith(remedy)
