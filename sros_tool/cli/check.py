@@ -30,6 +30,13 @@ _FAMILIES = ("policy", "keystore", "runtime")
 _LEVELS = click.Choice(["note", "warning", "error"])
 
 
+def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Completes the names of findings."""
+    from sros_tool.checks.registry import KINDS
+
+    return [each for each in KINDS if each.startswith(incomplete)]
+
+
 @click.command(
     "check",
     epilog="""\b
@@ -39,17 +46,26 @@ Example:
       /talker: node /talker may not publish /rosout
       Allow <topics publish="ALLOW"><topic>/rosout</topic></topics>. ...
   1 error
-  $ sros check keystore keystore --needs-renewal 30d || sros renew keystore --all-expiring 30d
-  $ sros check keystore keystore --policy robot.xml --sarif > findings.sarif
+  $ sros check keystore --policy robot.xml --sarif > findings.sarif
+  $ sros check --needs-renewal 30d keystore || \\
+        sros renew keystore --all-expiring 30d
 
-\b
-What the template of a keystore chose openly is accepted: it counts as a note, and is named in one
-line. --strict lets it count. Exit status: 1 if something of the level of --fail-on is shown.""",
+What the template of a keystore chose openly is accepted: it counts as a note, and is named in
+one line. --strict lets it count. Exit status: 1 if something of the level of --fail-on is
+shown.""",
 )
 @click.argument("targets", metavar="[policy|keystore|runtime] [PATH]...", nargs=-1, type=PATH)
 @click.option("--list", "as_list", is_flag=True, help="List all findings that there are.")
-@click.option("--include", metavar="ID", multiple=True, help="Only these; * and ? are wildcards.")
-@click.option("--exclude", metavar="ID", multiple=True, help="All but these.")
+@click.option(
+    "--include",
+    metavar="ID",
+    multiple=True,
+    shell_complete=_complete_id,
+    help="Only these; * and ? are wildcards.",
+)
+@click.option(
+    "--exclude", metavar="ID", multiple=True, shell_complete=_complete_id, help="All but these."
+)
 @click.option(
     "--severity",
     type=_LEVELS,
@@ -117,7 +133,8 @@ def check(
     """Find what is wrong or weak before a node starts.
 
     PATH is a policy, a folder of policies, a keystore, or an enclave; the first word may say which
-    it has to be. Without one: the keystore of $ROS_SECURITY_KEYSTORE, and the runtime.
+    it has to be. Without one: the keystore of $ROS_SECURITY_KEYSTORE, and the runtime, which is
+    the environment and the processes of this machine.
     """
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import Selection
@@ -143,9 +160,12 @@ def check(
 
 
 def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:
-    """The family that the first word names, or "", and the paths."""
+    """The family that the first word names, or "", and the paths.
+
+    A single word is a path where there is one of that name: `keystore` is what people call theirs.
+    """
     word = str(targets[0]) if targets else ""
-    if word in _FAMILIES:
+    if word in _FAMILIES and not (len(targets) == 1 and targets[0].exists()):
         if word == "runtime" and len(targets) > 1:
             raise UsageError("the runtime is that of this machine", "", "Leave the path out.")
         return word, targets[1:]
@@ -192,6 +212,9 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
     root = os.environ.get("ROS_SECURITY_KEYSTORE")
     if root and is_keystore(Path(root)):
         found += path_findings(Path(root), at)
+    elif not root:
+        looked = "looked at the runtime only: no path is given, nor is ROS_SECURITY_KEYSTORE set"
+        click.echo(looked, err=True)
     return list(dict.fromkeys(found))
 
 

@@ -40,6 +40,22 @@ def test_nothing_is_found_in_what_sros_makes(template: str, tmp_path: Path) -> N
     assert sros("check", root, "--strict").status == (template != "production")
 
 
+def test_a_folder_that_is_named_like_a_family_is_that_folder(tmp_path: Path) -> None:
+    """`keystore` is what the examples call a keystore, and beside it stands no other path."""
+    sros("create_keystore", "keystore", cwd=tmp_path).ok()
+    sros("create_enclave", "keystore", "/a", cwd=tmp_path).ok()
+    (tmp_path / "keystore/enclaves/a/key.pem").chmod(0o644)
+    for words in (["keystore"], ["keystore", "keystore"]):
+        ended = sros("check", *words, cwd=tmp_path, env={"ROS_SECURITY_KEYSTORE": None})
+        assert "keystore.key-readable" in ended.out, words
+
+
+def test_what_was_looked_at_is_told_where_nothing_was_named(tmp_path: Path) -> None:
+    ended = sros("check", cwd=tmp_path, env={"ROS_SECURITY_KEYSTORE": None})
+    assert ended.err.startswith("looked at the runtime only")
+    assert "looked at" not in sros("check", "runtime", cwd=tmp_path).err
+
+
 def test_one_authority_that_nobody_chose(tmp_path: Path) -> None:
     """A keystore of ros2/sros2 has no settings, so nothing in it counts as chosen."""
     root = tmp_path / "ks"
