@@ -141,14 +141,16 @@ def check(
     from sros_tool.cli.findings import SHOW, print_list
 
     family, paths = _family(targets)
+    form = "json" if as_json else "sarif" if as_sarif else form
     if needs_renewal is not None:
         if family not in ("", "keystore") or len(paths) > 1:
             raise UsageError("--needs-renewal looks at one keystore")
         root = paths[0] if paths else keystore_from_environment()
         at = _circumstances(domain, moment, ())
-        return _needs_renewal(root, needs_renewal, at.now, as_json)
+        if form == "sarif":
+            raise UsageError("--needs-renewal finds no faults to tell in SARIF", "", "Say --json.")
+        return _needs_renewal(root, needs_renewal, at.now, form == "json")
     selection = Selection(include, exclude, Severity[severity.upper()], strict, vendor or "")
-    form = "json" if as_json else "sarif" if as_sarif else form
     if as_list:
         print_list(selection, form)
         return 0

@@ -185,6 +185,12 @@ def test_at_domain_and_policy(bench: Bench) -> None:
     due = ("check", "keystore", bench.root, "--needs-renewal", "30d")
     sros(*due).ok()
     assert "/base" in sros(*due, "--at", "2099-01-01").out
+    as_json = sros(*due, "--at", "2099-01-01", "--format", "json").out
+    assert {each["enclave"] for each in json.loads(as_json)} >= {"/base"}
+    assert "/base" in sros(*due, "--at", "9000d").out
+    for refused in ("--sarif", bench.root):
+        assert sros(*due, refused).status == 2
+    assert sros("check", "policy", bench.root, *due[-2:]).status == 2
     for wrong in (("--at", "soon"), ("--domain", "x"), ("--domain", ""), ("runtime", bench.root)):
         assert sros("check", *wrong).status == 2
 
