@@ -1,0 +1,84 @@
+"""The wheel holds all that the verbs need: what is unpacked from it works far from any checkout."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture(scope="module")
+def unpacked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    command = [sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(CHECKOUT)]
+    built = subprocess.run(command, capture_output=True, text=True, check=False)
+    if built.returncode and "Could not find a version" in built.stdout + built.stderr:
+        pytest.skip("hatchling cannot be installed here")
+    assert built.returncode == 0, built.stdout + built.stderr
+    (wheel,) = folder.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder / "unpacked")
+    return folder / "unpacked"
+
+
+def run(unpacked: Path, cwd: Path, *words: str) -> str:
+    """What `sros` of the wheel prints; only what it depends on comes from elsewhere."""
+    script = (
+        f"import sys; sys.path.insert(0, {str(unpacked)!r}); import sros_tool.cli as cli; "
+        f"assert cli.__file__.startswith({str(unpacked)!r}), cli.__file__; cli.main()"
+    )
+    command = [sys.executable, "-P", "-c", script, *words]
+    ended = subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False)
+    assert ended.returncode == 0, (words, ended.stdout, ended.stderr)
+    return ended.stdout
+
+
+def test_the_licences_of_what_draws_the_pages_are_in_it(unpacked: Path) -> None:
+    (licences,) = unpacked.glob("*.dist-info/licenses")
+    assert (licences / "LICENSE").read_bytes() == (CHECKOUT / "LICENSE").read_bytes()
+    assert "d3" in (licences / "sros_tool/report/assets/view.js.LICENSES.txt").read_text()
+
+
+def test_every_file_of_the_package_is_in_it(unpacked: Path) -> None:
+    listed = subprocess.run(
+        ["git", "ls-files", "sros_tool", "policies", "keystore_templates"],
+        cwd=CHECKOUT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if listed.returncode:
+        pytest.skip("git does not know this checkout")
+    names = [name for name in listed.stdout.split() if (CHECKOUT / name).is_file()]
+    assert len(names) > 100
+    places = [name if name.startswith("sros_tool/") else f"sros_tool/{name}" for name in names]
+    assert [name for name in places if not (unpacked / name).is_file()] == []
+
+
+def test_the_verbs_work_with_what_is_in_it(unpacked: Path, tmp_path: Path) -> None:
+    def sros(*words: str) -> str:
+        return run(unpacked, tmp_path, *words)
+
+    sros("policies", "--copy", "policies")
+    policy = "policies/mobile_robot.xml"
+    for template in ("development", "production", "sros2"):
+        sros("create_keystore", template, "--template", template)
+    sros("generate_artifacts", "-k", "production", "-p", policy)
+    question = ("/mobile_robot/velocity_mux", "publish", "/cmd_vel", "--policy", policy)
+    assert f"from      {policy.removesuffix('.xml')}" in sros("explain", "production", *question)
+    sros("check", "production", "--policy", policy)
+    assert "policy.everything" in sros("check", "--list")
+    page = sros("view", "production")
+    for asset in ("view.js", "view.css"):
+        shipped = (CHECKOUT / "sros_tool/report/assets" / asset).read_text().strip()
+        assert shipped[:200] in page, asset
+    for form in ("svg", "dot", "mermaid", "json"):
+        assert "velocity_mux" in sros("view", policy, "--format", form)
+    assert "attacks" in sros("demo", "--list")
+    for shell in ("bash", "zsh", "fish"):
+        assert "_SROS_COMPLETE" in sros("completion", shell)
