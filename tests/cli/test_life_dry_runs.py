@@ -1,0 +1,59 @@
+"""What the verbs for the life of keys say in a dry run is what they then do, file by file."""
+
+from __future__ import annotations
+
+import shutil
+import stat
+import time
+from pathlib import Path
+
+import pytest
+from harness import snapshot, sros
+
+LINES = (
+    "renew ks /a --new-key",
+    "renew ks --all-expiring 400d",
+    "renew ks /a --revoke-old",
+    "revoke ks /a",
+    "crl ks --refresh",
+    "rotate_ca ks --next",
+    "rotate_ca ks --finish",
+    "rotate_ca ks --same-key --identity",
+)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("made")
+    sros("create_keystore", "ks", "--template", "production", cwd=folder).ok()
+    sros("create_enclave", "ks", "/a", "/b", "/c", cwd=folder).ok()
+    sros("revoke", "ks", "/c", cwd=folder).ok()
+    time.sleep(1.1)  # within the second of its making, a document that is made anew is the same
+    return folder
+
+
+@pytest.fixture
+def home(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "home", symlinks=True))
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_a_dry_run_tells_what_the_verb_then_does(line: str, home: Path) -> None:
+    before = snapshot(home)
+    said = sros(*line.split(), "--dry-run", cwd=home).ok().out
+    assert snapshot(home) == before
+    sros(*line.split(), cwd=home).ok()
+    after = snapshot(home)
+    files = [
+        path
+        for path in before.keys() | after.keys()
+        if not stat.S_ISDIR((after.get(path) or before[path])[0])
+    ]
+    done = {
+        path: "create" if path not in before else "replace" if path in after else "remove"
+        for path in files
+        if before.get(path) != after.get(path)
+    }
+    told = [line.split(" ", 2)[1:] for line in said.splitlines()]
+    assert {path: action for action, path in told} == done
+    assert len(told) == len(done) > 1
