@@ -38,6 +38,7 @@ def show_who(
     """Say which enclaves of the keystore may; 0 if any may."""
     from sros_tool.explain.question import ask
     from sros_tool.explain.who import who
+    from sros_tool.notes import Note
 
     if not 1 <= len(rest) <= 2:
         raise UsageError(
@@ -45,7 +46,8 @@ def show_who(
         )
     question = ask(rest[0], rest[1] if len(rest) > 1 else "", kind)
     chosen, why = vendor_of(vendor)
-    found = who(_keystore(root), question, chosen, place.setting, at=place.at)
+    keystore = _keystore(root)
+    found = who(keystore, question, chosen, place.setting, at=place.at)
     if as_json:
         print_json(
             {
@@ -61,6 +63,11 @@ def show_who(
             click.echo(line)
         documented = ", as documented" if chosen.documented_only else ""
         click.echo(f"{question}, on {chosen.title} ({why}{documented})", err=True)
+        if question.word == "call" and not kind and not any(each.outcome.ok for each in found):
+            action = ask("call", question.name, "action")
+            if any(e.outcome.ok for e in who(keystore, action, chosen, place.setting, at=place.at)):
+                told = f"enclaves may {action}: add --type action if that is what it is."
+                print_notes([Note("explain.an-action", told)])
     return 0 if any(each.outcome.ok for each in found) else 1
 
 

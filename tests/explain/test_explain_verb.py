@@ -367,6 +367,19 @@ def test_an_action_that_was_taken_for_a_service(tmp_path: Path) -> None:
     assert "an-action" not in explain("/fibonacci/server", *asked[1:]).err
 
 
+def test_an_action_that_was_taken_for_a_service_of_anybody(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", "production").ok()
+    sros("generate_artifacts", "-k", root, "-p", policies_dir() / "fibonacci.xml").ok()
+    found = explain(root, "--who", "call", "/fibonacci")
+    assert found.status == 1
+    assert "note [explain.an-action]" in found.err
+    as_action = explain(root, "--who", "call", "/fibonacci", "--type", "action")
+    assert as_action.out.splitlines()[0] == "/fibonacci/client"
+    assert "an-action" not in as_action.err
+    assert "an-action" not in explain(root, "--who", "call", "/nothing").err
+
+
 def test_a_key_that_stays_on_its_robot(keystore: Path, tmp_path: Path) -> None:
     sros("create_request", "/arm", tmp_path / "robot").ok()
     request = tmp_path / "robot/enclaves/arm/request.pem"

@@ -55,7 +55,8 @@ function showMap() {
   state.shown = scene;
   state.drawing = drawScene(byId("map"), scene, { overlay: model.overlay, problems, choose });
   byId("legend").replaceChildren(...legend(scene, model.overlay, { el, svg }));
-  const left = scene.id === "essential" ? "that only every node needs are left out" : "are not in this view";
+  const are = scene.hidden === 1 ? "is" : "are";
+  const left = scene.id === "essential" ? `that only every node needs ${are} left out` : `${are} not in this view`;
   const summary = scene.shown
     ? `${counted(model.enclaves.length, "enclave")}, ${counted(scene.shown, "name")}${scene.hidden ? `; ${scene.hidden} more ${left}` : ""}`
     : scene.title;
