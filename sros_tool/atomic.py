@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import secrets
+import stat
 from pathlib import Path
 
 
@@ -12,8 +13,8 @@ def replace_file(path: Path, data: bytes) -> None:
     """Let the file at ``path`` hold ``data``, on the disk when this returns.
 
     A file that exists keeps its mode and, where that is allowed, its owner; a symbolic link stays
-    and its target changes.  Raises `OSError` if the folder cannot be written; then nothing
-    changed.
+    and its target changes.  A device or a pipe (``/dev/null``) is written to, and never replaced.
+    Raises `OSError` if the folder cannot be written; then nothing changed.
     """
     target = Path(os.path.realpath(path))
     spare = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
@@ -21,6 +22,9 @@ def replace_file(path: Path, data: bytes) -> None:
         present = target.stat()
     except FileNotFoundError:
         present = None
+    if present and not stat.S_ISREG(present.st_mode) and not stat.S_ISDIR(present.st_mode):
+        target.write_bytes(data)
+        return
     handle = os.open(spare, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
     try:
         with os.fdopen(handle, "wb") as file:
