@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from sros_tool.cli.visible import visible, visible_json
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
@@ -96,13 +97,13 @@ def dry_run_option(function: Decorated) -> Decorated:
 
 def print_json(value: object) -> None:
     """Print a value as JSON, on stdout."""
-    click.echo(json.dumps(value, indent=2, ensure_ascii=False))
+    click.echo(visible_json(json.dumps(value, indent=2, ensure_ascii=False)))
 
 
 def print_notes(notes: Sequence[Note]) -> None:
     """Print remarks, on stderr."""
     for note in notes:
-        click.echo(f"note [{note.id}]: {note.text}", err=True)
+        click.echo(visible(f"note [{note.id}]: {note.text}"), err=True)
 
 
 def print_plan(root: Path, changes: Sequence[Change]) -> None:

@@ -162,7 +162,7 @@ def demo(
         network=network,
         keep=keep,
     )
-    for path in (summary, plot):
+    for path in (summary, plot, report):
         _check_place(path)
     if plot is not None and not any(scenario.measured for scenario in options.scenarios):
         raise UsageError(

@@ -18,6 +18,7 @@ from sros_tool.cli.common import (
 )
 from sros_tool.cli.explain_case import Place, case_of, vendor_of
 from sros_tool.cli.explain_options import refuse_ignored
+from sros_tool.cli.visible import visible
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
@@ -240,7 +241,7 @@ def _one(
     else:
         lines = table_lines(case, found) if all_vendors else lines_of(case, found[0], why, policy)
         for line in lines:
-            click.echo(line)
+            click.echo(visible(line))
     notes = [*_provenance_notes(found[0], policy), *_other_type(case, question, kind, chosen)]
     if not all_vendors:
         measured = [explain_case(case, question, v) for v in (Vendor.FAST, Vendor.CYCLONE)]

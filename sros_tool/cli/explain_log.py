@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,9 @@ import click
 
 from sros_tool.cli.common import print_json
 from sros_tool.cli.explain_case import Place, signed_material
-from sros_tool.errors import DocumentError, SrosError, UsageError
+from sros_tool.cli.log import read_log
+from sros_tool.cli.visible import visible
+from sros_tool.errors import SrosError, UsageError
 
 if TYPE_CHECKING:
     from sros_tool.explain.log import Finding
@@ -46,25 +47,17 @@ def show_log(
             return None
 
     findings = explain_log(
-        _read(log), look, lambda material: place.setting(material.domains), str(root or "")
+        read_log(log), look, lambda material: place.setting(material.domains), str(root or "")
     )
     if as_json:
         print_json({"log": log, "findings": [_json(each) for each in findings]})
     else:
         for finding in findings:
             for line in _lines(finding):
-                click.echo(line)
+                click.echo(visible(line))
         if not findings:
             click.echo("nothing in it tells of DDS Security refusing anything", err=True)
     return 1 if findings else 0
-
-
-def _read(log: str) -> str:
-    try:
-        data = sys.stdin.buffer.read() if log == "-" else Path(log).read_bytes()
-    except OSError as error:
-        raise DocumentError(f"the log '{log}' cannot be read", f"{error.strerror}.") from error
-    return data.decode("utf-8", "replace")
 
 
 def _lines(finding: Finding) -> Iterator[str]:

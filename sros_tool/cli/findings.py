@@ -12,13 +12,14 @@ from sros_tool.checks.kind import Finding
 from sros_tool.checks.registry import Chosen, Selection, select_kinds
 from sros_tool.checks.sarif import sarif
 from sros_tool.cli.common import print_json
+from sros_tool.cli.visible import visible
 
 _SCHEMA = 1
 
 
 def _print_text(chosen: Chosen, _selection: Selection) -> None:
     for each in chosen.shown:
-        click.echo("\n".join(finding_lines(each)))
+        click.echo(visible("\n".join(finding_lines(each))))
     for choice in dict.fromkeys(each.accepted for each in chosen.accepted):
         kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
         told = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +17,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
 )
+from sros_tool.cli.log import read_log
 from sros_tool.cli.observing import FOREVER, observe, observer_environment, why_empty
 from sros_tool.cli.policy import notes_json, right_json
 from sros_tool.errors import UsageError
@@ -219,13 +219,11 @@ def _from_logs(
 
 
 def _log_text(log: Path) -> str:
-    if str(log) == "-":
-        return sys.stdin.buffer.read().decode("utf-8", "replace")
-    if not log.exists():
+    if str(log) != "-" and not log.exists():
         raise UsageError(
             f"the log '{log}' does not exist", "", "The policy FILE stands before --from-log."
         )
-    return log.read_bytes().decode("utf-8", "replace")
+    return read_log(str(log))
 
 
 def _place(node: str | None) -> tuple[str, str] | None:

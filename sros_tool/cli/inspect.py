@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from sros_tool.cli.common import PATH, json_option, now, print_json
+from sros_tool.cli.visible import visible
 
 _INDENT = "  "
 
@@ -61,7 +62,7 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
         print_json(described)
     else:
         for line in _TEXT[described["kind"]](described):
-            click.echo(line)
+            click.echo(visible(line))
     bad = described.get("problems") or described.get("signature_verified") is False
     return 1 if bad and described.get("signed") is not False else 0
 
@@ -90,9 +91,10 @@ def _show_history(root: Path, as_json: bool) -> int:
             until = f"until {entry.not_after}" if entry.not_after else ""
             words = (entry.enclave or entry.subject, until, entry.serial, entry.reason)
             line = "  ".join(word for word in words if word)
-            click.echo(f"{entry.time}  {entry.what:11}  {item.status:10}  {line}".rstrip())
+            shown = visible(f"{entry.time}  {entry.what:11}  {item.status:10}  {line}")
+            click.echo(shown.rstrip())
         for name in found.unexplained:
-            click.echo(f"NOT IN THE LEDGER  {name}")
+            click.echo(visible(f"NOT IN THE LEDGER  {name}"))
     return 1 if found.unexplained else 0
 
 

@@ -8,6 +8,7 @@ import traceback
 
 import click
 
+from sros_tool.cli.visible import visible
 from sros_tool.errors import SrosError, UsageError
 
 _PHRASES = {
@@ -60,7 +61,7 @@ def _usage(error: click.UsageError) -> int:
 
 
 def _say(text: str, status: int) -> int:
-    print(" ".join(text.split()), file=sys.stderr)
+    print(visible(" ".join(text.split())), file=sys.stderr)
     return status
 
 

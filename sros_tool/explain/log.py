@@ -25,6 +25,10 @@ from sros_tool.graph.denials import (
 from sros_tool.runtime.security_log import plain_text
 
 _CONTINUED = re.compile(r"^(?:[0-9A-F]{8,}:error:|\(code: )")
+_WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
+"""As what a topic stands in a line: between punctuation, or with it where it has some itself."""
+_LONGEST = 8000
+"""How many characters of a line can be a message: a log may be one line of many megabytes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +76,9 @@ def explain_log(
     plain = plain_text(text)
     eye = _Eye(look, setting, root)
     lines = plain.splitlines()
-    denials = [(each, _named(lines, each.topic)) for each in read_denials(plain)]
+    refused = read_denials(plain)
+    naming = _naming(lines, {each.topic for each in refused})
+    denials = [(each, naming[each.topic]) for each in refused]
     told = {_process(line) for _, named in denials for _, line in named}
     hits = list(_strongest(_hits(_joined(lines)), told))
     found = [eye.finding(group) for group in _grouped(hits)]
@@ -88,13 +94,14 @@ def _joined(lines: list[str]) -> Iterator[tuple[int, str]]:
     number, current = 0, ""
     for index, line in enumerate(lines, 1):
         if current and _CONTINUED.match(line):
-            current += " " + line
+            if len(current) < _LONGEST:
+                current += " " + line
             continue
         if current:
-            yield number, current
+            yield number, current[:_LONGEST]
         number, current = index, line
     if current:
-        yield number, current
+        yield number, current[:_LONGEST]
 
 
 def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
@@ -138,10 +145,14 @@ def _grouped(hits: Iterable[_Hit]) -> Iterator[list[_Hit]]:
     return iter(groups.values())
 
 
-def _named(lines: list[str], topic: str) -> list[tuple[int, str]]:
-    """The lines that name a topic, with their numbers."""
-    named = re.compile(rf"(?<![\w/]){re.escape(topic)}(?![\w/])")
-    return [(number, line) for number, line in enumerate(lines, 1) if named.search(line)]
+def _naming(lines: list[str], topics: set[str]) -> dict[str, list[tuple[int, str]]]:
+    """The lines that name each topic, with their numbers, in one pass over the log."""
+    found: dict[str, list[tuple[int, str]]] = {topic: [] for topic in topics}
+    for number, line in enumerate(lines, 1):
+        words = (word for pattern in _WORDS for word in pattern.findall(line))
+        for topic in topics.intersection(words):
+            found[topic].append((number, line))
+    return found
 
 
 # ── looking ────────────────────────────────────────────────────────────────────────────────

@@ -17,7 +17,10 @@ from sros_tool.graph.fold import Right
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.names import expression_problem, is_expression
 
-_FAST = re.compile(r"(?P<topic>[^\s(]+) topic (?P<how>not found in allow|denied by deny) rule")
+_FAST = re.compile(
+    # Tried only where a word begins: in a line of one long word it would else be tried everywhere.
+    r"(?<![^\s(])(?P<topic>[^\s(]+) topic (?P<how>not found in allow|denied by deny) rule"
+)
 _CYCLONE = re.compile(
     r"(?:Local topic permission denied|Writer is not permitted|Reader is not permitted): "
     r"(?P<topic>\S+) (?P<how>denied by default rule|found in deny_rule)"

@@ -39,22 +39,35 @@ def matcher(style: Style, expression: str) -> Matcher | None:
     if SPECIAL.isdisjoint(expression):
         return None
     take_set = _fnmatch_set if style is Style.FNMATCH else _cyclone_set
-    parts = []
+    segments = [""]  # what stands between stars
     index = 0
     while index < len(expression):
         char = expression[index]
         index += 1
         if char == "*":
-            parts.append(".*")
+            if segments[-1] or len(segments) == 1:
+                segments.append("")
         elif char == "?":
-            parts.append(".")
+            segments[-1] += "."
         elif char == "[":
             part, index = take_set(expression, index)
-            parts.append(part)
+            segments[-1] += part
         else:
-            parts.append(re.escape(char))
-    joined = re.sub(r"(\.\*)+", ".*", "".join(parts))
-    return re.compile(joined + r"\Z", re.DOTALL).match
+            segments[-1] += re.escape(char)
+    return re.compile(_joined(segments) + r"\Z", re.DOTALL).match
+
+
+def _joined(segments: list[str]) -> str:
+    """The pattern of what stands between stars.
+
+    Each segment matches a fixed number of characters, so the first place where one fits is as good
+    as any later one: the atomic group keeps to it, or else many stars take exponential time.
+    """
+    first, *rest = segments
+    if not rest:
+        return first
+    *middle, last = rest
+    return first + "".join(f"(?>.*?{each})" for each in middle) + ".*" + last
 
 
 def matches(style: Style, expression: str, name: str) -> bool:

@@ -1,0 +1,233 @@
+"""Hostile input to the verbs that read ends in time, in one paragraph, and steers no terminal."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from harness import policy_text, publish, snapshot, sros
+from test_bad_input import NOT_FILES, check_refused, check_unchanged
+
+from sros_tool.cli.log import MAX_LOG
+from sros_tool.cli.visible import visible, visible_json
+from sros_tool.dds.decision.matching import matches
+from sros_tool.dds.decision.vendors import Style
+
+ESCAPES = ("\x1b", "\x9b", "\x07", "\u202e")
+DENIED = "rt/secret topic not found in allow rule. Writer is not allowed"
+POLICY = policy_text({"/a": publish("good")})
+
+
+@pytest.fixture(autouse=True)
+def in_time() -> Iterator[None]:
+    """What takes longer than this has been made to hang, even on a busy machine."""
+
+    def too_long(*_: object) -> None:
+        raise AssertionError("it hangs")
+
+    before = signal.signal(signal.SIGALRM, too_long)
+    signal.alarm(10)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+# ── files ──────────────────────────────────────────────────────────────────────────────────
+
+READERS: dict[str, Callable[[Path, Path], list[object]]] = {
+    "check --needs-renewal": lambda path, _: ["check", path, "--needs-renewal", "30d"],
+    "check --policy": lambda path, keystore: ["check", keystore, "--policy", path],
+    "explain --policy": lambda path, _: ["explain", "--policy", path, "/a", "publish", "/good"],
+    "explain": lambda path, _: ["explain", path, "/a", "publish", "/good"],
+    "view": lambda path, _: ["view", path],
+    "view --observed": lambda path, keystore: ["view", keystore, "--observed", path],
+    "demo --scenario": lambda path, _: ["demo", "--scenario", path],
+    "demo --keystore": lambda path, _: ["demo", "--scenario", "attacks", "--keystore", path],
+    "import --ca": lambda path, _: ["import", path, path.with_name("robot"), "--ca", path],
+    "crl": lambda path, _: ["crl", path],
+}
+
+
+@pytest.mark.parametrize("verb", READERS)
+@pytest.mark.parametrize("kind", [kind for kind in NOT_FILES if kind != "below a file"])
+def test_file(verb: str, kind: str, keystore: Path, tmp_path: Path) -> None:
+    path = tmp_path / ("file.toml" if verb == "demo --scenario" else "file.xml")
+    NOT_FILES[kind][0](path)
+    before = snapshot(tmp_path)
+    check_refused(sros(*READERS[verb](path, keystore)), "")
+    check_unchanged(tmp_path, before)
+
+
+# ── logs ───────────────────────────────────────────────────────────────────────────────────
+
+
+def _huge(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(MAX_LOG + 1)
+
+
+NOT_LOGS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "missing": (lambda path: None, "does not exist"),
+    "a folder": (Path.mkdir, "directory"),
+    "/dev/zero": (lambda path: path.symlink_to("/dev/zero"), "neither a file nor a pipe"),
+    "too large": (_huge, "too large"),
+    "a link to itself": (lambda path: path.symlink_to(path), ""),
+}
+LOG_VERBS = {
+    "explain": ["explain", "--log"],
+    "generate_policy": ["generate_policy", "--enclave", "/e", "--node", "/n", "--from-log"],
+}
+
+
+@pytest.mark.parametrize("verb", LOG_VERBS)
+@pytest.mark.parametrize("kind", NOT_LOGS)
+def test_what_is_no_log(verb: str, kind: str, tmp_path: Path) -> None:
+    make, why = NOT_LOGS[kind]
+    make(tmp_path / "log")
+    check_refused(sros(*LOG_VERBS[verb], tmp_path / "log"), why)
+
+
+@pytest.mark.parametrize("log", ["-", "/dev/zero"])
+def test_a_log_without_end(log: str) -> None:
+    """It must neither be waited for, nor fill the memory."""
+    with Path("/dev/zero").open("rb") as endless:
+        ended = subprocess.run(
+            [sys.executable, "-m", "sros_tool", "explain", "--log", log],
+            stdin=endless,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+    assert (ended.returncode, ended.stdout) == (1, "")
+    assert f"the log '{log}' is" in ended.stderr
+
+
+@pytest.mark.parametrize("verb", LOG_VERBS)
+def test_a_log_from_a_pipe(verb: str, tmp_path: Path) -> None:
+    """As ``--log <(journalctl)`` gives it."""
+    reading, writing = os.pipe()
+    os.write(writing, DENIED.encode())
+    os.close(writing)
+    try:
+        ended = sros(*LOG_VERBS[verb], f"/dev/fd/{reading}")
+    finally:
+        os.close(reading)
+    assert "secret" in ended.out, ended
+
+
+LOGS = {
+    "one long word": "a" * 1_000_000,
+    "one long word with marks": ("a" * 100 + ".-" * 200_000 + "\n") * 3,
+    "a label that never ends": "[" + "-1" * 300_000 + "\na" + " " * 300_000,
+    "many denials": "\n".join(f"rt/t{n} topic not found in allow rule" for n in range(8000)),
+    "many odd denials": "\n".join(f"rt/t;{n}! topic not found in allow rule" for n in range(8000)),
+    "an error stack without end": "Failed to parse certificate: \n" * 2 + "(code: 145) " * 9,
+    "continued for ever": "x\n" + "(code: 1) Failed to parse certificate: \n" * 100_000,
+    "one mark again and again": "Failed to parse certificate: " * 100_000,
+}
+
+
+@pytest.mark.parametrize("verb", LOG_VERBS)
+@pytest.mark.parametrize("case", LOGS)
+def test_a_log_that_takes_long(verb: str, case: str, tmp_path: Path) -> None:
+    (tmp_path / "log").write_text(f"{LOGS[case]}\n{DENIED}\n")
+    ended = sros(*LOG_VERBS[verb], tmp_path / "log")
+    assert "secret" in ended.out, ended.err
+    assert "Traceback" not in ended.err
+
+
+def test_a_topic_with_marks_is_told_by_its_lines(tmp_path: Path) -> None:
+    lines = ["rt/a-b topic denied by deny rule", "about rt/a-b", "about rt/a-bc, rt/a", ""]
+    (tmp_path / "log").write_text("\n".join(lines))
+    ended = sros("explain", "--log", tmp_path / "log", "--json")
+    assert [(each["line"], each["count"]) for each in json.loads(ended.out)["findings"]] == [(1, 2)]
+
+
+# ── names that steer a terminal ────────────────────────────────────────────────────────────
+
+
+def check_tame(text: str) -> None:
+    assert not [each for each in ESCAPES if each in text], text
+
+
+def test_a_log_with_escapes(tmp_path: Path) -> None:
+    evil = "rt/\x1b]0;evil\x07\x9b2J\u202ex topic not found in allow rule. create publisher"
+    (tmp_path / "log").write_text(evil)
+    told = sros("explain", "--log", tmp_path / "log")
+    assert "\\x1b]0;evil\\x07\\x9b2J\\u202ex" in told.out
+    document = sros("explain", "--log", tmp_path / "log", "--json").out
+    proposed = sros("generate_policy", "--from-log", tmp_path / "log")
+    for text in (told.out, document, proposed.out, proposed.err):
+        check_tame(text)
+    assert "\x9b2J\u202ex" in json.loads(document)["findings"][0]["text"]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "check {policy}",
+        "check {broken}",
+        "check {policy} --json",
+        "view {broken}",
+        "explain --policy {broken} /a publish /x",
+        "explain --policy {policy} /a publish /good",
+        "explain --policy {policy} /a publish /other",
+        "explain {keystore} --reach {evil}",
+        "inspect {evil}",
+        "demo --scenario {evil}",
+    ],
+)
+def test_a_file_name_with_escapes(line: str, keystore: Path, tmp_path: Path) -> None:
+    evil = tmp_path / "p\x1b]0;x\x07\x9b2J\u202e.xml"
+    broken = evil.with_suffix(".broken.xml")
+    evil.write_text(POLICY)
+    broken.write_text("<policy")
+    named = {"policy": evil, "broken": broken, "keystore": keystore, "evil": "/\x1b\x9b\u202e"}
+    ended = sros(*(word.format(**named) for word in line.split()))
+    check_tame(ended.out + ended.err)
+    assert "\\x1b" in ended.out + ended.err or "\\u001b" in ended.out, "it was not even named"
+
+
+def test_visible() -> None:
+    assert visible("a\tb\nc é 漢") == "a\tb\nc é 漢"
+    assert visible("\r\x1b[1m\x7f\x85\u2066") == "\\x0d\\x1b[1m\\x7f\\x85\\u2066"
+    value = {"a\x9b": "\x7f\u202e\x1b"}
+    document = visible_json(json.dumps(value, ensure_ascii=False))
+    check_tame(document)
+    assert json.loads(document) == value
+
+
+# ── patterns ───────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("style", Style)
+def test_many_stars(style: Style) -> None:
+    stars, name = "*a" * 40 + "*b", "a" * 250
+    assert not matches(style, stars, name)
+    assert matches(style, stars, name + "b")
+
+
+@pytest.mark.parametrize("question", ["/a publish {name} --all-vendors", "--reach /a"])
+def test_many_stars_in_a_policy(question: str, tmp_path: Path) -> None:
+    (tmp_path / "p.xml").write_text(policy_text({"/a": publish("/" + "*a" * 30 + "*b")}))
+    words = question.format(name="/" + "a" * 200).split()
+    ended = sros("explain", "--policy", tmp_path / "p.xml", *words)
+    assert ended.status in (0, 1)
+    assert "Traceback" not in ended.err
+    for verb in ("check", "view"):
+        assert sros(verb, tmp_path / "p.xml").status in (0, 1)
+
+
+# ── places to write to ─────────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("option", ["--summary", "--report", "--plot"])
+def test_demo_refuses_a_place_before_it_runs(option: str, tmp_path: Path) -> None:
+    words = ["demo", "--scenario", "governance", "--only", "nothing is named so"]
+    check_refused(sros(*words, option, tmp_path / "none" / "page"), "Its folder does not exist.")
