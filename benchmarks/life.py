@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -69,11 +69,13 @@ def replace_files(folder: Path, files: list[tuple[str, int]], count: int, *, che
     """Per enclave: a certificate for a key that exists, one signature, and files replaced.
 
     With ``check``, the two files that tell the key and the rights are read, and two signatures
-    verified.  One flush makes all of it last, and comes before the first file gets its name.
+    verified.  One flush makes all of it last, and comes before the first file gets its name.  All
+    of it is spread over the cores as sros spreads it.
     """
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec
 
+    from sros_tool.keystore.parallel import in_shares
     from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem
     from sros_tool.pki.keys import generate_key
     from sros_tool.validity import window
@@ -86,25 +88,32 @@ def replace_files(folder: Path, files: list[tuple[str, int]], count: int, *, che
     old, signed = issuer.issue(name, public, validity), key.sign(b"x" * 200, algorithm)
     payload = {file: b"x" * size for file, size in files}
     spare = "{}/.{}.new".format
-    for index in range(count):
-        place = os.path.join(folder, str(index))
-        if check:
-            for file in ("cert.pem", "permissions.p7s"):
-                with open(os.path.join(place, file), "rb", buffering=0) as there:
-                    there.readall()
-            old.verify_directly_issued_by(authority)
-            authority.public_key().verify(signed, b"x" * 200, algorithm)  # type: ignore[union-attr, arg-type, call-arg]
-        pem(issuer.issue(name, public, validity))
-        key.sign(b"x" * 200, algorithm)
-        for file, _ in files:
-            handle = os.open(spare(place, file), os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
-            os.write(handle, payload[file])
-            os.close(handle)
+
+    def write(share: Sequence[int]) -> None:
+        for index in share:
+            place = os.path.join(folder, str(index))
+            if check:
+                for file in ("cert.pem", "permissions.p7s"):
+                    with open(os.path.join(place, file), "rb", buffering=0) as there:
+                        there.readall()
+                old.verify_directly_issued_by(authority)
+                authority.public_key().verify(signed, b"x" * 200, algorithm)  # type: ignore[union-attr, arg-type, call-arg]
+            pem(issuer.issue(name, public, validity))
+            key.sign(b"x" * 200, algorithm)
+            for file, _ in files:
+                handle = os.open(spare(place, file), os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+                os.write(handle, payload[file])
+                os.close(handle)
+
+    def rename(share: Sequence[int]) -> None:
+        for index in share:
+            place = os.path.join(folder, str(index))
+            for file, _ in files:
+                os.replace(spare(place, file), os.path.join(place, file))
+
+    in_shares(range(count), write)
     os.sync()
-    for index in range(count):
-        place = os.path.join(folder, str(index))
-        for file, _ in files:
-            os.replace(spare(place, file), os.path.join(place, file))
+    in_shares(range(count), rename)
 
 
 def _seconds(action: Callable[[], object]) -> float:

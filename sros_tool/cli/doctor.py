@@ -24,16 +24,17 @@ Example:
       writer and reader on /sros_not_allowed: ... Not Allowed By Security
   DDS Security can be enforced here.
 
-Exit status: 0 if something here enforces security, 1 if nothing does.""",
+Exit status: 1 if nothing here enforces security, or if a finding is an error; else 0.""",
 )
 @json_option
 def doctor(as_json: bool) -> None:
     """Find the DDS stacks and RMWs of this machine that enforce security.
 
     Each is tried, in a process of its own and in an enclave made for the purpose; a name or a
-    version says nothing about how it was built. Also warns of misspelt ROS_SECURITY_* values.
+    version says nothing about how it was built. Also tells what `sros check runtime` finds:
+    misspelt ROS_SECURITY_* values, files that are missing, a clock that is off.
     """
-    from sros_tool.checks.kind import WARNING
+    from sros_tool.checks.kind import ERROR, WARNING
     from sros_tool.cli.check import findings_here
     from sros_tool.cli.findings import finding_lines
     from sros_tool.demo.doctor import diagnosis_text, examine
@@ -54,5 +55,5 @@ def doctor(as_json: bool) -> None:
         for each in findings:
             if each.severity >= WARNING:
                 click.echo("\n".join(("", *finding_lines(each))))
-    if not diagnosis.enforces:
+    if not diagnosis.enforces or any(each.severity >= ERROR for each in findings):
         sys.exit(1)

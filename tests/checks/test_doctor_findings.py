@@ -31,7 +31,9 @@ def test_findings(as_json: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch) 
     flags = ("--json",) if as_json else ()
 
     def said() -> str:
-        out = sros("doctor", *flags, env=env).ok().out
+        ended = sros("doctor", *flags, env=env)
+        assert ended.status == 1, "an RMW that is not here, or does not enforce, is an error"
+        out = ended.out
         return " ".join(e["id"] for e in json.loads(out)["findings"]) if as_json else out
 
     sound = said()
@@ -42,3 +44,8 @@ def test_findings(as_json: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch) 
     broken = said()
     assert "runtime.rmw-without-security" in broken
     assert "enclave.file-empty" in broken
+
+
+def test_status_0_where_nothing_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "examine", lambda *_: Diagnosis((RMW, CYCLONE), ()))
+    assert sros("doctor", env={}).ok().out.endswith("DDS Security can be enforced here.\n")
