@@ -231,3 +231,52 @@ def test_many_stars_in_a_policy(question: str, tmp_path: Path) -> None:
 def test_demo_refuses_a_place_before_it_runs(option: str, tmp_path: Path) -> None:
     words = ["demo", "--scenario", "governance", "--only", "nothing is named so"]
     check_refused(sros(*words, option, tmp_path / "none" / "page"), "Its folder does not exist.")
+    with_folder = sros(*words, option, tmp_path)
+    check_refused(with_folder, "It is a folder.")
+    check_refused(sros(*words, option, ""), "the path is empty")
+
+
+def test_view_refuses_a_place_that_is_not_there(keystore: Path, tmp_path: Path) -> None:
+    check_refused(sros("view", keystore, "-o", tmp_path / "none" / "p"), "does not exist")
+    told = sros("view", keystore, "-o", tmp_path / "a\x1b[2J\x9b.html").ok()
+    check_tame(told.err)
+    assert "\\x1b[2J\\x9b.html" in told.err
+
+
+@pytest.mark.parametrize("line", ["check {}", "check {} --sarif"])
+def test_a_folder_that_is_gone(line: str, keystore: Path, tmp_path: Path) -> None:
+    (tmp_path / "gone").mkdir()
+    command = f'cd {tmp_path}/gone && rmdir {tmp_path}/gone && exec "$0" -m sros_tool '
+    ended = subprocess.run(
+        ["/bin/sh", "-c", command + line.format(keystore), sys.executable],
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 1
+    assert ended.stderr.count("\n") == 1
+    assert "the folder that this runs in does not exist any more" in ended.stderr
+
+
+# ── TOML ───────────────────────────────────────────────────────────────────────────────────
+
+TOMLS = {
+    "nested lists": ("a=" + "[\n" * 4000 + "]\n" * 4000, "nested too deeply"),
+    "nested tables": ("\n".join(["x=["] + ["{a=["] * 2000), "nested too deeply"),
+    "a key of many dots": ("a" + ".a" * 50_000 + "=1", "longer than"),
+    "a number of many digits": ("domain=" + "9" * 4400, "longer than"),
+    "a number of many digits in lines": ("domain=" + "9" * 3990, ""),
+    "too long": ("# x\n" * 100_000, "longer than 256"),
+    "no such day": ("title=2027-02-30", ""),
+    "a null byte in a path": ('policy="a\\u0000b"', ""),
+}
+
+
+@pytest.mark.parametrize("verb", ["demo --scenario", "demo --template", "view {} --template"])
+@pytest.mark.parametrize("case", TOMLS)
+def test_toml(verb: str, case: str, keystore: Path, tmp_path: Path) -> None:
+    text, why = TOMLS[case]
+    (tmp_path / "hostile.toml").write_text(text)
+    words = verb.format(keystore).split()
+    check_refused(sros(*words, tmp_path / "hostile.toml"), why)

@@ -97,25 +97,25 @@ reason), 1 if not.""",
 )
 @click.option(
     "--keep",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=PATH,
     metavar="DIR",
     help="Leave keystores, reports and logs in DIR.",
 )
 @click.option(
     "--summary",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=PATH,
     metavar="FILE.md",
     help="Write a page for a reviewer, in Markdown.",
 )
 @click.option(
     "--plot",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=PATH,
     metavar="FILE.svg",
     help="Draw what security costs (with --scenario governance).",
 )
 @click.option(
     "--report",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=PATH,
     metavar="FILE.html",
     help="Write all of it as one page, with the plots of what security costs.",
 )
@@ -164,6 +164,8 @@ def demo(
     )
     for path in (summary, plot, report):
         _check_place(path)
+    if keep is not None and keep.exists() and not keep.is_dir():
+        raise UsageError(f"cannot keep anything in '{keep}'", "It is a file.", "Name a folder.")
     if plot is not None and not any(scenario.measured for scenario in options.scenarios):
         raise UsageError(
             "there is nothing to plot",
@@ -196,6 +198,8 @@ def _check_place(path: Path | None) -> None:
         raise UsageError(
             f"cannot write '{path}'", "Its folder does not exist.", "Make the folder first."
         )
+    if path is not None and path.is_dir():
+        raise UsageError(f"cannot write '{path}'", "It is a folder.", "Name a file.")
 
 
 def _list(scenarios: Sequence[Scenario], as_json: bool) -> None:

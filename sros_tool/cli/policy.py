@@ -16,6 +16,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
 )
+from sros_tool.cli.visible import visible
 from sros_tool.errors import PolicyError, UsageError
 
 if TYPE_CHECKING:
@@ -52,6 +53,10 @@ def notes_json(notes: Sequence[Note]) -> list[dict[str, str]]:
 
 def check_output(output: Path, *, force: bool) -> None:
     """Refuse a file that exists, unless it may be replaced."""
+    if not output.absolute().parent.is_dir():
+        raise UsageError(
+            f"cannot write '{output}'", "Its folder does not exist.", "Make the folder first."
+        )
     if output.exists() and not force:
         raise UsageError(f"'{output}' already exists", "", "Name another file, or add --force.")
 
@@ -62,7 +67,7 @@ def save(output: Path, document: bytes) -> str:
 
     verb = "replaced" if output.exists() else "wrote"
     replace_file(output, document)
-    return f"{verb} '{output}'"
+    return visible(f"{verb} '{output}'")
 
 
 # ── merge_policy ───────────────────────────────────────────────────────────────────────────

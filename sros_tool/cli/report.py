@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import traceback
+from pathlib import Path
 
 import click
 
@@ -83,6 +84,10 @@ def _verb() -> str | None:
 
 def _os_problem(error: OSError) -> str:
     if error.filename is None:  # perhaps what was done can only not be printed
+        try:
+            Path.cwd()
+        except OSError:
+            return "the folder that this runs in does not exist any more. Go to another one."
         return f"the operating system refuses: {error.strerror or error}."
     path = os.fsdecode(error.filename)
     return f"the operating system refuses '{path}': {error.strerror or error}. Nothing was changed."

@@ -52,6 +52,7 @@ from sros_tool.demo.model import (
 )
 from sros_tool.demo.policies import check_topic
 from sros_tool.errors import DocumentError, SrosError
+from sros_tool.keystore.toml import parse_toml
 from sros_tool.policy import Policy, read_policy
 from sros_tool.xml import read_bytes
 
@@ -83,7 +84,7 @@ def read_scenario(path: Path) -> Scenario:
     """Read a scenario file; raises `DocumentError` with the line of what is not understood."""
     try:
         text = read_bytes(path, "scenario").decode()
-        data = tomllib.loads(text)
+        data = parse_toml(text)
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise DocumentError(
             f"the scenario '{path}' is not valid TOML", f"{error}.", "Correct it there."
@@ -101,7 +102,7 @@ class _Reader:
         file = self._path.parent / self._text(data, "policy", "", 0)
         try:
             policy = read_policy(file)
-        except SrosError as error:
+        except (SrosError, ValueError) as error:  # a name that holds NUL is of no file
             raise self._error("", 0, "policy", str(error)) from error
         parties = {}
         for place, table in enumerate(self._tables(data, "party")):

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sros_tool.errors import DocumentError, SrosError
+from sros_tool.keystore.toml import parse_toml
 from sros_tool.names import expression_problem
 from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.resources import templates_dir
@@ -93,7 +94,7 @@ class _TemplateError(ValueError):
 
 def parse_template(text: str, name: str) -> Template:
     """Read the text of a template; unknown keys are errors, for a typo must not pass unseen."""
-    table = _Table(tomllib.loads(text), "")
+    table = _Table(parse_toml(text), "")
     authorities = table.table("authorities")
     certificates = table.table("certificates")
     permissions = table.table("permissions")
