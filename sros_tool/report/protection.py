@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
 from sros_tool.names import dds_names
@@ -17,21 +18,25 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
     """The weakest protection of the DDS topics of a name, in the governance's first domain rule.
 
     Whatever protects whole RTPS messages protects every topic in them.  A topic that no rule
-    names is not protected: vendors refuse it.
+    names is not protected: vendors refuse it.  Access is controlled where it is for each of the
+    topics in every domain, as in `sros_tool.explain.unguarded`.
     """
     if governance is None or not governance.domain_access_rules:
         return UNKNOWN
     domain = governance.domain_access_rules[0]
-    found = [
-        _protection(domain, rule)
-        for topic in _topics(kind, name)
-        for rule in _rules_for(domain, topic)
+    topics = _topics(kind, name)
+    found = [_protection(domain, rule) for topic in topics for rule in _rules_for(domain, topic)]
+    anywhere = [
+        rule
+        for each in governance.domain_access_rules
+        for topic in topics
+        for rule in _rules_for(each, topic)
     ]
-    if not found:
-        return Protection(Level.NONE)
-    return min(
-        found,
-        key=lambda each: (_ORDER.index(each.level), each.read_control, each.write_control),
+    weakest = min(found, key=lambda each: _ORDER.index(each.level), default=Protection(Level.NONE))
+    return replace(
+        weakest,
+        read_control=all(rule.enable_read_access_control for rule in anywhere),
+        write_control=all(rule.enable_write_access_control for rule in anywhere),
     )
 
 
@@ -59,8 +64,6 @@ def _protection(domain: DomainRule, rule: TopicRule) -> Protection:
         str(data),
         str(metadata),
         str(rtps),
-        rule.enable_read_access_control,
-        rule.enable_write_access_control,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -89,8 +90,6 @@ def test_only_what_both_sides_can_speak_of_is_compared(tmp_path: Path) -> None:
     both = {"/a": group("topics", "publish", "/x"), "/b": group("topics", "publish", "/y")}
     policy = source_of(tmp_path, both)
     enclave = source_of(tmp_path, {"/a": group("topics", "publish", "/x")}, "a.xml")
-    from dataclasses import replace
-
     picture = overlay(policy, replace(enclave, scope=frozenset({"/a"})), "drift")
     assert {e.enclave for e in picture.edges} == {"/a"}
     assert not picture.differences
@@ -140,6 +139,32 @@ def test_protection_is_the_weakest_of_the_topics_behind_a_name() -> None:
     }
     assert not shown["/camera/image"].read_control
     assert shown["/camera/image"].write_control
+
+
+def test_access_is_open_where_it_is_for_any_topic_behind_a_name() -> None:
+    secret = TopicProtection(read_access_control=False)
+    weaker = TopicProtection(data=Level.NONE, metadata=Level.NONE, write_access_control=False)
+    domain = DomainProtection(
+        named=(
+            NamedProtection("topics", "/dock/_action/status", secret),
+            NamedProtection("topics", "/dock/_action/feedback", weaker),
+            NamedProtection("topics", "/open/*", weaker),
+        ),
+    )
+    governance = governance_for(domain, DomainSet.of((0, 0)))
+    dock = protection_of(governance, "actions", "/dock")
+    assert not dock.read_control and not dock.write_control
+    topic = protection_of(governance, "topics", "/open/x")
+    assert topic.read_control and not topic.write_control
+    other = protection_of(governance, "topics", "/other")
+    assert other.read_control and other.write_control
+    # A topic is open if it is in any domain, as an enclave may join there.
+    closed = governance_for(DomainProtection(), DomainSet.of((1, 1)))
+    both = replace(
+        governance,
+        domain_access_rules=(*closed.domain_access_rules, *governance.domain_access_rules),
+    )
+    assert not protection_of(both, "topics", "/open/x").write_control
 
 
 def test_what_protects_whole_messages_protects_every_topic() -> None:

@@ -15,12 +15,17 @@ from harness import sros
 from pictures import HOSTILE, MOBILE_ROBOT, NOW, group, hostile_permissions, large_policy
 
 from sros_tool.explain.flow import OF_EVERY_NODE, Network
+from sros_tool.explain.unguarded import unguarded
+from sros_tool.keystore.layout import enclave_names
+from sros_tool.keystore.open import governance_of
+from sros_tool.keystore.rights import load_rights
 from sros_tool.policy.reader import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.compose import Source, compose
 from sros_tool.report.page import render_page
 from sros_tool.report.picture import Origin, Validity
 from sros_tool.report.scenes import scenes_of
+from sros_tool.resources import policies_dir
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
@@ -28,6 +33,7 @@ if TYPE_CHECKING:
 pytest_plugins = ["browsing"]
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
+PRODUCTION = policies_dir().parent / "keystore_templates/production.toml"
 SIZES = {"desk": (1440, 900), "phone": (390, 844)}
 
 
@@ -140,22 +146,75 @@ def test_filters_leave_what_fits(browser: Browser, robot_page: Path) -> None:
         assert page.locator("#map path.link.deny").count() == lines(page) > 0
 
 
+@pytest.fixture(scope="module")
+def open_keystores(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Keystores of the mobile robot whose governance leaves writing open, or some names."""
+    text = PRODUCTION.read_text()
+    some = "".join(
+        f'\n[[protection.{kind}]]\nnames = ["{name}"]\n{control}_access_control = false\n'
+        for kind, name, control in (
+            ("topic", "/cmd_vel", "write"),
+            ("topic", "/scan", "read"),
+            ("service", "/lifecycle_manager/is_active", "write"),
+        )
+    )
+    folder = tmp_path_factory.mktemp("open")
+    default = "[protection.default]\n"
+    assert default in text
+    for name, template in {
+        "some names": text + some,
+        "writing": text.replace(default, f"{default}write_access_control = false\n"),
+    }.items():
+        (folder / "open.toml").write_text(template)
+        sros("create_keystore", folder / name, "--template", folder / "open.toml").ok()
+        sros("generate_artifacts", "-k", folder / name, "-p", MOBILE_ROBOT).ok()
+    return {path.name: path for path in folder.iterdir() if path.is_dir()}
+
+
+def distances(network: Network, name: str, upstream: bool) -> dict[str, int]:
+    """The enclaves that a name is reached from (or that it reaches), each with its hops."""
+    hops = [hop for enclave in network.enclaves for hop in network.hops(enclave)]
+    found = {(hop.source if upstream else hop.target): 1 for hop in hops if hop.name == name}
+    for enclave in list(found):
+        reach = network.reach(enclave)
+        for other, path in (reach.learns_from if upstream else reach.influences).items():
+            found[other] = min(found.get(other, 99), 1 + len(path))
+    return found
+
+
+@pytest.mark.parametrize("open_to_all", ["nothing", "some names", "writing"])
 @pytest.mark.parametrize(
     "name", ["/cmd_vel", "/scan", "/navigate_to_pose", "/lifecycle_manager/is_active"]
 )
 @pytest.mark.parametrize("upstream", [True, False], ids=["reaches it", "is reached"])
 def test_the_flow_agrees_with_the_one_that_explain_follows(
-    browser: Browser, robot_page: Path, name: str, upstream: bool
+    browser: Browser,
+    robot_page: Path,
+    open_keystores: dict[str, Path],
+    tmp_path: Path,
+    open_to_all: str,
+    name: str,
+    upstream: bool,
 ) -> None:
     network = Network(policy_rights(read_policy(MOBILE_ROBOT)), without=OF_EVERY_NODE)
-    hops = [hop for enclave in network.enclaves for hop in network.hops(enclave)]
-    distance = {(hop.source if upstream else hop.target): 1 for hop in hops if hop.name == name}
-    for enclave in list(distance):
-        reach = network.reach(enclave)
-        for other, path in (reach.learns_from if upstream else reach.influences).items():
-            distance[other] = min(distance.get(other, 99), 1 + len(path))
+    distance = distances(network, name, upstream)
+    path = robot_page
+    if root := open_keystores.get(open_to_all):
+        network = Network(
+            load_rights(root).rights,
+            without=OF_EVERY_NODE,
+            unguarded=unguarded(governance_of(root)),
+            everybody=enclave_names(root),
+        )
+        by_permissions, distance = distance, distances(network, name, upstream)
+        # By permissions, too, whatever one of these names reaches comes to most enclaves.
+        more = upstream if open_to_all == "writing" else (name, upstream) == ("/scan", False)
+        if more:
+            assert distance != by_permissions
+        path = tmp_path / "open.html"
+        sros("view", root, "-o", path).ok()
     assert len(distance) > 1
-    with opened(browser, robot_page) as page:
+    with opened(browser, path) as page:
         page.fill("#search", name)
         page.keyboard.press("Enter")
         assert page.inner_text("#details h2") == name

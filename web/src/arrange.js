@@ -65,6 +65,7 @@ export function linkOf(source, target, bundle, ties) {
     deny: ties.some((tie) => tie.deny),
     level: bundle.protection.level,
     wildcard: ties.every((tie) => tie.by.length > 0),
+    open: ties.every((tie) => tie.open),
     mark: ties[0].mark,
   };
 }

@@ -33,7 +33,7 @@ export function pathOf(link, cards) {
 export function linkText(link, overlay) {
   const said = `${link.deny ? "DENY" : "ALLOW"} ${link.rights.join(", ")}`;
   const marked = markText(overlay, link.mark);
-  return [said, link.wildcard && "by a wildcard", marked, LEVELS[link.level]]
+  return [said, link.wildcard && "by a wildcard", link.open && "as everybody may", marked, LEVELS[link.level]]
     .filter(Boolean)
     .join(", ");
 }

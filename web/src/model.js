@@ -15,6 +15,8 @@ const OF_EVERY_NODE = "/parameter_events";
 export const sends = (tie) => SENDS.has(tie.right);
 
 export class Model {
+  #sides = new Map();
+
   constructor(data) {
     Object.assign(this, data);
     for (const bundle of data.bundles) bundle.ties = rowsOf(bundle.ties);
@@ -92,12 +94,34 @@ export class Model {
     return found;
   }
 
-  // Who writes (or reads) a bundle in the sense of information that flows, denials left out.
+  // Who writes (or reads) a bundle in the sense of information that flows: whom permissions allow
+  // it, denials left out, and everybody else where the governance does not look at permissions.
   #ends(bundle, writing) {
     if (bundle.names.every((name) => name === OF_EVERY_NODE)) return [];
-    return bundle.ties.filter(
+    const ties = bundle.ties.filter(
       (tie) => !tie.deny && (!ONE_WAY.has(tie.right) || sends(tie) === writing),
     );
+    const { read_control, write_control } = bundle.protection;
+    if (writing ? write_control : read_control) return ties;
+    const right = writing ? "publish" : "subscribe";
+    const said = new Set(ties.map((tie) => tie.enclave));
+    for (const { path } of this.enclaves) {
+      if (!said.has(path)) ties.push({ enclave: path, right, open: true, by: [], parts: [], mark: "both" });
+    }
+    return ties;
+  }
+
+  // All ends of one direction: of each bundle, and with their bundles of each enclave.
+  #side(writing) {
+    if (!this.#sides.has(writing)) {
+      const of = new Map(this.bundles.map((bundle) => [bundle, this.#ends(bundle, writing)]));
+      const by = new Map(this.enclaves.map(({ path }) => [path, []]));
+      for (const [bundle, ties] of of) {
+        for (const tie of ties) by.get(tie.enclave).push({ tie, bundle });
+      }
+      this.#sides.set(writing, { of, by });
+    }
+    return this.#sides.get(writing);
   }
 
   // Where information comes from that reaches a name (or where it goes from there).  Steps lead
@@ -105,6 +129,7 @@ export class Model {
   // A service or an action carries both ways: requests there, replies back.
   flow(kind, name, upstream) {
     const start = this.bundle(kind, name);
+    const [near, far] = [this.#side(upstream), this.#side(!upstream)];
     const hops = new Map();
     const steps = [];
     const met = new Set([start]);
@@ -112,7 +137,7 @@ export class Model {
     for (let hop = 1; front.length; hop += 1) {
       const reached = new Set();
       for (const bundle of front) {
-        for (const tie of this.#ends(bundle, upstream)) {
+        for (const tie of near.of.get(bundle)) {
           if (!hops.has(tie.enclave)) {
             hops.set(tie.enclave, hop);
             reached.add(tie.enclave);
@@ -122,8 +147,8 @@ export class Model {
       }
       front = [];
       for (const path of reached) {
-        for (const { tie, bundle } of this.tiesOf.get(path)) {
-          if (met.has(bundle) || !this.#ends(bundle, !upstream).includes(tie)) continue;
+        for (const { tie, bundle } of far.by.get(path)) {
+          if (met.has(bundle)) continue;
           steps.push({ hop, bundle, tie, near: false });
           front.push(bundle);
         }
