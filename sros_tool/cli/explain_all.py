@@ -90,6 +90,8 @@ def show_reach(
     source = load_rights(root or policy or keystore_from_environment())
     without = () if infrastructure else OF_EVERY_NODE
     network = Network(source.rights, without=without, **_opened(source))
+    if source.kind == "keystore":
+        _check_there(source.path, enclave)
     if enclave not in network.enclaves:
         raise KeystoreError(
             f"enclave {enclave} has no rights in '{source.path}'",
@@ -106,6 +108,15 @@ def show_reach(
         told = f"left out: {', '.join(without)}, which every node writes and reads"
         click.echo(f"{told} (--infrastructure counts it)", err=True)
     return 0
+
+
+def _check_there(root: Path, enclave: str) -> None:
+    from sros_tool.keystore.layout import enclave_names
+    from sros_tool.keystore.missing import no_such_enclave
+
+    there = tuple(enclave_names(root))
+    if enclave not in there:
+        raise no_such_enclave(root, enclave, there)
 
 
 def _opened(source: RightsSource) -> dict[str, Any]:

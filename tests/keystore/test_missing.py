@@ -5,8 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from harness import sros
 
+from sros_tool.keystore.create import list_enclaves
+from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.missing import likely, no_such_enclave
+from sros_tool.pki.certificates import load_certificate
 
 THERE = ("/mobile_robot/base", "/mobile_robot/teleop", "/mobile_robot/velocity_mux", "/arm/base")
 
@@ -44,3 +48,41 @@ def test_where_nobody_is_meant_the_error_says_who_is_there() -> None:
 
 def test_a_name_that_could_not_be_made_is_told_so() -> None:
     assert "does not start with '/'" in str(no_such_enclave(Path("robot"), "camera", THERE))
+
+
+def test_of_a_revoked_enclave_it_says_since_when(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root).ok()
+    sros("create_enclave", root, "/camera", "/camera2").ok()
+    before = str(no_such_enclave(root, "/camera3", list_enclaves(root)))
+    assert "Perhaps" in before and "was revoked" not in before
+    first = _serial(root, "/camera")
+    sros("renew", root, "/camera").ok()
+    serial = _serial(root, "/camera")
+    assert serial != first
+    sros("revoke", root, "/camera", "--reason", "keyCompromise").ok()
+    (entry, *_) = (e for e in read_ledger(root) if e.what == "revocation" and e.serial == serial)
+    said = (
+        f"enclave /camera of keystore '{root}' was revoked at {entry.time} (keyCompromise). Its "
+        f"files lie in '{root}/revoked/{serial}'. If it is needed again, make it anew with "
+        f"`sros create_enclave {root} /camera`."
+    )
+    assert str(no_such_enclave(root, "/camera", list_enclaves(root))) == said
+    for words in (("/camera", "publish", "/x"), ("--reach", "/camera")):
+        found = sros("explain", root, *words)
+        assert (found.status, found.out) == (1, "")
+        assert said in found.err
+    # Made anew it is there; and if its files are lost then, that is no revocation.
+    sros("create_enclave", root, "/camera").ok()
+    assert sros("explain", root, "/camera", "publish", "/x").ok().out.startswith("yes")
+    assert "was revoked" not in str(no_such_enclave(root, "/camera", ["/camera2"]))
+
+
+def test_a_broken_ledger_does_not_hide_that_the_enclave_is_missing(tmp_path: Path) -> None:
+    (tmp_path / "ledger.jsonl").write_text("no entry\n")
+    assert "/camera does not exist" in str(no_such_enclave(tmp_path, "/camera", THERE))
+
+
+def _serial(root: Path, name: str) -> str:
+    certificate = load_certificate((root / "enclaves" / name[1:] / "cert.pem").read_bytes(), "it")
+    return f"{certificate.serial_number:x}"
