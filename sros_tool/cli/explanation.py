@@ -30,7 +30,7 @@ def lines_of(case: Case, found: Explanation, why: str, policy: Path | None) -> I
     decision = answer.deciding.decision
     name, vendor = case.material.enclave, answer.vendor.title
     said = f"yes: {name} may" if answer.allowed else f"no: {name} may not"
-    documented = ", as documented" if answer.vendor.documented_only else ""
+    documented = ", as documented" if answer.as_documented else ""
     yield f"{said} {answer.question}, on {vendor} ({why}{documented})"
     yield _row("why", _reason(decision))
     if len(answer.problems) > 1:
@@ -157,7 +157,7 @@ def table_lines(case: Case, found: Sequence[Explanation]) -> Iterator[str]:
     yield f"may {case.material.enclave} {answers[0].question}?"
     width = max(len(each.vendor.title) for each in answers)
     for answer in answers:
-        remark = " (as documented)" if answer.vendor.documented_only else ""
+        remark = " (as documented)" if answer.as_documented else ""
         reason = _reason(answer.deciding.decision)
         yield f"  {answer.vendor.title:{width}}  {answer.outcome:11}  {reason}{remark}"
     yield differences(found)

@@ -81,6 +81,11 @@ class Answer:
         return self.outcome.ok
 
     @property
+    def as_documented(self) -> bool:
+        """Whether it rests on what the vendor documents: faults of files are seen here."""
+        return self.vendor.documented_only and not self.problems
+
+    @property
     def failing(self) -> tuple[PartAnswer, ...]:
         """The endpoints that are not allowed, of those the question is about."""
         return tuple(each for each in self.parts if each.part and not each.decision.outcome.ok)

@@ -217,6 +217,20 @@ def test_a_vendor_that_was_never_measured_is_marked(whole: Path) -> None:
         assert answer(*who, "--vendor", vendor)["documented_only"] is marked
 
 
+def test_faults_of_files_are_not_marked_as_documented(whole: Path, tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    shutil.copytree(whole, root, symlinks=True)
+    asked = (root, ENCLAVE, "publish", "/chatter")
+    marks = "(as documented)"
+    assert explain(*asked, "--all-vendors").ok().out.count(marks) == 2
+    (root / f"enclaves{ENCLAVE}/permissions.p7s").unlink()
+    table = explain(*asked, "--all-vendors")
+    assert table.status == 1 and table.out.count("permissions.p7s: missing") == 6
+    assert marks not in table.out
+    one = explain(*asked, "--vendor", "opendds")
+    assert one.status == 1 and "on OpenDDS (as asked)" in one.out
+
+
 def test_json_of_one_answer(whole: Path) -> None:
     told = answer(whole, ENCLAVE, "publish", "/chatter", "--policy", POLICY, "--domain", "0")
     assert {
