@@ -234,6 +234,11 @@ def test_demo_refuses_a_place_before_it_runs(option: str, tmp_path: Path) -> Non
     with_folder = sros(*words, option, tmp_path)
     check_refused(with_folder, "It is a folder.")
     check_refused(sros(*words, option, ""), "the path is empty")
+    (tmp_path / "mine").write_text("precious")
+    check_refused(sros(*words, option, tmp_path / "mine"), "already exists")
+    assert (tmp_path / "mine").read_text() == "precious"
+    for_all = [*words, "--force", option, tmp_path / "mine"]
+    assert "already exists" not in sros(*for_all).err
 
 
 def test_view_refuses_a_place_that_is_not_there(keystore: Path, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from sros_tool.cli.common import PATH, complete_template, json_option, now, print_json
+from sros_tool.cli.policy import check_output, force_option
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
@@ -119,6 +120,7 @@ reason), 1 if not.""",
     metavar="FILE.html",
     help="Write all of it as one page, with the plots of what security costs.",
 )
+@force_option
 @json_option
 def demo(
     backend: str,
@@ -134,6 +136,7 @@ def demo(
     summary: Path | None,
     plot: Path | None,
     report: Path | None,
+    force: bool,
     as_json: bool,
 ) -> None:
     """Show on a real DDS that nobody hears secured nodes, or gets in, without permission.
@@ -163,7 +166,8 @@ def demo(
         keep=keep,
     )
     for path in (summary, plot, report):
-        _check_place(path)
+        if path is not None:  # before the demo has run, and not after it
+            check_output(path, force=force)
     if keep is not None and keep.exists() and not keep.is_dir():
         raise UsageError(f"cannot keep anything in '{keep}'", "It is a file.", "Name a folder.")
     if plot is not None and not any(scenario.measured for scenario in options.scenarios):
@@ -190,16 +194,6 @@ def demo(
         click.echo(demo_table(result))
     if not result.as_expected:
         sys.exit(1)
-
-
-def _check_place(path: Path | None) -> None:
-    """Refuse a file that could not be written before the demo has run, and not after it."""
-    if path is not None and not path.absolute().parent.is_dir():
-        raise UsageError(
-            f"cannot write '{path}'", "Its folder does not exist.", "Make the folder first."
-        )
-    if path is not None and path.is_dir():
-        raise UsageError(f"cannot write '{path}'", "It is a folder.", "Name a file.")
 
 
 def _list(scenarios: Sequence[Scenario], as_json: bool) -> None:

@@ -52,12 +52,17 @@ def notes_json(notes: Sequence[Note]) -> list[dict[str, str]]:
 
 
 def check_output(output: Path, *, force: bool) -> None:
-    """Refuse a file that exists, unless it may be replaced."""
+    """Refuse a file that exists, unless it may be replaced, and what cannot be written.
+
+    A device or a pipe is written to, and needs no permission to be replaced.
+    """
     if not output.absolute().parent.is_dir():
         raise UsageError(
             f"cannot write '{output}'", "Its folder does not exist.", "Make the folder first."
         )
-    if output.exists() and not force:
+    if output.is_dir():
+        raise UsageError(f"cannot write '{output}'", "It is a folder.", "Name a file.")
+    if output.is_file() and not force:
         raise UsageError(f"'{output}' already exists", "", "Name another file, or add --force.")
 
 
