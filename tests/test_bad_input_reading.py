@@ -280,8 +280,9 @@ TOMLS = {
 
 @pytest.mark.parametrize("verb", ["demo --scenario", "demo --template", "view {} --template"])
 @pytest.mark.parametrize("case", TOMLS)
-def test_toml(verb: str, case: str, keystore: Path, tmp_path: Path) -> None:
+def test_toml(verb: str, case: str, tmp_path: Path) -> None:
     text, why = TOMLS[case]
     (tmp_path / "hostile.toml").write_text(text)
-    words = verb.format(keystore).split()
+    (tmp_path / "policy.xml").write_text(POLICY)
+    words = verb.format(tmp_path / "policy.xml").split()
     check_refused(sros(*words, tmp_path / "hostile.toml"), why)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from sros_tool.checks.kind import Finding as Checked
+    from sros_tool.report.compose import Source
     from sros_tool.report.picture import Finding, Picture
 
 FORMATS = ("html", "svg", "dot", "mermaid", "json")
@@ -154,6 +155,7 @@ def _picture(
         )
     read = [added(read_source(path, now=moment), path, _checked(path, moment)) for path in sources]
     if template:
+        _check_no_governance(sources, read)
         governance = template_governance(template)
         read = [each if each.governance else replace(each, governance=governance) for each in read]
     context = Context(common_rights(), _hosts(hosts))
@@ -170,6 +172,18 @@ def _picture(
     # Drift is told from the policy, whichever was named first.
     first, second = sorted(read, key=lambda each: each.origin.kind != "policy")
     return overlay(first, second, "drift", context)
+
+
+def _check_no_governance(sources: tuple[Path, ...], read: list[Source]) -> None:
+    """Refuse a template where a source has been signed with a governance, which would hold."""
+    for path, each in zip(sources, read, strict=True):
+        if each.origin.kind in ("keystore", "enclave"):
+            raise UsageError(
+                f"--template does not fit '{path}'",
+                f"It is {'an' if each.origin.kind == 'enclave' else 'a'} {each.origin.kind}, which "
+                "is drawn with its own governance; a template is for policies, which have none.",
+                "Leave --template out, or name the policy alone.",
+            )
 
 
 def _checked(path: Path, moment: datetime) -> list[Finding]:

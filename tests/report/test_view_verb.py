@@ -95,6 +95,26 @@ def test_a_keystore_tells_validity_protection_and_findings(robot_keystore: Path)
     assert not camera["problems"]
 
 
+@pytest.mark.parametrize("kind", ["a keystore", "an enclave", "drift", "use"])
+def test_a_template_is_refused_where_a_governance_holds(
+    robot_keystore: Path, tmp_path: Path, kind: str
+) -> None:
+    signed = robot_keystore
+    if kind == "an enclave":
+        signed = robot_keystore / "enclaves/mobile_robot/base"
+    words = {"drift": (MOBILE_ROBOT, signed), "use": (signed, "--observed", MOBILE_ROBOT)}
+    asked = words.get(kind, (signed,))
+    out = tmp_path / "out.json"
+    sros("view", *asked, "-o", out).ok()
+    out.unlink()
+    refused = sros("view", *asked, "--template", "production", "-o", out)
+    assert (refused.status, refused.out, out.exists()) == (2, "", False)
+    article = kind if kind.startswith("an ") else "a keystore"
+    assert f"--template does not fit '{signed}'" in refused.err
+    assert f"It is {article}, which is drawn with its own governance" in refused.err
+    assert "Leave --template out" in refused.err
+
+
 def test_a_template_protects_policies(tmp_path: Path) -> None:
     policy = write(tmp_path, "robot.xml", "/x")
     assert value(policy)["names"][0]["protection"]["level"] == "unknown"
