@@ -79,9 +79,17 @@ def test_every_attack_ends_as_expected(shown: tuple[dict[str, Any], int, Path]) 
 @needs_isolation
 @pytest.mark.parametrize("name", WEAKNESSES)
 def test_a_weakness_makes_its_rows_fail_and_no_others(name: str, tmp_path: Path) -> None:
-    """Of all rows, but for those that take a defence away from keystores of their own."""
+    """Of the rows that keep their defences: all that must fail, and of the others every second.
+
+    One weakness tries the even ones and the next the odd; with ``SROS_ALL_ROWS`` each tries all.
+    """
     weakness = WEAKNESSES[name]
-    tried = [row.name for row in ATTACKS.rows if not row.removed]
+    turn = list(WEAKNESSES).index(name) % 2
+    tried = [
+        row.name
+        for number, row in enumerate(row for row in ATTACKS.rows if not row.removed)
+        if number % 2 == turn or row.name in weakness.broken or "SROS_ALL_ROWS" in os.environ
+    ]
     root = make_weak(tmp_path, weakness, datetime.now(UTC))
     before = snapshot(root)
     words = [word for row in tried for word in ("--only", row)]

@@ -51,7 +51,6 @@ def vendor(request: pytest.FixtureRequest) -> str:
     [
         # Whether there is a list already decides whether Fast DDS asks for one of every CA.
         (Stage.DISTRIBUTE, "production", False),
-        (Stage.REISSUE, "production", False),
         (Stage.REISSUE, "production", True),
         (Stage.REISSUE, "sros2", True),
     ],
