@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import replace
 
 import click
 
@@ -40,7 +39,7 @@ def doctor(as_json: bool) -> None:
     from sros_tool.demo.doctor import diagnosis_text, examine
 
     moment = now()
-    diagnosis = examine(os.environ, moment)
+    diagnosis = examine(moment)
     insecure = {
         stack.rmw: stack.evidence
         for stack in diagnosis.stacks
@@ -51,7 +50,7 @@ def doctor(as_json: bool) -> None:
         shown = [each.as_json() for each in findings]
         print_json({**diagnosis.as_json(), "findings": shown})
     else:
-        click.echo(diagnosis_text(replace(diagnosis, warnings=())))
+        click.echo(diagnosis_text(diagnosis))
         for each in findings:
             if each.severity >= WARNING:
                 click.echo("\n".join(("", *finding_lines(each))))

@@ -1,8 +1,8 @@
-"""Examine this machine: which DDS stacks are here, which enforce security, what is misspelt."""
+"""Examine this machine: which DDS stacks are here, and which of them enforce security."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -15,7 +15,6 @@ from sros_tool.demo.scenarios.isolation import ISOLATION
 from sros_tool.demo.scenery import Setting, build_scenery
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.cyclone_library import INSTALL_ADVICE
-from sros_tool.runtime.rcl_security import spelling_warnings
 from sros_tool.runtime.stacks import ROS_ADVICE, Stack, survey
 
 _PROBE_DOMAIN = 80
@@ -24,10 +23,9 @@ _TEMPLATE = "production"
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found; ``warnings`` are about the environment variables."""
+    """What was found."""
 
     stacks: tuple[Stack, ...]
-    warnings: tuple[str, ...]
 
     @property
     def enforces(self) -> bool:
@@ -44,12 +42,11 @@ class Diagnosis:
         return {
             "enforces": self.enforces,
             "stacks": [vars(stack) for stack in self.stacks],
-            "warnings": list(self.warnings),
             "advice": self.advice,
         }
 
 
-def examine(environment: Mapping[str, str], now: datetime) -> Diagnosis:
+def examine(now: datetime) -> Diagnosis:
     """Try every stack in an enclave made for the purpose, and leave nothing behind."""
     with TemporaryDirectory(prefix="sros-doctor-") as folder:
         domains = DomainSet.of((_PROBE_DOMAIN, _PROBE_DOMAIN))
@@ -57,7 +54,7 @@ def examine(environment: Mapping[str, str], now: datetime) -> Diagnosis:
         setting = Setting(DEFAULT_TOPIC, domains, template, now)
         scenery = build_scenery(Path(folder), ISOLATION, setting)
         stacks = survey(scenery.probe(DEFAULT_TOPIC, _PROBE_DOMAIN))
-    return Diagnosis(stacks, spelling_warnings(environment))
+    return Diagnosis(stacks)
 
 
 def diagnosis_text(diagnosis: Diagnosis) -> str:
@@ -68,12 +65,12 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
         identity = f"{stack.dds} {stack.version}".strip() if stack.present else ""
         lines.append(f"{stack.name:<{width}}  {_answer(stack):<19}  {identity}".rstrip())
         lines += _indented([stack.evidence, stack.where, stack.advice])
-    lines += ["", *(f"warning: {warning}" for warning in diagnosis.warnings)]
-    lines.append(
+    lines += [
+        "",
         "DDS Security can be enforced here."
         if diagnosis.enforces
-        else f"Nothing here enforces DDS Security. {diagnosis.advice}"
-    )
+        else f"Nothing here enforces DDS Security. {diagnosis.advice}",
+    ]
     return "\n".join(lines)
 
 

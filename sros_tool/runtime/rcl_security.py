@@ -1,7 +1,7 @@
 """Which enclave a process would load, by exactly the rules of ROS 2's rcl (rcl/src/rcl/security.c).
 
 The rules are unforgiving: anything but ``true`` switches security off, anything but ``Enforce``
-lets a process go on unsecured.  `spelling_warnings` finds the values that someone meant otherwise.
+lets a process go on unsecured.
 """
 
 from __future__ import annotations
@@ -65,26 +65,3 @@ def choose_loadable(environment: Mapping[str, str], enclave: str = "/") -> Secur
 def domain_of(environment: Mapping[str, str]) -> int:
     """The domain that ROS_DOMAIN_ID names, 0 where it is not set.  Raises `SrosError`."""
     return domain_from(environment) or 0
-
-
-def spelling_warnings(environment: Mapping[str, str]) -> tuple[str, ...]:
-    """What in this environment leaves processes unsecured although security seems wanted."""
-    warnings = []
-    enable = environment.get(ENABLE)
-    if enable is not None and enable not in ("true", "", "false"):
-        warnings.append(
-            f"{ENABLE} is {enable!r}: only exactly 'true' switches security on, so every node"
-            " started here runs unsecured and says nothing about it."
-        )
-    strategy = environment.get(STRATEGY)
-    if enable == "true" and strategy != "Enforce":
-        shown = "not set" if strategy is None else repr(strategy)
-        warnings.append(
-            f"{STRATEGY} is {shown}: unless it is exactly 'Enforce', a node whose enclave or one"
-            " of whose files is missing runs unsecured."
-        )
-    elif strategy is not None and strategy not in ("Enforce", "Permissive", ""):
-        warnings.append(f"{STRATEGY} is {strategy!r}: only exactly 'Enforce' enforces.")
-    if enable == "true" and not environment.get(KEYSTORE):
-        warnings.append(f"{ENABLE} is 'true' but {KEYSTORE} is not set: no enclave is found.")
-    return tuple(warnings)

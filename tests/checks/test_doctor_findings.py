@@ -20,7 +20,7 @@ CYCLONE = Stack("Cyclone DDS", "cyclone", "Cyclone DDS", "0.10", "", True, True,
 
 @pytest.mark.parametrize("as_json", [False, True])
 def test_findings(as_json: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "examine", lambda *_: Diagnosis((RMW, CYCLONE), ()))
+    monkeypatch.setattr(doctor, "examine", lambda *_: Diagnosis((RMW, CYCLONE)))
     env = {
         "ROS_SECURITY_ENABLE": "true",
         "ROS_SECURITY_STRATEGY": "Enforce",
@@ -47,5 +47,5 @@ def test_findings(as_json: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_status_0_where_nothing_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "examine", lambda *_: Diagnosis((RMW, CYCLONE), ()))
+    monkeypatch.setattr(doctor, "examine", lambda *_: Diagnosis((RMW, CYCLONE)))
     assert sros("doctor", env={}).ok().out.endswith("DDS Security can be enforced here.\n")

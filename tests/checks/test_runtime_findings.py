@@ -20,6 +20,11 @@ from sros_tool.checks.runtimes.setting import Setting, running_processes
 
 pytest_plugins = ["sound_keystore"]
 
+SPELLING = {
+    *("enable-misspelt", "strategy-misspelt", "not-enforced", "not-enabled", "keystore-unset"),
+    "variable-misspelt",
+}
+
 
 def ids(setting: Setting) -> set[str]:
     return {each.id for each in runtime_findings(setting)}
@@ -121,3 +126,22 @@ def test_real_processes_are_read() -> None:
     finally:
         child.kill()
         child.wait()
+
+
+@pytest.mark.parametrize(
+    ("variables", "told"),
+    [
+        ({}, set()),
+        ({"ENABLE": "false"}, set()),
+        ({"ENABLE": "True"}, {"enable-misspelt"}),
+        ({"ENABLE": "1", "STRATEGY": "Enforce"}, {"enable-misspelt"}),
+        ({"ENABLE": "true", "STRATEGY": "enforce"}, {"strategy-misspelt", "keystore-unset"}),
+        ({"ENABLE": "true"}, {"not-enforced", "keystore-unset"}),
+        ({"ENABLE": "true", "STRATEGY": "Enforce"}, {"keystore-unset"}),
+        ({"STRATEGY": "ENFORCE"}, {"strategy-misspelt", "not-enabled"}),
+    ],
+)
+def test_spelling(variables: dict[str, str], told: set[str]) -> None:
+    named = {f"ROS_SECURITY_{name}": value for name, value in variables.items()}
+    found = {each.removeprefix("runtime.") for each in ids(Setting(named, datetime.now(UTC)))}
+    assert found & SPELLING == told

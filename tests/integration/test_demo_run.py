@@ -214,7 +214,7 @@ def test_doctor_finds_what_enforces(tmp_path: Path) -> None:
     stacks = {stack["kind"]: stack for stack in found["stacks"]}
     assert stacks["cyclone"]["enforces"] is True
     assert process.returncode == 1, "a misspelt variable switches security off"
-    assert "'True'" in found["warnings"][0]
+    assert "runtime.enable-misspelt" in {each["id"] for each in found["findings"]}
     assert list(tmp_path.iterdir()) == []
 
 

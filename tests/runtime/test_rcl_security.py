@@ -12,7 +12,6 @@ from sros_tool.runtime.rcl_security import (
     choose_enclave,
     choose_loadable,
     domain_of,
-    spelling_warnings,
 )
 
 
@@ -88,25 +87,3 @@ def test_domains() -> None:
     for wrong in ("231", "-1", "x", " 7 "):
         with pytest.raises(SrosError):
             domain_of({"ROS_DOMAIN_ID": wrong})
-
-
-@pytest.mark.parametrize(
-    ("variables", "told"),
-    [
-        ({}, []),
-        ({"ENABLE": "true", "STRATEGY": "Enforce", "KEYSTORE": "/k"}, []),
-        ({"ENABLE": "false"}, []),
-        ({"ENABLE": "True"}, ["'True'"]),
-        ({"ENABLE": "1", "STRATEGY": "Enforce"}, ["'1'"]),
-        ({"ENABLE": "true", "STRATEGY": "enforce", "KEYSTORE": "/k"}, ["'enforce'"]),
-        ({"ENABLE": "true", "KEYSTORE": "/k"}, ["STRATEGY is not set"]),
-        ({"ENABLE": "true", "STRATEGY": "Enforce"}, ["KEYSTORE is not set"]),
-        ({"STRATEGY": "ENFORCE"}, ["'ENFORCE'"]),
-    ],
-)
-def test_warnings(variables: dict[str, str], told: list[str]) -> None:
-    named = {f"ROS_SECURITY_{name}": value for name, value in variables.items()}
-    warnings = spelling_warnings(named)
-    assert len(warnings) == len(told)
-    for warning, part in zip(warnings, told, strict=True):
-        assert part in warning
