@@ -1,4 +1,4 @@
-"""README's floors hold: who imports whom, where rclpy may be, and how long a module is."""
+"""README's floors hold: who imports whom, and where rclpy may be."""
 
 import ast
 import re
@@ -24,10 +24,6 @@ FLOOR_OF = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
 # Where a process of its own runs the nodes of rclpy. Nothing else may need ROS.
 ROS_ROOMS = {"graph", "demo"}
 ROS_MODULES = {"runtime/probe_child.py"}
-
-LONGEST = 300
-# Each a single thing that does not part well: a file format, and the prototypes of a C library.
-LONGER = {"keystore/template.py": 310, "runtime/cyclone_library.py": 330}
 
 
 def imported(source: str, module: tuple[str, ...]) -> Iterator[tuple[int, str]]:
@@ -137,16 +133,6 @@ def test_the_modules_that_may_need_ros_are_the_ones_that_do() -> None:
     }
     assert not ROS_MODULES - users
     assert {Path(module).parts[0] for module in users - ROS_MODULES} == ROS_ROOMS
-
-
-def test_a_module_is_as_long_as_one_thing() -> None:
-    lengths = {module: len((PACKAGE / module).read_text().splitlines()) for module in MODULES}
-    assert [
-        f"{module}: {length} lines"
-        for module, length in lengths.items()
-        if length > LONGER.get(module, LONGEST)
-    ] == []
-    assert [module for module in LONGER if lengths[module] <= LONGEST] == []
 
 
 def test_the_readme_tells_the_same_floors() -> None:
