@@ -19,6 +19,19 @@ MAX_COMMON_NAME = 64
 ROS_DISCOVERY_TOPIC = "ros_discovery_info"
 """The DDS topic by which every ROS 2 participant announces its nodes (rmw_dds_common)."""
 
+PARAMETER_SERVICES = (
+    "describe_parameters",
+    "get_parameter_types",
+    "get_parameters",
+    "list_parameters",
+    "set_parameters",
+    "set_parameters_atomically",
+)
+"""The services that a node offers for its parameters, as ``~/NAME`` (rclcpp, rclpy)."""
+
+NODE_SERVICES = (*PARAMETER_SERVICES, "get_type_description")
+"""All services that a node of ROS 2 Jazzy offers under its own name, as ``~/NAME``."""
+
 # By far the most names need no closer look: relative, private or absolute, without wildcards.
 _PLAIN = re.compile(r"(?:~?/)?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")

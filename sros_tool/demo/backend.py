@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sros_tool.demo.model import Condition, Role
+from sros_tool.demo.node_names import naming_arguments
 from sros_tool.errors import UnavailableError
 from sros_tool.runtime.cyclone_library import INSTALL_ADVICE
 from sros_tool.runtime.security_log import CYCLONE_EXPLAINS
@@ -65,11 +66,17 @@ class Backend:
             return RCLPY
         return self.dds
 
-    def command(self, role: Role, *, secured: bool = False) -> list[str]:
-        """The program of a node, without its options."""
+    def command(
+        self, role: Role, options: Sequence[str], names: Sequence[str], *, secured: bool = False
+    ) -> list[str]:
+        """Return the command line of a process of that role.
+
+        ``names`` are the absolute ones of its ROS nodes, as `node_names` has them.
+        """
         if self.library(role, secured=secured) == RCLPY:
-            return _module(f"sros_tool.demo.{role.value}")
-        return [*_module("sros_tool.demo.cyclone_node"), role.value]
+            program = _module(f"sros_tool.demo.{role.value}")
+            return [*program, *options, *naming_arguments(role, names)]
+        return [*_module("sros_tool.demo.cyclone_node"), role.value, *options]
 
     def environment(
         self, role: Role, *, wire: bool = False, denied: bool = False, secured: bool = False

@@ -105,12 +105,17 @@ class Bench:
         authority = self.authorities(root).permissions
         return smime.sign(document, authority.certificate, authority.key)
 
-    def reissue(self, part: str, validity: Window, *, new_key: bool = False) -> None:
-        """Give an enclave another certificate for the same subject, and perhaps a new key."""
-        old = self.certificate(part)
+    def reissue(
+        self, part: str, validity: Window, *, new_key: bool = False, subject_of: str = ""
+    ) -> None:
+        """Give an enclave another certificate, and perhaps a new key.
+
+        Its subject stays, or becomes that of the part ``subject_of``.
+        """
+        subject = self.certificate(subject_of or part).subject
         key = generate_key() if new_key else self.key(part)
         issuer = self.authorities().identity.issuer()
-        self.put(part, CERTIFICATE, pem(issuer.issue(old.subject, key.public_key(), validity)))
+        self.put(part, CERTIFICATE, pem(issuer.issue(subject, key.public_key(), validity)))
         if new_key:
             self.put(part, KEY, key_pem(key))
 

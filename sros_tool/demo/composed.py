@@ -23,9 +23,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def build(node: Any, events: EventWriter) -> list[Any]:
         import rclpy
 
-        listener, server = rclpy.create_node("listener"), rclpy.create_node("server")
+        # Each node gets its endpoint before the next one is made: what is denied first is told.
         talk(node, options, events)
+        listener = rclpy.create_node("listener")
         listen(listener, options, events)
+        server = rclpy.create_node("server")
         serve(server, options, events)
         return [listener, server]
 

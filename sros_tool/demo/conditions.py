@@ -10,6 +10,10 @@ from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.policy.patterns import matches
 from sros_tool.translate import governance_for
 
+_SIGNERS_CHECKED = ((2, 1, 4), (2, 6, 5), (2, 8, 2), (2, 9, 2))
+"""The first release of each older line of Fast DDS that takes no signer but those in the file of
+the permissions CA (CVE-2023-24010); all do from 2.10 on.  From the tags of its repository."""
+
 _ENCRYPTING = (Protection.ENCRYPT, Protection.ENCRYPT_WITH_ORIGIN_AUTHENTICATION)
 
 
@@ -34,6 +38,18 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
         Condition.STRANGERS_SEE: strangers and not rule.enable_discovery_protection,
         Condition.UNCONTROLLED: uncontrolled,
         Condition.OPEN_JOIN: not domain.enable_join_access_control,
+        Condition.EXACT_SIGNER: backend.vendor is Condition.FAST and _checks_signers(backend.dds),
     }
     vendor = {backend.vendor} if backend.vendor else set()
     return frozenset(name for name, holds in found.items() if holds) | vendor
+
+
+def _checks_signers(dds: str) -> bool:
+    """Return whether that Fast DDS, as in ``Fast DDS 2.14.5``, knows its signers exactly.
+
+    One whose version is not known is taken for a recent one.
+    """
+    version = tuple(int(part) for part in dds.rpartition(" ")[2].split(".") if part.isdigit())
+    if len(version) < 3 or version >= (2, 10):
+        return True
+    return any(version[:2] == first[:2] and version >= first for first in _SIGNERS_CHECKED)

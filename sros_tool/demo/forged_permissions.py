@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from datetime import timedelta
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions, render_permissions
@@ -19,6 +20,9 @@ from sros_tool.errors import DocumentError
 from sros_tool.keystore.renew import renew
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import pem
+from sros_tool.validity import Window
+
+_DAY = timedelta(days=1)
 
 
 def _wanted(bench: Bench) -> bytes:
@@ -73,18 +77,36 @@ def signed_by_itself(bench: Bench) -> None:
     bench.put("guest", PERMISSIONS, signed)
 
 
-def signed_by_itself_and_trusting_the_identity_ca(bench: Bench) -> None:
-    """Its own DDS then has nothing against it; its peers decide."""
+def signed_by_itself_and_trusting_itself(bench: Bench) -> None:
+    """Its own DDS then has nothing against it; its peers decide.
+
+    Its certificate ends at the identity CA, for vendors that follow a chain, and is itself in the
+    file, for those that ask for the signer alone.
+    """
     certificate, key = bench.certificate("guest"), bench.key("guest")
     governance = bench.governance()
     signed_by_itself(bench)
     bench.put("guest", GOVERNANCE, smime.sign(governance, certificate, key))
-    bench.put("guest", PERMISSIONS_CA, bench.read("guest", IDENTITY_CA))
+    bench.put("guest", PERMISSIONS_CA, bench.read("guest", IDENTITY_CA) + pem(certificate))
+
+
+def trusted_as_signer(bench: Bench) -> None:
+    """As `signed_by_itself`, and guest and listener have its certificate among the signers."""
+    signed_by_itself(bench)
+    trusted = bench.read("guest", PERMISSIONS_CA) + pem(bench.certificate("guest"))
+    for part in ("guest", "listener"):
+        bench.put(part, PERMISSIONS_CA, trusted)
 
 
 def borrowed(bench: Bench) -> None:
     """The guest's certificate with the permissions of an enclave whose name contains its own."""
     bench.put("guest", PERMISSIONS, bench.read("admin", PERMISSIONS))
+
+
+def borrowed_with_the_subject(bench: Bench) -> None:
+    """As `borrowed`, and the CA gave both enclaves certificates of one subject."""
+    borrowed(bench)
+    bench.reissue("guest", Window(bench.now - _DAY, bench.now + _DAY), subject_of="admin")
 
 
 def signed_by_the_ca(bench: Bench) -> None:

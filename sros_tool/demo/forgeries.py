@@ -75,7 +75,7 @@ FORGERIES: Mapping[str, Forge] = {
     "permissions of another CA": permissions.signed_by_another_ca,
     "own permissions CA": permissions.own_permissions_ca,
     "signed by itself": permissions.signed_by_itself,
-    "signed by itself, own trust": permissions.signed_by_itself_and_trusting_the_identity_ca,
+    "signed by itself, own trust": permissions.signed_by_itself_and_trusting_itself,
     "borrowed": permissions.borrowed,
     "old permissions": permissions.signed_by_the_ca,
     "old permissions after renewal": permissions.old_permissions_after_renewal,
@@ -99,6 +99,8 @@ REMOVALS: Mapping[str, Removal] = {
     "client may do everything": Removal(permissions.every_topic("client")),
     "another CA trusted": Removal(permissions.trusted_by_the_listener_too),
     "one CA": Removal(permissions.signed_by_itself, _one_ca),
+    "trusted as signer": Removal(permissions.trusted_as_signer),
+    "borrowed with the subject": Removal(permissions.borrowed_with_the_subject),
     "borrowed with shared subjects": Removal(permissions.borrowed, _shared_subjects),
     "renewed with shared subjects": Removal(
         permissions.old_permissions_after_renewal, _shared_subjects

@@ -179,6 +179,7 @@ class Condition(StrEnum):
     OPEN_JOIN = "joining the domain is not controlled"
     CYCLONE = "Cyclone DDS 0.10"
     FAST = "Fast DDS"
+    EXACT_SIGNER = "only who is in the file of the permissions CA may sign (Fast DDS since 2.10)"
 
 
 @dataclass(frozen=True)
@@ -186,7 +187,8 @@ class Case:
     """Where all ``conditions`` hold, a row ends as ``expected``.
 
     ``open_because`` says why that lets an attack through ("": it does not), ``remedy`` what a user
-    can do then.  A case with ``skipped`` leaves the row out, for that reason.
+    can do then.  ``instead`` is another row that is played in place of it, for defences that a
+    vendor has in another form.
     """
 
     conditions: tuple[Condition, ...]
@@ -194,7 +196,7 @@ class Case:
     open_because: str = ""
     remedy: str = ""
     mechanism: str = ""
-    skipped: str = ""
+    instead: Row | None = None
 
 
 @dataclass(frozen=True)
@@ -224,7 +226,6 @@ class Row:
     removed: str = ""
     open_because: str = ""
     remedy: str = ""
-    skipped: str = ""
 
     @property
     def tapped(self) -> bool:
@@ -244,8 +245,8 @@ class Row:
         """The row as it must end where those conditions hold."""
         for case in self.cases:
             if conditions.issuperset(case.conditions):
-                if case.skipped:
-                    return replace(self, skipped=case.skipped, cases=())
+                if case.instead is not None:
+                    return case.instead.under(conditions)
                 claims = tuple(
                     claim.expecting(case.expected) if place == 0 else claim
                     for place, claim in enumerate(self.claims)

@@ -83,16 +83,16 @@ def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
             under = folder if len(scenarios) == 1 else folder / scenario.name
             spanned = given.domains if given else DomainSet.of((places[0], places[-1]))
             setting = Setting(topic, spanned, template, now)
-            scenery = build_scenery(under, scenario, setting, given)
-            tell(
-                f"{scenario.name}: running {len(scenario.rows)} rows on {backend.name}"
-                f" ({backend.dds}): {backend.why}"
-            )
             rows = tuple(
                 row.under(conditions(backend, template, _dds_topic(row, topic)))
                 for row in scenario.rows
             )
             scenario = replace(scenario, rows=rows)
+            scenery = build_scenery(under, scenario, setting, given)
+            tell(
+                f"{scenario.name}: running {len(scenario.rows)} rows on {backend.name}"
+                f" ({backend.dds}): {backend.why}"
+            )
             plan = Plan(
                 rows=scenario.rows,
                 domains=places,

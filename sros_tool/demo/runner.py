@@ -114,7 +114,7 @@ class _Stage:
         handshake = any(claim.wire is not Wire.TEXT for claim in row.claims)
         if (handshake or row.replay or row.forge) and not self._plan.own_networks:
             return "it needs a network namespace of its own"
-        return row.skipped or self._plan.scenery.problem(each.identity for each in row.parties)
+        return self._plan.scenery.problem(row, self._plan.topic)
 
     async def _play(self, index: int) -> RowRecord:
         row, domain = self._plan.rows[index], self._plan.domains[index]
@@ -186,7 +186,8 @@ class _Stage:
             secured=secured,
         )
         environment |= plan.scenery.environment(party.identity, domain)
-        command = [*backend.command(party.role, secured=secured), *options]
+        names = plan.scenery.node_names(party)
+        command = backend.command(party.role, options, names, secured=secured)
         return PartyProcess(
             party.name,
             command,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -11,14 +11,24 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.bench import Bench, copy_keystore
 from sros_tool.demo.forgeries import FORGERIES, REMOVALS
 from sros_tool.demo.given import GivenKeystore
-from sros_tool.demo.model import FOREIGN, OWN, Identity, Party, Scenario
+from sros_tool.demo.granted import enclave_grant, may
+from sros_tool.demo.model import FOREIGN, OWN, Identity, Party, Role, Row, Scenario, Status
+from sros_tool.demo.node_names import node_names
 from sros_tool.demo.policies import DENIED_TOPIC, SERVICE
 from sros_tool.errors import SrosError
 from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.keyring import IN_KEYSTORE
 from sros_tool.keystore.template import Template
+from sros_tool.names import dds_names
 from sros_tool.runtime.environment import DOMAIN, secured_environment
 from sros_tool.runtime.stacks import ProbeEnclave
+
+_RIGHTS = {
+    Role.TALKER: "publish",
+    Role.LISTENER: "subscribe",
+    Role.SERVER: "reply",
+    Role.CLIENT: "request",
+}
 
 PROBED = "talker"
 """The part whose enclave is used to find out whether a DDS enforces security."""
@@ -30,7 +40,8 @@ class Scenery:
 
     ``missing`` has the reason for which a keystore could not be made; ``casts`` the parts of
     those keystores that have other enclaves than the rest; ``services`` the name of the service
-    in the keystores in which it has another one.
+    in the keystores in which it has another one.  ``guessed`` says that its own keystore is the
+    user's, whose enclaves were given the parts that their rights fit best.
     """
 
     keystores: Mapping[str, Path]
@@ -38,6 +49,7 @@ class Scenery:
     missing: Mapping[str, str] = field(default_factory=dict)
     casts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     services: Mapping[str, str] = field(default_factory=dict)
+    guessed: bool = False
 
     def topic(self, party: Party, topic: str) -> str:
         """The ROS name that a party speaks on, where the topic of the demo is ``topic``."""
@@ -59,20 +71,51 @@ class Scenery:
         secured = secured_environment(root, self.enclave(identity), domain)
         return secured | dict(identity.variables)
 
+    def node_names(self, party: Party) -> tuple[str, ...]:
+        """Return the absolute names of a party's ROS nodes: those that its enclave allows."""
+        identity = party.identity
+        grant = None
+        if identity.keystore:
+            grant = enclave_grant(self.keystores[identity.keystore], self.enclave(identity))
+        return node_names(party.role, grant)
+
     def probe(self, topic: str, domain: int) -> ProbeEnclave:
         """What to ask a DDS in order to find out whether it enforces security."""
         environment = self.environment(Identity(OWN, PROBED), domain)
         return ProbeEnclave(environment, topic, DENIED_TOPIC)
 
-    def problem(self, identities: Iterable[Identity]) -> str:
-        """Why a party with one of these identities cannot take part, or ""."""
-        for identity in identities:
+    def problem(self, row: Row, topic: str) -> str:
+        """Why a row cannot be played on the ROS topic ``topic``, or ""."""
+        for party in row.parties:
+            identity = party.identity
             part = identity.enclave
             if part and not part.startswith("/") and part not in self._cast(identity):
                 return f"the keystore has no enclave for the part of the {part}"
             if identity.keystore in self.missing:
                 return self.missing[identity.keystore]
+        if self.guessed and row.expected is Status.REFUSED:
+            for party in row.parties:
+                if party.intruder and party.identity.keystore == OWN:
+                    return self._granted(party, topic)
         return ""
+
+    def _granted(self, party: Party, topic: str) -> str:
+        """That a party has the very right that its row wants to be denied, or ""."""
+        right = _RIGHTS[party.role]
+        name = self.topic(party, topic)
+        grant = enclave_grant(self.keystores[OWN], self.enclave(party.identity))
+        topics = dds_names(right, name)
+        if grant is None or not all(
+            may(grant, verb, each)
+            for verb in ("publish", "subscribe")
+            for each in getattr(topics, verb)
+        ):
+            return ""
+        enclave, part = self.enclave(party.identity), party.identity.enclave
+        return (
+            f"no enclave fits the part of the {part} better than {enclave}, and its permissions"
+            f" allow to {right} {name}"
+        )
 
     def _cast(self, identity: Identity) -> Mapping[str, str]:
         return self.casts.get(identity.keystore, self.cast)
@@ -108,7 +151,9 @@ def build_scenery(
         of_its_own = {OWN, *FORGERIES}
         casts = dict.fromkeys(of_its_own, given.cast)
         services = dict.fromkeys(of_its_own, given.service or SERVICE)
-        scenery = Scenery(keystores, scenario.cast, casts=casts, services=services)
+        scenery = Scenery(
+            keystores, scenario.cast, casts=casts, services=services, guessed=given.guessed
+        )
     return _with_forgeries(scenery, folder, scenario, setting, given)
 
 

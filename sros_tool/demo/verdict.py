@@ -222,7 +222,8 @@ def _failure(name: str, record: PartyRecord, event: Event) -> Finding:
         return Finding(Status.NOT_STARTED, f"{name}: {lacking}")
     if event.stage is Stage.ENDPOINT and (refusal := _own_denial(record, event.text)):
         return _refused(name, Stage.ENDPOINT, refusal)
-    if event.stage is Stage.PARTICIPANT:
+    if event.stage in (Stage.PARTICIPANT, Stage.ENDPOINT):
+        # A ROS node has topics and services of its own: denied one of them, it does not start.
         refusal = participant_refusal(told) or endpoint_refusal(told)
         if refusal:
             return _refused(name, Stage.PARTICIPANT, refusal)

@@ -137,10 +137,15 @@ def test_backends(
     assert why in chosen.why
     if name == "rclpy":
         assert chosen.environment(Role.TALKER, wire=False) == {"RMW_IMPLEMENTATION": "rmw_x"}
-        assert chosen.command(Role.TALKER)[-1] == "sros_tool.demo.talker"
+        command = chosen.command(Role.TALKER, ["--topic", "/x"], ["/robot/mouth"])
+        module, *options = command[command.index("-m") + 1 :]
+        assert module == "sros_tool.demo.talker"
+        remapped = ["-r", "talker:__node:=mouth", "-r", "mouth:__ns:=/robot"]
+        assert options == ["--topic", "/x", "--ros-args", *remapped, "--"]
     else:
         assert chosen.environment(Role.TALKER, wire=True) == {}
-        assert chosen.command(Role.LISTENER)[-2:] == ["sros_tool.demo.cyclone_node", "listener"]
+        command = chosen.command(Role.LISTENER, ["--topic", "/x"], ["/robot/ear"])
+        assert command[-4:] == ["sros_tool.demo.cyclone_node", "listener", "--topic", "/x"]
 
 
 @pytest.mark.parametrize(

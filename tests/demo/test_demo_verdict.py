@@ -122,14 +122,14 @@ CRASHES = {
         Status.NOT_LET_IN,
         "before it came to the topic",
     ),
-    "the log of another topic": (
+    "denied a topic that every node has": (
         PartyRecord(
             topic="/chatter",
             output="[SECURITY Error] rt/rosout topic not found in allow rule.\n",
             events=(Event(Kind.FAILED, 99, "RCLError: x", stage=Stage.ENDPOINT),),
         ),
-        Status.CRASHED,
-        "RCLError",
+        Status.NOT_LET_IN,
+        "before it came to the topic",
     ),
     "a denial in the log, then a crash": (
         PartyRecord(topic="/chatter", output=FAST_DDS_DENIAL, status=-6),

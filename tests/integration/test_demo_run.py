@@ -179,9 +179,11 @@ def test_a_node_that_dies_makes_its_row_fail(victim: str, tmp_path: Path) -> Non
     row = replace(row, controls=())
 
     class Dying(Backend):
-        def command(self, role: Any, *, secured: bool = False) -> list[str]:
+        def command(
+            self, role: Any, options: Any, names: Any, *, secured: bool = False
+        ) -> list[str]:
             if role.value != victim:
-                return super().command(role)
+                return super().command(role, options, names)
             code = (
                 "import os, sys; from pathlib import Path;"
                 "from sros_tool.runtime.events import *;"
@@ -189,7 +191,7 @@ def test_a_node_that_dies_makes_its_row_fail(victim: str, tmp_path: Path) -> Non
                 "EventWriter(report).report(Kind.READY);"
                 "import time; time.sleep(0.5); os.kill(os.getpid(), 11)"
             )
-            return [sys.executable, "-c", code]
+            return [sys.executable, "-c", code, *options]
 
     (result,) = play((row,), Dying("cyclone", "x", "y"), tmp_path).values()
     assert result.observed is Status.CRASHED
@@ -245,8 +247,10 @@ def test_a_denial_as_rclpy_over_fast_dds_shows_it(tmp_path: Path) -> None:
     """The exception misleads; what Fast DDS prints on stdout, in colour, is what counts."""
 
     class FastDds(Backend):
-        def command(self, role: Any, *, secured: bool = False) -> list[str]:
-            return [sys.executable, "-c", FAST_DDS_NODE]
+        def command(
+            self, role: Any, options: Any, names: Any, *, secured: bool = False
+        ) -> list[str]:
+            return [sys.executable, "-c", FAST_DDS_NODE, *options]
 
     rows = tuple(without_security(row) for row in ROWS if row.expected is Status.REFUSED)
     results = play(rows, FastDds("rclpy", "Fast DDS", "a test"), tmp_path)

@@ -6,9 +6,8 @@ import re
 from collections.abc import Iterator
 
 from sros_tool.checks.kind import NOTE, WARNING, Finding, Kind, by_id
-from sros_tool.checks.policies.nodes import PARAMETER_SERVICES
 from sros_tool.checks.policies.stated import CheckedPolicy, Stated
-from sros_tool.names import is_expression
+from sros_tool.names import NODE_SERVICES, is_expression
 from sros_tool.policy.model import RIGHTS
 from sros_tool.policy.patterns import covers, literal_prefix, matches
 
@@ -96,7 +95,6 @@ KINDS = by_id(
 _LONGEST = 247
 _DIGIT_FIRST = re.compile(r"/(?:[0-9]|\[[0-9-]+\])")
 _DDS_PREFIX = re.compile(r"/?(?:rt|rq|rr|rs)/")
-_NODE_SERVICES = (*PARAMETER_SERVICES, "get_type_description")
 _ACTION_SERVICE = re.compile(r"/_action/(?:send_goal|cancel_goal|get_result)\Z")
 _ACTION_TOPIC = re.compile(r"/_action/(?:feedback|status)\Z")
 _GLOBAL_TOPICS = ("/rosout", "/parameter_events", "/clock", "/tf", "/tf_static", "/diagnostics")
@@ -145,7 +143,7 @@ def _belongs(each: Stated) -> str:
     """The kind that the name has everywhere, where it is another than here."""
     kind, name = each.right.kind, each.name
     if kind != "services":
-        is_service = name.rpartition("/")[2] in _NODE_SERVICES or _ACTION_SERVICE.search(name)
+        is_service = name.rpartition("/")[2] in NODE_SERVICES or _ACTION_SERVICE.search(name)
         return "services" if is_service else ""
     return "topics" if name in _GLOBAL_TOPICS or _ACTION_TOPIC.search(name) else ""
 

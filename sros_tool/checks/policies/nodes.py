@@ -6,17 +6,9 @@ from collections.abc import Iterator
 
 from sros_tool.checks.kind import ERROR, NOTE, Finding, Kind, by_id
 from sros_tool.checks.policies.stated import CheckedPolicy
-from sros_tool.names import expand
+from sros_tool.names import PARAMETER_SERVICES, expand
 from sros_tool.policy.model import Enclave, Profile
 
-PARAMETER_SERVICES = (
-    "describe_parameters",
-    "get_parameter_types",
-    "get_parameters",
-    "list_parameters",
-    "set_parameters",
-    "set_parameters_atomically",
-)
 _INCLUDE = (
     '<xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> gives all of that; '
     "`sros policies --copy` has the file."

@@ -12,12 +12,27 @@ from sros_tool.demo.model import (
 )
 from sros_tool.demo.scenarios.attacks.kinds import injection, succeeds
 
-_FAST_LOOKS_AT_THE_SIGNER = Case(
-    (Condition.FAST,),
-    Status.SKIPPED,
-    skipped="Fast DDS accepts the permissions CA itself as signer only: there is nothing to remove",
-)
+_ITSELF = "permissions signed by the enclave itself"
+_BORROWED = "permissions borrowed from a longer name"
 
+_TRUSTED_AS_SIGNER = injection(
+    "permissions signed by the enclave itself, a trusted signer",
+    Identity("trusted as signer", "guest"),
+    Status.HEARD,
+    "who stands in the file of the permissions CA may sign",
+    attack=_ITSELF,
+    removed="a file of the permissions CA that holds the CA alone",
+    victims="trusted as signer",
+)
+_SAME_SUBJECT = injection(
+    "permissions borrowed, the same subject",
+    Identity("borrowed with the subject", "guest"),
+    Status.HEARD,
+    "two certificates of one subject fit the same permissions",
+    attack=_BORROWED,
+    removed="a subject of its own",
+    victims="borrowed with the subject",
+)
 _SIGNED_WRONG = "its own DDS verifies the signature of the permissions CA"
 
 ROWS: tuple[Row, ...] = (
@@ -79,34 +94,32 @@ ROWS: tuple[Row, ...] = (
             Identity(label, "guest"),
             closed,
             mechanism,
-            attack="permissions signed by the enclave itself",
+            attack=_ITSELF,
             cases=(
+                Case((Condition.EXACT_SIGNER,), closed, mechanism=exact),
                 Case(
-                    (Condition.ONE_CA, Condition.CYCLONE),
+                    (Condition.ONE_CA,),
                     Status.HEARD,
-                    "with one CA for both jobs, Cyclone DDS 0.10 takes any enclave's certificate"
-                    " for a signer of permissions (the class of CVE-2023-24011)",
+                    "with one CA for both jobs, this DDS takes any enclave's certificate for a"
+                    " signer of permissions (the class of CVE-2023-24011)",
                     "use a keystore with separate CAs (template development or production)",
-                ),
-                Case(
-                    (Condition.ONE_CA, Condition.FAST),
-                    Status.NOT_LET_IN,
-                    mechanism="Fast DDS accepts the permissions CA itself as signer only",
                 ),
             ),
         )
-        for name, label, closed, mechanism in (
+        for name, label, closed, mechanism, exact in (
             (
-                "permissions signed by the enclave itself",
+                _ITSELF,
                 "signed by itself",
                 Status.NOT_LET_IN,
                 "the permissions CA is on nobody's certificate path: it signs documents only",
+                "Fast DDS takes no signer but the permissions CA itself",
             ),
             (
                 "permissions and governance signed by itself",
                 "signed by itself, own trust",
                 Status.NOT_HEARD,
                 "its own DDS is made to agree; its peers verify with the permissions CA",
+                "its own DDS is made to agree; its peers take no signer but the permissions CA",
             ),
         )
     ),
@@ -115,18 +128,23 @@ ROWS: tuple[Row, ...] = (
         Identity("one CA", "guest"),
         Status.HEARD,
         "Cyclone DDS 0.10 accepts every signer whose certificate comes from the CA",
-        attack="permissions signed by the enclave itself",
+        attack=_ITSELF,
         removed="a permissions CA of its own",
         victims="one CA",
-        cases=(_FAST_LOOKS_AT_THE_SIGNER,),
+        cases=(Case((Condition.EXACT_SIGNER,), Status.HEARD, instead=_TRUSTED_AS_SIGNER),),
     ),
     injection(
-        "permissions borrowed from a longer name",
+        _BORROWED,
         Identity("borrowed", "guest"),
         Status.NOT_LET_IN,
         "each subject has a part that no other has",
-        attack="permissions borrowed from a longer name",
+        attack=_BORROWED,
         cases=(
+            Case(
+                (Condition.FAST,),
+                Status.NOT_LET_IN,
+                mechanism="Fast DDS compares whole subjects, and no two of them are the same",
+            ),
             Case(
                 (Condition.SHARED_SUBJECTS, Condition.CYCLONE),
                 Status.HEARD,
@@ -140,16 +158,10 @@ ROWS: tuple[Row, ...] = (
         Identity("borrowed with shared subjects", "guest"),
         Status.HEARD,
         "Cyclone DDS compares parts of names, so those of /guest/admin fit /guest",
-        attack="permissions borrowed from a longer name",
+        attack=_BORROWED,
         removed="unique subjects",
         victims="borrowed with shared subjects",
-        cases=(
-            Case(
-                (Condition.FAST,),
-                Status.SKIPPED,
-                skipped="Fast DDS compares whole subjects: there is nothing to remove",
-            ),
-        ),
+        cases=(Case((Condition.FAST,), Status.HEARD, instead=_SAME_SUBJECT),),
     ),
     injection(
         "old permissions put back",
