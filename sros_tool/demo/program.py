@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
-from sros_tool.demo.backend import AUTO, CYCLONE, Backend, choose_backend
+from sros_tool.demo.backend import AUTO, CYCLONE, RCLPY, Backend, choose_backend
 from sros_tool.demo.conditions import conditions
 from sros_tool.demo.cost import UNSECURED, CostResult, Effort, measure_cost
 from sros_tool.demo.given import GivenKeystore, open_given
@@ -115,7 +115,8 @@ def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
                 )
             elif scenario.measured:
                 tell("the cost of security is not measured: that needs --backend cyclone")
-            results.append(ScenarioResult(scenario.name, scenario.title, tuple(shown), cost))
+            cast = scenery.members(scenario.rows, on_ros=backend.name == RCLPY) if given else ()
+            results.append(ScenarioResult(scenario.name, scenario.title, tuple(shown), cost, cast))
         result = DemoResult(backend, topic, isolation, template.name, tuple(results))
         if options.keep is not None:
             text = json.dumps(result.as_json(), indent=2) + "\n"

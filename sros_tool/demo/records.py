@@ -72,6 +72,19 @@ class RowRecord:
 
 
 @dataclass(frozen=True)
+class CastMember:
+    """Who plays a part in a keystore of the user's: an enclave, and its ROS nodes on rclpy."""
+
+    part: str
+    enclave: str
+    nodes: tuple[str, ...] = ()
+
+    def as_json(self) -> dict[str, Any]:
+        """The member as `sros demo --json` shows it."""
+        return {"part": self.part, "enclave": self.enclave, "nodes": list(self.nodes)}
+
+
+@dataclass(frozen=True)
 class Finding:
     """What was observed about one claim, and in a clause why one may believe it."""
 

@@ -6,7 +6,7 @@
 - ``template``: the keystore template, whose expectations hold; ``topic``: the topic of the demo;
 - ``own_network``, ``network_reason``: whether it ran in a network namespace, and if not, why;
 - ``as_expected``: whether the exit status is 0;
-- ``scenarios``: a list of ``{"name", "title", "as_expected", "rows", "cost"}``;
+- ``scenarios``: a list of ``{"name", "title", "as_expected", "cast", "rows", "cost"}``;
 - ``rows``: the rows of all scenarios, in order, each with its ``scenario``.
 
 A row has ``name``, ``expected``, ``observed`` (statuses of `sros_tool.demo.model.Status`),
@@ -15,6 +15,10 @@ counted), ``domain``, ``seconds`` (how long the window was), and for attacks ``a
 one; "" elsewhere), ``defence_removed`` ("" for the attack itself; otherwise the row shows that
 the attack works without the defence named here), ``open_because`` ("" for a closed door;
 otherwise why it is known to be open) and ``remedy``.
+
+``cast`` says who plays which part in a keystore of the user's (empty without ``--keystore``): a
+list of ``{"part", "enclave", "nodes"}``; ``nodes`` are the absolute names of the ROS nodes that
+ran in the enclave, empty where none did.
 
 ``cost`` is null, or what `sros_tool.demo.cost.CostResult.as_json` describes.
 """
@@ -26,7 +30,7 @@ from typing import Any
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.cost import CostResult
-from sros_tool.demo.records import RowResult
+from sros_tool.demo.records import CastMember, RowResult
 from sros_tool.runtime.netns import Isolation
 
 
@@ -38,6 +42,7 @@ class ScenarioResult:
     title: str
     rows: tuple[RowResult, ...]
     cost: CostResult | None = None
+    cast: tuple[CastMember, ...] = ()
 
     @property
     def as_expected(self) -> bool:
@@ -50,6 +55,7 @@ class ScenarioResult:
             "name": self.name,
             "title": self.title,
             "as_expected": self.as_expected,
+            "cast": [member.as_json() for member in self.cast],
             "rows": [{**row.as_json(), "scenario": self.name} for row in self.rows],
             "cost": self.cost.as_json() if self.cost else None,
         }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -15,6 +15,7 @@ from sros_tool.demo.granted import enclave_grant, may
 from sros_tool.demo.model import FOREIGN, OWN, Identity, Party, Role, Row, Scenario, Status
 from sros_tool.demo.node_names import node_names
 from sros_tool.demo.policies import DENIED_TOPIC, SERVICE
+from sros_tool.demo.records import CastMember
 from sros_tool.errors import SrosError
 from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.keyring import IN_KEYSTORE
@@ -78,6 +79,21 @@ class Scenery:
         if identity.keystore:
             grant = enclave_grant(self.keystores[identity.keystore], self.enclave(identity))
         return node_names(party.role, grant)
+
+    def members(self, rows: Iterable[Row], *, on_ros: bool) -> tuple[CastMember, ...]:
+        """Return who plays in its own keystore in these rows, in the order of the cast."""
+        nodes: dict[str, set[str]] = {}
+        for row in rows:
+            for party in row.parties:
+                part = party.identity.enclave
+                if party.identity.keystore == OWN and part in self._cast(party.identity):
+                    nodes.setdefault(part, set()).update(self.node_names(party) if on_ros else ())
+        cast = self._cast(Identity(OWN))
+        return tuple(
+            CastMember(part, cast[part], tuple(sorted(nodes[part])))
+            for part in cast
+            if part in nodes
+        )
 
     def probe(self, topic: str, domain: int) -> ProbeEnclave:
         """What to ask a DDS in order to find out whether it enforces security."""

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from datetime import datetime
 
 from sros_tool.demo.model import Status
-from sros_tool.demo.records import RowResult
+from sros_tool.demo.records import CastMember, RowResult
 from sros_tool.demo.result import DemoResult
 from sros_tool.validity import iso
 
@@ -23,6 +23,8 @@ def summary_page(result: DemoResult, now: datetime) -> str:
         f" template `{result.template}`: **{_verdict(result, wrong)}**",
         "",
     ]
+    for scenario in result.scenarios:
+        lines += _cast(scenario.cast)
     if wrong:
         lines += ["## Not as expected", ""]
         lines += [
@@ -38,6 +40,14 @@ def summary_page(result: DemoResult, now: datetime) -> str:
         if scenario.cost is not None:
             lines += ["## What security costs", "", *scenario.cost.markdown(), ""]
     return "\n".join(lines).rstrip() + "\n"
+
+
+def _cast(members: Sequence[CastMember]) -> list[str]:
+    if not members:
+        return []
+    lines = ["## Who plays which part", "", "| part | enclave | ROS nodes |", "| --- | --- | --- |"]
+    lines += [f"| {each.part} | {each.enclave} | {', '.join(each.nodes)} |" for each in members]
+    return [*lines, ""]
 
 
 def _verdict(result: DemoResult, wrong: Sequence[RowResult]) -> str:

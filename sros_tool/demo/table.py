@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from sros_tool.demo.cost import cost_table
 from sros_tool.demo.model import Status
-from sros_tool.demo.records import RowResult
+from sros_tool.demo.records import CastMember, RowResult
 from sros_tool.demo.result import DemoResult, ScenarioResult
 
 _INDENT = " " * 6
@@ -27,8 +27,20 @@ def demo_table(result: DemoResult) -> str:
         lines.append("")
         if len(result.scenarios) > 1:
             lines += [f"{scenario.name}: {scenario.title}", ""]
+        lines += _cast(scenario.cast)
         lines += _scenario(scenario)
     return "\n".join([*lines, "", _summary(result.rows)])
+
+
+def _cast(members: Sequence[CastMember]) -> list[str]:
+    """Who plays which part, in a keystore that was not made for it."""
+    width = max((len(member.part) for member in members), default=0)
+    lines = [
+        f"{_INDENT}{member.part:<{width}}  {member.enclave}"
+        + (f" as node {', '.join(member.nodes)}" if member.nodes else "")
+        for member in members
+    ]
+    return ["cast by the rights in the keystore:", *lines, ""] if lines else []
 
 
 def _scenario(scenario: ScenarioResult) -> list[str]:

@@ -76,6 +76,13 @@ def _scenario(scenario: Json) -> str:
     rows = scenario["rows"]
     good = sum(bool(row["as_expected"]) for row in rows)
     parts = [f"<section><h2>{escape(scenario['title'])}</h2>"]
+    if scenario.get("cast"):
+        members = (
+            f"<b>{escape(each['part'])}</b> {escape(each['enclave'])}"
+            + (f" as node {escape(', '.join(each['nodes']))}" if each["nodes"] else "")
+            for each in scenario["cast"]
+        )
+        parts.append(f'<p class="soft">Cast: {"; ".join(members)}.</p>')
     if rows:
         told = f"{escape(scenario['name'])}: {good} of {len(rows)} rows as expected"
         parts += [f'<p class="soft">{told}</p>', _table(rows)]
