@@ -1,9 +1,9 @@
 """Starts processes of nodes, and prints as JSON what the ROS graph says of each node.
 
 Reads from stdin ``{"domain": N, "processes": {enclave: [node, ...]}}``, nodes as in
-``run_nodes.py``.  Runs in a network of its own where the kernel allows it.  Every node is
-described by its enclave, its endpoints in ROS terms, and the DDS topics that it writes and reads
-(``raw``), both as the graph tells them.
+``run_nodes.py``, or ``{enclave: {"command": [word, ...], "nodes": count}}``.  Runs in a network of
+its own where the kernel allows it.  Every node is described by its enclave, its endpoints in ROS
+terms, and the DDS topics that it writes and reads (``raw``), both as the graph tells them.
 """
 
 from __future__ import annotations
@@ -19,16 +19,20 @@ from typing import Any
 
 from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
 
+Process = list[dict[str, Any]] | dict[str, Any]
 RUN_NODES = Path(__file__).with_name("run_nodes.py")
-PATIENCE_S = 40.0
+PATIENCE_S = 120.0
 STILL_S = 1.0
 """The graph counts as complete when it has not changed for this long."""
 
 
-def start(enclave: str, nodes: list[dict[str, Any]]) -> subprocess.Popen[str]:
+def start(enclave: str, process: Process) -> subprocess.Popen[str]:
+    if isinstance(process, dict):
+        command = process["command"]
+    else:
+        command = [sys.executable, str(RUN_NODES), json.dumps(process)]
     # Simulated time, so that the nodes subscribe to /clock as well.
-    command = [sys.executable, str(RUN_NODES), json.dumps(nodes)]
-    command += ["--ros-args", "--enclave", enclave, "-p", "use_sim_time:=true"]
+    command = [*command, "--ros-args", "--enclave", enclave, "-p", "use_sim_time:=true"]
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, preexec_fn=end_with_parent)
 
 
@@ -70,13 +74,15 @@ def snapshot(observer: Any, enclaves: Collection[str]) -> list[dict[str, Any]]:
     return sorted(found, key=lambda each: (each["enclave"], each["ns"], each["name"]))
 
 
-def observe(processes: dict[str, list[dict[str, Any]]]) -> list[dict[str, Any]]:
+def observe(processes: dict[str, Process]) -> list[dict[str, Any]]:
     """The graph, once it shows the nodes of all ``processes`` and has come to rest."""
     import rclpy
 
     rclpy.init()
     observer = rclpy.create_node("sros_test_observer", start_parameter_services=False)
-    wanted = sum(map(len, processes.values()))
+    wanted = sum(
+        each["nodes"] if isinstance(each, dict) else len(each) for each in processes.values()
+    )
     deadline = time.monotonic() + PATIENCE_S
     seen: list[dict[str, Any]] = []
     since = time.monotonic()
@@ -95,9 +101,11 @@ def main() -> None:
     if try_isolation().isolated:
         enter_isolation()
     os.environ["ROS_DOMAIN_ID"] = str(task["domain"])
-    processes = [start(enclave, nodes) for enclave, nodes in task["processes"].items()]
+    processes = [start(enclave, process) for enclave, process in task["processes"].items()]
     try:
-        for process in processes:
+        for process, what in zip(processes, task["processes"].values(), strict=True):
+            if isinstance(what, dict):
+                continue  # it is seen in the graph when it is ready
             if process.stdout is None or process.stdout.readline() != "ready\n":
                 raise SystemExit("a node did not start")
         print(json.dumps(observe(task["processes"])))
