@@ -11,13 +11,28 @@ import re
 
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
-_TRACE_HEAD = re.compile(r"^\d+\.\d+ \[\d*\]\s+\S+: ")
+_FRAME = re.compile(
+    # Fast DDS: when, `[SECURITY Error]`, the place in its sources, and the function.
+    r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d[.\d]* (?=\[)|\[SECURITY\w* (?:Error|Warning)\]\s*"
+    r"|\s*\([^()\s]+\.(?:cpp|h|hpp|ipp):\d+\)|\s*-> Function \w+\Z"
+    # The file of ROS_SECURITY_LOG_FILE: when, severity, participant, domain, and the function.
+    r"|^\S+ \[[A-Z]+\] \S+ \d+ \w+::\w+ :\s*"
+    # Cyclone DDS and OpenSSL: when and by which thread, numbers, and places in their sources.
+    r"|^\d+\.\d+ \[\d*\]\s+\S+: |(?:candidate|adjusted)_guid: \S+ "
+    r"|Remote secure participant \S+ not allowed\. ?|[0-9A-F]{16}:error:[0-9A-F]+:[\w ]+:"
+    r"|:\.\./\S+\.c:\d+|\[\w+\] failed: |validate_local_identity: |Error\. (?=Error|validate)"
+)
+"""What is put around the reason of a refusal and says nothing to a person."""
 
 CYCLONE_EXPLAINS = {
     "CYCLONEDDS_URI": "<CycloneDDS><Domain><Tracing><Category>fatal,error,warning,trace</Category>"
     "<OutputFile>stderr</OutputFile></Tracing></Domain></CycloneDDS>"
 }
 """Makes Cyclone DDS say why it denies a topic, which it tells only its trace."""
+
+_NO_REASON = "{}, and Fast DDS gives no reason"
+_FUNCTION = re.compile(r"(?:-> Function |::)(\w+)(?: :)?\s*\Z")
+"""Of a line of Fast DDS that has no text of its own, what did not succeed."""
 
 _ENDPOINT_REFUSALS = (
     "topic not found in allow rule",
@@ -29,7 +44,7 @@ _ENDPOINT_REFUSALS = (
     "found in deny_rule",
 )
 _PARTICIPANT_REFUSALS = (
-    "function validate_local_identity",
+    "validate_local_identity",
     "error verifying private key",
     "error obtaining private key",
     "verifying ca certificate",
@@ -54,17 +69,17 @@ _NOT_BUILT_IN = (
 
 
 def endpoint_refusal(text: str) -> str:
-    """The line in which DDS Security denies a topic, a writer or a reader, or ""."""
+    """The words in which DDS Security denies a topic, a writer or a reader, or ""."""
     return _first_line_with(_ENDPOINT_REFUSALS, text)
 
 
 def participant_refusal(text: str) -> str:
-    """The line in which DDS Security refuses the files or the domain of a participant, or ""."""
+    """The words in which DDS Security refuses a participant's files or its domain, or ""."""
     return _first_line_with(_PARTICIPANT_REFUSALS, text)
 
 
 def missing_security(text: str) -> str:
-    """The line in which a DDS says that it was built without DDS Security, or ""."""
+    """The words in which a DDS says that it was built without DDS Security, or ""."""
     return _first_line_with(_NOT_BUILT_IN, text)
 
 
@@ -73,9 +88,21 @@ def plain_text(output: str) -> str:
     return _COLOUR.sub("", output)
 
 
+def plain_refusal(line: str) -> str:
+    """The words of a line of a DDS log: without time, severity, and places in its sources.
+
+    Never empty where the line is not: of a refusal without a reason it says what was refused.
+    """
+    line = " ".join(plain_text(line).split())
+    if words := " ".join(_FRAME.sub("", line).split()):
+        return words
+    function = _FUNCTION.search(line)
+    return _NO_REASON.format(function[1].replace("_", " ") + " failed") if function else line
+
+
 def _first_line_with(marks: tuple[str, ...], text: str) -> str:
     for line in plain_text(text).splitlines():
         lowered = line.lower()
         if any(mark in lowered for mark in marks):
-            return " ".join(_TRACE_HEAD.sub("", line).split())
+            return plain_refusal(line)
     return ""

@@ -4,24 +4,47 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.runtime.security_log import endpoint_refusal, missing_security, participant_refusal
+from sros_tool.runtime.security_log import (
+    endpoint_refusal,
+    missing_security,
+    participant_refusal,
+    plain_refusal,
+)
 
-ENDPOINT = [
-    "\x1b[37;1m2026-01-01 12:00:00.000 [\x1b[31;1mSECURITY Error\x1b[37;1m] \x1b[0mrt/chatter topic"
-    " not found in allow rule. (/x/Permissions.cpp:1246) -> Function check_create_datareader",
-    "[SECURITY Error] rt/chatter topic denied by deny rule. -> Function check_rule",
-    "[SECURITY Error] Not found topic access rule for topic ros_discovery_info",
-    "cannot create topic rt/chatter. Not Allowed By Security",
-    "1795242829.9 [121] python: Local topic permission denied: rt/x denied by default rule(145)",
-]
-PARTICIPANT = [
-    "[SECURITY Error]  -> Function validate_local_identity",
-    "[SECURITY Error] Error verifying private key",
-    "[SECURITY Error] PKCS7 data verification failed",
-    "[SECURITY Error] Not found the identity subject name in permissions file",
-    "Error occurred while validating local permissions: Subject name is invalid(code: 146)",
-    "Error occurred while validating local permission: Certificate not valid (code: 200)",
-]
+TIME = "\x1b[37;1m2026-01-01 12:00:00.000 [\x1b[31;1mSECURITY Error\x1b[37;1m] \x1b[0m"
+
+ENDPOINT = {
+    f"{TIME}rt/chatter topic not found in allow rule. (/x/Permissions.cpp:1246) -> Function "
+    "check_create_datareader": "rt/chatter topic not found in allow rule.",
+    f"{TIME}Error checking creation of local writer 1.2|0 (rt/x topic not found in allow rule. "
+    "(/x/Permissions.cpp:1192))":
+        "Error checking creation of local writer 1.2|0 (rt/x topic not found in allow rule.)",
+    "[SECURITY Error] rt/chatter topic denied by deny rule. -> Function check_rule":
+        "rt/chatter topic denied by deny rule.",
+    "[SECURITY Error] Not found topic access rule for topic ros_discovery_info":
+        "Not found topic access rule for topic ros_discovery_info",
+    "1795309235.50 [EMERGENCY] 01.0f|0.0.1.c1 0 Permissions::check_create_datawriter : "
+    "rt/x topic not found in allow rule.": "rt/x topic not found in allow rule.",
+    "cannot create topic rt/chatter. Not Allowed By Security":
+        "cannot create topic rt/chatter. Not Allowed By Security",
+    "1795242829.9 [121] python: Local topic permission denied: rt/x denied by default rule(145)":
+        "Local topic permission denied: rt/x denied by default rule(145)",
+}  # fmt: skip
+PARTICIPANT = {
+    f"{TIME} -> Function validate_local_identity":
+        "validate local identity failed, and Fast DDS gives no reason",
+    "1795309235.50 [EMERGENCY] 01.0f|0.0.1.c1 0 PKIDH::validate_local_identity : ":
+        "validate local identity failed, and Fast DDS gives no reason",
+    f"{TIME}Error verifying private key /k/key.pem (/x/FileProvider.cpp:242) -> Function "
+    "validate_local_identity": "Error verifying private key /k/key.pem",
+    "[SECURITY Error] PKCS7 data verification failed": "PKCS7 data verification failed",
+    "[SECURITY Error] Not found the identity subject name in permissions file":
+        "Not found the identity subject name in permissions file",
+    "Error occurred while validating local permissions: Subject name is invalid(code: 146)":
+        "Error occurred while validating local permissions: Subject name is invalid(code: 146)",
+    "Error occurred while validating local permission: Certificate not valid (code: 200)":
+        "Error occurred while validating local permission: Certificate not valid (code: 200)",
+}  # fmt: skip
 NEITHER = [
     "",
     "Segmentation fault",
@@ -32,17 +55,15 @@ NEITHER = [
 ]
 
 
-@pytest.mark.parametrize("line", ENDPOINT)
-def test_endpoint_refusals(line: str) -> None:
-    found = endpoint_refusal(f"before\n{line}\nafter")
-    assert found
-    assert "\x1b" not in found
+@pytest.mark.parametrize(("line", "words"), ENDPOINT.items())
+def test_endpoint_refusals(line: str, words: str) -> None:
+    assert endpoint_refusal(f"before\n{line}\nafter") == words == plain_refusal(line)
     assert not missing_security(line)
 
 
-@pytest.mark.parametrize("line", PARTICIPANT)
-def test_participant_refusals(line: str) -> None:
-    assert participant_refusal(f"before\n{line}\nafter") == " ".join(line.split())
+@pytest.mark.parametrize(("line", "words"), PARTICIPANT.items())
+def test_participant_refusals(line: str, words: str) -> None:
+    assert participant_refusal(f"before\n{line}\nafter") == words == plain_refusal(line)
     assert not endpoint_refusal(line)
 
 
