@@ -7,12 +7,12 @@ Compose before them, with colours, and with tracebacks between them.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from sros_tool.dds.decision import Vendor, Verb
 from sros_tool.explain.answer import Answer, Judge, Setting
-from sros_tool.explain.log_texts import MEANINGS, Meaning
+from sros_tool.explain.log_texts import MEANINGS, UNKNOWN, Meaning
 from sros_tool.explain.material import Material
 from sros_tool.explain.question import Part, Question, ask
 from sros_tool.explain.remedy import remedy
@@ -20,13 +20,22 @@ from sros_tool.graph.denials import (
     PROCESS_LABEL,
     SECURITY_DIRECTORY,
     Denial,
+    is_denial,
+    nodes_served,
     read_denials,
+    serving_node,
 )
-from sros_tool.runtime.security_log import plain_text
+from sros_tool.graph.observation import PUBLISH
+from sros_tool.policy.patterns import covers
+from sros_tool.runtime.security_log import plain_refusal, plain_text
+from sros_tool.translate import grant_rights
 
 _CONTINUED = re.compile(r"^(?:[0-9A-F]{8,}:error:|\(code: )")
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
 """As what a topic stands in a line: between punctuation, or with it where it has some itself."""
+_IN_DOMAIN = re.compile(r"\] \S+\|\S+ (\d+) \w+::\w+ :")
+"""The domain, in the file of ROS_SECURITY_LOG_FILE: behind the participant's identifier."""
+_NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
 _LONGEST = 8000
 """How many characters of a line can be a message: a log may be one line of many megabytes."""
 
@@ -54,12 +63,25 @@ class Finding:
 
 @dataclass(frozen=True, slots=True)
 class _Hit:
+    """A line that has a meaning; ``said`` is what it says itself, by the names of a pattern."""
+
     line: int
     text: str
     process: str
     enclave: str
     meaning: Meaning
-    cause: str
+    said: Mapping[str, str]
+
+    @property
+    def cause(self) -> str:
+        return self.meaning.cause.format(**self.said)
+
+    @property
+    def kind(self) -> str:
+        """What is the same of lines that are told as one."""
+        if self.meaning is not UNKNOWN:
+            return f"{self.meaning.id} {self.cause}"
+        return _NUMBERS.sub("", plain_refusal(self.text))
 
 
 Look = Callable[[str], Material | None]
@@ -111,12 +133,13 @@ def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
         if named := SECURITY_DIRECTORY.search(line):
             enclaves[process] = named["enclave"] or "/"
             continue
-        for meaning in MEANINGS:
+        for meaning in (*MEANINGS, *([] if is_denial(line) else [UNKNOWN])):
             if match := meaning.pattern.search(line):
-                cause = meaning.cause.format(**{k: v or "" for k, v in match.groupdict().items()})
-                yield _Hit(
-                    number, _without_label(line), process, enclaves.get(process, ""), meaning, cause
-                )
+                said = {name: text or "" for name, text in match.groupdict().items()}
+                if found := _IN_DOMAIN.search(line):
+                    said["domain"] = found[1]
+                enclave = enclaves.get(process, "")
+                yield _Hit(number, _without_label(line), process, enclave, meaning, said)
                 break
 
 
@@ -131,17 +154,19 @@ def _without_label(line: str) -> str:
 
 
 def _strongest(hits: Iterable[_Hit], told: set[str]) -> Iterator[_Hit]:
-    """The hits without those that only follow on what is ``told`` of the same process."""
+    """The hits without those that only follow on others, or on what is ``told``, of a process."""
     found = list(hits)
-    strong = told.union(hit.process for hit in found if not hit.meaning.weak)
-    return (hit for hit in found if not hit.meaning.weak or hit.process not in strong)
+    least = dict.fromkeys(told, 0)
+    for hit in found:
+        if hit.meaning is not UNKNOWN:
+            least[hit.process] = min(hit.meaning.weak, least.get(hit.process, hit.meaning.weak))
+    return (hit for hit in found if hit.meaning.weak <= least.get(hit.process, 0))
 
 
 def _grouped(hits: Iterable[_Hit]) -> Iterator[list[_Hit]]:
-    groups: dict[tuple[str, str, str, str], list[_Hit]] = {}
+    groups: dict[tuple[str, str, str], list[_Hit]] = {}
     for hit in hits:
-        key = (hit.process, hit.enclave, hit.meaning.id, hit.cause)
-        groups.setdefault(key, []).append(hit)
+        groups.setdefault((hit.process, hit.enclave, hit.kind), []).append(hit)
     return iter(groups.values())
 
 
@@ -178,21 +203,25 @@ class _Eye:
             first.text,
             first.enclave,
             first.cause,
-            meaning.remedy,
+            meaning.remedy.format(**first.said),
         )
-        material = self._look(first.enclave) if meaning.codes else None
+        looked_at = meaning.codes or meaning.id == "service"
+        material = self._look(first.enclave) if looked_at else None
         if material is None:
             return plain
         answer = self._answer(material, meaning.vendor or Vendor.FAST, ask("join"))
         causes = list(self._causes(material, answer, meaning.codes))
-        told = [text for text, _ in causes]
+        if meaning.id == "service" and not causes:
+            return replace(plain, enclave=material.enclave, found=_nodes(answer), checked=True)
+        causes = causes or list(self._out_of_domain(material, answer, first))
         remedies = list(dict.fromkeys(remedy for _, remedy in causes if remedy))
+        nothing = f"{_nothing_found(material)} {meaning.unseen.format(**first.said)}".rstrip()
         return replace(
             plain,
             enclave=material.enclave,
-            found=tuple(told),
+            found=tuple(text for text, _ in causes),
             checked=True,
-            remedy=" ".join(remedies) if remedies else _nothing_found(material),
+            remedy=" ".join(remedies) if remedies else nothing,
         )
 
     def denial(self, denial: Denial, named: list[tuple[int, str]]) -> Finding:
@@ -202,6 +231,8 @@ class _Eye:
         vendor = Vendor.CYCLONE if "permi" in text and "denied by" in text else Vendor.FAST
         who = "a peer" if denial.remote else denial.enclave or "the process"
         by = "a rule of the policy denies it" if denial.by_rule else "no rule allows it"
+        if node := serving_node(denial):
+            by += f"; every node has such a service, and this one is the node {node}"
         finding = Finding(
             "topic-denied",
             vendor,
@@ -214,18 +245,21 @@ class _Eye:
             f"{name}` says what the policy lacks.",
         )
         material = None if denial.remote else self._look(denial.enclave)
-        question = _question(denial)
-        if material is None or question is None:
+        if material is None or not denial.direction:
             return finding
+        question = _question(denial)
         answer = self._answer(material, vendor, question)
         if answer.allowed:
-            found = "the permissions that lie there now allow it"
+            found = ["the permissions that lie there now allow it"]
             remedy = "Restart the process: it loaded the permissions that were there before."
         else:
-            found, remedy = answer.deciding.decision.text, finding.remedy
+            found = [answer.deciding.decision.text]
+            other, better = _other_node(denial, answer)
+            found += other
+            remedy = better or finding.remedy
         remedy = remedy.replace("ENCLAVE", material.enclave)
         return replace(
-            finding, enclave=material.enclave, found=(found,), checked=True, remedy=remedy
+            finding, enclave=material.enclave, found=tuple(found), checked=True, remedy=remedy
         )
 
     def _answer(self, material: Material, vendor: Vendor, question: Question) -> Answer:
@@ -237,10 +271,68 @@ class _Eye:
         """The faults of an enclave, those first that the message can stand for."""
         fitting = [each for each in answer.problems if each.code in codes]
         for each in fitting or answer.problems:
-            yield str(each), remedy(each.code, self._root, material.enclave)
+            yield str(each), remedy(each.code, self._root, material.enclave, each.file)
         if not answer.problems and not answer.allowed:
             decision = answer.deciding.decision
             yield decision.text, remedy(decision.reason, self._root, material.enclave)
+
+    def _out_of_domain(
+        self, material: Material, answer: Answer, hit: _Hit
+    ) -> Iterator[tuple[str, str]]:
+        """That a process was in a domain its documents are not for, where only that is left."""
+        topic, said = hit.said.get("topic", ""), hit.said.get("domain", "")
+        if hit.meaning.id == "domain" and topic:
+            asked = _question(Denial(topic, PUBLISH))
+            decision = self._answer(material, answer.vendor, asked).deciding.decision
+            if decision.reason == "no-topic-rule":
+                yield decision.text, remedy(decision.reason, self._root, material.enclave)
+                return
+        governed = material.domains
+        if hit.meaning.id not in _OF_DOMAINS or governed is None:
+            return
+        where = f"domain {said}" if said else "another domain"
+        if said and int(said) in governed:
+            return
+        yield (
+            f"the governance is for domain {governed}: the process was in {where}, or had another "
+            "governance then",
+            remedy("governance-domain", self._root, material.enclave).replace(
+                "domain of the keystore", f"domain of the keystore, such as {next(iter(governed))}"
+            ),
+        )
+
+
+def _nodes(answer: Answer) -> tuple[str, ...]:
+    """For which nodes the permissions of an enclave are, as far as they tell."""
+    rights = grant_rights("", answer.grant) if answer.grant else ()
+    nodes = nodes_served((each.right, each.name) for each in rights)
+    if nodes:
+        return (f"its permissions are for {_listed(nodes)}",)
+    return (f"its permissions have nothing of {_EVERY_NODE}",)
+
+
+def _other_node(denial: Denial, answer: Answer) -> tuple[list[str], str]:
+    """What is to be said where a node has not the name that its permissions are for."""
+    rights = [(each.right, each.name) for each in grant_rights("", answer.grant)] if (
+        answer.grant
+    ) else []  # fmt: skip
+    node, nodes = serving_node(denial), nodes_served(rights)
+    if node and nodes and not any(covers(each, node) for each in nodes):
+        ns, _, name = nodes[0].rpartition("/")
+        return [f"the permissions are for {_listed(nodes)}, and this is the node {node}"], (
+            f"Start it under that name (`--ros-args -r __node:={name} -r __ns:={ns or '/'}`); or, "
+            f"if {node} is right, give it a profile in the policy of ENCLAVE, with common/node.xml."
+        )
+    if not nodes and (node or denial.topic in _OF_EVERY_NODE):
+        return [f"the permissions have nothing of {_EVERY_NODE}"], (
+            'Put <xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> into the '
+            "node's profile: `sros generate_policy POLICY --enclave ENCLAVE --from-log LOG` does."
+        )
+    return [], ""
+
+
+def _listed(nodes: Sequence[str]) -> str:
+    return f"the node{'s' * (len(nodes) > 1)} {', '.join(nodes)}"
 
 
 def _nothing_found(material: Material) -> str:
@@ -249,6 +341,10 @@ def _nothing_found(material: Material) -> str:
         "look at the files on the robot itself, its clock and its time zone."
     )
 
+
+_OF_DOMAINS = ("domain", "domain-of-permissions")
+_EVERY_NODE = "what every node has: parameter services, /rosout, /parameter_events"
+_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events")
 
 _HALVES = {
     ("rq", "publish"): ("call", "Request"),
@@ -270,9 +366,7 @@ def _in_ros_terms(denial: Denial) -> tuple[str, str]:
     return denial.direction or "use", denial.topic
 
 
-def _question(denial: Denial) -> Question | None:
-    """The question whose answer was no, about that one topic; None where that is not known."""
-    if not denial.direction:
-        return None
+def _question(denial: Denial) -> Question:
+    """The question whose answer was no, about that one topic."""
     part = Part(Verb(denial.direction), denial.topic)
     return Question(denial.direction, "topic", denial.direction, denial.topic, (part,))

@@ -1,6 +1,7 @@
 """What the security messages of Fast DDS, Cyclone DDS and rcl mean, and what else they could mean.
 
 Each text was seen in a real log of Fast DDS 2.9.1 or 2.14.5, Cyclone DDS 0.10.2, or rcl of Jazzy.
+With ROS_SECURITY_LOG_FILE the reasons of Fast DDS stand in that file, in another form, instead.
 Many stand for several causes; `Meaning.codes` are the faults of an enclave (`Problem.code`) among
 which the true one is found by looking at the enclave.
 """
@@ -34,8 +35,9 @@ class Meaning:
     """What a message means.
 
     ``cause`` may use the groups of ``pattern``.  ``codes`` are the faults it can stand for, if it
-    is about the enclave of the process itself.  ``weak`` says that it follows on a message that
-    tells more, if there is one.
+    is about the enclave of the process itself; ``unseen`` is what to do where it has none of them.
+    ``weak`` is 0 for a message that tells a cause, and higher the less it tells: of the messages
+    of a process the least weak ones count.
     """
 
     id: str
@@ -44,7 +46,8 @@ class Meaning:
     cause: str
     remedy: str
     codes: tuple[str, ...] = ()
-    weak: bool = False
+    unseen: str = ""
+    weak: int = 0
 
 
 def _meaning(
@@ -55,14 +58,32 @@ def _meaning(
     remedy: str,
     codes: tuple[str, ...] = (),
     *,
-    weak: bool = False,
+    unseen: str = "",
+    weak: int = 0,
 ) -> Meaning:
-    return Meaning(name, vendor, re.compile(pattern, re.IGNORECASE), cause, remedy, codes, weak)
+    expression = re.compile(pattern, re.IGNORECASE)
+    return Meaning(name, vendor, expression, cause, remedy, codes, unseen, weak)
 
 
 _CHECK = "Name the keystore and the enclave, and the true cause is looked for there."
+_CHECK_OR_FILE = (
+    "Name the keystore and the enclave, and the true cause is looked for there; or give `sros "
+    "explain --log` the file of ROS_SECURITY_LOG_FILE, where that is set."
+)
 _RENEW = "Renew it: `sros renew KEYSTORE ENCLAVE`."
-_SIGN = "Sign the permissions anew: `sros create_permission KEYSTORE ENCLAVE POLICY`."
+_SIGN = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
+_SIGN_ONE = (
+    f"Name the keystore and the enclave, and which of the two it is is looked for there. {_SIGN} "
+    "A governance has to be restored from a backup: every enclave depends on it."
+)
+_READABLE = (
+    "Let the user that runs the node read it, and enter the folders above it: `ls -lL {path}` run "
+    "as that user shows whether it may."
+)
+_SET_DOMAIN = (
+    "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env KEYSTORE ENCLAVE --domain ID` prints "
+    "the variables."
+)
 _PEERS = "Give both sides enclaves of the same keystore; `sros inspect` shows the CA of each."
 _FAST, _CYCLONE = Vendor.FAST, Vendor.CYCLONE
 
@@ -129,18 +150,20 @@ MEANINGS: tuple[Meaning, ...] = (
     ),
     _meaning(
         "revoked", _CYCLONE, r"Certificate not valid: error: certificate revoked",
-        "the certificate of the enclave is revoked", "Make the enclave anew, with another key.",
+        "the certificate of the enclave is revoked",
+        "It is meant to be kept out; if it shall run again, make it again with another key: `sros "
+        "create_enclave KEYSTORE ENCLAVE`.",
         ("revoked",),
     ),
     _meaning(
         "crl-expired", _CYCLONE, r"Certificate not valid: error: CRL (?:has expired|is not yet)",
         "the revocation list is out of date, so that everybody is refused",
-        "Sign it anew: `sros crl KEYSTORE --refresh`.", ("crl-expired", "crl-not-yet-valid"),
+        "Sign it again: `sros crl KEYSTORE --refresh`.", ("crl-expired", "crl-not-yet-valid"),
     ),
     _meaning(
         "crl-unreadable", _CYCLONE, r"Failed to read CRL",
         "crl.pem is not a revocation list, so that everybody is refused",
-        "Sign it anew: `sros crl KEYSTORE --refresh`.", ("crl-malformed",),
+        "Sign it again: `sros crl KEYSTORE --refresh`.", ("crl-malformed",),
     ),
     _meaning(
         "key-encrypted", _CYCLONE, r"Failed to parse certificate: .*(?:bad decrypt|empty password)",
@@ -155,17 +178,17 @@ MEANINGS: tuple[Meaning, ...] = (
     _meaning(
         "signature", _CYCLONE, r"PKCS7_signatureVerify:digest failure",
         "governance.p7s or permissions.p7s was changed after it was signed",
-        "Restore it, or sign it anew.", _SIGNATURE,
+        _SIGN_ONE, _SIGNATURE,
     ),
     _meaning(
         "signer", _CYCLONE, r"PKCS7_verify:certificate verify error",
         "governance.p7s or permissions.p7s was signed by another CA than the permissions CA that "
-        "lies with it", "Use the files of one keystore together, or sign anew.", _SIGNATURE,
+        "lies with it", f"Use the files of one keystore together. {_SIGN_ONE}", _SIGNATURE,
     ),
     _meaning(
         "not-signed", _CYCLONE, r"SMIME_read_ASN1_ex:no content type|SMIME_read_ASN1",
         "governance.p7s or permissions.p7s is plain XML or damaged, and not a signed document",
-        _SIGN, _SIGNATURE,
+        _SIGN_ONE, _SIGNATURE,
     ),
     _meaning(
         "permissions-expired", _CYCLONE, r"Permissions validity period expired(?P<when>[^)]*\))?",
@@ -184,8 +207,7 @@ MEANINGS: tuple[Meaning, ...] = (
     _meaning(
         "domain", _CYCLONE, r"Could not find domain (?P<domain>\d+) in governance",
         "the governance is not for domain {domain}",
-        "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env` prints it.",
-        ("governance-domain",),
+        _SET_DOMAIN, ("governance-domain",),
     ),
     _meaning(
         "malformed", _CYCLONE, r"Can not parse (?P<what>governance|permissions) file",
@@ -198,21 +220,69 @@ MEANINGS: tuple[Meaning, ...] = (
         r"(?P<path>\S+)",
         "the file {path} is missing, empty or not readable", "Restore it.", _FILES,
     ),
+    # ── Fast DDS, meeting peers ────────────────────────────────────────────────────────────
+    _meaning(
+        "peer-permissions-ca", _FAST, r"Remote participant PermissionsCA differs from local",
+        "a PEER was refused: its permissions CA is not that of this process. The two have enclaves "
+        "of different keystores, or one was started before the CA was replaced and one after",
+        _PEERS + " Restart both after each stage of `sros rotate_ca KEYSTORE`.",
+    ),
+    _meaning(
+        "peer-version", _FAST, r"Remote participant PermissionsCA algorithm differs from local",
+        "a PEER was refused: it runs another version of Fast DDS, or its permissions CA has a key "
+        "of another kind", "Run one version of Fast DDS on all hosts of the robot.",
+    ),
+    _meaning(
+        "peer-permissions", _FAST, r"Remote participant doesn't found in its permissions file",
+        "a PEER was refused: by the clock and the time zone of this host its permissions have "
+        "expired or are not valid yet, or they have no grant for its certificate",
+        "Compare clocks and time zones of both hosts, for Fast DDS reads dates in local time; "
+        "`sros inspect KEYSTORE` shows how long each enclave is valid, and `sros renew KEYSTORE "
+        "ENCLAVE` renews the peer's.",
+    ),
+    _meaning(
+        "peer-signature", _FAST, r"Cannot read as PKCS7 the permissions file",
+        "a PEER was refused: its permissions are not signed by the permissions CA of this process, "
+        "although that has the same name: enclaves of two keystores, or a changed file", _PEERS,
+    ),
+    _meaning(
+        "peer-malformed", _FAST,
+        r"Error validating remote permissions for \S+ \(Malformed permissions file",
+        "a PEER was refused: its permissions, although signed, are not such as Fast DDS accepts",
+        "Have sros write those of the peer: `sros create_permission KEYSTORE ENCLAVE POLICY`.",
+    ),
+    _meaning(
+        "peer-domain", _FAST, r"Error checking remote participant"
+        r"|Not found a rule allowing to use the domain_id.*check_remote_participant"
+        r"|check_remote_participant.*Not found a rule allowing to use the domain_id",
+        "a PEER was refused: its permissions are not for this domain",
+        "Sign those of the peer again, with this domain: `sros create_permission KEYSTORE ENCLAVE "
+        "POLICY` takes the domains of the keystore.",
+    ),
+    _meaning(
+        "peer-refused", _FAST, r"Error validating remote permissions for"
+        r"|Remote participant doesn't sent the signed permissions|Not receive remote permissions",
+        "a PEER was refused, not this process: its permissions did not arrive, or are not accepted",
+        _PEERS,
+    ),
     # ── Fast DDS, starting ─────────────────────────────────────────────────────────────────
     _meaning(
-        "identity", _FAST, r"SECURITY\s*Error\]\s*->\s*Function validate_local_identity",
+        "identity", _FAST, r"SECURITY\s*Error\]\s*->\s*Function validate_local_identity"
+        r"|PKIDH::validate_local_identity :\s*\Z",
         "the identity is refused, and the reason is left out: the certificate or its CA is out of "
         "date, of another CA, damaged or revoked, or crl.pem is out of date or damaged",
         _CHECK, (*_CERTIFICATE, "certificate-malformed", *_CA, *_CRL),
     ),
     _meaning(
-        "ca", _FAST, r"Error '(?P<number>\d+)' verifying CA certificate",
-        "the certificate of a CA is not valid (OpenSSL's error {number}; 10 is expired)",
-        "Replace the CA: `sros rotate_ca KEYSTORE`.", _CA,
+        "ca", _FAST, r"Error '(?P<number>\d+)' verifying CA certificate"
+        r"(?: for \S.*?: (?P<why>[a-z][\w ,()-]*?))?(?= \(\S+:\d+\)|\Z)",
+        "the first certificate of a CA's file is not accepted (OpenSSL's error {number}: {why})",
+        _CHECK, (*_CA, "certificate-malformed"),
     ),
     _meaning(
         "key-mismatch", _FAST, r"Error verifying private key",
-        "key.pem is not the key of cert.pem", "Restore the key, or make the enclave anew.",
+        "key.pem is not the key of cert.pem",
+        "Restore the key, or give the enclave another: `sros renew KEYSTORE ENCLAVE --new-key`.",
         ("key-mismatch",),
     ),
     _meaning(
@@ -222,17 +292,22 @@ MEANINGS: tuple[Meaning, ...] = (
     ),
     _meaning(
         "file-missing", _FAST, r"OpenSSL library cannot read file (?P<path>\S+)",
-        "the file {path} is missing or not readable", "Restore it.", _FILES,
+        "the file {path} is missing or not readable", _READABLE, _FILES, unseen=_READABLE,
+    ),
+    _meaning(
+        "file-missing", _FAST, r"Cannot (?:read|find) file file://(?P<path>\S+)",
+        "the file {path} is missing or not readable", _READABLE, _FILES, unseen=_READABLE,
     ),
     _meaning(
         "signature", _FAST, r"PKCS7 data verification failed",
         "governance.p7s or permissions.p7s was changed, or signed by another CA than the "
         "permissions CA that lies with it; which of the two, it does not say",
-        "Restore it, or sign it anew.", _SIGNATURE,
+        _SIGN_ONE, _SIGNATURE,
     ),
     _meaning(
         "not-signed", _FAST, r"Input data has not PKCS7 S/MIME format",
-        "governance.p7s or permissions.p7s is not a signed document", _SIGN, _SIGNATURE,
+        "governance.p7s or permissions.p7s is not a signed document: plain XML, or damaged; which "
+        "of the two, it does not say", _SIGN_ONE, _SIGNATURE,
     ),
     _meaning(
         "grant", _FAST, r"Not found the identity subject name in permissions file",
@@ -242,13 +317,13 @@ MEANINGS: tuple[Meaning, ...] = (
     ),
     _meaning(
         "domain-of-permissions", _FAST, r"Not found a rule allowing to use the domain_id",
-        "the permissions (of a peer, if it was about to match one) are not for this domain",
-        _SIGN, ("permissions-domain",),
+        "the permissions are not for the domain of this process", _SET_DOMAIN,
+        ("permissions-domain",),
     ),
     _meaning(
-        "domain", _FAST, r"Not found topic access rule for topic",
-        "the governance has no rule for the topic: most often because it is not for this domain",
-        "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env` prints it.",
+        "domain", _FAST, r"Not found topic access rule for topic (?P<topic>[^\s)]+)",
+        "the governance has no rule for the topic in the domain of this process: most often "
+        "because it does not list that domain (ROS_DOMAIN_ID)", _SET_DOMAIN,
         ("governance-domain",),
     ),
     _meaning(
@@ -266,20 +341,50 @@ MEANINGS: tuple[Meaning, ...] = (
     ),
     # ── what follows on others ─────────────────────────────────────────────────────────────
     _meaning(
+        "participant", _FAST, r"Error while configuring security plugin"
+        r"|Participant is not allowed with its own permissions file",
+        "the process may not join; Fast DDS 2.14 says why in a line of its own, or in the file of "
+        "ROS_SECURITY_LOG_FILE, and neither is in this log", _CHECK_OR_FILE, _ALL, weak=1,
+    ),
+    _meaning(
         "participant", _FAST, r"Cannot create participant due to initialization error"
-        r"|Problem creating RTPSParticipant",
-        "the process may not join, and Fast DDS 2.9 does not say why: it is silent about "
-        "signatures, expired permissions and subjects", _CHECK, _ALL, weak=True,
+        r"|Problem creating RTPSParticipant|failed to create participant",
+        "the process may not join, and this log does not say why: Fast DDS 2.9 is silent about "
+        "signatures, expired permissions and subjects, 2.14 tells its standard output or the file "
+        "of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL, weak=2,
+    ),
+    _meaning(
+        "service", ROS, r"(?:could not|failed to) create (?:service|client)"
+        r"|create_(?:service|client)\(\) failed",
+        "a service or client is denied by the permissions, and this text does not say which. Of a "
+        "node that fails when it is created it is a service of its own: it runs under another "
+        "name, or in another namespace, than the policy's node",
+        "Compare the node's name and namespace with the policy's profile (ns, node); the line that "
+        "names the topic is on standard output or in the file of ROS_SECURITY_LOG_FILE.", weak=2,
     ),
     _meaning(
         "endpoint", ROS, r"invalid allocator|Problem creating associated (?:Reader|Writer)"
-        r"|could not create (?:publisher|subscription|service|client)"
-        r"|failed to create (?:publisher|subscription|service|client|topic)"
-        r"|Not Allowed By Security",
+        r"|(?:could not|failed to) create (?:publisher|subscription|topic)"
+        r"|create_(?:publisher|subscription)\(\) could not create|Not Allowed By Security",
         "a publisher, subscription, client or server is denied by the permissions; this text does "
         "not say of which topic (`invalid allocator` has nothing to do with memory)",
-        "Look for the line before it that names the topic, on standard output; or ask "
-        "`sros explain` for each topic of the node.", weak=True,
+        "Look for the line before it that names the topic, on standard output or in the file of "
+        "ROS_SECURITY_LOG_FILE; or ask `sros explain` for each topic of the node.", weak=3,
     ),
 )  # fmt: skip
 """In the order in which they are tried: the first that matches a line counts."""
+
+UNKNOWN = Meaning(
+    "not-understood",
+    ROS,
+    re.compile(
+        r"\[SECURITY\w* (?:Error|Warning)\]"
+        r"|\[(?:EMERGENCY|ALERT|CRITICAL|ERROR|WARNING)\] \S+ \d+ \w+::\w+ :"
+        r"|\d+\.\d+ \[\d*\]\s+\S+: .*(?:[Ss]ecurity|handshake|[Pp]ermission|[Cc]ertificate|crypto)"
+        r"|SECURITY ERROR"
+    ),
+    "a line of DDS Security that sros does not know",
+    "Read it as it stands; what it is about may matter. If it kept a node from starting, `sros "
+    "check KEYSTORE` and `sros explain KEYSTORE ENCLAVE join` look at all that DDS looks at.",
+)
+"""For what looks like a message of DDS Security and is none of `MEANINGS`, nor a denied topic."""

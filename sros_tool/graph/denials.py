@@ -108,6 +108,11 @@ def _denials_of(lines: list[str]) -> Iterator[Denial]:
             yield Denial(topic, direction, enclave, by_rule, remote)
 
 
+def is_denial(line: str) -> bool:
+    """Whether a line denies a topic."""
+    return _denied(line) is not None
+
+
 def _denied(line: str) -> re.Match[str] | None:
     return _FAST.search(line) or _CYCLONE.search(line)
 
@@ -158,6 +163,28 @@ def propose(denials: Iterable[Denial]) -> Proposal:
 
 _SERVICE = re.compile(r"r(?P<side>[qr])(?P<name>/.+?)(?P<end>Request|Reply)\Z")
 _ACTION = re.compile(r"(?P<name>/.+)/_action/(?:send_goal|cancel_goal|get_result)\Z")
+
+
+_OWN_SERVICE = re.compile(
+    r"(?P<node>/.+)/(?:describe_parameters|get_parameter_types|get_parameters|list_parameters"
+    r"|set_parameters|set_parameters_atomically|get_type_description)\Z"
+)
+"""The services that every node offers, under its own name (rclcpp and rclpy of Jazzy)."""
+
+
+def serving_node(denial: Denial) -> str:
+    """The full name of the node, where a service that every node offers is what it is denied."""
+    if denial.remote or not (service := _SERVICE.match(denial.topic)):
+        return ""
+    offered = (service["side"] == "q") == (denial.direction == SUBSCRIBE)
+    own = _OWN_SERVICE.match(service["name"])
+    return own["node"] if own and denial.direction and offered else ""
+
+
+def nodes_served(rights: Iterable[tuple[str, str]]) -> tuple[str, ...]:
+    """The full names of the nodes whose own services these rights (right, name) let be offered."""
+    found = (_OWN_SERVICE.match(name) for right, name in rights if right == "reply")
+    return tuple(sorted({own["node"] for own in found if own}))
 
 
 def _is_ros(topic: str) -> bool:

@@ -169,6 +169,7 @@ BREAKAGES: dict[str, Callable[[Enclave], None]] = {
     "governance tampered": _tampered("governance"),
     "permissions tampered": _tampered("permissions"),
     "permissions of another CA": _foreign_signature,
+    "governance unsigned": lambda e: e.write("governance.p7s", e.document("governance")),
     "permissions unsigned": lambda e: e.write("permissions.p7s", e.document("permissions")),
     "permissions expired": lambda e: e.validity(e.now - 30 * DAY, e.now - 2 * DAY),
     "permissions not yet valid": lambda e: e.validity(e.now + 2 * DAY, e.now + 30 * DAY),
