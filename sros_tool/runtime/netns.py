@@ -7,6 +7,7 @@ capture packets inside (capabilities(7), user_namespaces(7)).
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import fcntl
 import os
@@ -26,6 +27,10 @@ _SIOCSIFFLAGS = 0x8914
 _IFF_UP = 0x1
 _IFF_MULTICAST = 0x1000
 _RTF_UP = 0x1
+
+_LOCAL_PORTS = Path("/proc/sys/net/ipv4/ip_local_port_range")
+_BELOW_DDS = "1024 7399"
+"""Where no domain's ports are: those begin at 7400 (RTPS 2.5 §9.6.2.3)."""
 
 _ALONE = 0
 _TRIAL_SECONDS = 10
@@ -100,6 +105,7 @@ def enter_isolation() -> None:
         Path("/proc/self/uid_map").write_text(f"{user} {user} 1", encoding="ascii")
         Path("/proc/self/gid_map").write_text(f"{group} {group} 1", encoding="ascii")
     _bring_up_loopback()
+    _keep_off_ports_of_dds()
 
 
 def end_with_parent() -> None:
@@ -138,6 +144,16 @@ def _add_multicast_route(asker: socket.socket) -> None:
         device=ctypes.addressof(device),
     )
     fcntl.ioctl(asker, _SIOCADDRT, bytes(entry))
+
+
+def _keep_off_ports_of_dds() -> None:
+    """Let the kernel give sockets that ask for any port none that a DDS domain needs.
+
+    From domain 102 on, the well-known ports lie where Linux takes such ports from: now and then a
+    participant could not join because another one's socket had been given that very port.
+    """
+    with contextlib.suppress(OSError):  # a container may not let anybody write there
+        _LOCAL_PORTS.write_text(_BELOW_DDS, encoding="ascii")
 
 
 def _internet_address(text: str) -> bytes:
