@@ -6,76 +6,19 @@ import json
 import os
 import random
 import shutil
-import signal
-import subprocess
 import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from children import LONG, run
 from harness import check_whole, policy_text, publish, remains, topics_of
+from kills import Moments, Server, server
 
 from sros_tool.keystore.layout import enclave_folder
 
-KILLS = 220
-# Forks the imported program for each line; a program of its own would take 0.2 s to start.
-SERVER = """
-import json, os, signal, sys, time
-answers = os.fdopen(os.dup(1), "w")
-for descriptor in (1, 2):  # what the program prints goes nowhere
-    os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor)
-from sros_tool.cli import main
-import sros_tool.cli.keystore, sros_tool.cli.program, sros_tool.keystore.create
-import sros_tool.keystore.parallel, sros_tool.policy
-for line in sys.stdin:
-    pause, words = json.loads(line)
-    child = os.fork()
-    if child == 0:
-        try:
-            sys.argv = ["sros", *words]
-            main(words)
-        except SystemExit as end:
-            os._exit(end.code or 0)
-        finally:
-            os._exit(70)
-    if pause is not None:
-        time.sleep(pause)
-        os.kill(child, signal.SIGKILL)
-    _, status = os.waitpid(child, 0)
-    print(os.waitstatus_to_exitcode(status), file=answers, flush=True)
-"""
+__all__ = ["server"]
 
-
-class Server:
-    """Starts the program, already imported, in processes of its own."""
-
-    def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", SERVER],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-        )
-
-    def run(self, *words: object, kill_after: float | None = None) -> int:
-        """Run the program; its exit status, which is negative if it was killed."""
-        assert self._process.stdin
-        assert self._process.stdout
-        self._process.stdin.write(json.dumps([kill_after, list(map(str, words))]) + "\n")
-        self._process.stdin.flush()
-        return int(self._process.stdout.readline())
-
-    def close(self) -> None:
-        self._process.communicate(timeout=10)
-
-
-@pytest.fixture
-def server() -> Iterator[Server]:
-    serving = Server()
-    yield serving
-    serving.close()
+KILLS = 60
 
 
 def write_policy(path: Path, version: str, enclaves: list[str]) -> Path:
@@ -101,35 +44,23 @@ def test_killed_at_random_moments(server: Server, keystore: Path, tmp_path: Path
     """Acceptance 4: no file is empty, no pair torn, no enclave has rights of neither policy."""
     enclaves = ["/a", "/b", "/a/inner", "/c/d/e"]
     policies = [write_policy(tmp_path / f"{name}.xml", name, enclaves) for name in ("v1", "v2")]
-    assert server.run("generate_artifacts", "-k", keystore, "-p", policies[0]) == 0
-    durations = []
-    for policy in (policies[1], policies[0], policies[1], policies[0]):
-        started = time.monotonic()
-        assert server.run("generate_artifacts", "-k", keystore, "-p", policy) == 0
-        durations.append(time.monotonic() - started)
+    server.run("generate_artifacts", "-k", keystore, "-p", policies[0])
+    length = server.run("generate_artifacts", "-k", keystore, "-p", policies[0])
     assert versions(keystore, enclaves) == {"v1"}
-    longest = 1.1 * sorted(durations)[2]
-    moments = random.Random(4)
-    current, killed, changed = "v1", 0, 0
-    for number in range(KILLS):
+    moments = Moments(KILLS, 4, length)
+    current = "v1"
+    for number, pause in enumerate(moments):
         wanted = "v2" if current == "v1" else "v1"
         words: list[object] = ["-e", f"/new{number}"] if number % 10 == 0 else []
         policy = policies[wanted == "v2"]
-        pause = moments.uniform(0, longest)
-        status = server.run(
-            "generate_artifacts", "-k", keystore, "-p", policy, *words, kill_after=pause
-        )
-        assert status in (0, -signal.SIGKILL)
-        killed += status != 0
+        killed = server.kill(pause, "generate_artifacts", "-k", keystore, "-p", policy, *words)
         check_whole(keystore)
         now = versions(keystore, enclaves)
         assert now in ({current}, {wanted}), f"kill {number} after {pause:.4f} s"
-        assert status != 0 or now == {wanted}
-        changed += now == {wanted}
+        assert killed or now == {wanted}
+        moments.tell(killed=killed, done=now == {wanted})
         (current,) = now
-    assert killed > KILLS / 2, "most of the processes ended before they were killed"
-    assert 10 < changed < KILLS - 10, "the kills were not spread over the work"
-    assert server.run("generate_artifacts", "-k", keystore, "-p", policies[0]) == 0
+    server.run("generate_artifacts", "-k", keystore, "-p", policies[0])
     check_whole(keystore)
     assert versions(keystore, enclaves) == {"v1"}
     assert not remains(tmp_path)
@@ -141,28 +72,24 @@ def test_killed_while_signing_with_every_core(
     """The processes that share the work end with the one that was killed."""
     enclaves = [f"/fleet/n{number}" for number in range(220)]
     policies = [write_policy(tmp_path / f"{name}.xml", name, enclaves) for name in ("v1", "v2")]
-    started = time.monotonic()
-    assert server.run("generate_artifacts", "-k", keystore, "-p", policies[0]) == 0
-    longest = time.monotonic() - started
+    length = server.run("generate_artifacts", "-k", keystore, "-p", policies[0])
     moments = random.Random(5)
     current = "v1"
-    for _ in range(8):
+    for _ in range(40 if LONG else 4):
         wanted = "v2" if current == "v1" else "v1"
-        server.run(
-            *("generate_artifacts", "-k", keystore, "-p", policies[wanted == "v2"]),
-            kill_after=moments.uniform(0.1, 1.0) * longest,
-        )
+        pause = moments.uniform(0.1, 1.0) * length
+        server.kill(pause, "generate_artifacts", "-k", keystore, "-p", policies[wanted == "v2"])
         now = versions(keystore, enclaves)
         assert now in ({current}, {wanted})
         (current,) = now
-    assert server.run("generate_artifacts", "-k", keystore, "-p", policies[0]) == 0
+    server.run("generate_artifacts", "-k", keystore, "-p", policies[0])
     check_whole(keystore)
     assert versions(keystore, enclaves) == {"v1"}
     assert not remains(tmp_path)
 
 
 def openssl(*words: object) -> None:
-    subprocess.run(["openssl", *map(str, words)], check=True, capture_output=True)
+    run(["openssl", *words])
 
 
 def verify_with_openssl(keystore: Path) -> None:
@@ -181,7 +108,7 @@ def test_bug_17_of_eight_at_once_one_makes_the_keystore(root: str, tmp_path: Pat
     for _ in range(5):
         if root == "empty":
             keystore.mkdir()
-        ended = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        ended = run(command, env=environment)
         statuses = json.loads(ended.stdout.splitlines()[-1])
         assert sorted(statuses) == [0] + [1] * 7, ended.stderr
         assert ended.stderr.count("already exists") == 7, ended.stderr

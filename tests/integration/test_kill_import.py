@@ -6,16 +6,12 @@ running nor the next import from going through.
 
 from __future__ import annotations
 
-import random
-import signal
-import time
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 from harness import remains, snapshot
-from test_kill import Server
+from kills import Moments, Server, server
 from test_kill_life import DIED, copy, in_child
 
 from sros_tool.keystore import create_enclaves, create_keystore, filesystem
@@ -27,10 +23,12 @@ from sros_tool.keystore.signing import sign_request
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.verify import check_enclave
 
+__all__ = ["server"]
+
 NOW = datetime.now(UTC)
 LATER = NOW + timedelta(hours=1)
 NAME, FOLDER = "/arm/camera", "enclaves/arm/camera"
-KILLS = 40
+KILLS = 25
 
 
 @pytest.fixture(params=["the first", "a renewal"])
@@ -96,13 +94,6 @@ def test_death_at_every_step(
     assert steps > 10
 
 
-@pytest.fixture
-def server() -> Iterator[Server]:
-    serving = Server()
-    yield serving
-    serving.close()
-
-
 def test_killed_at_random_moments(
     server: Server, robot: tuple[Path, bytes], tmp_path: Path
 ) -> None:
@@ -111,23 +102,12 @@ def test_killed_at_random_moments(
     sent.write_bytes(answer)
     work = tmp_path / "work" / "robot"
     work.parent.mkdir()
-    durations = []
-    for _ in range(3):
-        copy(folder, work)
-        started = time.monotonic()
-        assert server.run("import", sent, work) == 0
-        durations.append(time.monotonic() - started)
+    copy(folder, work)
+    moments = Moments(KILLS, 7, server.run("import", sent, work))
     expected = settled(work)
-    moments = random.Random(7)
-    killed = done = 0
-    for _ in range(KILLS):
+    for pause in moments:
         copy(folder, work)
-        pause = moments.uniform(0, 1.1 * sorted(durations)[1])
-        status = server.run("import", sent, work, kill_after=pause)
-        assert status in (0, -signal.SIGKILL)
-        killed += status != 0
-        done += see(work, folder)
+        killed = server.kill(pause, "import", sent, work)
+        moments.tell(killed=killed, done=see(work, folder))
         import_answer(work, answer, now=LATER)
         assert settled(work) == expected
-    assert killed > KILLS / 4
-    assert done

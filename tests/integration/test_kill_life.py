@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import os
-import random
 import shutil
-import signal
 import sys
-import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 from harness import check_whole, remains
-from test_kill import Server
+from kills import Moments, Server, server
 
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore import create_enclaves, filesystem, list_enclaves
@@ -26,9 +23,11 @@ from sros_tool.keystore.renew import renew
 from sros_tool.keystore.revoke import read_crl, refresh_crl, revoke
 from sros_tool.keystore.verify import check_enclave
 
+__all__ = ["server"]
+
 NOW = datetime.now(UTC)
 LATER = NOW + timedelta(hours=1)
-KILLS = 60
+KILLS = 25
 
 
 @dataclass(frozen=True)
@@ -192,13 +191,6 @@ def test_death_at_every_step(
 # ── real processes ─────────────────────────────────────────────────────────────────────────
 
 
-@pytest.fixture
-def server() -> Iterator[Server]:
-    serving = Server()
-    yield serving
-    serving.close()
-
-
 @pytest.mark.parametrize("verb", ["renew", "revoke"])
 def test_killed_at_random_moments(verb: str, server: Server, life: Path, tmp_path: Path) -> None:
     words: dict[str, tuple[object, ...]] = {
@@ -208,28 +200,14 @@ def test_killed_at_random_moments(verb: str, server: Server, life: Path, tmp_pat
     work = tmp_path / "work" / "ks"
     work.parent.mkdir()
     before = settled(life)
-    durations = []
-    for _ in range(3):
+    copy(life, work)
+    moments = Moments(KILLS, 6, server.run(verb, work, *words[verb]))
+    for pause in moments:
         copy(life, work)
-        started = time.monotonic()
-        assert server.run(verb, work, *words[verb]) == 0
-        durations.append(time.monotonic() - started)
-    moments = random.Random(6)
-    killed = done = 0
-    for _ in range(KILLS):
-        copy(life, work)
-        pause = moments.uniform(0, 1.1 * sorted(durations[-3:])[1])
-        started = time.monotonic()
-        status = server.run(verb, work, *words[verb], kill_after=pause)
-        assert status in (0, -signal.SIGKILL)
-        killed += status != 0
-        if status == 0:  # it ended before: the machine may have less to do than it had
-            durations.append(min(pause, time.monotonic() - started))
+        killed = server.kill(pause, verb, work, *words[verb])
         now = see(work)
-        done += now != before
         if now != before:
             check_end(verb, before, now)
+        moments.tell(killed=killed, done=now != before)
         VERBS["renew with new keys" if verb == "renew" else verb](work)
         check_end(verb, before, settled(work))
-    assert killed > KILLS / 3
-    assert done

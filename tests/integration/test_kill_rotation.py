@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import random
-import signal
-import time
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 from harness import check_enclave_whole, remains
-from test_kill import Server
+from kills import Moments, Server, server
 from test_kill_life import DIED, copy, in_child
 
 from sros_tool.errors import KeystoreError
@@ -25,9 +21,11 @@ from sros_tool.keystore.rotation import Stage, read_rotation, rotation_status
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.verify import check_enclave
 
+__all__ = ["server"]
+
 NOW = datetime.now(UTC)
 LATER = NOW + timedelta(hours=1)
-KILLS = 12
+KILLS = 8
 STAGES = (Stage.DISTRIBUTE, Stage.REISSUE, Stage.RETIRE)
 
 State = tuple[tuple[str, ...], str, tuple[tuple[str, int], ...], tuple[int, ...]]
@@ -103,36 +101,20 @@ def test_death_at_every_step_of_revoking_between_stages(
     assert outcomes == {True, False}
 
 
-@pytest.fixture
-def server() -> Iterator[Server]:
-    serving = Server()
-    yield serving
-    serving.close()
-
-
 def test_every_stage_killed_at_random_moments(server: Server, life: Path, tmp_path: Path) -> None:
     work = tmp_path / "work" / "ks"
     work.parent.mkdir()
-    moments = random.Random(8)
-    killed = done = 0
-    for stage in STAGES:
+    for number, stage in enumerate(STAGES):
         before = settled(life)
         copy(life, work)
-        started = time.monotonic()
-        assert server.run("rotate_ca", work, "--to", stage) == 0
-        duration = time.monotonic() - started
+        moments = Moments(KILLS, number, server.run("rotate_ca", work, "--to", stage))
         expected = settled(work)
-        for _ in range(KILLS):
+        for pause in moments:
             copy(life, work)
-            pause = moments.uniform(0, 1.1 * duration)
-            status = server.run("rotate_ca", work, "--to", stage, kill_after=pause)
-            assert status in (0, -signal.SIGKILL)
-            killed += status != 0
+            killed = server.kill(pause, "rotate_ca", work, "--to", stage)
             now = see(work)
             assert now in (before, expected), stage
-            done += now == expected
-            assert server.run("rotate_ca", work, "--to", stage) == 0
+            moments.tell(killed=killed, done=now == expected)
+            server.run("rotate_ca", work, "--to", stage)
             assert settled(work) == expected, stage
         rotate_ca(life, stage, now=NOW)
-    assert killed > KILLS
-    assert done
