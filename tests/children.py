@@ -17,7 +17,9 @@ from typing import Any, TypeVar
 PATIENCE = 300.0
 """Seconds after which something awaited is taken for never coming."""
 
-CHECKOUT = Path(__file__).parent.parent
+LATE = 30.0
+"""Seconds after which one who is expected on a DDS is taken for silent."""
+
 LONG = "SROS_LONG" in os.environ
 """Whether the long forms are asked for: more of what is drawn or killed at random."""
 
@@ -32,6 +34,7 @@ def run(
     said: str = "",
     env: Mapping[str, str] | None = None,
     cwd: Path | None = None,
+    patience: float = PATIENCE,
     **more: Any,
 ) -> Done:
     """Run a program to its end, with ``said`` on its standard input.
@@ -47,7 +50,7 @@ def run(
             cwd=cwd,
             capture_output=True,
             text=True,
-            timeout=PATIENCE,
+            timeout=patience,
             **more,
         )
     except subprocess.TimeoutExpired as late:
@@ -59,8 +62,17 @@ def run(
 
 
 def python(*words: object, **more: Any) -> Done:
-    """As `run`, with this Python: a script, or ``-c`` and code, or ``-m`` and a module."""
+    """As `run`, with this Python: a script, or ``-c`` and code, or ``-m`` and a module.
+
+    It finds what this process finds, unless ``env`` says otherwise.
+    """
+    more.setdefault("env", importing())
     return run([sys.executable, *words], **more)
+
+
+def importing(**variables: str) -> dict[str, str]:
+    """This process's environment, and more, for a Python that imports what is imported here."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), **variables}
 
 
 def finish(process: subprocess.Popen[str], *, status: int | None = 0) -> Done:

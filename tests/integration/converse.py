@@ -1,8 +1,7 @@
-"""Let Cyclone DDS nodes talk in a network of their own, and print what was heard, as JSON.
+"""Let Cyclone DDS nodes talk in a network of their own: what was heard, refused, and readable.
 
-Reads a JSON list of nodes from standard input: {"role", "name", "keystore", "enclave", "topic",
-"text"}; ``keystore`` "" is no security.  Prints for each node what it reported, and for each text
-in how many packets it was readable.
+As a program it reads a list of nodes from standard input, plays them, and prints a `Conversation`,
+both as JSON: each node takes part in a process of its own.
 """
 
 from __future__ import annotations
@@ -13,56 +12,167 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+
+from children import LATE, PATIENCE, python
 
 from sros_tool.demo.capture import Capture
 from sros_tool.runtime.environment import secured_environment
-from sros_tool.runtime.events import Kind, read_events
+from sros_tool.runtime.events import Event, Kind, read_events
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 
-WINDOW = 4.0
-START = 30.0
+ENOUGH = 11
+"""Messages after which somebody is heard, and is no longer waited for."""
+
+SILENCE = 4.0
+"""Seconds after which who is not expected is not heard any more; or twice what others needed."""
+
+SETTLED = {Kind.READY, Kind.REFUSED, Kind.FAILED}
+
+
+@dataclass(frozen=True)
+class Node:
+    """A talker or listener; with "" as ``keystore`` it is unsecured.
+
+    Those of whom it is expected that they speak or hear (``hears``) are waited for.
+    """
+
+    role: str
+    name: str
+    keystore: str
+    enclave: str
+    topic: str = "/chatter"
+    text: str = "Hello"
+    hears: bool = True
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a node reported: the kinds of its events, and why it was refused or failed."""
+
+    kinds: list[str]
+    sent: int
+    heard: list[str]
+    reasons: list[str]
+    errors: str
+
+
+@dataclass(frozen=True)
+class Conversation:
+    """What each node told, and in how many packets each talker's text was readable.
+
+    ``readable`` is None where packets may not be captured.
+    """
+
+    nodes: dict[str, Told]
+    readable: dict[str, int] | None
+
+    def heard(self, listener: str = "listener") -> bool:
+        """Whether a listener heard enough; fails unless it was able to."""
+        told = self.nodes[listener]
+        assert told.kinds and "failed" not in told.kinds, self
+        return len(told.heard) >= ENOUGH
+
+
+def talker(
+    keystore: Path,
+    enclave: str,
+    name: str = "talker",
+    *,
+    topic: str = "/chatter",
+    text: str = "Hello",
+) -> Node:
+    return Node("talker", name, str(keystore), enclave, topic, text)
+
+
+def listener(
+    keystore: Path,
+    enclave: str,
+    name: str = "listener",
+    *,
+    topic: str = "/chatter",
+    hears: bool = True,
+) -> Node:
+    return Node("listener", name, str(keystore), enclave, topic, hears=hears)
+
+
+def converse(domain: int, *nodes: Node) -> Conversation:
+    """Let the nodes talk, and tell what came of it."""
+    done = python(__file__, domain, said=json.dumps([asdict(node) for node in nodes]))
+    found = json.loads(done.stdout)
+    told = {name: Told(**each) for name, each in found["nodes"].items()}
+    return Conversation(told, found["readable"])
 
 
 def main() -> None:
-    nodes: list[dict[str, Any]] = json.load(sys.stdin)
-    domain = int(sys.argv[1])
-    isolation = try_isolation()
-    if isolation.isolated:
+    nodes = [Node(**each) for each in json.load(sys.stdin)]
+    if try_isolation().isolated:
         enter_isolation()
-    capture = open_capture([node["text"] for node in nodes if node["role"] == "talker"])
+    capture = open_capture([node.text for node in nodes if node.role == "talker"])
     with tempfile.TemporaryDirectory() as folder:
-        running = [(node, *start(node, domain, Path(folder))) for node in nodes]
-        deadline = time.monotonic() + START
-        settled = {Kind.READY, Kind.REFUSED, Kind.FAILED}
-        while time.monotonic() < deadline and not all(
-            settled & {event.kind for event in read_events(report)} for _, _, report in running
-        ):
-            time.sleep(0.05)
-        end = time.monotonic() + WINDOW
+        parties = [Party(node, int(sys.argv[1]), Path(folder)) for node in nodes]
+        wait_until_over(parties, capture)
+        told = {party.node.name: asdict(party.end()) for party in parties}
+    json.dump({"nodes": told, "readable": dict(capture.plain) if capture else None}, sys.stdout)
+
+
+class Party:
+    """A node that takes part, in a process of its own."""
+
+    def __init__(self, node: Node, domain: int, folder: Path) -> None:
+        self.node = node
+        self.process, self._report = start(node, domain, folder)
+        self._errors = self._report.with_suffix(".err")
+
+    def events(self) -> list[Event]:
+        return read_events(self._report)
+
+    def is_settled(self) -> bool:
+        """Whether it is ready, or will never be."""
+        return any(e.kind in SETTLED for e in self.events()) or self.process.poll() is not None
+
+    def is_content(self) -> bool:
+        """Whether nothing more has to be awaited of it."""
+        if self.process.poll() is not None:
+            return True
+        wanted = Kind.SENT if self.node.role == "talker" else Kind.HEARD
+        return sum(event.kind is wanted for event in self.events()) >= ENOUGH
+
+    def end(self) -> Told:
+        self.process.terminate()
+        self.process.wait(PATIENCE)
+        events = self.events()
+        return Told(
+            kinds=sorted({event.kind.value for event in events}),
+            sent=sum(event.kind is Kind.SENT for event in events),
+            heard=[event.text for event in events if event.kind is Kind.HEARD],
+            reasons=[e.text for e in events if e.kind in (Kind.REFUSED, Kind.FAILED)],
+            errors=self._errors.read_text(errors="replace"),
+        )
+
+
+def wait_until_over(parties: Sequence[Party], capture: Capture | None) -> None:
+    """Wait until all who can be heard were; who is to stay silent gets as long, and longer."""
+
+    def pause() -> None:
+        if capture:
+            capture.drain()
+        time.sleep(0.02)
+
+    hung = time.monotonic() + PATIENCE
+    while not all(party.is_settled() for party in parties) and time.monotonic() < hung:
+        pause()
+    begin = time.monotonic()
+    expected = [party for party in parties if party.node.hears]
+    while not all(party.is_content() for party in expected) and time.monotonic() < begin + LATE:
+        pause()
+    if len(expected) < len(parties):
+        needed = time.monotonic() - begin
+        end = begin + max(SILENCE, 2 * needed)
         while time.monotonic() < end:
-            if capture:
-                capture.drain()
-            time.sleep(0.02)
-        result = []
-        for node, process, report in running:
-            process.terminate()
-            process.wait(10)
-            events = read_events(report)
-            result.append(
-                {
-                    "name": node["name"],
-                    "kinds": sorted({event.kind.value for event in events}),
-                    "sent": sum(event.kind is Kind.SENT for event in events),
-                    "heard": [event.text for event in events if event.kind is Kind.HEARD],
-                    "reasons": [
-                        event.text for event in events if event.kind in (Kind.REFUSED, Kind.FAILED)
-                    ],
-                }
-            )
-    readable = dict(capture.plain) if capture else None
-    json.dump({"nodes": result, "readable": readable}, sys.stdout)
+            pause()
 
 
 def open_capture(texts: list[str]) -> Capture | None:
@@ -73,18 +183,20 @@ def open_capture(texts: list[str]) -> Capture | None:
         return None
 
 
-def start(node: dict[str, Any], domain: int, folder: Path) -> tuple[subprocess.Popen[bytes], Path]:
-    report = folder / f"{node['name']}.jsonl"
+def start(node: Node, domain: int, folder: Path) -> tuple[subprocess.Popen[bytes], Path]:
+    """The process of a node, the file that it reports to, and beside that its errors (.err)."""
+    report = folder / f"{node.name}.jsonl"
     report.touch()
     environment = {k: v for k, v in os.environ.items() if not k.startswith("ROS_")}
     environment["ROS_DOMAIN_ID"] = str(domain)
-    if node["keystore"]:
-        environment |= secured_environment(Path(node["keystore"]), node["enclave"], domain)
-    command = [sys.executable, "-m", "sros_tool.demo.cyclone_node", node["role"]]
-    command += ["--topic", node["topic"], "--text", node["text"], "--period", "0.1"]
-    process = subprocess.Popen(
-        [*command, "--report", str(report)], env=environment, stderr=subprocess.DEVNULL
-    )
+    if node.keystore:
+        environment |= secured_environment(Path(node.keystore), node.enclave, domain)
+    command = [sys.executable, "-m", "sros_tool.demo.cyclone_node", node.role]
+    command += ["--topic", node.topic, "--text", node.text, "--period", "0.1"]
+    with report.with_suffix(".err").open("wb") as errors:
+        process = subprocess.Popen(
+            [*command, "--report", str(report)], env=environment, stderr=errors
+        )
     return process, report
 
 

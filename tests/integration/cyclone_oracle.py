@@ -36,7 +36,7 @@ from sros_tool.runtime.cyclone_library import (
 )
 from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
 
-PATIENCE = 30.0
+PATIENCE = 120.0
 OPS = (ctypes.c_uint32 * 3)(0x01 << 24 | 0x05 << 16, 0, 0)
 
 REFUSALS = {-13: "denied", -3: "invalid"}

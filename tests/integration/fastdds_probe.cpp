@@ -1,10 +1,10 @@
 // Asks Fast DDS whether one enclave hears another.
 //
-//   fastdds_probe DOMAIN [SECONDS]
+//   fastdds_probe DOMAIN
 //
-// Reads questions from standard input, a line each: WRITER_FOLDER READER_FOLDER TOPIC.  Answers each
-// with a line: heard, silent (never matched, or nothing arrived within SECONDS), or what was refused:
-// "writer joins", "reader joins", "writer opens", "reader opens".
+// Reads questions from standard input, a line each: WRITER_FOLDER READER_FOLDER TOPIC SECONDS.
+// Answers each with a line: heard, silent (never matched, or nothing arrived within SECONDS), or what
+// was refused: "writer joins", "reader joins", "writer opens", "reader opens".
 //
 // A crl.pem in a folder is used as the RMWs of ROS 2 use it.
 
@@ -185,19 +185,19 @@ int main(int count, char** arguments)
 {
     if (count < 2)
     {
-        std::cerr << "usage: fastdds_probe DOMAIN [SECONDS]" << std::endl;
+        std::cerr << "usage: fastdds_probe DOMAIN" << std::endl;
         return 2;
     }
     const auto domain = static_cast<std::uint32_t>(std::stoul(arguments[1]));
-    const double seconds = count > 2 ? std::stod(arguments[2]) : 4.0;
     fast::Log::ClearConsumers();  // it writes to standard output
     eprosima::fastrtps::LibrarySettingsAttributes settings;
     settings.intraprocess_delivery = eprosima::fastrtps::INTRAPROCESS_OFF;
     eprosima::fastrtps::xmlparser::XMLProfileManager::library_settings(settings);
     std::string line, from, to, topic;
+    double seconds;
     while (std::getline(std::cin, line))
     {
-        std::istringstream(line) >> from >> to >> topic;
+        std::istringstream(line) >> from >> to >> topic >> seconds;
         std::cout << ask(domain, seconds, from, to, topic) << std::endl;
     }
 }

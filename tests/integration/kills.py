@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import signal
 import subprocess
@@ -12,7 +11,7 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from children import LONG, PATIENCE
+from children import LONG, PATIENCE, importing
 
 # Forks the imported program for each line; a program of its own would take 0.2 s to start.
 SERVER = """
@@ -56,7 +55,7 @@ class Server:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            env=importing(),
         )
 
     def run(self, *words: object) -> float:

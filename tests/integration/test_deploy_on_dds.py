@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import os
 import shutil
-import subprocess
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import pytest
+from children import importing, python, run
+from converse import converse, listener, talker
 from harness import policy_text, publish, snapshot
 
 from sros_tool.dds.domains import DomainSet
@@ -46,29 +45,6 @@ def home(tmp_path: Path) -> Path:
     return root
 
 
-def party(role: str, root: Path, enclave: str) -> dict[str, str]:
-    names = {"role": role, "name": role, "topic": "/image", "text": "Hello"}
-    return {**names, "keystore": str(root), "enclave": enclave}
-
-
-def converse(*parties: dict[str, str]) -> dict[str, Any]:
-    script = Path(__file__).with_name("converse.py")
-    done = subprocess.run(
-        [sys.executable, str(script), str(DOMAIN)],
-        input=json.dumps(parties),
-        capture_output=True,
-        text=True,
-        timeout=90,
-    )
-    assert done.returncode == 0, done.stderr
-    return {node["name"]: node for node in json.loads(done.stdout)["nodes"]}
-
-
-def assert_heard(said: dict[str, Any]) -> None:
-    assert said["talker"]["sent"] > 10, said
-    assert len(said["listener"]["heard"]) > 10, said
-
-
 def test_an_enclave_that_was_born_on_the_robot_talks_with_an_ordinary_one(
     home: Path, tmp_path: Path
 ) -> None:
@@ -91,15 +67,16 @@ def test_an_enclave_that_was_born_on_the_robot_talks_with_an_ordinary_one(
     twin = Path(shutil.copytree(robot, tmp_path / "twin"))
     for name, data in unpack(tampered).items():
         (twin / name).write_bytes(data)
-    parties = party("talker", twin, CAMERA), party("listener", home, VIEWER)
-    refused = converse(*parties)
-    assert refused["talker"]["sent"] == 0, refused
-    assert "ready" not in refused["talker"]["kinds"], refused
-    assert "ready" in refused["listener"]["kinds"], refused
+    hears = listener(home, VIEWER, topic="/image")
+    refused = converse(DOMAIN, talker(twin, CAMERA, topic="/image"), replace(hears, hears=False))
+    assert refused.nodes["talker"].sent == 0, refused
+    assert "ready" not in refused.nodes["talker"].kinds, refused
+    assert not refused.heard(), refused
 
     import_answer(robot, archive, now=now)
     assert not verify_arrival(robot, now=now, domain=DOMAIN).findings
-    assert_heard(converse(party("talker", robot, CAMERA), party("listener", home, VIEWER)))
+    said = converse(DOMAIN, talker(robot, CAMERA, topic="/image"), hears)
+    assert said.heard(), said
 
 
 def test_a_set_that_went_through_a_pipe_talks_when_the_original_is_gone(
@@ -109,14 +86,16 @@ def test_a_set_that_went_through_a_pipe_talks_when_the_original_is_gone(
     generate_artifacts(home, policies=[read_policy(tmp_path / "p.xml")], now=now)
     (tmp_path / "robot").mkdir()
     script = '"$0" -m sros_tool distribute_key ks --match "/arm/*" - | tar -xz -C robot'
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    subprocess.run(["sh", "-c", script, sys.executable], cwd=tmp_path, env=environment, check=True)
+    run(["sh", "-c", script, sys.executable], cwd=tmp_path, env=importing())
     shutil.rmtree(home)
     robot = tmp_path / "robot"
     arrival = verify_arrival(robot, now=now, domain=DOMAIN)
     assert not arrival.findings
     assert [each.name for each in arrival.enclaves] == [CAMERA, VIEWER]
-    assert_heard(converse(party("talker", robot, CAMERA), party("listener", robot, VIEWER)))
+    said = converse(
+        DOMAIN, talker(robot, CAMERA, topic="/image"), listener(robot, VIEWER, topic="/image")
+    )
+    assert said.heard(), said
 
 
 def test_what_run_starts_is_what_dds_loads(home: Path, tmp_path: Path) -> None:
@@ -124,11 +103,6 @@ def test_what_run_starts_is_what_dds_loads(home: Path, tmp_path: Path) -> None:
     made = create_request(robot, CAMERA)
     archive = sign_request(home, made.file.read_bytes(), now=datetime.now(UTC)).archive
     import_answer(robot, archive, now=datetime.now(UTC))
-    done = subprocess.run(
-        [sys.executable, "-m", "sros_tool", "run", str(robot), CAMERA, "--", "env"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = python("-m", "sros_tool", "run", robot, CAMERA, "--", "env")
     expected = secured_environment(robot, CAMERA, DOMAIN)
     assert {f"{name}={value}" for name, value in expected.items()} <= set(done.stdout.split("\n"))

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import shutil
-import sys
 from pathlib import Path
 
 import pytest
-from children import LONG, run
+from children import LONG, python, run
 from harness import check_whole, policy_text, publish, remains, topics_of
 from kills import Moments, Server, server
 
@@ -103,12 +101,10 @@ def verify_with_openssl(keystore: Path) -> None:
 @pytest.mark.parametrize("root", ["missing", "empty", "in a missing folder"])
 def test_bug_17_of_eight_at_once_one_makes_the_keystore(root: str, tmp_path: Path) -> None:
     keystore = tmp_path / ("deep/er/ks" if "folder" in root else "ks")
-    command = [sys.executable, "-c", _STARTER, str(keystore)]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     for _ in range(5):
         if root == "empty":
             keystore.mkdir()
-        ended = run(command, env=environment)
+        ended = python("-c", _STARTER, keystore)
         statuses = json.loads(ended.stdout.splitlines()[-1])
         assert sorted(statuses) == [0] + [1] * 7, ended.stderr
         assert ended.stderr.count("already exists") == 7, ended.stderr

@@ -54,12 +54,11 @@ def test_the_old_certificate_with_its_old_permissions(
     for file in ("cert.pem", "key.pem", "permissions.p7s"):
         shutil.copy(enclave_path(before, "/robot") / file, enclave_path(after, "/robot") / file)
     listener = (root, "/listener")
-    answers = ask(
-        [
-            Question((before, "/robot"), listener, "/secret"),
-            Question((after, "/robot"), listener, "/secret"),
-            Question((root, "/robot"), listener, "/secret"),
-            Question((root, "/robot"), listener, "/chatter"),
-        ]
+    ask(
+        {
+            Question((before, "/robot"), listener, "/secret"): kept,
+            Question((after, "/robot"), listener, "/secret"): put_back,
+            Question((root, "/robot"), listener, "/secret"): REFUSED,
+            Question((root, "/robot"), listener, "/chatter"): HEARD,
+        }
     )
-    assert answers == [kept, put_back, REFUSED, HEARD]

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
-import sys
 from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from children import python
+from test_life_on_dds import HEARD, SILENT, Question, ask_fast, compare, probe
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.keystore import create_enclaves, create_keystore
-from sros_tool.keystore.enclave import enclave_path
 from sros_tool.keystore.revoke import revoke
 from sros_tool.keystore.rotate import renew_identity_ca, rotate_ca
 from sros_tool.keystore.template import load_template
-from sros_tool.runtime.netns import try_isolation
+
+__all__ = ["probe"]
 
 pytestmark = pytest.mark.dds
 
@@ -27,7 +27,6 @@ DOMAIN = 141
 HERE = Path(__file__).parent
 ALL = {"running": True, "listener": True, "talker": True, "both": True}
 TOGETHER = {"running": True, "listener": False, "talker": False, "both": True}
-STAGES = ["distribute", "reissue", "retire"]
 
 
 def make(root: Path, template: str, *, revoked: bool = False) -> None:
@@ -42,11 +41,10 @@ def make(root: Path, template: str, *, revoked: bool = False) -> None:
 # ── Cyclone DDS: nodes that run, and are restarted one by one ──────────────────────────────
 
 
-def restarts(root: Path, *steps: str) -> list[dict[str, bool]]:
-    command = [sys.executable, str(HERE / "restarts.py"), str(root), str(DOMAIN), *steps]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
-    assert done.returncode == 0, done.stderr
-    return list(json.loads(done.stdout))
+def restarts(root: Path, steps: dict[str, dict[str, bool]]) -> None:
+    """Assert who hears whom after each step; who is to be heard is waited for."""
+    done = python(HERE / "restarts.py", root, DOMAIN, said=json.dumps(steps))
+    assert json.loads(done.stdout) == steps
 
 
 @pytest.mark.parametrize(
@@ -55,58 +53,29 @@ def restarts(root: Path, *steps: str) -> list[dict[str, bool]]:
 def test_the_stages_on_cyclone(template: str, revoked: bool, tmp_path: Path) -> None:
     """It trusts one CA at a time: after the stage reissue, all have to be restarted together."""
     make(tmp_path / "ks", template, revoked=revoked)
-    assert restarts(tmp_path / "ks", *STAGES) == [ALL, TOGETHER, ALL]
+    restarts(tmp_path / "ks", {"distribute": ALL, "reissue": TOGETHER, "retire": ALL})
 
 
 def test_a_ca_with_the_same_key_disturbs_nobody_on_cyclone(tmp_path: Path) -> None:
     make(tmp_path / "ks", "production", revoked=True)
-    assert restarts(tmp_path / "ks", "same-key") == [ALL]
+    restarts(tmp_path / "ks", {"same-key": ALL})
 
 
 def test_all_stages_at_once_on_cyclone(tmp_path: Path) -> None:
     make(tmp_path / "ks", "production")
-    assert restarts(tmp_path / "ks", "finish") == [TOGETHER]
+    restarts(tmp_path / "ks", {"finish": TOGETHER})
 
 
 # ── Fast DDS: processes with the files of one moment, and of another ───────────────────────
 
 
-@pytest.fixture(scope="module")
-def probe(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The program that asks Fast DDS."""
-    source = HERE / "fastdds_probe.cpp"
-    if not shutil.which("g++") or not Path("/usr/include/fastdds").is_dir():
-        pytest.skip("g++ and libfastrtps-dev are not installed")
-    if not source.exists():
-        pytest.skip(f"there is no {source.name} here")
-    program = tmp_path_factory.mktemp("probe") / "fastdds_probe"
-    command = ["g++", "-std=c++17", "-O0", "-o", str(program), str(source), "-lfastrtps"]
-    built = subprocess.run(command, capture_output=True, text=True)
-    assert built.returncode == 0, built.stderr
-    return program
-
-
-ISOLATED = """
-import os, sys
-from sros_tool.runtime.netns import enter_isolation
-enter_isolation()
-os.execv(sys.argv[1], sys.argv[1:])
-"""
-
-
-def talk(program: Path, *pairs: tuple[Path, Path]) -> list[str]:
-    """For each pair of keystores, whether the listener of one hears the talker of the other."""
-    lines = [
-        f"{enclave_path(talking, '/talker')} {enclave_path(listening, '/listener')} rt/chatter\n"
+def talk(program: Path, expected: str, *pairs: tuple[Path, Path]) -> None:
+    """Assert whether the talker of one keystore is heard by the listener of another."""
+    questions = {
+        Question((talking, "/talker"), (listening, "/listener")): expected
         for talking, listening in pairs
-    ]
-    command = [str(program), str(DOMAIN)]
-    if try_isolation().isolated:
-        command = [sys.executable, "-c", ISOLATED, *command]
-    done = subprocess.run(
-        command, input="".join(lines), capture_output=True, text=True, timeout=120
-    )
-    return done.stdout.splitlines()
+    }
+    compare(questions, ask_fast(program, questions, DOMAIN))
 
 
 def moments(root: Path, steps: int) -> list[Path]:
@@ -133,9 +102,9 @@ def test_the_stages_on_fast_dds(template: str, revoked: bool, probe: Path, tmp_p
     pairs = [(one, one) for one in copies]
     for one, next_one in pairwise(copies):
         pairs += [(one, next_one), (next_one, one)]
-    assert talk(probe, *pairs) == ["heard"] * len(pairs)
+    talk(probe, HEARD, *pairs)
     # Who missed a stage is left behind, so the answers above say something.
-    assert talk(probe, (copies[0], copies[2]), (copies[3], copies[1])) == ["silent"] * 2
+    talk(probe, SILENT, (copies[0], copies[2]), (copies[3], copies[1]))
 
 
 def test_a_ca_with_the_same_key_disturbs_nobody_on_fast_dds(probe: Path, tmp_path: Path) -> None:
@@ -143,4 +112,4 @@ def test_a_ca_with_the_same_key_disturbs_nobody_on_fast_dds(probe: Path, tmp_pat
     make(root, "production", revoked=True)
     before = Path(shutil.copytree(root, tmp_path / "before", symlinks=True))
     renew_identity_ca(root, now=datetime.now(UTC))
-    assert talk(probe, (before, root), (root, before), (root, root)) == ["heard"] * 3
+    talk(probe, HEARD, (before, root), (root, before), (root, root))

@@ -8,34 +8,24 @@ order of the cases.
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
-from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
 
-import pytest
+from children import LATE, python, run
 from cryptography import x509
+from fastdds import build, isolated
 
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem
 from sros_tool.pki.keys import generate_key, key_pem
-from sros_tool.runtime.netns import try_isolation
 from sros_tool.validity import Window
 
 HERE = Path(__file__).parent
-ISOLATED = """
-import os, sys
-from sros_tool.runtime.netns import end_with_parent, enter_isolation
-enter_isolation()
-os.execv(sys.argv[1], sys.argv[1:])
-"""
 
 MATCH_SECONDS = 2.5
 """How long a match is waited for; those that come take a tenth of a second."""
@@ -146,6 +136,8 @@ PEER_PERMISSIONS = b"""<?xml version="1.0" encoding="UTF-8"?>
 """
 
 
+_PATIENCE = 3600.0  # a full run asks thousands of questions of one process
+
 Asked = TypeVar("Asked")
 
 
@@ -165,25 +157,13 @@ def with_patience(
         for place, reply in enumerate(replies)
         if "unmatched" in reply.answers and doubtful(place, reply)
     ]
-    again = ask([asked[place] for place in late], 4 * MATCH_SECONDS)
+    again = ask([asked[place] for place in late], LATE)
     for place, reply in zip(late, again, strict=True):
         replies[place] = reply
     return replies
 
 
 # ── Fast DDS ───────────────────────────────────────────────────────────────────────────────
-
-
-@cache
-def fastdds_oracle(folder: Path) -> Path:
-    """The program that asks Fast DDS, built once in a folder."""
-    if not shutil.which("g++") or not Path("/usr/include/fastdds").is_dir():
-        pytest.skip("g++ and libfastrtps-dev are not installed")
-    program = folder / "fastdds_oracle"
-    command = ["g++", "-std=c++17", "-O0", "-o", str(program), str(HERE / "fastdds_oracle.cpp")]
-    built = subprocess.run([*command, "-lfastrtps"], capture_output=True, text=True)
-    assert built.returncode == 0, built.stderr
-    return program
 
 
 def ask_fastdds(
@@ -197,7 +177,7 @@ def ask_fastdds(
 
     A match is waited for so many seconds.
     """
-    program = fastdds_oracle(workshop.root)
+    program = build("fastdds_oracle.cpp", workshop.root)
     lines = [_line(workshop, case, seconds) for case in cases]
     return _spread(lines, at_once, lambda some: _ask_one_program(program, some))
 
@@ -221,16 +201,11 @@ def _line(workshop: Workshop, case: Case, seconds: float) -> str:
 
 
 def _ask_one_program(program: Path, lines: Sequence[str]) -> list[Reply]:
-    command = [str(program)]
-    if try_isolation().isolated:
-        command = [sys.executable, "-c", ISOLATED, *command]
+    command = isolated(program)
     replies: list[Reply] = []
     while len(replies) < len(lines):
         rest = lines[len(replies) :]
-        limit = 60 + len(rest) * (4 * MATCH_SECONDS + 1)
-        done = subprocess.run(
-            command, input="\n".join(rest) + "\n", capture_output=True, text=True, timeout=limit
-        )
+        done = run(command, said="\n".join(rest) + "\n", status=None, patience=_PATIENCE)
         replies += [_reply(line) for line in done.stdout.splitlines()]
         if len(replies) < len(lines):
             assert done.returncode < 0, (done.returncode, done.stderr)
@@ -260,11 +235,8 @@ def ask_cyclone(
 
 def ask_cyclone_records(records: Sequence[dict[str, Any]]) -> list[Reply]:
     """What Cyclone DDS does with cases in the form of `cyclone_oracle`."""
-    command = [sys.executable, str(HERE / "cyclone_oracle.py")]
-    done = subprocess.run(
-        command, input=json.dumps(list(records)), capture_output=True, text=True, timeout=3600
-    )
-    assert done.returncode == 0, done.stderr
+    script = HERE / "cyclone_oracle.py"
+    done = python(script, said=json.dumps(list(records)), patience=_PATIENCE)
     replies = [json.loads(line) for line in done.stdout.splitlines()]
     assert not [each for each in replies if each["end"] == "failed"], done.stderr
     return [Reply(each["end"], tuple(each["answers"]), each["log"]) for each in replies]
@@ -302,7 +274,7 @@ def ask_fastdds_folders(
     seconds: float = MATCH_SECONDS,
 ) -> list[Reply]:
     """What Fast DDS does with each pair of enclaves."""
-    program = fastdds_oracle(program_folder)
+    program = build("fastdds_oracle.cpp", program_folder)
     lines = [
         f"{own}\t{own}\t{domain}\t{zone}\t{peer}\t{peer}\t{int(seconds * 1000)}\tpublish\x1f{topic}"
         for own, peer, zone in pairs
