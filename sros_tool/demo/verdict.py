@@ -12,14 +12,12 @@ import signal
 from sros_tool.demo.model import STATUS_OF, Claim, Party, Relation, Role, Status, Wire
 from sros_tool.demo.records import Finding, PartyRecord, RowRecord, RowResult, forged_text
 from sros_tool.runtime.events import Event, Kind, Stage
-from sros_tool.runtime.security_log import endpoint_refusal, missing_security, participant_refusal
-
-_NOISE = re.compile(
-    r"(?:candidate|adjusted)_guid: \S+ |Remote secure participant \S+ not allowed\. ?"
-    r"|[0-9A-F]{16}:error:[0-9A-F]+:[\w ]+:|:\.\./\S+\.c:\d+|\[\w+\] failed: "
-    r"|validate_local_identity: |Error\. (?=Error|validate)"
+from sros_tool.runtime.security_log import (
+    endpoint_refusal,
+    missing_security,
+    participant_refusal,
+    plain_refusal,
 )
-"""Of Cyclone DDS and OpenSSL: numbers, and places in their sources."""
 
 
 def judge_row(record: RowRecord) -> RowResult:
@@ -216,7 +214,7 @@ def _trouble(name: str, record: PartyRecord) -> Finding | None:
 
 
 def _failure(name: str, record: PartyRecord, event: Event) -> Finding:
-    told = f"{record.output}\n{event.text}"
+    told = f"{event.text}\n{record.output}"
     reason = " ".join(event.text.split())
     if lacking := missing_security(told):
         return Finding(Status.NOT_STARTED, f"{name}: {lacking}")
@@ -243,7 +241,7 @@ def _speaks_of(line: str, topic: str) -> bool:
 
 
 def _refused(name: str, stage: Stage | None, reason: str) -> Finding:
-    reason = _NOISE.sub("", reason)
+    reason = plain_refusal(reason)
     if stage is Stage.ENDPOINT:
         return Finding(Status.REFUSED, f"{name}: {reason}")
     return Finding(Status.NOT_LET_IN, f"{name} was refused before it came to the topic: {reason}")

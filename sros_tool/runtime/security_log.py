@@ -14,7 +14,7 @@ _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _FRAME = re.compile(
     # Fast DDS: when, `[SECURITY Error]`, the place in its sources, and the function.
     r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d[.\d]* (?=\[)|\[SECURITY\w* (?:Error|Warning)\]\s*"
-    r"|\s*\([^()\s]+\.(?:cpp|h|hpp|ipp):\d+\)|\s*-> Function \w+\Z"
+    r"|\s*\([^()\s]+\.(?:cpp|h|hpp|ipp):\d+\)|\s*-> Function \w+\Z|, at \S+\.(?:cpp|c):\d+"
     # The file of ROS_SECURITY_LOG_FILE: when, severity, participant, domain, and the function.
     r"|^\S+ \[[A-Z]+\] \S+ \d+ \w+::\w+ :\s*"
     # Cyclone DDS and OpenSSL: when and by which thread, numbers, and places in their sources.

@@ -7,15 +7,15 @@ import shutil
 from pathlib import Path
 
 import pytest
+from enforcing import BACKENDS, enforcing_backend
 from harness import policy_text, publish, snapshot, sros
-from test_demo_attacks import _needs_cyclone, needs_isolation
+from test_demo_attacks import needs_isolation
 
+from sros_tool.demo.backend import RCLPY
 from sros_tool.demo.given import open_given
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.errors import SrosError
 from sros_tool.resources import policies_dir
-
-__all__ = ["_needs_cyclone"]  # a fixture of the other module, used here
 
 pytestmark = pytest.mark.dds
 
@@ -48,6 +48,66 @@ def test_who_plays_which_part_in_a_robot(robot: Path, tmp_path: Path) -> None:
     )
     with pytest.raises(SrosError, match="no two enclaves"):
         open_given(robot, "/no_such_topic", ATTACKS)
+
+
+@needs_isolation
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_a_robot_under_attack(backend: str, robot: Path) -> None:
+    """Each enclave of a robot is attacked with what its own permissions leave out."""
+    enforcing_backend(backend)
+    before = snapshot(robot)
+    words = ("a talker listens", "a listener publishes", "was not given", "poses as", "injects")
+    only = [argument for word in words for argument in ("--only", word)]
+    ended = sros(
+        *("demo", "--backend", backend, "--scenario", "attacks", "--keystore", robot, "--json"),
+        *only,
+    )
+    assert ended.status == 0, ended
+    assert snapshot(robot) == before
+    shown = json.loads(ended.out)
+    assert [row["name"] for row in shown["rows"] if row["observed"] == "skipped"] == []
+    assert len(shown["rows"]) > 10
+    cast = {each["part"]: each for each in shown["scenarios"][0]["cast"]}
+    assert {"talker", "listener", "guest", "server", "client"} <= set(cast)
+    for each in cast.values():
+        assert each["enclave"].startswith("/mobile_robot/")
+        assert bool(each["nodes"]) is (backend == RCLPY)
+
+
+def test_a_part_is_given_to_whom_it_fits_best(tmp_path: Path) -> None:
+    """Who may do both tells nothing by doing both, if there is somebody else."""
+    both = f"{publish('/image')}{HEARS}"
+    policies = {"/a": both, "/b": publish("/image"), "/c": both, "/d": HEARS, "/e": publish("/x")}
+    root = make_keystore(tmp_path, policies)
+    given = open_given(root, "/image", ATTACKS)
+    assert given.guessed
+    parts = ("talker", "listener", "guest")
+    assert [given.cast[part] for part in parts] == ["/b", "/d", "/e"]
+
+
+@needs_isolation
+def test_a_row_that_nobody_in_the_keystore_can_show_is_skipped(tmp_path: Path) -> None:
+    both = f"{publish('/image')}{HEARS}"
+    root = make_keystore(tmp_path, {"/a": both, "/b": both, "/c": publish("/x")})
+    ended = sros(
+        *("demo", "--backend", "cyclone", "--scenario", "attacks", "--keystore", root, "--json"),
+        *("--only", "a talker listens"),
+    )
+    closed, opened = json.loads(ended.out)["rows"]
+    assert closed["observed"] == "skipped"
+    assert closed["detail"] == (
+        "no enclave fits the part of the talker better than /a, and its permissions allow to"
+        " subscribe /image"
+    )
+    assert opened["observed"] == "heard"
+
+
+def make_keystore(folder: Path, rights: dict[str, str]) -> Path:
+    root = folder / "ks"
+    (folder / "policy.xml").write_text(policy_text(rights))
+    sros("create_keystore", root, "--template", "production").ok()
+    sros("generate_artifacts", "-k", root, "-p", folder / "policy.xml").ok()
+    return root
 
 
 @needs_isolation

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import signal
 import subprocess
@@ -12,6 +13,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from enforcing import enforcing_backend
+from harness import sros
 from test_demo_run import without_security
 
 from sros_tool.dds.domains import DomainSet
@@ -19,6 +22,7 @@ from sros_tool.demo.backend import RCLPY, Backend, choose_backend
 from sros_tool.demo.isolated import run_isolated
 from sros_tool.demo.model import UNSECURED, Status
 from sros_tool.demo.runner import Limits, Plan, run_plan
+from sros_tool.demo.scenarios import SCENARIOS
 from sros_tool.demo.scenarios.actions import ACTIONS
 from sros_tool.demo.scenarios.composition import COMPOSITION
 from sros_tool.demo.scenarios.isolation import ISOLATION, TALKER
@@ -84,6 +88,25 @@ def test_the_runner_drives_rclpy_nodes(tmp_path: Path) -> None:
         unpermitted = result.name in wired or "cannot be loaded" in result.detail
         skipped = result.observed is Status.SKIPPED and unpermitted
         assert result.observed is result.expected or skipped, result
+
+
+@pytest.mark.parametrize("name", [each.name for each in SCENARIOS if each.name != "attacks"])
+def test_every_scenario_on_an_rclpy_that_enforces_security(name: str, tmp_path: Path) -> None:
+    """The attacks are played by test_demo_attacks.py."""
+    backend = enforcing_backend(RCLPY)
+    page, summary = tmp_path / "page.html", tmp_path / "summary.md"
+    ended = sros(
+        *("demo", "--backend", "rclpy", "--scenario", name, "--json"),
+        *("--report", page, "--summary", summary),
+    )
+    shown = json.loads(ended.ok().out)
+    assert shown["dds"] == backend.dds
+    assert len(shown["rows"]) > 4
+    for row in shown["rows"]:
+        assert row["observed"] == row["expected"], row
+        assert "SECURITY" not in row["detail"], "the words of the refusal, not the line of the log"
+    assert page.stat().st_size > 1000
+    assert summary.stat().st_size > 300
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -8,8 +8,10 @@ from datetime import datetime
 from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
+from sros_tool.demo.backend import Backend
 from sros_tool.demo.bench import Bench, Forge
 from sros_tool.demo.forgeries import REMOVALS, in_clear
+from sros_tool.demo.model import Condition
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.demo.scenery import Setting, make_keystore
 from sros_tool.keystore.template import Template, load_template
@@ -19,11 +21,21 @@ DOMAIN = 7
 
 @dataclass(frozen=True)
 class Weakness:
-    """What is changed of a keystore that was made by the template production."""
+    """What is changed of a keystore that was made by the template production.
+
+    ``broken`` are the rows that must fail in it, ``on_fast`` those on Fast DDS, where they differ.
+    """
 
     broken: frozenset[str]
     template: Callable[[Template], Template] = lambda template: template
     forge: Forge | None = None
+    on_fast: frozenset[str] | None = None
+
+    def broken_on(self, backend: Backend) -> frozenset[str]:
+        """The rows that must fail in it on a back end."""
+        if backend.vendor is Condition.FAST and self.on_fast is not None:
+            return self.on_fast
+        return self.broken
 
 
 def _open_modes(bench: Bench) -> None:
@@ -41,6 +53,7 @@ WEAKNESSES: Mapping[str, Weakness] = {
             }
         ),
         lambda template: replace(template, separate_authorities=False),
+        on_fast=frozenset(),  # who signs has to stand in the file of the permissions CA
     ),
     "subjects that others contain": Weakness(
         frozenset(
@@ -50,6 +63,7 @@ WEAKNESSES: Mapping[str, Weakness] = {
             }
         ),
         lambda template: replace(template, unique_subject=False),
+        on_fast=frozenset({"old permissions put back after renewal"}),
     ),
     "a guest with wildcard permissions": Weakness(
         frozenset(
