@@ -23,9 +23,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sros_tool.demo.backend import Backend
 from sros_tool.demo.isolated import Tell
 from sros_tool.demo.launch import base_environment
-from sros_tool.demo.model import Identity
+from sros_tool.demo.model import Identity, Role
 from sros_tool.demo.network import RowNetwork
 from sros_tool.demo.scenery import Scenery
 from sros_tool.errors import SrosError
@@ -35,9 +36,9 @@ UNSECURED = "unsecured"
 PAYLOADS = (64, 1024, 16 * 1024, 256 * 1024, 1024 * 1024)
 NOTE = (
     "medians; latency is half a round trip, throughput is that of bursts which are waited for;"
-    " both ends are Python with ctypes, whose overhead is in all numbers alike and"
-    " makes the ratios smaller than those of nodes in C++; the numbers of payloads that do not fit"
-    " into the buffer of a socket scatter"
+    " both ends are Python, whose overhead is in all numbers alike and makes the ratios smaller"
+    " than those of nodes in C++; messages go over UDP, not through shared memory; the numbers of"
+    " payloads that do not fit into the buffer of a socket scatter"
 )
 _LONGEST = 60.0
 _TICK = 0.02
@@ -114,6 +115,7 @@ def measure_cost(
     scenery: Scenery,
     domain: int,
     folder: Path,
+    backend: Backend,
     effort: Effort,
     tell: Tell,
     *,
@@ -125,7 +127,9 @@ def measure_cost(
     # In turns, so that what else the machine does falls on all kinds alike.
     for turn in range(effort.rounds):
         for kind, ends in kinds.items():
-            found[kind].append(_run_pair(ends, scenery, domain, folder, effort, own_network))
+            found[kind].append(
+                _run_pair(ends, scenery, domain, folder, backend, effort, own_network)
+            )
         tell(f"measured {len(kinds)} kinds of protection, round {turn + 1} of {effort.rounds}")
     first = {kind: statistics.median(run["first"] for run in runs) for kind, runs in found.items()}
     measurements = [
@@ -146,12 +150,13 @@ def _run_pair(
     scenery: Scenery,
     domain: int,
     folder: Path,
+    backend: Backend,
     effort: Effort,
     own_network: bool,
 ) -> dict[str, Any]:
     answer = folder / "answer.json"
     answer.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "sros_tool.demo.cost_node"]
+    command = [sys.executable, "-m", "sros_tool.demo.cost_node", backend.name]
     ping = ["ping", "--answer", str(answer), "--seconds", str(effort.seconds)]
     ping += ["--sizes", *map(str, effort.payloads)]
     network = RowNetwork(own=own_network)
@@ -160,6 +165,7 @@ def _run_pair(
         with network.entered(), (folder / "cost.log").open("ab") as log:
             for identity, arguments in zip(ends, (["pong"], ping), strict=True):
                 environment = base_environment(os.environ)
+                environment |= backend.environment(Role.TALKER, wire=True)
                 environment |= scenery.environment(identity, domain)
                 processes.append(
                     subprocess.Popen(

@@ -1,9 +1,9 @@
-"""One end of a measurement over Cyclone DDS: ``python -m sros_tool.demo.cost_node ping|pong``.
+"""One end of a measurement: ``python -m sros_tool.demo.cost_node cyclone|rclpy ping|pong``.
 
 ``pong`` sends back what it gets: whole messages that begin with "e", and a short receipt for the
 last one of each burst, "b".  ``ping`` measures, and writes what it found as JSON.  Both read the
-environment of a ROS 2 node; what they cost in Python and ctypes is the same with and without
-security, and is in all numbers.
+environment of a ROS 2 node; what they cost in Python is the same with and without security, and is
+in all numbers.
 """
 
 from __future__ import annotations
@@ -14,24 +14,92 @@ import os
 import statistics
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
-from sros_tool.errors import SrosError
-from sros_tool.runtime.cyclone import Participant, Reader, Writer
-from sros_tool.runtime.rcl_security import choose_loadable, domain_of
+from sros_tool.errors import SrosError, UnavailableError
 
-_PING, _PONG = "rt/cost_ping", "rt/cost_pong"
+_PING, _PONG = "/cost_ping", "/cost_pong"
+_DEPTH = 10
 _BURST = 8  # below the depth of the history, so that nothing is overwritten before it is sent
 _BURST_BYTES = 128 * 1024  # and below what a socket holds by default, where a payload allows it
 _ASK_AGAIN = 0.005
 _LOST = 2.0
 
 
+class Link(Protocol):
+    """What one end writes to and reads from the other one."""
+
+    def write(self, text: str) -> None:
+        """Send a message."""
+
+    def wait(self, seconds: float) -> bool:
+        """Sleep until there is something to take, but no longer than ``seconds``."""
+
+    def take(self) -> Sequence[str]:
+        """Return the messages that have come since the last call, oldest first."""
+
+
+@contextmanager
+def _cyclone_link(sends: str, hears: str) -> Iterator[Link]:
+    from sros_tool.runtime.cyclone import Participant
+    from sros_tool.runtime.rcl_security import choose_loadable, domain_of
+
+    choice = choose_loadable(os.environ)
+    with Participant(domain_of(os.environ), choice.enclave) as participant:
+        reader, writer = participant.reader(f"rt{hears}"), participant.writer(f"rt{sends}")
+        yield _Ends(writer.write, reader.wait, reader.take)
+
+
+class _Ends:
+    def __init__(
+        self,
+        write: Callable[[str], None],
+        wait: Callable[[float], bool],
+        take: Callable[[], Sequence[str]],
+    ) -> None:
+        self.write, self.wait, self.take = write, wait, take
+
+
+@contextmanager
+def _rclpy_link(sends: str, hears: str) -> Iterator[Link]:
+    try:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from std_msgs.msg import String
+    except ImportError as error:
+        raise UnavailableError("rclpy cannot be loaded", f"{error}.", "Source ROS 2.") from error
+    rclpy.init(args=[])
+    node = rclpy.create_node("cost")
+    heard: list[str] = []
+    publisher = node.create_publisher(String, sends, _DEPTH)
+    node.create_subscription(String, hears, lambda message: heard.append(message.data), _DEPTH)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+
+    def wait(seconds: float) -> bool:
+        end = time.monotonic() + seconds
+        while not heard and (left := end - time.monotonic()) > 0:
+            executor.spin_once(left)
+        return bool(heard)
+
+    def take() -> Sequence[str]:
+        taken = heard[:]
+        heard.clear()
+        return taken
+
+    yield _Ends(lambda text: publisher.publish(String(data=text)), wait, take)
+
+
+_LINKS = {"cyclone": _cyclone_link, "rclpy": _rclpy_link}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, or answer until there is no parent any more; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m sros_tool.demo.cost_node")
+    parser.add_argument("library", choices=_LINKS)
     parser.add_argument("role", choices=("ping", "pong"))
     parser.add_argument("--sizes", type=int, nargs="*", default=[], help="payloads in bytes")
     parser.add_argument("--seconds", type=float, default=0.5, help="for each measurement")
@@ -39,17 +107,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     begin = time.monotonic()
     try:
-        choice = choose_loadable(os.environ)
-        with Participant(domain_of(os.environ), choice.enclave) as participant:
+        sends, hears = (_PONG, _PING) if options.role == "pong" else (_PING, _PONG)
+        with _LINKS[options.library](sends, hears) as link:
             if options.role == "pong":
-                _answer(participant.reader(_PING), participant.writer(_PONG), begin)
-            measured = _measure(
-                participant.writer(_PING),
-                participant.reader(_PONG),
-                begin,
-                options.sizes,
-                options.seconds,
-            )
+                _answer(link, begin)
+            measured = _measure(link, begin, options.sizes, options.seconds)
     except SrosError as error:
         print(error, file=sys.stderr)
         return 1
@@ -57,50 +119,48 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _answer(reader: Reader, writer: Writer, begin: float) -> None:
+def _answer(link: Link, begin: float) -> None:
     while True:
-        reader.wait(1.0)
-        for text in reader.take():
+        link.wait(1.0)
+        for text in link.take():
             if text[0] == "h":
-                writer.write(f"h{begin:.6f}")
+                link.write(f"h{begin:.6f}")
             elif text[0] == "e":
-                writer.write(text)
+                link.write(text)
             elif text[0] == "l":
-                writer.write("l")
+                link.write("l")
 
 
-def _measure(
-    writer: Writer, reader: Reader, begin: float, sizes: Sequence[int], seconds: float
-) -> dict[str, Any]:
+def _measure(link: Link, begin: float, sizes: Sequence[int], seconds: float) -> dict[str, Any]:
     other = ""
     while not other:
-        writer.write("h")
-        reader.wait(_ASK_AGAIN)
-        other = next(iter(reader.take()), "")
+        link.write("h")
+        link.wait(_ASK_AGAIN)
+        other = next(iter(link.take()), "")
     first = time.monotonic() - max(begin, float(other[1:]))
-    while reader.wait(0.3):
-        reader.take()  # further answers to "h"
+    while link.wait(0.3):
+        link.take()  # further answers to "h"
     found = []
     for size in sizes:
-        latency = _latency(writer, reader, size, seconds)
-        rate = _throughput(writer, reader, size, seconds)
+        latency = _latency(link, size, seconds)
+        rate = _throughput(link, size, seconds)
         found.append({"size": size, "latency": latency, "rate": rate})
     return {"first": first, "sizes": found}
 
 
-def _latency(writer: Writer, reader: Reader, size: int, seconds: float) -> float:
+def _latency(link: Link, size: int, seconds: float) -> float:
     """Half of the median round trip of a message of ``size`` bytes, in seconds."""
     text = "e".ljust(size, "x")
     times: list[float] = []
     end = time.monotonic() + seconds
     while (start := time.monotonic()) < end or not times:
-        writer.write(text)
-        _await(reader)
+        link.write(text)
+        _await(link)
         times.append(time.monotonic() - start)
     return statistics.median(times) / 2
 
 
-def _throughput(writer: Writer, reader: Reader, size: int, seconds: float) -> float:
+def _throughput(link: Link, size: int, seconds: float) -> float:
     """Messages per second in the median burst; each burst is waited for."""
     burst = max(1, min(_BURST, _BURST_BYTES // size))
     texts = [*["b".ljust(size, "x")] * (burst - 1), "l".ljust(size, "x")]
@@ -108,17 +168,17 @@ def _throughput(writer: Writer, reader: Reader, size: int, seconds: float) -> fl
     end = time.monotonic() + seconds
     while (start := time.monotonic()) < end or not times:
         for text in texts:
-            writer.write(text)
-        _await(reader)
+            link.write(text)
+        _await(link)
         times.append(time.monotonic() - start)
     return burst / statistics.median(times)
 
 
-def _await(reader: Reader) -> None:
+def _await(link: Link) -> None:
     """Wait for an answer; raises `SrosError` where a reliable one does not come."""
-    if not reader.wait(_LOST):
+    if not link.wait(_LOST):
         raise SrosError("an answer was lost", f"It did not come within {_LOST} s.")
-    reader.take()
+    link.take()
 
 
 if __name__ == "__main__":

@@ -42,11 +42,16 @@ def _open_default(template: Template) -> Template:
 
 
 def protected(level: Level) -> Callable[[Template], Template]:
-    """Templates with access control, and with messages protected by that level everywhere."""
+    """Templates with access control, and with messages protected by that level everywhere.
+
+    A payload is signed with the submessage that it is in: Fast DDS loses payloads that are signed
+    by themselves (`governance.signed-payload`).
+    """
     discovered = level is not Level.NONE
+    payload = level if level is Level.ENCRYPT else Level.NONE
 
     def change(template: Template) -> Template:
-        topics = TopicProtection(level, level, discovery=discovered, liveliness=discovered)
+        topics = TopicProtection(payload, level, discovery=discovered, liveliness=discovered)
         protection = replace(
             template.protection,
             rtps=level,

@@ -105,9 +105,11 @@ def composed_policy(topic: str) -> Policy:
 def measured_policy(topic: str) -> Policy:
     """The talker and listener, and two enclaves whose nodes send messages to and fro."""
     talking = talking_policy(topic)
+    basics = read_policy(policies_dir() / "defaults/node_basics.xml").enclaves[0].all_profiles()
     rights = (("publish", ALLOW), ("subscribe", ALLOW))
+    groups = (*basics[0].groups, Group("topics", rights, COST_TOPICS))
     ends = tuple(
-        Enclave(path, (Profiles((Profile("/", "cost", (Group("topics", rights, COST_TOPICS),)),)),))
+        Enclave(path, (Profiles((Profile("/", "cost", groups),)),))
         for path in ("/cost/ping", "/cost/pong")
     )
     return replace(talking, enclaves=(*talking.enclaves, *ends))

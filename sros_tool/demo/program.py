@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
-from sros_tool.demo.backend import AUTO, CYCLONE, RCLPY, Backend, choose_backend
+from sros_tool.demo.backend import AUTO, RCLPY, Backend, choose_backend
 from sros_tool.demo.conditions import conditions
 from sros_tool.demo.cost import UNSECURED, CostResult, Effort, measure_cost
 from sros_tool.demo.given import GivenKeystore, open_given
@@ -26,7 +26,7 @@ from sros_tool.demo.policies import DEFAULT_TOPIC, check_topic
 from sros_tool.demo.result import DemoResult, ScenarioResult
 from sros_tool.demo.runner import Limits, Plan, run_plan
 from sros_tool.demo.scenarios.isolation import ISOLATION
-from sros_tool.demo.scenery import Scenery, Setting, build_scenery
+from sros_tool.demo.scenery import Setting, build_scenery
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.runtime.netns import Isolation, try_isolation
@@ -105,16 +105,9 @@ def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
             )
             shown = run_isolated(partial(run_plan, plan), isolation, tell)
             cost = None
-            if scenario.measured and backend.name == CYCLONE:
-                cost = run_isolated(
-                    partial(
-                        _measure, scenario, scenery, places[0], under, options.effort, isolation
-                    ),
-                    isolation,
-                    tell,
-                )
-            elif scenario.measured:
-                tell("the cost of security is not measured: that needs --backend cyclone")
+            if scenario.measured:
+                measuring = partial(_measure, plan, scenario, under / "cost", options.effort)
+                cost = run_isolated(measuring, isolation, tell)
             cast = scenery.members(scenario.rows, on_ros=backend.name == RCLPY) if given else ()
             results.append(ScenarioResult(scenario.name, scenario.title, tuple(shown), cost, cast))
         result = DemoResult(backend, topic, isolation, template.name, tuple(results))
@@ -134,20 +127,22 @@ def _find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend
 
 
 def _measure(
-    scenario: Scenario,
-    scenery: Scenery,
-    domain: int,
-    folder: Path,
-    effort: Effort,
-    isolation: Isolation,
-    tell: Tell,
+    plan: Plan, scenario: Scenario, folder: Path, effort: Effort, tell: Tell
 ) -> CostResult:
     kinds = {UNSECURED: (Identity(), Identity())}
     for kind in scenario.measured:
         label = f"protection {kind}"
         kinds[kind] = (Identity(label, "pong"), Identity(label, "ping"))
-    place = folder / "cost"
-    return measure_cost(kinds, scenery, domain, place, effort, tell, own_network=isolation.isolated)
+    return measure_cost(
+        kinds,
+        plan.scenery,
+        plan.domains[0],
+        folder,
+        plan.backend,
+        effort,
+        tell,
+        own_network=plan.own_networks,
+    )
 
 
 def _given(options: DemoOptions) -> GivenKeystore | None:

@@ -270,6 +270,9 @@ CASES |= {
         ("read_access_control>true", "read_access_control>false")
     ),
     "governance.no-encryption": lambda b: b.governance(("ENCRYPT", "SIGN")),
+    "governance.signed-payload": lambda b: b.governance(
+        ("<data_protection_kind>ENCRYPT", "<data_protection_kind>SIGN")
+    ),
     "governance.no-authenticity": lambda b: b.governance(("ENCRYPT", "NONE")),
     "governance.discovery-open": lambda b: b.governance(
         ("<discovery_protection_kind>ENCRYPT", "<discovery_protection_kind>NONE")

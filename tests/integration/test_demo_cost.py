@@ -6,24 +6,20 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from enforcing import BACKENDS, enforcing_backend
 
 from sros_tool.demo.cost import Effort
 from sros_tool.demo.program import DemoOptions, run_demo
 from sros_tool.demo.scenarios.governance import GOVERNANCE
-from sros_tool.errors import UnavailableError
-from sros_tool.runtime.cyclone_library import load_cyclone
 
 pytestmark = pytest.mark.dds
 
 
-def test_each_kind_is_measured_by_the_same_program(tmp_path: Path) -> None:
-    try:
-        load_cyclone.cache_clear()
-        load_cyclone()
-    except UnavailableError as error:
-        pytest.skip(str(error))
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_each_kind_is_measured_by_the_same_program(backend: str, tmp_path: Path) -> None:
+    enforcing_backend(backend)
     options = DemoOptions(
-        backend="cyclone",
+        backend=backend,
         scenarios=(GOVERNANCE,),
         only=("under none",),
         effort=Effort((64, 65536), 0.05, 1),

@@ -52,6 +52,16 @@ NO_ENCRYPTION = Kind(
     f"{_GOVERNANCE} (data_protection_kind, metadata_protection_kind, rtps_protection_kind).",
     _TEMPLATE,
 )
+SIGNED_PAYLOAD = Kind(
+    "governance.signed-payload",
+    WARNING,
+    "topics of which Fast DDS loses messages",
+    "Where the payload is only signed, Fast DDS leaves its padding out of the signature: a message "
+    "whose serialized length is not a multiple of four is not accepted by the reader.",
+    "Fast DDS 2.14.5, measured; corrected in its source in August 2026 (pull request 6498).",
+    "Sign the submessage, with the payload in it (data NONE, metadata SIGN), or encrypt (data "
+    "ENCRYPT).",
+)
 NOT_AUTHENTIC = Kind(
     "governance.no-authenticity",
     ERROR,
@@ -120,8 +130,9 @@ XML_DIFFERS = Kind(
 )
 
 KINDS = by_id(
-    UNAUTHENTICATED, NO_JOIN_CONTROL, NO_ACCESS_CONTROL, NO_ENCRYPTION, NOT_AUTHENTIC,
-    DISCOVERY_OPEN, LIVELINESS_OPEN, NO_TOPIC_RULE, UNREACHABLE, DOMAIN_RANGE, DIFFERS, XML_DIFFERS,
+    UNAUTHENTICATED, NO_JOIN_CONTROL, NO_ACCESS_CONTROL, NO_ENCRYPTION, SIGNED_PAYLOAD,
+    NOT_AUTHENTIC, DISCOVERY_OPEN, LIVELINESS_OPEN, NO_TOPIC_RULE, UNREACHABLE, DOMAIN_RANGE,
+    DIFFERS, XML_DIFFERS,
 )  # fmt: skip
 
 _SIGNING = (Protection.SIGN, Protection.SIGN_WITH_ORIGIN_AUTHENTICATION)
@@ -156,7 +167,9 @@ def governance_findings(
     for rule in governance.domain_access_rules:
         subject = f"domain {rule.domains}"
         for kind, text in (*_domain_rule(rule), *_topic_rules(rule)):
-            yield kind.found(subject, text, file, accepted=accepted)
+            # A template chooses what is open, but nobody chooses that messages are lost.
+            chosen = "" if kind is SIGNED_PAYLOAD else accepted
+            yield kind.found(subject, text, file, accepted=chosen)
         for problem in domain_problems(rule.domains):
             yield DOMAIN_RANGE.found(subject, f"the range {problem}", file)
     yield from _copy(keystore)
@@ -210,6 +223,8 @@ def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[Kind, str]
         yield NOT_AUTHENTIC, f"nothing protects {name}"
     elif all(level in (*_NONE, *_SIGNING) for level in levels):
         yield NO_ENCRYPTION, f"{name} is signed only"
+    if topic.data_protection_kind in _SIGNING:
+        yield SIGNED_PAYLOAD, f"data_protection_kind is {topic.data_protection_kind} for {name}"
     if not topic.enable_discovery_protection:
         yield DISCOVERY_OPEN, f"enable_discovery_protection is false for {name}"
     if not topic.enable_liveliness_protection:
