@@ -1,4 +1,4 @@
-"""How Cyclone DDS 0.10 reads signed documents (its own XML parser and access_control_parser.c).
+"""How Cyclone DDS 0.10 reads signed documents (access_control_parser.c).
 
 Tags may be written in capitals, come in any order, and the last of several counts; blanks around
 texts do not.  Any element or attribute that it does not know makes the document malformed.
@@ -10,16 +10,8 @@ import re
 from collections.abc import Callable, Mapping
 from typing import TypeVar
 
-from lxml import etree
-
-from sros_tool.dds.decision.elements import (
-    UnreadableError,
-    attributes_of,
-    elements_of,
-    name_of,
-    root_of,
-    texts_of,
-)
+from sros_tool.dds.decision import cyclone_xml
+from sros_tool.dds.decision.elements import Element, UnreadableError
 from sros_tool.dds.domains import MAX_DOMAIN, DomainRange, DomainSet
 from sros_tool.dds.governance import (
     DATA_PROTECTIONS,
@@ -31,8 +23,6 @@ from sros_tool.dds.governance import (
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 
 Read = TypeVar("Read")
-BLANKS = " \t\v\r\n"
-_MARK = b"\xef\xbb\xbf"
 _SCHEMA_ATTRIBUTES = ("xmlns:xsi", "xsi:nonamespaceschemalocation")
 _IGNORED = ("relay", "value", "name", "tag", "data_tags")
 _NOTHING = "["
@@ -105,35 +95,32 @@ class _Node:
 
     def __init__(
         self,
-        element: etree._Element,
+        element: Element,
         grammar: Mapping[str, tuple[str, ...]],
         skipped: tuple[str, ...],
     ) -> None:
-        self.tag = name_of(element).lower()
-        self.attribute = element.get("name")
-        self.text = "".join(texts_of(element)).strip(BLANKS)
+        self.tag = element.name.lower()
+        self.attribute = element.attributes.get("name")
+        self.text = "".join(each for each in element.children if isinstance(each, str))
         _check_attributes(element, self.tag)
-        children = elements_of(element)
-        if self.text and (children or self.tag in grammar):
+        if self.text and self.tag in grammar:
             raise UnreadableError(f"<{self.tag}> holds text")
         self._children = []
-        for child in children:
-            tag = name_of(child).lower()
+        for child in element.elements:
+            tag = child.name.lower()
             if tag in skipped:
                 _check_skipped(child)
             elif tag in grammar.get(self.tag, ()):
                 self._children.append(_Node(child, grammar, skipped))
             else:
-                raise UnreadableError(f"<{self.tag}> holds <{name_of(child)}>")
+                raise UnreadableError(f"<{self.tag}> holds <{child.name}>")
 
     @classmethod
     def root(
         cls, xml: bytes, grammar: Mapping[str, tuple[str, ...]], skipped: tuple[str, ...]
     ) -> _Node:
-        if xml.startswith(_MARK):
-            raise UnreadableError("it begins with a byte order mark")
-        root = root_of(xml)
-        if name_of(root).lower() != "dds":
+        root = cyclone_xml.read(xml)
+        if root.name.lower() != "dds":
             raise UnreadableError("its root is not <dds>")
         return cls(root, grammar, skipped)
 
@@ -145,16 +132,16 @@ class _Node:
         return found[-1] if found else None
 
 
-def _check_attributes(element: etree._Element, tag: str) -> None:
-    for name in attributes_of(element):
+def _check_attributes(element: Element, tag: str) -> None:
+    for name in element.attributes:
         if name.lower() not in _SCHEMA_ATTRIBUTES and (name, tag) != ("name", "grant"):
             raise UnreadableError(f"<{tag}> has the attribute {name!r}")
 
 
-def _check_skipped(element: etree._Element) -> None:
-    for each in element.iter():
-        if isinstance(each.tag, str):
-            _check_attributes(each, "")
+def _check_skipped(element: Element) -> None:
+    _check_attributes(element, "")
+    for each in element.elements:
+        _check_skipped(each)
 
 
 # ── values ─────────────────────────────────────────────────────────────────────────────────

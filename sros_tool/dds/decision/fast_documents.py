@@ -1,4 +1,4 @@
-"""How Fast DDS reads signed documents (its GovernanceParser and PermissionsParser over TinyXML-2).
+"""How Fast DDS reads signed documents (its GovernanceParser and PermissionsParser).
 
 The order of elements is compulsory, texts keep their blanks, and words are written in one way.
 What stands behind the last element that it looks for goes unread.
@@ -10,10 +10,9 @@ import re
 from collections.abc import Callable
 from typing import TypeVar
 
-from lxml import etree
-
+from sros_tool.dds.decision import tinyxml
 from sros_tool.dds.decision.answers import Outcome
-from sros_tool.dds.decision.elements import UnreadableError, elements_of, name_of, root_of
+from sros_tool.dds.decision.elements import Element, Mark, UnreadableError
 from sros_tool.dds.domains import DomainRange, DomainSet
 from sros_tool.dds.governance import (
     DATA_PROTECTIONS,
@@ -31,8 +30,9 @@ Read = TypeVar("Read")
 
 def read_governance(xml: bytes) -> Governance:
     """Its governance; raises `UnreadableError`."""
-    parent = _top(xml, "domain_access_rules")
-    if parent.getnext() is not None or (parent.tail or "").strip():
+    root = tinyxml.read(xml)
+    parent = _first(root, "domain_access_rules")
+    if root.children[-1] is not parent:
         # A comment counts as well.
         raise UnreadableError("something stands behind <domain_access_rules>")
     return Governance(tuple(_domain_rule(each) for each in _all(parent, "domain_rule")))
@@ -40,54 +40,55 @@ def read_governance(xml: bytes) -> Governance:
 
 def read_permissions(xml: bytes) -> Permissions:
     """Its permissions; raises `UnreadableError`."""
-    return Permissions(tuple(_grant(each) for each in _all(_top(xml, "permissions"), "grant")))
+    return Permissions(
+        tuple(_grant(each) for each in _all(_first(tinyxml.read(xml), "permissions"), "grant"))
+    )
 
 
-def _top(xml: bytes, name: str) -> etree._Element:
-    root = root_of(xml)
-    if name_of(root) != "dds":
+def _first(root: Element, name: str) -> Element:
+    if root.name != "dds":
         raise UnreadableError("its root is not <dds>")
-    children = elements_of(root)
+    children = root.elements
     if not children:
         outcome = Outcome.CRASHES if name == "permissions" else Outcome.REFUSED
         raise UnreadableError("<dds> is empty", outcome)
-    if name_of(children[0]) != name:
+    if children[0].name != name:
         raise UnreadableError(f"<dds> does not begin with <{name}>")
     return children[0]
 
 
-def _all(parent: etree._Element, name: str) -> list[etree._Element]:
+def _all(parent: Element, name: str) -> list[Element]:
     """The children, all of one name, at least one."""
-    children = elements_of(parent)
-    if not children or any(name_of(child) != name for child in children):
-        raise UnreadableError(f"<{name_of(parent)}> needs <{name}> elements and nothing else")
+    children = parent.elements
+    if not children or any(child.name != name for child in children):
+        raise UnreadableError(f"<{parent.name}> needs <{name}> elements and nothing else")
     return children
 
 
 class _Sequence:
     """The child elements of one, taken in order."""
 
-    def __init__(self, element: etree._Element) -> None:
-        self._name = name_of(element)
-        self._children = elements_of(element)
+    def __init__(self, element: Element) -> None:
+        self._name = element.name
+        self._children = element.elements
         self._index = 0
 
-    def next(self, name: str) -> etree._Element:
+    def next(self, name: str) -> Element:
         """The next child, which must have this name."""
-        if self._index == len(self._children) or name_of(self._children[self._index]) != name:
+        if self._index == len(self._children) or self._children[self._index].name != name:
             raise UnreadableError(f"<{self._name}> lacks <{name}> in its place")
         self._index += 1
         return self._children[self._index - 1]
 
-    def rest(self) -> list[etree._Element]:
+    def rest(self) -> list[Element]:
         """The children not taken yet."""
         return self._children[self._index :]
 
-    def while_named(self, *names: str) -> list[etree._Element]:
+    def while_named(self, *names: str) -> list[Element]:
         """The children up to the first that has none of these names."""
         found = []
         while self._index < len(self._children):
-            if name_of(self._children[self._index]) not in names:
+            if self._children[self._index].name not in names:
                 break
             found.append(self._children[self._index])
             self._index += 1
@@ -96,65 +97,69 @@ class _Sequence:
     def end(self) -> None:
         """Nothing may follow."""
         if self.rest():
-            raise UnreadableError(f"<{self._name}> holds too much: <{name_of(self.rest()[0])}>")
+            raise UnreadableError(f"<{self._name}> holds too much: <{self.rest()[0].name}>")
 
 
 # ── texts ──────────────────────────────────────────────────────────────────────────────────
 
 
-def _text(element: etree._Element) -> str | None:
-    """The text before the first child element or inner comment; None if there are only blanks."""
-    if element.text and element.text.strip():
-        return element.text
-    for child in element:
-        if not isinstance(child, etree._Comment):
-            return None
-        if child.tail and child.tail.strip():
-            return child.tail
+def _text(element: Element) -> str | None:
+    """The text that stands first, comments aside; None if something else does, or nothing."""
+    for child in element.children:
+        if child is not Mark.COMMENT:
+            return child if isinstance(child, str) else None
     return None
 
 
-def _required(element: etree._Element) -> str:
+def _required(element: Element) -> str:
     text = _text(element)
     if text is None:
-        raise UnreadableError(f"<{name_of(element)}> is empty")
+        raise UnreadableError(f"<{element.name}> is empty")
     return text
 
 
-def _number(element: etree._Element) -> int:
-    found = _INTEGER.match(_required(element))
+def _first_text(element: Element) -> str:
+    """The text of a number or a flag, before which not even a comment may stand."""
+    first = element.children[0] if element.children else None
+    if not isinstance(first, str):
+        raise UnreadableError(f"<{element.name}> does not begin with its value")
+    return first
+
+
+def _number(element: Element) -> int:
+    found = _INTEGER.match(_first_text(element))
     if not found:
-        raise UnreadableError(f"<{name_of(element)}> holds no number")
+        raise UnreadableError(f"<{element.name}> holds no number")
     return (int(found[1], 16) if found[1] else int(found[2])) % 2**32
 
 
-def _flag(element: etree._Element) -> bool:
-    text = _required(element)
+def _flag(element: Element) -> bool:
+    text = _first_text(element)
     if found := _INTEGER.match(text):
         return int(found[1], 16) != 0 if found[1] else int(found[2]) != 0
     if text not in _TRUE + _FALSE:
-        raise UnreadableError(f"<{name_of(element)}> holds {text!r} instead of true or false")
+        raise UnreadableError(f"<{element.name}> holds {text!r} instead of true or false")
     return text in _TRUE
 
 
-def _kind(element: etree._Element) -> Protection:
+def _kind(element: Element) -> Protection:
     text = _required(element)
     if text not in list(Protection):
-        raise UnreadableError(f"<{name_of(element)}> holds {text!r}, which is no protection kind")
+        raise UnreadableError(f"<{element.name}> holds {text!r}, which is no protection kind")
     return Protection(text)
 
 
-def _data_kind(element: etree._Element) -> Protection:
+def _data_kind(element: Element) -> Protection:
     kind = _kind(element)
     if kind not in DATA_PROTECTIONS:
-        raise UnreadableError(f"<{name_of(element)}> holds {kind}, which is for metadata only")
+        raise UnreadableError(f"<{element.name}> holds {kind}, which is for metadata only")
     return kind
 
 
-def _domains(element: etree._Element) -> DomainSet:
+def _domains(element: Element) -> DomainSet:
     ranges = []
-    for child in elements_of(element):
-        match name_of(child):
+    for child in element.elements:
+        match child.name:
             case "id":
                 number = _number(child)
                 ranges.append(DomainRange(number, number))
@@ -167,24 +172,24 @@ def _domains(element: etree._Element) -> DomainSet:
     return DomainSet(tuple(ranges))
 
 
-def _range(element: etree._Element) -> DomainRange:
-    ends = elements_of(element)
-    if ends and name_of(ends[0]) == "max":
+def _range(element: Element) -> DomainRange:
+    ends = element.elements
+    if ends and ends[0].name == "max":
         return DomainRange(None, _number(ends[0]))
-    if not ends or name_of(ends[0]) != "min":
+    if not ends or ends[0].name != "min":
         raise UnreadableError("<id_range> begins with neither <min> nor <max>")
     first = _number(ends[0])
-    bounded = len(ends) > 1 and name_of(ends[1]) == "max"
+    bounded = len(ends) > 1 and ends[1].name == "max"
     return DomainRange(first, _number(ends[1]) if bounded else None)
 
 
 # ── governance ─────────────────────────────────────────────────────────────────────────────
 
 
-def _domain_rule(element: etree._Element) -> DomainRule:
+def _domain_rule(element: Element) -> DomainRule:
     take = _Sequence(element)
 
-    def field(name: str, read: Callable[[etree._Element], Read]) -> Read:
+    def field(name: str, read: Callable[[Element], Read]) -> Read:
         return read(take.next(name))
 
     rule = DomainRule(
@@ -202,13 +207,13 @@ def _domain_rule(element: etree._Element) -> DomainRule:
     return rule
 
 
-def _topic_rule(element: etree._Element) -> TopicRule:
+def _topic_rule(element: Element) -> TopicRule:
     take = _Sequence(element)
     expression = _text(take.next("topic_expression"))
     if expression is None:
         raise UnreadableError("<topic_expression> is empty", Outcome.CRASHES)
 
-    def field(name: str, read: Callable[[etree._Element], Read]) -> Read:
+    def field(name: str, read: Callable[[Element], Read]) -> Read:
         return read(take.next(name))
 
     rule = TopicRule(
@@ -227,8 +232,8 @@ def _topic_rule(element: etree._Element) -> TopicRule:
 # ── permissions ────────────────────────────────────────────────────────────────────────────
 
 
-def _grant(element: etree._Element) -> Grant:
-    name = element.get("name")
+def _grant(element: Element) -> Grant:
+    name = element.attributes.get("name")
     if name is None:
         raise UnreadableError("a <grant> has no name")
     take = _Sequence(element)
@@ -241,7 +246,7 @@ def _grant(element: etree._Element) -> Grant:
     return Grant(name, subject, not_before, not_after, rules, default == "ALLOW")
 
 
-def _validity(element: etree._Element) -> tuple[str, str]:
+def _validity(element: Element) -> tuple[str, str]:
     take = _Sequence(element)
     begin = _required(take.next("not_before"))
     end = _text(take.next("not_after"))
@@ -250,15 +255,15 @@ def _validity(element: etree._Element) -> tuple[str, str]:
     return begin, end
 
 
-def _rule(element: etree._Element) -> Rule:
+def _rule(element: Element) -> Rule:
     take = _Sequence(element)
     domains = _domains(take.next("domains"))
     verbs: dict[str, list[Criteria]] = {"publish": [], "subscribe": [], "relay": []}
     for child in take.while_named(*verbs):
-        verbs[name_of(child)].append(_criteria(child))
+        verbs[child.name].append(_criteria(child))
     take.end()
     return Rule(
-        name_of(element) == "allow_rule",
+        element.name == "allow_rule",
         domains,
         tuple(verbs["publish"]),
         tuple(verbs["subscribe"]),
@@ -266,11 +271,11 @@ def _rule(element: etree._Element) -> Rule:
     )
 
 
-def _criteria(element: etree._Element) -> Criteria:
+def _criteria(element: Element) -> Criteria:
     topics: list[str] = []
     partitions: list[str] = []
-    for child in elements_of(element):
-        match name_of(child):
+    for child in element.elements:
+        match child.name:
             case "topics":
                 topics += [_required(each) for each in _all(child, "topic")]
             case "partitions":
@@ -278,12 +283,12 @@ def _criteria(element: etree._Element) -> Criteria:
             case "data_tags":
                 pass
             case other:
-                raise UnreadableError(f"<{name_of(element)}> holds <{other}>")
+                raise UnreadableError(f"<{element.name}> holds <{other}>")
     return Criteria(tuple(topics), tuple(partitions))
 
 
-def _partition(element: etree._Element) -> str:
+def _partition(element: Element) -> str:
     text = _text(element)
-    if text is None and len(element):
+    if text is None and element.children:
         raise UnreadableError("<partition> holds something else than text")
     return text or ""

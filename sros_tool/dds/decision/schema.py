@@ -9,14 +9,8 @@ import re
 
 from lxml import etree
 
-from sros_tool.dds.decision.elements import (
-    UnreadableError,
-    attributes_of,
-    elements_of,
-    name_of,
-    root_of,
-    texts_of,
-)
+from sros_tool.dds.decision.elements import UnreadableError
+from sros_tool.xml import tag_of
 
 # The children of each element as an expression over "name,"; the others hold text.
 _DOMAINS = {
@@ -76,33 +70,45 @@ _TEXTS = {
     "metadata_protection_kind": _KIND,
     "data_protection_kind": "NONE|SIGN|ENCRYPT",
 }
-_EVERYWHERE = re.compile(r"xmlns(:.*)?|xsi:.*", re.DOTALL)
+_EVERYWHERE = "{http://www.w3.org/2001/XMLSchema-instance}"
 
 
 def check_permissions(xml: bytes) -> None:
     """Raises `UnreadableError` unless ``xml`` is valid permissions."""
-    _check(root_of(xml), "dds", _PERMISSIONS)
+    _check(_root(xml), "dds", _PERMISSIONS)
 
 
 def check_governance(xml: bytes) -> None:
     """Raises `UnreadableError` unless ``xml`` is valid governance."""
-    _check(root_of(xml), "dds", _GOVERNANCE)
+    _check(_root(xml), "dds", _GOVERNANCE)
+
+
+def _root(xml: bytes) -> etree._Element:
+    """The root; blanks may stand before the XML declaration."""
+    parser = etree.XMLParser(
+        remove_pis=True, resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False
+    )
+    try:
+        root: etree._Element = etree.fromstring(xml.lstrip(), parser)
+    except (etree.XMLSyntaxError, ValueError) as error:
+        raise UnreadableError(f"it is not well-formed XML ({error})") from error
+    return root
 
 
 def _check(element: etree._Element, name: str, grammar: dict[str, str]) -> None:
-    if name_of(element) != name:
+    if element.tag != name:
         raise UnreadableError(f"its root is not <{name}>")
-    children = elements_of(element)
-    text = "".join(texts_of(element))
-    attributes = [each for each in attributes_of(element) if not _EVERYWHERE.fullmatch(each)]
+    children = [child for child in element if isinstance(child.tag, str)]
+    text = "".join([element.text or "", *(child.tail or "" for child in element)])
+    attributes = [str(each) for each in element.attrib if not str(each).startswith(_EVERYWHERE)]
     if attributes != (["name"] if name == "grant" else []):
         raise UnreadableError(f"<{name}> has not the attributes that it should have")
     if name not in grammar:
         if children or not re.fullmatch(_TEXTS.get(name, "(?s:.*)"), text, re.ASCII):
             raise UnreadableError(f"<{name}> does not hold what it should, but {text!r}")
         return
-    names = "".join(f"{name_of(child)}," for child in children)
+    names = "".join(f"{tag_of(child)}," for child in children)
     if text.strip() or not re.fullmatch(grammar[name], names):
         raise UnreadableError(f"<{name}> has not the elements that it should have, in their order")
     for child in children:
-        _check(child, name_of(child), grammar)
+        _check(child, tag_of(child), grammar)
