@@ -37,6 +37,7 @@ from sros_tool.pki.certificates import (
     enclave_subject,
     issued_by,
     load_certificate,
+    subject_of,
     subject_text,
     validity_of,
 )
@@ -156,7 +157,7 @@ class Registrar:
             signed = smime.parse(read_bytes(path, "permissions document"))
             signed.verify(self._authorities.permissions.certificate)
             subjects = [
-                x509.Name.from_rfc4514_string(grant.subject)
+                subject_of(grant.subject)
                 for grant in parse_permissions(signed.document, f"'{path}'").grants
             ]
         except (SrosError, ValueError):

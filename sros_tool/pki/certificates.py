@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import secrets
 
 from cryptography import x509
@@ -10,6 +11,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.x509.oid import NameOID
 
 from sros_tool.errors import PkiError
+from sros_tool.pki import der
 from sros_tool.pki.keys import PrivateKey, PublicKey
 from sros_tool.validity import Window
 
@@ -37,6 +39,46 @@ _LEAF_USAGE = x509.KeyUsage(
 )
 UNREADABLE = (ValueError, UnsupportedAlgorithm, x509.DuplicateExtension, x509.InvalidVersion)
 """What `cryptography` raises for a certificate that is damaged or of an unknown kind."""
+
+_SHORT_NAMES = {
+    oid.dotted_string: name
+    for name, oid in {
+        "C": NameOID.COUNTRY_NAME,
+        "CN": NameOID.COMMON_NAME,
+        "DC": NameOID.DOMAIN_COMPONENT,
+        "GN": NameOID.GIVEN_NAME,
+        "INN": NameOID.INN,
+        "L": NameOID.LOCALITY_NAME,
+        "O": NameOID.ORGANIZATION_NAME,
+        "OGRN": NameOID.OGRN,
+        "OU": NameOID.ORGANIZATIONAL_UNIT_NAME,
+        "SN": NameOID.SURNAME,
+        "SNILS": NameOID.SNILS,
+        "ST": NameOID.STATE_OR_PROVINCE_NAME,
+        "UID": NameOID.USER_ID,
+        "businessCategory": NameOID.BUSINESS_CATEGORY,
+        "dnQualifier": NameOID.DN_QUALIFIER,
+        "emailAddress": NameOID.EMAIL_ADDRESS,
+        "generationQualifier": NameOID.GENERATION_QUALIFIER,
+        "initials": NameOID.INITIALS,
+        "jurisdictionC": NameOID.JURISDICTION_COUNTRY_NAME,
+        "jurisdictionL": NameOID.JURISDICTION_LOCALITY_NAME,
+        "jurisdictionST": NameOID.JURISDICTION_STATE_OR_PROVINCE_NAME,
+        "organizationIdentifier": NameOID.ORGANIZATION_IDENTIFIER,
+        "postalAddress": NameOID.POSTAL_ADDRESS,
+        "postalCode": NameOID.POSTAL_CODE,
+        "pseudonym": NameOID.PSEUDONYM,
+        "serialNumber": NameOID.SERIAL_NUMBER,
+        "street": NameOID.STREET_ADDRESS,
+        "title": NameOID.TITLE,
+        "unstructuredName": NameOID.UNSTRUCTURED_NAME,
+        "x500UniqueIdentifier": NameOID.X500_UNIQUE_IDENTIFIER,
+    }.items()
+}
+"""OpenSSL's short names of attributes; the value of any other is printed as bytes."""
+_OIDS = {name: x509.ObjectIdentifier(oid) for oid, name in _SHORT_NAMES.items()}
+_ESCAPED = re.compile(r'[,+"\\<>;]|^[# ]|(?<!^) \Z')
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 
 _NOT_A_CA = x509.BasicConstraints(ca=False, path_length=None)
 _A_CA = x509.BasicConstraints(ca=True, path_length=1)
@@ -196,8 +238,30 @@ def digest(certificate: x509.Certificate) -> str:
 
 
 def subject_text(name: x509.Name) -> str:
-    """A distinguished name as the permissions document writes it (RFC 4514, most general last)."""
-    return name.rfc4514_string()
+    """A distinguished name as OpenSSL prints it by RFC 2253, and vendors compare it.
+
+    The most general attribute stands last, also of those that share one RDN; non-ASCII characters
+    stand as they are.
+    """
+    return ",".join(
+        "+".join(map(_attribute_text, reversed(list(rdn)))) for rdn in reversed(name.rdns)
+    )
+
+
+def _attribute_text(attribute: x509.NameAttribute[str | bytes]) -> str:
+    known = _SHORT_NAMES.get(attribute.oid.dotted_string)
+    if known is None or isinstance(attribute.value, bytes):
+        (rdn,) = der.children(der.first(x509.Name([attribute]).public_bytes()).content)
+        (pair,) = der.children(rdn.content)
+        value = der.children(pair.content)[1].whole
+        return f"{known or attribute.oid.dotted_string}=#{value.hex().upper()}"
+    text = _ESCAPED.sub(lambda found: f"\\{found[0]}", attribute.value)
+    return f"{known}={_CONTROL.sub(lambda found: f'{chr(92)}{ord(found[0]):02X}', text)}"
+
+
+def subject_of(text: str) -> x509.Name:
+    """The distinguished name that `subject_text` prints so.  Raises `ValueError`."""
+    return x509.Name.from_rfc4514_string(text, _OIDS)
 
 
 def common_name_of(name: x509.Name) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from datetime import UTC, datetime, tzinfo
 
 from sros_tool.dds.decision.answers import Decision, Outcome, Refusal, Verb
@@ -113,6 +114,21 @@ class Access:
         traits = self._traits
         if traits.creates_topics and not _is_topic_name(topic):
             return self._answer(Outcome.DENIED, "invalid-name", f"{topic!r} is no name for a topic")
+        decision = self._ruled(verb, topic, partitions)
+        longest = traits.longest_topic_name
+        if decision.outcome.ok and longest is not None and len(topic.encode()) > longest:
+            text = f"no peer matches a topic whose name has more than {longest} bytes"
+            return replace(
+                decision,
+                outcome=Outcome.PEER_DENIES,
+                reason="long-name",
+                text=f"{traits.title}: {text}.",
+            )
+        return decision
+
+    def _ruled(self, verb: Verb, topic: str, partitions: tuple[str, ...]) -> Decision:
+        """What the governance and the rules of the grant say, for a participant that starts."""
+        join, traits = self._join, self._traits
         rule = self._governed.topic_rule(topic)
         if rule is None:
             return self._without_topic_rule(topic)

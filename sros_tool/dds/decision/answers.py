@@ -68,6 +68,7 @@ REASONS = {
     "expired": "the grant of the subject has ended",
     "malformed": "the vendor does not accept a document",
     "unauthenticated-with-rtps-protection": "the governance contradicts itself",
+    "long-name": "the name of the topic is too long for peers",
     "invalid-name": "the vendor does not accept the name of the topic",
     "open-range": "a range of domains without <min> ends the process",
     "empty-topic": "an expression without text ends the process",

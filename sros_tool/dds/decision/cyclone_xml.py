@@ -124,6 +124,7 @@ class _Reader:
             return not closes
         if text.startswith(tuple(_QUOTES), index):  # it reads on to the other quote
             self._string()
+            self._index = index
         return False
 
     def _content_text(self) -> str:

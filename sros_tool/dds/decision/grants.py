@@ -6,7 +6,7 @@ from datetime import datetime, tzinfo
 
 from sros_tool.dds.decision.answers import Refusal
 from sros_tool.dds.decision.moments import read_moment
-from sros_tool.dds.decision.subjects import same_subject
+from sros_tool.dds.decision.subjects import escaped, same_subject
 from sros_tool.dds.decision.vendors import Moments, Traits
 from sros_tool.dds.permissions import Grant, Permissions
 
@@ -17,6 +17,7 @@ def choose_grant(
     """The index of the grant, or why there is none."""
     now = at.timestamp()
     outdated: Refusal | None = None
+    certified = escaped(subject) if traits.escapes_subjects else subject
     states = [
         _state(traits, index, grant, now, zone) for index, grant in enumerate(permissions.grants)
     ]
@@ -25,7 +26,7 @@ def choose_grant(
             return state
     for index, (grant, state) in enumerate(zip(permissions.grants, states, strict=True)):
         granted = grant.subject.strip() if traits.trims_texts else grant.subject
-        if not same_subject(traits.subjects, granted, subject):
+        if not same_subject(traits.subjects, granted, certified):
             continue
         if state is None:
             return index

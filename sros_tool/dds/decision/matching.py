@@ -17,6 +17,7 @@ SPECIAL = frozenset("*?[")
 _BEFORE_SPECIAL = re.compile(r"[^*?\[]*")
 _NEVER = "(?!)"
 _CLASS = re.compile(r"\[:([a-y]*):\]")
+_EQUIVALENT = re.compile(r"\[=(.)=\]", re.DOTALL)
 _CLASSES = {
     "alnum": "0-9A-Za-z",
     "alpha": "A-Za-z",
@@ -132,42 +133,47 @@ def _set_of(members: list[str], negated: bool) -> str:
 def _fnmatch_set(text: str, start: int) -> tuple[str, int]:
     """The set that begins behind ``[``, as glibc reads it, and where the expression goes on.
 
-    A set that is never closed is a plain ``[``.  From an unknown class on, nothing matches.
+    Behind an unknown class or symbol, and behind a range without its end, no further character
+    matches; a set that is never closed is a plain ``[`` otherwise, and if ``[`` was in it before.
     """
     index = start
     negated = text[index : index + 1] in ("!", "^")
     index += negated
     members: list[str] = []
-    known = True
+    goes_on = True
     first = True
     while index < len(text):
         if text[index] == "]" and not first:
-            return (_NEVER if negated and not known else _set_of(members, negated)), index + 1
+            return (_set_of(members, negated) if goes_on or not negated else _NEVER), index + 1
         first = False
         if found := _CLASS.match(text, index):
-            known = known and found[1] in _CLASSES
-            if known:
-                members.append(_CLASSES[found[1]])
+            low = high = _CLASSES.get(found[1])
             index = found.end()
-            continue
-        low, index = _member(text, index)
-        if text[index : index + 1] == "-" and text[index + 1 : index + 2] not in ("", "]"):
-            high, index = _member(text, index + 1)
-            if known and low <= high:
-                members.append(f"{re.escape(low)}-{re.escape(high)}")
-        elif known:
-            members.append(re.escape(low))
-    return re.escape("["), start
+        elif found := _EQUIVALENT.match(text, index):
+            low = high = re.escape(found[1])
+            index = found.end()
+        else:
+            low, index = _member(text, index)
+            high = low
+            if text[index : index + 1] == "-" and text[index + 1 : index + 2] != "]":
+                high, index = _member(text, index + 1)
+        goes_on = goes_on and low is not None and high is not None
+        if goes_on and low is high:
+            members.append(low or "")
+        elif goes_on and low and high and low[-1] <= high[-1]:
+            members.append(f"{low}-{high}")
+    opening = re.escape("[")
+    return (opening if goes_on or opening in members else _NEVER), start
 
 
-def _member(text: str, index: int) -> tuple[str, int]:
-    """One character of a set, also as ``[=a=]`` or ``[.a.]``, and where the set goes on."""
-    if (
-        text[index : index + 2] in ("[=", "[.")
-        and text[index + 3 : index + 5] == text[index + 1] + "]"
-    ):
-        return text[index + 2], index + 5
-    return text[index], index + 1
+def _member(text: str, index: int) -> tuple[str | None, int]:
+    """One character of a set, also as ``[.a.]``, for a pattern; None where there is none."""
+    if text[index : index + 2] != "[.":
+        return (re.escape(text[index]) if index < len(text) else None), index + 1
+    end = text.find(".]", index + 2)
+    if end < 0:
+        return None, len(text)
+    return (re.escape(text[index + 2]) if end == index + 3 else None), end + 2
 
 
 def _cyclone_set(text: str, start: int) -> tuple[str, int]:

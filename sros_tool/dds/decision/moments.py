@@ -14,9 +14,9 @@ _CYCLONE = re.compile(
     r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)(\.\d{1,12})?(?:Z|([+-])(\d\d):(\d\d))?\Z", re.ASCII
 )
 # What std::get_time of libstdc++ takes of %Y-%m-%dT%H:%M:%S: the text may end behind the year, the
-# month or the day; behind the seconds anything may follow.
+# month or the day; one blank may stand before the day; behind the seconds anything may follow.
 _LOCAL = re.compile(
-    r"\s*(\d{1,4})(?:-(\d\d?)(?:-(\d\d?)(?:[Tt](\d\d?):(\d\d?):(\d\d?))?)?)?", re.ASCII
+    r"\s*(\d{1,4})(?:-(\d\d?)(?:-\s?(\d\d?)(?:[Tt](\d\d?):(\d\d?):(\d\d?))?)?)?", re.ASCII
 )
 _LAST_YEAR = 2262  # of 64 bits of nanoseconds
 _FARTHEST = timedelta(hours=12)
@@ -56,7 +56,7 @@ def _local(text: str, zone: tzinfo) -> float | None:
         # tm_isdst stays 0, so that mktime takes standard time, in summer too.
         offset = (aware.utcoffset() or timedelta(0)) - (aware.dst() or timedelta(0))
     except (ValueError, OverflowError):
-        return inf if year else -inf
+        return inf if year > 1 else -inf
     return timegm(wall.timetuple()) - offset.total_seconds()
 
 

@@ -1,7 +1,7 @@
 """Whether the subject of a grant is that of a certificate, as each vendor compares them.
 
-Certificates' subjects are RFC 4514 text, the most specific attribute first, as OpenSSL and
-`sros_tool.pki.certificates.subject_text` print them.
+Certificates' subjects are the text that OpenSSL and `sros_tool.pki.certificates.subject_text` print
+by RFC 2253, the most specific attribute first.
 """
 
 from __future__ import annotations
@@ -20,6 +20,15 @@ def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
     return _COMPARE[rule](granted, certified)
 
 
+def escaped(certified: str) -> str:
+    """The subject of a certificate with every byte beyond ASCII as ``\\C3``."""
+    parts = (
+        each if each.isascii() else "".join(f"\\{b:02X}" for b in each.encode())
+        for each in certified
+    )
+    return "".join(parts)
+
+
 def _exact(granted: str, certified: str) -> bool:
     return _attributes(granted) == _attributes(certified)
 
@@ -34,13 +43,48 @@ def _stripped(name: str) -> list[str]:
     return [part.strip(" ") for part in takewhile(bool, name.split(","))]
 
 
+_MOST_ATTRIBUTES = 20  # of which Fast DDS 2.14 takes notice
+_UNQUOTED = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*(?:"|\\?\Z)|[^"\\])', re.DOTALL)
+
+
 def _any_order(granted: str, certified: str) -> bool:
-    ours, theirs = _attributes(granted), _attributes(certified)
+    ours, theirs = _types_and_values(granted), _types_and_values(certified)
     first_values: dict[str, str] = {}
     for kind, value in theirs:
         first_values.setdefault(kind, value)
-    # Only the first value of a kind is ever found, so a repeated kind fits nothing.
+    # Only the first value of a kind is ever found, so a repeated kind fits nothing; one that the
+    # certificate lacks is empty there.
     return len(ours) == len(theirs) and all(first_values.get(k, "") == v for k, v in ours)
+
+
+def _types_and_values(name: str) -> list[tuple[str, str]]:
+    """The attributes that DistinguishedName.cpp of Fast DDS 2.14 finds, up to a malformed one."""
+    found: list[tuple[str, str]] = []
+    rest = name.lstrip(" ")
+    while rest and len(found) < _MOST_ATTRIBUTES:
+        equals = _outside_quotes(rest, "=")
+        if equals < 0:
+            break
+        # A cut that ends where it begins is one to the end of the text.
+        kind, rest = rest[: equals or None], rest[equals + 1 :]
+        comma = _outside_quotes(rest, ",")
+        value = rest if comma < 0 else rest[: comma or None]
+        found.append((_plain(kind), _plain(value)))
+        rest = "" if comma < 0 else rest[comma + 1 :].lstrip(" ")
+    return found
+
+
+def _outside_quotes(text: str, wanted: str) -> int:
+    """Where a character stands first, not escaped and not in quotes; -1 if nowhere."""
+    index = 0
+    while index < len(text):
+        found = _UNQUOTED.match(text, index)
+        if not found:
+            break
+        if found[0] == wanted:
+            return index
+        index = found.end()
+    return -1
 
 
 _PART = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^,"\\])*', re.DOTALL)

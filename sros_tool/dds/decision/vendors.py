@@ -98,6 +98,8 @@ class Traits:
     trims_texts: bool = False
     """Spaces around the text of an element do not count."""
     subjects: Subjects = Subjects.EXACT
+    escapes_subjects: bool = False
+    """A character beyond ASCII in a certificate's subject is compared as ``\\C3\\B6``."""
     moments: Moments = Moments.STANDARD
     passes_over_outdated_grants: bool = False
     """A later grant is used if the first of the subject is out of date."""
@@ -112,6 +114,8 @@ class Traits:
     honours_default: bool = True
     crashes_on_empty_texts: bool = False
     """An expression or a default without text ends the process once a decision comes to it."""
+    longest_topic_name: int | None = None
+    """A topic with a longer name, in bytes, is created and never matched."""
     creates_topics: bool = False
     """A topic is created before its endpoint, and needs a right in either direction."""
     always_needs_allow_rule: bool = False
@@ -129,6 +133,7 @@ _FAST = Traits(
     governance_both_ways=True,
     subjects=Subjects.ANY_ORDER,
     moments=Moments.LOCAL,
+    longest_topic_name=251,
     passes_over_outdated_grants=True,
     open_range=OpenRange.SINGLE,
     filters_own_domain=False,
@@ -155,6 +160,7 @@ TRAITS = {
         style=Style.CYCLONE,
         trims_texts=True,
         subjects=Subjects.SUBSET,
+        escapes_subjects=True,
         moments=Moments.CYCLONE,
         open_range=OpenRange.CRASHES,
         deny_partitions=DenyPartitions.ANY_OR_DEFAULT,
