@@ -31,7 +31,12 @@ _WORST = (
     Outcome.PEER_DENIES,
     Outcome.ALLOWED,
 )
-_UNTOLD_LOCALLY = {(Vendor.CYCLONE, "key-mismatch")}
+_UNTOLD_LOCALLY = {
+    (Vendor.CYCLONE, "key-mismatch"),
+    (Vendor.FAST, "key-algorithm"),
+    (Vendor.FAST_2_9, "key-algorithm"),
+    (Vendor.FAST_2_9, "document-size"),
+}
 """What a vendor does not notice itself, but every peer does."""
 
 # All enclaves of a keystore have the same governance.
@@ -100,6 +105,7 @@ class Judge:
         self._setting = setting
         self._governance: Governance | None = None
         self._permissions: Permissions | None = None
+        self._problems = material.problems(TRAITS[vendor])
         self._before = self._prepare()
         self._until = self._end()
 
@@ -116,9 +122,9 @@ class Judge:
 
     def _prepare(self) -> Access | Decision:
         material, setting = self._material, self._setting
-        if material.problems:
-            first = material.problems[0]
-            untold = all((self._vendor, each.code) in _UNTOLD_LOCALLY for each in material.problems)
+        if self._problems:
+            first = self._problems[0]
+            untold = all((self._vendor, each.code) in _UNTOLD_LOCALLY for each in self._problems)
             outcome = Outcome.PEER_DENIES if untold else Outcome.REFUSED
             return Decision(outcome, first.code, f"{self._vendor.title}: {first}.")
         governance = _governance_as(self._vendor, material.governance)
@@ -157,7 +163,7 @@ class Judge:
             outcome,
             deciding,
             tuple(asked),
-            self._material.problems,
+            self._problems,
             grant,
             self._domain_rule(),
             until,

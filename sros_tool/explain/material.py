@@ -9,10 +9,12 @@ from datetime import datetime, timedelta
 from functools import lru_cache
 from pathlib import Path
 
+from sros_tool.dds.decision import Traits
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import Governance, render_governance
+from sros_tool.dds.governance import Governance, parse_governance, render_governance
 from sros_tool.dds.permissions import render_permissions
 from sros_tool.errors import SrosError
+from sros_tool.keystore.acceptance import vendor_problems
 from sros_tool.keystore.layout import REQUEST
 from sros_tool.keystore.verify import EnclaveState, Problem, check_enclave
 from sros_tool.pki import smime
@@ -44,8 +46,9 @@ class Material:
     """An enclave as DDS gets it.
 
     ``governance`` and ``permissions`` are the XML within the signed documents; ``signed`` is the
-    signed permissions, b"" if they are not signed yet.  ``problems`` are those that keep a process
-    from running whatever the documents say.  ``ends`` are files with the moment when they expire.
+    signed permissions, b"" if they are not signed yet.  ``ends`` are files with the moment when
+    they expire.  ``state`` is what the files were found to be at the moment ``at``; None where they
+    are not made yet.
     """
 
     enclave: str
@@ -54,32 +57,43 @@ class Material:
     permissions: bytes
     domains: DomainSet | None
     signed: bytes = b""
-    problems: tuple[Problem, ...] = ()
     ends: tuple[tuple[str, datetime], ...] = ()
+    state: EnclaveState | None = None
+    at: datetime | None = None
+    key_elsewhere: bool = False
+    """Its key is on the robot on which it was made."""
+
+    def problems(self, traits: Traits) -> tuple[Problem, ...]:
+        """Those that keep a process of a vendor from running, whatever the documents say."""
+        if self.state is None or self.at is None:
+            return ()
+        passed_over = _LEFT_TO_THE_VENDOR | (
+            {"file-missing key.pem"} if self.key_elsewhere else set()
+        )
+        return tuple(
+            each
+            for each in vendor_problems(traits, self.state, self.at)
+            if each.code not in passed_over and f"{each.code} {each.file}" not in passed_over
+        )
 
 
 def from_folder(name: str, folder: Path, *, at: datetime) -> Material:
     """What lies in the folder of an enclave, as it is at a moment."""
     state = check_enclave(folder, now=at)
-    passed_over = _LEFT_TO_THE_VENDOR
-    if (folder / REQUEST).exists() and not (folder / "key.pem").exists():
-        passed_over = _LEFT_TO_THE_VENDOR | {"file-missing key.pem"}  # it is on the robot
-    governance = b""
-    with suppress(SrosError):
-        governance = _document(state.files.get("governance.p7s", b""))
+    governance, permissions = (
+        _document(state.files.get(file, b"")) for file in ("governance.p7s", "permissions.p7s")
+    )
     return Material(
         name,
         subject_text(state.certificate.subject) if state.certificate else "",
         governance,
-        state.permissions_document,
-        state.domains(),
+        permissions,
+        state.domains() or _domains(governance),
         state.files.get("permissions.p7s", b""),
-        tuple(
-            each
-            for each in state.problems
-            if each.code not in passed_over and f"{each.code} {each.file}" not in passed_over
-        ),
         tuple(_ends(state, folder)),
+        state,
+        at,
+        key_elsewhere=(folder / REQUEST).exists() and not (folder / "key.pem").exists(),
     )
 
 
@@ -101,7 +115,15 @@ def from_policy(enclave: Enclave, governance: Governance, *, at: datetime) -> Ma
 
 @lru_cache(maxsize=8)
 def _document(message: bytes) -> bytes:
-    return smime.parse(message).document
+    with suppress(SrosError):
+        return smime.parse(message).document
+    return b""
+
+
+def _domains(governance: bytes) -> DomainSet | None:
+    with suppress(SrosError):
+        return parse_governance(governance).domains().closed()
+    return None
 
 
 def _ends(state: EnclaveState, folder: Path) -> Iterator[tuple[str, datetime]]:

@@ -38,7 +38,7 @@ Parsed = TypeVar("Parsed")
 
 _OWN = "cert.pem"
 _ENCRYPTED = re.compile(rb"ENCRYPTED")
-_SIGNED = re.compile(rb"(?i)multipart/signed")
+_SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
 
 
 @dataclass(frozen=True, slots=True)

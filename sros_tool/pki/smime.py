@@ -2,7 +2,8 @@
 
 The form that every DDS vendor reads: CRLF line ends, a first part whose header
 ``Content-Type: text/plain`` is part of what is signed, SHA-256, the signer's certificate embedded
-(DDS-Security 1.1, 9.4.1.1; OpenSSL ``smime -sign -text``).
+(DDS-Security 1.1, 9.4.1.1; OpenSSL ``smime -sign -text``).  Opaque messages, which hold what they
+sign, are read as well, for every vendor takes them (``-nodetach``).
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import base64
 import binascii
 import re
 import secrets
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -32,6 +34,7 @@ _MULTIPART = re.compile(
     rb"(?im)^content-type:[ \t]*multipart/signed"
     rb"""((?:;[ \t]*(?:\n[ \t]+)?[\w-]+=(?:"[^"\x00-\x1f]+"|[^\s;"]+))+)$"""
 )
+_OPAQUE = re.compile(rb"(?im)^content-type:[ \t]*application/(?:x-)?pkcs7-mime(?:;|$)")
 _BOUNDARY = re.compile(rb"""(?i);\s*boundary=("([^"]{1,200})"|([^\s;"]{1,200}))""")
 _PKCS7 = re.compile(rb"(?im)^content-type:[ \t]*application/(?:x-)?pkcs7-signature(?:;|$)")
 
@@ -93,8 +96,12 @@ class SignedDocument:
 
     def signer(self) -> x509.Certificate | None:
         """The certificate that the signature names, if it is embedded."""
+        return self.signer_among(self.certificates)
+
+    def signer_among(self, certificates: Iterable[x509.Certificate]) -> x509.Certificate | None:
+        """The one of ``certificates`` that the signature names, by its issuer and serial number."""
         issuer, serial = self._issuer_and_serial
-        for certificate in self.certificates:
+        for certificate in certificates:
             if certificate.serial_number == serial and certificate.issuer.public_bytes() == issuer:
                 return certificate
         return None
@@ -116,7 +123,7 @@ class SignedDocument:
                 f"it is signed {who}, not by the permissions CA "
                 f"{authority.subject.rfc4514_string()}"
             )
-        if not self._intact(signer):
+        if not self.is_intact(signer):
             raise PkiError(
                 "its signature does not match its content",
                 "The document was changed after it was signed, or its signature is damaged.",
@@ -128,7 +135,8 @@ class SignedDocument:
         digest.update(self.content)
         return digest.finalize() == self._message_digest
 
-    def _intact(self, signer: x509.Certificate) -> bool:
+    def is_intact(self, signer: x509.Certificate) -> bool:
+        """Whether the key of ``signer`` signed this content."""
         if self._signed_attributes and not self.carries_digest():
             return False
         signed = self._signed_attributes or self.content
@@ -148,6 +156,13 @@ class SignedDocument:
 def parse(message: bytes) -> SignedDocument:
     """Take a ``.p7s`` apart.  Raises `PkiError` if it is no S/MIME signed message."""
     content, signature = _split(message)
+    try:
+        return _parse_cms(signature, content)
+    except (IndexError, *UNREADABLE) as error:
+        raise PkiError("its signature is not a CMS signature that can be read") from error
+
+
+def _document(content: bytes) -> bytes:
     header, separator, document = content.partition(b"\r\n\r\n")
     if not separator or not _TEXT.match(header):
         raise PkiError(
@@ -155,15 +170,17 @@ def parse(message: bytes) -> SignedDocument:
             "DDS vendors only accept documents signed with a text/plain header "
             "(openssl smime -sign -text).",
         )
-    try:
-        return _parse_cms(signature, content, document)
-    except (IndexError, *UNREADABLE) as error:
-        raise PkiError("its signature is not a CMS signature that can be read") from error
+    return document
 
 
-def _split(message: bytes) -> tuple[bytes, bytes]:
-    """The signed part, with CRLF line ends, and the DER of its signature."""
+def _split(message: bytes) -> tuple[bytes | None, bytes]:
+    """The signed part, with CRLF line ends, and the DER of its signature.
+
+    An opaque message has no signed part of its own: it is in its signature.
+    """
     head, _, body = message.replace(b"\r\n", b"\n").partition(b"\n\n")
+    if _OPAQUE.search(head):
+        return None, _decoded(body)
     multipart = _MULTIPART.search(head)
     boundary = _BOUNDARY.search(multipart[1]) if multipart else None
     if not boundary:
@@ -178,13 +195,17 @@ def _split(message: bytes) -> tuple[bytes, bytes]:
         raise PkiError("it does not consist of one signed part and one signature")
     content = parts[1].removeprefix(b"\n").replace(b"\n", b"\r\n")
     header, _, encoded = parts[2].removeprefix(b"\n").partition(b"\n\n")
-    try:
-        signature = base64.b64decode(b"".join(encoded.split()), validate=True)
-    except binascii.Error as error:
-        raise PkiError("its signature is not valid base64") from error
+    signature = _decoded(encoded)
     if not _PKCS7.search(header) or not signature:
         raise PkiError("it has no signature")
     return content, signature
+
+
+def _decoded(encoded: bytes) -> bytes:
+    try:
+        return base64.b64decode(b"".join(encoded.split()), validate=True)
+    except binascii.Error as error:
+        raise PkiError("its signature is not valid base64") from error
 
 
 @lru_cache(maxsize=16)
@@ -201,7 +222,7 @@ def _parts(value: der.Value, *tags: int) -> list[der.Value]:
     return parts
 
 
-def _parse_cms(signature: bytes, content: bytes, document: bytes) -> SignedDocument:
+def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     """Read ContentInfo / SignedData / SignerInfo (RFC 5652, sections 3, 5.1 and 5.3)."""
     message = der.first(signature)
     content_type, wrapped = _parts(message, der.OID, der.CONTEXT_0)[:2]
@@ -210,8 +231,12 @@ def _parse_cms(signature: bytes, content: bytes, document: bytes) -> SignedDocum
         raise ValueError("not SignedData")
     fields = _parts(signed_data, der.INTEGER, der.SET, der.SEQUENCE)
     version, digests, encapsulated = fields[:3]
-    if version.whole != _VERSION or _parts(encapsulated, der.OID)[0].content != _DATA:
-        raise ValueError("not a detached signature of data")
+    kind, *contained = _parts(encapsulated, der.OID)
+    if version.whole != _VERSION or kind.content != _DATA:
+        raise ValueError("not a signature of data")
+    if content is None:
+        (octets,) = _parts(contained[0], der.OCTET_STRING)
+        content = octets.content
     certificates = tuple(
         _certificate(value.whole)
         for field in fields[3:]
@@ -243,7 +268,7 @@ def _parse_cms(signature: bytes, content: bytes, document: bytes) -> SignedDocum
         raise ValueError("no signature value")
     return SignedDocument(
         content=content,
-        document=document,
+        document=_document(content),
         certificates=certificates,
         digest=algorithm.name,
         _digest_algorithm=algorithm,

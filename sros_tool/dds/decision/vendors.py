@@ -86,6 +86,34 @@ class DenyPartitions(Enum):
     """None: a deny rule holds whatever its partitions (Fast DDS)."""
 
 
+class Signers(Enum):
+    """Who may sign governance and permissions."""
+
+    AUTHORITY = auto()
+    """The permissions CA itself, whose certificate is in the message."""
+    LISTED = auto()
+    """Whose certificate is in the file of the permissions CA; no chain is verified (2.14)."""
+    CHAIN = auto()
+    """Whose certificate is in the message and has a chain to that CA, for S/MIME."""
+
+
+class Hashes(Enum):
+    """The hashes that may sign CAs and identities."""
+
+    ANY = auto()
+    SHA256 = auto()
+    """SHA-256, and SHA-1 with RSA (Fast DDS)."""
+
+
+class Keys(Enum):
+    """The keys that identities and their CA may have."""
+
+    ANY = auto()
+    EC_AND_RSA = auto()
+    SMALL = auto()
+    """EC of 256 bits, and RSA of 2048 (Cyclone DDS)."""
+
+
 @dataclass(frozen=True, slots=True)
 class Traits:
     """The rules by which one vendor decides, where vendors differ."""
@@ -126,6 +154,17 @@ class Traits:
     """Participants that refused each other still exchange what nothing protects (ran)."""
     refuses_open_rtps: bool = False
     """Unauthenticated participants together with RTPS protection are refused."""
+    admits_unauthenticated: bool = True
+    """Participants without security take part where the governance says so."""
+    signers: Signers = Signers.AUTHORITY
+    reads_first_authority: bool = False
+    """Of a file with several CAs only the first is trusted."""
+    verifies_authorities: bool = False
+    """The first certificate of a CA file is verified, strictly, when it is loaded."""
+    hashes: Hashes = Hashes.ANY
+    keys: Keys = Keys.ANY
+    largest_document: int | None = None
+    """With larger signed permissions, in bytes, a handshake never ends."""
 
 
 _FAST = Traits(
@@ -144,6 +183,10 @@ _FAST = Traits(
     always_needs_allow_rule=True,
     needs_domain_rule=False,
     refuses_open_rtps=True,
+    signers=Signers.LISTED,
+    verifies_authorities=True,
+    hashes=Hashes.SHA256,
+    keys=Keys.EC_AND_RSA,
 )
 
 TRAITS = {
@@ -154,6 +197,10 @@ TRAITS = {
         title="Fast DDS 2.9.1",
         subjects=Subjects.WHOLE_ATTRIBUTES,
         refuses_open_rtps=False,
+        admits_unauthenticated=False,
+        signers=Signers.CHAIN,
+        verifies_authorities=False,
+        largest_document=64 * 1024 - 1,
     ),
     Vendor.CYCLONE: Traits(
         "Cyclone DDS 0.10.2",
@@ -167,6 +214,9 @@ TRAITS = {
         crashes_on_empty_texts=True,
         creates_topics=True,
         shares_open_topics=True,
+        signers=Signers.CHAIN,
+        reads_first_authority=True,
+        keys=Keys.SMALL,
     ),
     Vendor.OPENDDS: Traits("OpenDDS", documented_only=True),
     Vendor.CONNEXT: Traits("Connext 6.1.1 and later", documented_only=True),

@@ -1,0 +1,163 @@
+"""Which CAs, identities and signatures a DDS vendor accepts when it loads an enclave.
+
+Vendors differ in it, by the traits in `sros_tool.dds.decision.vendors`; what all of them check
+alike is in `sros_tool.keystore.verify`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from datetime import datetime
+from functools import lru_cache
+from itertools import dropwhile
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
+
+from sros_tool.dds.decision import Traits
+from sros_tool.dds.decision.vendors import Hashes, Keys, Signers
+from sros_tool.dds.permissions import MAX_SIGNED_BYTES
+from sros_tool.errors import PkiError
+from sros_tool.keystore.verify import EnclaveState, Problem
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import load_certificates, subject_text
+from sros_tool.pki.chains import chain_fault
+from sros_tool.pki.keys import algorithm
+
+Certificates = tuple[x509.Certificate, ...]
+
+IDENTITY_CA, PERMISSIONS_CA = "identity_ca.cert.pem", "permissions_ca.cert.pem"
+CERTIFICATE, GOVERNANCE, PERMISSIONS = "cert.pem", "governance.p7s", "permissions.p7s"
+_SIDES = ((IDENTITY_CA, CERTIFICATE), (PERMISSIONS_CA, GOVERNANCE, PERMISSIONS))
+_JUDGED = frozenset({"ca-expired", "ca-not-yet-valid", "certificate-issuer", "signature"})
+"""Problems that do not hold for every vendor."""
+
+_certificates = lru_cache(maxsize=16)(load_certificates)
+
+
+def vendor_problems(traits: Traits, state: EnclaveState, at: datetime) -> tuple[Problem, ...]:
+    """The problems that a vendor has with an enclave when it loads it, at the moment ``at``.
+
+    Those of its documents' content are not among them, beyond what `EnclaveState` says.
+    """
+    faults = tuple(_faults(traits, state, at))
+    kept = [each for each in state.problems if each.code not in _JUDGED]
+    for side in _SIDES:
+        of_side = [each for each in faults if each.file in side]
+        files = {each.file for each in of_side} | ({side[0]} if of_side else set())
+        named = [each for each in state.problems if each.code in _JUDGED and each.file in files]
+        kept += named or of_side
+    return tuple(kept)
+
+
+def _faults(traits: Traits, state: EnclaveState, at: datetime) -> Iterator[Problem]:
+    read: dict[str, Certificates] = {}
+    for file in (IDENTITY_CA, PERMISSIONS_CA):
+        if file in state.files:
+            with suppress(PkiError):
+                read[file] = _certificates(state.files[file], file)
+    for file, certificates in read.items():
+        if fault := authority_fault(traits, certificates, at):
+            yield Problem(file, *fault)
+    authorities = read.get(IDENTITY_CA)
+    if authorities and state.certificate:
+        yield from _identity_faults(traits, state.certificate, authorities, at)
+    signers = read.get(PERMISSIONS_CA)
+    for file in (GOVERNANCE, PERMISSIONS) if signers else ():
+        if signers and file in state.files:
+            with suppress(PkiError):  # what is not signed at all no vendor takes
+                signed = _parsed(state.files[file])
+                if text := signer_fault(traits, signed, signers, at):
+                    yield Problem(file, text, "signature")
+    largest = traits.largest_document
+    if largest is not None and state.permissions_bytes > largest:
+        text = f"it has {state.permissions_bytes} bytes, and from {MAX_SIGNED_BYTES} on the "
+        yield Problem(PERMISSIONS, f"{text}handshake never ends", "document-size")
+
+
+_parsed = lru_cache(maxsize=8)(smime.parse)
+
+
+def authority_fault(
+    traits: Traits, certificates: Certificates, at: datetime
+) -> tuple[str, str] | None:
+    """Why the vendor refuses a CA file as such, and the code of the problem.
+
+    ``certificates`` are those of the file, in their order.
+    """
+    trusted = _trusted(traits, certificates)
+    if not trusted:
+        name = subject_text(certificates[0].subject)
+        return f"{name} is not signed with SHA-256", "signature-hash"
+    if traits.verifies_authorities:
+        fault = chain_fault(certificates[0], trusted, at=at, strict=True)
+        if fault:
+            return f"it is refused: {fault}", "ca-chain"
+    return None
+
+
+def signer_fault(
+    traits: Traits, signed: smime.SignedDocument, certificates: Certificates, at: datetime
+) -> str:
+    """Why the vendor does not take the signature of a document, or "".
+
+    ``certificates`` are those of the permissions CA's file, in their order.
+    """
+    trusted = _trusted(traits, certificates)
+    if traits.signers is Signers.AUTHORITY:
+        try:
+            signed.verify(certificates[0])
+        except PkiError as error:
+            return str(error)
+        return ""
+    listed = traits.signers is Signers.LISTED
+    signer = signed.signer_among(trusted if listed else signed.certificates)
+    if signer is None:
+        where = "in the file of the permissions CA" if listed else "in the message"
+        return f"the certificate of its signer is not {where}"
+    if not signed.is_intact(signer):
+        return "its signature does not match its content"
+    if listed:
+        return ""
+    fault = chain_fault(signer, trusted, signed.certificates, at=at, for_documents=True)
+    return f"its signer is not accepted: {fault}" if fault else ""
+
+
+def _trusted(traits: Traits, certificates: Certificates) -> Certificates:
+    if traits.reads_first_authority:
+        return certificates[:1]
+    return tuple(dropwhile(lambda each: not _hash_fits(traits, each), certificates))
+
+
+def _hash_fits(traits: Traits, certificate: x509.Certificate) -> bool:
+    digest = certificate.signature_hash_algorithm
+    if traits.hashes is Hashes.ANY or isinstance(digest, hashes.SHA256):
+        return True
+    return isinstance(digest, hashes.SHA1) and certificate.signature_algorithm_oid in _RSA_SHA1
+
+
+_RSA_SHA1 = {x509.SignatureAlgorithmOID.RSA_WITH_SHA1}
+
+
+def _identity_faults(
+    traits: Traits, certificate: x509.Certificate, authorities: Certificates, at: datetime
+) -> Iterator[Problem]:
+    if not _hash_fits(traits, certificate):
+        yield Problem(CERTIFICATE, "it is not signed with SHA-256", "signature-hash")
+    for file, each in ((CERTIFICATE, certificate), (IDENTITY_CA, authorities[0])):
+        if not _key_fits(traits, each):
+            text = f"it has a key of {algorithm(each.public_key())}"
+            yield Problem(file, text, "key-algorithm")
+    if fault := chain_fault(certificate, _trusted(traits, authorities), at=at):
+        yield Problem(CERTIFICATE, fault, "certificate-issuer")
+
+
+def _key_fits(traits: Traits, certificate: x509.Certificate) -> bool:
+    key = certificate.public_key()
+    if isinstance(key, ec.EllipticCurvePublicKey):
+        return traits.keys is not Keys.SMALL or key.key_size == 256
+    if isinstance(key, rsa.RSAPublicKey):
+        return traits.keys is not Keys.SMALL or key.key_size == 2048
+    return traits.keys is Keys.ANY
