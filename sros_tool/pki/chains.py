@@ -36,7 +36,9 @@ def chain_fault(
         if issuer is None or issuer in chain:
             return f"the issuer {subject_text(chain[-1].issuer)} is not among what is trusted"
         chain.append(issuer)
-    if chain[-1] not in authorities:
+    # Of several with the same name and key only the first is looked at.
+    root = next((each for each in authorities if issued_by(chain[-1], each)), None)
+    if root != chain[-1]:
         return f"the self-signed {subject_text(chain[-1].subject)} is not among what is trusted"
     faults = (
         *_extension_faults(chain),

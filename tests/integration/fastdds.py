@@ -1,18 +1,25 @@
-"""Programs that ask Debian's Fast DDS: built once for all workers, each in its own network."""
+"""Programs that ask Fast DDS: built once for all workers, each in its own network."""
 
 from __future__ import annotations
 
 import fcntl
+import os
+import re
 import shutil
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
 from children import run
 
+from sros_tool.dds.decision import Vendor
 from sros_tool.runtime.netns import try_isolation
 
 HERE = Path(__file__).parent
+OWN_FASTDDS = os.environ.get("SROS_FASTDDS_PREFIX", "")
+"""Where a Fast DDS with security of one's own is installed; without it, Debian's is asked."""
+
 ISOLATED = """
 import os, sys
 from sros_tool.runtime.netns import end_with_parent, enter_isolation
@@ -21,12 +28,22 @@ os.execv(sys.argv[1], sys.argv[1:])
 """
 
 
+@cache
+def fastdds_vendor() -> Vendor:
+    """Which of the two versions that sros knows the Fast DDS is that is asked."""
+    if not OWN_FASTDDS:
+        return Vendor.FAST_2_9
+    config = Path(OWN_FASTDDS, "include/fastrtps/config.h").read_text()
+    minor = re.search(r"FASTRTPS_VERSION_MINOR (\d+)", config)
+    return Vendor.FAST if minor and int(minor[1]) >= 14 else Vendor.FAST_2_9
+
+
 def build(source: str, folder: Path) -> Path:
     """The program of a source that lies here; skips the test where it cannot be built.
 
     It is made in the run's common folder above ``folder``, which is a temporary one of the test's.
     """
-    if not shutil.which("g++") or not Path("/usr/include/fastdds").is_dir():
+    if not shutil.which("g++") or not Path(OWN_FASTDDS or "/usr", "include/fastdds").is_dir():
         pytest.skip("g++ and libfastrtps-dev are not installed")
     common = (each for each in folder.parents if each.parent.name.startswith("pytest-of-"))
     program = next(common, folder) / Path(source).stem
@@ -34,9 +51,18 @@ def build(source: str, folder: Path) -> Path:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not program.exists():
             made = program.with_suffix(".new")
-            run(["g++", "-std=c++17", "-O0", "-o", made, HERE / source, "-lfastrtps"])
+            run(["g++", "-std=c++17", "-O0", "-o", made, HERE / source, *_libraries()])
             made.rename(program)
     return program
+
+
+def _libraries() -> list[str]:
+    if not OWN_FASTDDS:
+        return ["-lfastrtps"]
+    include, lib = f"{OWN_FASTDDS}/include", f"{OWN_FASTDDS}/lib"
+    # These tags come before $LD_LIBRARY_PATH, which may name another Fast DDS of that version.
+    found = f"-Wl,-rpath,{lib},--disable-new-dtags"
+    return [f"-I{include}", f"-L{lib}", found, "-lfastrtps", "-lfastcdr"]
 
 
 def isolated(*command: object) -> list[str]:

@@ -17,11 +17,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from children import LATE, python, run
-from cryptography import x509
 from fastdds import build, isolated
 
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem
+from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem, subject_of
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.validity import Window
 
@@ -89,8 +88,7 @@ class Workshop:
         if subject not in self._identities:
             folder = self._folder(f"identity {subject}".encode())
             key = generate_key()
-            name = x509.Name.from_rfc4514_string(subject)
-            certificate = self._issuer.issue(name, key.public_key(), self.window)
+            certificate = self._issuer.issue(subject_of(subject), key.public_key(), self.window)
             (folder / "key.pem").write_bytes(key_pem(key))
             (folder / "cert.pem").write_bytes(pem(certificate))
             for each, authority in self.authorities.items():

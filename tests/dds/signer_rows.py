@@ -1,0 +1,321 @@
+"""Who may sign, and which CA files are taken: enclaves made each in one way, and what vendors do.
+
+``YES`` is started and matched with an enclave made in the same way, ``REFUSED`` not started.  Runs
+of Fast DDS 2.9.1, Fast DDS 2.14.5 and Cyclone DDS 0.10.2.
+"""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.x509.oid import ExtendedKeyUsageOID
+
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import common_name, pem, subject_of
+from sros_tool.pki.keys import PrivateKey, generate_key, key_pem
+
+YES, REFUSED = "matched", "refused"
+NOW = datetime.now(UTC).replace(microsecond=0)
+DAY = timedelta(days=1)
+Pair = tuple[x509.Certificate, PrivateKey]
+Digest = hashes.SHA256 | hashes.SHA384 | hashes.SHA512
+
+SIGNS, CERTIFIES = "signs", "certifies"
+"""The keyUsages digitalSignature, and keyCertSign with cRLSign."""
+
+
+def authority(
+    name: str,
+    usage: str | None = f"{SIGNS} {CERTIFIES}",
+    *,
+    by: Pair | None = None,
+    key: PrivateKey | None = None,
+    days: tuple[int, int] = (-30, 30),
+    purpose: x509.ObjectIdentifier | None = None,
+    digest: Digest | None = None,
+    serial: int | None = None,
+    is_ca: bool = True,
+    identifiers: bool = True,
+) -> Pair:
+    """A certificate for CAs (or with ``is_ca`` false another) and its key."""
+    key = key or generate_key()
+    issuer, signing = by or (None, key)
+    public = key.public_key()
+    builder = x509.CertificateBuilder(
+        issuer.subject if issuer else common_name(name),
+        common_name(name),
+        public,
+        serial or x509.random_serial_number(),
+        NOW + days[0] * DAY,
+        NOW + days[1] * DAY,
+    ).add_extension(x509.BasicConstraints(is_ca, None), critical=True)
+    if usage is not None:
+        flags = [SIGNS in usage.split(), False, False, False, False]
+        flags += [CERTIFIES in usage.split()] * 2
+        builder = builder.add_extension(x509.KeyUsage(*flags, False, False), critical=True)
+    if purpose:
+        builder = builder.add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
+    if identifiers:
+        above = issuer.public_key() if issuer else public
+        builder = builder.add_extension(
+            x509.SubjectKeyIdentifier.from_public_key(public), critical=False
+        ).add_extension(
+            x509.AuthorityKeyIdentifier.from_issuer_public_key(above),  # type: ignore[arg-type]
+            critical=False,
+        )
+    return builder.sign(signing, digest or hashes.SHA256()), key
+
+
+def signed_by(pair: Pair, *options: str) -> Callable[[bytes], bytes]:
+    """How documents are signed; with options by ``openssl smime``."""
+
+    def sign(document: bytes) -> bytes:
+        if not options:
+            return smime.sign(document, *pair)
+        with TemporaryDirectory() as folder:
+            signer = Path(folder, "signer.pem")
+            signer.write_bytes(pem(pair[0]) + key_pem(pair[1]))
+            command = ["openssl", "smime", "-sign", "-text", "-signer", str(signer), *options]
+            return subprocess.run(command, input=document, check=True, capture_output=True).stdout
+
+    return sign
+
+
+@dataclass(frozen=True)
+class Made:
+    """How the enclaves of a row are made.
+
+    ``issuer`` issues their certificates with ``digest``, ``sign`` signs their documents; the CA
+    files consist of ``identity`` and ``permissions``, in that order.
+    """
+
+    sign: Callable[[bytes], bytes] | None = None
+    permissions: tuple[Pair, ...] = ()
+    issuer: Pair | None = None
+    identity: tuple[Pair, ...] = ()
+    own_signer: bool = False
+    """Every enclave signs its own permissions, with the key of its identity."""
+    digest: Digest = field(default_factory=hashes.SHA256)
+
+
+@dataclass(frozen=True)
+class Row:
+    """What Fast DDS 2.9.1, Fast DDS 2.14.5 and Cyclone DDS 0.10.2 do with one."""
+
+    name: str
+    made: Made
+    fast: str
+    later: str
+    cyclone: str
+
+
+def write_enclave(
+    row: Row, folder: Path, subject: str, governance: bytes, permissions: bytes
+) -> None:
+    """All files of an enclave as the row has them made."""
+    made = row.made
+    issuer = made.issuer or ROOT
+    key = generate_key()
+    name = subject_of(subject)
+    certificate = (
+        x509.CertificateBuilder(
+            issuer[0].subject,
+            name,
+            key.public_key(),
+            x509.random_serial_number(),
+            NOW - DAY,
+            NOW + DAY,
+        )
+        .add_extension(x509.BasicConstraints(False, None), critical=True)
+        .sign(issuer[1], made.digest)
+    )
+    sign = made.sign or signed_by(made.permissions[0] if made.permissions else SIGNER)
+    folder.mkdir()
+    (folder / "key.pem").write_bytes(key_pem(key))
+    (folder / "cert.pem").write_bytes(pem(certificate))
+    for role, pairs in (
+        ("identity", made.identity or (issuer,)),
+        ("permissions", made.permissions or (SIGNER,)),
+    ):
+        data = b"".join(pem(each) for each, _ in pairs)
+        (folder / f"{role}_ca.cert.pem").write_bytes(data)
+    (folder / "governance.p7s").write_bytes(sign(governance))
+    own = signed_by((certificate, key)) if made.own_signer else sign
+    (folder / "permissions.p7s").write_bytes(own(permissions))
+
+
+ROOT = authority("identity CA")
+SIGNER = authority("permissions CA")
+
+
+def rows() -> list[Row]:
+    """All rows, with CAs made for this moment."""
+    expired = authority("old CA", days=(-30, -1))
+    certifying = authority("permissions CA", CERTIFIES)
+    below_plain = authority("sub CA", None, by=SIGNER)
+    below_certifying = authority("sub CA", CERTIFIES, by=SIGNER)
+    below_both = authority("sub CA", by=SIGNER)
+    leaf = authority("leaf", SIGNS, by=SIGNER, is_ca=False)
+    renewed = authority("permissions CA", key=SIGNER[1])
+    same_serial = authority("permissions CA", key=SIGNER[1], serial=SIGNER[0].serial_number)
+    other = authority("other CA")
+    identity_below_plain = authority("identity sub CA", None, by=ROOT)
+    identity_below = authority("identity sub CA", CERTIFIES, by=ROOT)
+    purposes = {
+        "serverAuth": ExtendedKeyUsageOID.SERVER_AUTH,
+        "clientAuth": ExtendedKeyUsageOID.CLIENT_AUTH,
+    }
+    chained = (below_plain, below_certifying, below_both)
+    return [
+        Row("the permissions CA signs", Made(), YES, YES, YES),
+        Row("a stranger signs", Made(signed_by(other)), REFUSED, REFUSED, REFUSED),
+        Row("a leaf below the CA signs", Made(signed_by(leaf)), YES, REFUSED, YES),
+        Row(
+            "an intermediate without keyUsage signs, the CA alone in the file",
+            Made(signed_by(below_plain)), YES, REFUSED, YES,
+        ),
+        Row(
+            "an intermediate that may sign signs, the CA alone in the file",
+            Made(signed_by(below_both)), YES, REFUSED, YES,
+        ),
+        Row(
+            "an intermediate that only certifies signs, the CA alone in the file",
+            Made(signed_by(below_certifying)), REFUSED, REFUSED, REFUSED,
+        ),
+        Row(
+            "one CA for both jobs, the enclave signs for itself",
+            Made(permissions=(ROOT,), own_signer=True), YES, REFUSED, YES,
+        ),
+        Row("opaque", Made(signed_by(SIGNER, "-nodetach")), YES, YES, YES),
+        Row("-nocerts", Made(signed_by(SIGNER, "-nocerts")), REFUSED, YES, REFUSED),
+        Row(
+            "a CA that only certifies", Made(permissions=(certifying,)), REFUSED, YES, REFUSED
+        ),
+        *(
+            Row(
+                f"a CA for {name}",
+                Made(permissions=(authority("permissions CA", purpose=purpose),)),
+                REFUSED, YES, REFUSED,
+            )
+            for name, purpose in purposes.items()
+        ),
+        Row(
+            "a CA for emailProtection",
+            Made(
+                permissions=(
+                    authority("CA", purpose=ExtendedKeyUsageOID.EMAIL_PROTECTION),
+                )
+            ),
+            YES, YES, YES,
+        ),
+        Row(
+            "a CA that signs and does not certify",
+            Made(permissions=(authority("permissions CA", SIGNS),)), YES, REFUSED, YES,
+        ),
+        Row(
+            "a CA without keyUsage and identifiers",
+            Made(permissions=(authority("permissions CA", None, identifiers=False),)),
+            YES, YES, YES,
+        ),
+        Row(
+            "a valid CA and an expired one, which signs",
+            Made(signed_by(expired), (SIGNER, expired)), REFUSED, YES, REFUSED,
+        ),
+        Row(
+            "an expired CA and a valid one, which signs",
+            Made(signed_by(SIGNER), (expired, SIGNER)), YES, REFUSED, REFUSED,
+        ),
+        Row("an expired CA", Made(permissions=(expired,)), REFUSED, REFUSED, REFUSED),
+        Row(
+            "a renewed CA and the old one of the same key, which signs",
+            Made(signed_by(SIGNER), (renewed, SIGNER)), REFUSED, YES, REFUSED,
+        ),
+        Row(
+            "the old CA, which signs, and a renewed one of the same key",
+            Made(signed_by(SIGNER), (SIGNER, renewed)), YES, YES, YES,
+        ),
+        Row(
+            "a renewed CA of the same key alone", Made(signed_by(SIGNER), (renewed,)),
+            REFUSED, REFUSED, REFUSED,
+        ),
+        Row(
+            "a renewed CA of the same key and serial number",
+            Made(signed_by(SIGNER), (same_serial,)), REFUSED, YES, REFUSED,
+        ),
+        Row(
+            "root and intermediate that only certifies, which signs",
+            Made(signed_by(below_certifying), (SIGNER, below_certifying)), REFUSED, YES, REFUSED,
+        ),
+        Row(
+            "root and intermediate that may sign, which signs",
+            Made(signed_by(below_both), (SIGNER, below_both)), YES, YES, YES,
+        ),
+        *(
+            Row(
+                f"intermediate ({name}) and root", Made(permissions=(each, SIGNER)), fast, later,
+                REFUSED,
+            )
+            for each, name, fast, later in zip(
+                chained,
+                ("no keyUsage", "only certifies", "may sign"),
+                (YES, REFUSED, YES),
+                (REFUSED, YES, YES),
+                strict=True,
+            )
+        ),
+        Row(
+            "intermediate alone", Made(permissions=(below_both,)), REFUSED, REFUSED, REFUSED
+        ),
+        *(
+            Row(
+                f"permissions CA with {digest.name}",
+                Made(permissions=(authority("permissions CA", digest=digest),)),
+                REFUSED, REFUSED, YES,
+            )
+            for digest in (hashes.SHA384(), hashes.SHA512())
+        ),
+        *(
+            Row(
+                f"identity CA with {digest.name}",
+                Made(issuer=authority("identity CA", digest=digest)),
+                REFUSED, REFUSED, YES,
+            )
+            for digest in (hashes.SHA384(), hashes.SHA512())
+        ),
+        Row("a leaf with sha384", Made(digest=hashes.SHA384()), REFUSED, REFUSED, YES),
+        Row(
+            "two identity CAs, the first issues", Made(issuer=ROOT, identity=(ROOT, other)),
+            YES, YES, YES,
+        ),
+        Row(
+            "two identity CAs, the second issues", Made(issuer=ROOT, identity=(other, ROOT)),
+            YES, YES, REFUSED,
+        ),
+        Row(
+            "an expired identity CA and a valid one, which issues",
+            Made(issuer=ROOT, identity=(expired, ROOT)), YES, REFUSED, REFUSED,
+        ),
+        Row(
+            "identity intermediate and root",
+            Made(issuer=identity_below, identity=(identity_below, ROOT)), YES, YES, REFUSED,
+        ),
+        Row(
+            "identity intermediate without keyUsage and root",
+            Made(issuer=identity_below_plain, identity=(identity_below_plain, ROOT)),
+            YES, REFUSED, REFUSED,
+        ),
+        Row(
+            "identity intermediate alone", Made(issuer=identity_below), REFUSED, REFUSED, REFUSED
+        ),
+        Row(
+            "root and identity intermediate, which issues",
+            Made(issuer=identity_below, identity=(ROOT, identity_below)), YES, YES, REFUSED,
+        ),
+    ]  # fmt: skip

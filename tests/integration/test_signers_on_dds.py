@@ -1,0 +1,57 @@
+"""Who may sign and which CA files are taken: the vendors themselves, row by row."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+from decision_documents import allow, grant, permissions, publish, subscribe
+from signer_rows import YES, rows, write_enclave
+from vendor_oracle import (
+    PEER,
+    PEER_PERMISSIONS,
+    Pair,
+    Reply,
+    ask_cyclone_folders,
+    ask_fastdds_folders,
+    fastdds_vendor,
+    with_patience,
+)
+from vendor_rows import OPEN
+
+from sros_tool.dds.decision import Vendor
+
+pytestmark = pytest.mark.dds
+
+TOPIC = "rt/a"
+
+
+@pytest.mark.parametrize("asked", ["Fast DDS", "Cyclone DDS"])
+def test_every_row(asked: str, tmp_path: Path) -> None:
+    vendor = Vendor.CYCLONE if asked == "Cyclone DDS" else fastdds_vendor()
+    table = rows()
+    granted = permissions(
+        grant(allow(publish("*"), subscribe("*"), domains="<id>0</id>"), subject="CN=/t")
+    )
+    pairs: list[Pair] = []
+    for number, row in enumerate(table):
+        own, peer = tmp_path / f"{number} own", tmp_path / f"{number} peer"
+        write_enclave(row, own, "CN=/t", OPEN, granted)
+        write_enclave(row, peer, PEER, OPEN, PEER_PERMISSIONS)
+        pairs.append((own, peer, "UTC"))
+
+    def ask(some: Sequence[Pair], seconds: float) -> list[Reply]:
+        if vendor is Vendor.CYCLONE:
+            return ask_cyclone_folders(some, TOPIC, pairs[0][0], seconds=seconds)
+        return ask_fastdds_folders(some, TOPIC, tmp_path, seconds=seconds)
+
+    columns = {Vendor.FAST_2_9: "fast", Vendor.FAST: "later", Vendor.CYCLONE: "cyclone"}
+    expected = [getattr(row, columns[vendor]) for row in table]
+    replies = with_patience(ask, pairs, lambda place, _: expected[place] == YES)
+    wrong = [
+        f"{row.name}: {vendor.title} answers {reply}, not {answer}"
+        for row, reply, answer in zip(table, replies, expected, strict=True)
+        if (reply.answers[0] if reply.end == "joined" else reply.end) != answer
+    ]
+    assert not wrong, "\n".join(wrong)

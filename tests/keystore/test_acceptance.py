@@ -1,0 +1,31 @@
+"""Who may sign and which CAs are taken, by vendor, as the rows have it from the vendors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from decision_documents import allow, governance, grant, permissions, publish, subscribe
+from signer_rows import NOW, YES, Row, rows, write_enclave
+
+from sros_tool.dds.decision import TRAITS, Vendor
+from sros_tool.explain.answer import Judge, Setting
+from sros_tool.explain.material import from_folder
+from sros_tool.explain.question import ask
+
+
+@pytest.mark.parametrize("row", rows(), ids=lambda row: row.name)
+def test_each_vendor(row: Row, tmp_path: Path) -> None:
+    granted = permissions(grant(allow(publish("*"), subscribe("*"))))
+    write_enclave(row, tmp_path / "t", "CN=/t", governance(), granted)
+    material = from_folder("/t", tmp_path / "t", at=NOW)
+    expected = {
+        Vendor.FAST_2_9: row.fast,
+        Vendor.FAST: row.later,
+        Vendor.CYCLONE: row.cyclone,
+    }
+    for vendor, answer in expected.items():
+        problems = [str(each) for each in material.problems(TRAITS[vendor])]
+        assert (not problems) == (answer == YES), (vendor, problems)
+        said = Judge(vendor, material, Setting(42, NOW)).answer(ask("join"))
+        assert said.allowed == (answer == YES), (vendor, said)
