@@ -42,8 +42,9 @@ def vendor_problems(traits: Traits, state: EnclaveState, at: datetime) -> tuple[
 
     Those of its documents' content are not among them, beyond what `EnclaveState` says.
     """
-    faults = tuple(_faults(traits, state, at))
     kept = [each for each in state.problems if each.code not in _JUDGED]
+    known = {(each.file, each.code.replace("not-signed", "signature")) for each in kept}
+    faults = [each for each in _faults(traits, state, at) if (each.file, each.code) not in known]
     for side in _SIDES:
         of_side = [each for each in faults if each.file in side]
         files = {each.file for each in of_side} | ({side[0]} if of_side else set())
@@ -67,10 +68,12 @@ def _faults(traits: Traits, state: EnclaveState, at: datetime) -> Iterator[Probl
     signers = read.get(PERMISSIONS_CA)
     for file in (GOVERNANCE, PERMISSIONS) if signers else ():
         if signers and file in state.files:
-            with suppress(PkiError):  # what is not signed at all no vendor takes
-                signed = _parsed(state.files[file])
-                if text := signer_fault(traits, signed, signers, at):
-                    yield Problem(file, text, "signature")
+            try:
+                text = signer_fault(traits, _parsed(state.files[file]), signers, at)
+            except PkiError as error:
+                text = str(error)
+            if text:
+                yield Problem(file, text, "signature")
     largest = traits.largest_document
     if largest is not None and state.permissions_bytes > largest:
         text = f"it has {state.permissions_bytes} bytes, and from {MAX_SIGNED_BYTES} on the "
