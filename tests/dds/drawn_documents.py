@@ -29,9 +29,12 @@ from drawn_words import (
     ZONES,
 )
 from hypothesis import strategies as st
+from xml_forms import GOVERNANCE, PERMISSIONS
 
 from sros_tool.dds.decision import Verb
 
+FORMS = ("form",) * 20
+"""So often in place of an oddity a form of XML over which parsers differ."""
 Question = tuple[Verb, str, tuple[str, ...]]
 
 
@@ -80,7 +83,7 @@ class _Draw:
         self.domain = random.choice(DOMAINS) if random.random() < 0.3 else 42
         self.subject = random.choice(SUBJECTS)
         # One oddity at most, so that what decides is clear.
-        self.odd = "" if portable or random.random() < 0.75 else random.choice(ODDITIES)
+        self.odd = "" if portable or random.random() < 0.7 else random.choice((*ODDITIES, *FORMS))
 
     def chance(self, probability: float) -> bool:
         return self.random.random() < probability
@@ -106,10 +109,15 @@ class _Draw:
     def document(self, root: str, content: str) -> bytes:
         comment = "<!-- drawn -->" if self.odd == "comment" else ""
         after = "<!-- behind -->" if self.odd == f"comment behind {root}" else ""
-        return (
+        text = (
             f'<?xml version="1.0" encoding="UTF-8"?>\n{comment}<dds>{comment}'
             f"<{root}>{comment}{content}</{root}>{after}</dds>\n"
-        ).encode()
+        )
+        if self.odd == "form":
+            forms = PERMISSIONS if root == "permissions" else GOVERNANCE
+            old, new = self.random.choice([form for form in forms if form[0] in text])
+            text = text.replace(old, new, self.random.choice((1, -1)))
+        return text.encode()
 
     # ── questions ──────────────────────────────────────────────────────────────────────────
 

@@ -2,8 +2,16 @@
 
 from __future__ import annotations
 
-SUBJECTS = ("CN=/t", "CN=/t/u", "CN=/robot,O=x", "CN=/t,OU=5f3a", "CN=plain")
-"""Every subject that is drawn, for identities that are made once (RFC 4514)."""
+SUBJECTS = (
+    "CN=/t",
+    "CN=/t/u",
+    "CN=/robot,O=x",
+    "CN=/t,OU=5f3a",
+    "CN=plain",
+    "CN=/t,OU=y+O=x",
+    "street=s,CN=/t",
+)
+"""Every subject that is drawn, for identities that are made once, as OpenSSL prints them."""
 
 ZONES = ("UTC", "America/Los_Angeles", "Asia/Tokyo", "Europe/Berlin", "Asia/Kolkata")
 DOMAINS = (42, 0, 7, 41, 200)
@@ -19,7 +27,15 @@ TOPICS = (
     "rr/aReply",
     "ros_discovery_info",
 )
-ODD_TOPICS = ("rt/b-x", "*", "rt/*", "rt/a?", "rt/[ab]")
+ODD_TOPICS = (
+    "rt/b-x",
+    "*",
+    "rt/*",
+    "rt/a?",
+    "rt/[ab]",
+    "rt/[z-",
+    *(f"rt/{'n' * n}" for n in (248, 249)),
+)
 WILDCARDS = (
     "*",
     "rt/*",
@@ -42,6 +58,10 @@ SETS = (
     "rt/[a-]*",
     "rt[/]a",
     "rt/[]a]",
+    "rt/[z-",
+    "rt/[!a-",
+    "rt/[[.a.]b]",
+    "rt/[[=a=]c]",
 )
 PARTITIONS = ("p1", "p2", "q")
 PARTITION_EXPRESSIONS = ("p1", "p2", "p*", "*", "", "[pq]?")

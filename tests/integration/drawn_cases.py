@@ -12,11 +12,15 @@ from decision_documents import allow, criteria, deny, grant, permissions, topic_
 from hypothesis import strategies as st
 from vendor_oracle import Case, Question
 from vendor_rows import domain_rule, governance
+from xml_forms import GOVERNANCE, PERMISSIONS
 
 Text = st.SearchStrategy[str]
 
 HERE, ELSEWHERE = 42, 7
-SUBJECTS = ("CN=/t", "CN=/t", "CN=/t,O=x", "OU=1f,CN=/t")
+SUBJECTS = (
+    "CN=/t", "CN=/t", "CN=/t", "CN=/t,O=x", "OU=1f,CN=/t", "CN=/t,OU=y+O=x", "street=s,CN=/t",
+    "emailAddress=a,CN=/t",
+)  # fmt: skip
 ZONES = ("UTC", "UTC", "Asia/Tokyo", "America/Los_Angeles", "Europe/Berlin", "Asia/Kolkata")
 
 NAMES = ("rt/a", "rt/b", "rt/ab", "rt/a/b", "rt/c", "rq/aRequest", "rt/]", "rt/-")
@@ -28,8 +32,13 @@ ODD_EXPRESSIONS = (
     "rt/[^a]", "rt/[a", "rt/[]a]", "rt/[[:alpha:]]", "rt/[ab]b", "rt[!x]a", "rt[/]a", "rt/[!a-b]",
     "rt/[b-a]", "rt/[a-]", "rt/[-a]", "rt/\\a", " rt/a ", "rt/a]", "rt/[a]*", "[*", "rt/[!]]",
     "rt/[c-a]*", "rt/A", "rt/[]]", "rt/[!]a]", "rt/[]-a]", "rt/[a\\]]", "rt/[?]", "rt/[*]",
+    "rt/[z-", "rt/[a-", "rt/[!a-", "rt/[a-b", "rt/[[.a.]b]", "rt/[[=a=]b]", "rt/[[.a.]-c]",
+    "rt/[[.",    "rt/[[:x:]a]", "rt/[a[:x:]]", "rt/[[.ab.]b]",
 )  # fmt: skip
-ODD_NAMES = ("rt/*", "rt/[ab]", "*", "rt/a b", "rt/[a", "rt/\\a")
+ODD_NAMES = (
+    "rt/*", "rt/[ab]", "*", "rt/a b", "rt/[a", "rt/\\a", "rt/[z-",
+    *(f"rt/{'n' * n}" for n in (248, 249)),
+)  # fmt: skip
 PARTITIONS = ((), (), ("p1",), ("p2",), ("p1", "p2"), ("*",), ("",), ("p*",), ("p?", "q"))
 ASKED_PARTITIONS = ((), (), ("p1",), ("p2",), ("p1", "p2"), ("",), ("q",), ("p*",), ("p1", ""))
 DOMAINS = (
@@ -91,6 +100,9 @@ ODD_DATES = (
 ODD_SUBJECTS = (
     "CN = /t", "/CN=/t", "CN=/t/admin", "CN=/t, O=x", "O=x,CN=/t", "O=x, CN=/t", " CN=/t ", "cn=/t",
     "CN=/u", "", "CN=t", "CN=/t,O=x,OU=1f", "CN=/t|O=x", "OU=1f, CN=/t", "CN=/t,", "CN=/t,CN=/u",
+    'CN="/t', 'CN="/t"', "O=", "a,O=", "O,=",
+    "CN=/t,X=", "=CN=/t", "CN=/t,O=", "O=,CN=/t", "CN=\\/t", "CN=/t,O=x+OU=y", "CN=/t,OU=y+O=x",
+    "STREET=s,CN=/t", "CN=/t,,O=x", "CN=", "CN=/t,x",
 )  # fmt: skip
 
 
@@ -210,6 +222,7 @@ PERMISSION_DAMAGE = (
     ("rt/a<", "rt/<!-- x -->a<"),
     ("</domains>", "</domains><publish/>"),
     ("<allow_rule>", "<allow_rule/><allow_rule>"),
+    *PERMISSIONS,
 )
 GOVERNANCE_DAMAGE = (
     (">false<", ">FALSE<"),
@@ -240,6 +253,7 @@ GOVERNANCE_DAMAGE = (
     (">NONE</rtps", ">SIGN_WITH_ORIGIN_AUTHENTICATION</rtps"),
     ("<domains>", "<domains/><domains>"),
     ("<?xml", " <?xml"),
+    *GOVERNANCE,
 )
 
 
@@ -261,8 +275,8 @@ def cases(draw: st.DrawFn, now: datetime) -> Case:
     some = draw(
         st.lists(grants(subject, now), min_size=1, max_size=draw(st.sampled_from((1, 1, 2, 3))))
     )
-    granted = draw(damaged(permissions(*some), PERMISSION_DAMAGE, 8))
-    governed = draw(damaged(draw(governances()), GOVERNANCE_DAMAGE, 16))
+    granted = draw(damaged(permissions(*some), PERMISSION_DAMAGE, 4))
+    governed = draw(damaged(draw(governances()), GOVERNANCE_DAMAGE, 8))
     asked = st.builds(
         Question,
         st.sampled_from(("publish", "publish", "subscribe")),

@@ -332,6 +332,86 @@ def grants(now: datetime) -> list[Row]:
     ]
 
 
+def subjects() -> list[Row]:
+    """How the subject of a grant is compared, by the text of an identity's subject."""
+    a = allow(criteria("publish", "rt/a"))
+    pair, street, beyond = "CN=/t,OU=y+O=x", "street=s,CN=/t", "CN=/größe"
+    table = [
+        ('CN="/t', "CN=/t", REFUSED, REFUSED, YES),
+        ("O=", "CN=/t", REFUSED, REFUSED, YES),
+        ("a,O=", "CN=/t", REFUSED, REFUSED, YES),
+        ("CN=/t,X=", "CN=/t,O=x", REFUSED, REFUSED, YES),
+        ("CN=/t,X=", "CN=/t", REFUSED, YES, ""),
+        (pair, pair, YES, YES, ""),
+        ("CN=/t,O=x+OU=y", pair, REFUSED, REFUSED, ""),
+        (street, street, YES, YES, ""),
+        ("STREET=s,CN=/t", street, REFUSED, REFUSED, ""),
+        (beyond, beyond, YES, REFUSED, ""),
+        ("CN=/gr\\C3\\B6\\C3\\9Fe", beyond, REFUSED, YES, ""),
+    ]
+    return [
+        Row(
+            f"a grant for {granted}, the identity {subject}",
+            ask(permissions(grant(a, subject=granted)), subject=subject),
+            fast,
+            cyclone,
+            later,
+        )
+        for granted, subject, fast, cyclone, later in table
+    ]
+
+
+def names() -> list[Row]:
+    """Names of topics at the limit."""
+    everything = permissions(grant(allow(criteria("publish", "*"))))
+    unclosed = permissions(grant(allow(criteria("publish", "rt/[z-"))))
+    return [
+        Row("a name of 251 characters", ask(everything, f"rt/{'n' * 248}"), YES, YES),
+        Row("a name of 252 characters", ask(everything, f"rt/{'n' * 249}"), PEER_DENIES, YES),
+        Row("a set that ends in an open range", ask(unclosed, "rt/[z-"), NO, INVALID),
+    ]
+
+
+def forms() -> list[Row]:
+    """XML as the vendors' parsers read it: a text of permissions in place of another."""
+    a = "<topic>rt/a</topic>"
+    table = [
+        ("two hyphens in a comment", "<dds>", "<!-- ---- topics ---- --><dds>", YES, YES),
+        ("a comment before a number", ">42<", "><!-- c -->42<", REFUSED, YES),
+        ("a comment behind a number", ">42<", ">42<!-- c --><", YES, YES),
+        ("a comment before a topic", a, "<topic><!-- c -->rt/a</topic>", YES, YES),
+        ("a processing instruction", "<grant", "<?pi?><grant", REFUSED, YES),
+        ("CDATA", a, "<topic><![CDATA[rt/a]]></topic>", YES, YES),
+        ("CDATA behind a line break", a, "<topic>\n<![CDATA[rt/a]]></topic>", YES, YES),
+        ("CDATA behind text", a, "<topic>r<![CDATA[t/a]]></topic>", NO, YES),
+        ("a lone &", a, f"<topic>rt/x&y</topic>{a}", YES, REFUSED),
+        ("an unknown entity", a, f"<topic>rt/&x;</topic>{a}", YES, REFUSED),
+        ("a reference to NUL", a, "<topic>rt/a&#0;b</topic>", YES, YES),
+        ("a control character", a, f"<topic>rt/\x01</topic>{a}", YES, YES),
+        ("]]> in a text", a, f"<topic>rt/]]></topic>{a}", YES, YES),
+        ("a second root", "</dds>", "</dds><dds/>", YES, REFUSED),
+        ("text before the root", "<dds>", "text <dds>", YES, REFUSED),
+        ("text behind the root", "</dds>", "</dds> text", REFUSED, REFUSED),
+        (
+            "a prefix that is not declared",
+            "<dds>",
+            '<dds xsi:noNamespaceSchemaLocation="x">',
+            YES,
+            YES,
+        ),
+        ("an unknown encoding", "UTF-8", "nothing-8", YES, YES),
+        ("a NUL at the end", "</dds>", "</dds>\0", YES, REFUSED),
+        ("a date over two lines", "-01T", "-\n01T", YES, REFUSED),
+        ("a document type", "<dds>", "<!DOCTYPE dds><dds>", YES, YES),
+        ("a blank in a closing tag", "</topic>", "</topic >", YES, REFUSED),
+    ]
+    document = permissions(grant(allow(criteria("publish", "rt/a")))).decode()
+    return [
+        Row(name, ask(document.replace(old, new).encode()), fast, cyclone)
+        for name, old, new, fast, cyclone in table
+    ]
+
+
 def domains() -> list[Row]:
     """Domain ids and ranges, in permissions and in governance."""
 
@@ -427,5 +507,7 @@ def governances() -> list[Row]:
 
 def rows() -> list[Row]:
     """All rows; those about time are made for this moment."""
-    made: list[Callable[[], list[Row]]] = [matching, rules, domains, governances]
+    made: list[Callable[[], list[Row]]] = [
+        matching, rules, domains, governances, subjects, names, forms,
+    ]  # fmt: skip
     return [row for part in made for row in part()] + grants(datetime.now(UTC))

@@ -119,6 +119,8 @@ class _Node:
     def root(
         cls, xml: bytes, grammar: Mapping[str, tuple[str, ...]], skipped: tuple[str, ...]
     ) -> _Node:
+        if b"\0" in xml:
+            raise UnreadableError("it holds a NUL, at which the signed message ends")
         root = cyclone_xml.read(xml)
         if root.name.lower() != "dds":
             raise UnreadableError("its root is not <dds>")
