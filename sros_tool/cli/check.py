@@ -91,7 +91,7 @@ shown.""",
 )
 @click.option(
     "--vendor",
-    type=click.Choice(["fastdds", "cyclonedds"]),
+    type=click.Choice(["fastdds", "fastdds-2.9", "cyclonedds"]),
     help="All nodes run this DDS; leave out what concerns others.",
 )
 @click.option("--domain", metavar="ID", help="The domain that enclaves have to join.")

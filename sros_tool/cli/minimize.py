@@ -215,7 +215,7 @@ def _lines(use: EnclaveUse, measured: _Measured) -> Iterator[str]:
     sizes = f"{measured.before} bytes"
     if measured.after != measured.before:
         sizes += f", then {measured.after}"
-    too_large = "" if measured.after < MAX_SIGNED_BYTES else ": TOO LARGE, the handshake breaks"
+    too_large = "" if measured.after < MAX_SIGNED_BYTES else ": TOO LARGE for Fast DDS 2.9"
     yield f"  permissions.p7s: {sizes}, of at most {MAX_SIGNED_BYTES - 1}{too_large}"
     for proposal in measured.proposals:
         names = [right.told() for right in proposal.adds]

@@ -24,8 +24,8 @@ def document_notes(what: str, permissions: Permissions, signed_bytes: int) -> It
 
 
 _CONSEQUENCES = {
-    "portable.document-size": f"; from {MAX_SIGNED_BYTES} on, the DDS handshake breaks and the "
-    "node hears nobody. Use wildcards, or split the enclave.",
+    "portable.document-size": f"; from {MAX_SIGNED_BYTES} on, Fast DDS 2.9 never finishes "
+    "the handshake. Use wildcards, or split the enclave.",
     "portable.deny-blocks-topic": " on Cyclone DDS, which refuses the topic as a whole; Fast "
     "DDS allows it. What no rule allows is denied anyway, so the denial may be needless.",
     "portable.character-set": ". Vendors read plain sets alike, but only * and ? are part of the "

@@ -6,7 +6,7 @@ alike is in `sros_tool.keystore.verify`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from datetime import datetime
 from functools import lru_cache
@@ -16,16 +16,19 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
-from sros_tool.dds.decision import Traits
+from sros_tool.dds.decision import TRAITS, Traits, Vendor
 from sros_tool.dds.decision.vendors import Hashes, Keys, Signers
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES
 from sros_tool.errors import PkiError
+from sros_tool.keystore.layout import IDENTITY
 from sros_tool.keystore.verify import EnclaveState, Problem
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificates, subject_text
 from sros_tool.pki.chains import chain_fault
 from sros_tool.pki.keys import algorithm
 
+MEASURED = (Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE)
+"""The vendors whose loading of CAs and signatures was measured."""
 Certificates = tuple[x509.Certificate, ...]
 
 IDENTITY_CA, PERMISSIONS_CA = "identity_ca.cert.pem", "permissions_ca.cert.pem"
@@ -99,6 +102,44 @@ def authority_fault(
         if fault:
             return f"it is refused: {fault}", "ca-chain"
     return None
+
+
+def authority_refusals(role: str, certificates: Certificates, at: datetime) -> dict[Vendor, str]:
+    """Which vendors refuse what a CA issues (identity) or signs (permissions), and why.
+
+    ``certificates`` are those of its file, that of the CA itself first.  Only the vendors that were
+    measured are asked.
+    """
+    refusals = {}
+    for vendor in MEASURED:
+        traits = TRAITS[vendor]
+        fault = authority_fault(traits, certificates, at)
+        if fault:
+            refusals[vendor] = fault[0]
+        elif role == IDENTITY:
+            below = chain_fault(certificates[0], _trusted(traits, certificates), at=at)
+            key = "" if _key_fits(traits, certificates[0]) else "its key is not of a kind it takes"
+            refusals[vendor] = below or key
+        elif traits.signers is Signers.CHAIN:
+            trusted = _trusted(traits, certificates)
+            refusals[vendor] = chain_fault(certificates[0], trusted, at=at, for_documents=True)
+    return {vendor: text for vendor, text in refusals.items() if text}
+
+
+def refusals_text(refusals: Mapping[Vendor, str]) -> str:
+    """Which of the measured vendors refuse a CA and why, and which take it, as clauses."""
+    by_text: dict[str, list[str]] = {}
+    for vendor, text in refusals.items():
+        by_text.setdefault(text, []).append(vendor.title)
+    clauses = [
+        f"{' and '.join(titles)} {'refuses' if len(titles) == 1 else 'refuse'} what it issues or "
+        f"signs: {text}"
+        for text, titles in by_text.items()
+    ]
+    takes = [vendor.title for vendor in MEASURED if vendor not in refusals]
+    if takes:
+        clauses.append(f"{' and '.join(takes)} {'takes' if len(takes) == 1 else 'take'} it")
+    return "; ".join(clauses)
 
 
 def signer_fault(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -10,8 +10,10 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
+from sros_tool.dds.decision import Vendor
 from sros_tool.errors import PkiError
-from sros_tool.keystore.layout import IDENTITY
+from sros_tool.keystore.acceptance import MEASURED, authority_refusals, refusals_text
+from sros_tool.keystore.layout import PERMISSIONS
 from sros_tool.notes import Note
 from sros_tool.pki.certificates import (
     UNREADABLE,
@@ -22,6 +24,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
+from sros_tool.pki.chains import purpose_faults
 from sros_tool.pki.keys import PrivateKey, algorithm
 from sros_tool.validity import iso
 
@@ -62,7 +65,17 @@ def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> Im
     chain = list(_chain(own[0], certificates, role))
     for each in chain:
         _check_ca(each, role, now)
-    return ImportedAuthority(own[0], b"".join(map(pem, chain)), tuple(_notes(role, chain)))
+    refusals = authority_refusals(role, tuple(chain), now)
+    if len(refusals) == len(MEASURED):
+        raise PkiError(
+            f"{subject_text(own[0].subject)} cannot be the {role} CA: no DDS takes it",
+            f"{refusals_text(refusals)}.",
+            "Issue the CA's certificate anew, self-signed with SHA-256 and keyUsage keyCertSign "
+            "and digitalSignature.",
+        )
+    return ImportedAuthority(
+        own[0], b"".join(map(pem, chain)), tuple(_notes(role, chain, refusals))
+    )
 
 
 def _chain(
@@ -107,14 +120,20 @@ def _check_ca(certificate: x509.Certificate, role: str, now: datetime) -> None:
         )
 
 
-def _notes(role: str, chain: list[x509.Certificate]) -> Iterator[Note]:
+def _notes(
+    role: str, chain: list[x509.Certificate], refusals: Mapping[Vendor, str]
+) -> Iterator[Note]:
+    name = subject_text(chain[0].subject)
     if len(chain) > 1:
+        told = refusals_text(refusals)
+        yield Note("portable.intermediate", f"{name} is below another CA. {told}.")
+    elif role == PERMISSIONS and (fault := next(purpose_faults(chain), "")):
         yield Note(
-            "portable.intermediate",
-            "Cyclone DDS 0.10 takes a self-signed CA only; Fast DDS takes this chain."
-            if role == IDENTITY
-            else "Documents have to be signed by the permissions CA itself; no vendor follows its "
-            "chain, which is kept for people.",
+            "portable.ca-purpose",
+            f"{fault}: Fast DDS 2.9.1 and Cyclone DDS 0.10.2 refuse every document that it signs "
+            '("unsuitable certificate purpose"), and only Fast DDS 2.14 takes them. Issue its '
+            "certificate anew with keyUsage digitalSignature and without extendedKeyUsage, unless "
+            "all robots run Fast DDS 2.14.",
         )
     for each in chain:
         key, name = each.public_key(), subject_text(each.subject)
@@ -130,5 +149,5 @@ def _notes(role: str, chain: list[x509.Certificate]) -> Iterator[Note]:
         if not isinstance(each.signature_hash_algorithm, hashes.SHA256):
             yield Note(
                 "portable.signature-hash",
-                f"{name} is not signed with SHA-256, which Fast DDS 2.14 rejects in a CA.",
+                f"{name} is not signed with SHA-256, which Fast DDS rejects in a CA.",
             )

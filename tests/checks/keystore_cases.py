@@ -12,6 +12,7 @@ from bench import DAY, Bench, name_of, new_key
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem
@@ -87,6 +88,12 @@ CASES |= {
     "portable.intermediate": lambda b: b.trust(
         "identity",
         b.new_authority(IS_CA, issuer=(b.authority("identity").subject, b.key("identity")))[0],
+    ),
+    "portable.ca-purpose": lambda b: b.trust(
+        "permissions",
+        b.new_authority(IS_CA, (x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH]), False))[
+            0
+        ],
     ),
     "portable.key-algorithm": lambda b: b.trust(
         "identity", b.new_authority(IS_CA, curve=ec.SECP384R1())[0]

@@ -86,7 +86,6 @@ EQUIVALENT = {
 """Rules that make no difference to documents as the vendor reads them."""
 NOT_OF_DOCUMENTS = {
     "documented_only",
-    "admits_unauthenticated",
     "signers",
     "reads_first_authority",
     "verifies_authorities",

@@ -7,9 +7,15 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from cryptography.hazmat.primitives import hashes
+from cryptography.x509.oid import ExtendedKeyUsageOID
 from harness import sros
+from signer_rows import CERTIFIES, SIGNS, authority
 
+from sros_tool.dds.decision import Vendor
 from sros_tool.errors import UsageError
+from sros_tool.pki.certificates import pem
+from sros_tool.pki.keys import key_pem
 from sros_tool.validity import Lifespan, Span, Window, parse_span, span_text, window
 
 CA = "basicConstraints=critical,CA:TRUE"
@@ -111,6 +117,43 @@ def test_what_vendors_differ_about_is_said(name: str, note: str, pki: Path, tmp_
     assert note in sros("create_keystore", tmp_path / "ks", *place).ok().err
     plain = ("--identity-ca", pki / "root.pem", "--identity-key", pki / "root.key")
     assert "note [" not in sros("create_keystore", tmp_path / "plain", *plain).ok().err
+
+
+@pytest.mark.parametrize(
+    ("made", "words", "takes"),
+    [
+        ("only certifies", "lacks digitalSignature", {Vendor.FAST}),
+        ("for serverAuth", "lacks emailProtection", {Vendor.FAST}),
+        ("may sign", "", {Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE}),
+        ("only certifies, sha384", "no DDS takes it", set()),
+    ],
+)
+def test_who_refuses_what_a_permissions_ca_signs_is_said(
+    made: str, words: str, takes: set[Vendor], tmp_path: Path
+) -> None:
+    certificate, key = authority(
+        "corp CA",
+        CERTIFIES if made.startswith("only") else f"{SIGNS} {CERTIFIES}",
+        purpose=ExtendedKeyUsageOID.SERVER_AUTH if "serverAuth" in made else None,
+        digest=hashes.SHA384() if "sha384" in made else None,
+    )
+    (tmp_path / "ca.pem").write_bytes(pem(certificate))
+    (tmp_path / "ca.key").write_bytes(key_pem(key))
+    place = ("--permissions-ca", tmp_path / "ca.pem", "--permissions-key", tmp_path / "ca.key")
+    root = tmp_path / "ks"
+    ended = sros("create_keystore", root, *place)
+    assert words in ended.err
+    assert ended.status == (0 if takes else 1), ended
+    assert root.exists() == bool(takes)
+    if not takes:
+        return
+    assert ("portable.ca-purpose" in ended.err) == bool(words)
+    sros("create_enclave", root, "/a").ok()
+    for vendor in (Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE):
+        asked = sros("explain", root, "/a", "join", "--vendor", vendor)
+        assert asked.status == (0 if vendor in takes else 1), asked
+        checked = sros("check", root, "--vendor", vendor, "--include", "portable.ca-purpose")
+        assert checked.status == (0 if vendor in takes else 1), checked
 
 
 @pytest.mark.parametrize(

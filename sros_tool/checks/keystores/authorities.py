@@ -171,7 +171,7 @@ def _authority(
         yield CA_EXPIRED.found(subject, f"{name} is valid from {begin} to {end}", file)
     elif validity.not_after - keystore.now < _SOON:
         yield CA_ENDS.found(subject, f"{name} ends at {end}", file)
-    yield from authority_findings(certificate, subject, file)
+    yield from authority_findings(role, chain, keystore.now, subject, file)
     yield from _key(keystore, role, certificate)
 
 

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from datetime import datetime
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.keystore.acceptance import authority_refusals, refusals_text
+from sros_tool.keystore.layout import PERMISSIONS
 from sros_tool.pki.certificates import subject_text
+from sros_tool.pki.chains import purpose_faults
 from sros_tool.pki.keys import algorithm
 
 NOT_A_CA = Kind(
@@ -33,11 +37,22 @@ INTERMEDIATE = Kind(
     "portable.intermediate",
     WARNING,
     "a CA that is not self-signed",
-    "Cyclone DDS takes a self-signed identity CA only. The permissions CA has to sign documents "
-    "itself; no vendor follows its chain.",
-    "Cyclone DDS 0.10.2, Fast DDS 2.14.5; measured.",
-    "Use a root for robots of its own, unless all run Fast DDS.",
-    vendors=("cyclonedds",),
+    "Cyclone DDS takes a self-signed CA only, the first of its file. Fast DDS follows a chain of "
+    "identity CAs, 2.14 only where each has keyUsage and key identifiers. What a permissions CA "
+    "below another signs, Fast DDS 2.14 takes if it has keyUsage, 2.9 if it may sign documents.",
+    "Fast DDS 2.9.1 and 2.14.5 (FileProvider.cpp), Cyclone DDS 0.10.2; measured.",
+    "Use a root for robots of its own, unless all run a Fast DDS that takes it.",
+)
+CA_PURPOSE = Kind(
+    "portable.ca-purpose",
+    WARNING,
+    "a permissions CA whose certificate is not for signing documents",
+    "Fast DDS 2.9 and Cyclone DDS verify the purpose of S/MIME, and refuse every document "
+    '("unsuitable certificate purpose"): keyUsage must have digitalSignature, extendedKeyUsage '
+    "emailProtection, if they are there. Fast DDS 2.14 does not look at them.",
+    "RFC 8550, 4.4.2; Fast DDS 2.9.1 and 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
+    "Replace it with `sros rotate_ca ROOT`, or issue its certificate anew with digitalSignature.",
+    vendors=("fastdds-2.9", "cyclonedds"),
 )
 KEY_ALGORITHM = Kind(
     "portable.key-algorithm",
@@ -55,18 +70,26 @@ SIGNATURE_HASH = Kind(
     "Fast DDS refuses SHA-384 in a CA and in an enclave's certificate; Cyclone DDS takes it.",
     "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp), Cyclone DDS 0.10.2; measured.",
     "Issue it with SHA-256, as sros does.",
-    vendors=("fastdds",),
+    vendors=("fastdds", "fastdds-2.9"),
 )
 
-KINDS = by_id(NOT_A_CA, CA_EXTENSIONS, INTERMEDIATE, KEY_ALGORITHM, SIGNATURE_HASH)
+KINDS = by_id(
+    NOT_A_CA, CA_EXTENSIONS, INTERMEDIATE, CA_PURPOSE, KEY_ALGORITHM, SIGNATURE_HASH
+)  # fmt: skip
 
 
-def authority_findings(certificate: x509.Certificate, subject: str, file: str) -> Iterator[Finding]:
-    """Whether every vendor takes the certificate of a CA."""
+def authority_findings(
+    role: str, chain: tuple[x509.Certificate, ...], at: datetime, subject: str, file: str
+) -> Iterator[Finding]:
+    """Whether every vendor takes a CA; ``chain`` are the certificates of its file, in order."""
+    certificate = chain[0]
     name = subject_text(certificate.subject)
     if certificate.issuer != certificate.subject:
         issuer = subject_text(certificate.issuer)
-        yield INTERMEDIATE.found(subject, f"{name} is issued by {issuer}", file)
+        told = refusals_text(authority_refusals(role, chain, at))
+        yield INTERMEDIATE.found(subject, f"{name} is issued by {issuer}. {told}", file)
+    elif role == PERMISSIONS and (fault := next(purpose_faults(chain[:1]), "")):
+        yield CA_PURPOSE.found(subject, fault, file)
     yield from key_findings(certificate, subject, file, what=f"{name} has")
     yield from _extensions(certificate, subject, name, file)
 

@@ -43,7 +43,7 @@ ALLOW_RULES = Kind(
     "DDS goes on to a rule in which both match.",
     "Fast DDS 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
     "Put all topics into one allow rule.",
-    vendors=("fastdds",),
+    vendors=("fastdds", "fastdds-2.9"),
 )
 PARTITIONS = Kind(
     "portable.partitions",
@@ -70,7 +70,7 @@ GRANT_NAME = Kind(
     "Fast DDS refuses the document; Cyclone DDS takes it.",
     "omg_shared_ca_permissions.xsd; Fast DDS 2.14.5; measured.",
     'Write <grant name="...">.',
-    vendors=("fastdds",),
+    vendors=("fastdds", "fastdds-2.9"),
 )
 SUBJECT = Kind(
     "portable.subject",
@@ -98,7 +98,7 @@ TIME_WINDOW = Kind(
     "late in the west, and end up to 14 hours early in the east.",
     "Fast DDS 2.9.1 and 2.14.5 (mktime); measured in Los Angeles and Tokyo.",
     "Sign them with a beginning 14 hours back or more, as sros does, and renew them in time.",
-    vendors=("fastdds",),
+    vendors=("fastdds", "fastdds-2.9"),
 )
 LOCAL_TIME = Kind(
     "enclave.permissions-local-time",
@@ -108,7 +108,7 @@ LOCAL_TIME = Kind(
     'permissions file".',
     "Fast DDS 2.9.1 and 2.14.5 (mktime); measured.",
     "Run `sros renew ROOT NAME`, or let the host run in UTC.",
-    vendors=("fastdds",),
+    vendors=("fastdds", "fastdds-2.9"),
 )
 CHARACTER_CLASS = Kind(
     "portable.character-class",

@@ -22,8 +22,8 @@ UNAUTHENTICATED = Kind(
     "governance.unauthenticated",
     ERROR,
     "participants without an identity may join",
-    "Whatever no rule of a topic protects, they may read and write. Where whole messages are "
-    "protected, Fast DDS 2.14 refuses the document.",
+    "What no rule of a topic controls or protects, they read and write: on Fast DDS 2.14, which "
+    "refuses the document where whole messages are protected. Fast DDS 2.9 ignores it.",
     f"{_GOVERNANCE} (allow_unauthenticated_participants); measured.",
     "Set it to false.",
 )

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from datetime import UTC, datetime
 
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.checks.kind import NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.checks.policies.stated import CheckedPolicy
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
@@ -21,12 +21,14 @@ from sros_tool.validity import Window
 
 DOCUMENT_SIZE = Kind(
     "portable.document-size",
-    ERROR,
+    WARNING,
     "signed permissions of 64 KB or more",
-    "The handshake carries them. Fast DDS 2.9.1 aborts the process over it, others start and hear "
-    "nobody; Cyclone DDS 0.10.2 takes them.",
-    "ros2/sros2 issue 228; Fast DDS 2.9.1 (SecurityManager.cpp), Cyclone DDS 0.10.2; measured.",
+    "The handshake carries them. Fast DDS 2.9 never finishes it, and sometimes aborts; Fast DDS "
+    "2.14 and Cyclone DDS take them.",
+    "ros2/sros2 issue 228; Fast DDS 2.9.1 (SecurityManager.cpp) and 2.14.5, Cyclone DDS 0.10.2; "
+    "measured.",
     "Use wildcards (`sros minimize_policy` proposes them), or split the enclave.",
+    vendors=("fastdds-2.9",),
 )
 DENY_BLOCKS = Kind(
     "portable.deny-blocks-topic",

@@ -154,8 +154,6 @@ class Traits:
     """Participants that refused each other still exchange what nothing protects (ran)."""
     refuses_open_rtps: bool = False
     """Unauthenticated participants together with RTPS protection are refused."""
-    admits_unauthenticated: bool = True
-    """Participants without security take part where the governance says so."""
     signers: Signers = Signers.AUTHORITY
     reads_first_authority: bool = False
     """Of a file with several CAs only the first is trusted."""
@@ -197,7 +195,6 @@ TRAITS = {
         title="Fast DDS 2.9.1",
         subjects=Subjects.WHOLE_ATTRIBUTES,
         refuses_open_rtps=False,
-        admits_unauthenticated=False,
         signers=Signers.CHAIN,
         verifies_authorities=False,
         largest_document=64 * 1024 - 1,
