@@ -57,9 +57,11 @@ def authority(
         NOW + days[1] * DAY,
     ).add_extension(x509.BasicConstraints(is_ca, None), critical=True)
     if usage is not None:
-        flags = [SIGNS in usage.split(), False, False, False, False]
-        flags += [CERTIFIES in usage.split()] * 2
-        builder = builder.add_extension(x509.KeyUsage(*flags, False, False), critical=True)
+        signs, certifies = (word in usage.split() for word in (SIGNS, CERTIFIES))
+        allowed = x509.KeyUsage(
+            signs, False, False, False, False, certifies, certifies, False, False
+        )
+        builder = builder.add_extension(allowed, critical=True)
     if purpose:
         builder = builder.add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
     if identifiers:

@@ -14,13 +14,13 @@ from zoneinfo import ZoneInfo
 import pytest
 from bench import SECRET, Bench
 from broken_keystores import HARMLESS, MATCHED, MORE, ROWS, Breakage
+from fastdds import fastdds_vendor
 from harness import policy_text, publish, sros
 from vendor_oracle import (
     Pair,
     Reply,
     ask_cyclone_folders,
     ask_fastdds_folders,
-    fastdds_vendor,
     with_patience,
 )
 

@@ -19,6 +19,7 @@ from zoneinfo import ZoneInfo
 import pytest
 from drawn_cases import cases as drawn_cases
 from drawn_documents import documents
+from fastdds import fastdds_vendor
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from vendor_oracle import (
     Case,
@@ -27,7 +28,6 @@ from vendor_oracle import (
     Workshop,
     ask_cyclone,
     ask_fastdds,
-    fastdds_vendor,
     with_patience,
 )
 from vendor_rows import CRASHES, REFUSED, Row, rows

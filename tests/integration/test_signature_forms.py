@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from decision_documents import allow, grant, permissions, publish
+from fastdds import fastdds_vendor
 from vendor_oracle import (
     PEER,
     PEER_PERMISSIONS,
@@ -18,7 +19,6 @@ from vendor_oracle import (
     Workshop,
     ask_cyclone_folders,
     ask_fastdds_folders,
-    fastdds_vendor,
     with_patience,
 )
 from vendor_rows import OPEN

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from decision_documents import allow, grant, permissions, publish, subscribe
+from fastdds import fastdds_vendor
 from signer_rows import YES, rows, write_enclave
 from vendor_oracle import (
     PEER,
@@ -15,7 +16,6 @@ from vendor_oracle import (
     Reply,
     ask_cyclone_folders,
     ask_fastdds_folders,
-    fastdds_vendor,
     with_patience,
 )
 from vendor_rows import OPEN
