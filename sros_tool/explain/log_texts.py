@@ -66,10 +66,8 @@ def _meaning(
 
 
 _CHECK = "Name the keystore and the enclave, and the true cause is looked for there."
-_CHECK_OR_FILE = (
-    "Name the keystore and the enclave, and the true cause is looked for there; or give `sros "
-    "explain --log` the file of ROS_SECURITY_LOG_FILE, where that is set."
-)
+_FILE = "Where ROS_SECURITY_LOG_FILE is set, give `sros explain --log` that file."
+_CHECK_OR_FILE = f"{_CHECK} {_FILE}"
 _RENEW = "Renew it: `sros renew KEYSTORE ENCLAVE`."
 _SIGN = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
 _SIGN_ONE = (
@@ -344,14 +342,15 @@ MEANINGS: tuple[Meaning, ...] = (
         "participant", _FAST, r"Error while configuring security plugin"
         r"|Participant is not allowed with its own permissions file",
         "the process may not join; Fast DDS 2.14 says why in a line of its own, or in the file of "
-        "ROS_SECURITY_LOG_FILE, and neither is in this log", _CHECK_OR_FILE, _ALL, weak=1,
+        "ROS_SECURITY_LOG_FILE, and neither is in this log", _CHECK_OR_FILE, _ALL,
+        unseen=_FILE, weak=1,
     ),
     _meaning(
         "participant", _FAST, r"Cannot create participant due to initialization error"
         r"|Problem creating RTPSParticipant|failed to create participant",
         "the process may not join, and this log does not say why: Fast DDS 2.9 is silent about "
         "signatures, expired permissions and subjects, 2.14 tells its standard output or the file "
-        "of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL, weak=2,
+        "of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL, unseen=_FILE, weak=2,
     ),
     _meaning(
         "service", ROS, r"(?:could not|failed to) create (?:service|client)"

@@ -38,11 +38,10 @@ _DOMAIN = (
     "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env {root} {enclave} --domain ID` prints "
     "the variables; for another domain, make a keystore with `sros create_keystore --domain`."
 )
-_CA = {
-    IDENTITY: "Give the identity CA a longer life: `sros rotate_ca {root} --identity --same-key`.",
-    PERMISSIONS: "Replace it: `sros rotate_ca {root} --permissions --finish`, and restart all "
-    "processes together.",
-}
+_AUTHORITY = (
+    "Replace the CA and what expired with it: `sros rotate_ca {root} --finish && sros renew {root} "
+    "--all-expiring 30d`; then restart all processes together."
+)
 _ROTATION = (
     "The CAs of this keystore are being replaced: do the next stage with `sros rotate_ca {root} "
     "--next`, and restart the processes after it."
@@ -59,7 +58,7 @@ _BY_WORD = {
     "certificate-not-yet-valid": _CLOCK,
     "certificate-issuer": _REPLACE,
     "certificate-malformed": _REPLACE,
-    "ca-expired": _CA[IDENTITY],
+    "ca-expired": _AUTHORITY,
     "ca-not-yet-valid": "Set the clock of this host.",
     "key-mismatch": _NEW_KEY,
     "key-encrypted": f"DDS asks for no passphrase: store it without one, mode 0600. {_NEW_KEY}",
@@ -104,7 +103,6 @@ _BY_FILE = {
     ("governance.p7s", "signature"): _GOVERNANCE,
     ("governance.p7s", "not-signed"): _GOVERNANCE,
     ("governance.p7s", "file-empty"): _GOVERNANCE,
-    ("permissions_ca.cert.pem", "ca-expired"): _CA[PERMISSIONS],
     ("identity_ca.cert.pem", "certificate-malformed"): "Restore {path} from a backup.",
     ("permissions_ca.cert.pem", "certificate-malformed"): "Restore {path} from a backup.",
     ("identity_ca.cert.pem", "file-empty"): "Restore {path} from a backup.",

@@ -7,7 +7,7 @@ import re
 import shutil
 import subprocess
 import sys
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -165,6 +165,23 @@ def test_a_governance_as_plain_xml_is_not_mended_by_permissions(keystore: Path) 
     command = re.findall("`(openssl .+?)`", found)[0]
     assert run(command).returncode == 0
     assert "has no fault that would explain it" in sros(*asked).out
+
+
+def test_the_remedy_for_a_ca_that_expired_does_not_presume_a_rotation(tmp_path: Path) -> None:
+    keystore = make_keystore(tmp_path / "ks", datetime.now(UTC) - timedelta(days=3700))
+    asked = ("explain", keystore, ENCLAVE, "--log", log_of(FAST_14, "ca expired"))
+    found = sros(*asked).out
+    assert "identity_ca.cert.pem: it expired" in found
+    command = re.findall("`(sros rotate_ca .+?)`", found)[0]
+    assert run(command).returncode == 0
+    assert "has no fault that would explain it" in sros(*asked).out
+
+
+def test_during_a_rotation_the_remedy_is_its_next_stage(keystore: Path) -> None:
+    sros("rotate_ca", keystore, "--next").ok()
+    BREAKAGES["certificate of another CA"](Enclave(keystore))
+    asked = ("explain", keystore, ENCLAVE, "--log", log_of(FAST_14, "certificate of another CA"))
+    assert f"sros rotate_ca {keystore} --next" in sros(*asked).out
 
 
 def test_a_remedy_on_a_robot_is_for_the_keystore_at_home(keystore: Path) -> None:
