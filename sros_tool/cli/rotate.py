@@ -153,7 +153,8 @@ def _say(step: RotationStep, status: RotationStatus, *, together: bool, same_key
         click.echo("renewed the identity CA with its key; what it has issued stays valid")
         click.echo(
             "Restart the processes when it suits; those restarted and those not yet restarted talk "
-            f"with each other. Certificates end when they did: `sros renew {step.root} --all-expiring 30d`.",
+            "with each other. Certificates expire when they did: `sros renew "
+            f"{step.root} --all-expiring 30d` renews those that soon do.",
             err=True,
         )
         return

@@ -94,6 +94,7 @@ CASES: dict[str, Change] = {
     "runtime.keystore-relative": having(**{KEYSTORE: "keystore"}),
     "runtime.enclave-not-found": having(**{ENCLAVE: "/bass"}),
     "runtime.enclave-unset": having(**{ENCLAVE: None}),
+    "runtime.unsecured-without-enclave": having(**{ENCLAVE: None, STRATEGY: "Permissive"}),
     "runtime.domain-malformed": having(**{DOMAIN: "010"}),
     "runtime.domain-not-governed": having(**{DOMAIN: "7"}),
     "runtime.ca-key-present": lambda setting, bench: having(**{KEYSTORE: str(bench.root)})(

@@ -15,6 +15,7 @@ import pytest
 from bench import DAY, Bench
 from runtime_cases import CASES, DOMAIN, ENCLAVE, KEYSTORE, SOUND, having, running, sound_setting
 
+from sros_tool.checks.kind import ERROR, WARNING
 from sros_tool.checks.runtimes.runtime import runtime_findings
 from sros_tool.checks.runtimes.setting import Setting, running_processes
 
@@ -145,3 +146,25 @@ def test_spelling(variables: dict[str, str], told: set[str]) -> None:
     named = {f"ROS_SECURITY_{name}": value for name, value in variables.items()}
     found = {each.removeprefix("runtime.") for each in ids(Setting(named, datetime.now(UTC)))}
     assert found & SPELLING == told
+
+
+def test_what_no_enclave_leads_to_is_of_a_severity_that_is_shown(sound_one: Setting) -> None:
+    """Permissive runs unsecured, which is worse than not starting under Enforce."""
+    found = {
+        strategy: {
+            each.id: each.severity
+            for each in runtime_findings(
+                replace(
+                    sound_one,
+                    environment={
+                        **{k: v for k, v in sound_one.environment.items() if k != ENCLAVE},
+                        "ROS_SECURITY_STRATEGY": strategy,
+                    },
+                )
+            )
+        }
+        for strategy in ("Enforce", "Permissive")
+    }
+    assert found["Enforce"]["runtime.enclave-unset"] is WARNING
+    assert found["Permissive"]["runtime.unsecured-without-enclave"] is ERROR
+    assert "runtime.unsecured-without-enclave" not in found["Enforce"]

@@ -26,6 +26,10 @@ from sros_tool.runtime.environment import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STR
 from sros_tool.xml import read_bytes
 
 _RCL = "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy."
+_NAME_IT = (
+    "Start each process with `sros run ROOT NAME -- COMMAND...`, or set its enclave in the launch "
+    "file."
+)
 _ENV = '`eval "$(sros env ROOT NAME)"` sets all of them.'
 
 ENABLE_MISSPELT = Kind(
@@ -105,13 +109,21 @@ ENCLAVE_NOT_FOUND = Kind(
 )
 NO_ENCLAVE = Kind(
     "runtime.enclave-unset",
-    NOTE,
+    WARNING,
     "no enclave is named",
     "Every process has to say --ros-args --enclave NAME; one that does not uses the enclave /, "
-    "which the keystore does not have.",
+    "which the keystore does not have, and does not start.",
     _RCL,
-    "Start each process with `sros run ROOT NAME -- COMMAND...`, or set its enclave in the launch "
-    "file.",
+    _NAME_IT,
+)
+UNSECURED_WITHOUT_ENCLAVE = Kind(
+    "runtime.unsecured-without-enclave",
+    ERROR,
+    "no enclave is named, and nodes run unsecured",
+    "A process that does not say --ros-args --enclave NAME uses the enclave /, which the keystore "
+    "does not have; as ROS_SECURITY_STRATEGY is not exactly `Enforce`, it then runs UNSECURED.",
+    _RCL,
+    f"Write ROS_SECURITY_STRATEGY=Enforce. {_NAME_IT}",
 )
 DOMAIN_MALFORMED = Kind(
     "runtime.domain-malformed",
@@ -141,8 +153,8 @@ CA_KEY_HERE = Kind(
 
 KINDS = by_id(
     ENABLE_MISSPELT, NOT_ENABLED, MISSPELT, STRATEGY_MISSPELT, NOT_ENFORCED, KEYSTORE_UNSET,
-    KEYSTORE_NOT_FOUND, KEYSTORE_RELATIVE, ENCLAVE_NOT_FOUND, NO_ENCLAVE, DOMAIN_MALFORMED,
-    DOMAIN_NOT_GOVERNED, CA_KEY_HERE,
+    KEYSTORE_NOT_FOUND, KEYSTORE_RELATIVE, ENCLAVE_NOT_FOUND, NO_ENCLAVE,
+    UNSECURED_WITHOUT_ENCLAVE, DOMAIN_MALFORMED, DOMAIN_NOT_GOVERNED, CA_KEY_HERE,
 )  # fmt: skip
 
 _READ = (
@@ -216,7 +228,9 @@ def _enclave(setting: Setting, root: Path, domain: int | None) -> Iterator[Findi
             yield CA_KEY_HERE.found(KEYSTORE, f"'{root / ca_key(role)}' is there")
             break
     if not wanted and "/" not in names:
-        yield NO_ENCLAVE.found(ENCLAVE, f"it is not set, and '{root}' has no enclave /")
+        enforced = setting.environment.get(STRATEGY) == "Enforce"
+        kind = NO_ENCLAVE if enforced else UNSECURED_WITHOUT_ENCLAVE
+        yield kind.found(ENCLAVE, f"it is not set, and '{root}' has no enclave /")
         return
     name = wanted or "/"
     if name not in names and not enclave_path(root, name).is_dir():
