@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,35 +54,70 @@ def observe(
     secured: bool,
 ) -> tuple[Snapshot, str]:
     """What was seen, and by which RMW; ``watch`` is a duration or `FOREVER`, in place of a look."""
+    from sros_tool.graph.identity import identified
     from sros_tool.graph.source import ObserverError, RosGraph
     from sros_tool.graph.watch import SECURED, Settling, look_for, settle
     from sros_tool.validity import parse_duration
 
     seconds = None
+    enclaves = _enclaves_by_identity({**os.environ, **environment})
+
+    def identify(observation: Observation) -> Observation:
+        return identified(observation, enclaves)
+
     if watch not in (None, FOREVER):
         seconds = parse_duration(watch).total_seconds()
     try:
         with RosGraph(environment) as graph:
             if watch is not None:
-                snapshot = _watch(graph, seconds, common)
+                snapshot = _watch(graph, seconds, common, identify)
             elif spin_time is not None:
                 snapshot = look_for(graph, spin_time, time.monotonic)
             else:
                 settling = SECURED if secured else Settling()
                 snapshot = settle(graph, settling, time.monotonic)
-            return snapshot, graph.rmw
+            return replace(snapshot, observation=identify(snapshot.observation)), graph.rmw
     except ObserverError as error:
         raise _explained(error, environment) from error
 
 
-def _watch(graph: RosGraph, seconds: float | None, common: CommonParts) -> Snapshot:
+def _enclaves_by_identity(environment: Mapping[str, str]) -> dict[str, str]:
+    """The enclaves of the observer's keystore, by what the identifiers of participants begin with.
+
+    An enclave whose certificate cannot be read is left out.
+    """
+    from sros_tool.graph.identity import identity_of
+    from sros_tool.keystore.enclave import enclave_path
+    from sros_tool.keystore.layout import enclave_names, is_keystore
+    from sros_tool.pki.certificates import load_certificate
+    from sros_tool.runtime.environment import ENABLE, KEYSTORE
+    from sros_tool.xml import read_bytes
+
+    root = Path(environment.get(KEYSTORE, ""))
+    if environment.get(ENABLE) != "true" or not is_keystore(root):
+        return {}
+    found = {}
+    for name in enclave_names(root):
+        with suppress(SrosError):
+            data = read_bytes(enclave_path(root, name) / "cert.pem", "certificate")
+            subject = load_certificate(data, name).subject
+            found[identity_of(subject.public_bytes())] = name
+    return found
+
+
+def _watch(
+    graph: RosGraph,
+    seconds: float | None,
+    common: CommonParts,
+    identify: Callable[[Observation], Observation],
+) -> Snapshot:
     from sros_tool.graph.news import News
     from sros_tool.graph.watch import watch
 
     news = News(common)
 
     def tell(observation: Observation) -> None:
-        for line in news.lines(observation):
+        for line in news.lines(identify(observation)):
             click.echo(line, err=True)
 
     with _until_signalled() as stopped:

@@ -91,13 +91,18 @@ Example:
     shell_complete=complete_keystore_and_enclave,
 )
 @_DOMAIN
+@click.option("--no-ros-args", is_flag=True, help="Leave COMMAND as it is.")
 @click.pass_context
-def run(ctx: click.Context, words: tuple[str, ...], domain: str | None) -> None:
+def run(ctx: click.Context, words: tuple[str, ...], domain: str | None, no_ros_args: bool) -> None:
     """Run COMMAND in the enclave NAME of the keystore ROOT, or not at all (strategy Enforce).
 
     The enclave is checked first; what would keep the command from starting is said here, not
-    by an obscure message of the middleware.
+    by an obscure message of the middleware. Where COMMAND is known to start a ROS node (`ros2
+    run`, or an executable of a ROS package), `--ros-args --enclave NAME` is added to it, so that
+    the ROS graph shows the enclave.
     """
+    from sros_tool.runtime.ros_command import with_enclave
+
     root, rest = split_root(words)
     name, command = rest[0] if rest else "", [*rest[1:], *ctx.meta[_COMMAND]]
     if not command:
@@ -106,6 +111,13 @@ def run(ctx: click.Context, words: tuple[str, ...], domain: str | None) -> None:
     program = shutil.which(command[0])
     if program is None:
         raise UsageError(f"the command '{command[0]}' is not found")
+    given = tuple(command)
+    if not no_ros_args and (command := list(with_enclave(given, name))) != list(given):
+        added = " ".join(command[len(given) :])
+        click.echo(
+            f"added {added}, so that the ROS graph shows the enclave (--no-ros-args: do not)",
+            err=True,
+        )
     sys.stdout.flush()
     sys.stderr.flush()
     for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # by Python, and a command would inherit it

@@ -110,6 +110,9 @@ def groups_of(rights: Iterable[Right], ns: str, node: str) -> tuple[Group, ...]:
 
 def _rights_of(node: ObservedNode, remarks: Remarks) -> list[tuple[_Place, frozenset[Right]]]:
     """The profiles of a node, one for each enclave that it can be in."""
+    if not node.enclaves:
+        remarks.add("unknown-enclave", node.fqn)
+        return []
     name = stable_name(node.name)
     enclaves = [each for each in node.enclaves if _is_enclave(each)]
     if not _is_place(node.ns, node.name) or not enclaves:

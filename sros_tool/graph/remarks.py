@@ -27,6 +27,10 @@ _TEXTS = {
     "or a player: {}",
     "silent": "left out, as they were announced and had no endpoint: {}",
     "stray": "left out, as the writers or readers of these topics belong to no ROS node: {}",
+    "unknown-enclave": "left out, as the graph does not tell in which enclaves these nodes run: "
+    "theirs was set by ROS_SECURITY_ENCLAVE_OVERRIDE, and the observer's keystore has no "
+    "certificate of theirs; observe with the keystore that has their enclaves (--keystore), or "
+    "start them with `--ros-args --enclave /its/name`: {}",
     "tool": "left out, as they are tools that look at the robot: {}",
 }
 

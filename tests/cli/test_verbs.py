@@ -488,6 +488,21 @@ def test_run_executes_in_exactly_that_environment(keystore: Path, tmp_path: Path
     assert int(said.split()[1], 16) == 0
 
 
+def test_run_names_the_enclave_of_a_ros_node(keystore: Path, tmp_path: Path) -> None:
+    node = tmp_path / "lib/arm/driver"
+    for path, text in ((tmp_path / "share/arm/package.xml", "<package/>"), (node, "echo $*")):
+        path.parent.mkdir(parents=True)
+        path.write_text(f"#!/bin/sh\n{text}\n")
+    node.chmod(0o755)
+    command = [*PROGRAM, "run", str(keystore), "/a", "--", str(node), "--fast"]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert done.stdout == "--fast --ros-args --enclave /a\n"
+    assert done.stderr.startswith("added --ros-args --enclave /a, so that the ROS graph shows")
+    command = [*PROGRAM, "run", "--no-ros-args", str(keystore), "/a", "--", str(node), "--fast"]
+    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("--fast\n", "")
+
+
 @pytest.mark.parametrize(
     ("words", "out", "status"),
     [
