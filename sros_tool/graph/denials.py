@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 
 from sros_tool.graph.fold import Right
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
-from sros_tool.names import expression_problem, is_expression
+from sros_tool.names import NODE_SERVICES, expression_problem, is_expression
 
 _FAST = re.compile(
     # Tried only where a word begins: in a line of one long word it would else be tried everywhere.
@@ -165,11 +165,7 @@ _SERVICE = re.compile(r"r(?P<side>[qr])(?P<name>/.+?)(?P<end>Request|Reply)\Z")
 _ACTION = re.compile(r"(?P<name>/.+)/_action/(?:send_goal|cancel_goal|get_result)\Z")
 
 
-_OWN_SERVICE = re.compile(
-    r"(?P<node>/.+)/(?:describe_parameters|get_parameter_types|get_parameters|list_parameters"
-    r"|set_parameters|set_parameters_atomically|get_type_description)\Z"
-)
-"""The services that every node offers, under its own name (rclcpp and rclpy of Jazzy)."""
+_OWN_SERVICE = re.compile(rf"(?P<node>/.+)/(?:{'|'.join(NODE_SERVICES)})\Z")
 
 
 def serving_node(denial: Denial) -> str:

@@ -3,8 +3,8 @@
 JSON is a list of nodes, each with ``name``, ``ns`` and the names that it uses by right (publish,
 subscribe, reply, request, execute, call), and the nodes whose parameters it reads (ask);
 ``managed`` makes it a lifecycle node, ``bare`` one without parameter services.  What the messages
-are does not matter here, so every topic carries the same type, and so does every service and every
-action.  Prints ``ready`` and runs until it is ended.
+are does not matter here, so every topic but /rosout, which every node publishes, carries the same
+type, and so does every service and every action.  Prints ``ready`` and runs until it is ended.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import sys
 from typing import Any
 
 import rclpy
+from rcl_interfaces.msg import Log
 from rclpy.action import ActionClient, ActionServer
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode
@@ -32,7 +33,8 @@ def make_node(spec: dict[str, Any]) -> Any:
     for name in spec.get("publish", ()):
         node.create_publisher(String, name, 10)
     for name in spec.get("subscribe", ()):
-        node.create_subscription(String, name, lambda message: None, 10)
+        kind_of = Log if name == "/rosout" else String
+        node.create_subscription(kind_of, name, lambda message: None, 10)
     for name in spec.get("reply", ()):
         node.create_service(BasicTypes, name, lambda request, response: response)
     for name in spec.get("request", ()):
