@@ -126,7 +126,7 @@ def generate_policy(
     """
     present = _present_policy(file)
     if logs:
-        return _from_logs(file, logs, enclave, node, present, dry_run, as_json)
+        return _from_logs(file, logs, enclave, node, present, dry_run, as_json, flat=flat)
     if file is None:
         raise UsageError("no file is named", "", "Name the policy FILE to write.")
     if node is not None:
@@ -184,17 +184,24 @@ def _from_logs(
     present: Policy | None,
     dry_run: bool,
     as_json: bool,
+    *,
+    flat: bool,
 ) -> int:
+    from sros_tool.graph.common import common_parts
     from sros_tool.graph.denials import propose, read_denials
     from sros_tool.graph.document import render
     from sros_tool.graph.observation import Observation
     from sros_tool.graph.proposal import as_learned
     from sros_tool.graph.write import draft, write
     from sros_tool.policy.rights import order, policy_rights
+    from sros_tool.resources import policies_dir
     from sros_tool.runtime.security_log import plain_text
 
     denials = [each for log in logs for each in read_denials(plain_text(_log_text(log)))]
-    learned = as_learned(propose(denials), enclave or "", _place(node), present)
+    common = common_parts(file.parent if file else policies_dir(), policies_dir())
+    learned = as_learned(propose(denials), enclave or "", _place(node), present, common)
+    if flat:
+        learned = learned.flat()
     if not learned.profiles:
         print_notes(learned.notes)
         click.echo(
@@ -211,7 +218,7 @@ def _from_logs(
         print_notes(learned.notes)
         click.echo(render(learned.profiles).decode(), nl=False)
         return 0
-    plan = draft(file, learned, None)
+    plan = draft(file, learned, None if flat else common)
     if not dry_run:
         write(plan)
     _show(plan, learned, Observation(), dry_run, as_json)

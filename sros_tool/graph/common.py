@@ -49,11 +49,15 @@ class CommonParts:
         """The parts for a node with these rights (absolute names), and the rights that remain."""
         chosen, rest = [], rights
         for part, names in self.rights.items():
-            given = {Right(each.right, expand(each.name, ns, node)) for each in names}
+            given = _expanded(names, ns, node)
             if given <= rights and given & rest:
                 chosen.append(part)
                 rest -= given
         return tuple(chosen), rest
+
+    def given(self, parts: Iterable[str], ns: str, node: str) -> frozenset[Right]:
+        """What these parts give to a node, by absolute names."""
+        return frozenset().union(*(_expanded(self.rights[part], ns, node) for part in parts))
 
     def to_copy(self, parts: Iterable[str]) -> dict[str, bytes]:
         """The files that these parts need and that are not beside the policy yet."""
@@ -79,6 +83,10 @@ def common_parts(folder: Path, shipped: Path) -> CommonParts:
         if found:
             rights[part], missing[part] = found, copies
     return CommonParts(rights, missing)
+
+
+def _expanded(rights: Iterable[Right], ns: str, node: str) -> frozenset[Right]:
+    return frozenset(Right(each.right, expand(each.name, ns, node)) for each in rights)
 
 
 def _differs(folder: Path, path: str, needed: Mapping[str, bytes]) -> bool:

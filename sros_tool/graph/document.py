@@ -43,8 +43,7 @@ def render(profiles: Iterable[LearnedProfile]) -> bytes:
 
 def _content(profile: LearnedProfile, include: str, unit: str) -> Iterator[str]:
     """The lines of a profile's content; ``include`` is the start of the tag of an include."""
-    for part in profile.includes:
-        yield f'<{include} href="{part}" xpointer="xpointer(/profile/*)"/>'
+    yield from _includes(profile, include)
     for group in profile.groups:
         item = group.kind.removesuffix("s")
         rights = "".join(f' {right}="{said}"' for right, said in group.rights)
@@ -53,13 +52,18 @@ def _content(profile: LearnedProfile, include: str, unit: str) -> Iterator[str]:
         yield f"</{group.kind}>"
 
 
+def _includes(profile: LearnedProfile, include: str) -> Iterator[str]:
+    for part in profile.includes:
+        yield f'<{include} href="{part}" xpointer="xpointer(/profile/*)"/>'
+
+
 def with_includes(
     path: Path, before: bytes, merged: bytes, profiles: Iterable[LearnedProfile]
 ) -> tuple[bytes, tuple[str, ...]]:
     """``merged`` (the file ``before`` with learned rights), its new profiles with their includes.
 
-    Also tells what is now included.  A profile that ``before`` had stays as the merge left it,
-    and so does one of which the policy denies something.
+    Also tells what is now included.  A profile of which the policy denies something stays as the
+    merge left it; one that ``before`` had gets its includes in front of what it says.
     """
     name = f"the policy file '{path}'"
     known = _profiles(Text(before, name))
@@ -69,11 +73,15 @@ def with_includes(
     included: set[str] = set()
     for place, element in _profiles(text).items():
         profile = wanted.get(place)
-        if profile is None or place in known:
+        if profile is None:
             continue
-        if all(rules.allow(profile.enclave, each.right, each.name) for each in profile.rights):
+        if place in known:
+            text.put(element.inner, _in_front(profile, element, text))
+        elif all(rules.allow(profile.enclave, each.right, each.name) for each in profile.rights):
             text.put(element.inner, _inside(profile, element, text), element.close)
-            included.update(profile.includes)
+        else:
+            continue
+        included.update(profile.includes)
     if included and _prefix(text) is None:
         text.put(text.root.inner - len(">"), f' xmlns:xi="{XINCLUDE}"')
     return text.document(), tuple(sorted(included))
@@ -87,6 +95,19 @@ def _profiles(text: Text) -> dict[tuple[str, str, str], Element]:
         for profiles in enclave.named("profiles")
         for profile in profiles.named("profile")
     }
+
+
+def profiles_of(path: Path, document: bytes) -> frozenset[tuple[str, str, str]]:
+    """The enclave, namespace and node of each profile that stands in the file itself."""
+    return frozenset(_profiles(Text(document, f"the policy file '{path}'")))
+
+
+def _in_front(profile: LearnedProfile, element: Element, text: Text) -> str:
+    """The includes of a profile as text, to stand before its content."""
+    include = f"{_prefix(text) or 'xi'}:include"
+    outer = text.indent_of(element)
+    lead = "" if outer is None else text.newline + outer + text.unit
+    return "".join(lead + line for line in _includes(profile, include))
 
 
 def _inside(profile: LearnedProfile, element: Element, text: Text) -> str:

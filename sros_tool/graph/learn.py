@@ -7,7 +7,7 @@ is left out, above all a topic that is *named* like a wildcard.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sros_tool.errors import InvalidNameError
 from sros_tool.graph.common import CommonParts
@@ -51,6 +51,14 @@ class Learned:
     def includes(self) -> tuple[str, ...]:
         """Every part that is included, sorted."""
         return tuple(sorted({each for profile in self.profiles for each in profile.includes}))
+
+    def flat(self) -> Learned:
+        """The same without includes."""
+        profiles = (
+            replace(each, includes=(), groups=groups_of(each.rights, each.ns, each.node))
+            for each in self.profiles
+        )
+        return replace(self, profiles=tuple(profiles))
 
     def policy(self) -> Policy:
         """Everything as a policy without includes."""

@@ -5,18 +5,18 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sros_tool.atomic import replace_file
 from sros_tool.errors import DocumentError, PolicyError
 from sros_tool.graph.common import CommonParts
-from sros_tool.graph.document import render, with_includes
-from sros_tool.graph.learn import Learned
+from sros_tool.graph.document import profiles_of, render, with_includes
+from sros_tool.graph.learn import Learned, LearnedProfile
 from sros_tool.policy.edit import merge_into
 from sros_tool.policy.merge import Contradiction
 from sros_tool.policy.reader import read_policy
-from sros_tool.policy.rights import Right, order, policy_rights
+from sros_tool.policy.rights import Right, Rules, order, policy_rights, profile_rights
 from sros_tool.xml import read_bytes
 
 
@@ -60,7 +60,9 @@ def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
     merged = merge_into(path, additions)
     document, included = merged.document, tuple[str, ...]()
     if common and document != before:
-        document, included = with_includes(path, before, document, learned.profiles)
+        by_name, shown = _parted(path, before, merged.document, learned, common)
+        document = merge_into(path, by_name.policy()).document
+        document, included = with_includes(path, before, document, shown)
     least = policy_rights(read_policy(path, merged.document))
     return Draft(
         path,
@@ -72,6 +74,37 @@ def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
         least,
         least | rights,
     )
+
+
+def _parted(
+    path: Path, before: bytes, merged: bytes, learned: Learned, common: CommonParts
+) -> tuple[Learned, list[LearnedProfile]]:
+    """What goes into the file by its names, and the profiles that get includes.
+
+    A profile that is there gets an include only of what it has nothing of, and is denied none of.
+    """
+    known = profiles_of(path, before)
+    rules = Rules(policy_rights(read_policy(path, merged)))
+    says: dict[tuple[str, str, str], set[tuple[str, str]]] = {}
+    for enclave in read_policy(path, before).enclaves:
+        for profile in enclave.all_profiles():
+            rights = says.setdefault((enclave.path, profile.ns, profile.node), set())
+            rights |= {(each.right, each.name) for each in profile_rights(enclave.path, profile)}
+    by_name, shown = [], []
+    for each in learned.profiles:
+        place = each.enclave, each.ns, each.node
+        given = common.given(each.includes, each.ns, each.node)
+        if place not in known:
+            shown.append(each)
+        elif given and not any(
+            (right.right, right.name) in says[place]
+            or not rules.allow(each.enclave, right.right, right.name)
+            for right in given
+        ):
+            shown.append(each)
+            each = replace(each, rights=each.rights - given)
+        by_name.append(each)
+    return Learned(tuple(by_name)), shown
 
 
 def write(plan: Draft) -> None:

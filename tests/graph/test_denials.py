@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from sros_tool.errors import UsageError
-from sros_tool.graph.denials import Denial, propose, read_denials
+from sros_tool.graph.common import common_parts
+from sros_tool.graph.denials import Denial, Proposal, propose, read_denials
 from sros_tool.graph.fold import Right
 from sros_tool.graph.proposal import as_learned
-from sros_tool.policy import Enclave, Policy, Profile, Profiles
+from sros_tool.policy import ALLOW, Enclave, Group, Policy, Profile, Profiles
+from sros_tool.resources import policies_dir
 from sros_tool.runtime.security_log import plain_text
 
 LOGS = Path(__file__).with_name("logs")
@@ -190,3 +193,87 @@ def test_the_profile_that_is_there_is_taken() -> None:
 def test_an_enclave_that_nobody_names_is_asked_for() -> None:
     with pytest.raises(UsageError, match="--enclave"):
         as_learned(propose([Denial("rt/x", "publish")]), "", None, None)
+
+
+# ── nodes and their common parts ───────────────────────────────────────────────────────────
+
+COMMON = common_parts(policies_dir(), policies_dir())
+BARE = Profile("/", "talker", (Group("topics", (("publish", ALLOW),), ("chatter",)),))
+WHOLE = replace(
+    BARE,
+    groups=(
+        *BARE.groups,
+        Group("services", (("reply", ALLOW),), ("~/get_parameters", "~/describe_parameters")),
+        Group("topics", (("publish", ALLOW),), ("/rosout",)),
+    ),
+)
+
+
+def robot(*profiles: Profile) -> Policy:
+    return Policy((Enclave("/robot", (Profiles(profiles),)),))
+
+
+def of(topic: str, direction: str = "subscribe") -> Proposal:
+    return propose([Denial(topic, direction)])
+
+
+def test_a_node_of_another_name_gets_nothing_and_is_told() -> None:
+    proposal = propose(read_denials(secured_log("node_name_differs")))
+    learned = as_learned(proposal, "", None, the_talker(WHOLE), COMMON)
+    assert learned.profiles == ()
+    (note,) = learned.notes
+    assert note.id == "log.other-node"
+    assert "/foo: enclave /talker_listener/talker has /talker" in note.text
+    (profile,) = as_learned(proposal, "", ("/", "foo"), the_talker(WHOLE), COMMON).profiles
+    assert profile.node == "foo" and profile.includes == ("common/node.xml",)
+
+
+def test_topics_of_a_node_of_another_name_are_proposed() -> None:
+    proposal = propose([Denial("rq/foo/get_parametersRequest", "subscribe"),
+                        Denial("rt/x", "publish")])  # fmt: skip
+    (profile,) = as_learned(proposal, "/robot", None, robot(WHOLE), COMMON).profiles
+    assert (profile.node, profile.rights) == ("talker", frozenset([Right("publish", "/x")]))
+
+
+@pytest.mark.parametrize(
+    ("topic", "direction", "includes"),
+    [
+        ("rt/rosout", "publish", ("common/node.xml",)),
+        ("rq/talker/describe_parametersRequest", "subscribe", ("common/node.xml",)),
+        ("rq/talker/get_type_descriptionRequest", "subscribe", ("common/node.xml",)),
+        ("rt/chatter", "subscribe", ()),
+        ("rq/other/describe_parametersRequest", "publish", ()),
+    ],
+)
+def test_a_missing_common_part_is_one_include(
+    topic: str, direction: str, includes: tuple[str, ...]
+) -> None:
+    learned = as_learned(of(topic, direction), "/robot", None, robot(BARE), COMMON)
+    (profile,) = learned.profiles
+    assert profile.includes == includes
+    assert [note.id for note in learned.notes] == ["log.common-part"] * len(includes)
+    assert len(profile.rights) == (11 if includes else 1)
+    assert len(learned.flat().profiles[0].groups) > len(profile.groups) or not includes
+
+
+def test_of_a_common_part_that_is_there_one_right_is_proposed() -> None:
+    proposal = of("rq/talker/set_parametersRequest")
+    (profile,) = as_learned(proposal, "/robot", None, robot(WHOLE), COMMON).profiles
+    assert (profile.includes, len(profile.rights)) == ((), 1)
+
+
+def test_without_a_policy_the_node_is_that_of_its_services() -> None:
+    proposal = of("rq/hall/talker/describe_parametersRequest")
+    (profile,) = as_learned(proposal, "/robot", None, None, COMMON).profiles
+    assert (profile.ns, profile.node) == ("/hall", "talker")
+    assert profile.includes == ("common/node.xml",)
+
+
+def secured_log(name: str) -> str:
+    """A log of rclpy over Fast DDS 2.14.5 with security."""
+    logs = Path(__file__).parents[1] / "explain/logs"
+    return plain_text((logs / f"fastdds_2.14.5.{name}.log").read_text())
+
+
+def the_talker(profile: Profile) -> Policy:
+    return Policy((Enclave("/talker_listener/talker", (Profiles((profile,)),)),))

@@ -125,3 +125,55 @@ def test_the_enclave_has_to_be_known() -> None:
     ended = sros("generate_policy", "--from-log", LOG)
     assert ended.status == 2
     assert "Name it with --enclave." in ended.err
+
+
+BARE = """<policy version="0.2.0">
+  <enclaves>
+    <enclave path="/talker_listener/talker">
+      <profiles>
+        <profile ns="/" node="talker">
+          <topics publish="ALLOW">
+            <topic>chatter</topic>
+          </topics>
+        </profile>
+      </profiles>
+    </enclave>
+  </enclaves>
+</policy>
+"""
+SECURED = LOG.parents[2] / "explain/logs"
+
+
+def test_a_missing_common_part_is_included_in_one_round(tmp_path: Path) -> None:
+    path = tmp_path / "robot.xml"
+    path.write_text(BARE)
+    log = SECURED / "fastdds_2.14.5.common_part_missing.log"
+    ended = sros("generate_policy", path, "--from-log", log).ok()
+    text = path.read_text()
+    assert text.count("<xi:include") == 1 and "<topic>chatter</topic>" in text
+    assert (tmp_path / "common/node/parameters.xml").exists()
+    assert "added 11 rights" in ended.out and "proposed as a whole" in ended.err
+    rights = {(each.right, each.name) for each in policy_rights(read_policy(path))}
+    assert {("publish", "/rosout"), ("reply", "/talker/set_parameters")} < rights
+    again = sros("generate_policy", path, "--from-log", log).ok()
+    assert "nothing to add" in again.out and path.read_text() == text
+
+
+def test_a_missing_common_part_without_includes(tmp_path: Path) -> None:
+    path = tmp_path / "robot.xml"
+    path.write_text(BARE)
+    log = SECURED / "fastdds_2.14.5.common_part_missing.log"
+    ended = sros("generate_policy", path, "--flat", "--from-log", log).ok()
+    assert "added 11 rights" in ended.out
+    assert "include" not in path.read_text() and not (tmp_path / "common").exists()
+
+
+def test_the_services_of_a_node_of_another_name_are_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "robot.xml"
+    path.write_text(BARE)
+    log = SECURED / "fastdds_2.14.5.node_name_differs.log"
+    ended = sros("generate_policy", path, "--from-log", log)
+    assert ended.status == 1 and path.read_text() == BARE
+    assert "/foo: enclave /talker_listener/talker has /talker" in ended.err
+    sros("generate_policy", path, "--from-log", log, "--node", "/foo").ok()
+    assert 'node="foo"' in path.read_text()
