@@ -13,7 +13,7 @@ import pytest
 from harness import policy_text, publish, sros
 from xdist.scheduler import LoadScopeScheduling  # type: ignore[import-untyped]
 
-STARTED_ONCE = ("test_generate_policy.py", "test_demo_run.py")
+STARTED_ONCE = ("test_generate_policy.py", "test_demo_run.py", "test_policies_live.py")
 """Files whose tests share many processes that are started once."""
 
 POLICY = policy_text({"/a": publish("old_a"), "/b": publish("old_b")})

@@ -10,15 +10,15 @@ import importlib.util
 import json
 import shutil
 import signal
-import subprocess
-import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
+from children import python
+from converse import converse, listener, talker
 from enforcing import enforces
 
 from sros_tool.dds.domains import DomainSet
@@ -257,29 +257,30 @@ class Ended:
     status: int
     out: str
     err: str
-    seconds: float
+
+
+Command = str | dict[str, Any]
 
 
 def live(
-    domain: int, folder: Path, processes: list[dict[str, Any]], *commands: str | dict[str, Any]
+    domain: int,
+    folder: Path,
+    processes: list[dict[str, Any]],
+    *commands: Command | Sequence[Command],
 ) -> list[Ended]:
-    """Run commands beside the nodes, one after the other."""
+    """Run commands next to the nodes, one after the other; those of a list at the same time."""
+
+    def spelled(each: Command) -> dict[str, Any]:
+        return {"words": each.split()} if isinstance(each, str) else each
+
+    groups = [[each] if isinstance(each, str | dict) else each for each in commands]
     task = {
         "domain": domain,
         "folder": str(folder),
         "processes": processes,
-        "commands": [
-            {"words": each.split()} if isinstance(each, str) else each for each in commands
-        ],
+        "commands": [[spelled(each) for each in group] for group in groups],
     }
-    done = subprocess.run(
-        [sys.executable, str(SCRIPTS / "robot.py")],
-        input=json.dumps(task),
-        capture_output=True,
-        text=True,
-        timeout=180,
-    )
-    assert done.returncode == 0, done.stderr
+    done = python(SCRIPTS / "robot.py", said=json.dumps(task))
     return [Ended(**each) for each in json.loads(done.stdout.splitlines()[-1])]
 
 
@@ -296,17 +297,20 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Learned:
     folder = tmp_path_factory.mktemp("robot")
     (folder / "older.xml").write_text(OLDER)
     (folder / "elsewhere.xml").write_text(ELSEWHERE)
-    commands = [
-        "generate_policy robot.xml",
-        "generate_policy robot.xml --spin-time 5 --no-daemon --use-sim-time",
-        "generate_policy flat.xml --flat --json",
-        "generate_policy elsewhere.xml",
-        "generate_policy older.xml",
-        "generate_policy older.xml",
-        "generate_policy never.xml --dry-run",
-    ]
-    ended = live(DOMAIN, folder, ROBOT, *commands)
-    names = ("first", "second", "flat", "elsewhere", "older", "older_again", "dry")
+    at_first = {
+        "first": "generate_policy robot.xml",
+        "flat": "generate_policy flat.xml --flat --json",
+        "elsewhere": "generate_policy elsewhere.xml",
+        "dry": "generate_policy never.xml --dry-run",
+    }
+    then = {
+        "second": "generate_policy robot.xml --spin-time 5 --no-daemon --use-sim-time",
+        "older": "generate_policy older.xml",
+    }
+    at_last = {"older_again": "generate_policy older.xml"}
+    groups = (at_first, then, at_last)
+    ended = live(DOMAIN, folder, ROBOT, *(list(group.values()) for group in groups))
+    names = [name for group in groups for name in group]
     by_name = dict(zip(names, ended, strict=True))
     return Learned(folder, by_name, json.loads(by_name["flat"].out))
 
@@ -468,42 +472,10 @@ def keystore_of(policy: Policy, root: Path) -> Path:
 
 def refused(keystore: Path, enclave: str, endpoints: Iterable[Endpoint]) -> set[Endpoint]:
     questions = sorted(endpoints)
-    done = subprocess.run(
-        [
-            *(sys.executable, str(SCRIPTS / "ask_cyclone.py")),
-            *(str(enclave_path(keystore, enclave)), str(DOMAIN + 3)),
-        ],
-        input=json.dumps(questions),
-        capture_output=True,
-        text=True,
-        timeout=90,
-    )
-    assert done.returncode == 0, done.stderr
+    folder = enclave_path(keystore, enclave)
+    done = python(SCRIPTS / "ask_cyclone.py", folder, DOMAIN + 3, said=json.dumps(questions))
     answers = json.loads(done.stdout.splitlines()[-1])
     return {asked for asked, said in zip(questions, answers, strict=True) if said == "refused"}
-
-
-def heard(keystore: Path, topic: str, talker: str, listener: str) -> dict[str, Any]:
-    parties = [
-        {
-            "role": role,
-            "name": role,
-            "keystore": str(keystore),
-            "enclave": enclave,
-            "topic": topic,
-            "text": "Hello",
-        }
-        for role, enclave in (("talker", talker), ("listener", listener))
-    ]
-    done = subprocess.run(
-        [sys.executable, str(SCRIPTS.with_name("converse.py")), str(DOMAIN + 3)],
-        input=json.dumps(parties),
-        capture_output=True,
-        text=True,
-        timeout=90,
-    )
-    assert done.returncode == 0, done.stderr
-    return {each["name"]: each for each in json.loads(done.stdout)["nodes"]}
 
 
 def without(policy: Policy, path: str, name: str) -> Policy:
@@ -541,11 +513,12 @@ def test_a_learned_pair_works_on_cyclone_and_one_topic_less_fails(
     poorer = keystore_of(without(policy, "/talker", "chatter"), tmp_path / "poorer")
     seen = observed_endpoints(learned)
 
-    parties = heard(whole, "/chatter", "/talker", "/listener")
-    assert len(parties["listener"]["heard"]) > 5
-    parties = heard(poorer, "/chatter", "/talker", "/listener")
-    assert parties["listener"]["heard"] == []
-    assert "refused" in parties["talker"]["kinds"]
+    said = converse(DOMAIN + 3, talker(whole, "/talker"), listener(whole, "/listener"))
+    assert said.heard(), said
+    deaf = listener(poorer, "/listener", hears=False)
+    said = converse(DOMAIN + 3, talker(poorer, "/talker"), deaf)
+    assert said.nodes["listener"].heard == [], said
+    assert said.nodes["talker"].kinds == ["refused"], said
     assert refused(poorer, "/talker", seen["/talker"]) == {("publish", "rt/chatter")}
 
 
@@ -604,21 +577,12 @@ def test_what_cyclone_denied_is_proposed_and_then_allowed(tmp_path: Path) -> Non
 
     before = keystore("before")
     assert refused(before, enclave, wrong | never) == wrong | never
-    folder = str(enclave_path(before, enclave))
-    done = subprocess.run(
-        [sys.executable, "-c", _REFUSALS, folder, str(DOMAIN + 3)],
-        input=json.dumps(sorted(wrong | never)),
-        stdout=subprocess.PIPE,
-        text=True,
-        timeout=60,
-        check=True,
-    )
+    folder = enclave_path(before, enclave)
+    asked = json.dumps(sorted(wrong | never))
+    done = python("-c", _REFUSALS, folder, DOMAIN + 3, said=asked)
     (tmp_path / "arm.log").write_text(done.stdout)
     words = ["generate_policy", "robot.xml", "--enclave", enclave, "--from-log", "arm.log"]
-    ended = subprocess.run(
-        [sys.executable, "-m", "sros_tool", *words], cwd=tmp_path, capture_output=True, text=True
-    )
-    assert ended.returncode == 0, ended.stderr
+    ended = python("-m", "sros_tool", *words, cwd=tmp_path)
     assert "note [log.unclear]" in ended.stderr and "rt/never" in ended.stderr
     assert "added 2 rights" in ended.stdout
     assert refused(keystore("after"), enclave, wrong | never) == never
@@ -626,8 +590,18 @@ def test_what_cyclone_denied_is_proposed_and_then_allowed(tmp_path: Path) -> Non
 
 # ── over time ──────────────────────────────────────────────────────────────────────────────
 
-PASSER_BY = process("/passer_by", node("passer_by", publish=["hello"]), after=2.5, lives=2.0)
+WATCHING = "watching until Ctrl-C; then the policy is written"
+PASSED_BY = "new: /passer_by (/passer_by) publish /hello"
+PASSER_BY = process(
+    "/passer_by", node("passer_by", publish=["hello"]), visits=[WATCHING, PASSED_BY]
+)
+BEATS = "new: /steady (/steady) publish /beat"
 STEADY = process("/steady", node("steady", publish=["beat"]))
+
+
+def stopped(words: str, number: signal.Signals, once: str) -> dict[str, Any]:
+    """A command that gets a signal once it has said a text ("": once it looks at the graph)."""
+    return {"words": words.split(), "signal": int(number), "once": once}
 
 
 def rights_of(path: Path) -> set[tuple[str, str, str]]:
@@ -639,7 +613,7 @@ def test_a_watch_keeps_who_came_and_went(tmp_path: Path) -> None:
         DOMAIN + 1,
         tmp_path,
         [STEADY, PASSER_BY],
-        "generate_policy watched.xml --watch 9s",
+        stopped("generate_policy watched.xml --watch", signal.SIGINT, BEATS),
         "generate_policy after.xml",
     )
     assert watched.status == 0, watched.err
@@ -647,12 +621,11 @@ def test_a_watch_keeps_who_came_and_went(tmp_path: Path) -> None:
     assert ("/steady", "publish", "/beat") in rights_of(tmp_path / "watched.xml")
     assert {each[0] for each in rights_of(tmp_path / "after.xml")} == {"/steady"}
     news = [line for line in watched.err.splitlines() if line.startswith("new: ")]
-    # Both may be there at the first look, if the watch was slow to start.
     assert sorted(news) == [
         "new: /passer_by (/passer_by)",
-        "new: /passer_by (/passer_by) publish /hello",
+        PASSED_BY,
         "new: /steady (/steady)",
-        "new: /steady (/steady) publish /beat",
+        BEATS,
     ]
 
 
@@ -660,18 +633,15 @@ def test_a_watch_keeps_who_came_and_went(tmp_path: Path) -> None:
 def test_a_signal_ends_a_watch_and_the_policy_is_written(
     tmp_path: Path, number: signal.Signals
 ) -> None:
-    words = ["generate_policy", "--watch", "endless.xml"]
-    (ended,) = live(
-        DOMAIN + 2, tmp_path, [STEADY], {"words": words, "signal": int(number), "at": 5}
-    )
+    command = stopped("generate_policy --watch endless.xml", number, BEATS)
+    (ended,) = live(DOMAIN + 2, tmp_path, [STEADY], command)
     assert ended.status == 0, ended.err
-    assert ended.seconds < 8
     assert ("/steady", "publish", "/beat") in rights_of(tmp_path / "endless.xml")
 
 
 def test_ctrl_c_in_a_snapshot_writes_nothing(tmp_path: Path) -> None:
-    words = ["generate_policy", "none.xml", "--spin-time", "30"]
-    (ended,) = live(DOMAIN + 2, tmp_path, [], {"words": words, "signal": signal.SIGINT, "at": 3})
+    command = stopped("generate_policy none.xml --spin-time 3600", signal.SIGINT, "")
+    (ended,) = live(DOMAIN + 2, tmp_path, [], command)
     assert (ended.status, ended.err.strip()) == (130, "sros: interrupted")
     assert list(tmp_path.iterdir()) == []
 
@@ -679,11 +649,16 @@ def test_ctrl_c_in_a_snapshot_writes_nothing(tmp_path: Path) -> None:
 # ── nothing to see ─────────────────────────────────────────────────────────────────────────
 
 
-def test_no_nodes(tmp_path: Path) -> None:
-    (ended,) = live(DOMAIN + 4, tmp_path, [], "generate_policy empty.xml --spin-time 1")
+@pytest.mark.parametrize("how", ["--spin-time 1", "--watch 1s"])
+def test_no_nodes(how: str, tmp_path: Path) -> None:
+    (ended,) = live(DOMAIN + 4, tmp_path, [], f"generate_policy empty.xml {how}")
     assert ended.status == 1
     assert ended.out == ""
-    message, why = ended.err.splitlines()
+    *watching, message, why = ended.err.splitlines()
+    assert (
+        watching
+        == ["watching for 1 s, or until Ctrl-C; then the policy is written"][: "--watch" in how]
+    )
     assert message == NO_NODES
     assert f"domain {DOMAIN + 4}" in why and "--enclave" in why
     assert list(tmp_path.iterdir()) == []
@@ -711,18 +686,20 @@ def test_the_observer_may_join_and_nothing_else(tmp_path: Path) -> None:
 
 
 _OBSERVED_OBSERVER = """
-import json, os, time
+import json, os, sys, time
+from children import LATE
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 if try_isolation().isolated:
     enter_isolation()
 os.environ["ROS_DOMAIN_ID"] = "216"
 from sros_tool.graph.source import RosGraph
+expected = set(map(tuple, json.load(sys.stdin)))
 with RosGraph():
     import rclpy
     rclpy.init(args=[])
     asker = rclpy.create_node("asker")
     found = set()
-    end = time.monotonic() + 8
+    end = time.monotonic() + LATE
     while time.monotonic() < end:
         time.sleep(0.2)
         for topic, _ in asker.get_topic_names_and_types(no_demangle=True):
@@ -732,26 +709,23 @@ with RosGraph():
             ):
                 if any(each.node_name == "_sros_observer" for each in infos):
                     found.add((way, topic))
-                    end = min(end, time.monotonic() + 2)
+        if found >= expected:  # a little longer: there must not be more
+            end = min(end, time.monotonic() + 2)
 print(json.dumps(sorted(found)))
 """
 
 
 def test_the_observer_has_no_more_than_its_policy_says() -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", _OBSERVED_OBSERVER],
-        stdout=subprocess.PIPE,
-        text=True,
-        timeout=60,
-        check=True,
-    )
     (enclave,) = read_policy(policies_dir() / "observer.xml").enclaves
-    assert {tuple(each) for each in json.loads(done.stdout)} == allowed_endpoints(enclave)
+    allowed = allowed_endpoints(enclave)
+    done = python("-c", _OBSERVED_OBSERVER, said=json.dumps(sorted(allowed)))
+    assert {tuple(each) for each in json.loads(done.stdout)} == allowed
 
 
 _TALK_AND_LOOK = """
-import json, subprocess, sys, time
+import json, subprocess, sys
 from pathlib import Path
+from children import wait_for
 from sros_tool.runtime.cyclone import Participant
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 if sys.argv[3:]:
@@ -767,10 +741,8 @@ with (
     Participant(int(domain), Path(folders[1])) as observer,
     subprocess.Popen(talk, stdin=subprocess.PIPE) as process,
 ):
-    end = time.monotonic() + 15
-    while time.monotonic() < end and not observer.publications():
-        time.sleep(0.2)
-    print(json.dumps([each.topic for each in observer.publications()]))
+    found = wait_for(observer.publications, "the talker")
+    print(json.dumps([each.topic for each in found]))
     process.stdin.close()
 """
 
@@ -788,13 +760,6 @@ def test_a_secured_observer_sees_what_it_may_not_read(tmp_path: Path) -> None:
     )
     enclaves = ("/talker_listener/talker", "/sros_observer")
     folders = ":".join(str(enclave_path(root, each)) for each in enclaves)
-    done = subprocess.run(
-        [sys.executable, "-c", _TALK_AND_LOOK, folders, str(domain)],
-        input=_TALK_AND_LOOK,
-        stdout=subprocess.PIPE,
-        text=True,
-        timeout=60,
-        check=True,
-    )
+    done = python("-c", _TALK_AND_LOOK, folders, domain, said=_TALK_AND_LOOK)
     assert json.loads(done.stdout) == ["rt/chatter"]
     assert refused(root, "/sros_observer", {("subscribe", "rt/chatter")})

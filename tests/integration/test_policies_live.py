@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import subprocess
-import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -20,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from children import python
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.keystore import generate_artifacts
@@ -126,16 +125,9 @@ ENCLAVES = [(system, path) for system, processes in SYSTEMS.items() for path in 
 # ── observing ──────────────────────────────────────────────────────────────────────────────
 
 
-def run_script(script: str, arguments: Iterable[str], question: object) -> Any:
+def run_script(script: str, arguments: Iterable[object], question: object) -> Any:
     """The JSON answer of a script of ``ros_nodes`` to a JSON question."""
-    done = subprocess.run(
-        [sys.executable, str(SCRIPTS / script), *arguments],
-        input=json.dumps(question),
-        capture_output=True,
-        text=True,
-        timeout=90,
-    )
-    assert done.returncode == 0, done.stderr
+    done = python(SCRIPTS / script, *arguments, said=json.dumps(question))
     return json.loads(done.stdout.splitlines()[-1])
 
 
@@ -204,6 +196,7 @@ def uncovered(enclave: Enclave, endpoints: Iterable[Endpoint]) -> set[Endpoint]:
     }
 
 
+@cache
 def policy_of(system: str) -> Policy:
     return read_policy(policies_dir() / f"{system}.xml")
 
@@ -330,8 +323,8 @@ def keystore(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def refused_by_cyclone(keystore: Path, path: str, endpoints: Iterable[Endpoint]) -> set[Endpoint]:
     questions = sorted(endpoints)
-    folder = str(enclave_path(keystore, path))
-    answers = run_script("ask_cyclone.py", (folder, str(CYCLONE_DOMAIN)), questions)
+    folder = enclave_path(keystore, path)
+    answers = run_script("ask_cyclone.py", (folder, CYCLONE_DOMAIN), questions)
     assert len(answers) == len(questions)
     return {asked for asked, said in zip(questions, answers, strict=True) if said == "refused"}
 

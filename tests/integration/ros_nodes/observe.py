@@ -21,7 +21,7 @@ from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolat
 
 Process = list[dict[str, Any]] | dict[str, Any]
 RUN_NODES = Path(__file__).with_name("run_nodes.py")
-PATIENCE_S = 120.0
+PATIENCE_S = 240.0
 STILL_S = 1.0
 """The graph counts as complete when it has not changed for this long."""
 
