@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from children import PATIENCE
 from harness import policy_text, publish, snapshot, sros
 from test_bad_input import NOT_FILES, check_refused, check_unchanged
 
@@ -32,7 +33,7 @@ def in_time() -> Iterator[None]:
         raise AssertionError("it hangs")
 
     before = signal.signal(signal.SIGALRM, too_long)
-    signal.alarm(10)
+    signal.alarm(int(PATIENCE))
     yield
     signal.alarm(0)
     signal.signal(signal.SIGALRM, before)

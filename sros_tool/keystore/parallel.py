@@ -27,6 +27,7 @@ Progress = Callable[[str], None]
 _SMALLEST_SHARE = 100
 _MOST_PROCESSES = 8
 _PR_SET_PDEATHSIG = 1
+_ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 def in_shares(
@@ -46,7 +47,7 @@ def in_shares(
     children: list[tuple[int, int]] = []
     try:
         for share in shares[1:]:
-            children.append(_fork(share, work))
+            _fork(share, work, children)
         outcomes = [work(shares[0])]
         while children:
             outcomes.append(_collect(*children[0]))
@@ -61,16 +62,28 @@ def in_shares(
     return list(zip(shares, outcomes, strict=True))
 
 
-def _fork(share: Sequence[Item], work: Callable[[Sequence[Item]], Outcome]) -> tuple[int, int]:
+def _fork(
+    share: Sequence[Item],
+    work: Callable[[Sequence[Item]], Outcome],
+    children: list[tuple[int, int]],
+) -> None:
+    """Start a child and add it, with the pipe for its outcome, to ``children``.
+
+    A signal that came between these two would leave a child that nobody ends.
+    """
     parent = os.getpid()
     reader, writer = os.pipe()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
     child = os.fork()
     if child:
+        children.append((child, reader))
         os.close(writer)
-        return child, reader
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        return
     try:
         os.close(reader)
         _end_with(parent)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
         with open(writer, "wb") as pipe:
             pickle.dump(_attempt(share, work), pipe)
     finally:

@@ -13,6 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
+from children import finish, run, wait_for
 from harness import check_whole, policy_text, publish, remains, snapshot, sros, topics_of
 
 from sros_tool.cli.program import FAMILIES
@@ -529,7 +530,7 @@ def test_run_hands_everything_on(
 def test_a_reader_that_goes_away_is_no_trouble(keystore: Path) -> None:
     script = '"$@" | head -c 1'
     command = ["sh", "-c", script, "sh", *PROGRAM, "run", str(keystore), "/a", "--", "yes"]
-    ended = subprocess.run(command, capture_output=True, text=True, timeout=30)
+    ended = run(command)
     assert (ended.stdout, ended.stderr) == ("y", "")
 
 
@@ -540,13 +541,10 @@ def test_a_polite_end_leaves_nothing(number: signal.Signals, keystore: Path) -> 
     process = subprocess.Popen(
         [*PROGRAM, "create_enclave", str(keystore), *names], stderr=subprocess.PIPE, text=True
     )
-    deadline = time.monotonic() + 20
-    while not remains(keystore) and time.monotonic() < deadline:
-        time.sleep(0.002)
+    wait_for(lambda: remains(keystore), "the stage of a transaction", process)
     process.send_signal(number)
-    _, said = process.communicate(timeout=20)
-    assert process.returncode == (143 if number == signal.SIGTERM else 130), said
-    assert "Traceback" not in said
+    ended = finish(process, status=143 if number == signal.SIGTERM else 130)
+    assert "Traceback" not in ended.stderr
     assert snapshot(keystore.parent) == before
 
 
