@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from children import PATIENCE
 
 from tools import apt, checks, dds, environment, record, steps
 from tools.record import Record
@@ -35,7 +36,7 @@ def start(folder: Path, *arguments: str, **variables: str) -> subprocess.Complet
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         check=False,
     )
 
@@ -237,7 +238,7 @@ def test_a_second_setup_waits_for_the_first(
         while "waiting for it" not in capsys.readouterr().err:
             thread.join(0.01)
         order.append("first")
-    thread.join(10)
+    thread.join(PATIENCE)
     assert order == ["first", "second"]
     assert os.listdir(tmp_path) == []
 

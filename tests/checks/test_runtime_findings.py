@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
 from zoneinfo import ZoneInfo
 
 import pytest
 from bench import DAY, Bench
+from children import wait_for
 from runtime_cases import CASES, DOMAIN, ENCLAVE, KEYSTORE, SOUND, having, running, sound_setting
 
 from sros_tool.checks.kind import ERROR, WARNING
@@ -110,15 +111,16 @@ def test_variables_of_old_and_in_small_letters(name: str, sound_one: Setting, be
 
 def test_real_processes_are_read() -> None:
     environment = {**os.environ, ENCLAVE: "/sros_test_of_processes"}
-    command = [sys.executable, "-c", "import time; time.sleep(60)"]
+    command = [sys.executable, "-c", "import time; time.sleep(600)"]
     before = datetime.now(UTC) - timedelta(seconds=2)
     child = subprocess.Popen(command, env=environment)
     try:
-        deadline = time.monotonic() + 10
-        found = None
-        while time.monotonic() < deadline and not (found and found.environment.get(ENCLAVE)):
-            found = next((each for each in running_processes() if each.pid == child.pid), None)
-            time.sleep(0.05)
+
+        def seen() -> Any:
+            mine = (each for each in running_processes() if each.pid == child.pid)
+            return next((each for each in mine if each.environment.get(ENCLAVE)), None)
+
+        found = wait_for(seen, "the process with its environment")
         assert found is not None
         assert found.environment[ENCLAVE] == "/sros_test_of_processes"
         assert found.command[1] == "-c"

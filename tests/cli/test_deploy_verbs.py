@@ -12,6 +12,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from children import run
 from harness import policy_text, publish, remains, snapshot, sros, topics_of
 
 NAME, FOLDER = "/arm/camera", "enclaves/arm/camera"
@@ -26,13 +27,7 @@ def importable(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def shell(script: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     script = script.replace("sros ", f"{PROGRAM} ")
-    return subprocess.run(
-        ["bash", "-c", f"set -o pipefail; {script}"],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    return run(["bash", "-c", f"set -o pipefail; {script}"], cwd=cwd, status=None)
 
 
 def asked(tmp_path: Path, name: str = NAME) -> Path:

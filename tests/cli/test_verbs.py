@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
-from children import finish, run, wait_for
+from children import finish, python, run, wait_for
 from harness import check_whole, policy_text, publish, remains, snapshot, sros, topics_of
 
 from sros_tool.cli.program import FAMILIES
@@ -135,8 +135,7 @@ def test_root_with_any_name(name: str, tmp_path: Path) -> None:
     assert not remains(tmp_path)
     # What the shell is told is what the file system knows.
     script = 'eval "$("$@")"; test -f "$ROS_SECURITY_KEYSTORE/enclaves/robot/arm/key.pem"'
-    command = ["sh", "-c", script, "sh", *PROGRAM, "env", root, "/robot/arm"]
-    subprocess.run(command, cwd=tmp_path, check=True)
+    run(["sh", "-c", script, "sh", *PROGRAM, "env", root, "/robot/arm"], cwd=tmp_path)
 
 
 def test_root_is_the_working_folder_and_was_not_empty(tmp_path: Path) -> None:
@@ -295,9 +294,8 @@ def test_exports_repeat_byte_by_byte(keystore: Path, tmp_path: Path) -> None:
     assert not [path for path in exported if PRIVATE in path or "/b" in path]
     shutil.rmtree(keystore)
     (tmp_path / "robot").mkdir()
-    subprocess.run(  # as on a robot; Python's own way differs between its minor versions
-        ["tar", "-xzf", tmp_path / "1.tar.gz", "-C", tmp_path / "robot"], check=True
-    )
+    # As on a robot; Python's own way differs between its minor versions.
+    run(["tar", "-xzf", tmp_path / "1.tar.gz", "-C", tmp_path / "robot"])
     assert snapshot(tmp_path / "robot").keys() == exported.keys()
     for place in ("robot", "1"):
         sros("env", tmp_path / place, "/a").ok()
@@ -396,9 +394,7 @@ def test_completion_of_enclaves(keystore: Path) -> None:
         "COMP_CWORD": "3",
     }
     script = "from sros_tool.cli import main; main()"
-    ended = subprocess.run(
-        [sys.executable, "-c", script], env=environment, capture_output=True, text=True
-    )
+    ended = python("-c", script, env=environment)
     assert ended.stdout.split() == ["plain,/a", "plain,/b"], ended
 
 
@@ -469,14 +465,11 @@ print(json.dumps([dict(os.environ), os.getcwd(), [i.name for i in ignored]]))
 
 def test_run_executes_in_exactly_that_environment(keystore: Path, tmp_path: Path) -> None:
     command = [*PROGRAM, "run", "ks", "/a", "--", "env", "-i", "sh", "-c", "true"]
-    subprocess.run(command, cwd=tmp_path, check=True)
+    run(command, cwd=tmp_path)
     wrong = {"ROS_SECURITY_ENABLE": "false", "ROS_SECURITY_KEYSTORE": "/nowhere", "MINE": "1"}
     environment = {**os.environ, **wrong}
     command = [*PROGRAM, "run", "ks", "/a", "--", sys.executable, "-c", SHOW]
-    said = subprocess.run(
-        command, cwd=tmp_path, env=environment, check=True, capture_output=True
-    ).stdout
-    seen, folder, ignored = json.loads(said)
+    seen, folder, ignored = json.loads(run(command, cwd=tmp_path, env=environment).stdout)
     wanted = {**environment, **variables(keystore)}
     for each in (seen, wanted):
         each.pop("LC_CTYPE", None)  # Python sets it for itself where no locale is chosen
@@ -485,7 +478,7 @@ def test_run_executes_in_exactly_that_environment(keystore: Path, tmp_path: Path
     # Those that the new Python itself ignores; a command without Python sees none.
     assert set(ignored) <= {"SIGPIPE", "SIGXFSZ"}
     command = [*PROGRAM, "run", "ks", "/a", "--", "grep", "SigIgn", "/proc/self/status"]
-    said = subprocess.run(command, cwd=tmp_path, check=True, capture_output=True).stdout
+    said = run(command, cwd=tmp_path).stdout
     assert int(said.split()[1], 16) == 0
 
 
@@ -523,8 +516,8 @@ def test_run_hands_everything_on(
     (tmp_path / "here").write_text("#!/bin/sh\necho here\n")
     (tmp_path / "here").chmod(0o755)
     command = [*PROGRAM, "run", str(keystore), "/a", *words]
-    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
-    assert (ended.stdout, ended.returncode) == (out, status), ended.stderr
+    ended = run(command, cwd=tmp_path, status=status)
+    assert ended.stdout == out, ended.stderr
 
 
 def test_a_reader_that_goes_away_is_no_trouble(keystore: Path) -> None:

@@ -6,11 +6,10 @@ One process for each enclave asks for topics that the policy allows, and for suc
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from children import python
 from harness import sros
 
 from sros_tool.cli.common import now
@@ -61,14 +60,8 @@ def test_cyclone_does_as_told(policy: str, tmp_path: Path) -> None:
         folder = keystore / "enclaves" / enclave[1:]
         questions = [_question(policy, *words) for words in asked]
         parts = [part for each in questions for part in each.parts]
-        done = subprocess.run(
-            [sys.executable, program, folder],
-            input=json.dumps([[part.verb.value, part.topic] for part in parts]),
-            capture_output=True,
-            text=True,
-            timeout=60,
-        )
-        assert done.returncode == 0, done.stderr
+        asks = json.dumps([[part.verb.value, part.topic] for part in parts])
+        done = python(program, folder, said=asks)
         allowed = dict(zip(map(_key, parts), json.loads(done.stdout), strict=True))
         for question, words in zip(questions, asked, strict=True):
             expected = all(allowed[_key(part)] for part in question.parts)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
+from children import python
 from harness import Ended, policy_text, publish, sros, with_includes
 
 from sros_tool.cli.common import now
@@ -482,7 +481,5 @@ def test_completion(line: str, offered: list[str], whole: Path) -> None:
         "COMP_CWORD": str(len(words.split()) - 1),
     }
     script = "from sros_tool.cli import main; main()"
-    ended = subprocess.run(
-        [sys.executable, "-c", script], env=environment, capture_output=True, text=True
-    )
+    ended = python("-c", script, env=environment)
     assert set(ended.stdout.split()) == {f"plain,{each}" for each in offered}, ended

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from broken import BREAKAGES, ENCLAVE, Enclave, make_keystore
+from children import python
 from harness import policy_text, publish, sros
 
 from sros_tool.explain.log import Finding, explain_log
@@ -203,10 +204,7 @@ def test_what_cyclone_says_now(breakage: str, keystore: Path, tmp_path: Path) ->
     program = Path(__file__).with_name("join_cyclone.py")
     enclave = Enclave(keystore)
     BREAKAGES[breakage](enclave)
-    done = subprocess.run(
-        [sys.executable, program, enclave.folder], capture_output=True, text=True, timeout=60
-    )
-    assert done.returncode == 1, done
+    done = python(program, enclave.folder, status=1)
     log = tmp_path / "robot.log"
     log.write_text(done.stdout + done.stderr)
     found = sros("explain", keystore, ENCLAVE, "--log", log, "--domain", "0")
@@ -217,13 +215,8 @@ def test_what_cyclone_says_now(breakage: str, keystore: Path, tmp_path: Path) ->
 @pytest.mark.dds
 def test_cyclone_says_nothing_of_a_whole_enclave(keystore: Path, tmp_path: Path) -> None:
     program = Path(__file__).with_name("join_cyclone.py")
-    done = subprocess.run(
-        [sys.executable, program, Enclave(keystore).folder],
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert (done.returncode, done.stdout) == (0, "joined\n"), done
+    done = python(program, Enclave(keystore).folder)
+    assert done.stdout == "joined\n", done
     (tmp_path / "robot.log").write_text(done.stdout + done.stderr)
     assert sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log").status == 0
 

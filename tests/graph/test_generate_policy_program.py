@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from children import python
 from harness import sros
 
 from sros_tool.policy import read_policy
@@ -40,7 +40,7 @@ def test_every_module_of_the_graph_can_be_imported_without_rclpy() -> None:
         "    importlib.import_module(f'sros_tool.graph.{each.name}')\n"
         "import sros_tool.cli.generate_policy\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    python("-c", code)
 
 
 @pytest.mark.usefixtures("no_rclpy")

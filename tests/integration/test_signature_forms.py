@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from children import run
 from decision_documents import allow, grant, permissions, publish
 from fastdds import fastdds_vendor
 from vendor_oracle import (
@@ -70,7 +70,7 @@ def enclaves(workshop: Workshop) -> dict[str, Path]:
         out = made[name] / "permissions.p7s"
         out.unlink()
         command = ["openssl", *way.split(), *map(str, files), "-out", str(out)]
-        subprocess.run(command, check=True, capture_output=True)
+        run(command)
     return made
 
 

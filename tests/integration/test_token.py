@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from children import run
 
 MODULES = ("/usr/lib/softhsm/libsofthsm2.so", "/usr/lib/x86_64-linux-gnu/softhsm/libsofthsm2.so")
 MODULE = next((path for path in MODULES if Path(path).exists()), "")
@@ -27,22 +28,8 @@ def token(tmp_path: Path) -> dict[str, str]:
         f"directories.tokendir = {tmp_path / 'tokens'}\nobjectstore.backend = file\n"
     )
     environment = {**os.environ, "SOFTHSM2_CONF": str(configuration), "SROS_PKCS11_PIN": "1234"}
-    subprocess.run(
-        [
-            "softhsm2-util",
-            "--init-token",
-            "--free",
-            "--label",
-            "robot",
-            "--pin",
-            "1234",
-            "--so-pin",
-            "5678",
-        ],
-        env=environment,
-        check=True,
-        capture_output=True,
-    )
+    words = "--init-token --free --label robot --pin 1234 --so-pin 5678"
+    run(["softhsm2-util", *words.split()], env=environment)
     return environment
 
 

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from children import run
 from harness import certificate, snapshot, sros
 
 from sros_tool.errors import KeystoreError
@@ -122,7 +123,7 @@ def test_after_a_rotation_the_new_ca_is_named(robot: Path, tmp_path: Path) -> No
 
 def openssl_fingerprint(path: Path) -> str:
     words = ["openssl", "x509", "-in", str(path), "-noout", "-fingerprint", "-sha256"]
-    return subprocess.run(words, check=True, capture_output=True, text=True).stdout.strip()
+    return run(words).stdout.strip()
 
 
 def test_everybody_says_the_same_fingerprint(tmp_path: Path) -> None:

@@ -7,13 +7,13 @@ import io
 import os
 import shutil
 import stat
-import subprocess
 import tarfile
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from children import run
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
@@ -97,11 +97,9 @@ def test_a_request_has_a_key_that_stays(robot: Path, free_umask: None) -> None:
 
 def test_openssl_reads_a_request_and_agrees_about_the_key(robot: Path, tmp_path: Path) -> None:
     made = create_request(tmp_path / "other", "/x")
-    subprocess.run(
-        ["openssl", "req", "-in", made.file, "-verify", "-noout"], check=True, capture_output=True
-    )
+    run(["openssl", "req", "-in", made.file, "-verify", "-noout"])
     script = "openssl req -in $0 -pubkey -noout | openssl pkey -pubin -outform DER | sha256sum"
-    said = subprocess.run(["sh", "-c", script, made.file], capture_output=True, text=True)
+    said = run(["sh", "-c", script, made.file])
     assert said.stdout.split()[0] == made.key
 
 
@@ -326,7 +324,7 @@ def test_a_request_of_openssl_with_rsa_works(home: Path, tmp_path: Path) -> None
     command = ["openssl", "req", "-new", "-newkey", "rsa:2048", "-noenc"]
     command += ["-subj", r"/CN=\/arm\/camera"]
     command += ["-keyout", str(folder / "key.pem"), "-out", str(folder / "request.pem")]
-    subprocess.run(command, check=True, capture_output=True)
+    run(command)
     import_answer(tmp_path / "robot", sign(home, tmp_path / "robot").archive, now=NOW)
     assert verify_arrival(tmp_path / "robot", now=NOW).enclaves[0].loadable
 

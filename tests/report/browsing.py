@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import shutil
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from children import PATIENCE, run
 from harness import sros
 from pictures import MOBILE_ROBOT, WEB
 
@@ -45,7 +45,9 @@ def browser() -> Iterator[Browser]:
     if CHROMIUM is None:
         pytest.skip("needs chromium (on Debian: apt-get install chromium)")
     with playwright.sync_playwright() as driver:
-        running = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        running = driver.chromium.launch(
+            executable_path=CHROMIUM, args=FLAGS, timeout=PATIENCE * 1000
+        )
         yield running
         running.close()
 
@@ -60,7 +62,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copytree(WEB, copy, ignore=shutil.ignore_patterns("node_modules"))
     # The build of esbuild comes as a package of its own; no script of a package is run.
     command = [npm, "ci", "--ignore-scripts", "--no-audit", "--no-fund"]
-    done = subprocess.run(command, cwd=copy, capture_output=True, text=True, timeout=300)
+    done = run(command, cwd=copy, status=None)
     if done.returncode:
         pytest.skip(f"npm could not fetch the packages: {done.stderr.strip()[-300:]}")
     return copy

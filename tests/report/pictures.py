@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
 
+from children import PATIENCE
 from harness import policy_text
 
 from sros_tool.policy.reader import read_policy
@@ -14,6 +16,9 @@ from sros_tool.report.compose import Context, Source, compose
 from sros_tool.report.picture import Edge, Origin, Picture
 from sros_tool.report.sources import common_rights
 from sros_tool.resources import policies_dir
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
 
 NOW = datetime(2027, 1, 1, tzinfo=UTC)
 WEB = Path(__file__).resolve().parents[2] / "web"
@@ -104,3 +109,10 @@ def hostile_permissions() -> str:
         for text in HOSTILE
     )
     return f'<?xml version="1.0" encoding="UTF-8"?><dds><permissions>{grants}</permissions></dds>'
+
+
+def new_page(browser: Browser, **options: Any) -> Page:
+    """A page that waits for what it is told to wait for, however busy the machine is."""
+    page = browser.new_page(**options)
+    page.set_default_timeout(PATIENCE * 1000)
+    return page

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 import re
 import shutil
-import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from children import run
 from harness import sros
-from pictures import WEB, hostile_permissions
+from pictures import WEB, hostile_permissions, new_page
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -44,7 +44,7 @@ def test_every_library_in_the_script_has_its_licence_beside_it() -> None:
 def test_building_gives_the_very_files_that_ship(built: Path, tmp_path: Path) -> None:
     node = shutil.which("node")
     assert node is not None
-    subprocess.run([node, "build.mjs", str(tmp_path)], cwd=built, check=True, timeout=60)
+    run([node, "build.mjs", tmp_path], cwd=built)
     made = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
     shipped = {path.name: path.read_bytes() for path in ASSETS.iterdir()}
     del shipped["view.html"]  # it is written by hand
@@ -59,7 +59,7 @@ def test_mermaid_renders(
 ) -> None:
     hostile = tmp_path / "hostile.xml"
     hostile.write_text(hostile_permissions())
-    page = browser.new_page()
+    page = new_page(browser)
     page.set_content("<div id=out></div>")
     page.add_script_tag(path=built / "node_modules/@mermaid-js/tiny/dist/mermaid.tiny.js")
     for source in (robot_keystore, hostile):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from lxml import html
-from pictures import HOSTILE
+from pictures import HOSTILE, new_page
 
 from sros_tool.report.demo_page import render_demo_page, without_places
 
@@ -133,7 +133,7 @@ def test_it_opens_from_disk_and_runs_nothing(browser: Browser, built: Path, tmp_
     path = tmp_path / "demo.html"
     path.write_text(render_demo_page(result(*rows, cost=COST)))
     said: list[str] = []
-    page = browser.new_page()
+    page = new_page(browser)
     page.on("console", lambda message: said.append(message.text))
     page.goto(path.as_uri())
     assert not said

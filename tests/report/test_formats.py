@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from children import importing, python, run
 from harness import sros
 from lxml import etree
 from pictures import HOSTILE, MOBILE_ROBOT, hostile_permissions, mobile_robot
@@ -30,13 +28,8 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 def test_two_runs_write_the_same_bytes(form: str, robot_keystore: Path) -> None:
     found = set()
     for seed in ("1", "2"):
-        command = [sys.executable, "-m", "sros_tool", "view", str(robot_keystore), "--format", form]
-        done = subprocess.run(
-            command,
-            capture_output=True,
-            check=True,
-            env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": str(REPOSITORY)},
-        )
+        words = ("-m", "sros_tool", "view", robot_keystore, "--format", form)
+        done = python(*words, env=importing(PYTHONHASHSEED=seed))
         assert len(done.stdout) > 5000
         found.add(done.stdout)
     assert len(found) == 1
@@ -100,7 +93,7 @@ def test_dot_can_hold_any_name(tmp_path: Path) -> None:
     plain = re.sub(r'"(?:[^"\\]|\\.)*"', "", shown)
     assert re.fullmatch(r"[\w\s\[\]{}=,.;#>/-]*", plain), plain
     if shutil.which("dot"):
-        subprocess.run(["dot", "-Tsvg"], input=shown, text=True, check=True, capture_output=True)
+        run(["dot", "-Tsvg"], said=shown)
 
 
 def test_mermaid_holds_no_letter_of_markup_in_a_label(tmp_path: Path) -> None:

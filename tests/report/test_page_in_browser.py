@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from harness import sros
-from pictures import HOSTILE, MOBILE_ROBOT, NOW, group, hostile_permissions, large_policy
+from pictures import HOSTILE, MOBILE_ROBOT, NOW, group, hostile_permissions, large_policy, new_page
 
 from sros_tool.explain.flow import OF_EVERY_NODE, Network
 from sros_tool.explain.unguarded import unguarded
@@ -42,7 +42,7 @@ def opened(browser: Browser, path: Path, **options: Any) -> Iterator[Page]:
     """The page, opened from disk; afterwards nothing may have failed, or have been asked for."""
     said: list[str] = []
     asked: list[str] = []
-    page = browser.new_page(**{"viewport": {"width": 1440, "height": 900}, **options})
+    page = new_page(browser, **{"viewport": {"width": 1440, "height": 900}, **options})
     page.on("console", lambda message: said.append(message.text))
     page.on("pageerror", lambda error: said.append(str(error)))
     page.on("request", lambda request: asked.append(request.url))
@@ -426,7 +426,7 @@ def test_the_policy_of_the_page_stops_what_the_escaping_would_miss(
     broken = tmp_path / "broken.html"
     hole = "<script>window.broken=1</script><img src=x onerror=window.broken=2></body>"
     broken.write_text(robot_page.read_text().replace("</body>", hole))
-    page = browser.new_page()
+    page = new_page(browser)
     page.goto(broken.as_uri())
     page.wait_for_selector("body[data-ready]")
     assert page.evaluate("window.broken") is None
@@ -436,22 +436,27 @@ def test_the_policy_of_the_page_stops_what_the_escaping_would_miss(
 def test_a_hundred_enclaves_and_a_thousand_names_open_fast(
     browser: Browser, tmp_path: Path
 ) -> None:
-    source, path = tmp_path / "large.xml", tmp_path / "large.html"
-    source.write_text(large_policy(10, 10, 10))
-    sros("view", source, "-o", path).ok()
-    assert path.stat().st_size < 2_000_000
-    taken = []
+    """Ten times as much takes a few times as long, and not a hundred times."""
+    paths = {}
+    for robots in (1, 10):
+        source, paths[robots] = tmp_path / f"{robots}.xml", tmp_path / f"{robots}.html"
+        source.write_text(large_policy(robots, 10, 10))
+        sros("view", source, "-o", paths[robots]).ok()
+    assert paths[10].stat().st_size < 2_000_000
+    taken: dict[int, list[float]] = {1: [], 10: []}
     for _ in range(3):  # whatever else runs on the machine
-        begin = time.perf_counter()
-        with opened(browser, path) as page:
-            taken.append(time.perf_counter() - begin)
-            assert page.locator("#map .card.group").count() >= 10
-            page.click("#map .card.group >> nth=2")
-            assert page.locator("#map .card.enclave").count() >= 10
-            page.fill("#search", "/robot7/part3/t4")
-            page.keyboard.press("Enter")
-            assert "/robot7/part3" in details(page)
-    assert min(taken) < 2, taken
+        for robots, path in paths.items():
+            begin = time.perf_counter()
+            with opened(browser, path):
+                taken[robots].append(time.perf_counter() - begin)
+    assert min(taken[10]) < 20 * min(taken[1]), taken
+    with opened(browser, paths[10]) as page:
+        assert page.locator("#map .card.group").count() >= 10
+        page.click("#map .card.group >> nth=2")
+        assert page.locator("#map .card.enclave").count() >= 10
+        page.fill("#search", "/robot7/part3/t4")
+        page.keyboard.press("Enter")
+        assert "/robot7/part3" in details(page)
 
 
 def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from children import python
 
 from sros_tool.errors import UnavailableError
 from sros_tool.runtime import netns
@@ -91,5 +91,5 @@ def test_importing_loads_no_library() -> None:
         "import sros_tool.runtime.cyclone, sros_tool.runtime.stacks, sros_tool.demo.program;"
         "print(open('/proc/self/maps').read().count('libddsc'))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = python("-c", code)
     assert done.stdout.strip() == "0"
