@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from children import LONG
 from harness import policy_text, publish, sros
+from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadScopeScheduling  # type: ignore[import-untyped]
 
 STARTED_ONCE = ("test_generate_policy.py", "test_demo_run.py", "test_policies_live.py")
@@ -18,6 +20,14 @@ STARTED_ONCE = ("test_generate_policy.py", "test_demo_run.py", "test_policies_li
 
 POLICY = policy_text({"/a": publish("old_a"), "/b": publish("old_b")})
 
+# How long an example takes says something of the machine, not of what is tested.
+settings.register_profile(
+    "sros",
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    max_examples=1000 if LONG else 100,
+)
+settings.load_profile("sros")
 
 for each in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
     # Whoever starts the tests in the background may have had them ignored, and children inherit it.

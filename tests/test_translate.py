@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import UTC, datetime, timedelta
 from itertools import combinations
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sros_tool.dds.domains import DomainSet
@@ -179,7 +179,6 @@ def decided(rules: tuple[TopicRule, ...], topic: str) -> TopicRule:
     return next(rule for rule in rules if covers(rule.topic_expression, topic))
 
 
-@settings(deadline=None)
 @given(protections)
 def test_no_topic_rule_is_hidden_by_a_wider_one(protection: DomainProtection) -> None:
     (rule,) = governance_for(protection, DOMAINS).domain_access_rules

@@ -7,6 +7,7 @@ import platform
 from pathlib import Path
 
 import pytest
+from children import LONG
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -24,7 +25,7 @@ def fnmatch(expression: str, name: str) -> bool:
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="Fast DDS asks the C library")
-@settings(max_examples=2000, deadline=None)
+@settings(max_examples=5000 if LONG else 500)
 @given(expressions, names)
 @example("rt/[^a-c]", "rt/x")
 @example("[[:digit:]]", "1")
@@ -46,7 +47,7 @@ def cyclone() -> ctypes.CDLL:
     return library
 
 
-@settings(max_examples=2000, deadline=None)
+@settings(max_examples=5000 if LONG else 500)
 @given(expressions, names)
 @example("rt/[ab]-x", "rt/q")
 @example("[ab]", "]")

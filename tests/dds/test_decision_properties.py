@@ -9,7 +9,7 @@ from zoneinfo import ZoneInfo
 import pytest
 from decision_documents import NOW
 from drawn_documents import Case, cases, documents
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 
@@ -44,7 +44,6 @@ def decisions(vendor: Vendor, case: Case) -> list[Decision]:
     return [access.decide(*question) for question in case.questions]
 
 
-@settings(deadline=None)
 @given(cases(), st.sampled_from(Vendor))
 def test_every_question_has_an_answer_with_its_reason(case: Case, vendor: Vendor) -> None:
     for answer in decisions(vendor, case):
@@ -56,7 +55,6 @@ def test_every_question_has_an_answer_with_its_reason(case: Case, vendor: Vendor
             assert answer.grant is not None
 
 
-@settings(deadline=None)
 @given(cases(portable=True))
 def test_vendors_agree_within_the_portable_profile(case: Case) -> None:
     answers = {vendor: decisions(vendor, case) for vendor in Vendor}
@@ -71,7 +69,6 @@ def test_portable_cases_are_worth_asking() -> None:
     assert {Outcome.ALLOWED, Outcome.DENIED, Outcome.REFUSED} <= set(outcomes)
 
 
-@settings(deadline=None)
 @given(cases(), st.sampled_from(Vendor), LETTERS, st.booleans())
 def test_an_allow_rule_at_the_end_takes_no_right_away(
     case: Case, vendor: Vendor, topic: str, publish: bool

@@ -7,7 +7,7 @@ import string
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 
@@ -83,7 +83,6 @@ def schema(name: str) -> etree.XMLSchema:
 PERMISSIONS, GOVERNANCE = schema("dds_permissions"), schema("dds_governance")
 
 
-@settings(deadline=None)
 @given(permissions)
 def test_permissions_read_back(meant: Permissions) -> None:
     document = render_permissions(meant)
@@ -93,7 +92,6 @@ def test_permissions_read_back(meant: Permissions) -> None:
         PERMISSIONS.assertValid(etree.fromstring(document))
 
 
-@settings(deadline=None)
 @given(governances)
 def test_governance_reads_back(meant: Governance) -> None:
     document = render_governance(meant)
@@ -142,7 +140,6 @@ def test_permissions_that_are_none(old: str, new: str) -> None:
         parse_permissions(broken.encode())
 
 
-@settings(deadline=None)
 @given(st.binary(max_size=80) | texts.map(str.encode))
 def test_any_bytes_are_a_document_or_an_error(data: bytes) -> None:
     for parse in (parse_permissions, parse_governance):

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from children import LONG, PATIENCE
 from enforcing import BACKENDS, enforcing_backend
 from harness import snapshot, sros
 from test_demo_run import processes_with, start
@@ -32,8 +33,6 @@ pytestmark = pytest.mark.dds
 ISOLATION = try_isolation()
 needs_isolation = pytest.mark.skipif(not ISOLATION.isolated, reason=ISOLATION.reason)
 SIGNED_BY_ITSELF = "permissions signed by the enclave itself"
-LIMIT = 600
-"""Seconds that nothing takes, on however busy a machine."""
 NEEDS_ROOT = {"identity copied by another user of the robot"}
 
 
@@ -57,7 +56,7 @@ def shown(
     temporary = folder / "tmp"
     temporary.mkdir()
     process = demo(backend, "--json", "--summary", str(summary), folder=temporary)
-    output, errors = process.communicate(timeout=LIMIT)
+    output, errors = process.communicate(timeout=PATIENCE)
     assert not errors
     assert not list(temporary.iterdir())
     return json.loads(output), process.returncode, summary
@@ -93,7 +92,7 @@ def test_a_weakness_makes_its_rows_fail_and_no_others(
 ) -> None:
     """Of the rows that keep their defences: all that must fail, and of the others every second.
 
-    One weakness tries the even ones and the next the odd; with ``SROS_ALL_ROWS`` each tries all.
+    One weakness tries the even ones and the next the odd; in the long form each tries all.
     """
     weakness = WEAKNESSES[name]
     broken = weakness.broken_on(backend)
@@ -101,14 +100,14 @@ def test_a_weakness_makes_its_rows_fail_and_no_others(
     tried = [
         row.name
         for number, row in enumerate(row for row in ATTACKS.rows if not row.removed)
-        if number % 2 == turn or row.name in broken or "SROS_ALL_ROWS" in os.environ
+        if number % 2 == turn or row.name in broken or LONG
     ]
     root = make_weak(tmp_path, weakness, datetime.now(UTC))
     before = snapshot(root)
     words = [word for row in tried for word in ("--only", row)]
     chosen = ("--template", "production", "--keystore", str(root), "--json", *words)
     process = demo(backend, *chosen, folder=tmp_path)
-    output, errors = process.communicate(timeout=LIMIT)
+    output, errors = process.communicate(timeout=PATIENCE)
     assert snapshot(root) == before
     assert not errors
     rows = {row["name"]: row for row in json.loads(output)["rows"]}
@@ -126,12 +125,12 @@ def test_a_weakness_makes_its_rows_fail_and_no_others(
 @needs_isolation
 def test_interrupted_attacks_leave_nothing(backend: Backend, tmp_path: Path) -> None:
     process = demo(backend, folder=tmp_path)
-    deadline = time.monotonic() + LIMIT
+    deadline = time.monotonic() + PATIENCE
     while len(list(tmp_path.glob("sros-demo-*/rows/row_*/*.jsonl"))) < 10:
         assert time.monotonic() < deadline
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=LIMIT)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
     assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []

@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from children import PATIENCE
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.model import UNSECURED, Identity
@@ -74,7 +75,7 @@ def child(keystores: Scenery) -> Callable[[Identity, str], list[str]]:
             env={**environment, "PYTHONPATH": str(Path(__file__).parents[2])},
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=PATIENCE,
         )
         assert done.returncode == 0, done.stderr
         return done.stdout.splitlines()

@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+from children import PATIENCE
 from enforcing import enforcing_backend
 from harness import sros
 from test_demo_run import without_security
@@ -54,7 +55,7 @@ def node(module: str, folder: Path, *arguments: str, **more: str) -> subprocess.
     )
 
 
-def wait_for(path: Path, kind: Kind, seconds: float = 30) -> list[Event]:
+def wait_for(path: Path, kind: Kind, seconds: float = PATIENCE) -> list[Event]:
     deadline = time.monotonic() + seconds
     while True:
         events = read_events(path)
@@ -121,7 +122,7 @@ def test_nodes_take_ros_arguments_and_end_quietly(number: signal.Signals, tmp_pa
         for process in (listener, talker):
             process.send_signal(number)
     for process in (listener, talker):
-        output, errors = process.communicate(timeout=20)
+        output, errors = process.communicate(timeout=PATIENCE)
         assert process.returncode == 0
         assert "Traceback" not in errors
     assert "[ear]: I heard: 'Hi: " in output + errors or listener.returncode == 0
@@ -138,7 +139,7 @@ def test_a_cyclone_talker_is_heard_by_an_rclpy_listener(tmp_path: Path) -> None:
     finally:
         for process in (listener, talker):
             process.terminate()
-            process.communicate(timeout=20)
+            process.communicate(timeout=PATIENCE)
 
 
 def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
@@ -153,9 +154,9 @@ def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
     if stack.enforces:
         wait_for(tmp_path / "talker.jsonl", Kind.READY)
         talker.terminate()
-        talker.communicate(timeout=20)
+        talker.communicate(timeout=PATIENCE)
         return
-    _, errors = talker.communicate(timeout=60)
+    _, errors = talker.communicate(timeout=PATIENCE)
     assert talker.returncode == 1
     (failed,) = read_events(tmp_path / "talker.jsonl")
     assert (failed.kind, failed.stage) == (Kind.FAILED, Stage.PARTICIPANT)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from children import PATIENCE
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.isolated import run_isolated
@@ -58,7 +59,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], int
     keep = folder / "kept"
     arguments = ["--backend", "cyclone", "--json", "--domain", "140", "--keep", str(keep)]
     process = start("demo", *arguments, folder=folder)
-    output, errors = process.communicate(timeout=90)
+    output, errors = process.communicate(timeout=PATIENCE)
     assert not errors
     return json.loads(output), process.returncode, keep
 
@@ -95,13 +96,13 @@ def test_an_interrupted_demo_leaves_nothing(
     number: signal.Signals, after: str, tmp_path: Path
 ) -> None:
     process = start("demo", "--backend", "cyclone", "--domain", "160", folder=tmp_path)
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + PATIENCE
     wanted = "sros-demo-*/rows/row_*/*.jsonl" if after == "while rows run" else "sros-demo-*"
     while not list(tmp_path.glob(wanted)):
         assert time.monotonic() < deadline
         time.sleep(0.02)
     process.send_signal(number)
-    _, errors = process.communicate(timeout=15)
+    _, errors = process.communicate(timeout=PATIENCE)
     assert process.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143}[number]
     assert "Traceback" not in errors
     assert list(tmp_path.iterdir()) == []
@@ -110,13 +111,13 @@ def test_an_interrupted_demo_leaves_nothing(
 
 def test_no_node_outlives_a_killed_demo(tmp_path: Path) -> None:
     process = start("demo", "--backend", "cyclone", "--domain", "160", folder=tmp_path)
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + PATIENCE
     while not list(tmp_path.glob("sros-demo-*/rows/row_*/*.jsonl")):
         assert time.monotonic() < deadline
         time.sleep(0.02)
     assert processes_with(str(tmp_path))
     process.kill()
-    process.communicate(timeout=15)
+    process.communicate(timeout=PATIENCE)
     while processes_with(str(tmp_path)):
         assert time.monotonic() < deadline
         time.sleep(0.02)
@@ -211,7 +212,7 @@ def test_an_error_of_the_runner_is_an_error_of_the_demo() -> None:
 
 def test_doctor_finds_what_enforces(tmp_path: Path) -> None:
     process = start("doctor", "--json", folder=tmp_path, ROS_SECURITY_ENABLE="True")
-    output, _ = process.communicate(timeout=90)
+    output, _ = process.communicate(timeout=PATIENCE)
     found = json.loads(output)
     stacks = {stack["kind"]: stack for stack in found["stacks"]}
     assert stacks["cyclone"]["enforces"] is True
@@ -222,7 +223,7 @@ def test_doctor_finds_what_enforces(tmp_path: Path) -> None:
 
 def test_doctor_says_what_to_install(tmp_path: Path) -> None:
     process = start("doctor", folder=tmp_path, SROS_CYCLONEDDS_DIR=str(tmp_path))
-    output, _ = process.communicate(timeout=90)
+    output, _ = process.communicate(timeout=PATIENCE)
     assert "libddsc0debian" in output
     assert process.returncode == (0 if "enforces security" in output else 1)
 
@@ -239,7 +240,7 @@ if "without_permission" in argument["--report"]:
     events.report(Kind.FAILED, "RCLError: invalid allocator", stage=Stage.ENDPOINT)
     sys.exit(1)
 events.report(Kind.READY)
-import time; time.sleep(60)
+import time; time.sleep(600)
 """
 
 

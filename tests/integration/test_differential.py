@@ -2,7 +2,7 @@
 
 First row by row what was found out about them, then documents drawn in two ways: such as people
 write, with one oddity at most, and such as nobody would.  How many of each: $SROS_DIFFERENTIAL
-(250); from which seed: $SROS_DIFFERENTIAL_SEED (1).
+(100, in the long form 2000); from which seed: $SROS_DIFFERENTIAL_SEED (1).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 from zoneinfo import ZoneInfo
 
 import pytest
+from children import LONG
 from drawn_cases import cases as drawn_cases
 from drawn_documents import documents
 from fastdds import fastdds_vendor
@@ -36,7 +37,7 @@ from sros_tool.dds.decision import TRAITS, Access, Outcome, Refusal, Traits, Ven
 
 pytestmark = pytest.mark.dds
 
-COUNT = int(os.environ.get("SROS_DIFFERENTIAL", "250"))
+COUNT = int(os.environ.get("SROS_DIFFERENTIAL", "2000" if LONG else "100"))
 SEED = int(os.environ.get("SROS_DIFFERENTIAL_SEED", "1"))
 FASTS = (Vendor.FAST, Vendor.FAST_2_9)
 Draw = Callable[[int, int, datetime], list[Case]]

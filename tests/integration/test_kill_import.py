@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from harness import remains, snapshot
 from kills import Moments, Server, server
-from test_kill_life import DIED, copy, in_child
+from test_kill_life import DIED, copy, in_child, to_try
 
 from sros_tool.keystore import create_enclaves, create_keystore, filesystem
 from sros_tool.keystore.answer import import_answer
@@ -84,7 +84,7 @@ def test_death_at_every_step(
     assert status == 0
     expected = settled(work)
     outcomes = set()
-    for step in range(1, steps + 1):
+    for step in to_try(steps):
         copy(folder, work)
         assert in_child(run, step) == (DIED, 0), step
         outcomes.add(see(work, folder))

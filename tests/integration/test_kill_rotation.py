@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from harness import check_enclave_whole, remains
 from kills import Moments, Server, server
-from test_kill_life import DIED, copy, in_child
+from test_kill_life import DIED, copy, in_child, to_try
 
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore import create_enclaves, create_keystore, filesystem, list_enclaves
@@ -90,7 +90,7 @@ def test_death_at_every_step_of_revoking_between_stages(
     assert status == 0
     expected = settled(work)
     outcomes = set()
-    for step in range(1, steps + 1):
+    for step in to_try(steps):
         copy(life, work)
         assert in_child(lambda: revoke_once(work), step) == (DIED, 0), step
         now = see(work)

@@ -52,7 +52,7 @@ def test_the_policies_that_ship(file: Path) -> None:
         assert differences(enclave, made, DOMAINS, ASKED) == []
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(policies())
 def test_whatever_compares_equal_is_decided_equally(policy: Policy) -> None:
     """The step from equal sets to equal decisions, on the engine, for policies of every kind."""
@@ -62,7 +62,7 @@ def test_whatever_compares_equal_is_decided_equally(policy: Policy) -> None:
         assert differences(enclave, made, DOMAINS, ASKED) == []
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=30)
 @given(policies())
 def test_what_is_stated_is_what_the_rights_of_the_policy_say(policy: Policy) -> None:
     """The DDS names of the proof are those of the translation, by the policy's own meaning."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from datetime import timedelta
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sros_tool.keystore.template import (
@@ -67,7 +67,6 @@ templates = st.builds(
 )
 
 
-@settings(deadline=None)
 @given(templates)
 def test_a_template_reads_back(template: Template) -> None:
     assert parse_template(render_template(template), "other") == template

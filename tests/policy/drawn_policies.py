@@ -5,7 +5,6 @@ from __future__ import annotations
 from datetime import UTC, datetime, timedelta
 from fnmatch import fnmatchcase
 
-from hypothesis import settings
 from hypothesis import strategies as st
 
 from sros_tool.dds.domains import DomainSet
@@ -15,9 +14,6 @@ from sros_tool.policy import RIGHTS, Enclave, Group, Policy, Profile, Profiles, 
 from sros_tool.policy.rights import KIND_OF
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
-
-patient = settings(deadline=None)
-"""Machines are shared: how long an example takes says nothing about it."""
 
 EXACT = ("x", "y", "sub/x", "/x", "/ns/x", "~/p", "/ns/n/p", "fib", "/ns/fib", "fib/_action/status")
 WILD = ("*", "/*", "/ns/*", "~/*", "x*", "?", "/[xy]", "sub/?", "/n?/*", "fib/_action/*", "/*/_*/*")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from drawn_policies import PATHS, listed, patient, policies
+from drawn_policies import PATHS, listed, policies
 from hypothesis import given
 
 from sros_tool.policy import ALLOW, DENY, Policy
@@ -14,7 +14,6 @@ def right(name: str, word: str = "publish", enclave: str = "/a") -> Right:
     return Right(enclave, ALLOW, word, name)
 
 
-@patient
 @given(policies(), policies())
 def test_empty_just_if_the_permissions_list_the_same(first: Policy, second: Policy) -> None:
     same = all(
@@ -25,7 +24,6 @@ def test_empty_just_if_the_permissions_list_the_same(first: Policy, second: Poli
     assert bool(compare(policy_rights(first), policy_rights(second))) is not same
 
 
-@patient
 @given(policies(), policies())
 def test_the_other_way_round_it_is_the_same(first: Policy, second: Policy) -> None:
     one, other = policy_rights(first), policy_rights(second)

@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from drawn_policies import PATHS, effective, meant, patient, policies
+from drawn_policies import PATHS, effective, meant, policies
 from hypothesis import given, settings
 
 from sros_tool.policy import ALLOW, DENY, Group, Policy, read_policy, write_policy
@@ -40,7 +40,7 @@ def merged(first: Policy, second: Policy) -> Policy:
         return after
 
 
-@settings(patient, max_examples=60)
+@settings(max_examples=60)
 @given(policies(), policies())
 def test_merging_is_the_union_whichever_comes_first(first: Policy, second: Policy) -> None:
     forward, backward = merged(first, second), merged(second, first)
@@ -51,7 +51,6 @@ def test_merging_is_the_union_whichever_comes_first(first: Policy, second: Polic
         assert effective(backward, path) == allowed - denied
 
 
-@patient
 @given(policies())
 def test_merging_with_itself_adds_nothing(policy: Policy) -> None:
     plan = plan_merge(policy, policy)

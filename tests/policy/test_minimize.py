@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from drawn_policies import effective, exact_names, listed, meant, patient, policies
+from drawn_policies import effective, exact_names, listed, meant, policies
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -47,7 +47,7 @@ def use(given_policy: Policy, *rights: str, common: tuple[Group, ...] = ()) -> E
     return minimize(given_policy, seen(*rights), common).uses[0]
 
 
-@settings(patient, max_examples=100)
+@settings(max_examples=100)
 @given(
     policies(),
     st.one_of(policies(qualifier=st.just(ALLOW)), policies(exact_names, st.just(ALLOW))),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from harness import with_includes
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 
@@ -84,7 +84,6 @@ SCHEMA = etree.XMLSchema(
 )
 
 
-@settings(deadline=None)
 @given(policies)
 def test_a_policy_reads_back(policy: Policy) -> None:
     document = write_policy(policy)

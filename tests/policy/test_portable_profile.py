@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta, timezone
 
-from drawn_policies import EVERYTHING, PATHS, patient, policies
+from drawn_policies import EVERYTHING, PATHS, policies
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -26,7 +26,7 @@ NOW = datetime(2026, 7, 1, tzinfo=UTC)
 DOMAINS = DomainSet.of((0, 0))
 
 
-@settings(patient, max_examples=150)
+@settings(max_examples=150)
 @given(policies(), st.sampled_from(template_names()), st.sampled_from([-12, -8, 0, 9, 14]))
 def test_vendors_agree(policy: Policy, template: str, zone: int) -> None:
     governance = render_governance(governance_for(load_template(template).protection, DOMAINS))

@@ -6,7 +6,7 @@ from fnmatch import fnmatchcase
 from itertools import product
 
 import pytest
-from drawn_policies import PATHS, effective, grant_of, patient, policies
+from drawn_policies import PATHS, effective, grant_of, policies
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -49,7 +49,6 @@ def test_covers(wide: str, narrow: str, is_covered: bool) -> None:
     assert covers(wide, narrow) is is_covered
 
 
-@patient
 @given(expressions, expressions)
 def test_covering_and_overlapping_are_true_of_every_name(one: str, other: str) -> None:
     first = {word for word in WORDS if fnmatchcase(word, one)}
@@ -61,7 +60,6 @@ def test_covering_and_overlapping_are_true_of_every_name(one: str, other: str) -
     assert overlap(one, other) == overlap(other, one)
 
 
-@patient
 @given(policies())
 def test_permissions_tell_the_same_rights_as_their_policy(policy: Policy) -> None:
     for path in PATHS:
@@ -69,7 +67,6 @@ def test_permissions_tell_the_same_rights_as_their_policy(policy: Policy) -> Non
         assert folded(grant_rights(path, grant_of(policy, path))) == folded(own)
 
 
-@patient
 @given(policies())
 def test_folding_changes_no_right(policy: Policy) -> None:
     rights = policy_rights(policy)
@@ -77,7 +74,6 @@ def test_folding_changes_no_right(policy: Policy) -> None:
     assert folded(folded(rights)) == folded(rights)
 
 
-@patient
 @given(policies())
 def test_rules_answer_as_dds_does(policy: Policy) -> None:
     rules = Rules(policy_rights(policy))
