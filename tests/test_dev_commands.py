@@ -263,6 +263,38 @@ def test_counts_come_from_the_reports_of_pytest(tmp_path: Path) -> None:
     assert checks.count(tmp_path / "none.xml") == {}
 
 
+@pytest.mark.parametrize(
+    ("arguments", "started"),
+    [
+        ([], ["check", "format", "mypy", "not dds", "dds"]),
+        (["--long"], ["check", "format", "mypy", "not dds", "dds"]),
+        (["-k", "x"], ["check", "format", "mypy", "-k x"]),
+    ],
+)
+def test_every_check_is_run_and_shown_and_the_worst_counts(
+    arguments: list[str],
+    started: list[str],
+    venv: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    python = venv / "python"
+    ends = 'case "$*" in *mypy*) exit 3;; *"-m dds"*) exit 5;; esac'
+    python.write_text(f'#!/bin/sh\necho "ran $SROS_LONG: $*"\n{ends}\n')
+    python.chmod(0o755)
+    for name, value in (("PYTHON", python), ("VENV", venv), ("CHECKOUT", venv)):
+        monkeypatch.setattr(checks, name, value)
+    monkeypatch.setattr(checks, "read_record", Record)
+    assert checks.run(arguments, {"PATH": "/usr/bin:/bin"}, with_tests=True) == 3
+    lines = capfd.readouterr().out.splitlines()
+    ran = [line for line in lines if line.startswith("ran ")]
+    assert len(ran) == len(started)
+    assert all(any(word in line for line in ran) for word in started)
+    assert all(line.startswith("ran 1:") is ("--long" in arguments) for line in ran)
+    assert "mypy FAILED (3); " in lines[-1]
+    assert lines[-1].startswith("ruff check ok; ruff format ok; ")
+
+
 def test_one_package_that_fails_does_not_keep_the_others_away(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -8,6 +8,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,45 +20,66 @@ _NOTHING_COLLECTED = 5
 
 _PLUGINS = "xdist.plugin,_hypothesis_pytestplugin"
 
-LINTERS = {
+LONG = "--long"
+"""The argument that brings the long forms of the tests, as the variable SROS_LONG does."""
+
+RUFF = {
     "ruff check": ["-m", "ruff", "check", "--quiet"],
     "ruff format": ["-m", "ruff", "format", "--check", "--quiet"],
-    "mypy": ["-m", "mypy", "--no-error-summary"],
 }
+MYPY = {"mypy": ["-m", "mypy", "--no-error-summary"]}
 
 
 def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> int:
     """Run every check whatever the others say; return the worst exit status.
 
-    Without ``arguments`` the tests that start DDS processes run by themselves, after the others
-    have used all cores, and more of them at once than there are cores: each is in a network of its
-    own and mostly waits for real time to pass.  With ``arguments`` pytest runs once, with just
-    these.
+    Without ``arguments`` the tests that start DDS processes run beside the others, and so does
+    mypy: their output follows when the others have ended.  There are more of them at once than
+    there are cores: each is in a network of its own and mostly waits for real time to pass.  With
+    ``arguments`` pytest runs once, with just these.
     """
     started = time.monotonic()
     if read_record().ros_around:
         # ROS 2 brings pytest plugins of its own, made for other versions of pytest.
         env = {**env, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": _PLUGINS}
-    results = {name: _python(words, env, name) for name, words in LINTERS.items()}
-    counts: Counter[str] = Counter()
-    if with_tests and not arguments:
-        # The table is shown, not judged: how fast a shared machine is proves nothing.
-        results["benchmarks"] = _python(["-m", "benchmarks", "--rounds", "1"], env, "benchmarks")
-    if with_tests and arguments:
-        results["pytest"] = _python(["-m", "pytest", *arguments], env, "pytest")
-    elif with_tests:
-        cores = len(os.sched_getaffinity(0))
-        parts = {
-            "tests": ["-m", "not dds", "-n", str(cores)],
-            "tests on a real DDS": ["-m", "dds", "-n", str(2 * cores), "--dist", "loadscope"],
+    if LONG in arguments:
+        arguments = [each for each in arguments if each != LONG]
+        env = {**env, "SROS_LONG": "1"}
+    results = {name: _Step(name, words, env).end() for name, words in RUFF.items()}
+    if not with_tests or arguments:
+        steps = MYPY | ({"pytest": ["-m", "pytest", *arguments]} if with_tests else {})
+        results |= {name: _Step(name, words, env).end() for name, words in steps.items()}
+        return _conclude(results, Counter(), started)
+    cores = len(os.sched_getaffinity(0))
+    parts = {
+        "tests": ["-m", "not dds", "-n", str(cores)],
+        "tests on a real DDS": ["-m", "dds", "-n", str(2 * cores), "--dist", "loadscope"],
+    }
+    reports = {name: VENV / f"{name.replace(' ', '-')}.xml" for name in parts}
+    for report in reports.values():
+        report.unlink(missing_ok=True)
+    steps = MYPY | {
+        name: ["-m", "pytest", *words, f"--junit-xml={reports[name]}"]
+        for name, words in parts.items()
+    }
+    with ExitStack() as running:
+        # The one whose output is seen as it comes is started last, and ends first in general.
+        order = sorted(steps, key=lambda name: name == "tests")
+        begun = {
+            name: running.enter_context(_Step(name, steps[name], env, aside=name != "tests"))
+            for name in order
         }
-        for name, words in parts.items():
-            report = VENV / f"{name.replace(' ', '-')}.xml"
-            report.unlink(missing_ok=True)
-            command = ["-m", "pytest", *words, f"--junit-xml={report}"]
-            status = _python(command, env, name)
-            results[name] = 0 if status == _NOTHING_COLLECTED else status
-            counts += count(report)
+        ended = {name: begun[name].end() for name in reversed(order)}
+    for name in steps:
+        empty = name in parts and ended[name] == _NOTHING_COLLECTED
+        results[name] = 0 if empty else ended[name]
+    counts: Counter[str] = Counter()
+    for report in reports.values():
+        counts += count(report)
+    return _conclude(results, counts, started)
+
+
+def _conclude(results: Mapping[str, int], counts: Counter[str], started: float) -> int:
     verdicts = [f"{name} {_verdict(status)}" for name, status in results.items()]
     if counts:
         verdicts.append(", ".join(f"{number} {word}" for word, number in counts.items()))
@@ -83,10 +105,43 @@ def count(report: Path) -> Counter[str]:
     return found
 
 
-def _python(words: list[str], env: Mapping[str, str], name: str) -> int:
+class _Step:
+    """A check that runs; ``aside`` keeps its output until it has ended and is asked for it."""
+
+    def __init__(
+        self, name: str, words: list[str], env: Mapping[str, str], *, aside: bool = False
+    ) -> None:
+        self._name = name
+        self._output = (VENV / f"{name.replace(' ', '-')}.log").open("w+b") if aside else None
+        if not aside:
+            _say(name)
+        self._process = subprocess.Popen(
+            [PYTHON, *words], cwd=CHECKOUT, env=env, stdout=self._output, stderr=self._output
+        )
+
+    def end(self) -> int:
+        """Wait for its end, show what was kept, and return the exit status."""
+        status = self._process.wait()
+        if self._output:
+            _say(self._name)
+            self._output.seek(0)
+            sys.stdout.buffer.write(self._output.read())
+            sys.stdout.flush()
+        return status if status >= 0 else 128 - status
+
+    def __enter__(self) -> _Step:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process.poll() is None:  # interrupted
+            self._process.terminate()
+            self._process.wait()
+        if self._output:
+            self._output.close()
+
+
+def _say(name: str) -> None:
     print(f"dev: {name}", file=sys.stderr, flush=True)
-    ended = subprocess.run([PYTHON, *words], cwd=CHECKOUT, env=env, check=False)
-    return ended.returncode if ended.returncode >= 0 else 128 - ended.returncode
 
 
 def _verdict(status: int) -> str:

@@ -17,7 +17,8 @@ USAGE = """\
 Usage: ./dev COMMAND [ARGUMENTS…]
 
   demo [ARGUMENTS…]   show on a real DDS that secured nodes are closed to all others: sros demo
-  test [ARGUMENTS…]   ruff, mypy and pytest; ARGUMENTS go to pytest
+  test [ARGUMENTS…]   ruff, mypy and pytest; ARGUMENTS go to pytest, but --long: it brings more
+                      of what is drawn or killed at random, and takes much longer
   lint                ruff and mypy alone
   bench [ARGUMENTS…]  measure: python -m benchmarks
   sros ARGUMENTS…     run this checkout's sros
