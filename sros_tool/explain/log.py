@@ -33,7 +33,7 @@ from sros_tool.translate import grant_rights
 _CONTINUED = re.compile(r"^(?:[0-9A-F]{8,}:error:|\(code: )")
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
 """As what a topic stands in a line: between punctuation, or with it where it has some itself."""
-_IN_DOMAIN = re.compile(r"\] \S+\|\S+ (\d+) \w+::\w+ :")
+_IN_DOMAIN = re.compile(r"\] \S+\|\S+ (\d{1,9}) \w+::\w+ :")
 """The domain, in the file of ROS_SECURITY_LOG_FILE: behind the participant's identifier."""
 _NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
 _LONGEST = 8000
@@ -133,14 +133,21 @@ def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
         if named := SECURITY_DIRECTORY.search(line):
             enclaves[process] = named["enclave"] or "/"
             continue
-        for meaning in (*MEANINGS, *([] if is_denial(line) else [UNKNOWN])):
-            if match := meaning.pattern.search(line):
-                said = {name: text or "" for name, text in match.groupdict().items()}
-                if found := _IN_DOMAIN.search(line):
-                    said["domain"] = found[1]
-                enclave = enclaves.get(process, "")
-                yield _Hit(number, _without_label(line), process, enclave, meaning, said)
-                break
+        text = _without_label(line)
+        meaning, match = _meaning_of(line, text)
+        if meaning and match:
+            said = {name: found or "" for name, found in match.groupdict().items()}
+            if domain := _IN_DOMAIN.search(line):
+                said["domain"] = domain[1]
+            yield _Hit(number, text, process, enclaves.get(process, ""), meaning, said)
+
+
+def _meaning_of(line: str, text: str) -> tuple[Meaning | None, re.Match[str] | None]:
+    """What a line means, which is ``text`` without its label; UNKNOWN where only that is clear."""
+    for meaning in MEANINGS:
+        if match := meaning.pattern.search(line):
+            return meaning, match
+    return UNKNOWN, None if is_denial(line) else UNKNOWN.pattern.search(text)
 
 
 def _process(line: str) -> str:

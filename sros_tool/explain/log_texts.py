@@ -203,7 +203,7 @@ MEANINGS: tuple[Meaning, ...] = (
         "enclave, or to an earlier certificate", _SIGN, ("permissions-subject",),
     ),
     _meaning(
-        "domain", _CYCLONE, r"Could not find domain (?P<domain>\d+) in governance",
+        "domain", _CYCLONE, r"Could not find domain (?P<domain>\d{1,9}) in governance",
         "the governance is not for domain {domain}",
         _SET_DOMAIN, ("governance-domain",),
     ),
@@ -379,7 +379,8 @@ UNKNOWN = Meaning(
     re.compile(
         r"\[SECURITY\w* (?:Error|Warning)\]"
         r"|\[(?:EMERGENCY|ALERT|CRITICAL|ERROR|WARNING)\] \S+ \d+ \w+::\w+ :"
-        r"|\d+\.\d+ \[\d*\]\s+\S+: .*(?:[Ss]ecurity|handshake|[Pp]ermission|[Cc]ertificate|crypto)"
+        r"|\A\d+\.\d+ \[\d*\]\s+\S+: "
+        r".*(?:[Ss]ecurity|handshake|[Pp]ermission|[Cc]ertificate|crypto)"
         r"|SECURITY ERROR"
     ),
     "a line of DDS Security that sros does not know",

@@ -289,6 +289,7 @@ def test_single_lines(line: str, name: str) -> None:
         "2026-01-01 12:00:00.000 [SECURITY Error] Cannot find local writer 01.0f|0.0.1.c1",
         "2026-01-01 12:00:00.000 [SECURITY_CRYPTO Error] Invalid CryptoToken -> Function set",
         "[1795309573.65] [EMERGENCY] 01.0f|0.0.1.c1 0 PKIDH::begin_handshake_request : Bad thing",
+        "talker-1  | 1795242829.9 [0] python: Bad handshake",
         "1795242829.9 [0] python: Remote permissions could not be decoded by the security plugin",
     ],
 )
@@ -299,7 +300,7 @@ def test_what_is_not_understood_is_shown(line: str, tmp_path: Path) -> None:
     assert [each.id for each in explained(both)] == ["not-understood", "signature"]
     (tmp_path / "robot.log").write_text(line)
     said = sros("explain", "--log", tmp_path / "robot.log")
-    assert said.status == 1 and " ".join(line.split())[:100] in said.out
+    assert said.status == 1 and " ".join(line.split())[-20:] in said.out
 
 
 def test_what_tells_more_counts() -> None:
