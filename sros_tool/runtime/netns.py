@@ -33,7 +33,7 @@ _BELOW_DDS = "1024 7399"
 """Where no domain's ports are: those begin at 7400 (RTPS 2.5 §9.6.2.3)."""
 
 _ALONE = 0
-_TRIAL_SECONDS = 10
+_TRIAL_SECONDS = 60
 
 
 class _RouteEntry(ctypes.Structure):

@@ -24,7 +24,7 @@ from sros_tool.runtime.netns import end_with_parent
 from sros_tool.runtime.probing import ProbeRun, Verdict, judge
 from sros_tool.runtime.security_log import CYCLONE_EXPLAINS, plain_text
 
-PROBE_SECONDS = 20.0
+PROBE_SECONDS = 60.0
 
 _RMW_INDEX = "share/ament_index/resource_index/rmw_typesupport"
 _NOT_AN_RMW = "rmw_implementation"
