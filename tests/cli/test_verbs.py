@@ -489,11 +489,11 @@ def test_run_names_the_enclave_of_a_ros_node(keystore: Path, tmp_path: Path) -> 
         path.write_text(f"#!/bin/sh\n{text}\n")
     node.chmod(0o755)
     command = [*PROGRAM, "run", str(keystore), "/a", "--", str(node), "--fast"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    done = run(command)
     assert done.stdout == "--fast --ros-args --enclave /a\n"
     assert done.stderr.startswith("added --ros-args --enclave /a, so that the ROS graph shows")
     command = [*PROGRAM, "run", "--no-ros-args", str(keystore), "/a", "--", str(node), "--fast"]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
+    done = run(command)
     assert (done.stdout, done.stderr) == ("--fast\n", "")
 
 

@@ -8,12 +8,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from children import PATIENCE, finish
+from children import PATIENCE, finish, wait_for
 from enforcing import enforcing_backend
 from harness import sros
 from test_demo_run import without_security
@@ -56,14 +55,14 @@ def node(module: str, folder: Path, *arguments: str, **more: str) -> subprocess.
     )
 
 
-def wait_for(path: Path, kind: Kind, seconds: float = PATIENCE) -> list[Event]:
-    deadline = time.monotonic() + seconds
-    while True:
+def wait_until(kind: Kind, path: Path, process: subprocess.Popen[str]) -> list[Event]:
+    """Wait until a process has reported an event of that kind; return all that it reported."""
+
+    def found() -> list[Event]:
         events = read_events(path)
-        if any(event.kind is kind for event in events):
-            return events
-        assert time.monotonic() < deadline, f"{path.name} never said {kind}"
-        time.sleep(0.05)
+        return events if any(event.kind is kind for event in events) else []
+
+    return wait_for(found, f"{path.name} says {kind}", process, words=path.read_text)
 
 
 def test_the_runner_drives_rclpy_nodes(tmp_path: Path) -> None:
@@ -117,8 +116,8 @@ def test_nodes_take_ros_arguments_and_end_quietly(number: signal.Signals, tmp_pa
     listener = node("listener", tmp_path, *remap, "-r", "__node:=ear")
     talker = node("talker", tmp_path, "--period", "0.1", "--text", "Hi", *remap)
     try:
-        wait_for(tmp_path / "talker.jsonl", Kind.READY)
-        heard = wait_for(tmp_path / "listener.jsonl", Kind.HEARD)
+        wait_until(Kind.READY, tmp_path / "talker.jsonl", talker)
+        heard = wait_until(Kind.HEARD, tmp_path / "listener.jsonl", listener)
         assert heard[-1].text.startswith("Hi: ")
     finally:
         for process in (listener, talker):
@@ -133,7 +132,7 @@ def test_a_cyclone_talker_is_heard_by_an_rclpy_listener(tmp_path: Path) -> None:
     listener = node("listener", tmp_path)
     talker = node("cyclone_node", tmp_path, "talker", "--period", "0.1", "--text", "Cyclone")
     try:
-        heard = wait_for(tmp_path / "listener.jsonl", Kind.HEARD)
+        heard = wait_until(Kind.HEARD, tmp_path / "listener.jsonl", listener)
         assert heard[-1].text.startswith("Cyclone: ")
     finally:
         for process in (listener, talker):
@@ -151,7 +150,7 @@ def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
     variables = keystores.environment(TALKER, 190)
     talker = node("talker", tmp_path, **variables)
     if stack.enforces:
-        wait_for(tmp_path / "talker.jsonl", Kind.READY)
+        wait_until(Kind.READY, tmp_path / "talker.jsonl", talker)
         talker.terminate()
         talker.communicate(timeout=PATIENCE)
         return

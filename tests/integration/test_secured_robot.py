@@ -6,13 +6,12 @@ Runs where rclpy enforces DDS Security, and is skipped elsewhere.
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 import pytest
+from children import PATIENCE, python
 from enforcing import enforcing_backend
 from test_nodes_fit_their_enclaves import nodes_of
 
@@ -30,7 +29,6 @@ pytestmark = pytest.mark.dds
 
 SCRIPT = Path(__file__).with_name("ros_nodes") / "secured_robot.py"
 DOMAIN = 188
-PATIENCE_SECONDS = 180
 
 INSTANCES: dict[str, dict[str, dict[str, list[str]]]] = {
     "/mobile_robot/camera": {"driver": {"publish": ["image_raw/compressed"]}},
@@ -100,16 +98,9 @@ def test_the_robot_runs_secured_and_is_learned_again(robot: Policy, tmp_path: Pa
         "learn": ["generate_policy", "learned.xml", "--keystore", str(keystore),
                   "--enclave", "/sros_observer"],
         "until": sorted(wanted),
-        "patience": PATIENCE_SECONDS,
+        "patience": PATIENCE,
     }  # fmt: skip
-    done = subprocess.run(
-        [sys.executable, str(SCRIPT)],
-        input=json.dumps(task),
-        capture_output=True,
-        text=True,
-        timeout=4 * PATIENCE_SECONDS,
-    )
-    assert done.returncode == 0, done.stderr
+    done = python(SCRIPT, said=json.dumps(task), patience=4 * PATIENCE)
     said = json.loads(done.stdout.splitlines()[-1])
     assert said["ended"] == []
     for enclave, log in said["logs"].items():

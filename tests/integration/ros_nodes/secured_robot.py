@@ -17,6 +17,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+from children import run
+
 from sros_tool.errors import SrosError
 from sros_tool.policy import read_policy
 from sros_tool.policy.rights import policy_rights
@@ -71,9 +73,7 @@ def main() -> None:
         wait_until_ready(running, logs)
         deadline = time.monotonic() + task["patience"]
         while True:
-            done = subprocess.run(
-                [*SROS, *task["learn"]], cwd=folder, capture_output=True, text=True, timeout=300
-            )
+            done = run([*SROS, *task["learn"]], status=None, cwd=folder)
             said = learned(folder / "learned.xml") >= set(task["until"])
             if said or time.monotonic() > deadline:
                 break
