@@ -31,8 +31,10 @@ def run_ros_node(name: str, options: NodeOptions, arguments: Sequence[str], buil
         return _fail(name, error, Stage.IMPORT, events)
     stage = Stage.PARTICIPANT
     nodes: list[Any] = []
+    joined = False
     try:
         rclpy.init(args=list(arguments))
+        joined = True
         nodes.append(rclpy.create_node(name))
         stage = Stage.ENDPOINT
         nodes += build(nodes[0], events) or ()
@@ -44,7 +46,9 @@ def run_ros_node(name: str, options: NodeOptions, arguments: Sequence[str], buil
     except ImportError as error:
         return _fail(name, error, Stage.IMPORT, events)
     except Exception as error:
-        return _fail(name, error, stage, events)
+        # A signal ends the context, and what is being made then fails by that.
+        if rclpy.ok() or not joined:
+            return _fail(name, error, stage, events)
     finally:
         # Leaves the domain, and nothing in shared memory; what is half made may well complain.
         with suppress(Exception):

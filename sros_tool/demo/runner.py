@@ -38,14 +38,15 @@ _BRIEFEST = 1.0
 class Limits:
     """Seconds: to start in, the shortest and longest window, and for all rows together.
 
-    ``wave`` is for as many rows as run at once; many rows have more than ``total``.
+    ``wave`` is for as many rows as run at once; many rows have more than ``total``.  All but the
+    shortest window only tell a machine that is slow from a process that hangs.
     """
 
-    start: float = 20.0
+    start: float = 60.0
     window: float = 5.0
-    longest_window: float = 15.0
-    total: float = 50.0
-    wave: float = 25.0
+    longest_window: float = 30.0
+    total: float = 180.0
+    wave: float = 90.0
 
 
 @dataclass(frozen=True)

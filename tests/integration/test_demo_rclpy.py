@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from children import PATIENCE, finish, wait_for
+from children import PATIENCE, finish, python, wait_for
 from enforcing import enforcing_backend
 from harness import sros
 from test_demo_run import without_security
@@ -161,3 +161,29 @@ def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
     assert "security" in errors
     with pytest.raises(UnavailableError, match="no RMW under rclpy"):
         choose_backend("rclpy", keystores.probe("/chatter", 190))
+
+
+STOPPED_WHILE_IT_IS_MADE = """
+import sys
+from sros_tool.demo.options import node_options
+from sros_tool.demo.ros_node import run_ros_node
+
+def build(node, events):
+    import rclpy
+    if "signal" in sys.argv:
+        rclpy.try_shutdown()  # as the handler of a signal does
+    raise RuntimeError("half made")
+
+options = node_options("x", "", ["--report", sys.argv[1]])
+sys.exit(run_ros_node("talker", options, [], build))
+"""
+
+
+@pytest.mark.parametrize(("how", "status"), [("signal", 0), ("fault", 1)])
+def test_a_node_that_is_ended_while_it_is_made_has_not_failed(
+    how: str, status: int, tmp_path: Path
+) -> None:
+    report = tmp_path / "report.jsonl"
+    done = python("-c", STOPPED_WHILE_IT_IS_MADE, report, how, status=status)
+    last = read_events(report)[-1]
+    assert last.kind is (Kind.FAILED if status else Kind.DONE), done.stderr

@@ -12,7 +12,6 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from children import LONG
 from harness import check_whole, remains
 from kills import Moments, Server, server
 
@@ -158,8 +157,8 @@ def in_child(verb: Callable[[], object], at: int = 0) -> tuple[int, int]:
 
 
 def to_try(steps: int) -> range:
-    """Before which of so many steps to die: before every other one, in the long form before all."""
-    return range(1, steps + 1, 1 if LONG else 2)
+    """Before which of so many steps to die: before each."""
+    return range(1, steps + 1)
 
 
 def copy(source: Path, target: Path) -> Path:
