@@ -14,6 +14,7 @@ from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Criteria, Permissions
 from sros_tool.notes import Note
 
 _MANY = 3
+_LONGEST_TOPIC = 251  # bytes, of DDS names
 _LONGEST_NAME = 8  # parts; longer enclave names are not compared, the subsets would be too many
 
 
@@ -26,6 +27,8 @@ def document_notes(what: str, permissions: Permissions, signed_bytes: int) -> It
 _CONSEQUENCES = {
     "portable.document-size": f"; from {MAX_SIGNED_BYTES} on, Fast DDS 2.9 never finishes "
     "the handshake. Use wildcards, or split the enclave.",
+    "portable.long-name": f"; on Fast DDS no peer matches one of more than "
+    f"{_LONGEST_TOPIC}. Use shorter namespaces and names.",
     "portable.deny-blocks-topic": " on Cyclone DDS, which refuses the topic as a whole; Fast "
     "DDS allows it. What no rule allows is denied anyway, so the denial may be needless.",
     "portable.character-set": ". Vendors read plain sets alike, but only * and ? are part of the "
@@ -50,6 +53,15 @@ def outside(
     if signed_bytes >= MAX_SIGNED_BYTES:
         yield "portable.document-size", f"the signed permissions have {signed_bytes} bytes"
     for grant in permissions.grants:
+        long = [
+            topic
+            for rule in grant.rules
+            for criteria in (*rule.publish, *rule.subscribe)
+            for topic in criteria.topics
+            if len(topic.encode()) > _LONGEST_TOPIC and not any(each in topic for each in "*?[")
+        ]
+        if long:
+            yield "portable.long-name", f"{long[0][:60]}... has {len(long[0].encode())} bytes"
         allowed = [r for r in grant.rules if r.allow]
         denied = [r for r in grant.rules if not r.allow]
         for direction, other in (("publish", "subscribe"), ("subscribe", "publish")):

@@ -242,6 +242,7 @@ CASES |= {
     "portable.character-class": lambda b: b.permissions(("rt/rosout<", "rt/[^a]osout<")),
     "portable.empty-topic": lambda b: b.permissions(("rt/rosout<", "<")),
     "portable.character-set": lambda b: b.permissions(("rt/rosout<", "rt/[rs]osout<")),
+    "portable.long-name": lambda b: b.permissions(("rt/rosout<", f"rt/{'n' * 249}<")),
     "portable.document-size": lambda b: b.sign("enclaves/base/permissions.p7s", _many_topics),
     "portable.deny-blocks-topic": lambda b: b.permissions(
         (ALLOW, DENY_ALL.replace("publish", "subscribe").replace("rt/*", "rt/rosout") + ALLOW)

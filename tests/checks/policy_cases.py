@@ -88,6 +88,8 @@ CASES = [
          '</profile><profile ns="/" node="m">' + BASICS, line=None),
     Case("portable.document-size", topics("publish", *MANY), topics("publish", *MANY[:100]),
          line=None),
+    Case("portable.long-name", topics("publish", f"/{'n' * 249}"),
+         topics("publish", f"/{'n' * 248}"), line=None),
     Case("portable.deny-blocks-topic", f"{topics('publish', 'a')}{deny('subscribe', 'a')}",
          f"{topics('publish', '/x/*')}{deny('publish', '/x/a')}", line=None),
     Case("portable.character-set", topics("publish", "/x/[ab]"), topics("publish", "/x/?"),

@@ -111,7 +111,13 @@ def test_the_standard_reads_what_its_schema_allows(document: str) -> None:
     for case in documents(7, 1500):
         xml = case.permissions_xml if document == "permissions" else case.governance_xml
         read = read_permissions_as if document == "permissions" else read_governance_as
-        root = etree.fromstring(xml)
+        if b"<!DOCTYPE" in xml:
+            continue  # sros takes none
+        try:
+            root = etree.fromstring(xml)
+        except etree.XMLSyntaxError:
+            assert isinstance(read(Vendor.STANDARD, xml), Refusal)
+            continue
         if any(not grant.xpath("allow_rule|deny_rule") for grant in root.iter("grant")):
             continue  # the schema in use here asks for a rule where that of the standard does not
         if any(len(each.text or "") > 9 for each in root.iter("id")):

@@ -76,8 +76,8 @@ SUBJECT = Kind(
     "portable.subject",
     WARNING,
     "a subject that vendors compare differently",
-    "Cyclone DDS splits subjects at commas, slashes and bars, and Fast DDS 2.9 takes spaces around "
-    "= for part of the name.",
+    "Cyclone DDS splits subjects at commas, slashes and bars, and compares characters beyond ASCII "
+    "in their escaped form; Fast DDS 2.9 takes spaces around = for part of the name.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write it as RFC 4514 does, CN=/name, without , | and quotes in the name.",
 )
@@ -196,7 +196,7 @@ def domain_problems(domains: DomainSet) -> Iterator[str]:
 def _form(grant: Grant, name: str, file: str) -> Iterator[Finding]:
     if not grant.name:
         yield GRANT_NAME.found(name, f"the grant for {grant.subject} has none", file)
-    if not _SUBJECT.match(grant.subject):
+    if not (_SUBJECT.match(grant.subject) and grant.subject.isascii()):
         yield SUBJECT.found(name, f"the subject is {grant.subject!r}", file)
     if grant.default_allow:
         yield DEFAULT_ALLOW.found(name, "its default is ALLOW", file)

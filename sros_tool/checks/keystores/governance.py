@@ -175,9 +175,27 @@ def governance_findings(
     yield from _copy(keystore)
 
 
+def _let_in(rule: DomainRule) -> str:
+    """What comes of unauthenticated participants on Fast DDS 2.14, which heeds them; measured."""
+    if rule.rtps_protection_kind is not Protection.NONE:
+        return "with protected RTPS messages Fast DDS 2.14 refuses the document"
+    hidden = rule.discovery_protection_kind is not Protection.NONE
+    opened = [
+        each.topic_expression
+        for each in rule.topic_access_rules
+        if not (each.enable_read_access_control or each.enable_write_access_control)
+        and not (each.enable_discovery_protection and hidden)
+        and each.metadata_protection_kind is Protection.NONE
+        and each.data_protection_kind is Protection.NONE
+    ]
+    if not opened:
+        return "every topic is controlled or protected, so on Fast DDS they reach none"
+    return f"on Fast DDS 2.14 anybody reads and writes {', '.join(opened[:3])}"
+
+
 def _domain_rule(rule: DomainRule) -> Iterator[tuple[Kind, str]]:
     if rule.allow_unauthenticated_participants:
-        yield UNAUTHENTICATED, "allow_unauthenticated_participants is true"
+        yield UNAUTHENTICATED, f"allow_unauthenticated_participants is true: {_let_in(rule)}"
     if not rule.enable_join_access_control:
         yield NO_JOIN_CONTROL, "enable_join_access_control is false"
     if rule.discovery_protection_kind is Protection.NONE:

@@ -18,13 +18,13 @@ DIFFER = Kind(
     WARNING,
     "vendors that decide differently on the same permissions",
     "What works with one RMW is denied, or open, with another.",
-    "sros: its decision engine, compared with Fast DDS 2.9.1 and Cyclone DDS 0.10.2.",
+    "sros: its decision engine, compared with Fast DDS 2.9.1 and 2.14.5 and Cyclone DDS 0.10.2.",
     "Stay inside the portable profile; `sros explain --all-vendors` tells each decision.",
 )
 
 KINDS = by_id(DIFFER)
 
-_COMPARED = (Vendor.FAST, Vendor.CYCLONE)
+_COMPARED = (Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE)
 _UNHEARD_OF = "rt/sros_nobody_has_this"
 _MANY = 3
 

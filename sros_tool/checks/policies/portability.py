@@ -30,6 +30,16 @@ DOCUMENT_SIZE = Kind(
     "Use wildcards (`sros minimize_policy` proposes them), or split the enclave.",
     vendors=("fastdds-2.9",),
 )
+LONG_NAME = Kind(
+    "portable.long-name",
+    WARNING,
+    "a topic whose name is too long for Fast DDS",
+    "From 252 bytes on (prefix and suffix included) an endpoint is created on Fast DDS, and never "
+    "matched; Cyclone DDS takes it.",
+    "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "Use shorter namespaces and names.",
+    vendors=("fastdds", "fastdds-2.9"),
+)
 DENY_BLOCKS = Kind(
     "portable.deny-blocks-topic",
     WARNING,
@@ -68,7 +78,7 @@ SEVERAL_PROFILES = Kind(
     "Put all <profile> of an enclave into one <profiles>.",
 )
 
-KINDS = by_id(DOCUMENT_SIZE, DENY_BLOCKS, CHARACTER_SET, ENCLAVE_NAMES, SEVERAL_PROFILES)
+KINDS = by_id(DOCUMENT_SIZE, LONG_NAME, DENY_BLOCKS, CHARACTER_SET, ENCLAVE_NAMES, SEVERAL_PROFILES)
 
 _FROM_ALL_SIZES_ON = MAX_SIGNED_BYTES // 2
 _ANY_TIME = Window(datetime(2026, 1, 1, tzinfo=UTC), datetime(2027, 1, 1, tzinfo=UTC))
