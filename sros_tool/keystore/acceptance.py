@@ -46,8 +46,9 @@ def vendor_problems(traits: Traits, state: EnclaveState, at: datetime) -> tuple[
     Those of its documents' content are not among them, beyond what `EnclaveState` says.
     """
     kept = [each for each in state.problems if each.code not in _JUDGED]
-    known = {(each.file, each.code.replace("not-signed", "signature")) for each in kept}
-    faults = [each for each in _faults(traits, state, at) if (each.file, each.code) not in known]
+    # What is wrong with these for every vendor is not told twice.
+    known = {each.file for each in kept if each.file == CERTIFICATE or each.code == "not-signed"}
+    faults = [each for each in _faults(traits, state, at) if each.file not in known]
     for side in _SIDES:
         of_side = [each for each in faults if each.file in side]
         files = {each.file for each in of_side} | ({side[0]} if of_side else set())

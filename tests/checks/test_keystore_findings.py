@@ -53,3 +53,36 @@ def test_found(expected: str, bench: Bench) -> None:
     assert expected not in ids(bench)
     CASES[expected](bench)
     assert expected in ids(bench)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ((), "RTPS messages Fast DDS 2.14 refuses"),
+        ((("rtps_protection_kind>ENCRYPT", "rtps_protection_kind>NONE"),), "they reach none"),
+        (
+            (
+                ("rtps_protection_kind>ENCRYPT", "rtps_protection_kind>NONE"),
+                ("read_access_control>true", "read_access_control>false"),
+                ("write_access_control>true", "write_access_control>false"),
+                ("metadata_protection_kind>ENCRYPT", "metadata_protection_kind>NONE"),
+                ("data_protection_kind>ENCRYPT", "data_protection_kind>NONE"),
+                ("discovery_protection_kind>ENCRYPT", "discovery_protection_kind>NONE"),
+            ),
+            "on Fast DDS 2.14 anybody reads and writes *",
+        ),
+    ],
+)
+def test_what_strangers_reach_is_said(
+    changes: tuple[tuple[str, str], ...], words: str, bench: Bench
+) -> None:
+    bench.governance(("participants>false", "participants>true"))
+    bench.sign("enclaves/governance.p7s", lambda text: _present(text, changes))
+    found = keystore_findings(bench.checked, now=bench.now)
+    assert words in next(each.text for each in found if each.id == "governance.unauthenticated")
+
+
+def _present(text: str, changes: tuple[tuple[str, str], ...]) -> str:
+    for old, new in changes:
+        text = text.replace(old, new)
+    return text
