@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
-from functools import lru_cache
 from pathlib import Path
 
 from sros_tool.dds.decision import Traits
@@ -113,7 +112,6 @@ def from_policy(enclave: Enclave, governance: Governance, *, at: datetime) -> Ma
     )
 
 
-@lru_cache(maxsize=8)
 def _document(message: bytes) -> bytes:
     with suppress(SrosError):
         return smime.parse(message).document

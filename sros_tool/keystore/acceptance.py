@@ -70,23 +70,27 @@ def _faults(traits: Traits, state: EnclaveState, at: datetime) -> Iterator[Probl
     if authorities and state.certificate:
         yield from _identity_faults(traits, state.certificate, authorities, at)
     signers = read.get(PERMISSIONS_CA)
-    for file in (GOVERNANCE, PERMISSIONS) if signers else ():
-        if signers and file in state.files:
-            try:
-                text = signer_fault(traits, _parsed(state.files[file]), signers, at)
-            except PkiError as error:
-                text = str(error)
-            if text:
-                yield Problem(file, text, "signature")
+    for file in (GOVERNANCE, PERMISSIONS):
+        if not signers or file not in state.files:
+            continue
+        if text := _signature_fault(traits, state.files[file], signers, at):
+            yield Problem(file, text, "signature")
     largest = traits.largest_document
     if largest is not None and state.permissions_bytes > largest:
         text = f"it has {state.permissions_bytes} bytes, and from {MAX_SIGNED_BYTES} on the "
         yield Problem(PERMISSIONS, f"{text}handshake never ends", "document-size")
 
 
-_parsed = lru_cache(maxsize=8)(smime.parse)
+@lru_cache(maxsize=8)
+def _signature_fault(traits: Traits, message: bytes, signers: Certificates, at: datetime) -> str:
+    # The enclaves of a keystore have their governance in common.
+    try:
+        return signer_fault(traits, smime.parse(message), signers, at)
+    except PkiError as error:
+        return str(error)
 
 
+@lru_cache(maxsize=16)
 def authority_fault(
     traits: Traits, certificates: Certificates, at: datetime
 ) -> tuple[str, str] | None:

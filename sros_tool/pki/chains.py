@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
+from functools import lru_cache
 from typing import TypeVar
 
 from cryptography import x509
@@ -13,6 +14,8 @@ from sros_tool.pki.certificates import issued_by, subject_text, validity_of
 from sros_tool.validity import iso
 
 Extension = TypeVar("Extension", bound=x509.ExtensionType)
+
+_issued_by = lru_cache(maxsize=256)(issued_by)  # the CAs of a keystore come up again and again
 
 
 def chain_fault(
@@ -31,13 +34,13 @@ def chain_fault(
     ``X509_V_FLAG_CHECK_SS_SIGNATURE``).
     """
     chain = [start]
-    while not issued_by(chain[-1], chain[-1]):
+    while not _issued_by(chain[-1], chain[-1]):
         issuer = _issuer(chain[-1], [*authorities, *others], at)
         if issuer is None or issuer in chain:
             return f"the issuer {subject_text(chain[-1].issuer)} is not among what is trusted"
         chain.append(issuer)
     # Of several with the same name and key only the first is looked at.
-    root = next((each for each in authorities if issued_by(chain[-1], each)), None)
+    root = next((each for each in authorities if _issued_by(chain[-1], each)), None)
     if root != chain[-1]:
         return f"the self-signed {subject_text(chain[-1].subject)} is not among what is trusted"
     faults = (
@@ -55,7 +58,7 @@ def _issuer(
     found = [
         each
         for each in among
-        if each.subject == certificate.issuer and _signs(each) and issued_by(certificate, each)
+        if each.subject == certificate.issuer and _signs(each) and _issued_by(certificate, each)
     ]
     return next((each for each in found if validity_of(each).contains(at)), next(iter(found), None))
 

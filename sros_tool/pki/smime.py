@@ -153,6 +153,7 @@ class SignedDocument:
         return True
 
 
+@lru_cache(maxsize=8)  # one document is asked about from several sides, one after the other
 def parse(message: bytes) -> SignedDocument:
     """Take a ``.p7s`` apart.  Raises `PkiError` if it is no S/MIME signed message."""
     content, signature = _split(message)

@@ -57,11 +57,9 @@ def authority(
         NOW + days[1] * DAY,
     ).add_extension(x509.BasicConstraints(is_ca, None), critical=True)
     if usage is not None:
-        signs, certifies = (word in usage.split() for word in (SIGNS, CERTIFIES))
-        allowed = x509.KeyUsage(
-            signs, False, False, False, False, certifies, certifies, False, False
-        )
-        builder = builder.add_extension(allowed, critical=True)
+        signs, certifies = SIGNS in usage.split(), CERTIFIES in usage.split()
+        flags = x509.KeyUsage(signs, False, False, False, False, certifies, certifies, False, False)
+        builder = builder.add_extension(flags, critical=True)
     if purpose:
         builder = builder.add_extension(x509.ExtendedKeyUsage([purpose]), critical=False)
     if identifiers:
