@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from sros_tool.dds.decision import Decision, Outcome, Vendor, Verb
+from sros_tool.dds.decision import Outcome, Vendor, Verb
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
 from sros_tool.explain.answer import Answer, Judge, Setting
@@ -70,7 +70,7 @@ def explain(case: Case, question: Question, vendor: Vendor) -> Explanation:
         _origins(case, answer),
         _who_denies(answer),
         change,
-        "" if answer.allowed or change or sign else _remedy(case, decision),
+        "" if answer.allowed or change or sign else _remedy(case, answer, decision.reason),
         sign,
         recorded_policy(case.root, case.material.signed)
         if case.root and (case.root / LEDGER).exists()
@@ -121,9 +121,10 @@ def _change(case: Case, answer: Answer, known: Provenance | None) -> tuple[Chang
     return change, False
 
 
-def _remedy(case: Case, decision: Decision) -> str:
+def _remedy(case: Case, answer: Answer, reason: str) -> str:
     root = str(case.root) if case.root else ""
-    return remedy(decision.reason, root, case.material.enclave)
+    faulty = (each.file for each in answer.problems if each.code == reason)
+    return remedy(reason, root, case.material.enclave, next(faulty, ""))
 
 
 def _who_denies(answer: Answer) -> str:

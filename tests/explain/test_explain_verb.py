@@ -483,3 +483,16 @@ def test_completion(line: str, offered: list[str], whole: Path) -> None:
     script = "from sros_tool.cli import main; main()"
     ended = python("-c", script, env=environment)
     assert set(ended.stdout.split()) == {f"plain,{each}" for each in offered}, ended
+
+
+@pytest.mark.parametrize(
+    ("fault", "remedy"),
+    [("governance unsigned", "governance.p7s"), ("permissions unsigned", "create_permission")],
+)
+def test_the_remedy_is_for_the_file_that_is_at_fault(
+    fault: str, remedy: str, keystore: Path
+) -> None:
+    BREAKAGES[fault](Enclave(keystore))
+    told = explain(keystore, ENCLAVE, "publish", "/chatter")
+    assert told.status == 1
+    assert remedy in told.out.partition("  remedy ")[2], told.out
