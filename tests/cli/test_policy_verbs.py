@@ -333,8 +333,8 @@ def test_minimize_without_observation_is_wrong_usage(folder: Path) -> None:
 def test_four_times_as_large_policies_take_four_times_as_long(folder: Path) -> None:
     """Sixteen times would be quadratic; what is there anyway makes it less than four."""
     policies: dict[str, Callable[[int], tuple[str, str]]] = {
-        "enclaves": lambda n: (enclaves_policy(250 * n, 20), enclaves_policy(250 * n, 24)),
-        "topics": lambda n: (topics_policy(5000 * n), topics_policy(5100 * n)),
+        "enclaves": lambda n: (enclaves_policy(100 * n, 20), enclaves_policy(100 * n, 24)),
+        "topics": lambda n: (topics_policy(2000 * n), topics_policy(2040 * n)),
     }
     for made in policies.values():
         for verb in ("diff_policy", "merge_policy"):
