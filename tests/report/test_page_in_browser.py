@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -433,24 +432,15 @@ def test_the_policy_of_the_page_stops_what_the_escaping_would_miss(
     page.close()
 
 
-def test_a_hundred_enclaves_and_a_thousand_names_open_fast(
+def test_a_hundred_enclaves_and_a_thousand_names_can_be_explored(
     browser: Browser, tmp_path: Path
 ) -> None:
-    """Ten times as much takes a few times as long, and not a hundred times."""
-    paths = {}
-    for robots in (1, 10):
-        source, paths[robots] = tmp_path / f"{robots}.xml", tmp_path / f"{robots}.html"
-        source.write_text(large_policy(robots, 10, 10))
-        sros("view", source, "-o", paths[robots]).ok()
-    assert paths[10].stat().st_size < 2_000_000
-    taken: dict[int, list[float]] = {1: [], 10: []}
-    for _ in range(3):  # whatever else runs on the machine
-        for robots, path in paths.items():
-            begin = time.perf_counter()
-            with opened(browser, path):
-                taken[robots].append(time.perf_counter() - begin)
-    assert min(taken[10]) < 20 * min(taken[1]), taken
-    with opened(browser, paths[10]) as page:
+    """How long it takes to open is in the benchmarks."""
+    source, path = tmp_path / "large.xml", tmp_path / "large.html"
+    source.write_text(large_policy(10, 10, 10))
+    sros("view", source, "-o", path).ok()
+    assert path.stat().st_size < 2_000_000
+    with opened(browser, path) as page:
         assert page.locator("#map .card.group").count() >= 10
         page.click("#map .card.group >> nth=2")
         assert page.locator("#map .card.enclave").count() >= 10
