@@ -37,7 +37,7 @@ from sros_tool.dds.decision import TRAITS, Access, Outcome, Refusal, Traits, Ven
 
 pytestmark = pytest.mark.dds
 
-COUNT = int(os.environ.get("SROS_DIFFERENTIAL", "2000" if LONG else "100"))
+COUNT = int(os.environ.get("SROS_DIFFERENTIAL", "2000" if LONG else "50"))
 SEED = int(os.environ.get("SROS_DIFFERENTIAL_SEED", "1"))
 FASTS = (Vendor.FAST, Vendor.FAST_2_9)
 Draw = Callable[[int, int, datetime], list[Case]]
