@@ -15,7 +15,12 @@ from harness import policy_text, publish, sros
 from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadScopeScheduling  # type: ignore[import-untyped]
 
-STARTED_ONCE = ("test_generate_policy.py", "test_demo_run.py", "test_policies_live.py")
+STARTED_ONCE = (
+    "test_generate_policy.py",
+    "test_demo_run.py",
+    "test_policies_live.py",
+    "test_nodes_fit_their_enclaves.py",
+)
 """Files whose tests share many processes that are started once."""
 
 POLICY = policy_text({"/a": publish("old_a"), "/b": publish("old_b")})

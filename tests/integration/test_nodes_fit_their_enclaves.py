@@ -170,11 +170,20 @@ def seen(cast: list[Casting]) -> dict[Key, list[dict[str, Any]]]:
     return {key: nodes for found in shown for key, nodes in found.items()}
 
 
+def known(role: Role, name: str, topic: str) -> set[str]:
+    """The DDS topics without which a node is not yet seen whole."""
+    endpoints = {pair for each in NODE_SERVICES for pair in named("reply", f"{name}/{each}")}
+    if role in RIGHT:
+        endpoints |= named(RIGHT[role], topic)
+    return {dds_topic for _, dds_topic in endpoints}
+
+
 def observe(processes: dict[str, Key], number: int) -> dict[Key, list[dict[str, Any]]]:
     question = {
         label: {
             "command": BACKEND.command(role, ["--topic", topic], names),
-            "nodes": len(set(names)),
+            "nodes": len(names),
+            "topics": {name: sorted(known(role, name, topic)) for name in names},
         }
         for label, (role, names, topic) in processes.items()
     }

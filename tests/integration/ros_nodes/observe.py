@@ -1,9 +1,10 @@
 """Starts processes of nodes, and prints as JSON what the ROS graph says of each node.
 
 Reads from stdin ``{"domain": N, "processes": {enclave: [node, ...]}}``, nodes as in
-``run_nodes.py``, or ``{enclave: {"command": [word, ...], "nodes": count}}``.  Runs in a network of
-its own where the kernel allows it.  Every node is described by its enclave, its endpoints in ROS
-terms, and the DDS topics that it writes and reads (``raw``), both as the graph tells them.
+``run_nodes.py``, or ``{enclave: {"command": [word, ...], "nodes": count, "topics": {name: []}}}``
+with DDS topics that its nodes must have.  Runs in a network of its own where the kernel allows it.
+Every node is described by its enclave, its endpoints in ROS terms, and the DDS topics that it
+writes and reads (``raw``), both as the graph tells them.
 """
 
 from __future__ import annotations
@@ -17,13 +18,14 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+from sros_tool.names import NODE_SERVICES, dds_names, expand
 from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
 
 Process = list[dict[str, Any]] | dict[str, Any]
 RUN_NODES = Path(__file__).with_name("run_nodes.py")
 PATIENCE_S = 240.0
 STILL_S = 1.0
-"""The graph counts as complete when it has not changed for this long."""
+"""The graph counts as complete when it has not changed for this long, and lacks nothing known."""
 
 
 def start(enclave: str, process: Process) -> subprocess.Popen[str]:
@@ -90,10 +92,45 @@ def observe(processes: dict[str, Process]) -> list[dict[str, Any]]:
         now = snapshot(observer, processes)
         if now != seen:
             seen, since = now, time.monotonic()
-        if len(seen) >= wanted and time.monotonic() - since > STILL_S:
+        still = time.monotonic() - since > STILL_S
+        if still and len(seen) >= wanted and not any(lacks(each, processes) for each in seen):
             return seen
         time.sleep(0.1)
     raise SystemExit(f"the graph did not come to rest with {wanted} nodes: {seen}")
+
+
+def lacks(seen: dict[str, Any], processes: dict[str, Process]) -> bool:
+    """Whether a node is not yet seen with something that it is known to have."""
+    process = processes[seen["enclave"]]
+    topics = {
+        topic for way in ("publish", "subscribe") for topic in seen.get("raw", {}).get(way, ())
+    }
+    if isinstance(process, dict):
+        return not topics.issuperset(
+            process["topics"].get(expand(seen["name"], seen["ns"], ""), ())
+        )
+    spec = next((n for n in process if (n["name"], n["ns"]) == (seen["name"], seen["ns"])), None)
+    if spec is None:
+        return False
+    names = {
+        topic
+        for right in ("publish", "subscribe", "reply", "request", "execute", "call")
+        for name in spec.get(right, ())
+        for found in dds_names(right, expand(name, spec["ns"], spec["name"]))
+        for topic in found
+    }
+    return not topics.issuperset(names | services(expand(spec["name"], spec["ns"], ""), spec))
+
+
+def services(node: str, spec: dict[str, Any]) -> set[str]:
+    """The DDS topics of the services that a node offers by itself."""
+    offered = ("get_type_description",) if spec.get("bare") else NODE_SERVICES
+    return {
+        topic
+        for service in offered
+        for topics in dds_names("reply", f"{node}/{service}")
+        for topic in topics
+    }
 
 
 def main() -> None:
