@@ -16,8 +16,9 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from sros_tool.errors import SrosError, UnavailableError
 
@@ -29,42 +30,32 @@ _ASK_AGAIN = 0.005
 _LOST = 2.0
 
 
-class Link(Protocol):
-    """What one end writes to and reads from the other one."""
+@dataclass(frozen=True)
+class _Channel:
+    """What one end writes to and reads from the other one.
 
-    def write(self, text: str) -> None:
-        """Send a message."""
+    ``wait`` sleeps until there is something to take, but no longer than so many seconds; ``take``
+    returns the messages that have come since its last call, oldest first.
+    """
 
-    def wait(self, seconds: float) -> bool:
-        """Sleep until there is something to take, but no longer than ``seconds``."""
-
-    def take(self) -> Sequence[str]:
-        """Return the messages that have come since the last call, oldest first."""
+    write: Callable[[str], None]
+    wait: Callable[[float], bool]
+    take: Callable[[], Sequence[str]]
 
 
 @contextmanager
-def _cyclone_link(sends: str, hears: str) -> Iterator[Link]:
+def _cyclone_link(sends: str, hears: str) -> Iterator[_Channel]:
     from sros_tool.runtime.cyclone import Participant
     from sros_tool.runtime.rcl_security import choose_loadable, domain_of
 
     choice = choose_loadable(os.environ)
     with Participant(domain_of(os.environ), choice.enclave) as participant:
         reader, writer = participant.reader(f"rt{hears}"), participant.writer(f"rt{sends}")
-        yield _Ends(writer.write, reader.wait, reader.take)
-
-
-class _Ends:
-    def __init__(
-        self,
-        write: Callable[[str], None],
-        wait: Callable[[float], bool],
-        take: Callable[[], Sequence[str]],
-    ) -> None:
-        self.write, self.wait, self.take = write, wait, take
+        yield _Channel(writer.write, reader.wait, reader.take)
 
 
 @contextmanager
-def _rclpy_link(sends: str, hears: str) -> Iterator[Link]:
+def _rclpy_link(sends: str, hears: str) -> Iterator[_Channel]:
     try:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
@@ -90,7 +81,7 @@ def _rclpy_link(sends: str, hears: str) -> Iterator[Link]:
         heard.clear()
         return taken
 
-    yield _Ends(lambda text: publisher.publish(String(data=text)), wait, take)
+    yield _Channel(lambda text: publisher.publish(String(data=text)), wait, take)
 
 
 _LINKS = {"cyclone": _cyclone_link, "rclpy": _rclpy_link}
@@ -119,7 +110,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _answer(link: Link, begin: float) -> None:
+def _answer(link: _Channel, begin: float) -> None:
     while True:
         link.wait(1.0)
         for text in link.take():
@@ -131,7 +122,7 @@ def _answer(link: Link, begin: float) -> None:
                 link.write("l")
 
 
-def _measure(link: Link, begin: float, sizes: Sequence[int], seconds: float) -> dict[str, Any]:
+def _measure(link: _Channel, begin: float, sizes: Sequence[int], seconds: float) -> dict[str, Any]:
     other = ""
     while not other:
         link.write("h")
@@ -148,7 +139,7 @@ def _measure(link: Link, begin: float, sizes: Sequence[int], seconds: float) -> 
     return {"first": first, "sizes": found}
 
 
-def _latency(link: Link, size: int, seconds: float) -> float:
+def _latency(link: _Channel, size: int, seconds: float) -> float:
     """Half of the median round trip of a message of ``size`` bytes, in seconds."""
     text = "e".ljust(size, "x")
     times: list[float] = []
@@ -160,7 +151,7 @@ def _latency(link: Link, size: int, seconds: float) -> float:
     return statistics.median(times) / 2
 
 
-def _throughput(link: Link, size: int, seconds: float) -> float:
+def _throughput(link: _Channel, size: int, seconds: float) -> float:
     """Messages per second in the median burst; each burst is waited for."""
     burst = max(1, min(_BURST, _BURST_BYTES // size))
     texts = [*["b".ljust(size, "x")] * (burst - 1), "l".ljust(size, "x")]
@@ -174,7 +165,7 @@ def _throughput(link: Link, size: int, seconds: float) -> float:
     return burst / statistics.median(times)
 
 
-def _await(link: Link) -> None:
+def _await(link: _Channel) -> None:
     """Wait for an answer; raises `SrosError` where a reliable one does not come."""
     if not link.wait(_LOST):
         raise SrosError("an answer was lost", f"It did not come within {_LOST} s.")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from shlex import quote
 
 from sros_tool.dds.decision import Vendor, Verb
 from sros_tool.explain.answer import Answer, Judge, Setting
@@ -75,6 +76,11 @@ class _Hit:
     @property
     def cause(self) -> str:
         return self.meaning.cause.format(**self.said)
+
+    @property
+    def quoted(self) -> Mapping[str, str]:
+        """What the line says, as words of a command: whoever wrote the log chose them."""
+        return {name: quote(text) for name, text in self.said.items()}
 
     @property
     def kind(self) -> str:
@@ -210,7 +216,7 @@ class _Eye:
             first.text,
             first.enclave,
             first.cause,
-            meaning.remedy.format(**first.said),
+            meaning.remedy.format(**first.quoted),
         )
         looked_at = meaning.codes or meaning.id == "service"
         material = self._look(first.enclave) if looked_at else None
@@ -222,7 +228,7 @@ class _Eye:
             return replace(plain, enclave=material.enclave, found=_nodes(answer), checked=True)
         causes = causes or list(self._out_of_domain(material, answer, first))
         remedies = list(dict.fromkeys(remedy for _, remedy in causes if remedy))
-        nothing = f"{_nothing_found(material)} {meaning.unseen.format(**first.said)}".rstrip()
+        nothing = f"{_nothing_found(material)} {meaning.unseen.format(**first.quoted)}".rstrip()
         return replace(
             plain,
             enclave=material.enclave,

@@ -6,6 +6,7 @@ A command in a remedy is one that runs on a keystore with that fault, and mends 
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.errors import SrosError
 from sros_tool.keystore.enclave import enclave_path
@@ -153,7 +154,8 @@ def remedy(word: str, root: str, enclave: str, file: str = "") -> str:
 
 def _filled(text: str, root: str, enclave: str, file: str) -> str:
     path = enclave_path(Path(root), enclave) / (file or "cert.pem")
-    return text.format(root=root, enclave=enclave, path=path)
+    # What is copied into a shell must not become another command there.
+    return text.format(root=quote(root), enclave=quote(enclave), path=quote(str(path)))
 
 
 def _is_own_copy(keystore: Path, enclave: str, file: str) -> bool:

@@ -431,3 +431,9 @@ def test_json(tmp_path: Path) -> None:
 def test_wrong_usage(tmp_path: Path) -> None:
     assert sros("explain", "--log", tmp_path / "none.log").status == 1
     assert sros("explain", "ks", "/a", "publish", "/x", "--log", "-").status == 2
+
+
+def test_what_a_log_says_does_not_become_a_command() -> None:
+    line = "[SECURITY Error] Cannot read file file:///tmp/x;rm${IFS}-rf${IFS}~ (a.cpp:1)"
+    (found,) = explain_log(line, lambda _: None, lambda _: pytest.fail("nothing to look at"))
+    assert "'/tmp/x;rm${IFS}-rf${IFS}~'" in found.remedy
