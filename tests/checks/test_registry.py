@@ -17,6 +17,7 @@ from harness import sros
 
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Severity
 from sros_tool.checks.registry import KINDS, Selection
+from sros_tool.checks.runtimes import setting
 from sros_tool.dds.decision import Vendor
 from sros_tool.errors import UsageError
 
@@ -162,7 +163,10 @@ def test_it_finds_out_what_a_path_is(bench: Bench, tmp_path: Path) -> None:
         assert "Unable to check" in sros("check", wrong, cwd=tmp_path).err
 
 
-def test_the_runtime_and_the_keystore_it_names(bench: Bench) -> None:
+def test_the_runtime_and_the_keystore_it_names(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(setting, "running_processes", lambda: iter(()))
     env = {"ROS_SECURITY_ENABLE": "True", "ROS_SECURITY_KEYSTORE": str(bench.root)}
     ended = sros("check", env=env)
     assert ended.status == 1
