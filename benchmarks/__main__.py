@@ -97,7 +97,7 @@ def _timed(action: Callable[[int], object], rounds: int) -> float:
 
 
 def _artifacts(folder: Path, count: int, rounds: int) -> list[Row]:
-    from sros_tool.keystore import create_keystore, generate_artifacts
+    from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
     from sros_tool.keystore.template import load_template
     from sros_tool.policy import read_policy
 
@@ -127,7 +127,11 @@ def _artifacts(folder: Path, count: int, rounds: int) -> list[Row]:
 
 
 def _topics(folder: Path, most: int, rounds: int) -> list[Row]:
-    from sros_tool.keystore import create_enclaves, create_keystore, create_permission
+    from sros_tool.keystore.lifecycle.create import (
+        create_enclaves,
+        create_keystore,
+        create_permission,
+    )
     from sros_tool.keystore.template import load_template
     from sros_tool.policy import read_policy
 
@@ -174,7 +178,7 @@ _PEAK = """
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from sros_tool.keystore import create_keystore, generate_artifacts
+from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
 from sros_tool.keystore.template import load_template
 root, count = Path(sys.argv[1]), int(sys.argv[2])
 now = datetime.now(UTC)

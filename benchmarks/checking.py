@@ -18,8 +18,8 @@ def checking(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Figur
     """Seconds that it takes to check so many enclaves with so many rules each."""
     from sros_tool.checks.keystores.keystore import keystore_findings
     from sros_tool.checks.kind import WARNING
-    from sros_tool.checks.policies.files import policy_file_findings
-    from sros_tool.keystore import create_keystore, generate_artifacts
+    from sros_tool.checks.policies import policy_file_findings
+    from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
     from sros_tool.keystore.template import load_template
     from sros_tool.policy import read_policy
 

@@ -19,11 +19,11 @@ def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fig
     from sros_tool.dds.decision import Vendor
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.answer import Setting
-    from sros_tool.explain.flow import Network
     from sros_tool.explain.question import ask
+    from sros_tool.explain.reach import Network
     from sros_tool.explain.who import who
-    from sros_tool.keystore import create_keystore, generate_artifacts
-    from sros_tool.keystore.proof import prove
+    from sros_tool.keystore.issuing.proof import prove
+    from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
     from sros_tool.keystore.rights import load_rights
     from sros_tool.keystore.template import load_template
     from sros_tool.policy import read_policy

@@ -33,8 +33,8 @@ class Renewal:
 
 def measure_renewal(folder: Path, count: int) -> Renewal:
     """Renew ``count`` enclaves of a keystore, and replace as many files of the same sizes."""
-    from sros_tool.keystore import create_enclaves, create_keystore
-    from sros_tool.keystore.renew import renew
+    from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+    from sros_tool.keystore.lifecycle.renew import renew
     from sros_tool.keystore.template import load_template
 
     now = datetime.now(UTC)
@@ -75,7 +75,7 @@ def replace_files(folder: Path, files: list[tuple[str, int]], count: int, *, che
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    from sros_tool.keystore.parallel import in_shares
+    from sros_tool.parallel import in_shares
     from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem
     from sros_tool.pki.keys import generate_key
     from sros_tool.validity import window

@@ -97,11 +97,10 @@ def main() -> None:
 
 
 def _measured(folder: Path) -> dict[str, float]:
-    from sros_tool.graph.common import common_parts
-    from sros_tool.graph.learn import learn
+    from sros_tool.graph.document import draft, write
+    from sros_tool.graph.learn import common_parts, learn
     from sros_tool.graph.observation import Observation
-    from sros_tool.graph.source import RosGraph
-    from sros_tool.graph.write import draft, write
+    from sros_tool.graph.observe import RosGraph
     from sros_tool.resources import policies_dir
 
     seen = Observation()

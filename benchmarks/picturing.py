@@ -16,12 +16,12 @@ from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
-from sros_tool.policy.reader import read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.compose import Context, Source, compose
+from sros_tool.report.layout import scenes_of
 from sros_tool.report.page import render_page
 from sros_tool.report.picture import Origin
-from sros_tool.report.scenes import scenes_of
 from sros_tool.report.sources import common_rights
 from sros_tool.report.svg import render_svg
 

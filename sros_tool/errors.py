@@ -6,6 +6,8 @@ returns for an uncaught error: 1 for "no or failed", 2 for wrong usage.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 
 class SrosError(Exception):
     """Base of every error that sros raises on purpose.
@@ -56,3 +58,11 @@ class KeystoreError(SrosError):
 
 class UnavailableError(SrosError):
     """A DDS stack, an RMW or a privilege that is not there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """A remark with a stable ``id`` (such as ``portable.document-size``) and one paragraph."""
+
+    id: str
+    text: str

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from children import LONG
-from harness import policy_text, publish, sros
 from hypothesis import HealthCheck, settings
 from xdist.scheduler import LoadScopeScheduling  # type: ignore[import-untyped]
+
+from tests.support.children import LONG
+from tests.support.harness import policy_text, publish, sros
 
 STARTED_ONCE = (
     "test_generate_policy.py",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.atomic import replace_file
+from sros_tool.files import replace_file
 
 
 def test_a_file_keeps_its_mode_and_a_link_its_target(tmp_path: Path) -> None:

@@ -21,12 +21,12 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519
-from harness import Ended, policy_text, publish, snapshot, sros, with_includes
 
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name, issue_ca, pem
 from sros_tool.pki.keys import generate_key, key_pem, load_key
 from sros_tool.validity import Window
+from tests.support.harness import Ended, policy_text, publish, snapshot, sros, with_includes
 
 Words = list[object]
 Files = dict[str, tuple[int, bytes]]

@@ -11,14 +11,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from children import PATIENCE
-from harness import policy_text, publish, snapshot, sros
-from test_bad_input import NOT_FILES, check_refused, check_unchanged
 
-from sros_tool.cli.log import MAX_LOG
-from sros_tool.cli.visible import visible, visible_json
+from sros_tool.cli.common import MAX_LOG, visible, visible_json
 from sros_tool.dds.decision.matching import matches
 from sros_tool.dds.decision.vendors import Style
+from tests.support.children import PATIENCE
+from tests.support.harness import policy_text, publish, snapshot, sros
+from tests.test_bad_input import NOT_FILES, check_refused, check_unchanged
 
 ESCAPES = ("\x1b", "\x9b", "\x07", "\u202e")
 DENIED = "rt/secret topic not found in allow rule. Writer is not allowed"

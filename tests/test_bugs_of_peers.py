@@ -10,7 +10,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from harness import (
+
+from sros_tool.policy import ALLOW, read_policy
+from sros_tool.policy.document import write_policy
+from sros_tool.policy.merge import merge_into
+from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.resources import policies_dir
+from tests.support.harness import (
     Ended,
     policy_text,
     publish,
@@ -19,12 +25,6 @@ from harness import (
     topics_of,
     with_includes,
 )
-
-from sros_tool.policy import ALLOW, read_policy
-from sros_tool.policy.edit import merge_into
-from sros_tool.policy.rights import Right, policy_rights
-from sros_tool.policy.writer import write_policy
-from sros_tool.resources import policies_dir
 
 A = Path("enclaves/a")
 

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from children import PATIENCE
 
+from tests.support.children import PATIENCE
 from tools import apt, checks, dds, environment, record, steps
 from tools.record import Record
 from tools.steps import SetupError

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from lxml import etree
 
-from sros_tool.graph.common import PARTS
+from sros_tool.graph.learn import PARTS
 from sros_tool.names import MAX_COMMON_NAME, dds_names, expand
 from sros_tool.policy import DENY, Enclave, read_policy, write_policy
 from sros_tool.policy.model import Group, Profile

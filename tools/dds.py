@@ -21,7 +21,7 @@ _VARIABLE = "SROS_CYCLONEDDS_DIR"
 
 _ASK = """
 from sros_tool.errors import UnavailableError
-from sros_tool.runtime.cyclone_library import load_cyclone
+from sros_tool.runtime.cyclone import load_cyclone
 try:
     print(load_cyclone().plugins or "")
 except UnavailableError:

@@ -6,27 +6,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
-from sros_tool.checks.keystores import (
-    authorities,
-    certificates,
-    documents,
-    enclaves,
-    governance,
-    issued,
-    loading,
-    vendors,
-)
-from sros_tool.checks.keystores import files as keystore_files
+from sros_tool.checks import policies, runtime
+from sros_tool.checks.keystores import authorities, documents, enclaves, files, issued
 from sros_tool.checks.kind import NOTE, WARNING, Finding, Kind, Severity, by_id
-from sros_tool.checks.policies import files, naming, nodes, portability, rules
-from sros_tool.checks.runtimes import host, variables
 from sros_tool.errors import UsageError
 
-_MODULES = (
-    files, rules, nodes, naming, portability,
-    keystore_files, authorities, certificates, loading, enclaves, documents, governance, issued,
-    vendors, variables, host,
-)  # fmt: skip
+_MODULES = (policies, files, authorities, enclaves, documents, issued, runtime)
 
 KINDS: Mapping[str, Kind] = by_id(
     *(kind for module in _MODULES for _, kind in sorted(module.KINDS.items()))
@@ -68,7 +53,7 @@ class Selection:
         included = not self.include or any(_matches(kind, each) for each in self.include)
         if self.vendor and kind.vendors and self.vendor not in kind.vendors:
             return False
-        if self.vendor and kind is vendors.DIFFER:
+        if self.vendor and kind is documents.DIFFER:
             return False
         return included and not any(_matches(kind, each) for each in self.exclude)
 

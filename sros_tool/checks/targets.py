@@ -10,7 +10,7 @@ from pathlib import Path
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
-from sros_tool.checks.policies.files import policy_file_findings
+from sros_tool.checks.policies import policy_file_findings
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.keystore.layout import ENCLAVES, REQUIRED_FILES, is_keystore
 from sros_tool.policy.model import Policy

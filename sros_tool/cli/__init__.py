@@ -18,8 +18,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.stdout.reconfigure(errors="surrogateescape")  # a path need not be valid UTF-8
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # remarks of libraries are not for users
-    from sros_tool.cli.program import program
-    from sros_tool.cli.report import report_error
+    from sros_tool.cli.program import program, report_error
 
     try:
         status = program.main(arguments, prog_name="sros", standalone_mode=False)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -11,6 +12,10 @@ from typing import TYPE_CHECKING
 
 import click
 
+from sros_tool import __version__
+from sros_tool.checks.kind import Finding
+from sros_tool.checks.registry import Chosen, Selection, select_kinds
+from sros_tool.checks.sarif import sarif
 from sros_tool.cli.common import (
     PATH,
     domain_of,
@@ -19,6 +24,7 @@ from sros_tool.cli.common import (
     moment_of,
     now,
     print_json,
+    visible,
 )
 from sros_tool.errors import UsageError
 
@@ -138,7 +144,6 @@ def check(
     """
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import Selection
-    from sros_tool.cli.findings import SHOW, print_list
 
     family, paths = _family(targets)
     form = "json" if as_json else "sarif" if as_sarif else form
@@ -178,7 +183,7 @@ def _circumstances(
     domain: str | None, moment: str | None, policies: Sequence[Path]
 ) -> Circumstances:
     from sros_tool.checks.targets import Circumstances
-    from sros_tool.cli.zone import local_zone
+    from sros_tool.cli.common import local_zone
     from sros_tool.policy import read_policy
 
     read = tuple(read_policy(each) for each in policies)
@@ -187,7 +192,7 @@ def _circumstances(
 
 def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[Finding]:
     from sros_tool.checks.keystores.keystore import keystore_findings
-    from sros_tool.checks.policies.files import policy_file_findings
+    from sros_tool.checks.policies import policy_file_findings
     from sros_tool.checks.targets import path_findings, policies_below
     from sros_tool.keystore.layout import is_keystore
 
@@ -231,9 +236,8 @@ def findings_here(
     environment: Mapping[str, str], moment: datetime, insecure_rmws: Mapping[str, str]
 ) -> list[Finding]:
     """What is found in an environment on this machine; `insecure_rmws` were tried before."""
-    from sros_tool.checks.runtimes.runtime import runtime_findings
-    from sros_tool.checks.runtimes.setting import Setting, running_processes
-    from sros_tool.cli.zone import local_zone
+    from sros_tool.checks.runtime import Setting, running_processes, runtime_findings
+    from sros_tool.cli.common import local_zone
     from sros_tool.runtime.stacks import rmw_implementations
 
     zone = local_zone(environment)
@@ -251,7 +255,7 @@ def _shown(finding: Finding) -> Finding:
 
 
 def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> int:
-    from sros_tool.keystore.lifetime import describe_lifetime, parse_threshold, survey
+    from sros_tool.keystore.reader import describe_lifetime, parse_threshold, survey
     from sros_tool.validity import iso
 
     threshold = parse_threshold(text)
@@ -275,3 +279,120 @@ def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> in
         for other in unreadable:
             click.echo(f"{other.name}  nobody can tell: {other.error}")
     return 1 if due or unreadable else 0
+
+
+_SCHEMA = 1
+
+
+def _print_text(chosen: Chosen, _selection: Selection) -> None:
+    for each in chosen.shown:
+        click.echo(visible("\n".join(finding_lines(each))))
+    for choice in dict.fromkeys(each.accepted for each in chosen.accepted):
+        kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
+        told = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
+        click.echo(f"accepted, as the {choice} chose it: {told}")
+    click.echo(_summary(chosen), err=True)
+
+
+def finding_lines(finding: Finding) -> list[str]:
+    """A finding for people: where and what, why here, and what to do."""
+    head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"
+    told = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
+    by = f" (chosen by the {finding.accepted})" if finding.accepted else ""
+    return [head, f"    {told}{finding.text}{by}", f"    {finding.remedy}"]
+
+
+def _summary(chosen: Chosen) -> str:
+    counts = _counts(chosen)
+    told = [f"{number} {word}{'s' * (number != 1)}" for word, number in counts.items() if number]
+    number = chosen.hidden
+    hidden = f" (not shown: {number} note{'s' * (number != 1)}, --severity note)" if number else ""
+    return f"{', '.join(told) or 'nothing found'}{hidden}"
+
+
+def _counts(chosen: Chosen) -> dict[str, int]:
+    words = [each.severity.word for each in chosen.shown]
+    return {word: words.count(word) for word in ("error", "warning", "note")}
+
+
+def _print_json(chosen: Chosen, _selection: Selection) -> None:
+    print_json(
+        {
+            "version": _SCHEMA,
+            "findings": [each.as_json() for each in chosen.shown],
+            "accepted": [each.as_json() for each in chosen.accepted],
+            "counts": {**_counts(chosen), "hidden": chosen.hidden},
+        }
+    )
+
+
+def _print_sarif(chosen: Chosen, selection: Selection) -> None:
+
+    kinds, findings = select_kinds(selection), (*chosen.shown, *chosen.accepted)
+    print_json(sarif(findings, kinds, version=__version__, base=Path.cwd()))
+
+
+def print_list(selection: Selection, form: str) -> None:
+    """Show the kinds of findings that are selected."""
+
+    kinds = list(select_kinds(selection))
+    if form != "text":
+        print_json([each.as_json() for each in kinds])
+        return
+    width = max((len(each.id) for each in kinds), default=0)
+    for each in kinds:
+        click.echo(f"{each.id:{width}}  {each.severity.word:7}  {each.title}")
+
+
+SHOW: Mapping[str, Callable[[Chosen, Selection], None]] = {
+    "text": _print_text,
+    "json": _print_json,
+    "sarif": _print_sarif,
+}
+"""How findings are shown, by the value of --format."""
+
+
+@click.command(
+    "doctor",
+    epilog="""\b
+Example:
+  $ sros doctor
+  rclpy with rmw_fastrtps_cpp  does not enforce   Fast DDS 2.14.5
+      a secured participant fails: RCLError: error creating node: This Fast DDS version
+      doesn't have the security libraries
+  Cyclone DDS (libddsc)        enforces security  Cyclone DDS 0.10.2
+      in an enclave made by sros it created the allowed writer on /chatter, and refused
+      writer and reader on /sros_not_allowed: ... Not Allowed By Security
+  DDS Security can be enforced here.
+
+Exit status: 1 if nothing here enforces security, or if a finding is an error; else 0.""",
+)
+@json_option
+def doctor(as_json: bool) -> None:
+    """Find the DDS stacks and RMWs of this machine that enforce security.
+
+    Each is tried, in a process of its own and in an enclave made for the purpose; a name or a
+    version says nothing about how it was built. Also tells what `sros check runtime` finds:
+    misspelt ROS_SECURITY_* values, files that are missing, a clock that is off.
+    """
+    from sros_tool.checks.kind import ERROR, WARNING
+    from sros_tool.demo.doctor import diagnosis_text, examine
+
+    moment = now()
+    diagnosis = examine(moment)
+    insecure = {
+        stack.rmw: stack.evidence
+        for stack in diagnosis.stacks
+        if stack.rmw and stack.enforces is False
+    }
+    findings = findings_here(os.environ, moment, insecure)
+    if as_json:
+        shown = [each.as_json() for each in findings]
+        print_json({**diagnosis.as_json(), "findings": shown})
+    else:
+        click.echo(diagnosis_text(diagnosis))
+        for each in findings:
+            if each.severity >= WARNING:
+                click.echo("\n".join(("", *finding_lines(each))))
+    if not diagnosis.enforces or any(each.severity >= ERROR for each in findings):
+        sys.exit(1)

@@ -1,26 +1,51 @@
-"""What the verbs share: the keystore argument, common options, and how results are shown."""
+"""Makes text of others safe to show: what would steer a terminal is shown, and not obeyed."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
+import stat
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
+from zoneinfo import ZoneInfo
 
 import click
 
-from sros_tool.cli.visible import visible, visible_json
-from sros_tool.errors import UsageError
+from sros_tool.errors import DocumentError, PkiError, UsageError
+
+_CONTROLS = [
+    *(code for code in range(0x20) if chr(code) not in "\n\t"),
+    *range(0x7F, 0xA0),  # DEL, and C1, which holds CSI as one character
+    *(0x061C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)),  # bidirectional
+]
+_SHOWN = {code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" for code in _CONTROLS}
+_IN_JSON = {code: f"\\u{code:04x}" for code in _CONTROLS}
+
+
+def visible(text: str) -> str:
+    """``text`` with its control characters, but newline and tab, spelled as escapes.
+
+    Names of files, certificates and logs are chosen by others, who could otherwise clear the
+    screen, hide a denial, or let a name read backwards.
+    """
+    return text.translate(_SHOWN)
+
+
+def visible_json(document: str) -> str:
+    """The same for a JSON document, which goes on to mean the same."""
+    return document.translate(_IN_JSON)
+
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
-    from sros_tool.keystore.transaction import Change
-    from sros_tool.notes import Note
+    from sros_tool.errors import Note
+    from sros_tool.keystore.transaction.stage import Change
 
 Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
@@ -204,3 +229,124 @@ def progress_bar(total: int) -> Iterator[Callable[[str], None] | None]:
         return
     with click.progressbar(length=total, label="signing", file=sys.stderr) as bar:
         yield lambda _name: bar.update(1)
+
+
+if TYPE_CHECKING:
+    from sros_tool.keystore.authorities.keyring import Keyring
+
+PASSPHRASE, PASSPHRASE_FILE = "SROS_CA_PASSPHRASE", "SROS_CA_PASSPHRASE_FILE"
+PIN = "SROS_PKCS11_PIN"
+PLACES = {"identity": "SROS_IDENTITY_KEY", "permissions": "SROS_PERMISSIONS_KEY"}
+
+
+def keyring(
+    identity: str | None = None, permissions: str | None = None, *, encrypt: bool = False
+) -> Keyring:
+    """The keys at the places that are given, or that the environment names."""
+    from sros_tool.keystore.authorities.keyring import Keyring
+
+    given = {"identity": identity, "permissions": permissions}
+    places = {role: given[role] or os.environ.get(name, "") for role, name in PLACES.items()}
+    return Keyring(
+        _Answers(encrypt),
+        {role: _absolute(place) for role, place in places.items() if place},
+        encrypt,
+    )
+
+
+def _absolute(place: str) -> str:
+    if place.startswith("pkcs11:"):
+        return place
+    return f"file:{Path(place.removeprefix('file:')).absolute()}"
+
+
+class _Answers:
+    """A secrets handler that asks each question once."""
+
+    def __init__(self, new: bool) -> None:
+        self._new = new
+        self._known: dict[str, str] = {}
+
+    def __call__(self, what: str) -> str:
+        if what not in self._known:
+            self._known[what] = self._find(what)
+        return self._known[what]
+
+    def _find(self, what: str) -> str:
+        is_pin = " PIN " in f" {what} "
+        value = os.environ.get(PIN if is_pin else PASSPHRASE, "")
+        file = "" if is_pin else os.environ.get(PASSPHRASE_FILE, "")
+        if not value and file:
+            value = Path(file).read_text(encoding="utf-8").partition("\n")[0]
+        if not value and sys.stdin.isatty():
+            confirm = self._new and not is_pin
+            value = click.prompt(
+                what.capitalize(), hide_input=True, err=True, confirmation_prompt=confirm
+            )
+        if not value:
+            names = PIN if is_pin else f"{PASSPHRASE} or {PASSPHRASE_FILE}"
+            raise PkiError(f"{what} is needed", "There is no terminal to ask at.", f"Set {names}.")
+        return value
+
+
+_OFFSET = re.compile(r"([+-])(\d\d):?(\d\d)\Z")
+_LOCALTIME = Path("/etc/localtime")
+
+
+def named_zone(name: str) -> tzinfo:
+    """The zone of an IANA name (``Asia/Tokyo``) or an offset (``+09:00``)."""
+    if match := _OFFSET.match(name):
+        offset = timedelta(hours=int(match[2]), minutes=int(match[3]))
+        if offset < timedelta(hours=24):
+            return timezone(-offset if match[1] == "-" else offset)
+    try:
+        return ZoneInfo(name)
+    except (ValueError, OSError, LookupError) as error:
+        raise UsageError(
+            f"{name!r} is not a time zone", "", "Write for example Asia/Tokyo, UTC or +09:00."
+        ) from error
+
+
+def local_zone(environment: Mapping[str, str]) -> tzinfo:
+    """The zone of this machine, with its daylight saving where its name can be found."""
+    name = environment.get("TZ", "").removeprefix(":")
+    if not name and _LOCALTIME.exists():
+        _, found, name = str(_LOCALTIME.resolve()).partition("zoneinfo/")
+        name = name if found else ""
+    try:
+        return ZoneInfo(name)
+    except (ValueError, OSError, LookupError):
+        return datetime.now().astimezone().tzinfo or UTC
+
+
+MAX_LOG = 64 * 1024 * 1024
+"""Largest log that is read, in bytes."""
+
+
+def read_log(log: str) -> str:
+    """The text of a log, of standard input for "-"; a pipe (``<(journalctl ...)``) is read, too.
+
+    Raises `DocumentError` for what cannot be read, is a device, or is larger than ``MAX_LOG``.
+    """
+    try:
+        if log == "-":
+            data = sys.stdin.buffer.read(MAX_LOG + 1) if sys.stdin else b""
+        else:
+            kind = Path(log).stat().st_mode
+            if not (stat.S_ISREG(kind) or stat.S_ISFIFO(kind) or stat.S_ISDIR(kind)):
+                raise DocumentError(f"the log '{log}' is neither a file nor a pipe")
+            with Path(log).open("rb") as file:
+                data = file.read(MAX_LOG + 1)
+    except FileNotFoundError as error:
+        raise DocumentError(f"the log '{log}' does not exist") from error
+    except OSError as error:
+        raise DocumentError(f"the log '{log}' cannot be read", f"{error.strerror}.") from error
+    except ValueError as error:  # a name that holds NUL is of no file
+        raise DocumentError(f"the log '{log}' does not exist") from error
+    if len(data) > MAX_LOG:
+        raise DocumentError(
+            f"the log '{log}' is too large",
+            f"More than {MAX_LOG // 1024**2} MiB.",
+            "Cut it to what is of interest: tail -n 100000 LOG.",
+        )
+    return data.decode("utf-8", "replace")

@@ -146,10 +146,10 @@ def demo(
     attacks half a minute and a minute: every known way in, each tried a second time without the
     defence that closes it.
     """
-    from sros_tool.atomic import replace_file
     from sros_tool.demo.program import DemoOptions, run_demo
     from sros_tool.demo.scenarios import SCENARIOS, choose_scenarios
-    from sros_tool.demo.table import demo_table
+    from sros_tool.demo.show import demo_table
+    from sros_tool.files import replace_file
     from sros_tool.keystore.template import load_template
 
     if list_them:
@@ -186,7 +186,7 @@ def demo(
     if report is not None:
         _write_report(report, result.as_json(), keep)
     if summary is not None:
-        from sros_tool.demo.summary import summary_page
+        from sros_tool.demo.show import summary_page
 
         replace_file(summary, summary_page(result, moment).encode())
     if as_json:
@@ -208,7 +208,7 @@ def _list(scenarios: Sequence[Scenario], as_json: bool) -> None:
 
 def _write_report(report: Path, result: dict[str, Any], keep: Path | None) -> None:
     """The page, which says nothing of where on this machine things were."""
-    from sros_tool.atomic import replace_file
+    from sros_tool.files import replace_file
     from sros_tool.report.demo_page import render_demo_page, without_places
 
     places = [Path.home(), Path.cwd(), Path(tempfile.gettempdir()), *([keep] if keep else [])]

@@ -1,10 +1,12 @@
-"""The verb that says what DDS will decide, and why."""
+"""Of what, where and when ``sros explain`` is asked: its words and options as values."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Sequence
+from datetime import tzinfo
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -12,22 +14,447 @@ from sros_tool.cli.common import (
     KEYSTORE_VARIABLE,
     PATH,
     complete_keystore_and_enclave,
+    domain_of,
     json_option,
+    keystore_from_environment,
+    moment_of,
     print_json,
     print_notes,
+    read_log,
+    ros_domain,
+    visible,
 )
-from sros_tool.cli.explain_case import Place, case_of, vendor_of
-from sros_tool.cli.explain_options import refuse_ignored
-from sros_tool.cli.visible import visible
-from sros_tool.errors import UsageError
+from sros_tool.cli.policy import right_json
+from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.names import is_expression
+from sros_tool.validity import iso
+
+if TYPE_CHECKING:
+    from sros_tool.dds.decision import Vendor
+    from sros_tool.dds.domains import DomainSet
+    from sros_tool.explain.answer import Case, Setting
+    from sros_tool.explain.material import Material
+    from sros_tool.policy.model import Enclave
+
+
+class Place:
+    """The options that say where and when."""
+
+    def __init__(self, moment: str | None, domain: str | None, zone: str | None) -> None:
+        self.at = moment_of(moment)
+        self._domain = ros_domain() if domain is None else domain_of(domain)
+        self._zone = _zone(zone)
+
+    def setting(self, domains: DomainSet | None) -> Setting:
+        """Where a question is asked of an enclave that is made for these domains."""
+        from sros_tool.explain.answer import Setting
+        from sros_tool.runtime.environment import choose_domain
+
+        chosen = self._domain
+        if chosen is None:
+            chosen = choose_domain(domains, None, Path()) if domains else 0
+        return Setting(chosen, self.at, self._zone)
+
+
+def _zone(name: str | None) -> tzinfo:
+    from sros_tool.cli.common import local_zone, named_zone
+
+    return local_zone(os.environ) if name is None else named_zone(name)
+
+
+def case_of(root: Path | None, enclave: str, policy: Path | None, place: Place) -> Case:
+    """What is asked: the enclave of a keystore, of a folder, or of a policy alone."""
+    from sros_tool.explain.answer import Case
+
+    stated = _stated(policy, enclave)
+    if root is None and not policy and not _is_enclave(Path(enclave)):
+        root = keystore_from_environment()
+    material = signed_material(root, enclave, place, planned=stated is not None)
+    if material is None:
+        assert stated is not None
+        material = _planned(stated, root, place)
+    elif stated is None and policy:
+        stated = _stated(policy, material.enclave)
+    return Case(material, place.setting(material.domains), root, stated)
+
+
+def _stated(policy: Path | None, enclave: str) -> Enclave | None:
+    """What the policy file says of the enclave, where there is a file."""
+    from sros_tool.errors import PolicyError
+    from sros_tool.policy.document import read_policy
+
+    if policy is None:
+        return None
+    read = read_policy(policy)
+    found = read.enclave(enclave)
+    if found is None and not _is_enclave(Path(enclave)):
+        there = ", ".join(each.path for each in read.enclaves)
+        raise PolicyError(
+            f"unable to find enclave {enclave} in the policy '{policy}'", f"It has {there}."
+        )
+    return found
+
+
+def signed_material(
+    root: Path | None, name: str, place: Place, *, planned: bool = False
+) -> Material | None:
+    """What is signed for an enclave of a keystore, or in a folder of that name.
+
+    None if there is neither keystore nor folder, or, with ``planned``, no such enclave yet.
+    """
+    from sros_tool.explain.material import from_folder
+    from sros_tool.keystore.issuing.enclave import enclave_path
+    from sros_tool.keystore.layout import list_enclaves
+    from sros_tool.keystore.reader import no_such_enclave
+
+    if root is None:
+        folder = Path(name)
+        if not _is_enclave(folder):
+            return None
+        return from_folder(_name_of(folder, place), folder, at=place.at)
+    if _is_enclave(root) and not (root / "enclaves").is_dir():
+        own = _name_of(root, place)
+        if own != name:
+            raise KeystoreError(f"'{root}' is the folder of {own or 'no enclave'}, not of {name}")
+        return from_folder(own, root, at=place.at)
+    names = list_enclaves(root)
+    if name in names:
+        return from_folder(name, enclave_path(root, name), at=place.at)
+    if planned:
+        return None
+    raise no_such_enclave(root, name, names)
+
+
+def _is_enclave(folder: Path) -> bool:
+    return any((folder / name).exists() for name in ("cert.pem", "permissions.p7s"))
+
+
+def _name_of(folder: Path, place: Place) -> str:
+    """The name of the enclave whose folder this is: the common name of its certificate."""
+    from sros_tool.keystore.loading import check_enclave
+    from sros_tool.pki.certificates import common_name_of
+
+    certificate = check_enclave(folder, now=place.at).certificate
+    return common_name_of(certificate.subject) if certificate else ""
+
+
+def _planned(stated: Enclave, root: Path | None, place: Place) -> Material:
+    """What the policy would give, under the governance of the keystore or of a new one."""
+    from sros_tool.dds.domains import DomainSet
+    from sros_tool.explain.material import from_policy
+    from sros_tool.keystore.reader import governance_of
+    from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
+    from sros_tool.translate import governance_for
+
+    if root is not None:
+        return from_policy(stated, governance_of(root), at=place.at)
+    domain = place.setting(None).domain
+    protection = load_template(DEFAULT_TEMPLATE).protection
+    return from_policy(
+        stated, governance_for(protection, DomainSet.of((domain, domain))), at=place.at
+    )
+
+
+def vendor_of(name: str | None) -> tuple[Vendor, str]:
+    """The vendor of an option, or else of this machine, and why it is that one."""
+    from sros_tool.dds.decision import Vendor
+    from sros_tool.explain.material import vendor_here
+
+    if name:
+        return Vendor(name), "as asked"
+    choice = vendor_here(os.environ)
+    return choice.vendor, choice.why
+
+
+if TYPE_CHECKING:
+    from sros_tool.explain.reach import Path as FlowPath
+    from sros_tool.explain.reach import Reach
+    from sros_tool.explain.who import Standing
+    from sros_tool.keystore.rights import RightsSource
+
+
+def _keystore(root: Path | None) -> Path:
+    from sros_tool.keystore.layout import list_enclaves
+
+    found = root or keystore_from_environment()
+    list_enclaves(found)
+    return found
+
+
+def show_who(
+    root: Path | None,
+    rest: tuple[str, ...],
+    kind: str | None,
+    vendor: str | None,
+    place: Place,
+    as_json: bool,
+) -> int:
+    """Say which enclaves of the keystore may; 0 if any may."""
+    from sros_tool.errors import Note
+    from sros_tool.explain.question import ask
+    from sros_tool.explain.who import who
+
+    if not 1 <= len(rest) <= 2:
+        raise UsageError(
+            "--who takes what is to be done, and a name", "", "As in publish /cmd_vel."
+        )
+    question = ask(rest[0], rest[1] if len(rest) > 1 else "", kind)
+    chosen, why = vendor_of(vendor)
+    keystore = _keystore(root)
+    found = who(keystore, question, chosen, place.setting, at=place.at)
+    if as_json:
+        print_json(
+            {
+                "question": str(question),
+                "vendor": chosen.value,
+                "vendor_why": why,
+                "documented_only": chosen.documented_only,
+                "enclaves": [_who_json(each) for each in found],
+            }
+        )
+    else:
+        for line in _who_lines(found):
+            click.echo(line)
+        documented = ", as documented" if chosen.documented_only else ""
+        click.echo(f"{question}, on {chosen.title} ({why}{documented})", err=True)
+        if question.word == "call" and not kind and not any(each.outcome.ok for each in found):
+            action = ask("call", question.name, "action")
+            if any(e.outcome.ok for e in who(keystore, action, chosen, place.setting, at=place.at)):
+                told = f"enclaves may {action}: add --type action if that is what it is."
+                print_notes([Note("explain.an-action", told)])
+    return 0 if any(each.outcome.ok for each in found) else 1
+
+
+def show_reach(
+    enclave: str,
+    root: Path | None,
+    rest: tuple[str, ...],
+    policy: Path | None,
+    infrastructure: bool,
+    as_json: bool,
+) -> int:
+    """Say whom an enclave can influence and learn from."""
+    from sros_tool.explain.reach import OF_EVERY_NODE, Network
+    from sros_tool.keystore.rights import load_rights
+
+    if root is None and len(rest) == 1:
+        root, rest = Path(rest[0]), ()
+    if rest:
+        raise UsageError("--reach takes one enclave, and no question")
+    source = load_rights(root or policy or keystore_from_environment())
+    without = () if infrastructure else OF_EVERY_NODE
+    network = Network(source.rights, without=without, **_opened(source))
+    if source.kind == "keystore":
+        _check_there(source.path, enclave)
+    if enclave not in network.enclaves:
+        raise KeystoreError(
+            f"enclave {enclave} has no rights in '{source.path}'",
+            f"There are {', '.join(network.enclaves[:5]) or 'none'}.",
+        )
+    reach = network.reach(enclave)
+    if as_json:
+        print_json({"path": str(source.path), "left_out": list(without), **_reach_json(reach)})
+    else:
+        for line in _reach_lines(reach):
+            click.echo(line)
+    print_notes(source.notes)
+    if without and not as_json:
+        told = f"left out: {', '.join(without)}, which every node writes and reads"
+        click.echo(f"{told} (--infrastructure counts it)", err=True)
+    return 0
+
+
+def _check_there(root: Path, enclave: str) -> None:
+    from sros_tool.keystore.layout import enclave_names
+    from sros_tool.keystore.reader import no_such_enclave
+
+    there = tuple(enclave_names(root))
+    if enclave not in there:
+        raise no_such_enclave(root, enclave, there)
+
+
+def _opened(source: RightsSource) -> dict[str, Any]:
+    """What everybody in a keystore may do, because its governance does not control access."""
+    if source.kind != "keystore":
+        return {}
+    from sros_tool.explain.reach import unguarded
+    from sros_tool.keystore.layout import enclave_names
+    from sros_tool.keystore.reader import governance_of
+
+    return {
+        "unguarded": unguarded(governance_of(source.path)),
+        "everybody": enclave_names(source.path),
+    }
+
+
+# ── telling ───────────────────────────────────────────────────────────────────────────────
+
+
+def _who_lines(found: Sequence[Standing]) -> Iterator[str]:
+    """The enclaves that may, by which wildcard, and how many may not."""
+    able = [each for each in found if each.outcome.ok]
+    for each in able:
+        yield each.enclave + (f"  by the wildcard {each.wildcard}" if each.wildcard else "")
+    broken = [each for each in found if each.outcome in ("refused", "crashes")]
+    for each in broken:
+        yield f"  not now: {each.enclave}  {each.text.partition(': ')[2]}"
+    yield f"{len(able)} of {len(found)} enclaves may"
+
+
+def _who_json(each: Standing) -> dict[str, Any]:
+    """How one enclave stands to a question."""
+    return {
+        "enclave": each.enclave,
+        "allowed": each.outcome.ok,
+        "outcome": each.outcome.value,
+        "reason": each.reason,
+        "expression": each.expression or None,
+        "wildcard": each.wildcard or None,
+    }
+
+
+def _reach_lines(reach: Reach) -> Iterator[str]:
+    """Whom an enclave influences and learns from, each with a shortest path."""
+    from sros_tool.explain.reach import path_text
+
+    for what, paths in (
+        ("can influence", reach.influences),
+        ("can learn from", reach.learns_from),
+    ):
+        count = f"{len(paths)} enclave{'' if len(paths) == 1 else 's'}"
+        yield f"{reach.enclave} {what} {count}"
+        for _, path in sorted(paths.items(), key=lambda item: (len(item[1]), item[0])):
+            yield f"  {path_text(path)}"
+
+
+def _reach_json(reach: Reach) -> dict[str, Any]:
+    """Whom an enclave influences and learns from, with the hops of a shortest path."""
+    return {
+        "enclave": reach.enclave,
+        "influences": _paths_json(reach.influences),
+        "learns_from": _paths_json(reach.learns_from),
+    }
+
+
+def _paths_json(paths: dict[str, FlowPath]) -> list[dict[str, Any]]:
+    return [
+        {
+            "enclave": enclave,
+            "path": [
+                {
+                    "from": hop.source,
+                    "to": hop.target,
+                    "kind": hop.kind,
+                    "right": hop.right,
+                    "name": hop.name,
+                    "said": hop.said,
+                    "heard": hop.heard,
+                }
+                for hop in path
+            ],
+        }
+        for enclave, path in sorted(paths.items())
+    ]
+
+
+if TYPE_CHECKING:
+    from sros_tool.explain.log import Finding
+    from sros_tool.explain.material import Material
+
+
+def show_log(
+    log: str, root: Path | None, rest: tuple[str, ...], place: Place, *, as_json: bool
+) -> int:
+    """Explain the lines of a file, or of standard input for "-"; 1 if they tell of a fault."""
+    from sros_tool.explain.log import explain_log
+
+    if len(rest) > 1:
+        raise UsageError("--log takes a keystore and an enclave at most, and no question")
+    named = rest[0] if rest else ""
+    given: Material | None = None
+    if named:
+        given = signed_material(root, named, place)
+        if given is None:
+            raise UsageError(
+                f"no keystore is named to look for {named} in", "", "Write it before the enclave."
+            )
+
+    def look(enclave: str) -> Material | None:
+        if given is not None and enclave in ("", given.enclave):
+            return given
+        if root is None or not enclave:
+            return None
+        try:
+            return signed_material(root, enclave, place)
+        except SrosError:  # of another keystore
+            return None
+
+    findings = explain_log(
+        read_log(log), look, lambda material: place.setting(material.domains), str(root or "")
+    )
+    if as_json:
+        print_json({"log": log, "findings": [_json(each) for each in findings]})
+    else:
+        for finding in findings:
+            for line in _lines(finding):
+                click.echo(visible(line))
+        if not findings:
+            click.echo("nothing in it tells of DDS Security refusing anything", err=True)
+    return 1 if findings else 0
+
+
+def _lines(finding: Finding) -> Iterator[str]:
+    times = f"  ({finding.count} times)" if finding.count > 1 else ""
+    yield f"line {finding.line}: {finding.text[:160]}{times}"
+    of = f" [{finding.enclave}]" if finding.enclave else ""
+    source = finding.vendor.title.split()[0] + " DDS" if finding.vendor else "ROS 2"
+    yield f"  means     {source}{of}: {finding.cause}"
+    yield from (f"  found     {each}" for each in finding.found)
+    yield f"  remedy    {finding.remedy}"
+
+
+def _json(finding: Finding) -> dict[str, Any]:
+    return {
+        "id": finding.id,
+        "vendor": finding.vendor.value if finding.vendor else None,
+        "line": finding.line,
+        "count": finding.count,
+        "text": finding.text,
+        "enclave": finding.enclave or None,
+        "cause": finding.cause,
+        "checked": finding.checked,
+        "found": list(finding.found),
+        "remedy": finding.remedy,
+    }
+
+
+_IGNORED = {
+    "": ("infrastructure",),
+    "--who": ("infrastructure", "policy", "all_vendors"),
+    "--reach": ("kind", "vendor", "all_vendors", "moment", "domain", "time_zone"),
+    "--log": ("infrastructure", "kind", "policy", "vendor", "all_vendors"),
+}
+"""The options that have no meaning in each way of asking, by the names of their parameters."""
+
+
+def refuse_ignored(mode: str) -> None:
+    """Raise `UsageError` for an option that would change nothing."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        name = parameter.name or ""
+        if name in _IGNORED[mode] and context.params[name]:
+            option = parameter.opts[0]
+            said = f"{mode} takes no {option}" if mode else f"{option} goes with --reach only"
+            raise UsageError(said, "", "Leave it out.")
+
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
     from sros_tool.dds.decision import Vendor
-    from sros_tool.explain.case import Case, Explanation
+    from sros_tool.errors import Note
+    from sros_tool.explain.answer import Case, Explanation
     from sros_tool.explain.question import Question
-    from sros_tool.notes import Note
 
 _VENDORS = ("standard", "fastdds", "fastdds-2.9", "cyclonedds", "opendds", "connext")
 _WORDS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply", "join")
@@ -160,17 +587,11 @@ def explain(
     refuse_ignored(mode)
     root, rest = _split(words, keystore, verb=0 if who else 1)
     if log is not None:
-        from sros_tool.cli.explain_log import show_log
-
         return show_log(log, root, rest, Place(moment, domain, time_zone), as_json=as_json)
     if reach:
-        from sros_tool.cli.explain_all import show_reach
-
         return show_reach(reach, root, rest, policy, infrastructure, as_json)
     place = Place(moment, domain, time_zone)
     if who:
-        from sros_tool.cli.explain_all import show_who
-
         return show_who(root, rest, kind, vendor, place, as_json)
     return _one(root, rest, kind, policy, vendor, all_vendors, place, as_json)
 
@@ -210,15 +631,8 @@ def _one(
     place: Place,
     as_json: bool,
 ) -> int:
-    from sros_tool.cli.explanation import (
-        asked_json,
-        differences,
-        explanation_json,
-        lines_of,
-        table_lines,
-    )
     from sros_tool.dds.decision import Vendor
-    from sros_tool.explain.case import explain as explain_case
+    from sros_tool.explain.answer import explain as explain_case
     from sros_tool.explain.question import ask
 
     if not 2 <= len(rest) <= 3:
@@ -252,7 +666,7 @@ def _one(
 
 
 def _provenance_notes(found: Explanation, policy: Path | None) -> list[Note]:
-    from sros_tool.explain.origin import Provenance
+    from sros_tool.explain.answer import Provenance
 
     match found.provenance:
         case Provenance.CHANGED:
@@ -283,6 +697,291 @@ def _other_type(case: Case, question: Question, kind: str | None, vendor: Vendor
 
 
 def _note(name: str, text: str) -> Note:
-    from sros_tool.notes import Note
+    from sros_tool.errors import Note
 
     return Note(name, text)
+
+
+if TYPE_CHECKING:
+    from sros_tool.dds.decision import Decision
+    from sros_tool.explain.answer import Answer, Case, Change, Explanation, PartAnswer
+    from sros_tool.policy.model import Source
+
+_ADDITION = "allow.xml"
+_WIDTH = 10
+
+
+# ── one question ───────────────────────────────────────────────────────────────────────────
+
+
+def lines_of(case: Case, found: Explanation, why: str, policy: Path | None) -> Iterator[str]:
+    """The answer of one vendor, with its reasons; ``why`` says why it is this vendor's."""
+    answer = found.answer
+    decision = answer.deciding.decision
+    name, vendor = case.material.enclave, answer.vendor.title
+    said = f"yes: {name} may" if answer.allowed else f"no: {name} may not"
+    documented = ", as documented" if answer.as_documented else ""
+    yield f"{said} {answer.question}, on {vendor} ({why}{documented})"
+    yield _row("why", _reason(decision))
+    if len(answer.problems) > 1:
+        yield from (_row("and", str(each)) for each in answer.problems[1:])
+    if (answer.outcome, len(answer.failing)) != ("allowed", 0) and len(answer.parts) > 1:
+        yield from _parts(answer)
+    if decision.rule is not None and answer.grant:
+        rule = answer.grant.rules[decision.rule]
+        what = f"{'allow' if rule.allow else 'deny'} rule {decision.rule + 1}"
+        yield _row("rule", f"{what} of grant {answer.grant.name}: {decision.expression}")
+    if found.wildcard:
+        yield _row("wildcard", f"{found.wildcard} stands for more than this name")
+    for each in found.origins:
+        said = f"{each.qualifier.value} {each.right} {each.name}"
+        yield _row("from", f"{_shown(each.source)}: {said}")
+    if found.recorded and policy is None and decision.rule is not None:
+        yield _row(
+            "from", f"a policy file with the digest {found.recorded[:12]}; name it by --policy"
+        )
+    if answer.allowed:
+        yield _row("protected", ", ".join(_protection_words(answer)))
+    elif found.who_denies:
+        yield _row("denied by", found.who_denies)
+    if answer.until and answer.allowed:
+        yield _row("until", f"{iso(answer.until)}, when {answer.until_file} expires")
+    yield from _what_to_do(case, found, policy)
+
+
+def _row(label: str, text: str) -> str:
+    return f"  {label:{_WIDTH}}{text}"
+
+
+def _shown(source: Source) -> str:
+    """Where something stands, relative to here if it lies below."""
+    here = Path.cwd()
+    file = Path(source.file)
+    return f"{file.relative_to(here) if file.is_relative_to(here) else file}:{source.line}"
+
+
+def _reason(decision: Decision) -> str:
+    _, colon, text = decision.text.partition(": ")
+    return (text if colon else decision.text).removesuffix(".")
+
+
+def _parts(answer: Answer) -> Iterator[str]:
+    for each in answer.parts:
+        if each.part:
+            sign = "ok" if each.decision.outcome.ok else str(each.decision.outcome)
+            yield _row("part", f"{each.part}: {sign}")
+
+
+def _protection_words(answer: Answer) -> Iterator[str]:
+    topic, domain = _topic_rule(answer), answer.domain_rule
+    if topic:
+        yield f"payload {topic.data_protection_kind}"
+        yield f"submessages {topic.metadata_protection_kind}"
+    if domain:
+        yield f"RTPS messages {domain.rtps_protection_kind}"
+    if topic and not (topic.enable_read_access_control and topic.enable_write_access_control):
+        off = [
+            word
+            for word, on in (
+                ("reading", topic.enable_read_access_control),
+                ("writing", topic.enable_write_access_control),
+            )
+            if not on
+        ]
+        yield f"ACCESS CONTROL OFF for {' and '.join(off)}"
+
+
+def _topic_rule(answer: Answer) -> Any:
+    rules = (each.decision.topic_rule for each in (answer.deciding, *answer.parts))
+    return next((rule for rule in rules if rule), None)
+
+
+def _what_to_do(case: Case, found: Explanation, policy: Path | None) -> Iterator[str]:
+    if found.change:
+        yield from _change_lines(found.change)
+    if found.remedy:
+        yield _row("remedy", found.remedy)
+    commands = commands_of(case, found, policy)
+    for number, command in enumerate(commands):
+        yield _row("run" if not number else "", command)
+
+
+def _change_lines(change: Change) -> Iterator[str]:
+    yield _row("change", "the smallest change of the policy that would allow it:")
+    for edit in change.edits:
+        group = edit.xml.partition(" ")[0].removeprefix("<") if edit.xml else "group"
+        if edit.xml:
+            yield f"    at {_shown(edit.source)}, let the <{group}> read"
+            yield from (f"      {line}" for line in edit.xml.splitlines())
+        else:
+            yield f"    remove the group at {_shown(edit.source)}"
+    if change.lift and not change.edits:
+        yield from (f"    remove: {right.qualifier} {right.told()}" for right in change.lift)
+    for right in change.lift:
+        if is_expression(right.name):
+            yield f"    which lifts the denial of everything else in {right.name}, too"
+    if change.document:
+        yield f"    save as {_ADDITION}"
+        yield from (f"      {line}" for line in change.document.splitlines())
+
+
+def commands_of(case: Case, found: Explanation, policy: Path | None) -> list[str]:
+    """The commands that put a change into force, in their order."""
+    if not found.change and not found.sign:
+        return []
+    file = str(policy) if policy else "POLICY"
+    commands = []
+    if found.change and found.change.document:
+        commands.append(f"sros merge_policy {file} {_ADDITION} --in-place")
+    root = str(case.root) if case.root else "KEYSTORE"
+    commands.append(f"sros create_permission {root} {case.material.enclave} {file}")
+    return commands
+
+
+# ── all vendors ────────────────────────────────────────────────────────────────────────────
+
+
+def table_lines(case: Case, found: Sequence[Explanation]) -> Iterator[str]:
+    """One line for each vendor, and where they differ."""
+    answers = [each.answer for each in found]
+    yield f"may {case.material.enclave} {answers[0].question}?"
+    width = max(len(each.vendor.title) for each in answers)
+    for answer in answers:
+        remark = " (as documented)" if answer.as_documented else ""
+        reason = _reason(answer.deciding.decision)
+        yield f"  {answer.vendor.title:{width}}  {answer.outcome:11}  {reason}{remark}"
+    yield differences(found)
+
+
+def differences(found: Sequence[Explanation]) -> str:
+    """Which vendors answer otherwise than the first of them, in a sentence."""
+    first = found[0].answer
+    others = [e.answer for e in found if e.answer.outcome is not first.outcome]
+    if not others:
+        return "all of them decide alike"
+    told = ", ".join(f"{each.vendor.title} ({each.outcome})" for each in others)
+    return f"THEY DIFFER: {first.vendor.title} says {first.outcome}, otherwise decide {told}"
+
+
+# ── JSON ───────────────────────────────────────────────────────────────────────────────────
+
+
+def asked_json(case: Case, answer: Answer) -> dict[str, Any]:
+    """What was asked, where and when."""
+    question = answer.question
+    return {
+        "enclave": case.material.enclave,
+        "question": {
+            "word": question.word,
+            "type": question.type or None,
+            "right": question.right or None,
+            "name": question.name or None,
+        },
+        "domain": case.setting.domain,
+        "at": iso(case.setting.at),
+        "time_zone": str(case.setting.zone),
+    }
+
+
+def explanation_json(case: Case, found: Explanation, policy: Path | None) -> dict[str, Any]:
+    """The answer of one vendor."""
+    answer = found.answer
+    decision = answer.deciding.decision
+    return {
+        "vendor": answer.vendor.value,
+        "vendor_title": answer.vendor.title,
+        "documented_only": answer.vendor.documented_only,
+        "allowed": answer.allowed,
+        "outcome": answer.outcome.value,
+        "reason": decision.reason,
+        "text": decision.text,
+        "denied_by": found.who_denies or None,
+        "rule": _rule_json(answer),
+        "wildcard": found.wildcard or None,
+        "policy": _policy_json(found, policy),
+        "policy_sha256": found.recorded or None,
+        "protection": _protection_json(answer),
+        "until": iso(answer.until) if answer.until else None,
+        "until_file": answer.until_file or None,
+        "problems": [
+            {"file": each.file, "text": each.text, "code": each.code} for each in answer.problems
+        ],
+        "parts": [_part_json(each) for each in answer.parts],
+        "remedy": found.remedy or None,
+        "change": _change_json(found.change) if found.change else None,
+        "commands": commands_of(case, found, policy),
+    }
+
+
+def _rule_json(answer: Answer) -> dict[str, Any] | None:
+    decision = answer.deciding.decision
+    if decision.rule is None or answer.grant is None:
+        return None
+    return {
+        "grant": decision.grant,
+        "grant_name": answer.grant.name,
+        "rule": decision.rule,
+        "allow": answer.grant.rules[decision.rule].allow,
+        "expression": decision.expression,
+    }
+
+
+def _policy_json(found: Explanation, policy: Path | None) -> dict[str, Any] | None:
+    if found.provenance is None:
+        return None
+    return {
+        "file": str(policy),
+        "provenance": found.provenance.value,
+        "lines": [
+            {
+                "file": each.source.file,
+                "line": each.source.line,
+                "qualifier": each.qualifier.value,
+                "right": each.right,
+                "name": each.name,
+            }
+            for each in found.origins
+        ],
+        "would_allow": found.sign,
+    }
+
+
+def _protection_json(answer: Answer) -> dict[str, Any] | None:
+    topic, domain = _topic_rule(answer), answer.domain_rule
+    if domain is None:
+        return None
+    return {
+        "rtps": domain.rtps_protection_kind.value,
+        "discovery": domain.discovery_protection_kind.value,
+        "liveliness": domain.liveliness_protection_kind.value,
+        "topic_expression": topic.topic_expression if topic else None,
+        "data": topic.data_protection_kind.value if topic else None,
+        "metadata": topic.metadata_protection_kind.value if topic else None,
+        "read_access_control": topic.enable_read_access_control if topic else None,
+        "write_access_control": topic.enable_write_access_control if topic else None,
+    }
+
+
+def _part_json(each: PartAnswer) -> dict[str, Any]:
+    part = each.part
+    assert part is not None
+    return {
+        "verb": part.verb.value,
+        "topic": part.topic,
+        "role": part.role or None,
+        "outcome": each.decision.outcome.value,
+        "reason": each.decision.reason,
+        "expression": each.decision.expression,
+    }
+
+
+def _change_json(change: Change) -> dict[str, Any]:
+    return {
+        "add": [right_json(right) for right in change.add],
+        "lift": [right_json(right) for right in change.lift],
+        "document": change.document or None,
+        "edits": [
+            {"file": each.source.file, "line": each.source.line, "xml": each.xml}
+            for each in change.edits
+        ],
+    }

@@ -8,8 +8,7 @@ from typing import Any
 
 import click
 
-from sros_tool.cli.common import PATH, json_option, now, print_json
-from sros_tool.cli.visible import visible
+from sros_tool.cli.common import PATH, json_option, now, print_json, visible
 
 _INDENT = "  "
 

@@ -14,6 +14,7 @@ from sros_tool.cli.common import (
     complete_template,
     dry_run_option,
     json_option,
+    keyring,
     keystore_from_environment,
     now,
     print_json,
@@ -23,11 +24,10 @@ from sros_tool.cli.common import (
     ros_domain,
     split_root,
 )
-from sros_tool.cli.secrets import keyring
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
-    from sros_tool.keystore import Result
+    from sros_tool.keystore.lifecycle.create import Result
 
 
 @click.command(
@@ -51,7 +51,7 @@ def create_enclave(words: tuple[str, ...], dry_run: bool) -> None:
 
     An enclave that exists keeps its key and its permissions; a file that it lacks is added.
     """
-    from sros_tool.keystore import create_enclaves
+    from sros_tool.keystore.lifecycle.create import create_enclaves
 
     root, names = split_root(words)
     if not names:
@@ -86,7 +86,7 @@ Example:
 @dry_run_option
 def create_permission(words: tuple[str, ...], dry_run: bool) -> None:
     """Give the enclave NAME the permissions that the policy in POLICY_FILE states for it."""
-    from sros_tool.keystore import create_permission as create
+    from sros_tool.keystore.lifecycle.create import create_permission as create
     from sros_tool.policy import read_policy
 
     root, rest = split_root(words)
@@ -150,8 +150,7 @@ def generate_artifacts(
 
     Permissions that a policy states replace those that an enclave has.
     """
-    from sros_tool.cli.create_keystore import say_new_keystore
-    from sros_tool.keystore import generate_artifacts as generate
+    from sros_tool.keystore.lifecycle.create import generate_artifacts as generate
     from sros_tool.keystore.template import load_template
     from sros_tool.policy import read_policy
 
@@ -221,3 +220,191 @@ def list_enclaves(root: Path | None, as_json: bool) -> None:
         return
     for name in names:
         click.echo(name)
+
+
+if TYPE_CHECKING:
+    from sros_tool.dds.domains import DomainSet
+    from sros_tool.keystore.template import Template
+
+
+@click.command(
+    "create_keystore",
+    epilog="""\b
+Example:
+  $ sros create_keystore keystore
+  created keystore 'keystore' for domain 0
+    template development: encrypted and authenticated; every enclave may do everything until it
+    gets a policy
+    identity CA and permissions CA: separate, valid for 3650d; certificates 3650d, permissions 3650d
+    identity CA SHA-256 5fe417aaed47cccd3f4a6b3e8e94db185bfc8e1003ee5b8c8a4cb3dc1dc9a4e6
+    permissions CA SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91a0f5ac3e5ef1b0c4e47
+  $ sros create_keystore fleet --template production --domain 10-19""",
+)
+@click.argument("root", type=PATH)
+@click.option(
+    "--template",
+    "template_name",
+    default="development",
+    show_default=True,
+    metavar="NAME|FILE",
+    help="The choices to make it by: development, production, sros2, or a TOML file.",
+    shell_complete=complete_template,
+)
+@click.option(
+    "--domain",
+    metavar="IDS",
+    help="The ROS domains it is for, as 0 or 0,7 or 10-19. [default: $ROS_DOMAIN_ID, or 0]",
+)
+@click.option(
+    "--ca-layout",
+    type=click.Choice(["separate", "single"]),
+    help="Two CAs, for identities and permissions, or one for both.",
+)
+@click.option(
+    "--ca-validity",
+    metavar="SPAN",
+    help="How long the CAs last: 5y, until 2031-01-01, or from 2026-12-01/5y.",
+)
+@click.option("--validity", metavar="SPAN", help="The same for certificates.")
+@click.option("--permissions-validity", metavar="SPAN", help="The same for permissions.")
+@click.option(
+    "--identity-ca",
+    type=PATH,
+    help="The certificate of an existing identity CA, with its chain; needs --identity-key.",
+)
+@click.option("--permissions-ca", type=PATH, help="The same for the permissions CA.")
+@click.option(
+    "--identity-key",
+    metavar="URI",
+    help="Where the key of the identity CA is, or is to be made: file:PATH or pkcs11:...",
+)
+@click.option("--permissions-key", metavar="URI", help="The same for the permissions CA.")
+@click.option(
+    "--encrypt-ca-keys", is_flag=True, help="Protect new CA keys in files by a passphrase."
+)
+@dry_run_option
+def create_keystore(
+    root: Path | None,
+    template_name: str,
+    domain: str | None,
+    ca_layout: str | None,
+    ca_validity: str | None,
+    validity: str | None,
+    permissions_validity: str | None,
+    identity_ca: Path | None,
+    permissions_ca: Path | None,
+    identity_key: str | None,
+    permissions_key: str | None,
+    encrypt_ca_keys: bool,
+    dry_run: bool,
+) -> None:
+    """Create a keystore in the folder ROOT, by the choices of a template.
+
+    Passphrases of CA keys come from a prompt, from $SROS_CA_PASSPHRASE or from the file
+    $SROS_CA_PASSPHRASE_FILE; the PIN of a token from a prompt or $SROS_PKCS11_PIN.
+    """
+    from sros_tool.dds.domains import DomainSet
+    from sros_tool.keystore.lifecycle.create import create_keystore as create
+
+    root = root or keystore_from_environment()
+    own = ros_domain() if domain is None else None
+    domains = DomainSet.parse(domain, "--domain") if domain is not None else None
+    if own is not None:
+        domains = DomainSet.of((own, own))
+    template = _choices(template_name, ca_layout, ca_validity, validity, permissions_validity)
+    result = create(
+        root,
+        template=template,
+        domains=domains,
+        now=now(),
+        keyring=keyring(identity_key, permissions_key, encrypt=encrypt_ca_keys),
+        imported=_imported({"identity": identity_ca, "permissions": permissions_ca}),
+        dry_run=dry_run,
+    )
+    print_notes(result.notes)
+    if dry_run:
+        print_plan(root, result.changes)
+        return
+    say_new_keystore(root, template, result.domains)
+    _say_what_is_open(template)
+
+
+def _choices(
+    name: str,
+    ca_layout: str | None,
+    ca_validity: str | None,
+    validity: str | None,
+    permissions_validity: str | None,
+) -> Template:
+    from dataclasses import replace
+    from datetime import timedelta
+
+    from sros_tool.keystore.template import load_template
+    from sros_tool.validity import parse_span
+
+    template = load_template(name)
+    if ca_layout:
+        template = replace(template, separate_authorities=ca_layout == "separate")
+    if ca_validity is not None:
+        template = replace(template, authority_validity=parse_span(ca_validity))
+    if validity is not None:
+        span, permissions = parse_span(validity), template.permissions_validity
+        template = replace(template, certificate_validity=span)
+        if not isinstance(span, timedelta):
+            template = replace(template, permissions_validity=span)
+        elif isinstance(permissions, timedelta):
+            template = replace(template, permissions_validity=min(span, permissions))
+    if permissions_validity is not None:
+        template = replace(template, permissions_validity=parse_span(permissions_validity))
+    return template
+
+
+def _imported(files: dict[str, Path | None]) -> dict[str, bytes]:
+    from sros_tool.xml import read_bytes
+
+    return {
+        role: read_bytes(path, "CA certificate") for role, path in files.items() if path is not None
+    }
+
+
+def say_new_keystore(root: Path, template: Template, domains: DomainSet) -> None:
+    """Say what was made, and by which choices."""
+    from sros_tool.keystore.authorities.authority import load_ca_certificate
+    from sros_tool.keystore.layout import ROLES
+    from sros_tool.pki.certificates import digest
+    from sros_tool.validity import span_text
+
+    layout = (
+        "identity CA and permissions CA: separate"
+        if template.separate_authorities
+        else "one CA for identity and permissions"
+    )
+    click.echo(f"created keystore '{root}' for domain {domains}")
+    click.echo(f"  template {template.name}: {template.description}")
+    click.echo(
+        f"  {layout}, valid for {span_text(template.authority_validity)}; certificates "
+        f"{span_text(template.certificate_validity)}, permissions "
+        f"{span_text(template.permissions_validity)}"
+    )
+    # By these, those who get something from here know whose it is.
+    for role in ROLES if template.separate_authorities else ROLES[:1]:
+        name = f"{role} CA" if template.separate_authorities else "CA"
+        click.echo(f"  {name} SHA-256 {digest(load_ca_certificate(root, role))}")
+
+
+def _say_what_is_open(template: Template) -> None:
+    from sros_tool.keystore.template import EVERYTHING
+
+    if template.default_permissions == EVERYTHING:
+        click.echo(
+            "still open: a new enclave may publish, subscribe and call everything; "
+            "`sros create_permission` closes it with a policy, `--template production` from the "
+            "start.",
+            err=True,
+        )
+    if not template.separate_authorities:
+        click.echo(
+            "still open: with one CA for both jobs, Cyclone DDS 0.10.2 and Fast DDS 2.9.1 let an "
+            "enclave sign its own permissions; `--ca-layout separate` closes it.",
+            err=True,
+        )

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import importlib
+import os
+import sys
+import traceback
 from dataclasses import dataclass
+from pathlib import Path
 
 import click
 
 from sros_tool import __version__
+from sros_tool.cli.common import visible
+from sros_tool.errors import SrosError, UsageError
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +28,7 @@ class Verb:
 
 FAMILIES: dict[str, dict[str, Verb]] = {
     "Keystore": {
-        "create_keystore": Verb("create_keystore", "Create a keystore."),
+        "create_keystore": Verb("keystore", "Create a keystore."),
         "create_enclave": Verb("keystore", "Create enclaves in a keystore.", ("create_key",)),
         "create_permission": Verb("keystore", "Give an enclave the permissions of a policy."),
         "generate_artifacts": Verb("keystore", "Create enclaves and permissions from policies."),
@@ -32,36 +38,36 @@ FAMILIES: dict[str, dict[str, Verb]] = {
     "Life of keys": {
         "renew": Verb("life", "Renew certificates and permissions of enclaves."),
         "revoke": Verb("life", "Revoke enclaves."),
-        "rotate_ca": Verb("rotate", "Replace the CAs, stage by stage."),
+        "rotate_ca": Verb("life", "Replace the CAs, stage by stage."),
         "crl": Verb("life", "Show the revocation list, or sign it anew."),
     },
     "Deployment": {
         "distribute_key": Verb(
-            "deploy", "Export enclaves for the robot they run on.", ("export_enclave",)
+            "deployment", "Export enclaves for the robot they run on.", ("export_enclave",)
         ),
-        "verify": Verb("deploy", "Say whether what arrived on a robot can be used."),
+        "verify": Verb("deployment", "Say whether what arrived on a robot can be used."),
         "create_request": Verb(
-            "request", "Make a key on the robot, and the request to certify it."
+            "deployment", "Make a key on the robot, and the request to certify it."
         ),
-        "sign_request": Verb("request", "Answer the request of a robot."),
-        "import": Verb("request", "Put an answer beside its key.", attribute="import_verb"),
+        "sign_request": Verb("deployment", "Answer the request of a robot."),
+        "import": Verb("deployment", "Put an answer beside its key.", attribute="import_verb"),
     },
     "Policy": {
         "generate_policy": Verb("generate_policy", "Learn a policy from the running robot."),
         "merge_policy": Verb("policy", "Add the rights of policies to a policy file."),
         "diff_policy": Verb("policy", "Compare the rights of policies, permissions, keystores."),
-        "minimize_policy": Verb("minimize", "Narrow a policy to what was observed."),
+        "minimize_policy": Verb("policy", "Narrow a policy to what was observed."),
         "explain": Verb("explain", "Say what DDS will decide, by which rule, and why."),
         "view": Verb("view", "Draw who may do what, as a page, SVG, DOT, Mermaid or JSON."),
-        "policies": Verb("policies", "List or copy the policies that ship with sros."),
+        "policies": Verb("policy", "List or copy the policies that ship with sros."),
     },
     "Running": {
         "env": Verb("running", "Print the environment of an enclave."),
         "run": Verb("running", "Run a command in an enclave."),
         "check": Verb("check", "Find what is wrong or weak in policies, keystores, the runtime."),
-        "doctor": Verb("doctor", "Find out which DDS here enforces security."),
+        "doctor": Verb("check", "Find out which DDS here enforces security."),
         "demo": Verb("demo", "Show on a real DDS that secured nodes are isolated."),
-        "completion": Verb("completion", "Print the completion script of a shell."),
+        "completion": Verb("running", "Print the completion script of a shell."),
     },
 }
 _VERBS = {name: verb for family in FAMILIES.values() for name, verb in family.items()}
@@ -123,3 +129,98 @@ Exit status: 0 yes or done; 1 no, denied or failed; 2 wrong usage."""
 @click.version_option(__version__, "--version", "-V", message="sros %(version)s")
 def program() -> None:
     """Secure ROS 2 robots: keystores, enclaves and permissions from policies in ROS terms."""
+
+
+_PHRASES = {
+    "create_keystore": "create keystore",
+    "create_enclave": "create enclave",
+    "create_permission": "create permission",
+    "generate_artifacts": "generate artifacts",
+    "list_enclaves": "list enclaves",
+    "distribute_key": "distribute key",
+    "rotate_ca": "rotate the CA",
+    "create_request": "create the request",
+    "sign_request": "sign the request",
+    "import": "import the answer",
+    "generate_policy": "generate policy",
+    "merge_policy": "merge policies",
+    "diff_policy": "compare",
+    "minimize_policy": "minimize the policy",
+    "env": "print the environment",
+    "run": "run the command",
+    "demo": "run the demo",
+    "doctor": "examine this machine",
+}
+
+
+def report_error(error: BaseException) -> int:
+    """Print what is wrong, why, and what to do; return the exit status."""
+    if isinstance(error, SystemExit):
+        return error.code if isinstance(error.code, int) else 1
+    if isinstance(error, click.exceptions.Exit):
+        return error.exit_code
+    if isinstance(error, (KeyboardInterrupt, click.Abort)):
+        print("sros: interrupted", file=sys.stderr)
+        return 130
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):
+        error.show()
+        return 2
+    if isinstance(error, click.UsageError):
+        return _usage(error)
+    if isinstance(error, SrosError):
+        return _say(_prefixed(str(error)), error.exit_status)
+    if isinstance(error, OSError):
+        return _say(_prefixed(_os_problem(error)), 1)
+    return _defect(error)
+
+
+def _usage(error: click.UsageError) -> int:
+    message = error.format_message()
+    where = error.ctx.command_path if error.ctx else "sros"
+    return _say(f"{where}: {message} See `{where} --help`.", 2)
+
+
+def _say(text: str, status: int) -> int:
+    print(visible(" ".join(text.split())), file=sys.stderr)
+    return status
+
+
+def _prefixed(text: str) -> str:
+    verb = _verb()
+    if verb is None:
+        return f"sros: {text}"
+    return f"Unable to {_PHRASES.get(verb, verb.replace('_', ' '))}: {text}"
+
+
+def _verb() -> str | None:
+
+    for word in sys.argv[1:]:
+        if not word.startswith("-"):
+            return _NAMES.get(word.replace("-", "_"))
+    return None
+
+
+def _os_problem(error: OSError) -> str:
+    if error.filename is None:  # perhaps what was done can only not be printed
+        try:
+            Path.cwd()
+        except OSError:
+            return "the folder that this runs in does not exist any more. Go to another one."
+        return f"the operating system refuses: {error.strerror or error}."
+    path = os.fsdecode(error.filename)
+    return f"the operating system refuses '{path}': {error.strerror or error}. Nothing was changed."
+
+
+def _defect(error: BaseException) -> int:
+    if os.environ.get("SROS_DEBUG"):
+        traceback.print_exception(error)
+    return _say(
+        _prefixed(
+            f"this is a defect of sros: {type(error).__name__}: {error}. Please report it; "
+            "SROS_DEBUG=1 shows where it happened."
+        ),
+        1,
+    )
+
+
+__all__ = ["UsageError", "report_error"]

@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 
 from sros_tool.cli.common import complete_keystore_and_enclave, now, split_root
-from sros_tool.errors import KeystoreError, UsageError
+from sros_tool.errors import KeystoreError, UnavailableError, UsageError
 
 _COMMAND = "sros.command"
 _WORDS = click.argument(
@@ -79,7 +79,7 @@ class _WithCommand(click.Command):
     cls=_WithCommand,
     epilog="""\b
 Example:
-  $ sros run keystore /talker_listener/talker -- python3 -m sros_tool.demo.talker
+  $ sros run keystore /talker_listener/talker -- python3 -m sros_tool.demo.nodes.talker
   [INFO] [talker]: Publishing: 'Hello World: 1'""",
 )
 @click.argument(
@@ -101,7 +101,7 @@ def run(ctx: click.Context, words: tuple[str, ...], domain: str | None, no_ros_a
     run`, or an executable of a ROS package), `--ros-args --enclave NAME` is added to it, so that
     the ROS graph shows the enclave.
     """
-    from sros_tool.runtime.ros_command import with_enclave
+    from sros_tool.runtime.environment import with_enclave
 
     root, rest = split_root(words)
     name, command = rest[0] if rest else "", [*rest[1:], *ctx.meta[_COMMAND]]
@@ -130,10 +130,10 @@ def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict
 
     ``domain_text`` is an option's value; without it $ROS_DOMAIN_ID counts.
     """
-    from sros_tool.keystore.create import list_enclaves
-    from sros_tool.keystore.enclave import enclave_path
-    from sros_tool.keystore.missing import no_such_enclave
-    from sros_tool.keystore.verify import check_enclave
+    from sros_tool.keystore.issuing.enclave import enclave_path
+    from sros_tool.keystore.layout import list_enclaves
+    from sros_tool.keystore.loading import check_enclave
+    from sros_tool.keystore.reader import no_such_enclave
     from sros_tool.names import check_enclave_name
     from sros_tool.runtime.environment import (
         DOMAIN,
@@ -161,3 +161,22 @@ def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict
             f"See `sros inspect {folder}`.",
         )
     return secured_environment(root, name, domain)
+
+
+@click.command(
+    "completion",
+    epilog="""\b
+Example:
+  $ sros completion bash > ~/.local/share/bash-completion/completions/sros""",
+)
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
+def completion(shell: str) -> None:
+    """Print the script with which SHELL completes verbs, options, enclaves and templates."""
+    from click.shell_completion import get_completion_class
+
+    from sros_tool.cli.program import program
+
+    kind = get_completion_class(shell)
+    if kind is None:
+        raise UnavailableError(f"there is no completion for {shell}")
+    click.echo(kind(program, {}, "sros", "_SROS_COMPLETE").source())

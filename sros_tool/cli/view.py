@@ -189,7 +189,7 @@ def _check_no_governance(sources: tuple[Path, ...], read: list[Source]) -> None:
 def _checked(path: Path, moment: datetime) -> list[Finding]:
     """What `sros check` finds there; of permissions or an enclave alone, what it can."""
     from sros_tool.checks.targets import Circumstances, path_findings
-    from sros_tool.cli.zone import local_zone
+    from sros_tool.cli.common import local_zone
     from sros_tool.errors import SrosError
     from sros_tool.report.picture import Finding
 
@@ -227,10 +227,10 @@ def _hosts(words: tuple[str, ...]) -> dict[str, str]:
 def _rendered(
     picture: Picture, form: str, everything: bool, graphviz: bool, moment: datetime
 ) -> str:
-    from sros_tool.report.scenes import scenes_of
+    from sros_tool.report.layout import scenes_of
 
     if form == "json":
-        from sros_tool.report.as_json import render_json
+        from sros_tool.report.picture import render_json
 
         return render_json(picture)
     scenes = scenes_of(picture)
@@ -243,7 +243,7 @@ def _rendered(
         from sros_tool.report.svg import render_svg
 
         return render_svg(picture, scene)
-    from sros_tool.report.graphs import graphviz_svg, render_dot, render_mermaid
+    from sros_tool.report.dot_mermaid import graphviz_svg, render_dot, render_mermaid
 
     if form == "mermaid":
         return render_mermaid(picture, scene)

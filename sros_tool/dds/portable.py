@@ -11,7 +11,7 @@ from fnmatch import fnmatchcase
 from itertools import combinations
 
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Criteria, Permissions
-from sros_tool.notes import Note
+from sros_tool.errors import Note
 
 _MANY = 3
 _LONGEST_TOPIC = 251  # bytes, of DDS names

@@ -24,11 +24,10 @@ from pathlib import Path
 from typing import Any
 
 from sros_tool.demo.backend import Backend
-from sros_tool.demo.isolated import Tell
+from sros_tool.demo.keystores import Scenery
 from sros_tool.demo.launch import base_environment
 from sros_tool.demo.model import Identity, Role
-from sros_tool.demo.network import RowNetwork
-from sros_tool.demo.scenery import Scenery
+from sros_tool.demo.network import RowNetwork, Tell
 from sros_tool.errors import SrosError
 from sros_tool.runtime.netns import end_with_parent
 

@@ -10,11 +10,11 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from sros_tool.dds.domains import DomainSet
+from sros_tool.demo.keystores import Setting, build_scenery
 from sros_tool.demo.policies import DEFAULT_TOPIC
 from sros_tool.demo.scenarios.isolation import ISOLATION
-from sros_tool.demo.scenery import Setting, build_scenery
 from sros_tool.keystore.template import load_template
-from sros_tool.runtime.cyclone_library import INSTALL_ADVICE
+from sros_tool.runtime.cyclone import INSTALL_ADVICE
 from sros_tool.runtime.stacks import ROS_ADVICE, Stack, survey
 
 _PROBE_DOMAIN = 80

@@ -9,11 +9,11 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from sros_tool.demo.capture import udp_ports
 from sros_tool.demo.records import PartyRecord
+from sros_tool.demo.wire import udp_ports
 from sros_tool.runtime.events import Event, EventReader, Kind
 from sros_tool.runtime.netns import end_with_parent
-from sros_tool.runtime.security_log import plain_text
+from sros_tool.runtime.vendor_log import plain_text
 
 _LEFT_OUT_PREFIXES = ("ROS_SECURITY_",)
 _LEFT_OUT = frozenset(

@@ -16,17 +16,15 @@ from tempfile import TemporaryDirectory
 from types import FrameType
 
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
-from sros_tool.demo.backend import AUTO, RCLPY, Backend, choose_backend
-from sros_tool.demo.conditions import conditions
+from sros_tool.demo.backend import AUTO, RCLPY, Backend, choose_backend, conditions
 from sros_tool.demo.cost import UNSECURED, CostResult, Effort, measure_cost
-from sros_tool.demo.given import GivenKeystore, open_given
-from sros_tool.demo.isolated import Tell, run_isolated
+from sros_tool.demo.keystores import GivenKeystore, Setting, build_scenery, open_given
 from sros_tool.demo.model import Identity, Row, Scenario
+from sros_tool.demo.network import Tell, run_isolated
 from sros_tool.demo.policies import DEFAULT_TOPIC, check_topic
 from sros_tool.demo.result import DemoResult, ScenarioResult
 from sros_tool.demo.runner import Limits, Plan, run_plan
 from sros_tool.demo.scenarios.isolation import ISOLATION
-from sros_tool.demo.scenery import Setting, build_scenery
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.runtime.netns import Isolation, try_isolation

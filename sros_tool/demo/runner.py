@@ -1,4 +1,4 @@
-"""Run rows at the same time, each in a network or domain of its own, and record what happened.
+"""What an onlooker on the network does with packets that he has seen: replay them, change them.
 
 A row's window starts when all its processes are ready, so a busy machine is waited for.  It is as
 long for silence as for sound; only a brief row in which nobody has to be silent ends early.
@@ -11,21 +11,69 @@ import math
 import os
 import time
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from sros_tool.demo.backend import Backend
-from sros_tool.demo.isolated import ENDING_SIGNALS
+from sros_tool.demo.keystores import Scenery
 from sros_tool.demo.launch import PartyProcess, base_environment
 from sros_tool.demo.model import DENIALS, SPEAKING, Claim, Party, Relation, Role, Row, Wire
-from sros_tool.demo.network import RowNetwork
-from sros_tool.demo.onlooker import end_softly, forge_packets, replay_packets
-from sros_tool.demo.records import RowRecord, RowResult
-from sros_tool.demo.scenery import Scenery
+from sros_tool.demo.network import ENDING_SIGNALS, RowNetwork
+from sros_tool.demo.records import Replay, RowRecord, RowResult, forged_text
 from sros_tool.demo.verdict import judge_row
-from sros_tool.demo.wiretap import Wiretap
+from sros_tool.demo.wire import Wiretap, with_other_words
 from sros_tool.runtime.events import Kind
+
+_ONLOOKER_TICK = 0.05
+_ONLOOKER_GRACE = 0.3
+_SECONDS_TO_END = 2.0
+_AFTER_REPLAY = 2.0
+_LONGEST_PAUSE = 0.5
+_ROUNDS = 2
+_FORGED = 5
+_AFTER_FORGERY = 1.0
+
+
+async def replay_packets(talker: PartyProcess, tap: Wiretap) -> Replay:
+    """Let a talker leave, then send again what it had sent, at the pace of the original."""
+    packets = tap.packets(talker.ports())
+    await end_softly([talker])
+    await asyncio.sleep(_ONLOOKER_GRACE)
+    started = time.monotonic()
+    # Twice, since the listener may take from the first round only who there is to hear.
+    for _ in range(_ROUNDS):
+        for before, each in zip([*packets[:1], *packets], packets, strict=False):
+            await asyncio.sleep(min(each.time - before.time, _LONGEST_PAUSE))
+            tap.send(each.packet)
+    await asyncio.sleep(_AFTER_REPLAY)
+    return Replay(len(packets), started)
+
+
+async def forge_packets(talker: PartyProcess, tap: Wiretap) -> Replay:
+    """Hold a talker, and go on in its name with packets that say something else."""
+    talker.hold()
+    await asyncio.sleep(_ONLOOKER_GRACE)
+    words, others = talker.text, forged_text(talker.text)
+    packets = [each.packet for each in reversed(tap.packets(talker.ports()))]
+    last = next((each for each in packets if with_other_words(each, words, others, 1)), b"")
+    started = time.monotonic()
+    steps = range(1, _FORGED + 1) if last else ()
+    sent = [each for step in steps if (each := with_other_words(last, words, others, step))]
+    for packet in sent:
+        tap.send(packet)
+    await asyncio.sleep(_AFTER_FORGERY)
+    return Replay(len(sent), started)
+
+
+async def end_softly(processes: Collection[PartyProcess]) -> None:
+    """Let processes end by themselves, for a while; they log and report until then."""
+    for process in processes:
+        process.ask_to_end()
+    latest = time.monotonic() + _SECONDS_TO_END
+    while time.monotonic() < latest and not all(process.gone for process in processes):
+        await asyncio.sleep(_ONLOOKER_TICK)
+
 
 _TICK = 0.05
 _GRACE = 0.3

@@ -12,7 +12,7 @@ import signal
 from sros_tool.demo.model import STATUS_OF, Claim, Party, Relation, Role, Status, Wire
 from sros_tool.demo.records import Finding, PartyRecord, RowRecord, RowResult, forged_text
 from sros_tool.runtime.events import Event, Kind, Stage
-from sros_tool.runtime.security_log import (
+from sros_tool.runtime.vendor_log import (
     endpoint_refusal,
     missing_security,
     participant_refusal,

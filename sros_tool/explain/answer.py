@@ -1,11 +1,20 @@
-"""Answers a question by the decision engine, for one vendor: the outcome, and what decided it."""
+"""Answers a question by the decision engine, for one vendor: the outcome, and what decided it.
+
+A right is added only if none covers the question, and a denial is lifted only if it stands in the
+way; the result is tried out on the decision engine before it is proposed.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
+from enum import StrEnum
 from functools import lru_cache
+from pathlib import Path
+
+from lxml import etree
 
 from sros_tool.dds.decision import (
     TRAITS,
@@ -14,15 +23,34 @@ from sros_tool.dds.decision import (
     Outcome,
     Refusal,
     Vendor,
+    Verb,
     read_governance_as,
     read_permissions_as,
 )
-from sros_tool.dds.decision.moments import read_moment
-from sros_tool.dds.governance import DomainRule, Governance
+from sros_tool.dds.decision.matching import read_moment
+from sros_tool.dds.governance import DomainRule, Governance, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions
-from sros_tool.explain.material import Material
+from sros_tool.errors import SrosError
+from sros_tool.explain.material import Material, from_policy
 from sros_tool.explain.question import OWN_PARTS, Part, Question
-from sros_tool.keystore.verify import Problem
+from sros_tool.explain.remedy import remedy
+from sros_tool.keystore.issuing.ledger import LEDGER, read_ledger
+from sros_tool.keystore.loading import Problem
+from sros_tool.names import dds_names, expand, is_expression
+from sros_tool.policy.document import write_policy
+from sros_tool.policy.model import (
+    ALLOW,
+    DENY,
+    Enclave,
+    Group,
+    Policy,
+    Profile,
+    Profiles,
+    Qualifier,
+    Source,
+)
+from sros_tool.policy.rights import Right, profile_rights
+from sros_tool.translate import grant_rights
 
 _WORST = (
     Outcome.CRASHES,
@@ -185,3 +213,368 @@ class Judge:
             if self._material.signed and moment is not None and 0 < moment < 2**40:
                 ends.append(("permissions.p7s", datetime.fromtimestamp(moment, UTC)))
         return min(ends, key=lambda each: each[1], default=("", None))
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """A name in a policy that stands for a rule: where it is written, how, and what it says.
+
+    ``group`` and ``profile`` are those that it stands in; ``right`` is the policy's word.
+    """
+
+    source: Source
+    qualifier: Qualifier
+    right: str
+    name: str
+    group: Group
+    profile: Profile
+
+    def __str__(self) -> str:
+        """As ``robot.xml:12: ALLOW publish chatter``."""
+        return f"{self.source}: {self.qualifier.value} {self.right} {self.name}"
+
+
+class Provenance(StrEnum):
+    """How signed permissions and a policy file hang together."""
+
+    SAME = "same"
+    """They were made from the file as it is now."""
+    CHANGED = "changed"
+    """They were made from another file, or the file has changed since."""
+    UNKNOWN = "unknown"
+    """The ledger does not know what they were made from."""
+    PLANNED = "planned"
+    """The policy was asked itself; nothing is signed."""
+
+
+def provenance(root: Path, signed: bytes, policy: Enclave) -> Provenance:
+    """Whether ``policy`` is what the ledger of a keystore says that ``signed`` was made from."""
+    digest = recorded_policy(root, signed)
+    if not digest:
+        return Provenance.UNKNOWN
+    return Provenance.SAME if digest == policy.digest else Provenance.CHANGED
+
+
+def recorded_policy(root: Path, signed: bytes) -> str:
+    """The SHA-256 of the policy that signed permissions were made from, or ""."""
+    digest = hashlib.sha256(signed).hexdigest()
+    found = (e.policy for e in reversed(read_ledger(root)) if e.sha256 == digest)
+    return next(found, "")
+
+
+def origins(
+    enclave: Enclave, verb: Verb, expression: str, qualifier: Qualifier
+) -> tuple[Origin, ...]:
+    """The names of an enclave's policy that stand for a DDS ``expression`` of signed permissions.
+
+    Several nodes of an enclave may have the same right, so there may be several.
+    """
+    return tuple(
+        each
+        for each in _names(enclave)
+        if each.qualifier is qualifier and expression in _topics(each, verb)
+    )
+
+
+def origins_of(enclave: Enclave, right: Right) -> tuple[Origin, ...]:
+    """The names of an enclave's policy that state a right or denial."""
+    return tuple(
+        each
+        for each in _names(enclave)
+        if (each.qualifier, each.right) == (right.qualifier, right.right)
+        and expand(each.name, each.profile.ns, each.profile.node) == right.name
+    )
+
+
+def _names(enclave: Enclave) -> Iterator[Origin]:
+    for profile in enclave.all_profiles():
+        for group in profile.groups:
+            for index, name in enumerate(group.names):
+                source = group.source_of(index)
+                for right, qualifier in group.rights:
+                    yield Origin(source, qualifier, right, name, group, profile)
+
+
+def _topics(origin: Origin, verb: Verb) -> tuple[str, ...]:
+    fqn = expand(origin.name, origin.profile.ns, origin.profile.node)
+    names = dds_names(origin.right, fqn)
+    return names.publish if verb is Verb.PUBLISH else names.subscribe
+
+
+_NO_RULE = frozenset({"no-rule", "default"})
+
+
+@dataclass(frozen=True, slots=True)
+class Edit:
+    """A group of a policy file that is to be replaced; ``xml`` may be "", where nothing is left."""
+
+    source: Source
+    xml: str
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """Rights to add and denials to lift.
+
+    ``document`` is a policy of the additions alone, for ``sros merge_policy``; ``edits`` are how
+    the groups that deny have to read, where the policy file is known.
+    """
+
+    add: tuple[Right, ...]
+    lift: tuple[Right, ...]
+    document: str
+    edits: tuple[Edit, ...]
+
+
+def smallest_change(
+    enclave: str,
+    rights: Iterable[Right],
+    question: Question,
+    governance: Governance,
+    vendor: Vendor,
+    setting: Setting,
+    policy: Enclave | None = None,
+) -> Change | None:
+    """The change that makes ``vendor`` allow the question, or None if no policy could.
+
+    ``rights`` are what the enclave has now, ``policy`` is where they come from, if that is known.
+    """
+    if not question.right:
+        return None
+    wanted = question.allowed(enclave)
+    present = {right for right in rights if right.kind != "dds"}
+    add: list[Right] = []
+    lift: list[Right] = []
+    while True:
+        material = from_policy(as_policy(enclave, present), governance, at=setting.at)
+        answer = Judge(vendor, material, setting).answer(question)
+        decision = answer.deciding.decision
+        if answer.allowed:
+            break
+        if decision.reason == "deny-rule":
+            blocking = _blocking(present, answer.deciding, decision.expression or "")
+        elif decision.reason in _NO_RULE and wanted not in present:
+            present.add(wanted)
+            add.append(wanted)
+            continue
+        else:
+            return None
+        if not blocking:
+            return None
+        present.difference_update(blocking)
+        lift += sorted(blocking)
+    return Change(
+        tuple(add),
+        tuple(lift),
+        _document(add, policy),
+        tuple(_edits(lift, policy)) if policy else (),
+    )
+
+
+def as_policy(enclave: str, rights: Iterable[Right]) -> Enclave:
+    """An enclave with one nameless node that has these rights."""
+    groups = tuple(
+        Group(right.kind, ((right.right, right.qualifier),), (right.name,))
+        for right in sorted(rights)
+    )
+    return Enclave(enclave, (Profiles((Profile("/", "", groups),)),))
+
+
+def _blocking(rights: Iterable[Right], deciding: PartAnswer, expression: str) -> list[Right]:
+    """The denials from which an expression comes; of the other direction only if it must be.
+
+    Cyclone DDS denies a topic as a whole by a denial of either direction.
+    """
+    publishes = deciding.part is not None and deciding.part.verb is Verb.PUBLISH
+    own: list[Right] = []
+    other: list[Right] = []
+    for right in rights:
+        if right.qualifier is DENY:
+            names = dds_names(right.right, right.name)
+            if expression in (names.publish if publishes else names.subscribe):
+                own.append(right)
+            elif expression in names.publish + names.subscribe:
+                other.append(right)
+    return own or other
+
+
+def _document(add: list[Right], policy: Enclave | None) -> str:
+    if not add:
+        return ""
+    (right,) = add
+    ns, node = _place(right, policy)
+    group = Group(right.kind, ((right.right, right.qualifier),), (right.name,))
+    enclave = Enclave(right.enclave, (Profiles((Profile(ns, node, (group,)),)),))
+    return write_policy(Policy((enclave,))).decode().rstrip()
+
+
+def _place(right: Right, policy: Enclave | None) -> tuple[str, str]:
+    """The node that gets a right: the innermost one whose namespace the name lies in."""
+    profiles = policy.all_profiles() if policy else ()
+    fitting = [
+        each for each in profiles if right.name.startswith(each.ns.rstrip("/") + "/")
+    ] or list(profiles)
+    if not fitting:
+        return "/", right.enclave.rpartition("/")[2] or "node"
+    best = max(fitting, key=lambda each: len(each.ns))
+    return best.ns, best.node
+
+
+def _edits(lift: list[Right], policy: Enclave) -> Iterable[Edit]:
+    """What each group that denies has to read without these denials."""
+    groups: dict[Source, Group] = {}
+    found: dict[Source, set[tuple[str, str]]] = {}
+    for right in lift:
+        for origin in origins_of(policy, right):
+            groups[origin.group.source] = origin.group
+            found.setdefault(origin.group.source, set()).add((origin.name, origin.right))
+    for source, lifted in found.items():
+        group = groups[source]
+        kept: dict[tuple[tuple[str, str], ...], list[str]] = {}
+        for name in group.names:
+            rights = tuple(each for each in group.rights if (name, each[0]) not in lifted)
+            if rights:
+                kept.setdefault(rights, []).append(name)
+        yield Edit(source, "\n".join(_xml(group.kind, *each) for each in kept.items()))
+
+
+def _xml(kind: str, rights: tuple[tuple[str, str], ...], names: list[str]) -> str:
+    element = etree.Element(kind, dict(rights))
+    for name in names:
+        etree.SubElement(element, kind.removesuffix("s")).text = name
+    etree.indent(element, space="  ")
+    return etree.tostring(element, encoding="unicode")
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """Of what, where and by which policy a question is asked.
+
+    ``root`` is the keystore, ``policy`` the enclave's part of a policy file, where given.
+    """
+
+    material: Material
+    setting: Setting
+    root: Path | None = None
+    policy: Enclave | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """An answer with its reasons.
+
+    ``wildcard`` is the expression of a rule that allows or denies by a wildcard, or "".
+    ``change`` is what a policy would have to say, ``remedy`` what to do where that is no matter
+    of the policy.  ``sign`` says that the policy file, as it is now, would allow it once signed.
+    ``recorded`` is the SHA-256 of the policy that the permissions were made from, where known.
+    """
+
+    answer: Answer
+    wildcard: str
+    provenance: Provenance | None
+    origins: tuple[Origin, ...]
+    who_denies: str
+    change: Change | None = None
+    remedy: str = ""
+    sign: bool = False
+    recorded: str = ""
+
+
+def explain(case: Case, question: Question, vendor: Vendor) -> Explanation:
+    """What one vendor answers, and why."""
+    answer = Judge(vendor, case.material, case.setting).answer(question)
+    decision = answer.deciding.decision
+    known = _provenance(case)
+    change, sign = None, False
+    if not answer.allowed and not answer.problems:
+        change, sign = _change(case, answer, known)
+    return Explanation(
+        answer,
+        decision.expression if is_expression(decision.expression or "") else "",  # type: ignore[arg-type]
+        known,
+        _origins(case, answer),
+        _who_denies(answer),
+        change,
+        "" if answer.allowed or change or sign else _remedy(case, answer, decision.reason),
+        sign,
+        recorded_policy(case.root, case.material.signed)
+        if case.root and (case.root / LEDGER).exists()
+        else "",
+    )
+
+
+def _provenance(case: Case) -> Provenance | None:
+    if case.policy is None:
+        return None
+    if not case.material.signed:
+        return Provenance.PLANNED
+    if case.root is None:
+        return Provenance.UNKNOWN
+    return provenance(case.root, case.material.signed, case.policy)
+
+
+def _origins(case: Case, answer: Answer) -> tuple[Origin, ...]:
+    decision, part = answer.deciding.decision, answer.deciding.part
+    if case.policy is None or part is None or not decision.expression or answer.grant is None:
+        return ()
+    rule = answer.grant.rules[decision.rule or 0]
+    verb, qualifier = part.verb, ALLOW if rule.allow else DENY
+    found = origins(case.policy, verb, decision.expression, qualifier)
+    # Cyclone DDS denies a topic as a whole, also by a rule of the other direction.
+    other = Verb.SUBSCRIBE if verb is Verb.PUBLISH else Verb.PUBLISH
+    return found or origins(case.policy, other, decision.expression, qualifier)
+
+
+def _change(case: Case, answer: Answer, known: Provenance | None) -> tuple[Change | None, bool]:
+    """What would have to change, and whether signing the policy as it is would do."""
+    try:
+        governance = parse_governance(case.material.governance)
+    except SrosError:
+        return None, False
+    name = case.material.enclave
+    rights: frozenset[Right] = frozenset()
+    if case.policy:
+        profiles = case.policy.all_profiles()
+        rights = frozenset(r for each in profiles for r in profile_rights(name, each))
+    elif answer.grant:
+        rights = grant_rights(name, answer.grant)
+    change = smallest_change(
+        name, rights, answer.question, governance, answer.vendor, case.setting, case.policy
+    )
+    if change and not (change.add or change.lift):
+        return None, known is Provenance.CHANGED
+    return change, False
+
+
+def _remedy(case: Case, answer: Answer, reason: str) -> str:
+    root = str(case.root) if case.root else ""
+    faulty = (each.file for each in answer.problems if each.code == reason)
+    return remedy(reason, root, case.material.enclave, next(faulty, ""))
+
+
+def _who_denies(answer: Answer) -> str:
+    question = answer.question
+    match answer.outcome:
+        case Outcome.ALLOWED:
+            return ""
+        case Outcome.PEER_DENIES:
+            return "the peers: the node starts, and none of them talks to it"
+        case Outcome.REFUSED:
+            return "DDS in the process itself: no node of the enclave starts"
+        case Outcome.CRASHES:
+            return "nobody: the process crashes when it starts"
+        case Outcome.DENIED if answer.deciding.part not in question.parts:
+            return "DDS in the process itself: no node of the enclave starts"
+        case _:
+            return f"DDS in the process itself: {_MADE.get(question.word, 'it')} is not created"
+
+
+_MADE = {
+    "publish": "the publisher",
+    "subscribe": "the subscription",
+    "call": "the client",
+    "request": "the client",
+    "serve": "the server",
+    "reply": "the server",
+    "execute": "the action server",
+}

@@ -13,7 +13,6 @@ from shlex import quote
 
 from sros_tool.dds.decision import Vendor, Verb
 from sros_tool.explain.answer import Answer, Judge, Setting
-from sros_tool.explain.log_texts import MEANINGS, UNKNOWN, Meaning
 from sros_tool.explain.material import Material
 from sros_tool.explain.question import Part, Question, ask
 from sros_tool.explain.remedy import remedy
@@ -28,7 +27,7 @@ from sros_tool.graph.denials import (
 )
 from sros_tool.graph.observation import PUBLISH
 from sros_tool.policy.patterns import covers
-from sros_tool.runtime.security_log import plain_refusal, plain_text
+from sros_tool.runtime.vendor_log import MEANINGS, UNKNOWN, Meaning, plain_refusal, plain_text
 from sros_tool.translate import grant_rights
 
 _CONTINUED = re.compile(r"^(?:[0-9A-F]{8,}:error:|\(code: )")

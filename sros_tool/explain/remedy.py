@@ -9,7 +9,8 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.errors import SrosError
-from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.issuing.ledger import LEDGER
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     IDENTITY,
@@ -17,8 +18,7 @@ from sros_tool.keystore.layout import (
     PRIVATE,
     ca_certificate,
 )
-from sros_tool.keystore.ledger import LEDGER
-from sros_tool.keystore.rotation import Stage, read_rotation
+from sros_tool.keystore.lifecycle.rotation.state import Stage, read_rotation
 
 _RENEW = "Renew it: `sros renew {root} {enclave}`."
 _NEW_KEY = "Give the enclave another key: `sros renew {root} {enclave} --new-key`."

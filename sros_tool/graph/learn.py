@@ -1,4 +1,7 @@
-"""Turns an observation into the least policy under which the robot does what was seen.
+"""How a learned policy writes names: relative where that serves, and not those of one run.
+
+A part is chosen only where the node has everything in it, so that an include grants nothing that
+was not seen.
 
 Names come over the network, and on an unsecured robot from anybody: whatever is no plain ROS name
 is left out, above all a topic that is *named* like a wildcard.
@@ -6,15 +9,15 @@ is left out, above all a topic that is *named* like a wildcard.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
-from sros_tool.errors import InvalidNameError
-from sros_tool.graph.common import CommonParts
-from sros_tool.graph.fold import Right, fold
-from sros_tool.graph.naming import is_tool, stable_name, written
-from sros_tool.graph.observation import Endpoint, Observation, ObservedNode
-from sros_tool.graph.remarks import Remarks
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.permissions import Criteria, Rule
+from sros_tool.errors import DocumentError, InvalidNameError, Note
+from sros_tool.graph.observation import PUBLISH, SUBSCRIBE, Endpoint, Observation, ObservedNode
 from sros_tool.names import (
     check_enclave_name,
     check_namespace,
@@ -22,8 +25,267 @@ from sros_tool.names import (
     expression_problem,
     is_expression,
 )
-from sros_tool.notes import Note
+from sros_tool.policy.document import Includer, Place
 from sros_tool.policy.model import ALLOW, RIGHTS, Enclave, Group, Policy, Profile, Profiles
+from sros_tool.translate import ros_rights
+from sros_tool.xml import read_bytes, tag_of
+
+_CHANGING = (
+    # tf2_ros names the node of a listener by its address; the others by their process.
+    (re.compile(r"(transform_listener_impl_)[0-9a-f]+\Z"), r"\1*"),
+    (re.compile(r"(launch_ros_)[0-9]+\Z"), r"\1*"),
+    (re.compile(r"(rqt_gui_(?:py|cpp)_node_)[0-9]+\Z"), r"\1*"),
+)
+_TOOLS = re.compile(r"_ros2cli(_.*)?\Z|_sros_observer\Z")
+
+_ABSOLUTE = frozenset(
+    ("/bond", "/clock", "/diagnostics", "/parameter_events", "/rosout", "/tf", "/tf_static")
+)
+"""Names that packages write with a leading slash, so that a namespace does not change them."""
+
+
+def is_tool(name: str) -> bool:
+    """Whether a node is that of a tool that looks at the robot, and no part of it."""
+    return _TOOLS.match(name) is not None
+
+
+def stable_name(name: str) -> str:
+    """The node's name, with ``*`` for a part that is another one each time that it starts."""
+    for pattern, stable in _CHANGING:
+        if pattern.match(name):
+            return pattern.sub(stable, name)
+    return name
+
+
+def written(fqn: str, ns: str, node: str) -> str:
+    """How the profile of ``node`` in ``ns`` writes an absolute name; `expand` gives it back.
+
+    ``~/x`` for what is the node's own, ``x`` for what is in its namespace, ``/x`` for the rest.
+    In the root namespace only what lies directly in it is relative, as the rest is of others.
+    """
+    own = expand("~/", ns, node)
+    if fqn.startswith(own):
+        return "~/" + fqn[len(own) :]
+    prefix = "/" if ns == "/" else ns + "/"
+    if fqn in _ABSOLUTE or not fqn.startswith(prefix):
+        return fqn
+    rest = fqn[len(prefix) :]
+    if ns == "/" and "/" in re.sub(r"/_(action/\w+|service_event)\Z", "", rest):
+        return fqn
+    return rest
+
+
+_SHOWN = 5
+
+_TEXTS = {
+    "ambiguous": "the graph does not tell in which enclave each of these nodes of the same name "
+    "runs, so their rights stand in all of them; start them one at a time under --watch to tell "
+    "them apart: {}",
+    "changing-name": "nodes that get another name each time they start have a profile with a "
+    "wildcard: {}",
+    "half-service": "left out, as only one half of a service was seen (look again with a longer "
+    "--spin-time): {}",
+    "no-ros-name": "left out, as a policy has no words for topics outside of ROS's naming: {}",
+    "odd-name": "left out, as these are no names that ROS gives; somebody may be trying to get a "
+    "wildcard into your policy: {}",
+    "odd-node": "left out, as no policy can name these nodes or their enclaves: {}",
+    "partial-action": "only parts of an action are used, and stand as what they are: {}",
+    "root-enclave": "all {} nodes run in the enclave /, and share all rights; start each process "
+    "with `--ros-args --enclave /its/name` and learn again to tell them apart",
+    "service-event": "service introspection is on: what these services are asked is readable by "
+    "every subscriber; take the topics out if that is for debugging only: {}",
+    "sets-clock": "may set the clock of every node that uses simulated time; meant for a simulator "
+    "or a player: {}",
+    "silent": "left out, as they were announced and had no endpoint: {}",
+    "stray": "left out, as the writers or readers of these topics belong to no ROS node: {}",
+    "unknown-enclave": "left out, as the graph does not tell in which enclaves these nodes run: "
+    "theirs was set by ROS_SECURITY_ENCLAVE_OVERRIDE, and the observer's keystore has no "
+    "certificate of theirs; observe with the keystore that has their enclaves (--keystore), or "
+    "start them with `--ros-args --enclave /its/name`: {}",
+    "tool": "left out, as they are tools that look at the robot: {}",
+}
+
+
+class Remarks:
+    """Collects remarks of a kind, and says each kind once."""
+
+    def __init__(self) -> None:
+        self._found: dict[str, set[str]] = {}
+
+    def add(self, kind: str, subject: str) -> None:
+        """Remark on a node, a topic, or a number."""
+        self._found.setdefault(kind, set()).add(subject)
+
+    def notes(self) -> tuple[Note, ...]:
+        """One note for each kind, in the order of their ids."""
+        return tuple(
+            Note(f"graph.{kind}", _TEXTS[kind].format(_listed(sorted(subjects))))
+            for kind, subjects in sorted(self._found.items())
+        )
+
+
+def _listed(subjects: list[str]) -> str:
+    more = len(subjects) - _SHOWN
+    return ", ".join(subjects[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+
+
+_ANY_DOMAIN = DomainSet.of((0, 0))
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Right:
+    """A right (publish, subscribe, request, reply, call, execute) on an absolute ROS name."""
+
+    right: str
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Folded:
+    """The rights behind a set of endpoints.
+
+    ``halves`` are endpoints of services whose other half is missing; ``foreign`` are topics that
+    have no ROS name.  Neither can be said in a policy.
+    """
+
+    rights: frozenset[Right]
+    halves: frozenset[Endpoint]
+    foreign: frozenset[Endpoint]
+
+
+def fold(endpoints: Iterable[Endpoint]) -> Folded:
+    """Actions and services are folded back from their topics where all of these are there."""
+    endpoints = tuple(endpoints)
+    rule = Rule(True, _ANY_DOMAIN, _criteria(endpoints, PUBLISH), _criteria(endpoints, SUBSCRIBE))
+    rights, halves, foreign = set(), set(), set()
+    for each in ros_rights(rule):
+        if each.kind != "dds":
+            rights.add(Right(each.right, each.name))
+        elif each.name.startswith(("rq/", "rr/")):
+            halves.add(Endpoint(each.name, each.right))
+        else:
+            foreign.add(Endpoint(each.name, each.right))
+    return Folded(frozenset(rights), frozenset(halves), frozenset(foreign))
+
+
+def _criteria(endpoints: Iterable[Endpoint], direction: str) -> tuple[Criteria, ...]:
+    topics = tuple(sorted(each.topic for each in endpoints if each.direction == direction))
+    return (Criteria(topics),) if topics else ()
+
+
+PARTS = (
+    "common/lifecycle_node.xml",
+    "common/component_container.xml",
+    "common/node.xml",
+    "common/rclcpp_node.xml",
+    "common/rclpy_node.xml",
+    "common/transform_listener.xml",
+    "common/node/logging.xml",
+    "common/node/parameters.xml",
+    "common/node/time.xml",
+    "common/node/types.xml",
+)
+"""The parts that a learned policy includes, relative to its folder; the widest first."""
+
+
+@dataclass(frozen=True, slots=True)
+class CommonParts:
+    """The parts that can be included beside a policy.
+
+    ``rights`` are those of each part, with names as it writes them; ``missing`` are the files
+    that have to be copied for a part: their paths beside the policy, and their content.
+    """
+
+    rights: Mapping[str, frozenset[Right]] = field(default_factory=dict)
+    missing: Mapping[str, Mapping[str, bytes]] = field(default_factory=dict)
+
+    def choose(
+        self, rights: frozenset[Right], ns: str, node: str
+    ) -> tuple[tuple[str, ...], frozenset[Right]]:
+        """The parts for a node with these rights (absolute names), and the rights that remain."""
+        chosen, rest = [], rights
+        for part, names in self.rights.items():
+            given = _expanded(names, ns, node)
+            if given <= rights and given & rest:
+                chosen.append(part)
+                rest -= given
+        return tuple(chosen), rest
+
+    def given(self, parts: Iterable[str], ns: str, node: str) -> frozenset[Right]:
+        """What these parts give to a node, by absolute names."""
+        return frozenset().union(*(_expanded(self.rights[part], ns, node) for part in parts))
+
+    def to_copy(self, parts: Iterable[str]) -> dict[str, bytes]:
+        """The files that these parts need and that are not beside the policy yet."""
+        return {path: data for part in parts for path, data in self.missing[part].items()}
+
+
+def common_parts(folder: Path, shipped: Path) -> CommonParts:
+    """What a policy in ``folder`` can include, from there or copied from ``shipped``.
+
+    A file of the user is taken as it is; what it would silently mix with ours is left out.
+    """
+    rights, missing = {}, {}
+    for part in PARTS:
+        needed = _closure(shipped, part)
+        if (folder / part).exists():
+            found, copies = _rights(folder, part), dict[str, bytes]()
+        else:
+            copies = {path: data for path, data in needed.items() if not (folder / path).exists()}
+            other = [
+                path for path in needed if path not in copies and _differs(folder, path, needed)
+            ]
+            found = None if other else _rights(shipped, part)
+        if found:
+            rights[part], missing[part] = found, copies
+    return CommonParts(rights, missing)
+
+
+def _expanded(rights: Iterable[Right], ns: str, node: str) -> frozenset[Right]:
+    return frozenset(Right(each.right, expand(each.name, ns, node)) for each in rights)
+
+
+def _differs(folder: Path, path: str, needed: Mapping[str, bytes]) -> bool:
+    try:
+        return read_bytes(folder / path, "policy file") != needed[path]
+    except DocumentError:
+        return True
+
+
+def _rights(root: Path, part: str) -> frozenset[Right] | None:
+    """What a part grants; None if it cannot be read, or denies something."""
+    includer = Includer(root.resolve())
+    file = (root / part).resolve()
+    rights = set()
+    try:
+        for group, _ in includer.children(includer.load(file), Place(file)):
+            for right, qualifier in group.attrib.items():
+                if qualifier != ALLOW:
+                    return None
+                rights |= {Right(str(right), (name.text or "").strip()) for name in group}
+    except DocumentError:
+        return None
+    return frozenset(rights)
+
+
+def _closure(root: Path, part: str) -> dict[str, bytes]:
+    """A shipped part and everything that it includes: path below ``root``, content."""
+    found: dict[str, bytes] = {}
+    waiting = [(root / part).resolve()]
+    includer = Includer(root.resolve())
+    while waiting:
+        file = waiting.pop()
+        path = file.relative_to(root.resolve()).as_posix()
+        if path in found:
+            continue
+        found[path] = read_bytes(file, "policy file")
+        waiting += [
+            (file.parent / each.get("href", "")).resolve()
+            for each in includer.load(file)
+            if tag_of(each).endswith("}include")
+        ]
+    return found
+
 
 _Place = tuple[str, str, str]
 
@@ -175,3 +437,31 @@ def _is_place(ns: str, name: str) -> bool:
     except InvalidNameError:
         return False
     return plain and name.replace("_", "a").isalnum() and name.isascii() and not name[0].isdigit()
+
+
+_EVERY_NODE = "common/node.xml"
+
+
+class News:
+    """Remembers what was told.  What every node has is not worth a line."""
+
+    def __init__(self, common: CommonParts) -> None:
+        self._ordinary = common.rights.get(_EVERY_NODE, frozenset[Right]())
+        self._told: set[tuple[str, str, str]] = set()
+        self._rights: set[tuple[str, str, str, Right]] = set()
+
+    def lines(self, observation: Observation) -> list[str]:
+        """A line for each node and each right in ``observation`` that was not told before."""
+        lines = []
+        for each in learn(observation).profiles:
+            place = each.enclave, each.ns, each.node
+            name = f"{each.ns.rstrip('/')}/{each.node}"
+            if place not in self._told:
+                self._told.add(place)
+                lines.append(f"new: {name} ({each.enclave})")
+            for right in sorted(each.rights):
+                plain = Right(right.right, written(right.name, each.ns, each.node))
+                if plain not in self._ordinary and (*place, right) not in self._rights:
+                    self._rights.add((*place, right))
+                    lines.append(f"new: {name} ({each.enclave}) {right.right} {right.name}")
+        return lines

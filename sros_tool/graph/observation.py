@@ -1,7 +1,7 @@
 """What was seen of a ROS graph: nodes with their DDS endpoints, and the union of several looks.
 
 Topics stand here by their raw DDS names (``rt/chatter``, ``rq/addRequest``), for only those tell
-everything apart; `sros_tool.graph.fold` says them in ROS terms.
+everything apart; `sros_tool.graph.learn` says them in ROS terms.
 """
 
 from __future__ import annotations

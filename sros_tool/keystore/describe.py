@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives import hashes
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, SrosError
-from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.issuing.enclave import enclave_path
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     PERMISSIONS,
@@ -25,8 +25,8 @@ from sros_tool.keystore.layout import (
     enclave_names,
     is_keystore,
 )
-from sros_tool.keystore.open import load_settings
-from sros_tool.keystore.verify import EnclaveState, check_enclave
+from sros_tool.keystore.loading import EnclaveState, check_enclave
+from sros_tool.keystore.reader import load_settings
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     load_certificate,

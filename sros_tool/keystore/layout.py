@@ -9,6 +9,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from sros_tool.errors import KeystoreError
+
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 SETTINGS = "sros.toml"
 """The choices by which the keystore was made; keystores of ros2/sros2 have none."""
@@ -85,3 +87,19 @@ def enclave_names(root: Path) -> Iterator[str]:
         if "key.pem" in files or "cert.pem" in files:
             found.append(folder[len(top) :].replace(os.sep, "/") or "/")
     yield from sorted(found)
+
+
+def list_enclaves(root: Path) -> tuple[str, ...]:
+    """The names of the enclaves of a keystore, sorted; `KeystoreError` if it is none."""
+    check_keystore(root)
+    return tuple(enclave_names(root))
+
+
+def check_keystore(root: Path) -> None:
+    """Raise `KeystoreError` if ``root`` is no keystore."""
+    if not is_keystore(root):
+        raise KeystoreError(
+            f"'{root}' is not a valid keystore",
+            "It does not exist." if not root.exists() else f"It has no {ENCLAVES} folder in use.",
+            f"Make one with `sros create_keystore {root}`.",
+        )

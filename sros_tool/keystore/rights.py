@@ -14,18 +14,17 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
-from sros_tool.errors import DocumentError, SrosError
-from sros_tool.keystore.enclave import enclave_path
+from sros_tool.errors import DocumentError, Note, SrosError
+from sros_tool.keystore.issuing.enclave import enclave_path
 from sros_tool.keystore.layout import (
     PERMISSIONS,
     PUBLIC,
     enclave_names,
     is_keystore,
 )
-from sros_tool.notes import Note
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
-from sros_tool.policy.reader import read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.translate import grant_rights
 from sros_tool.xml import parse, read_bytes

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sros_tool.errors import DocumentError, SrosError
-from sros_tool.keystore.toml import parse_toml
+from sros_tool.files import parse_toml
 from sros_tool.names import expression_problem
 from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.resources import templates_dir

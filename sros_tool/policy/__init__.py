@@ -1,5 +1,6 @@
 """Policies in ROS terms: their model, and SROS2 policy XML 0.2.0."""
 
+from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.model import (
     ALLOW,
     DENY,
@@ -12,8 +13,6 @@ from sros_tool.policy.model import (
     Qualifier,
     Source,
 )
-from sros_tool.policy.reader import read_policy
-from sros_tool.policy.writer import write_policy
 
 __all__ = [
     "ALLOW",

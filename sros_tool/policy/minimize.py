@@ -1,4 +1,4 @@
-"""Narrows a policy to what was observed, and measures how much wider it was.
+"""Rewrites an enclave with fewer rights: rules that go, and names in place of wildcards.
 
 Over-privilege of an enclave is the number of pairs (right, name) that it is allowed, divided by
 the number of those that were observed.  A pair is one of publish, subscribe, request, reply, call,
@@ -10,26 +10,86 @@ observed and is not allowed does not count either: it cannot have worked.
 
 from __future__ import annotations
 
+import re
 from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
 
 from sros_tool.errors import PolicyError
 from sros_tool.names import expand, is_expression
-from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy
-from sros_tool.policy.narrow import narrowed_enclave
-from sros_tool.policy.patterns import covers, literal_prefix, matches
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Qualifier
+from sros_tool.policy.patterns import compiled, covers, literal_prefix, matches
 from sros_tool.policy.rights import (
     KIND_OF,
     Right,
     Rules,
+    Said,
     folded,
     order,
     parts,
     policy_rights,
+    sayable,
     unfolded,
 )
+
+
+def narrowed_enclave(
+    enclave: Enclave, kept: Set[Right], replacements: Mapping[Right, Sequence[Right]]
+) -> Enclave:
+    """``enclave`` with its denials, the ALLOW rights in ``kept``, and names for wildcards.
+
+    The names of a wildcard stand once, where it stood first, and are written as it was: relative,
+    private or absolute.  Profiles stay, even without a rule.
+    """
+    pending = dict(replacements)
+    blocks = []
+    for block in enclave.profiles:
+        profiles = tuple(
+            _profile(enclave.path, profile, kept, pending) for profile in block.profiles
+        )
+        blocks.append(replace(block, profiles=profiles))
+    return replace(enclave, profiles=tuple(blocks))
+
+
+def _profile(
+    path: str, profile: Profile, kept: Set[Right], pending: dict[Right, Sequence[Right]]
+) -> Profile:
+    """The profile; what it takes of ``pending`` is removed there."""
+    said: dict[tuple[str, str], dict[tuple[str, Qualifier], None]] = {}
+    for group in profile.groups:
+        for name in group.names:
+            fqn = expand(name, profile.ns, profile.node)
+            for right, qualifier in group.rights:
+                whole = Right(path, qualifier, right, fqn)
+                if qualifier is DENY or whole in kept:
+                    said.setdefault((group.kind, name), {})[right, qualifier] = None
+                for each in pending.pop(whole, ()):
+                    written = _written(each.name, name, profile)
+                    said.setdefault((each.kind, written), {})[each.right, ALLOW] = None
+    groups: dict[tuple[str, Said], list[str]] = {}
+    for (kind, name), rights in said.items():
+        for together in sayable(rights):
+            groups.setdefault((kind, together), []).append(name)
+    return replace(
+        profile,
+        groups=tuple(
+            Group(kind, rights, tuple(dict.fromkeys(names)))
+            for (kind, rights), names in groups.items()
+        ),
+    )
+
+
+def _written(fqn: str, like: str, profile: Profile) -> str:
+    """An absolute name as the rule that it comes from was written, where that is possible."""
+    if like.startswith("/"):
+        return fqn
+    prefix = expand("~/" if like.startswith("~") else "", profile.ns, profile.node)
+    rest = fqn.removeprefix(prefix)
+    if not fqn.startswith(prefix) or not rest:
+        return fqn
+    return f"~/{rest}" if like.startswith("~") else rest
+
 
 Pair = tuple[str, str]
 
@@ -295,3 +355,111 @@ def _for_nodes(enclave: Enclave, common: Sequence[Group]) -> Iterator[Right]:
                 fqn = expand(name, profile.ns, profile.node)
                 for right, _ in group.rights:
                     yield Right(enclave.path, ALLOW, right, fqn)
+
+
+_DIGITS = re.compile(r"\d+")
+_FEWEST = 3  # names that are worth a wildcard
+
+
+@dataclass(frozen=True, slots=True)
+class Proposal:
+    """A wildcard in place of names: ``saves`` bytes of the signed document.
+
+    ``adds`` are the topics and services known from elsewhere that it would newly allow.  A safe
+    proposal has none; it still allows names that nobody has used so far.
+    """
+
+    rule: Right
+    replaces: tuple[Right, ...]
+    adds: tuple[Right, ...]
+    saves: int
+
+
+def propose_wildcards(
+    enclave: str,
+    rights: Iterable[Right],
+    known: Iterable[Right],
+    *,
+    needed: int,
+    size: Callable[[Right], int],
+) -> tuple[Proposal, ...]:
+    """Wildcards by which the document of an enclave becomes ``needed`` bytes smaller, if possible.
+
+    ``rights`` are the enclave's, ``known`` those of every enclave, ``size`` tells the bytes that a
+    right takes.  Those that save most come first; such that grant something known are used only
+    if the safe ones do not suffice.
+    """
+    own = [right for right in rights if right.enclave == enclave and right.qualifier is ALLOW]
+    rules = Rules(own)
+    foreign = _foreign(enclave, rules, known)
+    candidates: dict[frozenset[Right], Proposal] = {}
+    for rule, found in _candidates(own).items():
+        other = candidates.get(frozenset(found))
+        # Of wildcards that stand for the same names, the one that says most grants least.
+        if other is None or len(rule.name) > len(other.rule.name):
+            adds = tuple(sorted(_added(rule, foreign), key=order))
+            saves = sum(map(size, found)) - size(rule)
+            names = tuple(sorted(found, key=order))
+            candidates[frozenset(found)] = Proposal(rule, names, adds, saves)
+    best = sorted(
+        candidates.values(), key=lambda each: (len(each.adds), -each.saves, order(each.rule))
+    )
+    chosen: list[Proposal] = []
+    replaced: set[Right] = set()
+    for each in best:
+        if needed <= 0:
+            break
+        names = tuple(right for right in each.replaces if right not in replaced)
+        saves = sum(map(size, names)) - size(each.rule)
+        if len(names) < _FEWEST or saves <= 0:
+            continue
+        chosen.append(Proposal(each.rule, names, each.adds, saves))
+        replaced.update(names)
+        needed -= saves
+    return tuple(chosen)
+
+
+def _candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
+    """The wildcards that stand for several names of one right, with these."""
+    found: dict[Right, list[Right]] = defaultdict(list)
+    for right in rights:
+        if right.name.startswith("/") and not is_expression(right.name):
+            for expression in set(_wider(right.name)):
+                found[right._replace(name=expression)].append(right)
+    return {rule: names for rule, names in found.items() if len(names) >= _FEWEST}
+
+
+def _wider(name: str) -> Iterator[str]:
+    """A folder with all below it, never that of the root; and the name without its numbers."""
+    tokens = name.split("/")[1:-1]
+    for depth in range(1, len(tokens) + 1):
+        yield "/" + "/".join((*tokens[:depth], "*"))
+    numbers = list(_DIGITS.finditer(name))
+    for number in numbers:
+        yield f"{name[: number.start()]}*{name[number.end() :]}"
+    if len(numbers) > 1:
+        yield _DIGITS.sub("*", name)
+
+
+def _foreign(enclave: str, own: Rules, known: Iterable[Right]) -> dict[str, list[str]]:
+    """The known names by right (in parts of actions) that the enclave is not allowed."""
+    by_service: dict[bool, set[str]] = {True: set(), False: set()}
+    for part in unfolded(known):
+        if not is_expression(part.name):
+            by_service[part.right in ("request", "reply")].add(part.name)
+    return {
+        right: sorted(
+            name
+            for name in by_service[right in ("request", "reply")]
+            if not own.cover(Right(enclave, ALLOW, right, name))
+        )
+        for right in ("publish", "subscribe", "request", "reply")
+    }
+
+
+def _added(rule: Right, foreign: dict[str, list[str]]) -> Iterator[Right]:
+    for part in parts(rule):
+        match = compiled(part.name).match
+        for name in foreign[part.right]:
+            if match(name):
+                yield part._replace(name=name)

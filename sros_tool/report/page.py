@@ -19,9 +19,8 @@ from typing import Any
 
 from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
-from sros_tool.report.fold import Bundle, fold
-from sros_tool.report.picture import Enclave, Picture
-from sros_tool.report.scene import Scene
+from sros_tool.report.layout import Scene
+from sros_tool.report.picture import Bundle, Enclave, Picture, fold
 from sros_tool.validity import iso
 
 _ASSETS = Path(__file__).with_name("assets")

@@ -21,18 +21,18 @@ from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import from_json
-from sros_tool.keystore.authority import load_ca_certificate
-from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.authorities.authority import load_ca_certificate
+from sros_tool.keystore.issuing.enclave import enclave_path
 from sros_tool.keystore.layout import PERMISSIONS, PUBLIC, REQUEST, enclave_names
-from sros_tool.keystore.lists import read_lists
-from sros_tool.keystore.open import load_governance
+from sros_tool.keystore.lifecycle.revocation_list import read_lists
+from sros_tool.keystore.loading import EnclaveState, check_enclave
+from sros_tool.keystore.reader import load_governance
 from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.verify import EnclaveState, check_enclave
 from sros_tool.pki.certificates import load_certificates, subject_text, validity_of
 from sros_tool.pki.keys import algorithm
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
-from sros_tool.policy.reader import read_policy
 from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.report.compose import Source
 from sros_tool.report.picture import Enclave, Finding, Origin, Validity

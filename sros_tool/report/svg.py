@@ -6,17 +6,22 @@ from collections.abc import Iterable
 from xml.sax.saxutils import escape
 
 from sros_tool.policy.model import ALLOW
-from sros_tool.report.picture import Level, Mark, Overlay, Picture
-from sros_tool.report.scene import LINE, PAD, SMALL, Card, Link, Scene
-from sros_tool.report.wording import (
+from sros_tool.report.layout import (
     KIND_NAMES,
     LEVEL_NAMES,
+    LINE,
     LISTENERS,
     ONLOOKERS,
     OWN,
+    PAD,
     SENDERS,
+    SMALL,
+    Card,
+    Link,
+    Scene,
     counted,
 )
+from sros_tool.report.picture import Level, Mark, Overlay, Picture
 
 _HEAD = 40
 _STYLE = """\

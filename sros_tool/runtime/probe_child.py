@@ -15,10 +15,12 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from sros_tool.errors import SrosError
-from sros_tool.runtime.cyclone import Participant, SecurityRefusedError, security_properties
-from sros_tool.runtime.cyclone_library import (
+from sros_tool.runtime.cyclone import (
+    Participant,
+    SecurityRefusedError,
     loaded_libraries,
     plugins_beside,
+    security_properties,
     version_of,
 )
 from sros_tool.runtime.events import EventWriter, Kind, Stage

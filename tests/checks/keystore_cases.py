@@ -8,7 +8,6 @@ import shutil
 from collections.abc import Callable
 from datetime import timedelta, timezone
 
-from bench import DAY, Bench, name_of, new_key
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -17,6 +16,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem
 from sros_tool.policy import read_policy
+from tests.checks.bench import DAY, Bench, name_of, new_key
 
 Break = Callable[[Bench], object]
 CASES: dict[str, Break] = {}

@@ -7,9 +7,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import timedelta
 
-from bench import Bench
-
-from sros_tool.checks.runtimes.setting import Process, Setting
+from sros_tool.checks.runtime import Process, Setting
+from tests.checks.bench import Bench
 
 Change = Callable[[Setting, Bench], Setting]
 

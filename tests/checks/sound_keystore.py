@@ -7,8 +7,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from bench import SECRET, Bench
-from harness import sros
+
+from tests.checks.bench import SECRET, Bench
+from tests.support.harness import sros
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 

@@ -7,14 +7,14 @@ import shutil
 from pathlib import Path
 
 import pytest
-from bench import DAY, Bench
 
 from sros_tool.checks.keystores.keystore import keystore_findings
-from sros_tool.checks.policies.files import policy_file_findings
+from sros_tool.checks.policies import policy_file_findings
 from sros_tool.errors import KeystoreError
 from sros_tool.resources import policies_dir
+from tests.checks.bench import DAY, Bench
 
-pytest_plugins = ["sound_keystore"]
+pytest_plugins = ["tests.checks.sound_keystore"]
 
 ROUNDS = 120
 

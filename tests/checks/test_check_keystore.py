@@ -8,18 +8,18 @@ from pathlib import Path
 from zoneinfo import ZoneInfo
 
 import pytest
-from harness import policy_text, publish, sros
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.registry import Selection
 from sros_tool.dds.decision import Access, Vendor
-from sros_tool.keystore.create import create_enclaves, create_keystore
-from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.loading import check_enclave
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.verify import check_enclave
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, subject_text
 from sros_tool.pki.keys import load_key
+from tests.support.harness import policy_text, publish, sros
 
 NOW = datetime.now(UTC)
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import json
 
 import pytest
-from bench import Bench
-from harness import sros
 
-from sros_tool.checks.runtimes import setting
+from sros_tool.checks import runtime
 from sros_tool.demo import doctor
 from sros_tool.demo.doctor import Diagnosis
 from sros_tool.runtime.stacks import Stack
+from tests.checks.bench import Bench
+from tests.support.harness import sros
 
-pytest_plugins = ["sound_keystore"]
+pytest_plugins = ["tests.checks.sound_keystore"]
 
 RMW = Stack("rclpy", "rmw", "Fast DDS", "2.14", "", True, False, "no security", "", "rmw_x")
 CYCLONE = Stack("Cyclone DDS", "cyclone", "Cyclone DDS", "0.10", "", True, True, "it refused")
@@ -50,5 +50,5 @@ def test_findings(as_json: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch) 
 def test_status_0_where_nothing_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(doctor, "examine", lambda *_: Diagnosis((RMW, CYCLONE)))
     # Other tests run secured processes on this machine, and doctor looks at those, too.
-    monkeypatch.setattr(setting, "running_processes", lambda: iter(()))
+    monkeypatch.setattr(runtime, "running_processes", lambda: iter(()))
     assert sros("doctor", env={}).ok().out.endswith("DDS Security can be enforced here.\n")

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import pytest
-from bench import Bench
-from keystore_cases import CASES
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.pki.certificates import pem
 from sros_tool.policy import read_policy
+from tests.checks.bench import Bench
+from tests.checks.keystore_cases import CASES
 
-pytest_plugins = ["sound_keystore"]
+pytest_plugins = ["tests.checks.sound_keystore"]
 
 
 def ids(bench: Bench) -> set[str]:

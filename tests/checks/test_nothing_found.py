@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from harness import sros
 
 from sros_tool.keystore.template import template_names
 from sros_tool.resources import policies_dir
+from tests.support.harness import sros
 
 
 def life(root: Path, template: str) -> Iterator[tuple[str, Path]]:

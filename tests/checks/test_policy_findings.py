@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from harness import with_includes
-from policy_cases import BASICS, CASES, TYPES, Case, deny, services, topics
 
 from sros_tool.checks.kind import WARNING, Finding
-from sros_tool.checks.policies.files import policy_file_findings
+from sros_tool.checks.policies import policy_file_findings
 from sros_tool.resources import policies_dir
+from tests.checks.policy_cases import BASICS, CASES, TYPES, Case, deny, services, topics
+from tests.support.harness import with_includes
 
 FOUND_OTHERWISE = {
     "policy.malformed",

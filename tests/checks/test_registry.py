@@ -7,21 +7,18 @@ import re
 from pathlib import Path
 from typing import Any
 
-import keystore_cases
-import policy_cases
 import pytest
-import runtime_cases
-import test_policy_findings
-from bench import Bench
-from harness import sros
 
+from sros_tool.checks import runtime
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Severity
 from sros_tool.checks.registry import KINDS, Selection
-from sros_tool.checks.runtimes import setting
 from sros_tool.dds.decision import Vendor
 from sros_tool.errors import UsageError
+from tests.checks import keystore_cases, policy_cases, runtime_cases, test_policy_findings
+from tests.checks.bench import Bench
+from tests.support.harness import sros
 
-pytest_plugins = ["sound_keystore"]
+pytest_plugins = ["tests.checks.sound_keystore"]
 
 
 def test_every_finding_has_a_test_that_brings_it_about() -> None:
@@ -166,7 +163,7 @@ def test_it_finds_out_what_a_path_is(bench: Bench, tmp_path: Path) -> None:
 def test_the_runtime_and_the_keystore_it_names(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(setting, "running_processes", lambda: iter(()))
+    monkeypatch.setattr(runtime, "running_processes", lambda: iter(()))
     env = {"ROS_SECURITY_ENABLE": "True", "ROS_SECURITY_KEYSTORE": str(bench.root)}
     ended = sros("check", env=env)
     assert ended.status == 1

@@ -12,15 +12,23 @@ from typing import Any
 from zoneinfo import ZoneInfo
 
 import pytest
-from bench import DAY, Bench
-from children import wait_for
-from runtime_cases import CASES, DOMAIN, ENCLAVE, KEYSTORE, SOUND, having, running, sound_setting
 
 from sros_tool.checks.kind import ERROR, WARNING
-from sros_tool.checks.runtimes.runtime import runtime_findings
-from sros_tool.checks.runtimes.setting import Setting, running_processes
+from sros_tool.checks.runtime import Setting, running_processes, runtime_findings
+from tests.checks.bench import DAY, Bench
+from tests.checks.runtime_cases import (
+    CASES,
+    DOMAIN,
+    ENCLAVE,
+    KEYSTORE,
+    SOUND,
+    having,
+    running,
+    sound_setting,
+)
+from tests.support.children import wait_for
 
-pytest_plugins = ["sound_keystore"]
+pytest_plugins = ["tests.checks.sound_keystore"]
 
 SPELLING = {
     *("enable-misspelt", "strategy-misspelt", "not-enforced", "not-enabled", "keystore-unset"),

@@ -12,8 +12,9 @@ import sys
 from pathlib import Path
 
 import pytest
-from children import run
-from harness import policy_text, publish, remains, snapshot, sros, topics_of
+
+from tests.support.children import run
+from tests.support.harness import policy_text, publish, remains, snapshot, sros, topics_of
 
 NAME, FOLDER = "/arm/camera", "enclaves/arm/camera"
 PROGRAM = f"{sys.executable} -m sros_tool"

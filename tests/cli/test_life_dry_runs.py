@@ -8,7 +8,8 @@ import time
 from pathlib import Path
 
 import pytest
-from harness import snapshot, sros
+
+from tests.support.harness import snapshot, sros
 
 LINES = (
     "renew ks /a --new-key",

@@ -12,13 +12,13 @@ from pathlib import Path
 from types import FrameType
 
 import pytest
-from harness import policy_text, publish, snapshot, sros
 
 from benchmarks.inputs import enclaves_policy, topics_policy
-from sros_tool.atomic import replace_file
+from sros_tool.files import replace_file
 from sros_tool.policy import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.resources import policies_dir
+from tests.support.harness import policy_text, publish, snapshot, sros
 
 DENY = '<topics publish="DENY"><topic>cmd_vel</topic></topics>'
 A = '<?xml version="1.0"?>\n<!-- mine -->\n' + policy_text({"/a": publish("x", "/cam/*") + DENY})

@@ -13,12 +13,20 @@ import time
 from pathlib import Path
 
 import pytest
-from children import finish, python, run, wait_for
-from harness import check_whole, policy_text, publish, remains, snapshot, sros, topics_of
 
 from sros_tool.cli.program import FAMILIES
 from sros_tool.keystore.layout import PRIVATE, REQUIRED_FILES
 from sros_tool.resources import policies_dir
+from tests.support.children import finish, python, run, wait_for
+from tests.support.harness import (
+    check_whole,
+    policy_text,
+    publish,
+    remains,
+    snapshot,
+    sros,
+    topics_of,
+)
 
 VERBS = [name for family in FAMILIES.values() for name in family]
 PROGRAM = [sys.executable, "-m", "sros_tool"]

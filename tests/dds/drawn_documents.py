@@ -14,8 +14,11 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 from random import Random
 
-from decision_documents import NOW
-from drawn_words import (
+from hypothesis import strategies as st
+
+from sros_tool.dds.decision import Verb
+from tests.dds.decision_documents import NOW
+from tests.dds.drawn_words import (
     DOMAINS,
     NEAR,
     ODD_TOPICS,
@@ -28,10 +31,7 @@ from drawn_words import (
     WILDCARDS,
     ZONES,
 )
-from hypothesis import strategies as st
-from xml_forms import GOVERNANCE, PERMISSIONS
-
-from sros_tool.dds.decision import Verb
+from tests.dds.xml_forms import GOVERNANCE, PERMISSIONS
 
 FORMS = ("form",) * 20
 """So often in place of an oddity a form of XML over which parsers differ."""

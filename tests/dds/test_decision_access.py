@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from decision_documents import (
+
+from sros_tool.dds.decision import Access, Outcome, Vendor, Verb
+from tests.dds.decision_documents import (
     NOW,
     SUBJECT,
     allow,
@@ -15,8 +17,6 @@ from decision_documents import (
     subscribe,
     topic_rule,
 )
-
-from sros_tool.dds.decision import Access, Outcome, Vendor, Verb
 
 VENDORS = list(Vendor)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from decision_documents import (
+
+from sros_tool.dds.decision import Access, Outcome, Vendor
+from tests.dds.decision_documents import (
     NOW,
     SUBJECT,
     allow,
@@ -13,8 +15,6 @@ from decision_documents import (
     publish,
     topic_rule,
 )
-
-from sros_tool.dds.decision import Access, Outcome, Vendor
 
 EVERYTHING = permissions(grant(allow(publish("*"))))
 ELSEWHERE = permissions(grant(allow(publish("rt/a"), domains="<id>7</id>")))

@@ -7,12 +7,12 @@ import platform
 from pathlib import Path
 
 import pytest
-from children import LONG
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sros_tool.dds.decision.matching import Expressions, matches
 from sros_tool.dds.decision.vendors import Style
+from tests.support.children import LONG
 
 NOESCAPE = 2  # <fnmatch.h> of glibc
 PIECES = [*"abx]-[!^*?1:/", "[a-c]", "[!a]", "[^a]", "[[:digit:]]", "[[:alpha:]", "[[:foo:]]"]

@@ -7,9 +7,6 @@ from pathlib import Path
 from zoneinfo import ZoneInfo
 
 import pytest
-from children import LONG
-from decision_documents import NOW
-from drawn_documents import Case, cases, documents
 from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
@@ -26,6 +23,9 @@ from sros_tool.dds.decision import (
 )
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Criteria, Permissions, Rule
+from tests.dds.decision_documents import NOW
+from tests.dds.drawn_documents import Case, cases, documents
+from tests.support.children import LONG
 
 LETTERS = st.sampled_from(["rt/a", "rt/b", "rt/*", "rt/[ab]"])
 

@@ -11,7 +11,9 @@ from datetime import timedelta
 from zoneinfo import ZoneInfo
 
 import pytest
-from decision_documents import (
+
+from sros_tool.dds.decision import Access, Outcome, Refusal, Vendor, Verb
+from tests.dds.decision_documents import (
     NOW,
     allow,
     criteria,
@@ -23,8 +25,6 @@ from decision_documents import (
     subscribe,
     topic_rule,
 )
-
-from sros_tool.dds.decision import Access, Outcome, Refusal, Vendor, Verb
 
 WORDS = {
     "yes": Outcome.ALLOWED,

@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import pytest
 
-from sros_tool.dds.decision import cyclone_xml, tinyxml
+from sros_tool.dds.decision import cyclone as cyclone_xml
+from sros_tool.dds.decision import fastdds
 from sros_tool.dds.decision.elements import Element, Mark, UnreadableError
 
 REFUSED = None
@@ -42,7 +43,7 @@ TABLE = [
     ("<b></c>", REFUSED, REFUSED),
     ('"x', ['"x'], REFUSED),
 ]
-READERS = {"Fast DDS": tinyxml.read, "Cyclone DDS": cyclone_xml.read}
+READERS = {"Fast DDS": fastdds.read, "Cyclone DDS": cyclone_xml.read}
 
 
 def content(read: Callable[[bytes], Element], xml: str) -> list[Element | str | Mark] | None:
@@ -56,7 +57,7 @@ def content(read: Callable[[bytes], Element], xml: str) -> list[Element | str | 
 def test_content(text: str, fast: object, cyclone: object) -> None:
     # Behind a comment Cyclone DDS looks for text only where seven characters are left.
     xml = f"<a>{text}</a>\n\n\n\n"
-    assert content(tinyxml.read, xml) == fast
+    assert content(fastdds.read, xml) == fast
     assert content(cyclone_xml.read, xml) == cyclone
 
 
@@ -86,7 +87,7 @@ def test_content(text: str, fast: object, cyclone: object) -> None:
     ],
 )
 def test_documents(xml: str, fast: bool, cyclone: bool) -> None:
-    assert (content(tinyxml.read, xml) is not REFUSED) == fast
+    assert (content(fastdds.read, xml) is not REFUSED) == fast
     assert (content(cyclone_xml.read, xml) is not REFUSED) == cyclone
 
 

@@ -6,11 +6,11 @@ from itertools import chain, combinations
 
 import pytest
 
-from sros_tool.demo.forgeries import FORGERIES, REMOVALS
+from sros_tool.demo.forger import FORGERIES, REMOVALS
+from sros_tool.demo.keystores import Scenery
 from sros_tool.demo.model import DENIALS, FOREIGN, OWN, Condition, Row, Status
 from sros_tool.demo.scenarios import SCENARIOS
 from sros_tool.demo.scenarios.attacks import ATTACKS
-from sros_tool.demo.scenery import Scenery
 
 ROWS = (
     *ATTACKS.rows,

@@ -8,7 +8,7 @@ import struct
 
 import pytest
 
-from sros_tool.demo.capture import PacketCounter, udp_ports
+from sros_tool.demo.wire import PacketCounter, udp_ports
 
 
 def packet(payload: bytes, source: int = 7000, target: int = 7410, protocol: int = 17) -> bytes:

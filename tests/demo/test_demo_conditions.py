@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from sros_tool.demo.backend import Backend
-from sros_tool.demo.conditions import conditions
+from sros_tool.demo.backend import Backend, conditions
 from sros_tool.demo.model import Condition, Status
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.keystore.template import Template, load_template

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from harness import policy_text, publish, sros
 
-from sros_tool.demo.custom import read_scenario
 from sros_tool.demo.model import OWN, UNSECURED, Identity, Relation, Role, Status
+from sros_tool.demo.scenarios.custom import read_scenario
 from sros_tool.errors import DocumentError
+from tests.support.harness import policy_text, publish, sros
 
 GOOD = """title = "who sees the camera"
 policy = "robot.xml"

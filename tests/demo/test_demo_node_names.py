@@ -6,18 +6,23 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from harness import policy_text, publish
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
-from sros_tool.demo.granted import is_node_allowed, may, nodes_named
 from sros_tool.demo.model import Role
-from sros_tool.demo.node_names import naming_arguments, node_names
+from sros_tool.demo.nodes.names import (
+    is_node_allowed,
+    may,
+    naming_arguments,
+    node_names,
+    nodes_named,
+)
 from sros_tool.names import NODE_SERVICES
 from sros_tool.policy import read_policy
 from sros_tool.resources import policies_dir
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
+from tests.support.harness import policy_text, publish
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 

@@ -8,21 +8,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from harness import sros
 
 from sros_tool.demo import backend as backends
 from sros_tool.demo.backend import Backend, choose_backend
 from sros_tool.demo.model import Role, Status
-from sros_tool.demo.options import split_ros_args
+from sros_tool.demo.nodes.options import split_ros_args
 from sros_tool.demo.policies import check_topic, talking_policy
 from sros_tool.demo.program import DemoOptions, run_demo
 from sros_tool.demo.records import RowResult
 from sros_tool.demo.result import DemoResult, ScenarioResult
-from sros_tool.demo.table import demo_table
+from sros_tool.demo.show import demo_table
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.netns import Isolation
 from sros_tool.runtime.stacks import ProbeEnclave, Stack
+from tests.support.harness import sros
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 PROBE = ProbeEnclave({}, "/chatter", "/denied")
@@ -139,13 +139,13 @@ def test_backends(
         assert chosen.environment(Role.TALKER, wire=False) == {"RMW_IMPLEMENTATION": "rmw_x"}
         command = chosen.command(Role.TALKER, ["--topic", "/x"], ["/robot/mouth"])
         module, *options = command[command.index("-m") + 1 :]
-        assert module == "sros_tool.demo.talker"
+        assert module == "sros_tool.demo.nodes.talker"
         remapped = ["-r", "talker:__node:=mouth", "-r", "mouth:__ns:=/robot"]
         assert options == ["--topic", "/x", "--ros-args", *remapped, "--"]
     else:
         assert chosen.environment(Role.TALKER, wire=True) == {}
         command = chosen.command(Role.LISTENER, ["--topic", "/x"], ["/robot/ear"])
-        assert command[-4:] == ["sros_tool.demo.cyclone_node", "listener", "--topic", "/x"]
+        assert command[-4:] == ["sros_tool.demo.nodes.cyclone", "listener", "--topic", "/x"]
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,10 @@ from __future__ import annotations
 import struct
 
 import pytest
-from test_demo_capture import packet
 
-from sros_tool.demo.capture import PacketCounter
 from sros_tool.demo.records import forged_text
-from sros_tool.demo.replay import packets_of, with_other_words, without_checksum
+from sros_tool.demo.wire import PacketCounter, packets_of, with_other_words, without_checksum
+from tests.demo.test_demo_capture import packet
 
 WORDS = "Hello World from the talker"
 

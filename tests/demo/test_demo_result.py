@@ -11,8 +11,7 @@ from sros_tool.demo.cost import CostResult, Measurement, cost_table, payload_tex
 from sros_tool.demo.model import Status
 from sros_tool.demo.records import RowResult
 from sros_tool.demo.result import DemoResult, ScenarioResult
-from sros_tool.demo.summary import summary_page
-from sros_tool.demo.table import demo_table
+from sros_tool.demo.show import demo_table, summary_page
 from sros_tool.report import cost_plot
 from sros_tool.runtime.netns import Isolation
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from cryptography import x509
 
-from sros_tool.keystore import create_keystore, generate_artifacts
+from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, common_name, issue_ca, load_certificate, pem

@@ -6,8 +6,7 @@ import ctypes
 import sys
 from pathlib import Path
 
-from sros_tool.runtime.cyclone import DdsError, Participant
-from sros_tool.runtime.cyclone_library import load_cyclone
+from sros_tool.runtime.cyclone import DdsError, Participant, load_cyclone
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 
 if try_isolation().isolated:

@@ -15,17 +15,14 @@ import pytest
 
 from sros_tool.dds.decision import Outcome, Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.explain.answer import Judge, Setting
-from sros_tool.explain.case import Case, explain
-from sros_tool.explain.change import as_policy
+from sros_tool.explain.answer import Case, Judge, Setting, as_policy, explain
 from sros_tool.explain.material import from_policy
 from sros_tool.explain.question import Question, ask
 from sros_tool.keystore.template import load_template
 from sros_tool.names import is_expression
 from sros_tool.policy import ALLOW, DENY, Enclave, Policy, read_policy
-from sros_tool.policy.patterns import matches
+from sros_tool.policy.patterns import common_name, matches
 from sros_tool.policy.rights import Right, Rules, policy_rights
-from sros_tool.policy.witness import common_name
 from sros_tool.resources import policies_dir
 from sros_tool.translate import governance_for
 

@@ -9,18 +9,18 @@ import json
 from pathlib import Path
 
 import pytest
-from children import python
-from harness import sros
 
 from sros_tool.cli.common import now
 from sros_tool.dds.decision import Vendor
 from sros_tool.explain.answer import Judge, Setting
 from sros_tool.explain.material import from_folder
 from sros_tool.explain.question import Part, Question, ask
-from sros_tool.keystore import create_keystore, generate_artifacts
+from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.policy import read_policy
 from sros_tool.resources import policies_dir
+from tests.support.children import python
+from tests.support.harness import sros
 
 pytestmark = pytest.mark.dds
 

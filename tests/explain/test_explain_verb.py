@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
-from children import python
-from harness import Ended, policy_text, publish, sros, with_includes
 
 from sros_tool.cli.common import now
 from sros_tool.policy import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.resources import policies_dir
+from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
+from tests.support.children import python
+from tests.support.harness import Ended, policy_text, publish, sros, with_includes
 
 POLICY = policies_dir() / "talker_listener.xml"
 HERE = {"RMW_IMPLEMENTATION": "rmw_fastrtps_cpp", "TZ": "UTC"}

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.explain.flow import OF_EVERY_NODE, Network, path_text
-from sros_tool.explain.unguarded import Unguarded
+from sros_tool.explain.reach import OF_EVERY_NODE, Network, Unguarded, path_text
 from sros_tool.policy.model import ALLOW, DENY
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, Rules

@@ -10,12 +10,12 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from broken import BREAKAGES, ENCLAVE, Enclave, make_keystore
-from children import python, run
-from harness import policy_text, publish, sros
 
 from sros_tool.explain.log import Finding, explain_log
 from sros_tool.resources import policies_dir
+from tests.explain.broken import BREAKAGES, ENCLAVE, Enclave, make_keystore
+from tests.support.children import python, run
+from tests.support.harness import policy_text, publish, sros
 
 LOGS = Path(__file__).with_name("logs")
 FAST, FAST_14, CYCLONE = "fastdds_2.9.1", "fastdds_2.14.5", "cyclone_0.10.2"

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import sros_tool.dds.decision as decision
-import sros_tool.keystore.verify as verify
+import sros_tool.keystore.loading as verify
 from sros_tool.dds.decision import Verb
 from sros_tool.errors import UsageError
 from sros_tool.explain.question import TYPES, WORDS, ask

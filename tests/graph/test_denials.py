@@ -8,13 +8,11 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import UsageError
-from sros_tool.graph.common import common_parts
-from sros_tool.graph.denials import Denial, Proposal, propose, read_denials
-from sros_tool.graph.fold import Right
-from sros_tool.graph.proposal import as_learned
+from sros_tool.graph.denials import Denial, Proposal, as_learned, propose, read_denials
+from sros_tool.graph.learn import Right, common_parts
 from sros_tool.policy import ALLOW, Enclave, Group, Policy, Profile, Profiles
 from sros_tool.resources import policies_dir
-from sros_tool.runtime.security_log import plain_text
+from sros_tool.runtime.vendor_log import plain_text
 
 LOGS = Path(__file__).with_name("logs")
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from graphs import endpoints
 
-from sros_tool.graph.fold import Right, fold
+from sros_tool.graph.learn import Right, fold
 from sros_tool.graph.observation import Endpoint
+from tests.graph.graphs import endpoints
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness import Ended, sros
+
+from tests.support.harness import Ended, sros
 
 FAKE = Path(__file__).with_name("fake_rclpy.py")
 NO_NODES = "No nodes detected in the ROS graph. No policy file was generated."

@@ -7,11 +7,11 @@ import sys
 from pathlib import Path
 
 import pytest
-from children import python
-from harness import sros
 
 from sros_tool.policy import read_policy
 from sros_tool.policy.rights import policy_rights
+from tests.support.children import python
+from tests.support.harness import sros
 
 LOG = Path(__file__).with_name("logs") / "fastdds_2.9.1.log"
 CYCLONE = LOG.with_name("cyclone_0.10.2.log")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from cryptography import x509
-from graphs import graph, node
 
-from sros_tool.graph.identity import identified, identity_of
 from sros_tool.graph.learn import learn
+from sros_tool.graph.observe import identified, identity_of
 from sros_tool.pki.certificates import common_name
+from tests.graph.graphs import graph, node
 
 # As Fast DDS 2.14.5 gave them to participants of these enclaves.
 TALKER = "daf710ced9771cd6134cada3"

@@ -6,13 +6,12 @@ import shutil
 from pathlib import Path
 
 import pytest
-from graphs import common, endpoints, graph, node
 
-from sros_tool.graph.common import PARTS, CommonParts, common_parts
-from sros_tool.graph.learn import Learned, learn
+from sros_tool.graph.learn import PARTS, CommonParts, Learned, common_parts, learn
 from sros_tool.graph.observation import Endpoint, ObservedNode, make_observation
 from sros_tool.policy.model import ALLOW, Group
 from sros_tool.resources import policies_dir
+from tests.graph.graphs import common, endpoints, graph, node
 
 
 @pytest.fixture

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.graph.naming import is_tool, stable_name, written
+from sros_tool.graph.learn import is_tool, stable_name, written
 from sros_tool.names import expand
 
 

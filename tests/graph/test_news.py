@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from graphs import graph, node
-
-from sros_tool.graph.common import common_parts
-from sros_tool.graph.news import News
+from sros_tool.graph.learn import News, common_parts
 from sros_tool.resources import policies_dir
+from tests.graph.graphs import graph, node
 
 
 def test_each_new_thing_is_one_line(tmp_path: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from graphs import graph, node
-
 from sros_tool.graph.observation import (
     Endpoint,
     Observation,
@@ -11,6 +9,7 @@ from sros_tool.graph.observation import (
     make_observation,
     to_json,
 )
+from tests.graph.graphs import graph, node
 
 
 def test_the_union_keeps_nodes_and_endpoints_that_were_gone() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sros_tool.graph.observation import Endpoint
-from sros_tool.graph.resolve import NOBODY, Listed, Sighting, resolve
+from sros_tool.graph.observe import NOBODY, Listed, Sighting, resolve
 
 X = Endpoint("rt/x", "publish")
 

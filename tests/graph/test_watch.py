@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from graphs import graph, node
-
 from sros_tool.graph.observation import Observation
-from sros_tool.graph.watch import Settling, look_for, settle, watch
+from sros_tool.graph.observe import Settling, look_for, settle, watch
+from tests.graph.graphs import graph, node
 
 ONE = graph(node("/a", "publish x"))
 TWO = graph(node("/a", "publish x"), node("/b", "publish y", participant="p2"))

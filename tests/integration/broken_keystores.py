@@ -14,7 +14,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import timedelta
 
-from bench import DAY, Bench, new_key
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
@@ -25,6 +24,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem
 from sros_tool.pki.keys import key_pem, load_key
 from sros_tool.validity import Window, iso
+from tests.checks.bench import DAY, Bench, new_key
 
 MATCHED, UNMATCHED, DENIED, REFUSED = "matched", "unmatched", "denied", "refused"
 CRASHED = "crashed"

@@ -16,12 +16,11 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from children import LATE, PATIENCE, python
-
-from sros_tool.demo.capture import Capture
+from sros_tool.demo.wire import Capture
 from sros_tool.runtime.environment import secured_environment
 from sros_tool.runtime.events import Event, Kind, read_events
 from sros_tool.runtime.netns import enter_isolation, try_isolation
+from tests.support.children import LATE, PATIENCE, python
 
 ENOUGH = 11
 """Messages after which somebody is heard, and is no longer waited for."""
@@ -191,7 +190,7 @@ def start(node: Node, domain: int, folder: Path) -> tuple[subprocess.Popen[bytes
     environment["ROS_DOMAIN_ID"] = str(domain)
     if node.keystore:
         environment |= secured_environment(Path(node.keystore), node.enclave, domain)
-    command = [sys.executable, "-m", "sros_tool.demo.cyclone_node", node.role]
+    command = [sys.executable, "-m", "sros_tool.demo.nodes.cyclone", node.role]
     command += ["--topic", node.topic, "--text", node.text, "--period", "0.1"]
     with report.with_suffix(".err").open("wb") as errors:
         process = subprocess.Popen(

@@ -26,13 +26,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from sros_tool.runtime.cyclone import STRING_TYPE, security_properties
-from sros_tool.runtime.cyclone_library import (
+from sros_tool.runtime.cyclone import (
+    STRING_TYPE,
     CycloneLibrary,
     SampleInfo,
     StringSample,
     TopicDescriptor,
     load_cyclone,
+    security_properties,
 )
 from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from datetime import datetime, timedelta, timezone
 
-from decision_documents import allow, criteria, deny, grant, permissions, topic_rule
 from hypothesis import strategies as st
-from vendor_oracle import Case, Question
-from vendor_rows import domain_rule, governance
-from xml_forms import GOVERNANCE, PERMISSIONS
+
+from tests.dds.decision_documents import allow, criteria, deny, grant, permissions, topic_rule
+from tests.dds.xml_forms import GOVERNANCE, PERMISSIONS
+from tests.integration.vendor_oracle import Case, Question
+from tests.integration.vendor_rows import domain_rule, governance
 
 Text = st.SearchStrategy[str]
 

@@ -11,9 +11,9 @@ import pytest
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import CYCLONE, RCLPY, Backend, choose_backend
+from sros_tool.demo.keystores import Setting, build_scenery
 from sros_tool.demo.policies import DEFAULT_TOPIC
 from sros_tool.demo.scenarios.isolation import ISOLATION
-from sros_tool.demo.scenery import Setting, build_scenery
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
 

@@ -11,10 +11,10 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from children import run
 
 from sros_tool.dds.decision import Vendor
 from sros_tool.runtime.netns import try_isolation
+from tests.support.children import run
 
 HERE = Path(__file__).parent
 OWN_FASTDDS = os.environ.get("SROS_FASTDDS_PREFIX", "")

@@ -11,7 +11,8 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from children import LONG, PATIENCE, importing
+
+from tests.support.children import LONG, PATIENCE, importing
 
 # Forks the imported program for each line; a program of its own would take 0.2 s to start.
 SERVER = """
@@ -21,8 +22,8 @@ said = tempfile.TemporaryFile()
 for descriptor in (1, 2):
     os.dup2(said.fileno(), descriptor)
 from sros_tool.cli import main
-import sros_tool.cli.keystore, sros_tool.cli.program, sros_tool.keystore.create
-import sros_tool.keystore.parallel, sros_tool.policy
+import sros_tool.cli.keystore, sros_tool.cli.program, sros_tool.keystore.lifecycle.create
+import sros_tool.parallel, sros_tool.policy
 for line in sys.stdin:
     pause, words = json.loads(line)
     said.seek(0)

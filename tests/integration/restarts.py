@@ -17,13 +17,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from subprocess import Popen
 
-from children import LATE, PATIENCE, wait_for
-from converse import SETTLED, SILENCE, Node, start
-
-from sros_tool.keystore.rotate import renew_identity_ca, rotate_ca
-from sros_tool.keystore.rotation import Stage
+from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
+from sros_tool.keystore.lifecycle.rotation.state import Stage
 from sros_tool.runtime.events import Kind, read_events
 from sros_tool.runtime.netns import enter_isolation, try_isolation
+from tests.integration.converse import SETTLED, SILENCE, Node, start
+from tests.support.children import LATE, PATIENCE, wait_for
 
 ENOUGH = 5
 

@@ -12,22 +12,22 @@ from pathlib import Path
 from zoneinfo import ZoneInfo
 
 import pytest
-from bench import SECRET, Bench
-from broken_keystores import HARMLESS, MATCHED, MORE, ROWS, Breakage
-from fastdds import fastdds_vendor
-from harness import policy_text, publish, sros
-from vendor_oracle import (
+
+from sros_tool.dds.decision import Vendor
+from sros_tool.explain.answer import Judge, Setting
+from sros_tool.explain.material import from_folder
+from sros_tool.explain.question import ask as question
+from tests.checks.bench import SECRET, Bench
+from tests.integration.broken_keystores import HARMLESS, MATCHED, MORE, ROWS, Breakage
+from tests.integration.fastdds import fastdds_vendor
+from tests.integration.vendor_oracle import (
     Pair,
     Reply,
     ask_cyclone_folders,
     ask_fastdds_folders,
     with_patience,
 )
-
-from sros_tool.dds.decision import Vendor
-from sros_tool.explain.answer import Judge, Setting
-from sros_tool.explain.material import from_folder
-from sros_tool.explain.question import ask as question
+from tests.support.harness import policy_text, publish, sros
 
 pytestmark = [pytest.mark.dds, pytest.mark.xdist_group("broken_keystores")]
 

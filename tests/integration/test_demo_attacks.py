@@ -14,19 +14,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from children import LONG, PATIENCE
-from enforcing import BACKENDS, enforcing_backend
-from harness import snapshot, sros
-from test_demo_run import processes_with, start
-from weak_keystores import WEAKNESSES, make_weak
 
-from sros_tool.demo.backend import Backend
-from sros_tool.demo.conditions import conditions
-from sros_tool.demo.isolated import run_isolated
-from sros_tool.demo.network import RowNetwork
+from sros_tool.demo.backend import Backend, conditions
+from sros_tool.demo.network import RowNetwork, run_isolated
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.netns import try_isolation
+from tests.integration.enforcing import BACKENDS, enforcing_backend
+from tests.integration.test_demo_run import processes_with, start
+from tests.integration.weak_keystores import WEAKNESSES, make_weak
+from tests.support.children import LONG, PATIENCE
+from tests.support.harness import snapshot, sros
 
 pytestmark = pytest.mark.dds
 

@@ -6,11 +6,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from enforcing import BACKENDS, enforcing_backend
 
 from sros_tool.demo.cost import Effort
 from sros_tool.demo.program import DemoOptions, run_demo
 from sros_tool.demo.scenarios.governance import GOVERNANCE
+from tests.integration.enforcing import BACKENDS, enforcing_backend
 
 pytestmark = pytest.mark.dds
 

@@ -10,15 +10,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from children import PATIENCE
 
 from sros_tool.dds.domains import DomainSet
+from sros_tool.demo.keystores import Scenery, Setting, build_scenery
 from sros_tool.demo.model import UNSECURED, Identity
 from sros_tool.demo.scenarios.isolation import ISOLATION, LISTENER, TALKER, TALKER_DENIED
-from sros_tool.demo.scenery import Scenery, Setting, build_scenery
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
-from sros_tool.runtime.cyclone_library import load_cyclone
+from sros_tool.runtime.cyclone import load_cyclone
+from tests.support.children import PATIENCE
 
 pytestmark = pytest.mark.dds
 
@@ -188,7 +188,7 @@ def test_unpacked_packages_are_used_alone(tmp_path: Path) -> None:
     for file in library.plugins.glob("libdds_security_*.so"):
         (plugins / file.name).write_bytes(file.read_bytes())
     code = (
-        "from sros_tool.runtime.cyclone_library import load_cyclone, loaded_libraries\n"
+        "from sros_tool.runtime.cyclone import load_cyclone, loaded_libraries\n"
         "library = load_cyclone()\n"
         "print(library.plugins)\n"
         "print(*loaded_libraries('libddsc'), *loaded_libraries('libiceoryx'), sep='\\n')\n"

@@ -7,15 +7,15 @@ import shutil
 from pathlib import Path
 
 import pytest
-from enforcing import BACKENDS, enforcing_backend
-from harness import policy_text, publish, snapshot, sros
-from test_demo_attacks import needs_isolation
 
 from sros_tool.demo.backend import RCLPY
-from sros_tool.demo.given import open_given
+from sros_tool.demo.keystores import open_given
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.errors import SrosError
 from sros_tool.resources import policies_dir
+from tests.integration.enforcing import BACKENDS, enforcing_backend
+from tests.integration.test_demo_attacks import needs_isolation
+from tests.support.harness import policy_text, publish, snapshot, sros
 
 pytestmark = pytest.mark.dds
 

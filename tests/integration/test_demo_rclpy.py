@@ -12,27 +12,25 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from children import PATIENCE, finish, python, wait_for
-from enforcing import enforcing_backend
-from harness import sros
-from test_demo_run import without_security
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY, Backend, choose_backend
-from sros_tool.demo.isolated import run_isolated
+from sros_tool.demo.keystores import Scenery, Setting, build_scenery
 from sros_tool.demo.model import UNSECURED, Status
+from sros_tool.demo.network import run_isolated
 from sros_tool.demo.runner import Limits, Plan, run_plan
 from sros_tool.demo.scenarios import SCENARIOS
-from sros_tool.demo.scenarios.actions import ACTIONS
-from sros_tool.demo.scenarios.composition import COMPOSITION
-from sros_tool.demo.scenarios.isolation import ISOLATION, TALKER
-from sros_tool.demo.scenarios.services import SERVICES
-from sros_tool.demo.scenery import Scenery, Setting, build_scenery
+from sros_tool.demo.scenarios.isolation import COMPOSITION, ISOLATION, TALKER
+from sros_tool.demo.scenarios.services import ACTIONS, SERVICES
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.events import Event, Kind, Stage, read_events
 from sros_tool.runtime.netns import try_isolation
 from sros_tool.runtime.stacks import rclpy_stacks
+from tests.integration.enforcing import enforcing_backend
+from tests.integration.test_demo_run import without_security
+from tests.support.children import PATIENCE, finish, python, wait_for
+from tests.support.harness import sros
 
 pytestmark = [
     pytest.mark.dds,
@@ -47,7 +45,7 @@ def node(module: str, folder: Path, *arguments: str, **more: str) -> subprocess.
     variables = {**os.environ, "ROS_DOMAIN_ID": DOMAIN, "ROS_LOG_DIR": str(folder), **more}
     report = ["--report", str(folder / f"{module}.jsonl")]
     return subprocess.Popen(
-        [sys.executable, "-m", f"sros_tool.demo.{module}", *report, *arguments],
+        [sys.executable, "-m", f"sros_tool.demo.nodes.{module}", *report, *arguments],
         env=variables,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -165,8 +163,8 @@ def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
 
 STOPPED_WHILE_IT_IS_MADE = """
 import sys
-from sros_tool.demo.options import node_options
-from sros_tool.demo.ros_node import run_ros_node
+from sros_tool.demo.nodes.options import node_options
+from sros_tool.demo.nodes.ros_node import run_ros_node
 
 def build(node, events):
     import rclpy

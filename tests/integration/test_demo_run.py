@@ -13,18 +13,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from children import PATIENCE
 
 from sros_tool.demo.backend import Backend
-from sros_tool.demo.isolated import run_isolated
+from sros_tool.demo.keystores import Scenery
 from sros_tool.demo.model import UNSECURED, Row, Status
+from sros_tool.demo.network import run_isolated
 from sros_tool.demo.records import RowResult
 from sros_tool.demo.runner import Limits, Plan, run_plan
 from sros_tool.demo.scenarios.isolation import ROWS
-from sros_tool.demo.scenery import Scenery
 from sros_tool.errors import SrosError, UnavailableError
-from sros_tool.runtime.cyclone_library import load_cyclone
+from sros_tool.runtime.cyclone import load_cyclone
 from sros_tool.runtime.netns import try_isolation
+from tests.support.children import PATIENCE
 
 pytestmark = pytest.mark.dds
 

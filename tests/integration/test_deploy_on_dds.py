@@ -9,21 +9,21 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from children import importing, python, run
-from converse import converse, listener, talker
-from harness import policy_text, publish, snapshot
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import SrosError
-from sros_tool.keystore import create_keystore, generate_artifacts
-from sros_tool.keystore.answer import import_answer
-from sros_tool.keystore.archive import pack, unpack
-from sros_tool.keystore.arrival import verify_arrival
-from sros_tool.keystore.request import create_request
-from sros_tool.keystore.signing import sign_request
+from sros_tool.keystore.delivery.answer import import_answer
+from sros_tool.keystore.delivery.archive import pack, unpack
+from sros_tool.keystore.delivery.arrival import verify_arrival
+from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.signing import sign_request
+from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.policy import read_policy
 from sros_tool.runtime.environment import secured_environment
+from tests.integration.converse import converse, listener, talker
+from tests.support.children import importing, python, run
+from tests.support.harness import policy_text, publish, snapshot
 
 pytestmark = pytest.mark.dds
 

@@ -17,12 +17,13 @@ from typing import Any
 from zoneinfo import ZoneInfo
 
 import pytest
-from children import LONG
-from drawn_cases import cases as drawn_cases
-from drawn_documents import documents
-from fastdds import fastdds_vendor
 from hypothesis import HealthCheck, Phase, given, seed, settings
-from vendor_oracle import (
+
+from sros_tool.dds.decision import TRAITS, Access, Outcome, Refusal, Traits, Vendor, Verb
+from tests.dds.drawn_documents import documents
+from tests.integration.drawn_cases import cases as drawn_cases
+from tests.integration.fastdds import fastdds_vendor
+from tests.integration.vendor_oracle import (
     Case,
     Question,
     Reply,
@@ -31,9 +32,8 @@ from vendor_oracle import (
     ask_fastdds,
     with_patience,
 )
-from vendor_rows import CRASHES, REFUSED, Row, rows
-
-from sros_tool.dds.decision import TRAITS, Access, Outcome, Refusal, Traits, Vendor, Verb
+from tests.integration.vendor_rows import CRASHES, REFUSED, Row, rows
+from tests.support.children import LONG
 
 pytestmark = pytest.mark.dds
 

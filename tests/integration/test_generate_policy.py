@@ -17,14 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from children import python
-from converse import converse, listener, talker
-from enforcing import enforces
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY
-from sros_tool.keystore import generate_artifacts
-from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.policy import Enclave, Group, Policy, read_policy
@@ -32,6 +29,9 @@ from sros_tool.policy.rights import policy_rights
 from sros_tool.resources import policies_dir
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
+from tests.integration.converse import converse, listener, talker
+from tests.integration.enforcing import enforces
+from tests.support.children import python
 
 pytestmark = [
     pytest.mark.dds,
@@ -688,12 +688,12 @@ def test_the_observer_may_join_and_nothing_else(tmp_path: Path) -> None:
 
 _OBSERVED_OBSERVER = """
 import json, os, sys, time
-from children import LATE
+from tests.support.children import LATE
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 if try_isolation().isolated:
     enter_isolation()
 os.environ["ROS_DOMAIN_ID"] = "216"
-from sros_tool.graph.source import RosGraph
+from sros_tool.graph.observe import RosGraph
 expected = set(map(tuple, json.load(sys.stdin)))
 with RosGraph():
     import rclpy
@@ -726,7 +726,7 @@ def test_the_observer_has_no_more_than_its_policy_says() -> None:
 _TALK_AND_LOOK = """
 import json, subprocess, sys
 from pathlib import Path
-from children import wait_for
+from tests.support.children import wait_for
 from sros_tool.runtime.cyclone import Participant
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 if sys.argv[3:]:

@@ -8,11 +8,11 @@ import shutil
 from pathlib import Path
 
 import pytest
-from children import LONG, python, run
-from harness import check_whole, policy_text, publish, remains, topics_of
-from kills import Moments, Server, server
 
 from sros_tool.keystore.layout import enclave_folder
+from tests.integration.kills import Moments, Server, server
+from tests.support.children import LONG, python, run
+from tests.support.harness import check_whole, policy_text, publish, remains, topics_of
 
 __all__ = ["server"]
 
@@ -117,7 +117,7 @@ def test_bug_17_of_eight_at_once_one_makes_the_keystore(root: str, tmp_path: Pat
 _STARTER = """
 import json, os, sys, time
 from pathlib import Path
-import sros_tool.keystore.create, sros_tool.cli.keystore, sros_tool.cli.program
+import sros_tool.keystore.lifecycle.create, sros_tool.cli.keystore, sros_tool.cli.program
 from sros_tool.cli import main
 sys.argv = ["sros", "create_keystore", sys.argv[1]]
 ready, go = os.pipe()

@@ -10,18 +10,19 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from harness import remains, snapshot
-from kills import Moments, Server, server
-from test_kill_life import DIED, copy, in_child, to_try
 
-from sros_tool.keystore import create_enclaves, create_keystore, filesystem
-from sros_tool.keystore.answer import import_answer
-from sros_tool.keystore.arrival import verify_arrival
-from sros_tool.keystore.request import create_request
-from sros_tool.keystore.revoke import revoke
-from sros_tool.keystore.signing import sign_request
+from sros_tool.keystore.delivery.answer import import_answer
+from sros_tool.keystore.delivery.arrival import verify_arrival
+from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.signing import sign_request
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.loading import check_enclave
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.verify import check_enclave
+from sros_tool.keystore.transaction import filesystem
+from tests.integration.kills import Moments, Server, server
+from tests.integration.test_kill_life import DIED, copy, in_child, to_try
+from tests.support.harness import remains, snapshot
 
 __all__ = ["server"]
 

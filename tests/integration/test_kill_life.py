@@ -12,16 +12,19 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from harness import check_whole, remains
-from kills import Moments, Server, server
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore import create_enclaves, filesystem, list_enclaves
-from sros_tool.keystore.enclave import enclave_path
 from sros_tool.keystore.history import history
-from sros_tool.keystore.renew import renew
-from sros_tool.keystore.revoke import read_crl, refresh_crl, revoke
-from sros_tool.keystore.verify import check_enclave
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.lifecycle.create import create_enclaves
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revocation_list import read_crl
+from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
+from sros_tool.keystore.loading import check_enclave
+from sros_tool.keystore.transaction import filesystem
+from tests.integration.kills import Moments, Server, server
+from tests.support.harness import check_whole, remains
 
 __all__ = ["server"]
 

@@ -6,20 +6,22 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from harness import check_enclave_whole, remains
-from kills import Moments, Server, server
-from test_kill_life import DIED, copy, in_child, to_try
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore import create_enclaves, create_keystore, filesystem, list_enclaves
-from sros_tool.keystore.enclave import enclave_path
 from sros_tool.keystore.history import history
-from sros_tool.keystore.lists import read_lists
-from sros_tool.keystore.revoke import revoke
-from sros_tool.keystore.rotate import rotate_ca
-from sros_tool.keystore.rotation import Stage, read_rotation, rotation_status
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.lifecycle.revocation_list import read_lists
+from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
+from sros_tool.keystore.lifecycle.rotation.state import Stage, read_rotation, rotation_status
+from sros_tool.keystore.loading import check_enclave
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.verify import check_enclave
+from sros_tool.keystore.transaction import filesystem
+from tests.integration.kills import Moments, Server, server
+from tests.integration.test_kill_life import DIED, copy, in_child, to_try
+from tests.support.harness import check_enclave_whole, remains
 
 __all__ = ["server"]
 

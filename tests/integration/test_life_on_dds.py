@@ -9,19 +9,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from children import LATE, run
-from converse import ENOUGH, converse, listener, talker
-from fastdds import build, isolated
-from harness import policy_text, publish
-from vendor_oracle import MATCH_SECONDS
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts
-from sros_tool.keystore.enclave import enclave_path
-from sros_tool.keystore.renew import renew
-from sros_tool.keystore.revoke import revoke
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.policy import read_policy
+from tests.integration.converse import ENOUGH, converse, listener, talker
+from tests.integration.fastdds import build, isolated
+from tests.integration.vendor_oracle import MATCH_SECONDS
+from tests.support.children import LATE, run
+from tests.support.harness import policy_text, publish
 
 pytestmark = pytest.mark.dds
 

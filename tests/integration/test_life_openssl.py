@@ -7,7 +7,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from harness import sros
+
+from tests.support.harness import sros
 
 
 def openssl(*words: object, accept: bool = True) -> str:

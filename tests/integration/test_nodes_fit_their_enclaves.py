@@ -18,24 +18,23 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_policies_live import all_dds_endpoints, observed_in, run_script, without
 
 from sros_tool.dds.decision import Access, Outcome, Vendor, Verb
 from sros_tool.dds.domains import DomainSet
-from sros_tool.demo.backend import RCLPY, Backend
-from sros_tool.demo.conditions import conditions
+from sros_tool.demo.backend import RCLPY, Backend, conditions
+from sros_tool.demo.keystores import Scenery, Setting, build_scenery
 from sros_tool.demo.model import DENIALS, Party, Relation, Role, Row, Scenario, Status
-from sros_tool.demo.node_names import OWN_NAMES
+from sros_tool.demo.nodes.names import OWN_NAMES
 from sros_tool.demo.scenarios import SCENARIOS
-from sros_tool.demo.scenery import Scenery, Setting, build_scenery
-from sros_tool.keystore import generate_artifacts
-from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.names import NODE_SERVICES, ROS_DISCOVERY_TOPIC, dds_names, expand
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, subject_text
 from sros_tool.policy import Enclave, read_policy
 from sros_tool.resources import policies_dir
+from tests.integration.test_policies_live import all_dds_endpoints, observed_in, run_script, without
 
 pytestmark = [
     pytest.mark.dds,

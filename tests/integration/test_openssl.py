@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from harness import sros
 from lxml import etree
 
 from sros_tool.errors import SrosError
@@ -16,6 +15,7 @@ from sros_tool.keystore.template import template_names
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.resources import policies_dir
+from tests.support.harness import sros
 
 SCHEMAS = Path(__file__).parents[1] / "schemas"
 

@@ -7,8 +7,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from harness import publish
-from test_life_on_dds import (
+
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.template import load_template
+from tests.integration.test_life_on_dds import (
     HEARD,
     LISTENS,
     REFUSED,
@@ -21,10 +24,7 @@ from test_life_on_dds import (
     permit,
     probe,
 )
-
-from sros_tool.keystore.enclave import enclave_path
-from sros_tool.keystore.renew import renew
-from sros_tool.keystore.template import load_template
+from tests.support.harness import publish
 
 __all__ = ["ask", "probe"]
 

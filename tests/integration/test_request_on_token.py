@@ -7,7 +7,8 @@ import subprocess
 from pathlib import Path
 
 import pytest
-from test_token import MODULE, make, sros, token
+
+from tests.integration.test_token import MODULE, make, sros, token
 
 __all__ = ["token"]
 

@@ -7,9 +7,14 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
-import made_by_ros2
 import pytest
-from test_life_on_dds import (
+
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
+from sros_tool.keystore.lifecycle.rotation.state import Stage
+from tests.integration.test_life_on_dds import (
     ANY,
     DOMAIN,
     HEARD,
@@ -22,12 +27,7 @@ from test_life_on_dds import (
     open_template,
     probe,
 )
-
-from sros_tool.keystore.enclave import enclave_path
-from sros_tool.keystore.renew import renew
-from sros_tool.keystore.revoke import revoke
-from sros_tool.keystore.rotate import rotate_ca
-from sros_tool.keystore.rotation import Stage
+from tests.support import made_by_ros2
 
 __all__ = ["ask", "probe"]
 

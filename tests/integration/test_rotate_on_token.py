@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from test_token import MODULE, make, sros, token, uri
+
+from tests.integration.test_token import MODULE, make, sros, token, uri
 
 __all__ = ["token"]
 

@@ -11,19 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from children import PATIENCE, python
-from enforcing import enforcing_backend
-from test_nodes_fit_their_enclaves import nodes_of
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY
 from sros_tool.explain.log import explain_log
-from sros_tool.keystore import generate_artifacts
+from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.names import expand
 from sros_tool.policy import Policy, read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.resources import policies_dir
+from tests.integration.enforcing import enforcing_backend
+from tests.integration.test_nodes_fit_their_enclaves import nodes_of
+from tests.support.children import PATIENCE, python
 
 pytestmark = pytest.mark.dds
 

@@ -8,10 +8,16 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from children import run
-from decision_documents import allow, grant, permissions, publish
-from fastdds import fastdds_vendor
-from vendor_oracle import (
+
+from sros_tool.dds.decision import TRAITS, Vendor
+from sros_tool.errors import PkiError
+from sros_tool.explain.material import from_folder
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import pem
+from sros_tool.pki.keys import key_pem
+from tests.dds.decision_documents import allow, grant, permissions, publish
+from tests.integration.fastdds import fastdds_vendor
+from tests.integration.vendor_oracle import (
     PEER,
     PEER_PERMISSIONS,
     Pair,
@@ -21,14 +27,8 @@ from vendor_oracle import (
     ask_fastdds_folders,
     with_patience,
 )
-from vendor_rows import OPEN
-
-from sros_tool.dds.decision import TRAITS, Vendor
-from sros_tool.errors import PkiError
-from sros_tool.explain.material import from_folder
-from sros_tool.pki import smime
-from sros_tool.pki.certificates import pem
-from sros_tool.pki.keys import key_pem
+from tests.integration.vendor_rows import OPEN
+from tests.support.children import run
 
 pytestmark = pytest.mark.dds
 

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
-from decision_documents import allow, grant, permissions, publish, subscribe
-from fastdds import fastdds_vendor
-from signer_rows import YES, rows, write_enclave
-from vendor_oracle import (
+
+from sros_tool.dds.decision import Vendor
+from tests.dds.decision_documents import allow, grant, permissions, publish, subscribe
+from tests.dds.signer_rows import YES, rows, write_enclave
+from tests.integration.fastdds import fastdds_vendor
+from tests.integration.vendor_oracle import (
     PEER,
     PEER_PERMISSIONS,
     Pair,
@@ -18,9 +20,7 @@ from vendor_oracle import (
     ask_fastdds_folders,
     with_patience,
 )
-from vendor_rows import OPEN
-
-from sros_tool.dds.decision import Vendor
+from tests.integration.vendor_rows import OPEN
 
 pytestmark = pytest.mark.dds
 

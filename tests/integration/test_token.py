@@ -9,7 +9,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from children import run
+
+from tests.support.children import run
 
 MODULES = ("/usr/lib/softhsm/libsofthsm2.so", "/usr/lib/x86_64-linux-gnu/softhsm/libsofthsm2.so")
 MODULE = next((path for path in MODULES if Path(path).exists()), "")

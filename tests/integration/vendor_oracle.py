@@ -16,13 +16,12 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
 
-from children import LATE, python, run
-from fastdds import build, isolated
-
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem, subject_of
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.validity import Window
+from tests.integration.fastdds import build, isolated
+from tests.support.children import LATE, python, run
 
 HERE = Path(__file__).parent
 

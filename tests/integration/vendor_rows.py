@@ -10,8 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-from decision_documents import allow, criteria, deny, grant, permissions, topic_rule
-from vendor_oracle import Case, Question
+from tests.dds.decision_documents import allow, criteria, deny, grant, permissions, topic_rule
+from tests.integration.vendor_oracle import Case, Question
 
 YES, NO, PEER_DENIES, REFUSED = "matched", "denied", "unmatched", "refused"
 CRASHES, INVALID = "crashed", "invalid"

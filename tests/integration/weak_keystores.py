@@ -9,11 +9,10 @@ from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import Backend
-from sros_tool.demo.bench import Bench, Forge
-from sros_tool.demo.forgeries import REMOVALS, in_clear
+from sros_tool.demo.forger import REMOVALS, Bench, Forge, in_clear
+from sros_tool.demo.keystores import Setting, make_keystore
 from sros_tool.demo.model import Condition
 from sros_tool.demo.scenarios.attacks import ATTACKS
-from sros_tool.demo.scenery import Setting, make_keystore
 from sros_tool.keystore.template import Template, load_template
 
 DOMAIN = 7

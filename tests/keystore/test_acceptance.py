@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from decision_documents import allow, governance, grant, permissions, publish, subscribe
-from signer_rows import NOW, YES, Row, rows, write_enclave
 
 from sros_tool.dds.decision import TRAITS, Vendor
 from sros_tool.explain.answer import Judge, Setting
 from sros_tool.explain.material import from_folder
 from sros_tool.explain.question import ask
+from tests.dds.decision_documents import allow, governance, grant, permissions, publish, subscribe
+from tests.dds.signer_rows import NOW, YES, Row, rows, write_enclave
 
 
 @pytest.mark.parametrize("row", rows(), ids=lambda row: row.name)

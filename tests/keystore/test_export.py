@@ -9,20 +9,20 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from harness import policy_text, publish, snapshot
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
-from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts
-from sros_tool.keystore.archive import unpack
-from sros_tool.keystore.arrival import verify_arrival
-from sros_tool.keystore.export import Selection, distribute, pack_enclaves, select
-from sros_tool.keystore.renew import renew
-from sros_tool.keystore.request import create_request
-from sros_tool.keystore.revoke import revoke
-from sros_tool.keystore.signing import sign_request
+from sros_tool.keystore.delivery.archive import unpack
+from sros_tool.keystore.delivery.arrival import verify_arrival
+from sros_tool.keystore.delivery.export import Selection, distribute, pack_enclaves, select
+from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.signing import sign_request
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.template import load_template
 from sros_tool.policy import read_policy
+from tests.support.harness import policy_text, publish, snapshot
 
 NOW = datetime.now(UTC)
 NAMES = ("/arm/camera", "/arm/gripper", "/armada", "/base")

@@ -6,17 +6,17 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from children import run
 from cryptography.hazmat.primitives import hashes
 from cryptography.x509.oid import ExtendedKeyUsageOID
-from harness import sros
-from signer_rows import CERTIFIES, SIGNS, authority
 
 from sros_tool.dds.decision import Vendor
 from sros_tool.errors import UsageError
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem
 from sros_tool.validity import Lifespan, Span, Window, parse_span, span_text, window
+from tests.dds.signer_rows import CERTIFIES, SIGNS, authority
+from tests.support.children import run
+from tests.support.harness import sros
 
 CA = "basicConstraints=critical,CA:TRUE"
 USAGE = "keyUsage=critical,keyCertSign,cRLSign,digitalSignature"

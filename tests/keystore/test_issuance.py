@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore import create_enclaves, create_keystore
-from sros_tool.keystore.request import create_request
-from sros_tool.keystore.rotate import rotate_ca
-from sros_tool.keystore.signing import sign_request
+from sros_tool.errors import Note
+from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.signing import sign_request
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.template import load_template
-from sros_tool.notes import Note
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
 LATE = NOW + timedelta(days=1800)  # the CAs of production live for 1825 days

@@ -6,13 +6,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from harness import sros
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore import create_enclaves, create_keystore, list_enclaves
-from sros_tool.keystore.keyring import Keyring
-from sros_tool.keystore.open import load_settings
+from sros_tool.keystore.authorities.keyring import Keyring
+from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.reader import load_settings
 from sros_tool.keystore.template import load_template
+from tests.support.harness import sros
 
 NOW = datetime.now(UTC)
 

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pytest
 from cryptography.hazmat.primitives import hashes
-from harness import certificate, policy_text, publish, snapshot, sros
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.history import Status, history
-from sros_tool.keystore.ledger import LEDGER, Entry, read_ledger
-from sros_tool.keystore.renew import renew
-from sros_tool.keystore.revoke import refresh_crl, revoke
+from sros_tool.keystore.issuing.ledger import LEDGER, Entry, read_ledger
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction import Transaction
+from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.policy import read_policy
+from tests.support.harness import certificate, policy_text, publish, snapshot, sros
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
 

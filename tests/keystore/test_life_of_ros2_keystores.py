@@ -8,15 +8,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from harness import certificate, check_enclave_whole, remains, snapshot, sros
-from made_by_ros2 import make
 
-from sros_tool.keystore import list_enclaves
-from sros_tool.keystore.enclave import enclave_path
 from sros_tool.keystore.history import Status, history
-from sros_tool.keystore.lists import read_lists
-from sros_tool.keystore.rotation import rotation_status
-from sros_tool.keystore.verify import check_enclave
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.lifecycle.revocation_list import read_lists
+from sros_tool.keystore.lifecycle.rotation.state import rotation_status
+from sros_tool.keystore.loading import check_enclave
+from tests.support.harness import certificate, check_enclave_whole, remains, snapshot, sros
+from tests.support.made_by_ros2 import make
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 

@@ -7,15 +7,15 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from harness import certificate
 
-from sros_tool.keystore import create_enclaves, create_keystore
-from sros_tool.keystore.enclave import enclave_path
 from sros_tool.keystore.history import Status, history
-from sros_tool.keystore.ledger import LEDGER, read_ledger
-from sros_tool.keystore.lists import read_crl
-from sros_tool.keystore.revoke import refresh_crl, revoke
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.issuing.ledger import LEDGER, read_ledger
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.lifecycle.revocation_list import read_crl
+from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.template import load_template
+from tests.support.harness import certificate
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
 DAY = timedelta(days=1)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from harness import sros
 
-from sros_tool.keystore.create import list_enclaves
-from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.missing import likely, no_such_enclave
+from sros_tool.keystore.issuing.ledger import read_ledger
+from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.reader import likely, no_such_enclave
 from sros_tool.pki.certificates import load_certificate
+from tests.support.harness import sros
 
 THERE = ("/mobile_robot/base", "/mobile_robot/teleop", "/mobile_robot/velocity_mux", "/arm/base")
 

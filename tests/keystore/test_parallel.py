@@ -6,9 +6,9 @@ import os
 from pathlib import Path
 
 import pytest
-from children import python
 
-from sros_tool.keystore import parallel
+from sros_tool import parallel
+from tests.support.children import python
 
 ITEMS = range(1000)
 
@@ -26,7 +26,7 @@ INTERRUPTED = """
 import os, signal, sys
 from itertools import count
 from pathlib import Path
-from sros_tool.keystore import parallel
+from sros_tool import parallel
 
 folder = Path(sys.argv[1])
 fork, children = os.fork, []

@@ -8,25 +8,24 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from children import run
-from harness import certificate, snapshot, sros
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore import create_keystore
-from sros_tool.keystore.answer import SEAL, import_answer, seal
-from sros_tool.keystore.archive import pack, unpack
-from sros_tool.keystore.arrival import verify_arrival
-from sros_tool.keystore.authority import load_authority
-from sros_tool.keystore.keyring import IN_KEYSTORE
+from sros_tool.keystore.authorities.authority import load_authority
+from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
+from sros_tool.keystore.delivery.answer import SEAL, import_answer, seal
+from sros_tool.keystore.delivery.archive import pack, unpack
+from sros_tool.keystore.delivery.arrival import read_pin, verify_arrival
+from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.layout import PERMISSIONS
-from sros_tool.keystore.open import load_settings
-from sros_tool.keystore.request import create_request
-from sros_tool.keystore.rotate import rotate_ca
-from sros_tool.keystore.rotation import Stage
-from sros_tool.keystore.signing import sign_request
+from sros_tool.keystore.lifecycle.create import create_keystore
+from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
+from sros_tool.keystore.lifecycle.rotation.state import Stage
+from sros_tool.keystore.reader import load_settings
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.trust import read_pin
 from sros_tool.pki.certificates import digest
+from tests.support.children import run
+from tests.support.harness import certificate, snapshot, sros
 
 NOW = datetime.now(UTC)
 NAME, FOLDER = "/arm/camera", "enclaves/arm/camera"

@@ -8,8 +8,6 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from drawn_policies import policies
-from harness import policy_text, publish, snapshot, sros
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -17,8 +15,8 @@ from sros_tool.dds.decision import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, parse_permissions
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore import proof
-from sros_tool.keystore.proof import (
+from sros_tool.keystore.issuing import proof
+from sros_tool.keystore.issuing.proof import (
     differences,
     prove,
     signed_expressions,
@@ -32,6 +30,8 @@ from sros_tool.policy.rights import Rules, policy_rights
 from sros_tool.resources import policies_dir
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
+from tests.policy.drawn_policies import policies
+from tests.support.harness import policy_text, publish, snapshot, sros
 
 NOW = datetime(2026, 11, 21, tzinfo=UTC)
 DOMAINS = DomainSet.parse("0,10-19")

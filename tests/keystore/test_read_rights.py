@@ -6,14 +6,14 @@ import shutil
 from pathlib import Path
 
 import pytest
-from harness import policy_text, publish, sros
 
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import SrosError
-from sros_tool.keystore.measure import Scale
+from sros_tool.keystore.issuing.size import Scale
 from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.policy import read_policy
 from sros_tool.translate import grant_rights
+from tests.support.harness import policy_text, publish, sros
 
 DOCUMENT = """<dds><permissions>{}</permissions></dds>"""
 GRANT = """<grant name="/g"><subject_name>{subject}</subject_name><validity>

@@ -9,19 +9,29 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from harness import certificate, check_whole, policy_text, publish, snapshot, sros, topics_of
 
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts
-from sros_tool.keystore.enclave import enclave_path
-from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.renew import Threshold, lifetimes, parse_threshold, renew
-from sros_tool.keystore.revoke import read_crl, revoke
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.issuing.ledger import read_ledger
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revocation_list import read_crl
+from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.loading import check_enclave
+from sros_tool.keystore.reader import Threshold, lifetimes, parse_threshold
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.verify import check_enclave
 from sros_tool.pki import smime
 from sros_tool.policy import read_policy
+from tests.support.harness import (
+    certificate,
+    check_whole,
+    policy_text,
+    publish,
+    snapshot,
+    sros,
+    topics_of,
+)
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
 LATER = NOW + timedelta(days=100)

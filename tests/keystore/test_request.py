@@ -13,30 +13,31 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from children import run
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from cryptography.x509.oid import NameOID
-from harness import certificate, policy_text, publish, remains, snapshot, topics_of
 
 from sros_tool.errors import KeystoreError, PkiError, PolicyError, SrosError
-from sros_tool.keystore import create_enclaves, create_keystore, create_permission, list_enclaves
-from sros_tool.keystore.answer import SEAL, import_answer
-from sros_tool.keystore.archive import MAX_MEMBER, MAX_UNPACKED, pack, unpack
-from sros_tool.keystore.arrival import verify_arrival
+from sros_tool.keystore.delivery.answer import SEAL, import_answer
+from sros_tool.keystore.delivery.archive import MAX_MEMBER, MAX_UNPACKED, pack, unpack
+from sros_tool.keystore.delivery.arrival import verify_arrival
+from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.signing import Signed, sign_request
 from sros_tool.keystore.history import history
-from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.renew import renew
-from sros_tool.keystore.request import create_request
-from sros_tool.keystore.revoke import refresh_crl, revoke
-from sros_tool.keystore.signing import Signed, sign_request
+from sros_tool.keystore.issuing.ledger import read_ledger
+from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import common_name
 from sros_tool.pki.keys import generate_key
 from sros_tool.pki.requests import key_digest, load_request, make_request
 from sros_tool.policy import read_policy
+from tests.support.children import run
+from tests.support.harness import certificate, policy_text, publish, remains, snapshot, topics_of
 
 NOW = datetime.now(UTC)
 LATER = NOW + timedelta(days=30)

@@ -10,18 +10,20 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from harness import certificate, check_whole, snapshot, sros
 
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore import create_enclaves, create_keystore, list_enclaves
-from sros_tool.keystore.enclave import enclave_path
-from sros_tool.keystore.export import distribute
-from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.renew import renew
-from sros_tool.keystore.revoke import read_crl, refresh_crl, revoke
+from sros_tool.keystore.delivery.export import distribute
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.issuing.ledger import read_ledger
+from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revocation_list import read_crl
+from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
+from sros_tool.keystore.loading import check_enclave
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.verify import check_enclave
 from sros_tool.pki.crl import REASONS, RevocationList
+from tests.support.harness import certificate, check_whole, snapshot, sros
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
 DAY = timedelta(days=1)

@@ -14,25 +14,31 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import rsa
-from harness import check_enclave_whole, policy_text, publish, remains, snapshot, sros
-from test_transaction import DIED, in_child
 
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore import create_enclaves, create_keystore, generate_artifacts, list_enclaves
-from sros_tool.keystore.bundle import authority_files, certificates_of
-from sros_tool.keystore.enclave import enclave_path
-from sros_tool.keystore.export import distribute
-from sros_tool.keystore.keyring import Keyring
-from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.lists import read_crl, read_lists
-from sros_tool.keystore.revoke import refresh_crl, revoke
-from sros_tool.keystore.rotate import RotationStep, renew_identity_ca, rotate_ca
-from sros_tool.keystore.rotation import ROTATION, Stage, retired_key, rotation_status
+from sros_tool.keystore.authorities.authority import authority_files, certificates_of
+from sros_tool.keystore.authorities.keyring import Keyring
+from sros_tool.keystore.delivery.export import distribute
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.issuing.ledger import read_ledger
+from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.lifecycle.revocation_list import read_crl, read_lists
+from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
+from sros_tool.keystore.lifecycle.rotation.stages import RotationStep, renew_identity_ca, rotate_ca
+from sros_tool.keystore.lifecycle.rotation.state import (
+    ROTATION,
+    Stage,
+    retired_key,
+    rotation_status,
+)
+from sros_tool.keystore.loading import check_enclave
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.verify import check_enclave
 from sros_tool.pki.certificates import common_name, digest, pem
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.policy import read_policy
+from tests.keystore.test_transaction import DIED, in_child
+from tests.support.harness import check_enclave_whole, policy_text, publish, remains, snapshot, sros
 
 NOW = datetime.now(UTC)
 STAGES = (Stage.DISTRIBUTE, Stage.REISSUE, Stage.RETIRE)
@@ -530,7 +536,7 @@ def test_death_at_every_step(stage: Stage | None, tmp_path: Path) -> None:
 
 
 def shape_after_tidy(root: Path) -> tuple[object, ...]:
-    from sros_tool.keystore.transaction import tidy
+    from sros_tool.keystore.transaction.recovery import tidy
 
     tidy(root)
     return shape(root)

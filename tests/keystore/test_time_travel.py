@@ -13,30 +13,31 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
-from children import LONG
 from cryptography import x509
-from harness import certificate, policy_text, publish, topics_of
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore import create_enclaves, create_keystore, filesystem, generate_artifacts
 from sros_tool.keystore import history as history_of_keystores
-from sros_tool.keystore.bundle import certificates_of
-from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.authorities.authority import certificates_of
 from sros_tool.keystore.history import Status, history
-from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.lifetime import Threshold, lifetimes
-from sros_tool.keystore.lists import read_crl, read_lists
-from sros_tool.keystore.parallel import in_shares
-from sros_tool.keystore.renew import renew
-from sros_tool.keystore.revoke import refresh_crl, revoke
-from sros_tool.keystore.rotate import rotate_ca
-from sros_tool.keystore.rotation import Stage, read_rotation
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.issuing.ledger import read_ledger
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revocation_list import read_crl, read_lists
+from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
+from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
+from sros_tool.keystore.lifecycle.rotation.state import Stage, read_rotation
+from sros_tool.keystore.loading import check_enclave
+from sros_tool.keystore.reader import Threshold, lifetimes
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.verify import check_enclave
+from sros_tool.keystore.transaction import filesystem
+from sros_tool.parallel import in_shares
 from sros_tool.pki.certificates import issued_by, validity_of
 from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.policy import read_policy
 from sros_tool.validity import Window
+from tests.support.children import LONG
+from tests.support.harness import certificate, policy_text, publish, topics_of
 
 BEGIN = datetime(2026, 1, 31, 12, 30, tzinfo=UTC)
 MONTH = timedelta(days=30)

@@ -15,9 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sros_tool.errors import PkiError, SrosError
-from sros_tool.keystore import create_enclaves
 from sros_tool.keystore.describe import describe
-from sros_tool.keystore.verify import check_enclave
+from sros_tool.keystore.lifecycle.create import create_enclaves
+from sros_tool.keystore.loading import check_enclave
 from sros_tool.pki import der
 
 FILES = (

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from drawn_policies import PATHS, listed, policies
 from hypothesis import given
 
 from sros_tool.policy import ALLOW, DENY, Policy
-from sros_tool.policy.diff import compare
-from sros_tool.policy.rights import Right, Rules, policy_rights
+from sros_tool.policy.rights import Right, Rules, compare, policy_rights
+from tests.policy.drawn_policies import PATHS, listed, policies
 
 
 def right(name: str, word: str = "publish", enclave: str = "/a") -> Right:

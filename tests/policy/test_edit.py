@@ -10,7 +10,7 @@ import pytest
 
 from sros_tool.errors import DocumentError, PolicyError
 from sros_tool.policy import Policy, read_policy
-from sros_tool.policy.edit import merge_into
+from sros_tool.policy.merge import merge_into
 from sros_tool.policy.rights import policy_rights
 
 POLICY = """\

@@ -6,14 +6,13 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from drawn_policies import PATHS, effective, meant, policies
 from hypothesis import given, settings
 
 from sros_tool.policy import ALLOW, DENY, Group, Policy, read_policy, write_policy
-from sros_tool.policy.edit import merge_all, merge_into
-from sros_tool.policy.merge import merge_notes, plan_merge
+from sros_tool.policy.merge import merge_all, merge_into, merge_notes, plan_merge
 from sros_tool.policy.model import Enclave, Profile, Profiles
 from sros_tool.policy.rights import Right, policy_rights
+from tests.policy.drawn_policies import PATHS, effective, meant, policies
 
 
 def one(*groups: Group, node: str = "n") -> Policy:

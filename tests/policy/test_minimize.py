@@ -5,16 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from drawn_policies import effective, exact_names, listed, meant, policies
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sros_tool.keystore.measure import Scale, right_bytes
+from sros_tool.keystore.issuing.size import Scale, right_bytes
 from sros_tool.names import is_expression
 from sros_tool.policy import ALLOW, Group, Policy, read_policy
-from sros_tool.policy.minimize import EnclaveUse, minimize
+from sros_tool.policy.minimize import EnclaveUse, minimize, propose_wildcards
 from sros_tool.policy.rights import Right, Rules, policy_rights
-from sros_tool.policy.wildcards import propose_wildcards
+from tests.policy.drawn_policies import effective, exact_names, listed, meant, policies
 
 COMMON = (
     Group("topics", (("publish", ALLOW),), ("/rosout",)),

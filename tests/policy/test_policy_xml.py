@@ -7,7 +7,6 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from harness import with_includes
 from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
@@ -24,6 +23,7 @@ from sros_tool.policy import (
     read_policy,
     write_policy,
 )
+from tests.support.harness import with_includes
 
 names = st.sampled_from(("x", "/x/y", "~/z", "~", "*", "a?", "[!a-c]d", "/a/*/b"))
 
@@ -158,7 +158,7 @@ def test_comments_count_for_nothing(comment: str, tmp_path: Path) -> None:
 
 
 def test_includes_have_a_size_in_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from sros_tool.policy import include
+    from sros_tool.policy import document as include
 
     part = '<profile ns="/" node="n"><topics publish="ALLOW"><topic>t</topic></topics></profile>'
     (tmp_path / "part.xml").write_text(part)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta, timezone
 
-from drawn_policies import EVERYTHING, PATHS, policies
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -21,6 +20,7 @@ from sros_tool.policy import Enclave, Policy
 from sros_tool.policy.patterns import overlap
 from sros_tool.translate import governance_for, permissions_for
 from sros_tool.validity import window
+from tests.policy.drawn_policies import EVERYTHING, PATHS, policies
 
 NOW = datetime(2026, 7, 1, tzinfo=UTC)
 DOMAINS = DomainSet.of((0, 0))

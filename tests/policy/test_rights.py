@@ -6,7 +6,6 @@ from fnmatch import fnmatchcase
 from itertools import product
 
 import pytest
-from drawn_policies import PATHS, effective, grant_of, policies
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,6 +13,7 @@ from sros_tool.policy import ALLOW, DENY, Policy
 from sros_tool.policy.patterns import covers, overlap
 from sros_tool.policy.rights import Right, Rules, folded, parts, policy_rights, unfolded
 from sros_tool.translate import grant_rights
+from tests.policy.drawn_policies import PATHS, effective, grant_of, policies
 
 WORDS = [
     "/" + "".join(letters)

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.policy.patterns import matches, overlap
-from sros_tool.policy.witness import common_name
+from sros_tool.policy.patterns import common_name, matches, overlap
 
 PIECES = ["/", "a", "b", "*", "?", "[ab]", "[!a]"]
 expressions = st.lists(st.sampled_from(PIECES), min_size=1, max_size=5).map(

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from children import PATIENCE, run
-from harness import sros
-from pictures import MOBILE_ROBOT, WEB
+
+from tests.report.pictures import MOBILE_ROBOT, WEB
+from tests.support.children import PATIENCE, run
+from tests.support.harness import sros
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.sax.saxutils import escape
 
-from children import PATIENCE
-from harness import policy_text
-
-from sros_tool.policy.reader import read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.compose import Context, Source, compose
 from sros_tool.report.picture import Edge, Origin, Picture
 from sros_tool.report.sources import common_rights
 from sros_tool.resources import policies_dir
+from tests.support.children import PATIENCE
+from tests.support.harness import policy_text
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page

@@ -9,14 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from children import run
-from harness import sros
-from pictures import WEB, hostile_permissions, new_page
+
+from tests.report.pictures import WEB, hostile_permissions, new_page
+from tests.support.children import run
+from tests.support.harness import sros
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-pytest_plugins = ["browsing"]
+pytest_plugins = ["tests.report.browsing"]
 pytestmark = pytest.mark.xdist_group("browser")
 
 ASSETS = WEB.parent / "sros_tool" / "report" / "assets"

@@ -7,7 +7,7 @@ from itertools import combinations, pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.report.columns import Item, _crossings, heights, ordered
+from sros_tool.report.layout import Item, _crossings, heights, ordered
 
 ITEMS = st.lists(
     st.tuples(st.integers(20, 90), st.sampled_from("abc"), st.integers(-200, 900)), max_size=12

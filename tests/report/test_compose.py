@@ -6,17 +6,16 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from pictures import edge, group, mobile_robot, source_of
 
 from sros_tool.dds.domains import DomainSet
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.minimize import minimize
 from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
-from sros_tool.policy.reader import read_policy
-from sros_tool.report.compose import Context, compose, group_of, overlay
+from sros_tool.report.compose import Context, compose, group_of, overlay, protection_of
 from sros_tool.report.picture import Level as Shown
 from sros_tool.report.picture import Mark
-from sros_tool.report.protection import protection_of
 from sros_tool.translate import governance_for
+from tests.report.pictures import edge, group, mobile_robot, source_of
 
 
 def test_before_and_after_are_marked_and_listed(tmp_path: Path) -> None:

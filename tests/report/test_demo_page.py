@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 from lxml import html
-from pictures import HOSTILE, new_page
 
 from sros_tool.report.demo_page import render_demo_page, without_places
+from tests.report.pictures import HOSTILE, new_page
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-pytest_plugins = ["browsing"]
+pytest_plugins = ["tests.report.browsing"]
 KINDS = ("unsecured", "signed", "encrypted")
 
 

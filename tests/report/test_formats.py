@@ -8,17 +8,17 @@ import shutil
 from pathlib import Path
 
 import pytest
-from children import importing, python, run
-from harness import sros
 from lxml import etree
-from pictures import HOSTILE, MOBILE_ROBOT, hostile_permissions, mobile_robot
 
-from sros_tool.report.as_json import render_json
-from sros_tool.report.graphs import render_dot, render_mermaid
-from sros_tool.report.scenes import scenes_of
+from sros_tool.report.dot_mermaid import render_dot, render_mermaid
+from sros_tool.report.layout import scenes_of
+from sros_tool.report.picture import render_json
 from sros_tool.report.svg import render_svg
+from tests.report.pictures import HOSTILE, MOBILE_ROBOT, hostile_permissions, mobile_robot
+from tests.support.children import importing, python, run
+from tests.support.harness import sros
 
-pytest_plugins = ["browsing"]
+pytest_plugins = ["tests.report.browsing"]
 
 FORMATS = ("html", "svg", "dot", "mermaid", "json")
 REPOSITORY = Path(__file__).resolve().parents[2]

@@ -10,26 +10,33 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from harness import sros
-from pictures import HOSTILE, MOBILE_ROBOT, NOW, group, hostile_permissions, large_policy, new_page
 
-from sros_tool.explain.flow import OF_EVERY_NODE, Network
-from sros_tool.explain.unguarded import unguarded
+from sros_tool.explain.reach import OF_EVERY_NODE, Network, unguarded
 from sros_tool.keystore.layout import enclave_names
-from sros_tool.keystore.open import governance_of
+from sros_tool.keystore.reader import governance_of
 from sros_tool.keystore.rights import load_rights
-from sros_tool.policy.reader import read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.compose import Source, compose
+from sros_tool.report.layout import scenes_of
 from sros_tool.report.page import render_page
 from sros_tool.report.picture import Origin, Validity
-from sros_tool.report.scenes import scenes_of
 from sros_tool.resources import policies_dir
+from tests.report.pictures import (
+    HOSTILE,
+    MOBILE_ROBOT,
+    NOW,
+    group,
+    hostile_permissions,
+    large_policy,
+    new_page,
+)
+from tests.support.harness import sros
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
-pytest_plugins = ["browsing"]
+pytest_plugins = ["tests.report.browsing"]
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 PRODUCTION = policies_dir().parent / "keystore_templates/production.toml"
@@ -450,7 +457,7 @@ def test_a_hundred_enclaves_and_a_thousand_names_can_be_explored(
 
 
 def test_overlays_can_be_filtered_and_listed(browser: Browser, tmp_path: Path) -> None:
-    from harness import policy_text
+    from tests.support.harness import policy_text
 
     allowed = group("topics", "publish", "/x", "/unused") + group("topics", "subscribe", "/z*")
     used = group("topics", "publish", "/x", "/forbidden") + group("topics", "subscribe", "/z1")

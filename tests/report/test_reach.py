@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pictures import edge, edges, group, mobile_robot, picture_of
-
 from sros_tool.policy.model import ALLOW, DENY
+from tests.report.pictures import edge, edges, group, mobile_robot, picture_of
 
 
 def test_a_wildcard_leads_to_the_known_names_that_it_matches(tmp_path: Path) -> None:

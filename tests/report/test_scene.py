@@ -6,15 +6,14 @@ import itertools
 from pathlib import Path
 
 import pytest
-from pictures import group, large_policy, mobile_robot, picture_of, source_of
 
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import DENY
-from sros_tool.policy.reader import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.compose import Source, compose, overlay
+from sros_tool.report.layout import Scene, scenes_of
 from sros_tool.report.picture import Origin, Picture
-from sros_tool.report.scene import Scene
-from sros_tool.report.scenes import scenes_of
+from tests.report.pictures import group, large_policy, mobile_robot, picture_of, source_of
 
 
 @pytest.fixture(scope="module")

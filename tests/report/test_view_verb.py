@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness import policy_text, sros
-from pictures import MOBILE_ROBOT, group
 
-pytest_plugins = ["browsing"]
+from tests.report.pictures import MOBILE_ROBOT, group
+from tests.support.harness import policy_text, sros
+
+pytest_plugins = ["tests.report.browsing"]
 
 
 def write(folder: Path, name: str, *names: str) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sros_tool.runtime.events import Event, Kind, Stage
-from sros_tool.runtime.probing import ProbeRun, judge
+from sros_tool.runtime.stacks import ProbeRun, judge
 
 JOINED = Event(Kind.READY, 1, stage=Stage.PARTICIPANT)
 ALLOWED = Event(Kind.READY, 2, "writer /ok", stage=Stage.ENDPOINT)

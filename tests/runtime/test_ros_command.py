@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.runtime.ros_command import with_enclave
+from sros_tool.runtime.environment import with_enclave
 
 ADDED = ("--ros-args", "--enclave", "/arm")
 

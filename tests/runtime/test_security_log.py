@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.runtime.security_log import (
+from sros_tool.runtime.vendor_log import (
     endpoint_refusal,
     missing_security,
     participant_refusal,

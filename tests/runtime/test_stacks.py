@@ -6,12 +6,12 @@ import sys
 from pathlib import Path
 
 import pytest
-from children import python
 
 from sros_tool.errors import UnavailableError
 from sros_tool.runtime import netns
-from sros_tool.runtime.cyclone_library import FOLDER_VARIABLE, load_cyclone, version_of
+from sros_tool.runtime.cyclone import FOLDER_VARIABLE, load_cyclone, version_of
 from sros_tool.runtime.stacks import rmw_implementations
+from tests.support.children import python
 
 
 def index(prefix: Path, *names: str) -> Path:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from sros_tool.checks.keystores.opened import OpenedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.keystore.issuing.ledger import LEDGER
 from sros_tool.keystore.layout import (
     ENCLAVES,
     OPTIONAL_FILES,
@@ -20,9 +21,8 @@ from sros_tool.keystore.layout import (
     REVOKED,
     SETTINGS,
 )
-from sros_tool.keystore.ledger import LEDGER
-from sros_tool.keystore.rotation import RETIRED, ROTATION
-from sros_tool.keystore.transaction import STAGE
+from sros_tool.keystore.lifecycle.rotation.state import RETIRED, ROTATION
+from sros_tool.keystore.transaction.stage import STAGE
 
 KEY_READABLE = Kind(
     "keystore.key-readable",

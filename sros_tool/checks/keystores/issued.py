@@ -11,17 +11,16 @@ from typing import TypeVar
 
 from cryptography.hazmat.primitives import hashes, serialization
 
+from sros_tool.checks.keystores.documents import DIFFERS as GOVERNANCE_DIFFERS
 from sros_tool.checks.keystores.enclaves import grant_of
-from sros_tool.checks.keystores.governance import DIFFERS as GOVERNANCE_DIFFERS
 from sros_tool.checks.keystores.opened import OpenedEnclave, OpenedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
-from sros_tool.checks.policies.portability import ENCLAVE_NAMES
+from sros_tool.checks.policies import ENCLAVE_NAMES
 from sros_tool.dds.portable import mistaken_names, some_pairs
 from sros_tool.errors import SrosError
+from sros_tool.keystore.delivery.arrival import fingerprints
 from sros_tool.keystore.layout import ROLES, enclave_folder
-from sros_tool.keystore.trust import fingerprints
-from sros_tool.policy.diff import compare
-from sros_tool.policy.rights import Right, policy_rights
+from sros_tool.policy.rights import Right, compare, policy_rights
 from sros_tool.translate import grant_rights
 
 SERIAL_TWICE = Kind(

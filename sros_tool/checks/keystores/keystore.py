@@ -11,10 +11,14 @@ from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 
 from sros_tool.checks.keystores.authorities import check_authorities
-from sros_tool.checks.keystores.documents import check_documents
+from sros_tool.checks.keystores.documents import (
+    check_documents,
+    check_governance,
+    check_vendors,
+    governance_findings,
+)
 from sros_tool.checks.keystores.enclaves import EVERYTHING, LONG_PERMISSIONS, check_enclave
 from sros_tool.checks.keystores.files import check_files
-from sros_tool.checks.keystores.governance import check_governance, governance_findings
 from sros_tool.checks.keystores.issued import (
     Traits,
     check_issued,
@@ -23,14 +27,13 @@ from sros_tool.checks.keystores.issued import (
     wanted_rights,
 )
 from sros_tool.checks.keystores.opened import OpenedEnclave, OpenedKeystore, open_keystore
-from sros_tool.checks.keystores.vendors import check_vendors
 from sros_tool.checks.kind import Finding
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
-from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.issuing.enclave import enclave_path
 from sros_tool.keystore.layout import GOVERNANCE_P7S, REQUEST
-from sros_tool.keystore.parallel import in_shares
-from sros_tool.keystore.verify import check_enclave as load_enclave
+from sros_tool.keystore.loading import check_enclave as load_enclave
+from sros_tool.parallel import in_shares
 from sros_tool.pki import smime
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right

@@ -11,8 +11,8 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.errors import SrosError
-from sros_tool.keystore.create import list_enclaves
-from sros_tool.keystore.enclave import enclave_path
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.issuing.ledger import LEDGER, Entry, read_ledger
 from sros_tool.keystore.layout import (
     CRL,
     GOVERNANCE_P7S,
@@ -21,11 +21,11 @@ from sros_tool.keystore.layout import (
     ROLES,
     SETTINGS,
     ca_certificate,
+    list_enclaves,
 )
-from sros_tool.keystore.ledger import LEDGER, Entry, read_ledger
-from sros_tool.keystore.open import load_settings
+from sros_tool.keystore.loading import EnclaveState
+from sros_tool.keystore.reader import load_settings
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.verify import EnclaveState
 from sros_tool.pki.certificates import load_certificates
 from sros_tool.pki.crl import RevocationList, load_crl
 from sros_tool.policy.model import Policy

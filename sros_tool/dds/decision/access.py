@@ -1,21 +1,343 @@
-"""What a vendor decides for one identity on one domain at one moment, and why."""
+"""Which grant of a permissions document holds for an identity at a moment."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 
 from sros_tool.dds.decision.answers import Decision, Outcome, Refusal, Verb
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
-from sros_tool.dds.decision.governed import Governed
-from sros_tool.dds.decision.grants import choose_grant
-from sros_tool.dds.decision.joining import decide_join
-from sros_tool.dds.decision.rights import Rights, Verdict, rules_for
-from sros_tool.dds.decision.vendors import TRAITS, Vendor
-from sros_tool.dds.decision.wording import verdict_text
-from sros_tool.dds.governance import Governance, Protection, TopicRule
-from sros_tool.dds.permissions import Grant, Permissions
+from sros_tool.dds.decision.matching import Expressions, escaped, matches, read_moment, same_subject
+from sros_tool.dds.decision.vendors import (
+    TRAITS,
+    DenyPartitions,
+    Moments,
+    OpenRange,
+    Style,
+    Traits,
+    Vendor,
+)
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.governance import DomainRule, Governance, Protection, TopicRule
+from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
+
+
+def choose_grant(
+    traits: Traits, permissions: Permissions, subject: str, *, at: datetime, zone: tzinfo
+) -> int | Refusal:
+    """The index of the grant, or why there is none."""
+    now = at.timestamp()
+    outdated: Refusal | None = None
+    certified = escaped(subject) if traits.escapes_subjects else subject
+    states = [
+        _state(traits, index, grant, now, zone) for index, grant in enumerate(permissions.grants)
+    ]
+    for state in states:
+        if state and state.reason == "malformed":  # of whomever it is
+            return state
+    for index, (grant, state) in enumerate(zip(permissions.grants, states, strict=True)):
+        granted = grant.subject.strip() if traits.trims_texts else grant.subject
+        if not same_subject(traits.subjects, granted, certified):
+            continue
+        if state is None:
+            return index
+        if not traits.passes_over_outdated_grants:
+            return state
+        outdated = outdated or state
+    return outdated or Refusal(
+        "no-grant", f"{traits.title}: no grant of the permissions names the subject {subject!r}."
+    )
+
+
+def _state(traits: Traits, index: int, grant: Grant, now: float, zone: tzinfo) -> Refusal | None:
+    """Why the grant does not hold now, if so."""
+    begin = read_moment(traits.moments, grant.not_before, zone)
+    end = read_moment(traits.moments, grant.not_after, zone)
+    name = f"grant {grant.name!r}" if grant.name else f"grant {index + 1}"
+    if begin is None or end is None:
+        wrong = grant.not_before if begin is None else grant.not_after
+        return Refusal("malformed", f"{traits.title} cannot read the date {wrong!r} of {name}.")
+    how = ", which it reads in the host's local time" if traits.moments is Moments.LOCAL else ""
+    # Fast DDS counts whole seconds and includes both ends; Cyclone DDS excludes them.
+    strict = traits.moments is Moments.CYCLONE
+    if now < begin or (strict and now == begin):
+        return Refusal(
+            "not-yet-valid", f"{traits.title}: {name} begins at {grant.not_before}{how}."
+        )
+    seconds = int(now) if traits.moments is Moments.LOCAL else now
+    if seconds > end or (strict and now == end):
+        return Refusal("expired", f"{traits.title}: {name} ended at {grant.not_after}{how}.")
+    return None
+
+
+def holds_for(rule: OpenRange, domains: DomainSet, domain: int) -> bool | None:
+    """Whether ``domain`` is in ``domains``; None if the vendor crashes over the answer."""
+    for part in domains.ranges:
+        first, last = part.first, part.last
+        if first is None:
+            if rule is OpenRange.CRASHES:
+                return None
+            first = 0
+        if last is None:
+            last = first if rule is not OpenRange.OPEN else domain
+        elif last == 0 and rule is OpenRange.SINGLE:
+            last = first  # Fast DDS keeps 0 for "no upper end"
+        if first <= domain <= last:
+            return True
+    return False
+
+
+DEFAULT_PARTITION = ("",)
+Numbered = tuple[int, Rule]
+"""A rule with its index in the grant."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the rules say: ALLOWED, DENIED or CRASHES, why, by which rule and expression."""
+
+    outcome: Outcome
+    reason: str
+    rule: int | None = None
+    expression: str | None = None
+
+    @property
+    def allowed(self) -> bool:
+        """Whether they say yes."""
+        return self.outcome is Outcome.ALLOWED
+
+
+@dataclass(frozen=True, slots=True)
+class _Entry:
+    """One ``<topic>`` of a rule; ``partitions`` are those that the vendor weighs with it."""
+
+    criteria: int
+    rule: int
+    allow: bool
+    expression: str
+    partitions: tuple[str, ...]
+
+    def verdict(self, *, fits: bool) -> Verdict:
+        if not self.expression:
+            return Verdict(Outcome.CRASHES, "empty-topic", self.rule)
+        if not self.allow:
+            return Verdict(Outcome.DENIED, "deny-rule", self.rule, self.expression)
+        if not fits:
+            return Verdict(Outcome.DENIED, "partition", self.rule, self.expression)
+        return Verdict(Outcome.ALLOWED, "allow-rule", self.rule, self.expression)
+
+
+def rules_for(traits: Traits, grant: Grant, domain: int) -> tuple[list[Numbered], Verdict]:
+    """The rules of the grant for ``domain``, and the verdict where none of them matches."""
+    found: list[Numbered] = []
+    for index, rule in enumerate(grant.rules):
+        holds = holds_for(traits.open_range, rule.domains, domain)
+        if holds is None:
+            # Cyclone DDS looks for the next rule before it uses one: the last one is never used.
+            return found[:-1], Verdict(Outcome.CRASHES, "open-range", index)
+        if holds:
+            found.append((index, rule))
+    return found, last_word(traits, grant)
+
+
+def last_word(traits: Traits, grant: Grant) -> Verdict:
+    """The verdict where no rule matches."""
+    if not traits.honours_default:
+        return Verdict(Outcome.DENIED, "no-rule")
+    if traits.crashes_on_empty_texts and grant.default_empty:
+        return Verdict(Outcome.CRASHES, "empty-default")
+    return Verdict(Outcome.ALLOWED if grant.default_allow else Outcome.DENIED, "default")
+
+
+class Rights:
+    """Rules in their order, for one verb, or for both where only the topic is asked for."""
+
+    def __init__(
+        self, traits: Traits, rules: Iterable[Numbered], otherwise: Verdict, *verbs: str
+    ) -> None:
+        """``otherwise`` is the verdict where no rule matches."""
+        self._traits = traits
+        self._otherwise = otherwise
+        self._entries: list[_Entry] = []
+        count = 0
+        for index, rule, criteria in (
+            (index, rule, getattr(rule, verb)) for index, rule in rules for verb in verbs
+        ):
+            for each in criteria:
+                count += 1
+                # Fast DDS weighs the partitions of all criteria of a verb in a rule together.
+                weighed = _partitions(traits, rule, criteria if traits.topic_decides else (each,))
+                self._entries += [
+                    _Entry(count, index, rule.allow, trimmed(traits, expression), weighed)
+                    for expression in each.topics
+                    if trimmed(traits, expression) or traits.crashes_on_empty_texts
+                ]
+        texts = (stand_in(traits, entry.expression) for entry in self._entries)
+        self._topics = Expressions(traits.style, texts)
+
+    def ask(self, topic: str, partitions: tuple[str, ...]) -> Verdict:
+        """The verdict on an endpoint of ``topic`` in ``partitions`` (none: the default one)."""
+        wanted = partitions or DEFAULT_PARTITION
+        passed = 0
+        for position in self._topics.matching(topic):
+            entry = self._entries[position]
+            if entry.criteria == passed:
+                continue  # the first topic of some criteria that matches is the only one looked at
+            passed = entry.criteria
+            fits = self._fits(entry, wanted)
+            if fits or self._traits.topic_decides or not entry.expression:
+                return entry.verdict(fits=fits)
+        return self._otherwise
+
+    def ask_topic(self, topic: str) -> Verdict:
+        """The verdict on a topic in itself, whatever the partitions."""
+        position = self._topics.first(topic)
+        if position is None:
+            return self._otherwise
+        return self._entries[position].verdict(fits=True)
+
+    def _fits(self, entry: _Entry, wanted: tuple[str, ...]) -> bool:
+        style, named = self._traits.style, entry.partitions
+        if entry.allow:
+            if wanted is DEFAULT_PARTITION is named:
+                return True
+            return all(_named(style, named, each) for each in wanted)
+        if self._traits.deny_partitions is DenyPartitions.IGNORED:
+            return True
+        return any(_named(style, named, each) for each in wanted)
+
+
+def _named(style: Style, expressions: tuple[str, ...], partition: str) -> bool:
+    return any(matches(style, expression, partition) for expression in expressions)
+
+
+def stand_in(traits: Traits, text: str) -> str:
+    """An expression that matches every name, for one over which the vendor crashes."""
+    text = trimmed(traits, text)
+    return text or "*" if traits.crashes_on_empty_texts else text
+
+
+def trimmed(traits: Traits, text: str) -> str:
+    """The text as the vendor takes it from its element."""
+    return text.strip(" \t\v\r\n") if traits.trims_texts else text
+
+
+def _partitions(traits: Traits, rule: Rule, criteria: tuple[Criteria, ...]) -> tuple[str, ...]:
+    """The partitions that ``criteria`` of ``rule`` name; without any, what the vendor implies."""
+    everywhere = not rule.allow and traits.deny_partitions is DenyPartitions.ANY_OR_ALL
+    implied = ("*",) if everywhere else DEFAULT_PARTITION
+    if implied is DEFAULT_PARTITION and not any(each.partitions for each in criteria):
+        return DEFAULT_PARTITION
+    found = [text for each in criteria for text in each.partitions or implied]
+    return tuple(dict.fromkeys(trimmed(traits, text) for text in found))
+
+
+class Governed:
+    """The first domain rule that lists the domain (``rule``, None without one), and its topics."""
+
+    def __init__(self, traits: Traits, governance: Governance, domain: int) -> None:
+        self.rule: DomainRule | None = None
+        for rule in governance.domain_access_rules:
+            if holds_for(traits.open_range, rule.domains, domain):
+                self.rule = rule
+                break
+        self._topic_rules = self.rule.topic_access_rules if self.rule else ()
+        self._topics = Expressions(
+            traits.style,
+            (stand_in(traits, each.topic_expression) for each in self._topic_rules),
+            both_ways=traits.governance_both_ways,
+        )
+
+    def topic_rule(self, topic: str) -> TopicRule | None:
+        """The first rule whose expression matches; where one is empty, the vendor may crash."""
+        position = self._topics.first(topic)
+        return None if position is None else self._topic_rules[position]
+
+    def all_controlled(self) -> bool:
+        """Whether every topic rule controls reading and writing."""
+        return all(
+            rule.enable_read_access_control and rule.enable_write_access_control
+            for rule in self._topic_rules
+        )
+
+
+def verdict_text(verdict: Verdict, asked: str, domain: int, *, by_peers: bool = False) -> str:
+    """What ``verdict`` says about ``asked`` (``publish rt/a``), as a clause.
+
+    ``by_peers`` says that the own participant lets it pass and its peers do not.
+    """
+    rule = "" if verdict.rule is None else f"rule {verdict.rule + 1}"
+    peers = f" for domain {domain}, and peers keep to that" if by_peers else ""
+    match verdict.reason:
+        case "allow-rule":
+            return f"{rule} allows {asked} by {verdict.expression}"
+        case "deny-rule":
+            return f"{rule} denies {asked} by {verdict.expression}{peers}"
+        case "partition":
+            return f"{rule} has {verdict.expression}, but not the partitions of {asked}{peers}"
+        case "default":
+            word = "ALLOW" if verdict.allowed else "DENY"
+            return f"no rule names {asked}, and the grant's default is {word}"
+        case "open-range":
+            return f"{rule} has domains without <min>, over which the process crashes"
+        case "empty-topic":
+            return f"{rule} has a <topic> without text, over which the process crashes"
+        case "empty-default":
+            return "the grant's <default> is empty, over which the process crashes"
+        case _:
+            return f"no rule allows {asked}{peers}"
+
+
+@dataclass(frozen=True, slots=True)
+class Joining:
+    """The outcome, why, and a clause that says so."""
+
+    outcome: Outcome
+    reason: str
+    text: str
+
+
+def decide_join(
+    traits: Traits,
+    governed: Governed,
+    grant: Grant,
+    rules: list[Numbered],
+    otherwise: Verdict,
+    domain: int,
+) -> Joining:
+    """``rules`` are those of the grant for ``domain``, ``otherwise`` the verdict behind them."""
+    where = f"domain {domain}"
+    if traits.always_needs_allow_rule and not any(rule.allow for rule in grant.rules):
+        text = "the grant has no allow rule, so nothing starts"
+        return Joining(Outcome.REFUSED, "no-rule", text)
+    rule = governed.rule
+    if rule is None:
+        text = f"the governance does not list {where}"
+        if traits.needs_domain_rule:
+            return Joining(Outcome.REFUSED, "domain-not-in-governance", text)
+        text += "; the participant starts, but no endpoint can be created"
+        return Joining(Outcome.ALLOWED, "domain-not-in-governance", text)
+    open_door = rule.allow_unauthenticated_participants
+    if traits.refuses_open_rtps and open_door and rule.rtps_protection_kind != Protection.NONE:
+        text = "the governance lets unauthenticated participants in and protects RTPS"
+        return Joining(Outcome.REFUSED, "unauthenticated-with-rtps-protection", text)
+    if not rule.enable_join_access_control:
+        text = f"joining {where} is not access controlled"
+        return Joining(Outcome.ALLOWED, "unrestricted", text)
+    if any(each.allow for _, each in rules):
+        return Joining(Outcome.ALLOWED, "allow-rule", f"an allow rule holds on {where}")
+    missing = f"no allow rule of the grant holds on {where}"
+    opened = not governed.all_controlled() and otherwise.outcome is not Outcome.ALLOWED
+    if traits.always_needs_allow_rule or opened:
+        return Joining(Outcome.PEER_DENIES, "no-rule", f"{missing}, so peers refuse it")
+    if otherwise.outcome is Outcome.DENIED:
+        return Joining(Outcome.REFUSED, "no-rule", missing)
+    return Joining(
+        otherwise.outcome, otherwise.reason, verdict_text(otherwise, f"joining {where}", domain)
+    )
+
 
 _TOPIC_NAME = re.compile(r"[A-Za-z_/][A-Za-z0-9_/]*\Z")
 _ENDPOINTS = (Verb.PUBLISH, Verb.SUBSCRIBE)

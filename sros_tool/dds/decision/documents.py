@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sros_tool.dds.decision import cyclone_documents, fast_documents, schema
+from sros_tool.dds.decision import cyclone, elements, fastdds
 from sros_tool.dds.decision.answers import Refusal
 from sros_tool.dds.decision.elements import UnreadableError
 from sros_tool.dds.decision.vendors import TRAITS, Vendor
@@ -22,11 +22,11 @@ def read_permissions_as(vendor: Vendor, xml: bytes) -> Permissions | Refusal:
     try:
         match vendor:
             case Vendor.FAST | Vendor.FAST_2_9:
-                return fast_documents.read_permissions(xml)
+                return fastdds.read_permissions(xml)
             case Vendor.CYCLONE:
-                return cyclone_documents.read_permissions(xml)
+                return cyclone.read_permissions(xml)
             case _:
-                schema.check_permissions(xml)
+                elements.check_permissions(xml)
                 return parse_permissions(xml, _PERMISSIONS)
     except UnreadableError as error:
         return error.refusal(TRAITS[vendor].title, _PERMISSIONS)
@@ -39,11 +39,11 @@ def read_governance_as(vendor: Vendor, xml: bytes) -> Governance | Refusal:
     try:
         match vendor:
             case Vendor.FAST | Vendor.FAST_2_9:
-                return fast_documents.read_governance(xml)
+                return fastdds.read_governance(xml)
             case Vendor.CYCLONE:
-                return cyclone_documents.read_governance(xml)
+                return cyclone.read_governance(xml)
             case _:
-                schema.check_governance(xml)
+                elements.check_governance(xml)
                 return parse_governance(xml, _GOVERNANCE)
     except UnreadableError as error:
         return error.refusal(TRAITS[vendor].title, _GOVERNANCE)

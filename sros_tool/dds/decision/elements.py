@@ -1,11 +1,18 @@
-"""Elements of a document as a vendor's own XML parser sees them."""
+"""Elements of a document as a vendor's own XML parser sees them.
+
+DDS-Security 1.1, the schemas omg_shared_ca_permissions and omg_shared_ca_governance of 20170901.
+"""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from enum import Enum, auto
 
+from lxml import etree
+
 from sros_tool.dds.decision.answers import Outcome, Refusal
+from sros_tool.xml import tag_of
 
 
 class UnreadableError(Exception):
@@ -46,3 +53,105 @@ class Element:
     def elements(self) -> list[Element]:
         """The child elements."""
         return [child for child in self.children if isinstance(child, Element)]
+
+
+# The children of each element as an expression over "name,"; the others hold text.
+_DOMAINS = {
+    "domains": "(id,|id_range,)+",
+    "id_range": "min,(max,)?|max,",
+}
+_RULE = "domains,(publish,)*(subscribe,)*(relay,)*"
+# The schema lets these stand in any order, each once.
+_CRITERIA = "(?!.*(?:^|,)(\\w+,).*\\1)(?=.*topics,)(topics,|partitions,|data_tags,)*"
+_PERMISSIONS = _DOMAINS | {
+    "dds": "permissions,",
+    "permissions": "(grant,)+",
+    "grant": "subject_name,validity,(allow_rule,|deny_rule,)*default,",
+    "validity": "not_before,not_after,",
+    "allow_rule": _RULE,
+    "deny_rule": _RULE,
+    "publish": _CRITERIA,
+    "subscribe": _CRITERIA,
+    "relay": _CRITERIA,
+    "topics": "(topic,)+",
+    "partitions": "(partition,)+",
+    "data_tags": "(tag,)+",
+    "tag": "name,value,",
+}
+_GOVERNANCE = _DOMAINS | {
+    "dds": "domain_access_rules,",
+    "domain_access_rules": "(domain_rule,)+",
+    "domain_rule": "domains,allow_unauthenticated_participants,enable_join_access_control,"
+    "discovery_protection_kind,liveliness_protection_kind,rtps_protection_kind,"
+    "topic_access_rules,",
+    "topic_access_rules": "(topic_rule,)+",
+    "topic_rule": "topic_expression,enable_discovery_protection,enable_liveliness_protection,"
+    "enable_read_access_control,enable_write_access_control,metadata_protection_kind,"
+    "data_protection_kind,",
+}
+
+_KIND = r"(NONE|(SIGN|ENCRYPT)(_WITH_ORIGIN_AUTHENTICATION)?)"
+_NUMBER = r"\s*\+?\d+\s*"
+_FLAG = r"\s*(true|false|0|1)\s*"
+_DATE = r"\s*-?\d{4,}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|[+-]\d\d:\d\d)?\s*"
+_TEXTS = {
+    "id": _NUMBER,
+    "min": _NUMBER,
+    "max": _NUMBER,
+    "not_before": _DATE,
+    "not_after": _DATE,
+    "default": "ALLOW|DENY",
+    "allow_unauthenticated_participants": _FLAG,
+    "enable_join_access_control": _FLAG,
+    "enable_discovery_protection": _FLAG,
+    "enable_liveliness_protection": _FLAG,
+    "enable_read_access_control": _FLAG,
+    "enable_write_access_control": _FLAG,
+    "discovery_protection_kind": _KIND,
+    "liveliness_protection_kind": _KIND,
+    "rtps_protection_kind": _KIND,
+    "metadata_protection_kind": _KIND,
+    "data_protection_kind": "NONE|SIGN|ENCRYPT",
+}
+_EVERYWHERE = "{http://www.w3.org/2001/XMLSchema-instance}"
+
+
+def check_permissions(xml: bytes) -> None:
+    """Raises `UnreadableError` unless ``xml`` is valid permissions."""
+    _check(_root(xml), "dds", _PERMISSIONS)
+
+
+def check_governance(xml: bytes) -> None:
+    """Raises `UnreadableError` unless ``xml`` is valid governance."""
+    _check(_root(xml), "dds", _GOVERNANCE)
+
+
+def _root(xml: bytes) -> etree._Element:
+    """The root; blanks may stand before the XML declaration."""
+    parser = etree.XMLParser(
+        remove_pis=True, resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False
+    )
+    try:
+        root: etree._Element = etree.fromstring(xml.lstrip(), parser)
+    except (etree.XMLSyntaxError, ValueError) as error:
+        raise UnreadableError(f"it is not well-formed XML ({error})") from error
+    return root
+
+
+def _check(element: etree._Element, name: str, grammar: dict[str, str]) -> None:
+    if element.tag != name:
+        raise UnreadableError(f"its root is not <{name}>")
+    children = [child for child in element if isinstance(child.tag, str)]
+    text = "".join([element.text or "", *(child.tail or "" for child in element)])
+    attributes = [str(each) for each in element.attrib if not str(each).startswith(_EVERYWHERE)]
+    if attributes != (["name"] if name == "grant" else []):
+        raise UnreadableError(f"<{name}> has not the attributes that it should have")
+    if name not in grammar:
+        if children or not re.fullmatch(_TEXTS.get(name, "(?s:.*)"), text, re.ASCII):
+            raise UnreadableError(f"<{name}> does not hold what it should, but {text!r}")
+        return
+    names = "".join(f"{tag_of(child)}," for child in children)
+    if text.strip() or not re.fullmatch(grammar[name], names):
+        raise UnreadableError(f"<{name}> has not the elements that it should have, in their order")
+    for child in children:
+        _check(child, tag_of(child), grammar)

@@ -1,12 +1,21 @@
-"""Expressions with wildcards, as each vendor matches topics and partitions against them."""
+"""Expressions with wildcards, as each vendor matches topics and partitions against them.
+
+Certificates' subjects are the text that OpenSSL and `sros_tool.pki.certificates.subject_text` print
+by RFC 2253, the most specific attribute first.
+"""
 
 from __future__ import annotations
 
 import re
+from calendar import timegm
 from collections.abc import Callable, Iterable, Sequence
+from datetime import datetime, timedelta, tzinfo
 from functools import lru_cache
+from itertools import takewhile
+from math import inf
 
-from sros_tool.dds.decision.vendors import Style
+from sros_tool.dds.decision.vendors import Moments, Style, Subjects
+from sros_tool.validity import parse_iso
 
 Matcher = Callable[[str], object]
 """Truthy if a name matches."""
@@ -202,3 +211,195 @@ def _cyclone_set(text: str, start: int) -> tuple[str, int]:
             members.append(re.escape(last))
         index += 1
     return _set_of(members, negated), index
+
+
+_MOST_PARTS = 20  # Cyclone DDS 0.10 refuses a grant's subject of more
+
+
+def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
+    """Whether a grant for ``granted`` is one for the certificate's subject ``certified``."""
+    return _COMPARE[rule](granted, certified)
+
+
+def escaped(certified: str) -> str:
+    """The subject of a certificate with every byte beyond ASCII as ``\\C3``."""
+    parts = (
+        each if each.isascii() else "".join(f"\\{b:02X}" for b in each.encode())
+        for each in certified
+    )
+    return "".join(parts)
+
+
+def _exact(granted: str, certified: str) -> bool:
+    return _attributes(granted) == _attributes(certified)
+
+
+def _whole_attributes(granted: str, certified: str) -> bool:
+    # Fast DDS 2.9 splits at every comma, also at an escaped one.
+    return _stripped(granted) == _stripped(certified)
+
+
+def _stripped(name: str) -> list[str]:
+    # It stops at the first part that is empty: what stands behind two commas does not count.
+    return [part.strip(" ") for part in takewhile(bool, name.split(","))]
+
+
+_MOST_ATTRIBUTES = 20  # of which Fast DDS 2.14 takes notice
+_UNQUOTED = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*(?:"|\\?\Z)|[^"\\])', re.DOTALL)
+
+
+def _any_order(granted: str, certified: str) -> bool:
+    ours, theirs = _types_and_values(granted), _types_and_values(certified)
+    first_values: dict[str, str] = {}
+    for kind, value in theirs:
+        first_values.setdefault(kind, value)
+    # Only the first value of a kind is ever found, so a repeated kind fits nothing; one that the
+    # certificate lacks is empty there.
+    return len(ours) == len(theirs) and all(first_values.get(k, "") == v for k, v in ours)
+
+
+def _types_and_values(name: str) -> list[tuple[str, str]]:
+    """The attributes that DistinguishedName.cpp of Fast DDS 2.14 finds, up to a malformed one."""
+    found: list[tuple[str, str]] = []
+    rest = name.lstrip(" ")
+    while rest and len(found) < _MOST_ATTRIBUTES:
+        equals = _outside_quotes(rest, "=")
+        if equals < 0:
+            break
+        # A cut that ends where it begins is one to the end of the text.
+        kind, rest = rest[: equals or None], rest[equals + 1 :]
+        comma = _outside_quotes(rest, ",")
+        value = rest if comma < 0 else rest[: comma or None]
+        found.append((_plain(kind), _plain(value)))
+        rest = "" if comma < 0 else rest[comma + 1 :].lstrip(" ")
+    return found
+
+
+def _outside_quotes(text: str, wanted: str) -> int:
+    """Where a character stands first, not escaped and not in quotes; -1 if nowhere."""
+    index = 0
+    while index < len(text):
+        found = _UNQUOTED.match(text, index)
+        if not found:
+            break
+        if found[0] == wanted:
+            return index
+        index = found.end()
+    return -1
+
+
+_PART = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^,"\\])*', re.DOTALL)
+_EQUALS = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^="\\])*', re.DOTALL)
+
+
+def _attributes(name: str) -> list[tuple[str, str]]:
+    """Kinds and values without quotes, escapes and outer spaces; up to the first malformed one."""
+    found = []
+    index = 0
+    while index < len(name):
+        part = _PART.match(name, index)
+        text = part[0].strip(" ") if part else ""
+        kind = _EQUALS.match(text)
+        if not text or not kind or kind.end() >= len(text):
+            break
+        found.append((_plain(kind[0]), _plain(text[kind.end() + 1 :])))
+        index += len(part[0]) + 1 if part else 1
+    return found
+
+
+def _plain(text: str) -> str:
+    return text.strip(" ").replace("\\", "").replace('"', "")
+
+
+def _subset(granted: str, certified: str) -> bool:
+    parts = [part for part in re.split(r"[,/|]", granted) if part]
+    if len(parts) > _MOST_PARTS:
+        return False
+    values: dict[str, str] = {}
+    for part in parts:
+        kind, _, value = part.partition("=")
+        values.setdefault(kind, value)
+    wanted = re.split(r"[,/|]", certified)
+    if wanted and not wanted[-1]:  # what ends in a separator has nothing behind it
+        wanted.pop()
+    for part in wanted:
+        kind, _, value = part.partition("=")
+        if not part or values.get(kind) != value:
+            return False
+    return True
+
+
+_COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
+    Subjects.EXACT: _exact,
+    Subjects.WHOLE_ATTRIBUTES: _whole_attributes,
+    Subjects.ANY_ORDER: _any_order,
+    Subjects.SUBSET: _subset,
+}
+
+
+_CYCLONE = re.compile(
+    r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)(\.\d{1,12})?(?:Z|([+-])(\d\d):(\d\d))?\Z", re.ASCII
+)
+# What std::get_time of libstdc++ takes of %Y-%m-%dT%H:%M:%S: the text may end behind the year, the
+# month or the day; one blank may stand before the day; behind the seconds anything may follow.
+_LOCAL = re.compile(
+    r"\s*(\d{1,4})(?:-(\d\d?)(?:-\s?(\d\d?)(?:[Tt](\d\d?):(\d\d?):(\d\d?))?)?)?", re.ASCII
+)
+_LAST_YEAR = 2262  # of 64 bits of nanoseconds
+_FARTHEST = timedelta(hours=12)
+
+
+def read_moment(rule: Moments, text: str, zone: tzinfo) -> float | None:
+    """The moment that ``text`` means; None if the vendor calls the document malformed.
+
+    ``zone`` is that of the host.  What Cyclone DDS cannot read is minus infinity: a grant that
+    begins then has begun, one that ends then has ended.
+    """
+    match rule:
+        case Moments.LOCAL:
+            return _local(text, zone)
+        case Moments.CYCLONE:
+            return _cyclone(text)
+        case Moments.STANDARD:
+            try:
+                return parse_iso(text).timestamp()
+            except ValueError:
+                return None
+
+
+def _local(text: str, zone: tzinfo) -> float | None:
+    found = _LOCAL.match(text)
+    if not found or (found[6] is None and found.end() < len(text)):
+        return None
+    year, month, day, hour, minute, second = (int(each or -1) for each in found.groups())
+    if 0 in (month, day) or month > 12 or day > 31 or hour > 23 or minute > 59 or second > 60:
+        return None
+    # A month or a day that is not there stays zero: January, and the last day of the month before.
+    days = timedelta(days=max(day, 0) - 1)
+    time = timedelta(hours=max(hour, 0), minutes=max(minute, 0), seconds=max(second, 0))
+    try:
+        wall = datetime(year, max(month, 1), 1) + days + time
+        aware = wall.replace(tzinfo=zone)
+        # tm_isdst stays 0, so that mktime takes standard time, in summer too.
+        offset = (aware.utcoffset() or timedelta(0)) - (aware.dst() or timedelta(0))
+    except (ValueError, OverflowError):
+        return inf if year > 1 else -inf
+    return timegm(wall.timetuple()) - offset.total_seconds()
+
+
+def _cyclone(text: str) -> float:
+    found = _CYCLONE.match(text)
+    if not found:
+        return -inf
+    year, month, day, hour, minute, second = (int(found[index]) for index in range(1, 7))
+    offset = timedelta(hours=int(found[9] or 0), minutes=int(found[10] or 0))
+    if not 1970 <= year <= _LAST_YEAR or offset > _FARTHEST or int(found[10] or 0) > 59:
+        return -inf
+    try:
+        moment = timegm(datetime(year, month, day, hour, minute, second).timetuple())
+    except ValueError:
+        return -inf
+    seconds = moment + float(found[7] or 0)
+    if found[8]:
+        seconds -= offset.total_seconds() * (-1 if found[8] == "-" else 1)
+    return seconds if 0 <= seconds < 2**63 / 1e9 else -inf

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from sros_tool.demo.custom import read_scenario
 from sros_tool.demo.model import Scenario
-from sros_tool.demo.scenarios.actions import ACTIONS
 from sros_tool.demo.scenarios.attacks import ATTACKS
-from sros_tool.demo.scenarios.composition import COMPOSITION
+from sros_tool.demo.scenarios.custom import read_scenario
 from sros_tool.demo.scenarios.governance import GOVERNANCE
-from sros_tool.demo.scenarios.isolation import ISOLATION
-from sros_tool.demo.scenarios.services import SERVICES
+from sros_tool.demo.scenarios.isolation import COMPOSITION, ISOLATION
+from sros_tool.demo.scenarios.services import ACTIONS, SERVICES
 from sros_tool.errors import UsageError
 
 SCENARIOS: tuple[Scenario, ...] = (

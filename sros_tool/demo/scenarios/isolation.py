@@ -19,7 +19,7 @@ from sros_tool.demo.model import (
     Scenario,
     Status,
 )
-from sros_tool.demo.policies import talking_policy
+from sros_tool.demo.policies import SERVICE, composed_policy, talking_policy
 
 TALKER = Identity(OWN, "talker")
 LISTENER = Identity(OWN, "listener")
@@ -154,4 +154,93 @@ ISOLATION = Scenario(
         "listener without permission": "/talker_listener/listener_without_permission",
     },
     talking_policy,
+)
+
+
+_CONTAINER = Party("container", Role.COMPOSED, Identity(OWN, "container"))
+_TALKER = Party("talker", Role.TALKER, Identity(OWN, "talker"))
+_LISTENER = Party("listener", Role.LISTENER, Identity(OWN, "listener"))
+_CLIENT = Party("client", Role.CLIENT, Identity(OWN, "client"), SERVICE)
+_COMPOSITION_OPEN_LISTENER = Party("unsecured listener", Role.LISTENER, UNSECURED)
+
+COMPOSITION_ROWS: tuple[Row, ...] = (
+    Row(
+        "listener of a container hears a talker",
+        Status.HEARD,
+        "the enclave of the container may subscribe the topic",
+        (_CONTAINER, _TALKER),
+        (Claim(Relation.HEARS, "container", "talker"),),
+        brief=True,
+    ),
+    Row(
+        "talker of a container is heard by a listener",
+        Status.HEARD,
+        "the enclave of the container may publish the topic",
+        (_CONTAINER, _LISTENER),
+        (Claim(Relation.HEARS, "listener", "container"),),
+        brief=True,
+    ),
+    Row(
+        "server of a container answers a client",
+        Status.ANSWERED,
+        "the enclave of the container may reply",
+        (_CONTAINER, _CLIENT),
+        (Claim(Relation.IS_ANSWERED, "client", "container"),),
+        brief=True,
+    ),
+    Row(
+        "unsecured listener hears a container",
+        Status.NOT_HEARD,
+        "one participant, one identity: what protects one node protects all of them",
+        (_CONTAINER, _COMPOSITION_OPEN_LISTENER, _LISTENER),
+        (Claim(Relation.HEARS, "unsecured listener", "container", holds=False),),
+        (Claim(Relation.HEARS, "listener", "container"),),
+    ),
+    Row(
+        "container in the enclave of one of its nodes",
+        Status.REFUSED,
+        "the process needs the rights of all of its nodes: one of them is denied",
+        (Party("container as a listener", Role.COMPOSED, Identity(OWN, "listener")), _LISTENER),
+        (Claim(Relation.IS_REFUSED, "container as a listener"),),
+        (Claim(Relation.STARTS, "listener"),),
+    ),
+    Row(
+        "listener node with the rights of its container publishes",
+        Status.HEARD,
+        "DDS cannot tell the nodes of a process apart: they share the sum of their rights",
+        (
+            Party("listener node gone astray", Role.TALKER, Identity(OWN, "container")),
+            _LISTENER,
+        ),
+        (Claim(Relation.HEARS, "listener", "listener node gone astray"),),
+        brief=True,
+        attack="a node uses the rights of its neighbour",
+        open_because="one process is one participant with one enclave",
+        remedy="run nodes that must not be trusted with each other's rights in processes of their"
+        " own",
+    ),
+    Row(
+        "listener node in an enclave of its own publishes",
+        Status.REFUSED,
+        "its own enclave has its own rights only",
+        (
+            Party("listener that talks", Role.TALKER, Identity(OWN, "listener")),
+            _TALKER,
+        ),
+        (Claim(Relation.IS_REFUSED, "listener that talks"),),
+        (Claim(Relation.STARTS, "talker"),),
+    ),
+)
+
+COMPOSITION = Scenario(
+    "composition",
+    "several nodes in one process share one enclave",
+    COMPOSITION_ROWS,
+    {
+        "container": "/composition",
+        "talker": "/talker_listener/talker",
+        "listener": "/talker_listener/listener",
+        "client": f"{SERVICE}/client",
+    },
+    composed_policy,
 )

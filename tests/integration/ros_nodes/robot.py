@@ -21,9 +21,8 @@ from itertools import repeat
 from pathlib import Path
 from typing import Any
 
-from children import PATIENCE, wait_for
-
 from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
+from tests.support.children import PATIENCE, wait_for
 
 RUN_NODES = Path(__file__).with_name("run_nodes.py")
 OBSERVER = b"sros_tool.graph.observer"

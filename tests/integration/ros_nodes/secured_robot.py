@@ -17,12 +17,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-from children import run
-
 from sros_tool.errors import SrosError
 from sros_tool.policy import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
+from tests.support.children import run
 
 RUN_NODES = Path(__file__).with_name("run_nodes.py")
 SROS = (sys.executable, "-m", "sros_tool")

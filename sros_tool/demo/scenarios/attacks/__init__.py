@@ -10,22 +10,23 @@ from __future__ import annotations
 from sros_tool.demo.model import Row, Scenario
 from sros_tool.demo.policies import GUEST, SERVICE, attacked_policy
 from sros_tool.demo.scenarios.attacks import (
-    governance,
+    documents,
     identities,
-    permissions,
     rights,
     strangers,
     variables,
-    wire,
+)
+from sros_tool.demo.scenarios.attacks import (
+    strangers as wire,
 )
 
 ROWS: tuple[Row, ...] = (
-    *wire.ROWS,
+    *wire.WIRE_ROWS,
     *strangers.ROWS,
     *rights.ROWS,
     *identities.ROWS,
-    *permissions.ROWS,
-    *governance.ROWS,
+    *documents.ROWS,
+    *documents.GOVERNANCE_ROWS,
     *variables.ROWS,
 )
 

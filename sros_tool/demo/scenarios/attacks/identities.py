@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sros_tool.demo.forged_identities import STOLEN
+from sros_tool.demo.forger import STOLEN
 from sros_tool.demo.model import (
     FOREIGN,
     OWN,

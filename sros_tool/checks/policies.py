@@ -1,0 +1,696 @@
+"""Findings in policies."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import cached_property
+from pathlib import Path
+from urllib.parse import unquote
+
+from lxml import etree
+
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
+from sros_tool.dds.portable import mistaken_names, outside, some_pairs
+from sros_tool.errors import SrosError
+from sros_tool.keystore.issuing.size import Scale, right_bytes
+from sros_tool.names import NODE_SERVICES, PARAMETER_SERVICES, expand, is_expression
+from sros_tool.pki.certificates import common_name, subject_text
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Policy, Profile, Source
+from sros_tool.policy.patterns import covers, literal_prefix, matches, overlap
+from sros_tool.policy.rights import Right, Rules, parts, policy_rights
+from sros_tool.translate import permissions_for
+from sros_tool.validity import Window
+from sros_tool.xml import parse, read_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Stated:
+    """One right as one line of a policy states it; ``written`` is the name as it stands there."""
+
+    right: Right
+    written: str
+    source: Source
+    profile: Profile
+
+    @property
+    def allows(self) -> bool:
+        """Whether it is an ALLOW."""
+        return self.right.qualifier is ALLOW
+
+    @property
+    def name(self) -> str:
+        """The absolute name."""
+        return self.right.name
+
+    def found(self, kind: Kind, text: str, remedy: str = "") -> Finding:
+        """A finding of that kind about this line."""
+        file, line = self.source.file, self.source.line
+        return kind.found(self.right.enclave, text, file, line, remedy)
+
+
+class CheckedPolicy:
+    """A policy, its statements, and its rights in a form that can be asked."""
+
+    def __init__(self, policy: Policy) -> None:
+        self.policy = policy
+
+    @cached_property
+    def rules(self) -> Rules:
+        """All rights and denials."""
+        return Rules(policy_rights(self.policy))
+
+    @cached_property
+    def statements(self) -> tuple[Stated, ...]:
+        """Every right and denial, in the order of the document."""
+        return tuple(each for enclave in self.policy.enclaves for each in _statements(enclave))
+
+
+def _statements(enclave: Enclave) -> Iterator[Stated]:
+    for profile in enclave.all_profiles():
+        for group in profile.groups:
+            for index, written in enumerate(group.names):
+                name = expand(written, profile.ns, profile.node)
+                source = group.source_of(index)
+                for right, qualifier in group.rights:
+                    stated = Right(enclave.path, qualifier, right, name)
+                    yield Stated(stated, written, source, profile)
+
+
+NEVER_MATCHES = Kind(
+    "policy.name-never-matches",
+    WARNING,
+    "a name that no topic, service or action can have",
+    "A rule with such a name allows, or denies, nothing.",
+    "rmw (validate_full_topic_name.h: at most 247 characters, no part begins with a digit).",
+    "Correct the name.",
+)
+DDS_NAME = Kind(
+    "policy.dds-name",
+    WARNING,
+    "a DDS name where a ROS name is meant",
+    "rt/, rq/ and rr/ are put before ROS names when these become DDS topics; in a policy the name "
+    "stands without.",
+    "ROS 2 design, Topic and Service name mapping to DDS.",
+    "Write the ROS name, without its prefix.",
+)
+WRONG_KIND = Kind(
+    "policy.wrong-kind",
+    WARNING,
+    "a topic said to be a service, or a service said to be a topic",
+    "The name is one that every node of ROS 2 has, and it has it for something else, so the rule "
+    "allows nothing that is used.",
+    "ROS 2 Jazzy (rclcpp 28, rclpy 7); ROS 2 design, Actions.",
+    "Move the name to the group of its kind.",
+)
+EVERYTHING = Kind(
+    "policy.everything",
+    WARNING,
+    "a wildcard that allows to act on everything",
+    "Who holds it can command every node and answer in the place of every other.",
+    "ROS 2 design, ROS 2 Security Enclaves: the least that is needed.",
+    "Name what the node uses; `sros minimize_policy` narrows it to what was observed.",
+)
+WIDE = Kind(
+    "policy.wide-wildcard",
+    WARNING,
+    "a wildcard wider than a namespace",
+    "* crosses slashes, so the rule reaches nodes and namespaces that were not thought of.",
+    "DDS-Security 1.1, 9.4.1.3 (POSIX fnmatch, in which * also matches a slash).",
+    "Begin it with a whole namespace, as in /arm/*, or end it with a whole name.",
+)
+READS_EVERYTHING = Kind(
+    "policy.reads-everything",
+    NOTE,
+    "a wildcard by which an enclave reads across namespaces",
+    "A recorder needs it; anything else learns more than it has to.",
+    "ROS 2 design, ROS 2 Security Enclaves: the least that is needed.",
+    "Name the topics, or deny those that are nobody's business.",
+)
+SETS_PARAMETERS = Kind(
+    "policy.sets-all-parameters",
+    WARNING,
+    "a wildcard by which an enclave sets the parameters of every node",
+    "Parameters switch use_sim_time, remove limits, and change what drivers do.",
+    "ROS 2 Jazzy: set_parameters of every node.",
+    "Name the nodes whose parameters it has to set.",
+)
+SETS_CLOCK = Kind(
+    "policy.sets-clock",
+    NOTE,
+    "an enclave that may publish /clock",
+    "Who sets the clock can let every timeout expire on nodes that use simulated time.",
+    "ROS 2 design, Clock and Time.",
+    "Give it to a simulator alone.",
+)
+NO_COUNTERPART = Kind(
+    "policy.no-counterpart",
+    NOTE,
+    "nobody in the policy is allowed the other side",
+    "What is read here, nobody may publish; what is asked for, nobody may answer. It may be a "
+    "typing error, or the other side is in another policy.",
+    "sros: the policy as a whole.",
+    "Compare the names on both sides, after remapping.",
+)
+
+NAMING_KINDS = by_id(
+    NEVER_MATCHES, DDS_NAME, WRONG_KIND, EVERYTHING, WIDE, READS_EVERYTHING, SETS_PARAMETERS,
+    SETS_CLOCK, NO_COUNTERPART,
+)  # fmt: skip
+
+_LONGEST = 247
+_DIGIT_FIRST = re.compile(r"/(?:[0-9]|\[[0-9-]+\])")
+_DDS_PREFIX = re.compile(r"/?(?:rt|rq|rr|rs)/")
+_ACTION_SERVICE = re.compile(r"/_action/(?:send_goal|cancel_goal|get_result)\Z")
+_ACTION_TOPIC = re.compile(r"/_action/(?:feedback|status)\Z")
+_GLOBAL_TOPICS = ("/rosout", "/parameter_events", "/clock", "/tf", "/tf_static", "/diagnostics")
+_ALL = re.compile(r"/?[*?]*\*[*?]*\Z")
+_OTHER_SIDE = {"subscribe": "publish", "request": "reply", "call": "execute"}
+
+
+def check_names(checked: CheckedPolicy) -> Iterator[Finding]:
+    """Every name by itself."""
+    for each in checked.statements:
+        if reason := _never(each.name):
+            yield each.found(NEVER_MATCHES, f"{each.name} matches nothing: {reason}")
+        if _DDS_PREFIX.match(each.written):
+            yield each.found(DDS_NAME, f"{each.written} becomes {each.name}")
+        if kind := _belongs(each):
+            yield each.found(WRONG_KIND, f"{each.name} is one of the {kind}")
+        if each.allows:
+            yield from _breadth(each)
+
+
+def check_counterparts(checked: CheckedPolicy) -> Iterator[Finding]:
+    """Names that one side is allowed and the other side nobody."""
+    names: dict[str, set[str]] = {right: set() for pair in RIGHTS.values() for right in pair}
+    for each in checked.statements:
+        if each.allows:
+            names[each.right.right].add(each.name)
+    wild = {right: [n for n in found if is_expression(n)] for right, found in names.items()}
+    for each in checked.statements:
+        other = _OTHER_SIDE.get(each.right.right)
+        name = each.name
+        if not other or not each.allows or is_expression(name) or name in _GLOBAL_TOPICS:
+            continue
+        if name not in names[other] and not any(matches(wide, name) for wide in wild[other]):
+            if _ACTION_TOPIC.search(name) or _ACTION_SERVICE.search(name):
+                continue  # it stands as an action there
+            yield each.found(NO_COUNTERPART, f"no enclave may {other} {name}")
+
+
+def _never(name: str) -> str:
+    if len(name) > _LONGEST and not is_expression(name):
+        return f"it has {len(name)} characters, and a ROS name has at most {_LONGEST}"
+    return "a part of it begins with a digit" if _DIGIT_FIRST.search(name) else ""
+
+
+def _belongs(each: Stated) -> str:
+    """The kind that the name has everywhere, where it is another than here."""
+    kind, name = each.right.kind, each.name
+    if kind != "services":
+        is_service = name.rpartition("/")[2] in NODE_SERVICES or _ACTION_SERVICE.search(name)
+        return "services" if is_service else ""
+    return "topics" if name in _GLOBAL_TOPICS or _ACTION_TOPIC.search(name) else ""
+
+
+def _breadth(each: Stated) -> Iterator[Finding]:
+    name, right = each.name, each.right.right
+    if right == "publish" and name == "/clock":
+        yield each.found(SETS_CLOCK, f"{each.right.enclave} may publish /clock")
+    if not is_expression(name):
+        return
+    told = each.right.told()
+    if _ALL.match(name):
+        kind = READS_EVERYTHING if right == "subscribe" else EVERYTHING
+        yield each.found(kind, f"{told} stands for every name")
+    elif literal_prefix(name).count("/") < 2 and is_expression(name.rpartition("/")[2]):
+        kind = READS_EVERYTHING if right == "subscribe" else WIDE
+        yield each.found(
+            kind, f"{told} begins with no whole namespace, and ends with no whole name"
+        )
+    elif right == "request" and covers(name, "/*/set_parameters"):
+        yield each.found(SETS_PARAMETERS, f"{told} reaches every node")
+
+
+_NODES_INCLUDE = (
+    '<xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> gives all of that; '
+    "`sros policies --copy` has the file."
+)
+
+NO_TYPE_DESCRIPTION = Kind(
+    "policy.no-type-description",
+    ERROR,
+    "a node that may not offer ~/get_type_description",
+    "Nodes of Jazzy offer this service, and one that is denied it ends as soon as it starts.",
+    "ROS 2 Jazzy, rclcpp 28 and rclpy 7 (node type descriptions interface); REP-2016.",
+    f'Allow <services reply="ALLOW"><service>~/get_type_description</service></services>. '
+    f"{_NODES_INCLUDE}",
+)
+NO_ROSOUT = Kind(
+    "policy.no-rosout",
+    ERROR,
+    "a node that may not publish /rosout",
+    "Every node makes a publisher for its log when it starts, and fails where it may not.",
+    "ROS 2 Jazzy, rcl 9 (rcl_logging_rosout_init_publisher_for_node).",
+    f'Allow <topics publish="ALLOW"><topic>/rosout</topic></topics>. {_NODES_INCLUDE}',
+)
+NO_PARAMETER_EVENTS = Kind(
+    "policy.no-parameter-events",
+    ERROR,
+    "a node that may not publish /parameter_events",
+    "Every node announces its parameters there, and fails at its start where it may not.",
+    "ROS 2 Jazzy, rclcpp 28 (NodeParameters) and rclpy 7 (Node).",
+    f'Allow <topics publish="ALLOW"><topic>/parameter_events</topic></topics>. {_NODES_INCLUDE}',
+)
+NO_PARAMETER_SERVICES = Kind(
+    "policy.no-parameter-services",
+    ERROR,
+    "a node that may not offer all of its parameter services",
+    "Every node offers all six unless it was made without, and fails at its start where it may "
+    "not.",
+    "ROS 2 Jazzy, rclcpp 28 (ParameterService) and rclpy 7 (start_parameter_services).",
+    f'Allow <services reply="ALLOW"> with ~/get_parameters and the others. {_NODES_INCLUDE}',
+)
+NO_PARAMETERS = Kind(
+    "policy.without-parameters",
+    NOTE,
+    "a node that may offer no parameter service at all",
+    "It has everything else that it needs, so it may well have been made without parameters; "
+    "otherwise it fails at its start.",
+    "ROS 2 Jazzy, rclcpp 28 (NodeOptions) and rclpy 7 (start_parameter_services).",
+    f"If it has parameters, let it offer them. {_NODES_INCLUDE}",
+)
+RELATIVE_GLOBAL = Kind(
+    "policy.relative-global-name",
+    ERROR,
+    "a name that ROS has at the root, said relative to a namespace",
+    "/rosout, /parameter_events and /clock are absolute also for nodes in a namespace, so the "
+    "rule allows a topic that nobody uses. Sample policies of ros2/sros2 have this.",
+    "rcl 9 (logging_rosout.h: /rosout); rclcpp 28 (/parameter_events, /clock).",
+    "Put a / before the name.",
+)
+
+NODES_KINDS = by_id(
+    NO_TYPE_DESCRIPTION, NO_ROSOUT, NO_PARAMETER_EVENTS, NO_PARAMETER_SERVICES, NO_PARAMETERS,
+    RELATIVE_GLOBAL,
+)  # fmt: skip
+
+_GLOBAL = ("rosout", "parameter_events", "clock")
+_BASICS = (
+    (NO_TYPE_DESCRIPTION, "reply", ("~/get_type_description",)),
+    (NO_ROSOUT, "publish", ("/rosout",)),
+    (NO_PARAMETER_EVENTS, "publish", ("/parameter_events",)),
+    (NO_PARAMETER_SERVICES, "reply", tuple(f"~/{name}" for name in PARAMETER_SERVICES)),
+)
+_LISTENER = "transform_listener_impl_"
+"""Begins the names of the nodes that tf2_ros makes; they have no parameters, and no events."""
+_OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
+
+
+def check_nodes(checked: CheckedPolicy) -> Iterator[Finding]:
+    """Every node of a policy, by what its enclave allows as a whole.
+
+    Nodes whose names begin with an underscore are hidden ones, tools that are started without
+    log, parameters and types (ROS 2 design, "Topic and Service Names"; ros2cli does so).
+    """
+    for enclave in checked.policy.enclaves:
+        for profile in enclave.all_profiles():
+            if profile.node and profile.ns.startswith("/") and not profile.node.startswith("_"):
+                yield from _basics(checked, enclave, profile)
+    for each in checked.statements:
+        if each.written in _GLOBAL and each.profile.ns != "/" and each.right.kind == "topics":
+            text = f"{each.written} becomes {each.name} in namespace {each.profile.ns}"
+            yield each.found(RELATIVE_GLOBAL, text, f"Write /{each.written}.")
+
+
+def _basics(checked: CheckedPolicy, enclave: Enclave, profile: Profile) -> Iterator[Finding]:
+    node = expand("~", profile.ns, profile.node)
+    listener = profile.node.startswith(_LISTENER)
+    lacks_others = False
+    for kind, right, names in _BASICS:
+        if listener and kind not in _OF_LISTENERS:
+            continue
+        wanted = (expand(name, profile.ns, profile.node) for name in names)
+        missing = [name for name in wanted if not checked.rules.allow(enclave.path, right, name)]
+        if not missing:
+            continue
+        if kind is NO_PARAMETER_SERVICES and len(missing) == len(names) and not lacks_others:
+            kind = NO_PARAMETERS
+        lacks_others = True
+        text = f"node {node} may not {right} {', '.join(missing)}"
+        yield kind.found(enclave.path, text, profile.source.file, profile.source.line)
+
+
+DOCUMENT_SIZE = Kind(
+    "portable.document-size",
+    WARNING,
+    "signed permissions of 64 KB or more",
+    "The handshake carries them. Fast DDS 2.9 never finishes it, and sometimes aborts; Fast DDS "
+    "2.14 and Cyclone DDS take them.",
+    "ros2/sros2 issue 228; Fast DDS 2.9.1 (SecurityManager.cpp) and 2.14.5, Cyclone DDS 0.10.2; "
+    "measured.",
+    "Use wildcards (`sros minimize_policy` proposes them), or split the enclave.",
+    vendors=("fastdds-2.9",),
+)
+LONG_NAME = Kind(
+    "portable.long-name",
+    WARNING,
+    "a topic whose name is too long for Fast DDS",
+    "From 252 bytes on (prefix and suffix included) an endpoint is created on Fast DDS, and never "
+    "matched; Cyclone DDS takes it.",
+    "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "Use shorter namespaces and names.",
+    vendors=("fastdds", "fastdds-2.9"),
+)
+DENY_BLOCKS = Kind(
+    "portable.deny-blocks-topic",
+    WARNING,
+    "a denial of one direction of a topic that is allowed in the other",
+    "Cyclone DDS asks whether the topic may be made at all, and a denial of either direction "
+    "answers no; Fast DDS allows it.",
+    "Cyclone DDS 0.10.2 (access_control.c), Fast DDS 2.9.1 and 2.14.5; measured.",
+    "Remove the denial: what no rule allows is denied anyway.",
+    vendors=("cyclonedds",),
+)
+CHARACTER_SET = Kind(
+    "portable.character-set",
+    NOTE,
+    "a [set] of characters in a name",
+    "Vendors read plain sets alike, but only * and ? are part of the portable profile.",
+    "Fast DDS 2.14.5 (fnmatch), Cyclone DDS 0.10.2 (its own matching); measured.",
+    "Use * or ?, or write the names out.",
+)
+ENCLAVE_NAMES = Kind(
+    "portable.enclave-names",
+    WARNING,
+    "an enclave whose name consists of parts of another's",
+    "Cyclone DDS compares the parts of two subjects as sets, one way: /robot fits the (public) "
+    "permissions of /robot/admin, and gets in with them.",
+    "Cyclone DDS 0.10.2 (access_control.c); an enclave did so here and was heard.",
+    "Choose names none of which is made of parts of another, such as /robot_admin, or subjects "
+    "with a part of their own (template production).",
+    vendors=("cyclonedds",),
+)
+SEVERAL_PROFILES = Kind(
+    "policy.several-profiles",
+    NOTE,
+    "an enclave with several <profiles>",
+    "sros joins them. ros2/sros2 makes a grant of each, of which DDS reads only the first.",
+    "ros2/sros2 0.13; DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2.",
+    "Put all <profile> of an enclave into one <profiles>.",
+)
+
+PORTABILITY_KINDS = by_id(
+    DOCUMENT_SIZE, LONG_NAME, DENY_BLOCKS, CHARACTER_SET, ENCLAVE_NAMES, SEVERAL_PROFILES
+)
+
+_FROM_ALL_SIZES_ON = MAX_SIGNED_BYTES // 2
+_ANY_TIME = Window(datetime(2026, 1, 1, tzinfo=UTC), datetime(2027, 1, 1, tzinfo=UTC))
+_DOMAINS = DomainSet.of((0, 0))
+
+
+def check_portability(checked: CheckedPolicy) -> Iterator[Finding]:
+    """Every enclave as its permissions would be signed."""
+    for enclave in checked.policy.enclaves:
+        source = enclave.source
+        permissions = permissions_for(
+            enclave,
+            subject=subject_text(common_name(enclave.path)),
+            validity=_ANY_TIME,
+            domains=_DOMAINS,
+        )
+        size = _signed_bytes(enclave)
+        for found in outside_findings(permissions, size, enclave.path, source.file, source.line):
+            yield _at_denial(found, checked) if found.kind is DENY_BLOCKS else found
+        if len(enclave.profiles) > 1:
+            text = f"it has {len(enclave.profiles)} <profiles>"
+            yield SEVERAL_PROFILES.found(enclave.path, text, source.file, source.line)
+    if pairs := mistaken_names(each.path for each in checked.policy.enclaves):
+        text = f"Cyclone DDS takes {some_pairs(pairs)}"
+        first = checked.policy.enclave(pairs[0][0])
+        line = first.source.line if first else None
+        yield ENCLAVE_NAMES.found(pairs[0][0], text, checked.policy.file, line)
+
+
+def _at_denial(found: Finding, checked: CheckedPolicy) -> Finding:
+    """``found``, at the first denial of its enclave."""
+    denials = (s for s in checked.statements if s.right.enclave == found.subject and not s.allows)
+    source = next(denials).source
+    return replace(found, file=source.file, line=source.line)
+
+
+def outside_findings(
+    permissions: Permissions, signed_bytes: int, subject: str, file: str, line: int | None = None
+) -> Iterator[Finding]:
+    """What of a permissions document lies outside of the portable profile."""
+    for identity, fact in outside(permissions, signed_bytes, overlap):
+        yield PORTABILITY_KINDS[identity].found(subject, fact, file, line)
+
+
+def _signed_bytes(enclave: Enclave) -> int:
+    """The size of the signed permissions; small ones are not measured."""
+    rights = policy_rights(Policy((enclave,)))
+    estimate = sum(map(right_bytes, rights))
+    return Scale().signed_bytes(enclave) if estimate > _FROM_ALL_SIZES_ON else estimate
+
+
+_ORDER = (
+    "sros signs the denials of an enclave before its permissions, as ros2/sros2 does, and the "
+    "first rule that matches decides (DDS-Security 1.1, 9.4.1.3)."
+)
+
+CONTRADICTION = Kind(
+    "policy.contradiction",
+    WARNING,
+    "the same name is allowed and denied",
+    "The denial counts, so the permission does nothing; one of them is not meant.",
+    _ORDER,
+    "Remove the one that is not meant.",
+)
+UNREACHABLE = Kind(
+    "policy.unreachable-rule",
+    WARNING,
+    "a permission that a denial takes away as a whole",
+    "A denial of the same enclave, perhaps of another node in it, covers every name of the rule, "
+    "so it never allows anything.",
+    _ORDER,
+    "Remove the permission, or narrow the denial.",
+)
+NO_EFFECT = Kind(
+    "policy.deny-without-effect",
+    WARNING,
+    "a denial of what nothing allows",
+    "What no rule allows is denied anyway. The denial takes nothing away, and on Cyclone DDS it "
+    "can close the other direction of the topic.",
+    "DDS-Security 1.1, 9.4.1.3 (the default is DENY); Cyclone DDS 0.10.2 refuses a topic of "
+    "which one direction is denied.",
+    "Remove the denial.",
+)
+RULES_REDUNDANT = Kind(
+    "policy.redundant-rule",
+    NOTE,
+    "a permission that a wildcard beside it gives already",
+    "The name stands under a wildcard of the same profile, so it only makes the document longer.",
+    "sros: rights of a profile are joined.",
+    "Remove the name, or better the wildcard.",
+)
+HALF_ACTION = Kind(
+    "policy.action-in-part",
+    ERROR,
+    "a part of an action without the others",
+    "An action is three services and two topics, and its client or server makes all five when it "
+    "starts: denied one of them, it fails.",
+    "ROS 2 design, Actions; rcl_action 9 (rcl_action_client_init, rcl_action_server_init).",
+    'Write <actions call="ALLOW"> or <actions execute="ALLOW"> with the name of the action.',
+)
+
+RULES_KINDS = by_id(CONTRADICTION, UNREACHABLE, NO_EFFECT, RULES_REDUNDANT, HALF_ACTION)
+
+_GOAL = "/_action/send_goal"
+_WHOLE = {"request": "call", "reply": "execute"}
+
+
+def check_rules(checked: CheckedPolicy) -> Iterator[Finding]:
+    """Every statement against the others of its enclave."""
+    for each in checked.statements:
+        if each.allows:
+            yield from _permission(each, checked.rules)
+        elif not checked.rules.meeting(each.right._replace(qualifier=ALLOW)):
+            yield each.found(NO_EFFECT, f"nothing allows to {each.right.told()}")
+    yield from _redundant(checked)
+
+
+def _permission(each: Stated, rules: Rules) -> Iterator[Finding]:
+    denial = each.right._replace(qualifier=DENY)
+    if denials := rules.covering(denial):
+        same = set(parts(denial)) == set(denials)
+        shown = ", ".join(sorted({f"{by.right} {by.name}" for by in denials}))
+        if same:
+            text = f"{each.right.told()} is allowed here and denied in the same enclave"
+            yield each.found(CONTRADICTION, text)
+        else:
+            yield each.found(UNREACHABLE, f"{each.right.told()} is denied by {shown}")
+        return
+    if each.name.endswith(_GOAL) and each.right.right in _WHOLE:
+        action = each.name.removesuffix(_GOAL)
+        whole = _WHOLE[each.right.right]
+        if not rules.allow(each.right.enclave, whole, action):
+            text = f"{each.name} is allowed, but not all that it takes to {whole} {action}"
+            yield each.found(HALF_ACTION, text)
+
+
+def _redundant(checked: CheckedPolicy) -> Iterator[Finding]:
+    wild: dict[tuple[int, str], list[str]] = defaultdict(list)
+    for each in checked.statements:
+        if each.allows and is_expression(each.name):
+            wild[id(each.profile), each.right.right].append(each.name)
+    for each in checked.statements:
+        # What was included is the same for all; that some node does not need it is no fault.
+        if not each.allows or each.source.file != each.profile.source.file:
+            continue
+        for wide in wild.get((id(each.profile), each.right.right), ()):
+            if wide != each.name and covers(wide, each.name):
+                yield each.found(RULES_REDUNDANT, f"{each.right.told()} is part of {wide}")
+                break
+
+
+MALFORMED = Kind(
+    "policy.malformed",
+    ERROR,
+    "a policy that cannot be read",
+    "Nothing can be made from it.",
+    "SROS2 policy XML 0.2.0 (policy.xsd of ros2/sros2) and the names of ROS 2.",
+    "Correct it where the text says.",
+)
+DUPLICATE = Kind(
+    "policy.duplicate-enclave",
+    ERROR,
+    "an enclave that is given twice",
+    "One verb of ros2/sros2 takes the first and another one the last, so rights change with the "
+    "command; sros takes neither.",
+    "ros2/sros2 0.13 (create_permission, generate_artifacts).",
+    "Join the two into one <enclave>.",
+)
+FALLBACK = Kind(
+    "policy.include-fallback",
+    WARNING,
+    "an include whose file does not exist",
+    "Its <xi:fallback> stands in, so the rights are others than those that were meant.",
+    "XInclude 1.0, 4.4.",
+    "Put the file there, or remove the include.",
+)
+REDUNDANT = Kind(
+    "policy.redundant-include",
+    NOTE,
+    "an include that brings nothing new",
+    "The same profile includes the file once more, itself or through another.",
+    "XInclude 1.0.",
+    "Remove it.",
+)
+
+FILES_KINDS = by_id(MALFORMED, DUPLICATE, FALLBACK, REDUNDANT)
+
+_CHECKS = (check_rules, check_nodes, check_names, check_counterparts, check_portability)
+_PLACE = re.compile(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
+_INCLUDE = re.compile(r"\{http://www\.w3\.org/200[13]/XInclude\}include\Z")
+_MANY = 1000
+
+
+def policy_findings(policy: Policy) -> Iterator[Finding]:
+    """Everything that is found in a policy that could be read."""
+    checked = CheckedPolicy(policy)
+    for check in _CHECKS:
+        yield from check(checked)
+
+
+def policy_file_findings(path: Path) -> Iterator[Finding]:
+    """Everything that is found in a policy file, also where it cannot be read."""
+    try:
+        policy = read_policy(path)
+    except SrosError as error:
+        yield from _unreadable(path, error)
+        return
+    yield from policy_findings(policy)
+    yield from _includes(path)
+
+
+def _unreadable(path: Path, error: SrosError) -> Iterator[Finding]:
+    found = False
+    for name, line in _duplicates(path):
+        found = True
+        yield DUPLICATE.found(name, f"{name} stands here once more", str(path), line)
+    if found:
+        return
+    match = _PLACE.match(error.what)
+    file, line, text = (match["file"], int(match["line"]), match["text"]) if match else ("", 0, "")
+    why = " ".join(part for part in (f"{text or error.what}.", error.why) if part)
+    yield MALFORMED.found(str(path), why, file or str(path), line, error.remedy)
+
+
+def _duplicates(path: Path) -> Iterator[tuple[str, int]]:
+    try:
+        root = parse(read_bytes(path, "policy file"), str(path))
+    except SrosError:
+        return
+    seen: set[str] = set()
+    for element in root.iter("enclave"):
+        name = element.get("path", "")
+        if name in seen:
+            yield name, element.sourceline or 0
+        seen.add(name)
+
+
+# ── includes ───────────────────────────────────────────────────────────────────────────────
+
+
+def _includes(path: Path) -> Iterator[Finding]:
+    """The includes in the file itself; what they include in turn is looked into once."""
+    root = parse(read_bytes(path, "policy file"), str(path))
+    below: dict[Path, frozenset[Path]] = {}
+    for parent in root.iter():
+        includes = [child for child in parent if _INCLUDE.match(str(child.tag))]
+        files = [_target(path, child) for child in includes]
+        for index, (element, file) in enumerate(zip(includes, files, strict=True)):
+            href = element.get("href", "")
+            line = element.sourceline
+            if not file.exists():
+                yield FALLBACK.found(str(path), f"'{href}' does not exist", str(path), line)
+                continue
+            others = [each for number, each in enumerate(files) if number != index]
+            twice = file in files[:index] and element.get("xpointer") in (
+                each.get("xpointer") for each in includes[:index]
+            )
+            if twice or any(file != o and file in _reached(o, below) for o in others):
+                text = f"'{href}' comes with another include of the same profile"
+                yield REDUNDANT.found(str(path), text, str(path), line)
+
+
+def _target(path: Path, element: etree._Element) -> Path:
+    return Path(os.path.realpath(path.parent / unquote(element.get("href", ""))))
+
+
+def _reached(file: Path, known: dict[Path, frozenset[Path]]) -> frozenset[Path]:
+    """The files that one includes, itself or through others."""
+    if file in known:
+        return known[file]
+    known[file] = frozenset()  # for includes in a circle
+    reached: set[Path] = set()
+    if file.exists() and len(known) < _MANY:
+        root = parse(read_bytes(file, "policy file"), str(file))
+        for element in root.iter():
+            if _INCLUDE.match(str(element.tag)):
+                target = _target(file, element)
+                reached |= {target, *_reached(target, known)}
+    known[file] = frozenset(reached)
+    return known[file]
+
+
+KINDS = {**NAMING_KINDS, **NODES_KINDS, **PORTABILITY_KINDS, **RULES_KINDS, **FILES_KINDS}

@@ -1,0 +1,529 @@
+"""Findings in the environment of a process, and in the processes that run."""
+
+from __future__ import annotations
+
+import difflib
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta, tzinfo
+from pathlib import Path
+
+from sros_tool.checks.keystores.keystore import joined, keystore_findings
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.governance import parse_governance
+from sros_tool.errors import SrosError
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.layout import (
+    GOVERNANCE_P7S,
+    IDENTITY,
+    PERMISSIONS,
+    ca_key,
+    enclave_names,
+    is_keystore,
+)
+from sros_tool.pki import smime
+from sros_tool.runtime.environment import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
+from sros_tool.validity import iso
+from sros_tool.xml import read_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """A process that runs: its command, environment, and the moment of its start."""
+
+    pid: int
+    command: tuple[str, ...]
+    environment: Mapping[str, str]
+    started: datetime
+
+    @property
+    def told(self) -> str:
+        """As "process 4711 (talker)"."""
+        program = Path(self.command[0]).name if self.command else "?"
+        return f"process {self.pid} ({program})"
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What checks of the runtime look at.
+
+    ``clock`` is what the clock of the host says, where ``now`` is another moment.
+    ``rmws`` are the installed RMWs; ``insecure_rmws`` those that were tried and do not enforce
+    security, with what was seen.  ``zone`` is that of the host.
+    """
+
+    environment: Mapping[str, str]
+    now: datetime
+    zone: tzinfo = UTC
+    processes: tuple[Process, ...] = ()
+    rmws: tuple[str, ...] = ()
+    insecure_rmws: Mapping[str, str] = field(default_factory=dict)
+    clock: datetime | None = None
+
+
+def running_processes(proc: Path = Path("/proc")) -> Iterator[Process]:
+    """The processes whose environment this user may read, but for this one."""
+    ticks = os.sysconf("SC_CLK_TCK")
+    begin = _boot_time(proc)
+    for folder in sorted(proc.glob("[0-9]*"), key=lambda each: int(each.name)):
+        if int(folder.name) == os.getpid():
+            continue
+        with suppress(OSError, ValueError, IndexError):
+            environment = dict(
+                word.split("=", 1) for word in _words(folder / "environ") if "=" in word
+            )
+            # The command may hold spaces and brackets; the numbers follow the last bracket.
+            numbers = (folder / "stat").read_text().rpartition(")")[2].split()
+            started = begin + timedelta(seconds=int(numbers[19]) / ticks)
+            command = tuple(_words(folder / "cmdline"))
+            yield Process(int(folder.name), command, environment, started)
+
+
+def _words(path: Path) -> list[str]:
+    text = path.read_bytes().decode("utf-8", "replace")
+    return [word for word in text.split("\0") if word]
+
+
+def _boot_time(proc: Path) -> datetime:
+    with suppress(OSError, StopIteration, ValueError):
+        lines = (proc / "stat").read_text().splitlines()
+        seconds = next(line.split()[1] for line in lines if line.startswith("btime "))
+        return datetime.fromtimestamp(int(seconds), UTC)
+    return datetime.fromtimestamp(0, UTC)
+
+
+RMW = "RMW_IMPLEMENTATION"
+
+RMW_NOT_INSTALLED = Kind(
+    "runtime.rmw-not-installed",
+    ERROR,
+    "RMW_IMPLEMENTATION names an RMW that is not installed",
+    "No node starts.",
+    "rmw_implementation 2.15 (functions.cpp).",
+    "Install it, or choose one that is there.",
+)
+RMW_INSECURE = Kind(
+    "runtime.rmw-without-security",
+    ERROR,
+    "an RMW that does not enforce DDS Security",
+    "It was built without, or is not on DDS; nodes fail, or run unsecured.",
+    "Found by trying (`sros doctor`); rmw_zenoh reads none of the files of an enclave.",
+    "Use an RMW of which `sros doctor` says that it enforces security.",
+)
+CLOCK_BEHIND = Kind(
+    "runtime.clock-behind",
+    ERROR,
+    "the clock of this host is behind",
+    "Files of the keystore were written in the future. Certificates may not be valid yet, and "
+    "expired ones may seem valid.",
+    "RFC 5280, 6.1.3 (the current time); robots without a battery for their clock.",
+    "Set the clock before nodes start, for instance by chrony with makestep.",
+)
+DAEMON_UNSECURED = Kind(
+    "runtime.daemon-unsecured",
+    WARNING,
+    "the daemon of ros2 runs without security",
+    "`ros2 topic list` and others ask it, and it sees nothing of a secured robot, so the graph "
+    "seems empty.",
+    "ros2cli 0.32 (daemon); it keeps the environment in which it was started.",
+    "Run `ros2 daemon stop`; it is started anew by the next command, with this environment.",
+)
+DAEMON_OTHER = Kind(
+    "runtime.daemon-differs",
+    WARNING,
+    "the daemon of ros2 runs with another keystore or enclave",
+    "`ros2 topic list` and others ask it, and show what that enclave sees.",
+    "ros2cli 0.32 (daemon); it keeps the environment in which it was started.",
+    "Run `ros2 daemon stop`.",
+)
+PROCESS_UNSECURED = Kind(
+    "runtime.process-unsecured",
+    WARNING,
+    "a node that runs without security beside secured ones",
+    "It and the secured nodes do not see each other.",
+    "DDS-Security 1.1, 9.4.1.2 (allow_unauthenticated_participants is false).",
+    "Start it with `sros run ROOT NAME -- COMMAND...`.",
+)
+PROCESS_OUTDATED = Kind(
+    "runtime.process-outdated",
+    WARNING,
+    "a process that runs with older files of its enclave",
+    "A running participant does not notice changed certificates, permissions or revocation lists.",
+    "Fast DDS 2.14.5, Cyclone DDS 0.10.2 (read at the start).",
+    "Restart it.",
+)
+MIXED_VENDORS = Kind(
+    "runtime.mixed-vendors",
+    WARNING,
+    "secured processes on different RMWs",
+    "Vendors do not talk to each other securely on these versions, and say nothing about it.",
+    "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
+    "Use one RMW per robot.",
+)
+
+HOST_KINDS = by_id(
+    RMW_NOT_INSTALLED, RMW_INSECURE, CLOCK_BEHIND, DAEMON_UNSECURED, DAEMON_OTHER,
+    PROCESS_UNSECURED, PROCESS_OUTDATED, MIXED_VENDORS,
+)  # fmt: skip
+
+DEFAULT_RMW = "rmw_fastrtps_cpp"
+_NOT_DDS = ("rmw_zenoh", "rmw_email", "rmw_iceoryx")
+_DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
+_TOLERANCE = timedelta(minutes=2)
+_LOADED = ("cert.pem", "permissions.p7s", "governance.p7s", "crl.pem", "identity_ca.cert.pem")
+
+
+def check_host(setting: Setting) -> Iterator[Finding]:
+    """The RMW that nodes would use, the clock, and what runs."""
+    yield from _rmw(setting)
+    yield from _clock(setting)
+    yield from _processes(setting)
+
+
+def _rmw(setting: Setting) -> Iterator[Finding]:
+    chosen = setting.environment.get(RMW, "")
+    if chosen and setting.rmws and chosen not in setting.rmws:
+        text = f"{RMW} is {chosen}; there are {', '.join(setting.rmws)}"
+        yield RMW_NOT_INSTALLED.found(RMW, text)
+    if not is_secured(setting.environment):
+        return
+    used = chosen or DEFAULT_RMW
+    if used.startswith(_NOT_DDS):
+        yield RMW_INSECURE.found(used, f"{used} is not on DDS")
+    elif used in setting.insecure_rmws:
+        yield RMW_INSECURE.found(used, setting.insecure_rmws[used])
+
+
+def _clock(setting: Setting) -> Iterator[Finding]:
+    root = setting.environment.get(KEYSTORE, "")
+    if not root or not Path(root).is_dir():
+        return
+    files = [each for name in ("ledger.jsonl", "enclaves/*.p7s", "enclaves/**/cert.pem")
+             for each in Path(root).glob(name)]  # fmt: skip
+    newest = max((each.stat().st_mtime for each in files if each.exists()), default=0.0)
+    written = datetime.fromtimestamp(newest, UTC)
+    clock = setting.clock or setting.now
+    if written > clock + _TOLERANCE:
+        text = f"it says {iso(clock)}, and '{root}' was written at {iso(written)}"
+        yield CLOCK_BEHIND.found("clock", text)
+
+
+def _processes(setting: Setting) -> Iterator[Finding]:
+    secured_here = is_secured(setting.environment)
+    rmws: dict[str, list[str]] = {}
+    for process in setting.processes:
+        environment = process.environment
+        if _is_daemon(process):
+            # Each domain has a daemon of its own; commands ask that of theirs.
+            if secured_here and _domain(environment) == _domain(setting.environment):
+                yield from _daemon(process, setting.environment)
+        elif is_secured(environment):
+            rmws.setdefault(environment.get(RMW) or DEFAULT_RMW, []).append(process.told)
+            yield from _outdated(process)
+        elif secured_here and _is_node_beside(process, setting.environment):
+            text = f"it is in domain {_domain(environment)}, and {ENABLE} is not 'true' for it"
+            yield PROCESS_UNSECURED.found(process.told, text)
+    if secured_here:
+        rmws.setdefault(setting.environment.get(RMW) or DEFAULT_RMW, []).append("this environment")
+    if len({_vendor(rmw) for rmw in rmws}) > 1:
+        text = "; ".join(f"{rmw}: {', '.join(users[:3])}" for rmw, users in sorted(rmws.items()))
+        yield MIXED_VENDORS.found("RMWs", text)
+
+
+def _daemon(process: Process, wanted: Mapping[str, str]) -> Iterator[Finding]:
+    if not is_secured(process.environment):
+        text = f"{ENABLE} is not 'true' for {process.told}"
+        yield DAEMON_UNSECURED.found(process.told, text)
+        return
+    differing = [
+        name
+        for name in (KEYSTORE, ENCLAVE)
+        if process.environment.get(name, "") != wanted.get(name, "")
+    ]
+    if differing:
+        text = f"it has another {', '.join(differing)}"
+        yield DAEMON_OTHER.found(process.told, text)
+
+
+def _outdated(process: Process) -> Iterator[Finding]:
+    root, name = process.environment.get(KEYSTORE, ""), process.environment.get(ENCLAVE, "")
+    if not (root.startswith("/") and name.startswith("/")):
+        return
+    folder = enclave_path(Path(root), name)
+    newer = [
+        file
+        for file in _LOADED
+        if (folder / file).exists()
+        and datetime.fromtimestamp((folder / file).stat().st_mtime, UTC) > process.started
+    ]
+    if newer:
+        text = f"it runs since {iso(process.started)}; {', '.join(newer)} of {name} are newer"
+        yield PROCESS_OUTDATED.found(process.told, text)
+
+
+def is_secured(environment: Mapping[str, str]) -> bool:
+    """Whether security is on."""
+    return environment.get(ENABLE) == "true"
+
+
+def _is_daemon(process: Process) -> bool:
+    return any(mark in word for word in process.command for mark in _DAEMON)
+
+
+def _is_node_beside(process: Process, environment: Mapping[str, str]) -> bool:
+    """Whether a process is a node in the same domain, as far as its command tells."""
+    return "--ros-args" in process.command and _domain(process.environment) == _domain(environment)
+
+
+def _domain(environment: Mapping[str, str]) -> str:
+    return environment.get(DOMAIN) or "0"
+
+
+def _vendor(rmw: str) -> str:
+    return "_".join(rmw.split("_")[:2])
+
+
+_RCL = "rcl 9 (rcl/src/rcl/security.c); ran with ROS 2 Jazzy."
+_NAME_IT = (
+    "Start each process with `sros run ROOT NAME -- COMMAND...`, or set its enclave in the launch "
+    "file."
+)
+_ENV = '`eval "$(sros env ROOT NAME)"` sets all of them.'
+
+ENABLE_MISSPELT = Kind(
+    "runtime.enable-misspelt",
+    ERROR,
+    "ROS_SECURITY_ENABLE is neither true nor false",
+    "Only exactly `true` switches security on; with anything else every node runs unsecured, and "
+    "says nothing about it.",
+    _RCL,
+    f"Write ROS_SECURITY_ENABLE=true. {_ENV}",
+)
+NOT_ENABLED = Kind(
+    "runtime.not-enabled",
+    WARNING,
+    "security is prepared and not switched on",
+    "Without ROS_SECURITY_ENABLE=true nodes run unsecured, whatever the other variables say.",
+    _RCL,
+    f"Write ROS_SECURITY_ENABLE=true, or unset the others. {_ENV}",
+)
+MISSPELT = Kind(
+    "runtime.variable-misspelt",
+    ERROR,
+    "a variable that nobody reads",
+    "It is all but the name of one that rcl reads, so what it says is ignored in silence.",
+    _RCL,
+    "Correct the name.",
+)
+STRATEGY_MISSPELT = Kind(
+    "runtime.strategy-misspelt",
+    ERROR,
+    "ROS_SECURITY_STRATEGY is neither Enforce nor Permissive",
+    "Only exactly `Enforce` enforces; with anything else a node whose enclave is missing runs "
+    "unsecured.",
+    _RCL,
+    f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV}",
+)
+NOT_ENFORCED = Kind(
+    "runtime.not-enforced",
+    WARNING,
+    "security is on and not enforced",
+    "A node whose enclave, or one of whose files, is missing runs unsecured, even while it logs "
+    "that it found a security directory.",
+    _RCL,
+    f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV}",
+)
+KEYSTORE_UNSET = Kind(
+    "runtime.keystore-unset",
+    ERROR,
+    "security is on and no keystore is named",
+    "With Enforce no node starts (error not set); without, all run unsecured.",
+    _RCL,
+    f"Set ROS_SECURITY_KEYSTORE. {_ENV}",
+)
+KEYSTORE_NOT_FOUND = Kind(
+    "runtime.keystore-not-found",
+    ERROR,
+    "ROS_SECURITY_KEYSTORE names no keystore",
+    "With Enforce no node starts; without, all run unsecured.",
+    _RCL,
+    f"Correct the path. {_ENV}",
+)
+KEYSTORE_RELATIVE = Kind(
+    "runtime.keystore-relative",
+    WARNING,
+    "ROS_SECURITY_KEYSTORE is a relative path",
+    "It means something else to each process that is started in another folder, as services are.",
+    _RCL,
+    f"Write the whole path. {_ENV}",
+)
+ENCLAVE_NOT_FOUND = Kind(
+    "runtime.enclave-not-found",
+    ERROR,
+    "the enclave is not in the keystore",
+    "With Enforce the node does not start; without, it runs unsecured. Names are compared exactly.",
+    _RCL,
+    "Correct the name, or make it with `sros create_enclave`.",
+)
+NO_ENCLAVE = Kind(
+    "runtime.enclave-unset",
+    WARNING,
+    "no enclave is named",
+    "Every process has to say --ros-args --enclave NAME; one that does not uses the enclave /, "
+    "which the keystore does not have, and does not start.",
+    _RCL,
+    _NAME_IT,
+)
+UNSECURED_WITHOUT_ENCLAVE = Kind(
+    "runtime.unsecured-without-enclave",
+    ERROR,
+    "no enclave is named, and nodes run unsecured",
+    "A process that does not say --ros-args --enclave NAME uses the enclave /, which the keystore "
+    "does not have; as ROS_SECURITY_STRATEGY is not exactly `Enforce`, it then runs UNSECURED.",
+    _RCL,
+    f"Write ROS_SECURITY_STRATEGY=Enforce. {_NAME_IT}",
+)
+DOMAIN_MALFORMED = Kind(
+    "runtime.domain-malformed",
+    ERROR,
+    "ROS_DOMAIN_ID is no domain id",
+    "Nodes do not start, or with a leading zero join another domain than it seems.",
+    "rcl 9 (rcl/src/rcl/domain_id.c: strtoul with base 0); domains above 230 Cyclone DDS refuses.",
+    "Write one whole number from 0 to 230, without leading zeros.",
+)
+DOMAIN_NOT_GOVERNED = Kind(
+    "runtime.domain-not-governed",
+    ERROR,
+    "the keystore is not made for this domain",
+    'No node starts: Fast DDS says "Not found topic access rule for topic ros_discovery_info", '
+    'Cyclone DDS "Could not find domain in governance".',
+    "DDS-Security 1.1, 9.4.1.2; measured.",
+    "Set ROS_DOMAIN_ID to a domain of the keystore, or make one with --domain.",
+)
+CA_KEY_HERE = Kind(
+    "runtime.ca-key-present",
+    NOTE,
+    "nodes run with the keystore that has the keys of the CAs",
+    "Who breaks into a node can make any enclave, with any rights.",
+    "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6.",
+    "Run them with an export (`sros distribute_key`), and keep the keystore elsewhere.",
+)
+
+VARIABLES_KINDS = by_id(
+    ENABLE_MISSPELT, NOT_ENABLED, MISSPELT, STRATEGY_MISSPELT, NOT_ENFORCED, KEYSTORE_UNSET,
+    KEYSTORE_NOT_FOUND, KEYSTORE_RELATIVE, ENCLAVE_NOT_FOUND, NO_ENCLAVE,
+    UNSECURED_WITHOUT_ENCLAVE, DOMAIN_MALFORMED, DOMAIN_NOT_GOVERNED, CA_KEY_HERE,
+)  # fmt: skip
+
+_READ = (
+    ENABLE, STRATEGY, KEYSTORE, ENCLAVE, DOMAIN, "RMW_IMPLEMENTATION", "ROS_SECURITY_LOG_FILE",
+    "ROS_SECURITY_LOG_VERBOSITY", "ROS_SECURITY_LOG_PUBLISH",
+)  # fmt: skip
+_OLD = {
+    "ROS_SECURITY_ROOT_DIRECTORY": KEYSTORE,
+    "ROS_SECURITY_NODE_DIRECTORY": ENCLAVE,
+    "ROS_SECURITY_LOOKUP_TYPE": ENCLAVE,
+}
+_CLOSE = 0.88
+
+
+def check_variables(setting: Setting) -> Iterator[Finding]:
+    """The variables, and the enclave that they name, as a node would load it."""
+    environment = setting.environment
+    yield from _spelling(environment)
+    if environment.get(ENABLE) != "true":
+        return
+    if environment.get(STRATEGY) != "Enforce" and environment.get(STRATEGY) in (
+        None, "", "Permissive",
+    ):  # fmt: skip
+        yield NOT_ENFORCED.found(STRATEGY, _value(environment, STRATEGY))
+    domain: int | None = None
+    try:
+        domain = domain_from(environment) or 0
+    except SrosError as error:
+        yield DOMAIN_MALFORMED.found(DOMAIN, error.what, remedy=error.remedy)
+    text = environment.get(KEYSTORE, "")
+    if not text:
+        yield KEYSTORE_UNSET.found(KEYSTORE, _value(environment, KEYSTORE))
+        return
+    root = Path(text)
+    if not root.is_absolute():
+        yield KEYSTORE_RELATIVE.found(KEYSTORE, _value(environment, KEYSTORE))
+    if not is_keystore(root):
+        missing = "does not exist" if not root.exists() else "has no enclaves folder in use"
+        yield KEYSTORE_NOT_FOUND.found(KEYSTORE, f"'{root}' {missing}")
+        return
+    yield from _enclave(setting, root, domain)
+
+
+def _spelling(environment: Mapping[str, str]) -> Iterator[Finding]:
+    enable, strategy = environment.get(ENABLE), environment.get(STRATEGY)
+    if enable not in (None, "", "true", "false"):
+        yield ENABLE_MISSPELT.found(ENABLE, _value(environment, ENABLE))
+    elif enable is None and (strategy or environment.get(KEYSTORE) or environment.get(ENCLAVE)):
+        named = [name for name in (STRATEGY, KEYSTORE, ENCLAVE) if environment.get(name)]
+        yield NOT_ENABLED.found(ENABLE, f"{', '.join(named)} are set, and {ENABLE} is not")
+    if strategy not in (None, "", "Enforce", "Permissive"):
+        yield STRATEGY_MISSPELT.found(STRATEGY, _value(environment, STRATEGY))
+    for name in sorted(environment):
+        if name in _READ or not name.upper().startswith(("ROS", "RMW")):
+            continue
+        close = difflib.get_close_matches(name.upper(), _READ, n=1, cutoff=_CLOSE)
+        meant = _OLD.get(name) or (close[0] if close else "")
+        if meant:
+            yield MISSPELT.found(name, f"{name} is set; {meant} is meant")
+
+
+def _enclave(setting: Setting, root: Path, domain: int | None) -> Iterator[Finding]:
+    names, wanted = set(enclave_names(root)), setting.environment.get(ENCLAVE, "")
+    governed = _governed(root)
+    if governed and domain is not None and domain not in governed:
+        text = f"the governance of '{root}' is for domain {governed}, not for {domain}"
+        yield DOMAIN_NOT_GOVERNED.found(DOMAIN, text)
+        domain = None  # this is said
+    for role in (IDENTITY, PERMISSIONS):
+        if (root / ca_key(role)).exists():
+            yield CA_KEY_HERE.found(KEYSTORE, f"'{root / ca_key(role)}' is there")
+            break
+    if not wanted and "/" not in names:
+        enforced = setting.environment.get(STRATEGY) == "Enforce"
+        kind = NO_ENCLAVE if enforced else UNSECURED_WITHOUT_ENCLAVE
+        yield kind.found(ENCLAVE, f"it is not set, and '{root}' has no enclave /")
+        return
+    name = wanted or "/"
+    if name not in names and not enclave_path(root, name).is_dir():
+        close = difflib.get_close_matches(name, names, n=1)
+        hint = f"; it has {close[0]}" if close else ""
+        yield ENCLAVE_NOT_FOUND.found(ENCLAVE, f"'{root}' has no enclave {name}{hint}")
+        return
+    found = keystore_findings(root, now=setting.now, zone=setting.zone, domain=domain, only=(name,))
+    for each in found:
+        if each.id == "enclave.governance-domain":
+            yield DOMAIN_NOT_GOVERNED.found(DOMAIN, each.text, each.file)
+        else:
+            yield each
+
+
+def _governed(root: Path) -> DomainSet | None:
+    """The domains that the governance of a keystore names, as far as it can be read."""
+    try:
+        signed = smime.parse(read_bytes(root / GOVERNANCE_P7S, "governance document"))
+        return parse_governance(signed.document).domains().closed()
+    except SrosError:  # told of the enclave; an export has a copy in each
+        return None
+
+
+def _value(environment: Mapping[str, str], name: str) -> str:
+    value = environment.get(name)
+    return f"{name} is not set" if value is None else f"{name} is {value!r}"
+
+
+def runtime_findings(setting: Setting) -> list[Finding]:
+    """Everything that is found in an environment and on its host."""
+    return joined([*check_variables(setting), *check_host(setting)])
+
+
+KINDS = {**HOST_KINDS, **VARIABLES_KINDS}

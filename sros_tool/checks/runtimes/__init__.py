@@ -1,1 +1,0 @@
-"""Findings in the environment of a process, and in the processes that run."""

@@ -1,0 +1,390 @@
+"""The verbs that bring enclaves to robots: exporting them, and verifying what arrived."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from sros_tool.cli.common import (
+    PATH,
+    complete_keystore_and_enclave,
+    domain_of,
+    dry_run_option,
+    json_option,
+    keyring,
+    keystore_from_environment,
+    moment_of,
+    now,
+    print_json,
+    print_notes,
+    print_plan,
+    split_root,
+)
+from sros_tool.errors import DocumentError, UsageError
+
+STREAM = Path("-")
+"""Standard input or output, where a file could be named."""
+
+
+@click.command(
+    "distribute_key",
+    epilog="""\b
+Example:
+  $ sros distribute_key keystore /talker talker.tar.gz
+  exported enclave /talker to 'talker.tar.gz'
+  $ tar -xzf talker.tar.gz -C /etc/robot/keystore      # on the robot
+  $ sros distribute_key keystore --match '/arm/*' - | ssh robot tar -xz -C robot
+  exported enclave /arm/gripper to standard output
+  exported enclave /arm/wrist to standard output
+  left out enclave /arm/camera: its key was made on its robot""",
+)
+@click.argument(
+    "words",
+    metavar="[ROOT] [NAME...] TARGET",
+    nargs=-1,
+    required=True,
+    shell_complete=complete_keystore_and_enclave,
+)
+@click.option("--all", "every", is_flag=True, help="Export all enclaves of the keystore.")
+@click.option(
+    "--match",
+    "patterns",
+    multiple=True,
+    metavar="PATTERN",
+    help="Export those that fit, such as '/arm/*'; * also stands for '/'.  May be repeated.",
+)
+@click.option("--force", is_flag=True, help="Replace what TARGET holds of another version.")
+@dry_run_option
+def distribute_key(
+    words: tuple[str, ...], every: bool, patterns: tuple[str, ...], force: bool, dry_run: bool
+) -> None:
+    """Export the enclaves NAME... to TARGET: a folder, a .tar.gz, or - for standard output.
+
+    TARGET is a keystore with these enclaves only: real files in place of links, and no CA key.
+    """
+    from sros_tool.keystore.delivery.archive import SUFFIXES
+    from sros_tool.keystore.delivery.export import distribute, pack_enclaves, select
+
+    root, rest = split_root(words)
+    names = rest[:-1]
+    if not rest or not (names or every or patterns):
+        raise UsageError("distribute_key takes a keystore, one or more enclaves and a target")
+    target = PATH.convert(rest[-1], None, None)
+    _check_target(root, rest[-1])
+    selection = select(root, names, patterns, every=every)
+    if target == STREAM:
+        if not dry_run:
+            refuse_terminal()
+        packed = pack_enclaves(root, selection.names, now=now())
+        if dry_run:
+            for path in packed.paths:
+                click.echo(f"would send {path}")
+        else:
+            write_stdout(packed.data)
+        where, done = "standard output", not dry_run
+    else:
+        export = distribute(root, selection.names, target, now=now(), force=force, dry_run=dry_run)
+        where, done = f"'{target}'", bool(export.changes) and not dry_run
+        if dry_run:
+            archive = target.name.endswith(SUFFIXES)
+            print_plan(target.parent if archive else target, export.changes)
+        elif not export.changes:
+            for name in selection.names:
+                click.echo(f"'{target}' already holds enclave {name} as it is", err=True)
+        for change in export.changes if done else ():
+            if change.action == "replace":
+                click.echo(f"replaced {change.path}", err=True)
+    for name in selection.names if done else ():
+        click.echo(f"exported enclave {name} to {where}", err=target == STREAM)
+    for name in selection.left_out:
+        click.echo(f"left out enclave {name}: its key was made on its robot", err=True)
+
+
+def _check_target(root: Path, word: str) -> None:
+    """Refuse the name of an enclave as the target: there it was forgotten."""
+    from sros_tool.keystore.layout import enclave_names
+
+    if word.startswith("/") and not Path(word).exists() and word in set(enclave_names(root)):
+        raise UsageError(
+            f"no target is named: '{word}' is an enclave",
+            "",
+            "Add a folder, a .tar.gz, or - for standard output.",
+        )
+
+
+def write_stdout(data: bytes) -> None:
+    """Write binary data on standard output, after what was printed."""
+    sys.stdout.flush()
+    sys.stdout.buffer.write(data)
+    sys.stdout.buffer.flush()
+
+
+def refuse_terminal() -> None:
+    """Raise `UsageError` where binary data would land on a terminal."""
+    if sys.stdout is not None and sys.stdout.isatty():
+        raise UsageError(
+            "an archive would be written to this terminal",
+            "It is binary, and it may hold private keys.",
+            "Lead it into a pipe, such as `| ssh robot tar -xz -C /etc/robot`, or name a file.",
+        )
+
+
+@click.command(
+    "verify",
+    epilog="""\b
+Example:
+  $ sros verify robot
+  /arm/camera  loadable in domain 0 until 2027-05-20T07:45:12Z
+  /arm/gripper  loadable in domain 0 until 2027-05-20T07:45:12Z
+  /arm/wrist  NOT LOADABLE
+    permissions.p7s: missing
+    key.pem: others have access to it (mode 0644): chmod 600
+  $ sros verify robot --at 2027-06-01 || echo 'renew before June'""",
+)
+@click.argument("folder", metavar="[DIR]", type=PATH, required=False)
+@click.option("--domain", metavar="ID", help="Ask also whether it may join this ROS domain.")
+@click.option("--at", metavar="MOMENT", help="As if it were then: 2027-06-01, or 90d from now.")
+@json_option
+def verify(folder: Path | None, domain: str | None, at: str | None, as_json: bool) -> int:
+    """On a robot: say whether the enclaves in DIR, or the enclave DIR, can be used as they are.
+
+    Checks that they are complete, consistent, in date and loadable; that nobody else can read the
+    keys; that no CA key came with them; and that they trust the same CAs.  The exit status is 0 if
+    all is well.
+    """
+    from sros_tool.keystore.delivery.arrival import verify_arrival
+    from sros_tool.validity import iso
+
+    folder = folder or keystore_from_environment()
+    wanted, moment = domain_of(domain), moment_of(at)
+    arrival = verify_arrival(folder, now=moment, domain=wanted)
+    if as_json:
+        print_json({**arrival.describe(), "at": iso(moment), "domain": wanted})
+        return 1 if arrival.findings else 0
+    for each in arrival.enclaves:
+        until = f" until {iso(each.until)}" if each.until else ""
+        said = f"loadable in domain {each.domains}{until}" if each.loadable else "NOT LOADABLE"
+        click.echo(f"{each.name}  {said}")
+        for finding in arrival.findings:
+            if finding.enclave == each.name:
+                click.echo(f"  {finding.file}: {finding.text}")
+    for finding in arrival.findings:
+        if not finding.enclave:
+            click.echo(f"{finding.file}: {finding.text}")
+    return 1 if arrival.findings else 0
+
+
+if TYPE_CHECKING:
+    from cryptography import x509
+
+
+@click.command(
+    "create_request",
+    epilog="""\b
+Example:
+  $ sros create_request /arm/camera robot
+  made the key of enclave /arm/camera, which stays in 'robot'
+    its SHA-256 is 6f5bbd292e91c5d0fbf579aa0d036ac044cdd9788c6efdbc730a4b3a2a2809da
+    have 'robot/enclaves/arm/camera/request.pem' signed: sros sign_request
+  $ ssh robot cat robot/enclaves/arm/camera/request.pem |          # all the rest, from home
+      sros sign_request keystore - | ssh robot sros import - robot""",
+)
+@click.argument("name")
+@click.argument("folder", metavar="[DIR]", type=PATH, required=False)
+@click.option("--again", is_flag=True, help="Make the request anew, for the key that is there.")
+@dry_run_option
+def create_request(name: str, folder: Path | None, again: bool, dry_run: bool) -> None:
+    """On a robot: make the key of the enclave NAME in the folder DIR, and a signing request.
+
+    The key never leaves DIR.  Send the request home, where `sros sign_request` answers it; `sros
+    import` puts the answer beside the key.
+    """
+    from sros_tool.keystore.delivery.request import create_request as create
+
+    folder = folder or keystore_from_environment()
+    made = create(folder, name, again=again, dry_run=dry_run)
+    if dry_run:
+        print_plan(folder, made.changes)
+        return
+    if again:
+        click.echo(f"made the request of enclave {name} anew, for the key that is there")
+    else:
+        click.echo(f"made the key of enclave {name}, which stays in '{folder}'")
+    click.echo(f"  its SHA-256 is {made.key}")
+    click.echo(f"  have '{made.file}' signed: sros sign_request")
+
+
+@click.command(
+    "sign_request",
+    epilog="""\b
+Example:
+  $ sros sign_request keystore request.pem -p camera.xml
+  signed the request of enclave /arm/camera for the key 6f5bbd292e91c5d0fbf579aa0d036ac044cdd978...
+    the robot will trust CN=sros identity CA 4f122aed, SHA-256 5fe417aaed47cccd3f4a6b3e8e94db18...
+    and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91a...
+    send 'request.answer.tar.gz' to the robot: sros import request.answer.tar.gz DIR --ca e15ab4...
+  $ sros sign_request keystore keystore/enclaves/arm/camera/request.pem --renew -o camera.tgz""",
+)
+@click.argument("words", metavar="[ROOT] REQUEST", nargs=-1, required=True)
+@click.option(
+    "-p",
+    "--policy-file",
+    type=PATH,
+    help="The policy that states the rights. [default: by the template of the keystore]",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=PATH,
+    metavar="ANSWER",
+    help="Where to write the answer; - is standard output. [default: request.answer.tar.gz]",
+)
+@click.option(
+    "--renew", is_flag=True, help="Answer for an enclave that exists; it keeps its rights."
+)
+@click.option("--force", is_flag=True, help="Replace ANSWER if it exists.")
+@dry_run_option
+def sign_request(
+    words: tuple[str, ...],
+    policy_file: Path | None,
+    output: Path | None,
+    renew: bool,
+    force: bool,
+    dry_run: bool,
+) -> None:
+    """At home: certify the key of the file REQUEST (or -), and sign the enclave's permissions.
+
+    The answer is one .tar.gz for `sros import` on the robot.  It holds no secret: certificate,
+    permissions, governance, the certificates of the CAs, and what was revoked.  The keystore knows
+    the enclave from then on, without its key.  Compare the key's SHA-256 with what the robot says.
+    """
+    from sros_tool.keystore.authorities.authority import load_ca_certificate
+    from sros_tool.keystore.delivery.signing import sign_request as sign
+    from sros_tool.keystore.layout import PERMISSIONS
+    from sros_tool.pki.certificates import digest
+    from sros_tool.policy import read_policy
+    from sros_tool.runtime.environment import domain_from
+
+    root, rest = split_root(words) if len(words) > 1 else (keystore_from_environment(), words)
+    if len(rest) != 1:
+        raise UsageError("sign_request takes a keystore and one request")
+    request = PATH.convert(rest[0], None, None)
+    if output is None:
+        output = STREAM if request == STREAM else Path(request.name).with_suffix(".answer.tar.gz")
+    stream = output == STREAM
+    if stream and not dry_run:
+        refuse_terminal()
+    signed = sign(
+        root,
+        _read(request, "signing request"),
+        now=now(),
+        policy=read_policy(policy_file) if policy_file else None,
+        renew=renew,
+        answer=None if stream else output,
+        force=force,
+        domain=domain_from(os.environ),
+        keyring=keyring(),
+        dry_run=dry_run,
+    )
+    if dry_run:
+        print_plan(root, signed.changes)
+        if not stream:
+            click.echo(f"would {'replace' if output.exists() else 'create'} {output}")
+    else:
+        if stream:
+            write_stdout(signed.archive)
+        word = "renewed" if renew else "signed the request of"
+        click.echo(f"{word} enclave {signed.name} for the key {signed.key}", err=stream)
+        permissions_ca = load_ca_certificate(root, PERMISSIONS)
+        click.echo(f"  the robot will trust {_named(signed.identity_ca)}", err=stream)
+        if permissions_ca != signed.identity_ca:
+            click.echo(f"  and {_named(permissions_ca)}", err=stream)
+        if not stream:
+            click.echo(
+                f"  send '{output}' to the robot: sros import {output.name} DIR --ca "
+                f"{digest(permissions_ca)}"
+            )
+    print_notes(signed.notes)
+
+
+@click.command(
+    "import",
+    epilog="""\b
+Example:
+  $ sros import request.answer.tar.gz robot
+  imported enclave /arm/camera, which can run until 2027-05-20T07:45:12Z
+    it trusts CN=sros identity CA 4f122aed, SHA-256 5fe417aaed47cccd3f4a6b3e8e94db185bfc8e10...
+    and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd9...
+    compare both with what sign_request said, or say --ca: nothing else vouches for them
+  $ sros import request.answer.tar.gz robot --ca e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91...
+  $ sros run robot /arm/camera -- ros2 run camera driver""",
+)
+@click.argument("answer", type=PATH)
+@click.argument("folder", metavar="[DIR]", type=PATH, required=False)
+@click.option("--force", is_flag=True, help="Go back to an older answer, or move to other CAs.")
+@click.option(
+    "--ca",
+    "pin",
+    metavar="FILE|SHA-256",
+    help="Accept it only if this permissions CA has signed it: its certificate, or the SHA-256 "
+    "that sign_request and create_keystore say.",
+)
+@dry_run_option
+def import_verb(
+    answer: Path, folder: Path | None, force: bool, pin: str | None, dry_run: bool
+) -> None:
+    """On a robot: put the file ANSWER (or -) beside the key that waits in DIR, or change nothing.
+
+    All of it is checked first: that the certificate is for this key, the chain, the signatures,
+    the dates, and that the archive holds nothing else.  The first answer tells the robot whom to
+    trust; whoever carries it could send one of his own, unless --ca says whose it has to be.  Later
+    ones have to come from the same CAs.
+    """
+    from sros_tool.keystore.delivery.answer import import_answer
+    from sros_tool.keystore.delivery.arrival import read_pin
+
+    folder = folder or keystore_from_environment()
+    pinned = read_pin(pin) if pin is not None else frozenset[str]()
+    data = _read(answer, "answer")
+    done = import_answer(folder, data, now=now(), pinned=pinned, force=force, dry_run=dry_run)
+    if dry_run:
+        print_plan(folder, done.changes)
+        return
+    if not done.changes:
+        click.echo(f"'{folder}' already holds enclave {done.name} as it is", err=True)
+        return
+    from sros_tool.validity import iso
+
+    click.echo(f"imported enclave {done.name}, which can run until {iso(done.until)}")
+    click.echo(f"  it trusts {_named(done.identity_ca)}")
+    if done.permissions_ca != done.identity_ca:
+        click.echo(f"  and {_named(done.permissions_ca)}")
+    if done.first and not pinned:
+        click.echo(
+            "  compare both with what sign_request said, or say --ca: nothing else vouches for them"
+        )
+
+
+def _read(path: Path, what: str) -> bytes:
+    """The bytes of a file, or of standard input; more than any answer has is refused."""
+    from sros_tool.keystore.delivery.archive import MAX_PACKED
+    from sros_tool.xml import read_bytes
+
+    if path != STREAM:
+        return read_bytes(path, what)
+    data = sys.stdin.buffer.read(MAX_PACKED + 1) if sys.stdin else b""
+    if not data:
+        raise DocumentError(
+            f"the {what} is empty", "Nothing came from standard input.", "See what sends it."
+        )
+    return data
+
+
+def _named(certificate: x509.Certificate) -> str:
+    from sros_tool.pki.certificates import digest, subject_text
+
+    return f"{subject_text(certificate.subject)}, SHA-256 {digest(certificate)}"

@@ -1,0 +1,448 @@
+"""XML as Cyclone DDS 0.10 reads it (ddsrt/src/xmlparser.c).
+
+Names are of ASCII letters, digits, ``_ - :``; comments, processing instructions and ``<!...>`` are
+passed over between any two tokens; an element holds either elements or one text.
+
+Tags may be written in capitals, come in any order, and the last of several counts; blanks around
+texts do not.  Any element or attribute that it does not know makes the document malformed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from typing import TypeVar
+
+from sros_tool.dds.decision.elements import Element, UnreadableError
+from sros_tool.dds.domains import MAX_DOMAIN, DomainRange, DomainSet
+from sros_tool.dds.governance import DATA_PROTECTIONS, DomainRule, Governance, Protection, TopicRule
+from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
+
+BLANKS = " \t\v\r\n"
+_CDATA = "<![CDATA["
+_ROOM = len(_CDATA) - 2  # it looks for more text only where so many characters are left
+_DEEPEST = 200  # of elements within each other; any such document is refused for its names
+_NAME = re.compile("[A-Za-z][A-Za-z0-9_:-]*")
+_PASSED_OVER = re.compile(
+    rf"(?:[{BLANKS}]++|<!--.*?-->|<\?(?:.*?\?>|.*)|<!(?!--|\[CDATA\[)(?:[^>]*>|.*))*+", re.DOTALL
+)
+_QUOTES = {'"': '"', "'": "'", "\xe2\x80\x9c": "\xe2\x80\x9d", "\xe2\x80\x98": "\xe2\x80\x99"}
+_REFERENCE = re.compile("&(.{0,15}?;)?", re.DOTALL)
+_NUMBER = re.compile(rf"#(?:x[{BLANKS}\f]*([+-]?(?:0[xX])?[0-9a-fA-F]+)|[{BLANKS}\f]*([+-]?\d+))")
+_ENTITIES = {"lt": "<", "gt": ">", "amp": "&", "apos": "'", "quot": '"'}
+
+
+def read(xml: bytes) -> Element:
+    """The root of a document; raises `UnreadableError` where Cyclone DDS refuses it.
+
+    A text is without the blanks around it, and decoded as UTF-8, each byte that is none as a
+    surrogate.
+    """
+    return _Reader(xml).root()
+
+
+class _Reader:
+    def __init__(self, xml: bytes) -> None:
+        self._text = xml.decode("latin-1").partition("\0")[0]  # each character stands for a byte
+        self._index = 0
+
+    def root(self) -> Element:
+        root = self._element(0)
+        self._pass_over()
+        if self._index < len(self._text):
+            raise self._error("something stands behind its root")
+        return root
+
+    def _error(self, why: str) -> UnreadableError:
+        line = self._text.count("\n", 0, self._index) + 1
+        return UnreadableError(f"its XML cannot be read, {why} (line {line})")
+
+    def _pass_over(self) -> None:
+        found = _PASSED_OVER.match(self._text, self._index)
+        self._index = found.end() if found else self._index
+        if self._text.startswith("<!--", self._index):
+            raise self._error("a comment is not closed")
+
+    def _take(self, mark: str) -> bool:
+        there = self._text.startswith(mark, self._index)
+        self._index += len(mark) if there else 0
+        return there
+
+    def _name(self) -> str:
+        found = _NAME.match(self._text, self._index)
+        if not found:
+            raise self._error("a name is malformed")
+        self._index = found.end()
+        return found[0]
+
+    def _string(self) -> str:
+        for begin, end in _QUOTES.items():
+            if self._take(begin):
+                stop = self._text.find(end, self._index)
+                if stop < 0:
+                    raise self._error("a quoted text does not end")
+                text = self._text[self._index : stop]
+                self._index = stop + len(end)
+                return self._unescaped(text)
+        raise self._error("an attribute has no value")
+
+    def _element(self, depth: int) -> Element:
+        self._pass_over()
+        if self._text.startswith(_CDATA, self._index) or not self._take("<") or depth > _DEEPEST:
+            raise self._error("an element was expected")
+        element = Element(self._name())
+        self._pass_over()
+        while _NAME.match(self._text, self._index):
+            name = self._name()
+            self._pass_over()
+            if not self._take("="):
+                raise self._error(f"the attribute {name} has no value")
+            self._pass_over()
+            element.attributes[name] = _decoded(self._string())
+            self._pass_over()
+        if self._take("/>"):
+            return element
+        if not self._take(">"):
+            raise self._error(f"<{element.name}> does not end")
+        self._content(element, depth)
+        self._pass_over()
+        closed = self._take("/>") or (self._take("</") and self._name() == element.name)
+        if not closed or not self._take(">"):
+            raise self._error(f"<{element.name}> is not closed")
+        return element
+
+    def _content(self, element: Element, depth: int) -> None:
+        start = self._index
+        if not self._opens():
+            self._index = start
+            if text := self._content_text():
+                element.children.append(text)
+            return
+        while self._opens():
+            element.children.append(self._element(depth + 1))
+
+    def _opens(self) -> bool:
+        """Whether the next token begins an element; raises where it is none at all."""
+        self._pass_over()
+        text, index = self._text, self._index
+        if text[index : index + 1] == "<" and not text.startswith(_CDATA, index):
+            closes = text[index + 1 : index + 2] == "/"
+            if not _NAME.match(text, index + 1 + closes):
+                raise self._error("a name is malformed")
+            return not closes
+        if text.startswith(tuple(_QUOTES), index):  # it reads on to the other quote
+            self._string()
+            self._index = index
+        return False
+
+    def _content_text(self) -> str:
+        text, done, pending = self._text, "", ""
+        while True:
+            stop = text.find("<", self._index)
+            stop = len(text) if stop < 0 else stop
+            pending += text[self._index : stop]
+            self._index = stop
+            if self._take(_CDATA):
+                stop = text.find("]]>", self._index)
+                if stop < 0:
+                    raise self._error("a CDATA is not closed")
+                if stop > self._index:
+                    done += self._unescaped(pending) + text[self._index : stop]
+                    pending = ""
+                self._index = stop + len("]]>")
+            if text[self._index : self._index + 1] == "<":
+                if not text.startswith("<!--", self._index):
+                    break
+                stop = text.find("-->", self._index + len("<!--"))
+                if stop < 0:
+                    raise self._error("a comment is not closed")
+                self._index = stop + len("-->")
+            if len(text) - self._index < _ROOM:
+                break
+        content = (done + self._unescaped(pending)).strip(BLANKS)
+        return _decoded(content.partition("\0")[0])
+
+    def _unescaped(self, text: str) -> str:
+        return _REFERENCE.sub(self._referred, text) if "&" in text else text
+
+    def _referred(self, found: re.Match[str]) -> str:
+        word = (found[1] or "").removesuffix(";")
+        if word in _ENTITIES:
+            return _ENTITIES[word]
+        number = _NUMBER.fullmatch(word)
+        if number:
+            code = (int(number[1], 16) if number[1] else int(number[2])) % 2**32
+            if code <= 0x10FFFF:
+                return chr(code).encode("utf-8", "surrogatepass").decode("latin-1")
+        raise self._error(f"&{word} is no reference to a character")
+
+
+def _decoded(text: str) -> str:
+    return text if text.isascii() else text.encode("latin-1").decode("utf-8", "surrogateescape")
+
+
+Read = TypeVar("Read")
+_SCHEMA_ATTRIBUTES = ("xmlns:xsi", "xsi:nonamespaceschemalocation")
+_IGNORED = ("relay", "value", "name", "tag", "data_tags")
+_NOTHING = "["
+"""An expression that nothing matches: a set that does not end."""
+_INTEGER = re.compile(r"[+-]?(?:0[xX][0-9a-fA-F]+|0[0-7]*|[1-9]\d*)\Z", re.ASCII)
+
+# What may stand in what; without an entry, only text may.
+_DOMAINS = {"domains": ("id", "id_range"), "id_range": ("min", "max")}
+_DOMAIN_FLAGS = ("allow_unauthenticated_participants", "enable_join_access_control")
+_DOMAIN_KINDS = (
+    "discovery_protection_kind",
+    "liveliness_protection_kind",
+    "rtps_protection_kind",
+)
+_TOPIC_FLAGS = (
+    "enable_discovery_protection",
+    "enable_liveliness_protection",
+    "enable_read_access_control",
+    "enable_write_access_control",
+)
+_TOPIC_KINDS = ("metadata_protection_kind", "data_protection_kind")
+_GOVERNANCE = _DOMAINS | {
+    "dds": ("domain_access_rules",),
+    "domain_access_rules": ("domain_rule",),
+    "domain_rule": ("domains", "topic_access_rules", *_DOMAIN_FLAGS, *_DOMAIN_KINDS),
+    "topic_access_rules": ("topic_rule",),
+    "topic_rule": ("topic_expression", *_TOPIC_FLAGS, *_TOPIC_KINDS),
+}
+_RULE = ("domains", "publish", "subscribe")
+_PERMISSIONS = _DOMAINS | {
+    "dds": ("permissions",),
+    "permissions": ("grant",),
+    "grant": ("subject_name", "validity", "allow_rule", "deny_rule", "default"),
+    "validity": ("not_before", "not_after"),
+    "allow_rule": _RULE,
+    "deny_rule": _RULE,
+    "publish": ("topics", "partitions"),
+    "subscribe": ("topics", "partitions"),
+    "topics": ("topic",),
+    "partitions": ("partition",),
+}
+
+
+def read_governance(xml: bytes) -> Governance:
+    """Its governance; raises `UnreadableError`."""
+    dds = _Node.root(xml, _GOVERNANCE, ())
+    parent = dds.last("domain_access_rules")
+    rules = parent.all("domain_rule") if parent else []
+    if not rules:
+        raise UnreadableError("it has no <domain_rule>")
+    return Governance(tuple(_domain_rule(each) for each in rules))
+
+
+def read_permissions(xml: bytes) -> Permissions:
+    """Its permissions; raises `UnreadableError`.
+
+    A ``<topic>`` without text is "", a rule without domains has a range without ends, and a
+    ``<default>`` may be empty: over each it crashes once it comes to it.
+    """
+    dds = _Node.root(xml, _PERMISSIONS, _IGNORED)
+    parent = dds.last("permissions")
+    grants = parent.all("grant") if parent else []
+    if not grants:
+        raise UnreadableError("it has no <grant>")
+    return Permissions(tuple(_grant(each) for each in grants))
+
+
+class _Node:
+    """An element that may stand where it does, with the children that count."""
+
+    def __init__(
+        self,
+        element: Element,
+        grammar: Mapping[str, tuple[str, ...]],
+        skipped: tuple[str, ...],
+    ) -> None:
+        self.tag = element.name.lower()
+        self.attribute = element.attributes.get("name")
+        self.text = "".join(each for each in element.children if isinstance(each, str))
+        _check_attributes(element, self.tag)
+        if self.text and self.tag in grammar:
+            raise UnreadableError(f"<{self.tag}> holds text")
+        self._children = []
+        for child in element.elements:
+            tag = child.name.lower()
+            if tag in skipped:
+                _check_skipped(child)
+            elif tag in grammar.get(self.tag, ()):
+                self._children.append(_Node(child, grammar, skipped))
+            else:
+                raise UnreadableError(f"<{self.tag}> holds <{child.name}>")
+
+    @classmethod
+    def root(
+        cls, xml: bytes, grammar: Mapping[str, tuple[str, ...]], skipped: tuple[str, ...]
+    ) -> _Node:
+        if b"\0" in xml:
+            raise UnreadableError("it holds a NUL, at which the signed message ends")
+        root = read(xml)
+        if root.name.lower() != "dds":
+            raise UnreadableError("its root is not <dds>")
+        return cls(root, grammar, skipped)
+
+    def all(self, *tags: str) -> list[_Node]:
+        return [child for child in self._children if child.tag in tags]
+
+    def last(self, tag: str) -> _Node | None:
+        found = self.all(tag)
+        return found[-1] if found else None
+
+
+def _check_attributes(element: Element, tag: str) -> None:
+    for name in element.attributes:
+        if name.lower() not in _SCHEMA_ATTRIBUTES and (name, tag) != ("name", "grant"):
+            raise UnreadableError(f"<{tag}> has the attribute {name!r}")
+
+
+def _check_skipped(element: Element) -> None:
+    _check_attributes(element, "")
+    for each in element.elements:
+        _check_skipped(each)
+
+
+# ── values ─────────────────────────────────────────────────────────────────────────────────
+
+
+def _number(node: _Node) -> int:
+    if not node.text:
+        return 0
+    if not _INTEGER.match(node.text):
+        raise UnreadableError(f"<{node.tag}> holds {node.text!r}, which is no number")
+    sign, digits = ("-", node.text[1:]) if node.text[0] == "-" else ("", node.text.lstrip("+"))
+    octal = len(digits) > 1 and digits[0] == "0" and digits[1] not in "xX"
+    number = int(sign + digits, 8 if octal else 0)
+    if not -(2**63) <= number < 2**63:
+        raise UnreadableError(f"<{node.tag}> holds {number}, which is far too large")
+    number = (number + 2**31) % 2**32 - 2**31  # it keeps 32 bits, and looks at the range then
+    if not 0 <= number <= MAX_DOMAIN:
+        raise UnreadableError(f"<{node.tag}> holds {number}, which is above {MAX_DOMAIN}")
+    return number
+
+
+def _flag(node: _Node) -> bool:
+    word = node.text.lower()
+    if word not in ("", "true", "false", "0", "1"):
+        raise UnreadableError(f"<{node.tag}> holds {node.text!r} instead of true or false")
+    return word in ("true", "1")
+
+
+def _kind(node: _Node) -> Protection:
+    known: tuple[str, ...] = tuple(Protection)
+    if node.tag == "data_protection_kind":
+        known = DATA_PROTECTIONS
+    if node.text and node.text not in known:
+        raise UnreadableError(
+            f"<{node.tag}> holds {node.text!r}, which is no protection kind there"
+        )
+    return Protection(node.text) if node.text else Protection.NONE
+
+
+def _domains(node: _Node | None) -> DomainSet:
+    if node is None:
+        return DomainSet((DomainRange(None, None),))
+    ranges = []
+    for child in node.all("id", "id_range"):
+        if child.tag == "id":
+            number = _number(child)
+            ranges.append(DomainRange(number, number))
+            continue
+        ends = [child.last("min"), child.last("max")]
+        first, last = (None if end is None else _number(end) for end in ends)
+        ranges.append(DomainRange(first, last))
+    return DomainSet(tuple(ranges))
+
+
+# ── governance ─────────────────────────────────────────────────────────────────────────────
+
+
+def _domain_rule(node: _Node) -> DomainRule:
+    domains, topics = node.last("domains"), node.last("topic_access_rules")
+    if domains is None:
+        raise UnreadableError("a <domain_rule> lacks its <domains>")
+    read = _domains(domains)
+    if not read.ranges:
+        raise UnreadableError("<domains> is empty")
+    for part in read.ranges:
+        if part.first is None:
+            raise UnreadableError("an <id_range> lacks its <min>")
+        if part.last is not None and part.last < part.first:
+            raise UnreadableError("an <id_range> ends before it begins")
+    rules = topics.all("topic_rule") if topics else []
+    if not rules:
+        raise UnreadableError("a <domain_rule> has no topic rules")
+    return DomainRule(
+        domains=read,
+        allow_unauthenticated_participants=_field(node, _DOMAIN_FLAGS[0], _flag),
+        enable_join_access_control=_field(node, _DOMAIN_FLAGS[1], _flag),
+        discovery_protection_kind=_field(node, _DOMAIN_KINDS[0], _kind),
+        liveliness_protection_kind=_field(node, _DOMAIN_KINDS[1], _kind),
+        rtps_protection_kind=_field(node, _DOMAIN_KINDS[2], _kind),
+        topic_access_rules=tuple(_topic_rule(each) for each in rules),
+    )
+
+
+def _topic_rule(node: _Node) -> TopicRule:
+    expression = node.last("topic_expression")
+    return TopicRule(
+        topic_expression=expression.text if expression else "",
+        enable_discovery_protection=_field(node, _TOPIC_FLAGS[0], _flag),
+        enable_liveliness_protection=_field(node, _TOPIC_FLAGS[1], _flag),
+        enable_read_access_control=_field(node, _TOPIC_FLAGS[2], _flag),
+        enable_write_access_control=_field(node, _TOPIC_FLAGS[3], _flag),
+        metadata_protection_kind=_field(node, _TOPIC_KINDS[0], _kind),
+        data_protection_kind=_field(node, _TOPIC_KINDS[1], _kind),
+    )
+
+
+def _field(node: _Node, name: str, read: Callable[[_Node], Read]) -> Read:
+    child = node.last(name)
+    if child is None:
+        raise UnreadableError(f"a <{node.tag}> lacks its <{name}>")
+    return read(child)
+
+
+# ── permissions ────────────────────────────────────────────────────────────────────────────
+
+
+def _grant(node: _Node) -> Grant:
+    subject, validity = node.last("subject_name"), node.last("validity")
+    begin = validity.last("not_before") if validity else None
+    end = validity.last("not_after") if validity else None
+    if not (subject and subject.text and begin and begin.text and end and end.text):
+        raise UnreadableError("a <grant> lacks its <subject_name> or its <validity>")
+    rules = tuple(_rule(each) for each in node.all("allow_rule", "deny_rule"))
+    default = node.last("default")
+    word = None if default is None else default.text
+    return Grant(
+        name=node.attribute or "",
+        subject=subject.text,
+        not_before=begin.text,
+        not_after=end.text,
+        rules=rules,
+        default_allow=word == "ALLOW",
+        default_empty=word == "",
+    )
+
+
+def _rule(node: _Node) -> Rule:
+    publish, subscribe = (
+        tuple(_criteria(each) for each in node.all(verb)) for verb in ("publish", "subscribe")
+    )
+    allow = node.tag == "allow_rule"
+    return Rule(allow, _domains(node.last("domains")), publish, subscribe)
+
+
+def _criteria(node: _Node) -> Criteria:
+    topics, partitions = node.last("topics"), node.last("partitions")
+    return Criteria(
+        tuple(each.text for each in topics.all("topic")) if topics else (),
+        # A list of no partitions is not the default one: nothing lies in it.
+        tuple(each.text for each in partitions.all("partition")) or (_NOTHING,)
+        if partitions
+        else (),
+    )

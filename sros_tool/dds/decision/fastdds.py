@@ -1,0 +1,451 @@
+"""XML as TinyXML-2 9 reads it, the parser of Fast DDS: it forgives much that XML forbids.
+
+It knows bytes, not encodings, and neither namespaces nor entities of a document: ``--`` in a
+comment, a lone ``&``, control characters, ``]]>`` in a text and a second root are all taken.
+
+The order of elements is compulsory, texts keep their blanks, and words are written in one way.
+What stands behind the last element that it looks for goes unread.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import TypeVar
+
+from sros_tool.dds.decision.answers import Outcome
+from sros_tool.dds.decision.elements import Element, Mark, UnreadableError
+from sros_tool.dds.domains import DomainRange, DomainSet
+from sros_tool.dds.governance import DATA_PROTECTIONS, DomainRule, Governance, Protection, TopicRule
+from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
+
+_BLANKS = " \t\n\v\f\r"
+_MARK = "\xef\xbb\xbf"
+_DEEPEST = 99  # elements within each other
+_NAME = "[A-Za-z_:\x80-\xff][A-Za-z0-9_:.\x80-\xff-]*+"
+_VALUE = "(?:\"[^\"]*\"|'[^']*')"
+_ATTRIBUTE = f"({_NAME})[{_BLANKS}]*=[{_BLANKS}]*({_VALUE})"
+_TAG = re.compile(f"<[{_BLANKS}]*(/?)({_NAME})((?:[{_BLANKS}]*{_ATTRIBUTE})*+)[{_BLANKS}]*(/?)>")
+_ATTRIBUTES = re.compile(_ATTRIBUTE)
+_TEXT = re.compile(f"[{_BLANKS}]*([^<]*)<")
+_LINE_END = re.compile("\r\n?|\n\r?")
+_SPECIAL = (("<?", "?>"), ("<!--", "-->"), ("<![CDATA[", "]]>"), ("<!", ">"))
+_ENTITIES = {"quot": '"', "amp": "&", "apos": "'", "lt": "<", "gt": ">"}
+_REFERENCE = re.compile("&(?:#x?([^;]*)|(quot|amp|apos|lt|gt));")
+
+
+def read(xml: bytes) -> Element:
+    """The first element of a document; raises `UnreadableError` where TinyXML-2 refuses it.
+
+    A text is decoded as UTF-8, each byte that is none as a surrogate.
+    """
+    return _Reader(xml).root()
+
+
+class _Reader:
+    def __init__(self, xml: bytes) -> None:
+        # Signed documents have these line ends; each character stands for a byte.
+        canonical = xml.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n").decode("latin-1")
+        self._text = canonical.partition("\0")[0].lstrip(_BLANKS).removeprefix(_MARK)
+        self._index = 0
+
+    def root(self) -> Element:
+        document = Element("")
+        if not self._text:
+            raise self._error("it is empty")
+        self._read_into(document)
+        if not document.elements:
+            raise self._error("it has no element")
+        return document.elements[0]
+
+    def _error(self, why: str) -> UnreadableError:
+        line = self._text.count("\r\n", 0, self._index) + 1
+        return UnreadableError(f"its XML cannot be read, {why} (line {line})")
+
+    def _read_into(self, document: Element) -> None:
+        text = self._text
+        stack = [document]
+        while found := _TEXT.match(text, self._index):
+            children = stack[-1].children
+            if found[1]:
+                self._need_more(found.end())
+                children.append(_plain(found[0][:-1]))
+            self._index = found.end() - 1
+            if text[found.end() : found.end() + 1] in ("?", "!"):
+                self._take_special(stack)
+                continue
+            tag = _TAG.match(text, self._index)
+            if not tag:
+                raise self._error("a tag is malformed")
+            self._index = tag.end()
+            closing, name, closed = tag[1], tag[2], tag[6]
+            if closing and not closed:
+                if len(stack) == 1:
+                    return  # what stands behind it goes unread
+                if stack.pop().name != _decoded(name):
+                    raise self._error(f"</{name}> closes another element")
+                continue
+            element = Element(_decoded(name), self._attributes(tag[3]) if tag[3] else {})
+            children.append(element)
+            if not closed:
+                stack.append(element)
+                if len(stack) > _DEEPEST:
+                    raise self._error("its elements are nested too deeply")
+        if len(stack) > 1:
+            raise self._error(f"<{stack[-1].name}> is not closed")
+        if text[self._index :].strip(_BLANKS):
+            raise self._error("it ends with text")
+
+    def _need_more(self, index: int) -> None:
+        if index >= len(self._text):
+            raise self._error("it ends with <")
+
+    def _take_special(self, stack: list[Element]) -> None:
+        """A declaration, comment, CDATA or anything else that begins with ``<?`` or ``<!``."""
+        text, children = self._text, stack[-1].children
+        begin, end = next(each for each in _SPECIAL if text.startswith(each[0], self._index))
+        start = self._index + len(begin)
+        stop = text.find(end, start)
+        if stop < 0:
+            raise self._error(f"{begin} is not closed")
+        self._index = stop + len(end)
+        if begin == "<?":
+            if len(stack) > 1 or any(each is not Mark.DECLARATION for each in children):
+                raise self._error("a processing instruction stands behind the prolog")
+            children.append(Mark.DECLARATION)
+        elif begin == "<![CDATA[":
+            children.append(_decoded(_LINE_END.sub("\n", text[start:stop])))
+        else:
+            children.append(Mark.COMMENT if begin == "<!--" else Mark.OTHER)
+
+    def _attributes(self, text: str) -> dict[str, str]:
+        found = {}
+        for name, value in _ATTRIBUTES.findall(text):
+            if name in found:
+                raise self._error(f"the attribute {name} stands there twice")
+            found[name] = _plain(value[1:-1])
+        return {_decoded(name): value for name, value in found.items()}
+
+
+def _decoded(text: str) -> str:
+    return text if text.isascii() else text.encode("latin-1").decode("utf-8", "surrogateescape")
+
+
+def _plain(text: str) -> str:
+    """The text with its line ends and references resolved, up to a NUL."""
+    if "&" not in text:
+        return _decoded(_LINE_END.sub("\n", text) if "\r" in text or "\n" in text else text)
+    # It writes into the text that it reads: of a lone "&" nothing is written, so that the
+    # character stays that stood there before.
+    written = list(text)
+    place = index = 0
+    while index < len(text):
+        taken, into = text[index], text[index]
+        if taken in "\r\n":
+            taken, into = _LINE_END.match(text, index)[0], "\n"  # type: ignore[index]
+        elif taken == "&":
+            found = _REFERENCE.match(text, index)
+            character = _referred(found) if found else None
+            if found and character is not None:
+                taken, into = found[0], character
+            elif text[index + 1 :] == "#":
+                into = ""
+            elif text[index + 1 : index + 2] != "#":
+                into = written[place]
+        written[place : place + len(into)] = into
+        place += len(into)
+        index += len(taken)
+    return _decoded("".join(written[:place]).partition("\0")[0])
+
+
+def _referred(found: re.Match[str]) -> str | None:
+    """The bytes of a reference; None where it is malformed."""
+    if found[2]:
+        return _ENTITIES[found[2]]
+    # It reads the digits from the last one on, back to the mark before them.
+    base, mark = (16, "x") if found[0][2] == "x" else (10, "#")
+    digits = found[1].rpartition(mark)[2]
+    if not re.fullmatch("[0-9a-fA-F]*" if base == 16 else "[0-9]*", digits):
+        return None
+    return _utf8(int(digits or "0", base))
+
+
+def _utf8(number: int) -> str:
+    if number < 0x80:
+        return chr(number)
+    for length, limit, head in ((2, 0x800, 0xC0), (3, 0x10000, 0xE0), (4, 0x200000, 0xF0)):
+        if number < limit:
+            rest = [0x80 | number >> 6 * place & 0x3F for place in range(length - 1)]
+            return "".join(map(chr, [head | number >> 6 * (length - 1), *reversed(rest)]))
+    return ""
+
+
+_INTEGER = re.compile(r"\s*(?:0[xX]([0-9a-fA-F]+)|([+-]?\d+))", re.ASCII)
+_TRUE, _FALSE = ("true", "True", "TRUE"), ("false", "False", "FALSE")
+Read = TypeVar("Read")
+
+
+def read_governance(xml: bytes) -> Governance:
+    """Its governance; raises `UnreadableError`."""
+    root = read(xml)
+    parent = _first(root, "domain_access_rules")
+    if root.children[-1] is not parent:
+        # A comment counts as well.
+        raise UnreadableError("something stands behind <domain_access_rules>")
+    return Governance(tuple(_domain_rule(each) for each in _all(parent, "domain_rule")))
+
+
+def read_permissions(xml: bytes) -> Permissions:
+    """Its permissions; raises `UnreadableError`."""
+    return Permissions(
+        tuple(_grant(each) for each in _all(_first(read(xml), "permissions"), "grant"))
+    )
+
+
+def _first(root: Element, name: str) -> Element:
+    if root.name != "dds":
+        raise UnreadableError("its root is not <dds>")
+    children = root.elements
+    if not children:
+        outcome = Outcome.CRASHES if name == "permissions" else Outcome.REFUSED
+        raise UnreadableError("<dds> is empty", outcome)
+    if children[0].name != name:
+        raise UnreadableError(f"<dds> does not begin with <{name}>")
+    return children[0]
+
+
+def _all(parent: Element, name: str) -> list[Element]:
+    """The children, all of one name, at least one."""
+    children = parent.elements
+    if not children or any(child.name != name for child in children):
+        raise UnreadableError(f"<{parent.name}> needs <{name}> elements and nothing else")
+    return children
+
+
+class _Sequence:
+    """The child elements of one, taken in order."""
+
+    def __init__(self, element: Element) -> None:
+        self._name = element.name
+        self._children = element.elements
+        self._index = 0
+
+    def next(self, name: str) -> Element:
+        """The next child, which must have this name."""
+        if self._index == len(self._children) or self._children[self._index].name != name:
+            raise UnreadableError(f"<{self._name}> lacks <{name}> in its place")
+        self._index += 1
+        return self._children[self._index - 1]
+
+    def rest(self) -> list[Element]:
+        """The children not taken yet."""
+        return self._children[self._index :]
+
+    def while_named(self, *names: str) -> list[Element]:
+        """The children up to the first that has none of these names."""
+        found = []
+        while self._index < len(self._children):
+            if self._children[self._index].name not in names:
+                break
+            found.append(self._children[self._index])
+            self._index += 1
+        return found
+
+    def end(self) -> None:
+        """Nothing may follow."""
+        if self.rest():
+            raise UnreadableError(f"<{self._name}> holds too much: <{self.rest()[0].name}>")
+
+
+# ── texts ──────────────────────────────────────────────────────────────────────────────────
+
+
+def _text(element: Element) -> str | None:
+    """The text that stands first, comments aside; None if something else does, or nothing."""
+    for child in element.children:
+        if child is not Mark.COMMENT:
+            return child if isinstance(child, str) else None
+    return None
+
+
+def _required(element: Element) -> str:
+    text = _text(element)
+    if text is None:
+        raise UnreadableError(f"<{element.name}> is empty")
+    return text
+
+
+def _first_text(element: Element) -> str:
+    """The text of a number or a flag, before which not even a comment may stand."""
+    first = element.children[0] if element.children else None
+    if not isinstance(first, str):
+        raise UnreadableError(f"<{element.name}> does not begin with its value")
+    return first
+
+
+def _number(element: Element) -> int:
+    found = _INTEGER.match(_first_text(element))
+    if not found:
+        raise UnreadableError(f"<{element.name}> holds no number")
+    return (int(found[1], 16) if found[1] else int(found[2])) % 2**32
+
+
+def _flag(element: Element) -> bool:
+    text = _first_text(element)
+    if found := _INTEGER.match(text):
+        return int(found[1], 16) != 0 if found[1] else int(found[2]) != 0
+    if text not in _TRUE + _FALSE:
+        raise UnreadableError(f"<{element.name}> holds {text!r} instead of true or false")
+    return text in _TRUE
+
+
+def _kind(element: Element) -> Protection:
+    text = _required(element)
+    if text not in list(Protection):
+        raise UnreadableError(f"<{element.name}> holds {text!r}, which is no protection kind")
+    return Protection(text)
+
+
+def _data_kind(element: Element) -> Protection:
+    kind = _kind(element)
+    if kind not in DATA_PROTECTIONS:
+        raise UnreadableError(f"<{element.name}> holds {kind}, which is for metadata only")
+    return kind
+
+
+def _domains(element: Element) -> DomainSet:
+    ranges = []
+    for child in element.elements:
+        match child.name:
+            case "id":
+                number = _number(child)
+                ranges.append(DomainRange(number, number))
+            case "id_range":
+                ranges.append(_range(child))
+            case other:
+                raise UnreadableError(f"<domains> holds <{other}>")
+    if not ranges:
+        raise UnreadableError("<domains> is empty")
+    return DomainSet(tuple(ranges))
+
+
+def _range(element: Element) -> DomainRange:
+    ends = element.elements
+    if ends and ends[0].name == "max":
+        return DomainRange(None, _number(ends[0]))
+    if not ends or ends[0].name != "min":
+        raise UnreadableError("<id_range> begins with neither <min> nor <max>")
+    first = _number(ends[0])
+    bounded = len(ends) > 1 and ends[1].name == "max"
+    return DomainRange(first, _number(ends[1]) if bounded else None)
+
+
+# ── governance ─────────────────────────────────────────────────────────────────────────────
+
+
+def _domain_rule(element: Element) -> DomainRule:
+    take = _Sequence(element)
+
+    def field(name: str, read: Callable[[Element], Read]) -> Read:
+        return read(take.next(name))
+
+    rule = DomainRule(
+        domains=field("domains", _domains),
+        allow_unauthenticated_participants=field("allow_unauthenticated_participants", _flag),
+        enable_join_access_control=field("enable_join_access_control", _flag),
+        discovery_protection_kind=field("discovery_protection_kind", _kind),
+        liveliness_protection_kind=field("liveliness_protection_kind", _kind),
+        rtps_protection_kind=field("rtps_protection_kind", _kind),
+        topic_access_rules=field(
+            "topic_access_rules", lambda each: tuple(map(_topic_rule, _all(each, "topic_rule")))
+        ),
+    )
+    take.end()
+    return rule
+
+
+def _topic_rule(element: Element) -> TopicRule:
+    take = _Sequence(element)
+    expression = _text(take.next("topic_expression"))
+    if expression is None:
+        raise UnreadableError("<topic_expression> is empty", Outcome.CRASHES)
+
+    def field(name: str, read: Callable[[Element], Read]) -> Read:
+        return read(take.next(name))
+
+    rule = TopicRule(
+        topic_expression=expression,
+        enable_discovery_protection=field("enable_discovery_protection", _flag),
+        enable_liveliness_protection=field("enable_liveliness_protection", _flag),
+        enable_read_access_control=field("enable_read_access_control", _flag),
+        enable_write_access_control=field("enable_write_access_control", _flag),
+        metadata_protection_kind=field("metadata_protection_kind", _kind),
+        data_protection_kind=field("data_protection_kind", _data_kind),
+    )
+    take.end()
+    return rule
+
+
+# ── permissions ────────────────────────────────────────────────────────────────────────────
+
+
+def _grant(element: Element) -> Grant:
+    name = element.attributes.get("name")
+    if name is None:
+        raise UnreadableError("a <grant> has no name")
+    take = _Sequence(element)
+    subject = _required(take.next("subject_name"))
+    not_before, not_after = _validity(take.next("validity"))
+    rules = tuple(_rule(each) for each in take.while_named("allow_rule", "deny_rule"))
+    default = _required(take.next("default"))
+    if default not in ("ALLOW", "DENY"):
+        raise UnreadableError(f"<default> holds {default!r}")
+    return Grant(name, subject, not_before, not_after, rules, default == "ALLOW")
+
+
+def _validity(element: Element) -> tuple[str, str]:
+    take = _Sequence(element)
+    begin = _required(take.next("not_before"))
+    end = _text(take.next("not_after"))
+    if end is None:
+        raise UnreadableError("<not_after> is empty", Outcome.CRASHES)
+    return begin, end
+
+
+def _rule(element: Element) -> Rule:
+    take = _Sequence(element)
+    domains = _domains(take.next("domains"))
+    verbs: dict[str, list[Criteria]] = {"publish": [], "subscribe": [], "relay": []}
+    for child in take.while_named(*verbs):
+        verbs[child.name].append(_criteria(child))
+    take.end()
+    return Rule(
+        element.name == "allow_rule",
+        domains,
+        tuple(verbs["publish"]),
+        tuple(verbs["subscribe"]),
+        tuple(verbs["relay"]),
+    )
+
+
+def _criteria(element: Element) -> Criteria:
+    topics: list[str] = []
+    partitions: list[str] = []
+    for child in element.elements:
+        match child.name:
+            case "topics":
+                topics += [_required(each) for each in _all(child, "topic")]
+            case "partitions":
+                partitions += [_partition(each) for each in _all(child, "partition")]
+            case "data_tags":
+                pass
+            case other:
+                raise UnreadableError(f"<{element.name}> holds <{other}>")
+    return Criteria(tuple(topics), tuple(partitions))
+
+
+def _partition(element: Element) -> str:
+    text = _text(element)
+    if text is None and element.children:
+        raise UnreadableError("<partition> holds something else than text")
+    return text or ""

@@ -1,0 +1,1 @@
+"""The nodes of the demo: rclpy and Cyclone DDS."""

@@ -1,0 +1,341 @@
+"""What a Cyclone DDS node does in each role; each function makes its endpoints, then runs.
+
+Services and actions speak on the DDS topics that rmw_cyclonedds would use (rq/...Request,
+rr/...Reply, rt/..._action/...), in strings: names and rights are those of ROS 2, the type is not.
+A request is "CLIENT NUMBER ARGUMENTS"; its reply begins with the same two words.
+
+The nodes read the same environment as a ROS 2 node and speak on the same DDS topics with the same
+type, so that rclpy nodes hear them, and a launcher need not know which kind it starts.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import sys
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from types import FrameType
+
+from sros_tool.demo.nodes.options import (
+    NodeOptions,
+    fibonacci,
+    operands,
+    option_parser,
+    options_of,
+    split_ros_args,
+)
+from sros_tool.errors import SrosError
+from sros_tool.runtime.cyclone import Participant, Reader, SecurityRefusedError, Writer
+from sros_tool.runtime.events import EventWriter, Kind, Stage
+from sros_tool.runtime.rcl_security import choose_loadable, domain_of
+
+_LISTEN_SECONDS = 0.02
+_ORDER = 5
+
+Ready = Callable[[], None]
+"""Called when all endpoints are there."""
+
+
+class Talker:
+    """Says its text and a number, again and again."""
+
+    def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
+        self._writer = participant.writer(dds_topic(options.topic))
+        self._options, self._events = options, events
+        self._sent = 0
+        self._due = time.monotonic() + options.period
+
+    def step(self) -> None:
+        """Speak if it is time."""
+        if time.monotonic() < self._due:
+            return
+        self._due += self._options.period
+        self._sent += 1
+        text = f"{self._options.text}: {self._sent}"
+        self._writer.write(text)
+        self._events.report(Kind.SENT, text, count=self._sent)
+
+
+class Listener:
+    """Reports what it hears."""
+
+    def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
+        self._reader = participant.reader(dds_topic(options.topic))
+        self._events = events
+        self._heard = 0
+
+    def step(self) -> None:
+        """Report what has come."""
+        for text in self._reader.take():
+            self._heard += 1
+            self._events.report(Kind.HEARD, text, count=self._heard)
+
+
+class Observer:
+    """Counts the publishers of topics."""
+
+    def __init__(
+        self,
+        participant: Participant,
+        options: NodeOptions,
+        events: EventWriter,
+        also: Sequence[str] = (),
+    ) -> None:
+        self._participant, self._options, self._events = participant, options, events
+        self._topics = [options.topic, *also]
+        self._due = time.monotonic()
+
+    def step(self) -> None:
+        """Look if it is time."""
+        if time.monotonic() < self._due:
+            return
+        self._due += self._options.period
+        found = [publication.topic for publication in self._participant.publications()]
+        counts = {topic: found.count(dds_topic(topic)) for topic in self._topics}
+        self._events.report(Kind.SEEN, " ".join(sorted(set(found))), publishers=counts)
+
+
+class Service:
+    """One side of a service: what it sends on one topic, and takes from another."""
+
+    def __init__(self, participant: Participant, name: str, *, server: bool) -> None:
+        request, reply = f"rq{name}Request", f"rr{name}Reply"
+        self._reader: Reader = participant.reader(request if server else reply)
+        self._writer: Writer = participant.writer(reply if server else request)
+
+    def take(self) -> list[list[str]]:
+        """The requests or replies that have come, each as its client, its number, and the rest."""
+        return [text.split(" ", 2) for text in self._reader.take()]
+
+    def send(self, client: str, number: str, text: str) -> None:
+        """Send a request or reply."""
+        self._writer.write(f"{client} {number} {text}")
+
+
+class Server:
+    """Adds two numbers for whoever asks."""
+
+    def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
+        self._service = Service(participant, options.service, server=True)
+        self._options, self._events = options, events
+        self._answered = 0
+
+    def step(self) -> None:
+        """Answer what was asked."""
+        for client, number, question in self._service.take():
+            first, second = map(int, question.split(" + "))
+            self._answered += 1
+            answer = f"{self._options.text}: {question} = {first + second}"
+            self._service.send(client, number, answer)
+            self._events.report(Kind.SENT, answer, count=self._answered)
+
+
+class Client:
+    """Asks for sums, again and again, and reports the right answers."""
+
+    def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
+        self._service = Service(participant, options.service, server=False)
+        self._options, self._events = options, events
+        self._name = uuid.uuid4().hex
+        self._asked = self._right = 0
+        self._due = time.monotonic() + options.period
+
+    def step(self) -> None:
+        """Ask if it is time, and check what was answered."""
+        if time.monotonic() >= self._due:
+            self._due += self._options.period
+            self._asked += 1
+            first, second = operands(self._asked)
+            self._service.send(self._name, str(self._asked), f"{first} + {second}")
+            self._events.report(Kind.SENT, f"{first} + {second}", count=self._asked)
+        for client, number, answer in self._service.take():
+            first, second = operands(int(number))
+            if client == self._name and answer.endswith(f": {first} + {second} = {first + second}"):
+                self._right += 1
+                self._events.report(Kind.HEARD, answer, count=self._right)
+
+
+class ActionServer:
+    """Counts Fibonacci's numbers, says how far it is, and tells the result to whoever fetches it.
+
+    A goal is "CLIENT NUMBER ORDER"; feedback and status are "CLIENT NUMBER WHAT".
+    """
+
+    def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
+        action = f"{options.topic}/_action"
+        self._goals = Service(participant, f"{action}/send_goal", server=True)
+        self._cancels = Service(participant, f"{action}/cancel_goal", server=True)
+        self._results = Service(participant, f"{action}/get_result", server=True)
+        self._feedback = participant.writer(f"rt{action}/feedback")
+        self._status = participant.writer(f"rt{action}/status")
+        self._options, self._events = options, events
+        self._orders: dict[tuple[str, str], int] = {}
+        self._done = 0
+
+    def step(self) -> None:
+        """Accept goals, work on them, and hand out results."""
+        for client, number, order in self._goals.take():
+            self._orders[client, number] = int(order)
+            self._goals.send(client, number, "accepted")
+            for length in range(2, int(order) + 1):
+                self._feedback.write(f"{client} {number} {fibonacci(length)}")
+            self._status.write(f"{client} {number} succeeded")
+        for client, number, _ in self._results.take():
+            result = fibonacci(self._orders.pop((client, number), 0))
+            self._done += 1
+            answer = f"{self._options.text}: {result}"
+            self._results.send(client, number, answer)
+            self._events.report(Kind.SENT, answer, count=self._done)
+        self._cancels.take()
+
+
+class ActionClient:
+    """Sends goals, again and again; reports a result that is right and whose feedback came."""
+
+    def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
+        action = f"{options.topic}/_action"
+        self._goals = Service(participant, f"{action}/send_goal", server=False)
+        self._cancels = Service(participant, f"{action}/cancel_goal", server=False)
+        self._results = Service(participant, f"{action}/get_result", server=False)
+        self._feedback = participant.reader(f"rt{action}/feedback")
+        self._status = participant.reader(f"rt{action}/status")
+        self._options, self._events = options, events
+        self._name = uuid.uuid4().hex
+        self._sent = self._right = 0
+        self._steps: dict[str, int] = {}
+        self._succeeded: set[str] = set()
+        self._due = time.monotonic() + options.period
+
+    def step(self) -> None:
+        """Send a goal if it is time, fetch the results of those that were accepted."""
+        if time.monotonic() >= self._due:
+            self._due += self._options.period
+            self._sent += 1
+            self._goals.send(self._name, str(self._sent), str(_ORDER))
+            self._events.report(Kind.SENT, f"goal {self._sent}", count=self._sent)
+        for text in self._feedback.take():
+            client, number, _ = text.split(" ", 2)
+            if client == self._name:
+                self._steps[number] = self._steps.get(number, 0) + 1
+        for text in self._status.take():
+            client, number, _ = text.split(" ", 2)
+            if client == self._name:
+                self._succeeded.add(number)
+        for client, number, word in self._goals.take():
+            if client == self._name and word == "accepted":
+                self._results.send(client, number, "?")
+        for client, number, answer in self._results.take():
+            complete = self._steps.get(number) == _ORDER - 1 and number in self._succeeded
+            if client == self._name and complete and answer.endswith(f": {fibonacci(_ORDER)}"):
+                self._right += 1
+                self._events.report(Kind.HEARD, answer, count=self._right)
+        self._cancels.take()
+
+
+class Composed:
+    """A talker, a listener and a server in one process: one participant, one enclave."""
+
+    def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
+        kinds = (Talker, Listener, Server)
+        self._nodes = [kind(participant, options, events) for kind in kinds]
+
+    def step(self) -> None:
+        """Let each of them act."""
+        for node in self._nodes:
+            node.step()
+
+
+Node = Talker | Listener | Observer | Server | Client | ActionServer | ActionClient | Composed
+
+ROLES: dict[str, type[Node]] = {
+    "talker": Talker,
+    "listener": Listener,
+    "observer": Observer,
+    "server": Server,
+    "client": Client,
+    "action_server": ActionServer,
+    "action_client": ActionClient,
+    "composed": Composed,
+}
+
+
+def run(node: Node) -> None:
+    """Let a node act until it is stopped."""
+    while True:
+        node.step()
+        time.sleep(_LISTEN_SECONDS)
+
+
+def dds_topic(topic: str) -> str:
+    """The DDS topic of a ROS topic of a node in the namespace "/"."""
+    return f"rt/{topic.removeprefix('/')}"
+
+
+class _Stopped(Exception):  # noqa: N818 - not an error
+    """Ctrl-C or SIGTERM."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Play a role until told to stop; returns the exit status."""
+    own, ros = split_ros_args(sys.argv[1:] if arguments is None else arguments)
+    parser = option_parser("sros_tool.demo.nodes.cyclone", "Play a role over Cyclone DDS.")
+    parser.add_argument("role", choices=tuple(ROLES))
+    parser.add_argument("--also", action="append", default=[], help="one more topic to look at")
+    parsed = parser.parse_args(own)
+    options = options_of(parsed, parsed.role)
+    _stop_on_signals()
+    events = EventWriter(options.report)
+    stage = Stage.PARTICIPANT
+    try:
+        choice = choose_loadable(os.environ, _enclave_in(ros))
+        _say(parsed.role, choice.note)
+        with Participant(domain_of(os.environ), choice.enclave) as participant:
+            stage = Stage.ENDPOINT
+            node = (
+                Observer(participant, options, events, parsed.also)
+                if parsed.role == "observer"
+                else ROLES[parsed.role](participant, options, events)
+            )
+            stage = Stage.RUNNING
+            events.report(Kind.READY)
+            run(node)
+    except _Stopped:
+        pass
+    except SecurityRefusedError as refusal:
+        events.report(Kind.REFUSED, str(refusal), stage=stage)
+        _say(parsed.role, f"refused by DDS Security: {refusal}")
+        return 1
+    except SrosError as error:
+        events.report(Kind.FAILED, str(error), stage=stage)
+        _say(parsed.role, f"failed: {error}")
+        return 1
+    events.report(Kind.DONE)
+    return 0
+
+
+def _enclave_in(ros_arguments: Sequence[str]) -> str:
+    enclave = "/"
+    for flag, value in itertools.pairwise(ros_arguments):
+        if flag in ("-e", "--enclave"):
+            enclave = value
+    return enclave
+
+
+def _say(role: str, text: str) -> None:
+    print(f"[{role}] {text}", file=sys.stderr, flush=True)
+
+
+def _stop_on_signals() -> None:
+    def stop(_number: int, _frame: FrameType | None) -> None:
+        raise _Stopped
+
+    handler: Callable[[int, FrameType | None], None] = stop
+    signal.signal(signal.SIGINT, handler)
+    signal.signal(signal.SIGTERM, handler)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

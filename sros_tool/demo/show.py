@@ -1,0 +1,189 @@
+"""Show the result of the demo as text: one line per row, and under it what was seen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from datetime import datetime
+
+from sros_tool.demo.cost import cost_table
+from sros_tool.demo.model import Status
+from sros_tool.demo.records import CastMember, RowResult
+from sros_tool.demo.result import DemoResult, ScenarioResult
+from sros_tool.validity import iso
+
+_INDENT = " " * 6
+
+
+def demo_table(result: DemoResult) -> str:
+    """The table, with the backend above it and the verdict below."""
+    network = (
+        "a network namespace of its own"
+        if result.isolation.isolated
+        else f"the network of this machine ({result.isolation.reason})"
+    )
+    lines = [
+        f"{result.backend.dds}, topic {result.topic}, in {network}",
+        f"backend {result.backend.name}: {result.backend.why}",
+    ]
+    for scenario in result.scenarios:
+        lines.append("")
+        if len(result.scenarios) > 1:
+            lines += [f"{scenario.name}: {scenario.title}", ""]
+        lines += _cast(scenario.cast)
+        lines += _scenario(scenario)
+    return "\n".join([*lines, "", _summary(result.rows)])
+
+
+def _cast(members: Sequence[CastMember]) -> list[str]:
+    """Who plays which part, in a keystore that was not made for it."""
+    width = max((len(member.part) for member in members), default=0)
+    lines = [
+        f"{_INDENT}{member.part:<{width}}  {member.enclave}"
+        + (f" as node {', '.join(member.nodes)}" if member.nodes else "")
+        for member in members
+    ]
+    return ["cast by the rights in the keystore:", *lines, ""] if lines else []
+
+
+def _scenario(scenario: ScenarioResult) -> list[str]:
+    rows = scenario.rows
+    widths = [
+        max(len(text) for text in column)
+        for column in (
+            ["what was tried", *(row.name for row in rows)],
+            ["expected", *(row.expected for row in rows)],
+            ["observed", *(row.observed for row in rows)],
+        )
+    ]
+    lines = [_line("", ("what was tried", "expected", "observed"), widths)] if rows else []
+    for row in rows:
+        lines += [
+            _line(_mark(row), (row.name, row.expected, row.observed), widths),
+            f"{_INDENT}{row.detail}",
+        ]
+        if row.known_open:
+            lines.append(f"{_INDENT}{row.open_because}; to do: {row.remedy}")
+    return lines if scenario.cost is None else [*lines, "", *cost_table(scenario.cost)]
+
+
+def _line(mark: str, cells: Sequence[str], widths: Sequence[int]) -> str:
+    padded = (cell.ljust(width) for cell, width in zip(cells, widths, strict=True))
+    return f"{mark:<4}  {'  '.join(padded)}".rstrip()
+
+
+def _mark(row: RowResult) -> str:
+    if row.observed is Status.SKIPPED:
+        return "skip"
+    if row.known_open:
+        return "open"
+    return "ok" if row.as_expected else "FAIL"
+
+
+def _summary(rows: Sequence[RowResult]) -> str:
+    wrong = sum(1 for row in rows if not row.as_expected)
+    skipped = sum(1 for row in rows if row.observed is Status.SKIPPED)
+    known = sum(1 for row in rows if row.known_open)
+    good = len(rows) - wrong - skipped
+    parts = [f"{good} of {len(rows)} rows as expected"]
+    if known:
+        parts.append(f"{known} of them known to be open")
+    if skipped:
+        parts.append(f"{skipped} skipped")
+    if wrong:
+        parts.append(f"{wrong} not as expected")
+    return ", ".join(parts) + "."
+
+
+def summary_page(result: DemoResult, now: datetime) -> str:
+    """The page; ``now`` is when it was seen."""
+    attacks = [row for row in result.rows if row.attack and not row.removed]
+    others = [row for row in result.rows if not row.attack]
+    wrong = [row for row in result.rows if not row.as_expected]
+    lines = [
+        "# What was tried on this robot's security",
+        "",
+        f"Seen {iso(now)} with `sros demo` on {result.backend.dds}, expectations of the keystore"
+        f" template `{result.template}`: **{_verdict(result, wrong)}**",
+        "",
+    ]
+    for scenario in result.scenarios:
+        lines += _summary_cast(scenario.cast)
+    if wrong:
+        lines += ["## Not as expected", ""]
+        lines += [
+            f"- **{row.name}**: expected {row.expected}, observed {row.observed}. {row.detail}"
+            for row in wrong
+        ]
+        lines.append("")
+    if attacks:
+        lines += _attacks(attacks, [row for row in result.rows if row.removed])
+    if others:
+        lines += ["## What else was shown", "", *_table(others)]
+    for scenario in result.scenarios:
+        if scenario.cost is not None:
+            lines += ["## What security costs", "", *scenario.cost.markdown(), ""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _summary_cast(members: Sequence[CastMember]) -> list[str]:
+    if not members:
+        return []
+    lines = ["## Who plays which part", "", "| part | enclave | ROS nodes |", "| --- | --- | --- |"]
+    lines += [f"| {each.part} | {each.enclave} | {', '.join(each.nodes)} |" for each in members]
+    return [*lines, ""]
+
+
+def _verdict(result: DemoResult, wrong: Sequence[RowResult]) -> str:
+    known = sum(1 for row in result.rows if row.known_open)
+    skipped = sum(1 for row in result.rows if row.observed is Status.SKIPPED)
+    parts = [f"{len(wrong)} of {len(result.rows)} rows not as expected" if wrong else "as expected"]
+    if known:
+        parts.append(f"{known} ways in that are known to be open")
+    if skipped:
+        parts.append(f"{skipped} rows could not be tried")
+    return ", ".join(parts) + "."
+
+
+def _attacks(attacks: Sequence[RowResult], removed: Sequence[RowResult]) -> list[str]:
+    closed = [row for row in attacks if not row.open_because]
+    open_ = [row for row in attacks if row.open_because]
+    lines = [
+        "## Attacks",
+        "",
+        "An attack that fails proves something only if it works elsewhere: the last column says how"
+        " the same attack ended without the defence.",
+        "",
+        "| attack | expected | observed | what decides | without the defence |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for row in closed:
+        twins = "; ".join(_unique(_twin(each) for each in removed if each.attack == row.attack))
+        lines.append(f"| {_cells(row)} | {row.mechanism} | {twins} |")
+    if open_:
+        lines += ["", "## Known to be open, and what to do", ""]
+        lines += [
+            "| attack | expected | observed | why | remedy |",
+            "| --- | --- | --- | --- | --- |",
+        ]
+        lines += [f"| {_cells(row)} | {row.open_because} | {row.remedy} |" for row in open_]
+    return [*lines, ""]
+
+
+def _twin(row: RowResult) -> str:
+    return f"{row.observed} without {row.removed}"
+
+
+def _unique(texts: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(texts))
+
+
+def _table(rows: Sequence[RowResult]) -> list[str]:
+    lines = ["| row | expected | observed | what decides |", "| --- | --- | --- | --- |"]
+    return [*lines, *(f"| {_cells(row)} | {row.mechanism} |" for row in rows), ""]
+
+
+def _cells(row: RowResult) -> str:
+    observed = str(row.observed) if row.as_expected else f"**{row.observed}**"
+    if row.observed is Status.SKIPPED:
+        observed = f"skipped: {row.detail}"
+    return f"{row.name} | {row.expected} | {observed}"

@@ -1,0 +1,257 @@
+"""Count what is readable on the wire, with a packet socket in plain Python.
+
+Needs CAP_NET_RAW in the network that is looked at: root has it, and so has whoever made a network
+namespace of his own (`sros_tool.runtime.netns`).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from sros_tool.demo.records import WireCount
+
+_ETH_P_IP = 0x0800
+_PACKET_OUTGOING = 4
+_UDP = 17
+_BUFFER_BYTES = 16 * 1024 * 1024
+_SO_RCVBUFFORCE = 33
+
+_RTPS_HEADER = 20
+_PROTECTED_SUBMESSAGES = range(0x30, 0x35)
+"""SEC_BODY, SEC_PREFIX, SEC_POSTFIX, SRTPS_PREFIX, SRTPS_POSTFIX (DDS-Security 1.1 §7.3.6)."""
+
+
+class Kept(NamedTuple):
+    """A captured packet: when it was read (CLOCK_MONOTONIC), its UDP source port, all of it."""
+
+    time: float
+    source: int
+    packet: bytes
+
+
+class PacketCounter:
+    """Counts IPv4 packets in which one of ``marks`` is readable, and those that are protected.
+
+    ``plain`` counts by mark, ``protected`` by UDP port, for both ports of a packet.  With
+    ``keep``, the RTPS packets themselves are in ``kept``, in order.
+    """
+
+    def __init__(self, marks: Sequence[str], *, keep: bool = False) -> None:
+        self._marks = {mark: mark.encode() for mark in marks}
+        self._keep = keep
+        self.plain: Counter[str] = Counter()
+        self.protected: Counter[int] = Counter()
+        self.kept: list[Kept] = []
+
+    def count(self, packet: bytes) -> None:
+        """Count one packet; whatever is not UDP is passed over."""
+        start = (packet[0] & 0x0F) * 4 if packet else 0
+        if len(packet) < max(20, start) + 8 or packet[9] != _UDP:
+            return
+        source = int.from_bytes(packet[start : start + 2], "big")
+        target = int.from_bytes(packet[start + 2 : start + 4], "big")
+        payload = packet[start + 8 :]
+        if self._keep and payload[:4] == b"RTPS":
+            self.kept.append(Kept(time.monotonic(), source, packet))
+        for mark, raw in self._marks.items():
+            if raw in payload:
+                self.plain[mark] += 1
+        if _is_protected(payload):
+            self.protected.update({source, target})
+
+
+class Capture(PacketCounter):
+    """Listens on every interface and counts; only what is to be kept is stored, in memory.
+
+    Raises `PermissionError` where it is not permitted.
+    """
+
+    def __init__(self, marks: Sequence[str], *, keep: bool = False) -> None:
+        super().__init__(marks, keep=keep)
+        self._socket = socket.socket(socket.AF_PACKET, socket.SOCK_DGRAM, socket.htons(_ETH_P_IP))
+        self._socket.setblocking(False)
+        try:
+            self._socket.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _BUFFER_BYTES)
+        except OSError:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+
+    def fileno(self) -> int:
+        """The descriptor to wait on."""
+        return self._socket.fileno()
+
+    def drain(self) -> None:
+        """Count all packets that have come."""
+        while True:
+            try:
+                packet, address = self._socket.recvfrom(65535)
+            except BlockingIOError:
+                return
+            if address[2] != _PACKET_OUTGOING:
+                self.count(packet)
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._socket.close()
+
+
+def _is_protected(payload: bytes) -> bool:
+    """Whether a UDP payload is RTPS with a protected submessage (RTPS 2.3 §9.4)."""
+    if payload[:4] != b"RTPS":
+        return False
+    position = _RTPS_HEADER
+    while position + 4 <= len(payload):
+        kind, flags = payload[position], payload[position + 1]
+        if kind in _PROTECTED_SUBMESSAGES:
+            return True
+        size = payload[position + 2 : position + 4]
+        length = int.from_bytes(size, "little" if flags & 1 else "big")
+        if length == 0:
+            return False
+        position += 4 + length
+    return False
+
+
+def udp_ports(process: int) -> frozenset[int]:
+    """The UDP ports that a process has bound, by its open descriptors; empty if it has ended."""
+    folder = Path(f"/proc/{process}")
+    try:
+        links = list((folder / "fd").iterdir())
+        lines = (folder / "net" / "udp").read_text(encoding="ascii").splitlines()[1:]
+    except OSError:
+        return frozenset()
+    inodes = {_socket_inode(link) for link in links}
+    rows = [line.split() for line in lines]
+    return frozenset(int(row[1].partition(":")[2], 16) for row in rows if row[9] in inodes)
+
+
+def _socket_inode(link: Path) -> str:
+    try:
+        target = str(link.readlink())
+    except OSError:
+        return ""  # closed meanwhile
+    return target.removeprefix("socket:[").removesuffix("]") if target[:8] == "socket:[" else ""
+
+
+_REPLAY_RTPS_HEADER, _DATA = 20, 0x15
+_NUMBER = 20
+"""From the head of a DATA submessage to the low half of its sequence number."""
+
+
+class Injector:
+    """Sends whole IPv4 packets under the address they came from; needs CAP_NET_RAW.
+
+    A packet socket would not do: the kernel drops loopback addresses that come in by one.
+    Raises `PermissionError` where it is not permitted.
+    """
+
+    def __init__(self) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
+
+    def send(self, packet: bytes) -> None:
+        """Send one packet as it is, but for the checksum, which the loopback never filled in."""
+        self._socket.sendto(without_checksum(packet), (socket.inet_ntoa(packet[16:20]), 0))
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+
+def packets_of(kept: Sequence[Kept], ports: Collection[int]) -> list[Kept]:
+    """The captured packets that were sent from one of the ports, in order."""
+    return [each for each in kept if each.source in ports]
+
+
+def with_other_words(packet: bytes, words: str, others: str, step: int) -> bytes | None:
+    """An RTPS packet that says something else of the same length, ``step`` messages later.
+
+    The sequence number of the DATA submessage that holds ``words`` is raised, so that a reader
+    takes it for the writer's next one (RTPS 2.3 §9.4.5.3).  None where no words are readable.
+    """
+    start = (packet[0] & 0x0F) * 4 + 8
+    position = start + _REPLAY_RTPS_HEADER
+    changed = bytearray(packet)
+    while position + 4 <= len(packet):
+        kind, flags = packet[position], packet[position + 1]
+        order: Literal["little", "big"] = "little" if flags & 1 else "big"
+        length = int.from_bytes(packet[position + 2 : position + 4], order)
+        end = position + 4 + length if length else len(packet)
+        place = packet.find(words.encode(), position, end)
+        if kind == _DATA and place >= 0:
+            number = slice(position + _NUMBER, position + _NUMBER + 4)
+            raised = int.from_bytes(packet[number], order) + step
+            changed[number] = raised.to_bytes(4, order)
+            changed[place : place + len(others.encode())] = others.encode()
+            return bytes(changed)
+        position = end
+    return None
+
+
+def without_checksum(packet: bytes) -> bytes:
+    """A UDP packet whose checksum says that there is none (RFC 768: zero)."""
+    start = (packet[0] & 0x0F) * 4 + 6
+    return packet[:start] + b"\0\0" + packet[start + 2 :]
+
+
+_CERTIFICATE = "-----BEGIN CERTIFICATE-----"
+
+
+class Wiretap:
+    """Captures from the moment it is made; ``problem`` says why that is not permitted, or "".
+
+    ``texts`` marks what each party says, by its name; ``topic`` is a DDS topic name.  Make it in
+    the network that it listens in on, and in the loop of asyncio.
+    """
+
+    def __init__(self, texts: Mapping[str, str], topic: str, *, replayed: bool) -> None:
+        self._texts = texts
+        self._topic = topic
+        self.problem = ""
+        self._capture: Capture | None = None
+        self._injector: Injector | None = None
+        try:
+            self._capture = Capture([*texts.values(), topic, _CERTIFICATE], keep=replayed)
+            self._injector = Injector() if replayed else None
+        except OSError as error:
+            self.problem = f"capturing packets is not permitted: {error.strerror}"
+            self.close()
+            return
+        asyncio.get_running_loop().add_reader(self._capture.fileno(), self._capture.drain)
+
+    def count(self, ports: Collection[int]) -> dict[str, WireCount]:
+        """What was readable so far, by party; packets of ``ports`` count as protected."""
+        if self._capture is None:
+            return {}
+        self._capture.drain()
+        plain = self._capture.plain
+        protected = sum(self._capture.protected[port] for port in ports)
+        return {
+            name: WireCount(plain[text], protected, plain[self._topic], plain[_CERTIFICATE])
+            for name, text in self._texts.items()
+        }
+
+    def packets(self, ports: Collection[int]) -> list[Kept]:
+        """The packets that were sent from one of the ports so far, in order."""
+        if self._capture is None:
+            return []
+        self._capture.drain()
+        return packets_of(self._capture.kept, ports)
+
+    def send(self, packet: bytes) -> None:
+        """Send a packet again."""
+        if self._injector is not None:
+            self._injector.send(packet)
+
+    def close(self) -> None:
+        """Stop listening."""
+        if self._capture is not None:
+            asyncio.get_running_loop().remove_reader(self._capture.fileno())
+            self._capture.close()
+        if self._injector is not None:
+            self._injector.close()
+        self._capture = self._injector = None

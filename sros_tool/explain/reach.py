@@ -1,0 +1,320 @@
+"""Topics that the governance leaves open: everybody in the domain may write or read them.
+
+Whoever publishes a topic influences all who may subscribe to it.  A service carries both ways: the
+request to the server, the reply to the client; an action is its services and topics.  All of them
+are DDS topics, and are followed as such.  Where both sides are wildcards, there is a way if they
+have a name in common that neither side is denied.
+Nothing here reads files: rights go in, ways come out.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import defaultdict, deque
+from collections.abc import Collection, Container, Iterable, Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import product
+
+from sros_tool.dds.governance import Governance
+from sros_tool.names import dds_names, is_expression
+from sros_tool.policy.model import DENY
+from sros_tool.policy.patterns import common_name, literal_prefix, matches, overlap
+from sros_tool.policy.rights import Right
+
+
+@dataclass(frozen=True, slots=True)
+class Unguarded:
+    """DDS topics without access control in one direction (publish or subscribe).
+
+    ``topic`` is an expression; ``without`` are those of earlier rules that guard a part of it.
+    """
+
+    direction: str
+    topic: str
+    without: tuple[str, ...]
+
+
+def unguarded(governance: Governance) -> Iterator[Unguarded]:
+    """What anybody may do in any of the domains; the first topic rule that matches holds.
+
+    DDS-Security 1.1, 9.4.1.2.6 (topic rules, and enable_read/write_access_control).
+    """
+    for domain in governance.domain_access_rules:
+        guarded: dict[str, list[str]] = {"publish": [], "subscribe": []}
+        for rule in domain.topic_access_rules:
+            for direction, on in (
+                ("publish", rule.enable_write_access_control),
+                ("subscribe", rule.enable_read_access_control),
+            ):
+                if on:
+                    guarded[direction].append(rule.topic_expression)
+                else:
+                    yield Unguarded(direction, rule.topic_expression, tuple(guarded[direction]))
+
+
+OF_EVERY_NODE = ("/parameter_events",)
+"""Topics that every node publishes and reads: with them, everybody influences everybody."""
+
+_ACTION = "/_action/"
+_SAID_AS = {
+    "rt": ("topics", "publish", ""),
+    "rq": ("services", "request", "Request"),
+    "rr": ("services", "reply", "Reply"),
+}
+"""What a ROS node does that writes a DDS topic of this prefix, and how such a topic ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class Hop:
+    """Information goes from ``source`` to ``target``, which are enclaves, by one ROS name.
+
+    ``right`` is what the source does (publish, request, reply; call or execute where the name is
+    of an action), ``kind`` topics, services, actions or dds.  ``name`` is a name that both may use;
+    ``said`` and ``heard`` are the names or wildcards of their rights by which they may.
+    """
+
+    source: str
+    target: str
+    kind: str
+    right: str
+    name: str
+    said: str
+    heard: str
+
+    def __str__(self) -> str:
+        """As ``/a -publish /x-> /b``."""
+        return f"{self.source} {self.arrow()}"
+
+    def arrow(self) -> str:
+        """As ``-publish /x-> /b``."""
+        return f"-{self.right} {self.name}-> {self.target}"
+
+
+Path = tuple[Hop, ...]
+"""Hops, each of which starts where the one before it ends."""
+
+
+def path_text(path: Path) -> str:
+    """As ``/a -publish /x-> /b -publish /y-> /c``."""
+    return " ".join((path[0].source, *(hop.arrow() for hop in path)))
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """What an enclave can influence and what it can learn from, each with a shortest path.
+
+    Paths of ``influences`` start at the enclave, those of ``learns_from`` end there.
+    """
+
+    enclave: str
+    influences: dict[str, Path]
+    learns_from: dict[str, Path]
+
+
+@dataclass(frozen=True, slots=True)
+class _End:
+    """One side's right to DDS topics, and the denials and exceptions that take from it."""
+
+    enclave: str
+    topic: str
+    without: tuple[str, ...]
+
+
+class _Side:
+    """The ends of all enclaves in one direction: all that write, or all that read.
+
+    They are found by their exact topics, and by what stands before their first wildcard.
+    """
+
+    def __init__(self, ends: Iterable[_End]) -> None:
+        self.of: dict[str, list[_End]] = defaultdict(list)
+        self._exact: dict[str, list[_End]] = defaultdict(list)
+        self._wild: dict[str, list[_End]] = defaultdict(list)
+        for end in ends:
+            self.of[end.enclave].append(end)
+            if is_expression(end.topic):
+                self._wild[literal_prefix(end.topic)].append(end)
+            else:
+                self._exact[end.topic].append(end)
+        self._topics = sorted(self._exact)
+        self._prefixes = sorted(self._wild)
+
+    def meeting(self, topic: str) -> Iterator[_End]:
+        """The ends that might share a name with a topic or wildcard."""
+        prefix = literal_prefix(topic)
+        if prefix == topic:
+            yield from self._exact.get(topic, ())
+        else:
+            for name in _starting(self._topics, prefix):
+                yield from self._exact[name]
+        for longer in _starting(self._prefixes, prefix):
+            yield from self._wild[longer]
+        for length in range(len(prefix)):
+            yield from self._wild.get(prefix[:length], ())
+
+
+def _starting(ordered: list[str], prefix: str) -> Iterator[str]:
+    """The texts of a sorted list that start with ``prefix``."""
+    for index in range(bisect_left(ordered, prefix), len(ordered)):
+        if not ordered[index].startswith(prefix):
+            return
+        yield ordered[index]
+
+
+_Used = set[tuple[str, tuple[str, ...]]]
+
+
+class Network:
+    """All enclaves of a system, connected by what they may say and hear.
+
+    ``without`` are topics (ROS names) that do not count.  What is ``unguarded`` all of
+    ``everybody`` may do, whatever the rights say.
+    """
+
+    def __init__(
+        self,
+        rights: Iterable[Right],
+        *,
+        without: Collection[str] = (),
+        unguarded: Iterable[Unguarded] = (),
+        everybody: Iterable[str] = (),
+    ) -> None:
+        ends: dict[str, list[_End]] = {"publish": [], "subscribe": []}
+        denied: dict[tuple[str, str], set[str]] = defaultdict(set)
+        allowed: dict[tuple[str, str], set[str]] = defaultdict(set)
+        for right in rights:
+            into = denied if right.qualifier is DENY else allowed
+            for direction, topic in _topics(right):
+                into[right.enclave, direction].add(topic)
+        ignored = ["rt" + name for name in without]
+        for (enclave, direction), topics in sorted(allowed.items()):
+            outside = sorted(denied[enclave, direction].union(ignored))
+            for topic in sorted(topics, key=_plain_first):
+                met = tuple(each for each in outside if overlap(each, topic))
+                if topic not in met:
+                    ends[direction].append(_End(enclave, topic, met))
+        for each, enclave in product(dict.fromkeys(unguarded), everybody):
+            outside = sorted({*each.without, *ignored})
+            met = tuple(other for other in outside if overlap(other, each.topic))
+            if each.topic not in met:
+                ends[each.direction].append(_End(enclave, each.topic, met))
+        self._sides = {direction: _Side(found) for direction, found in ends.items()}
+
+    @property
+    def enclaves(self) -> tuple[str, ...]:
+        """The enclaves that may say or hear anything, sorted."""
+        return tuple(sorted({name for side in self._sides.values() for name in side.of}))
+
+    def hops(self, enclave: str) -> Iterator[Hop]:
+        """Every way by which information leaves an enclave, one hop far, itself left out."""
+        return self._steps(enclave, True, set(), {enclave})
+
+    def reach(self, enclave: str) -> Reach:
+        """What an enclave can influence and learn from over any number of hops."""
+        return Reach(enclave, self._search(enclave, True), self._search(enclave, False))
+
+    def _search(self, start: str, forward: bool) -> dict[str, Path]:
+        paths: dict[str, Path] = {start: ()}
+        used: _Used = set()
+        queue = deque([start])
+        while queue:
+            here = queue.popleft()
+            for hop in self._steps(here, forward, used, paths):
+                there = hop.target if forward else hop.source
+                if there not in paths:
+                    paths[there] = (*paths[here], hop) if forward else (hop, *paths[here])
+                    queue.append(there)
+        del paths[start]
+        return paths
+
+    def _steps(
+        self, enclave: str, forward: bool, used: _Used, known: Container[str]
+    ) -> Iterator[Hop]:
+        """The hops out of an enclave, or into it, from or to others than the ``known``.
+
+        Ends whose like was ``used`` already lead nowhere new, and are left out.
+        """
+        directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
+        own, others = (self._sides[direction] for direction in directions)
+        for end in own.of.get(enclave, ()):
+            like = (end.topic, end.without)
+            if like in used:
+                continue
+            used.add(like)
+            for other in others.meeting(end.topic):
+                if other.enclave not in known and (name := _shared(end, other)):
+                    yield _hop(end, other, name) if forward else _hop(other, end, name)
+
+
+def _topics(right: Right) -> Iterator[tuple[str, str]]:
+    """The DDS topics behind a right, each with its direction."""
+    if right.kind == "dds":
+        yield right.right, right.name
+        return
+    names = dds_names(right.right, right.name)
+    yield from (("publish", topic) for topic in names.publish)
+    yield from (("subscribe", topic) for topic in names.subscribe)
+
+
+def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
+    """Tells ways by topics of the robot before those by services, and every node's log last."""
+    kind = topic[:3]
+    return (
+        topic == "rt/rosout",
+        kind == "rr/",
+        kind != "rt/" or _ACTION in topic,
+        is_expression(topic),
+        topic,
+    )
+
+
+def _shared(one: _End, other: _End) -> str:
+    """A DDS topic that both ends may use, or ""."""
+    if not overlap(one.topic, other.topic):
+        return ""
+    exact = next((end.topic for end in (one, other) if not is_expression(end.topic)), "")
+    outside = set(one.without + other.without)
+    if exact:
+        return "" if any(matches(each, exact) for each in outside) else exact
+    return _shared_by_wildcards(*sorted((one.topic, other.topic)), tuple(sorted(outside)))
+
+
+@lru_cache(maxsize=4096)
+def _shared_by_wildcards(one: str, other: str, outside: tuple[str, ...]) -> str:
+    for prefix, (_, _, end) in _SAID_AS.items():
+        # In ROS terms first, so that the name is one that a node could have.
+        inner = [_ros_part(each, prefix, end) for each in (one, other)]
+        outer = [_ros_part(each, prefix, end) for each in outside]
+        name = common_name(inner, filter(None, outer)) if all(inner) else ""
+        topic = f"{prefix}{name}{end}"
+        if name and not any(matches(each, topic) for each in outside):
+            return topic
+    return common_name((one, other), outside, absolute=False) or ""
+
+
+def _ros_part(topic: str, prefix: str, end: str) -> str:
+    """What a DDS expression says of ROS names of one kind, or "" where it says nothing simple."""
+    if topic == "*":
+        return "*"
+    if topic.startswith(prefix + "/") and topic.endswith(end):
+        return topic[len(prefix) : len(topic) - len(end)]
+    return ""
+
+
+def _in_ros_terms(topic: str) -> tuple[str, str, str]:
+    """The kind, the right of the writer and the ROS name of a DDS topic or expression."""
+    kind, right, end = _SAID_AS.get(topic[:2], ("", "", ""))
+    name = _ros_part(topic, topic[:2], end) if kind else ""
+    if not name.startswith("/"):
+        return "dds", "publish", topic
+    action, part, _ = name.partition(_ACTION)
+    if part and action:
+        return "actions", "call" if right == "request" else "execute", action
+    return kind, right, name
+
+
+def _hop(said: _End, heard: _End, topic: str) -> Hop:
+    kind, right, name = _in_ros_terms(topic)
+    ends = (_in_ros_terms(end.topic)[2] for end in (said, heard))
+    return Hop(said.enclave, heard.enclave, kind, right, name, *ends)

@@ -1,0 +1,71 @@
+"""Replaces a file as a whole: readers find the old content or the new, never a part."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import stat
+import tomllib
+from pathlib import Path
+from typing import Any
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Let the file at ``path`` hold ``data``, on the disk when this returns.
+
+    A file that exists keeps its mode and, where that is allowed, its owner; a symbolic link stays
+    and its target changes.  A device or a pipe (``/dev/null``) is written to, and never replaced.
+    Raises `OSError` if the folder cannot be written; then nothing changed.
+    """
+    target = Path(os.path.realpath(path))
+    spare = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
+    try:
+        present = target.stat()
+    except FileNotFoundError:
+        present = None
+    if present and not stat.S_ISREG(present.st_mode) and not stat.S_ISDIR(present.st_mode):
+        target.write_bytes(data)
+        return
+    handle = os.open(spare, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            if present:
+                with contextlib.suppress(PermissionError):
+                    os.fchown(handle, present.st_uid, present.st_gid)
+                os.fchmod(handle, present.st_mode & 0o7777)
+            file.write(data)
+            file.flush()
+            os.fsync(handle)
+        spare.replace(target)
+    except BaseException:
+        spare.unlink(missing_ok=True)
+        raise
+    folder = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+LONGEST_LINE = 4000
+"""In characters: the parser takes quadratic time for a key of many dots."""
+LARGEST = 256 * 1024
+"""Of a document, in characters."""
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """The tables of a TOML document; raises `tomllib.TOMLDecodeError`, and nothing else."""
+    if len(text) > LARGEST:
+        raise tomllib.TOMLDecodeError(f"it is longer than {LARGEST // 1024} KiB")
+    for number, line in enumerate(text.split("\n"), 1):
+        if len(line) > LONGEST_LINE:
+            raise tomllib.TOMLDecodeError(f"line {number} is longer than {LONGEST_LINE} characters")
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError:
+        raise
+    except RecursionError as error:
+        raise tomllib.TOMLDecodeError("it is nested too deeply") from error
+    except ValueError as error:  # a number of thousands of digits, a date that does not exist
+        raise tomllib.TOMLDecodeError(str(error)) from error

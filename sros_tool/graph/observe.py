@@ -1,0 +1,406 @@
+"""Finds the process and the enclave of every node in what rclpy tells of a graph.
+
+rclpy lists nodes with their enclaves, but without their processes; and endpoints with the names
+of their nodes and with their participants (processes), but without enclaves.  Where nodes of the
+same name run in several enclaves, the two lists have to be brought together.
+
+Times are in seconds.  The clock is passed in, as is the source: a test needs neither.
+
+The graph shows the enclave of ``--ros-args --enclave``, and "/" of a process that has it from
+ROS_SECURITY_ENCLAVE_OVERRIDE.  But a secured participant's identifier begins with a digest of the
+subject of its certificate (DDS-Security 1.1, 9.3.3), which its peers check when it comes.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import json
+import os
+import selectors
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from hashlib import sha256
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+from sros_tool.errors import UnavailableError
+from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, make_observation
+
+Listed = tuple[str, str, str]
+"""A node as it is announced: enclave, namespace, name."""
+_Name = tuple[str, str]
+
+# What rmw reports for an endpoint that no announced node claims (rmw_dds_common, graph_cache).
+NOBODY = "_NODE_NAME_UNKNOWN_"
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """One look at the graph: the announced nodes, in their order, and all endpoints.
+
+    Each endpoint comes with its participant, and the namespace and name of its node.  ``ordered``
+    says that the nodes are listed by ascending participant, as rmw_dds_common does (graph_cache
+    keeps its participants in a map by identifier).
+    """
+
+    listed: tuple[Listed, ...]
+    endpoints: tuple[tuple[str, str, str, Endpoint], ...]
+    ordered: bool = False
+
+
+def resolve(sighting: Sighting) -> Observation:
+    """The nodes of a sighting, each with its process and the enclaves that it can have."""
+    found: dict[str, dict[_Name, set[Endpoint]]] = {}
+    strays = set()
+    for participant, ns, name, endpoint in sighting.endpoints:
+        if name in ("", NOBODY):
+            strays.add((participant, endpoint))
+        else:
+            nodes = found.setdefault(participant, {})
+            nodes.setdefault((ns, name), set()).add(endpoint)
+    candidates = _enclaves(sighting, {each: frozenset(nodes) for each, nodes in found.items()})
+    nodes_seen = []
+    heard = set()
+    for participant, nodes in found.items():
+        enclaves = tuple(sorted(candidates[participant]))
+        if not enclaves:  # its announcement is still to come, or was just withdrawn
+            strays |= {(participant, each) for every in nodes.values() for each in every}
+            continue
+        for (ns, name), endpoints in nodes.items():
+            heard |= {(enclave, ns, name) for enclave in enclaves}
+            nodes_seen.append(ObservedNode(enclaves, ns, name, participant, frozenset(endpoints)))
+    return make_observation(nodes_seen, set(sighting.listed) - heard, strays)
+
+
+def _enclaves(
+    sighting: Sighting, processes: dict[str, frozenset[_Name]]
+) -> dict[str, frozenset[str]]:
+    """The enclaves in which each process can be, narrowed as far as the sighting allows."""
+    free: dict[str, Counter[_Name]] = {}
+    for enclave, ns, name in sighting.listed:
+        free.setdefault(enclave, Counter())[(ns, name)] += 1
+    candidates = {
+        each: frozenset(e for e, names in free.items() if all(names[n] for n in nodes))
+        for each, nodes in processes.items()
+    }
+    if sighting.ordered:
+        candidates = _by_order(sighting.listed, processes, candidates)
+    settled: set[str] = set()
+    while True:
+        news = [each for each, left in candidates.items() if len(left) == 1 and each not in settled]
+        if not news:
+            return candidates
+        # A node that is taken is not there for another process; that may settle further ones.
+        for each in news:
+            settled.add(each)
+            (enclave,) = candidates[each]
+            free[enclave].subtract(processes[each])
+        for each, left in candidates.items():
+            if each not in settled:
+                possible = frozenset(
+                    e for e in left if all(free[e][name] > 0 for name in processes[each])
+                )
+                candidates[each] = possible or left
+
+
+def _by_order(
+    listed: Sequence[Listed],
+    processes: dict[str, frozenset[_Name]],
+    candidates: dict[str, frozenset[str]],
+) -> dict[str, frozenset[str]]:
+    """The candidates, where the order of the list tells them; as they were, where it is in doubt.
+
+    The nth node of a name belongs to the nth participant that has this name, if there are as
+    many nodes as participants of it.
+    """
+    enclaves: dict[_Name, list[str]] = {}
+    for enclave, ns, name in listed:
+        enclaves.setdefault((ns, name), []).append(enclave)
+    told: dict[str, set[str]] = {}
+    for node, places in enclaves.items():
+        owners = sorted(each for each, names in processes.items() if node in names)
+        if len(owners) == len(places):
+            for owner, enclave in zip(owners, places, strict=True):
+                told.setdefault(owner, set()).add(enclave)
+    if any(len(each) > 1 or not each <= candidates[owner] for owner, each in told.items()):
+        return candidates  # not the order that was promised
+    return {each: frozenset(told.get(each, left)) for each, left in candidates.items()}
+
+
+def nodes_of(listed: Sequence[Sequence[str]]) -> tuple[Listed, ...]:
+    """The announced nodes from JSON."""
+    return tuple((enclave, ns, name) for enclave, ns, name in listed)
+
+
+PERIOD_SECONDS = 0.1
+"""How often the graph is looked at; a node that lives for a second is seen several times."""
+_START_SECONDS = 30.0
+_END_SECONDS = 3.0
+
+
+class GraphSource(Protocol):
+    """Where observations come from; tests put a script in its place."""
+
+    def next(self, seconds: float) -> Observation | None:
+        """The graph after its next change, or None if it has not changed for ``seconds``."""
+
+
+class ObserverError(UnavailableError):
+    """The observer could not look: ``reason`` and ``output`` say what rclpy and the DDS said."""
+
+    def __init__(self, what: str, reason: str, output: str) -> None:
+        super().__init__(what, reason)
+        self.reason = reason
+        self.output = output
+
+
+def require_rclpy() -> None:
+    """Raise `UnavailableError` if this Python has no rclpy."""
+    if importlib.util.find_spec("rclpy") is None:
+        raise UnavailableError(
+            "rclpy is not installed for this Python, and without it sros cannot see the ROS graph",
+            f"Python is {sys.executable}.",
+            "On a machine with ROS 2, source its setup file first (. /opt/ros/jazzy/setup.bash); "
+            "elsewhere install sros with it: pip install 'sros_tool[ros]'. "
+            "A policy can still be learned from logs with --from-log.",
+        )
+
+
+class RosGraph:
+    """The ROS graph as it is from now on; use as a context manager.
+
+    ``environment`` is added to that of this process: the domain, and the enclave if the observer
+    is to be secured.  Raises `UnavailableError` without rclpy, and `ObserverError` where rclpy
+    cannot start a node.
+    """
+
+    def __init__(self, environment: Mapping[str, str] | None = None) -> None:
+        require_rclpy()
+        self._environment = {**os.environ, **(environment or {})}
+        self.rmw = ""
+
+    def __enter__(self) -> Self:
+        read_end, write_end = os.pipe()
+        self._output = tempfile.TemporaryFile()
+        try:
+            self._process = subprocess.Popen(
+                # -P: what lies in the present folder is not what shall be imported.
+                [
+                    *(sys.executable, "-P", "-m", "sros_tool.graph.observer"),
+                    *(str(write_end), str(PERIOD_SECONDS)),
+                ],
+                stdin=subprocess.PIPE,
+                stdout=self._output,
+                stderr=subprocess.STDOUT,
+                pass_fds=[write_end],
+                env=self._environment,
+                process_group=0,  # Ctrl-C is for this process, which then ends the other one
+            )
+        except BaseException:
+            os.close(read_end)
+            self._output.close()
+            raise
+        finally:
+            os.close(write_end)
+        self._report = read_end
+        self._rest = b""
+        try:
+            answer = self._line(_START_SECONDS)
+            if answer is None or "ready" not in answer:
+                raise self._failed(answer)
+        except BaseException:
+            self.close()
+            raise
+        self.rmw = answer["ready"]
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def next(self, seconds: float) -> Observation | None:
+        """The graph after its next change, or None if it has not changed for ``seconds``."""
+        line = self._line(seconds)
+        if line is None:
+            return None
+        endpoints = tuple(
+            (participant, ns, name, Endpoint(topic, direction))
+            for participant, ns, name, topic, direction in line["endpoints"]
+        )
+        return resolve(Sighting(nodes_of(line["listed"]), endpoints, line["ordered"]))
+
+    def close(self) -> None:
+        """End the observer, politely first, so that the graph forgets it at once."""
+        if self._process.stdin:
+            self._process.stdin.close()
+        try:
+            self._process.wait(_END_SECONDS)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        os.close(self._report)
+        self._output.close()
+
+    def _line(self, seconds: float) -> dict[str, Any] | None:
+        """The next line of the observer, or None after ``seconds``."""
+        deadline = time.monotonic() + seconds
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._report, selectors.EVENT_READ)
+            while b"\n" not in self._rest:
+                left = deadline - time.monotonic()
+                if not selector.select(max(left, 0)):
+                    return None
+                data = os.read(self._report, 1 << 20)
+                if not data:
+                    with contextlib.suppress(subprocess.TimeoutExpired):
+                        self._process.wait(_END_SECONDS)
+                    raise self._failed(None)
+                self._rest += data
+        line, _, self._rest = self._rest.partition(b"\n")
+        found: dict[str, Any] = json.loads(line)
+        return found
+
+    def _failed(self, answer: Mapping[str, Any] | None) -> ObserverError:
+        self._output.seek(0)
+        output = self._output.read().decode("utf-8", "replace")
+        if answer is None:
+            ended = self._process.poll()
+            reason = (
+                f"It ended with status {ended}." if ended is not None else "It does not answer."
+            )
+            return ObserverError("the process that observes the ROS graph failed", reason, output)
+        what = {
+            "import": "rclpy cannot be imported",
+            "participant": "rclpy cannot start",
+            "node": "rclpy cannot start a node to observe the graph with",
+        }[answer["failed"]]
+        return ObserverError(what, f"{answer['reason']}".rstrip(".") + ".", output)
+
+
+Clock = Callable[[], float]
+_TICK = 0.2
+
+
+@dataclass(frozen=True, slots=True)
+class Settling:
+    """When a graph counts as complete: after ``least``, unchanged for ``still``; at ``most``.
+
+    Fast DDS announces its participants every 3 s after a first burst, some of which gets lost when
+    there are many: half a robot was seen to stand still from 0.4 to 3.4 s.
+    """
+
+    least: float = 4.0
+    still: float = 3.5
+    most: float = 30.0
+
+
+SECURED = Settling(least=6.0, still=5.0, most=45.0)
+"""Secured participants authenticate each other first, which takes up to 2.5 s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The graph at the end of a look, how long the look took, and whether it had come to rest."""
+
+    observation: Observation
+    seconds: float
+    settled: bool
+
+
+def settle(source: GraphSource, settling: Settling, clock: Clock) -> Snapshot:
+    """The graph once it has come to rest, or as it is at the latest moment."""
+    begin = changed = clock()
+    seen = Observation()
+    while True:
+        now = clock()
+        if now - begin >= settling.most:
+            return Snapshot(seen, now - begin, False)
+        if now - begin >= settling.least and now - changed >= settling.still:
+            return Snapshot(seen, now - begin, True)
+        news = source.next(_TICK)
+        if news is not None:
+            seen, changed = news, clock()
+
+
+def look_for(source: GraphSource, seconds: float, clock: Clock) -> Snapshot:
+    """The graph as it is after exactly so many seconds."""
+    begin = clock()
+    seen = Observation()
+    while (left := begin + seconds - clock()) > 0:
+        seen = source.next(min(left, _TICK)) or seen
+    return Snapshot(seen, seconds, True)
+
+
+def watch(
+    source: GraphSource,
+    seconds: float | None,
+    clock: Clock,
+    *,
+    stop: Callable[[], bool],
+    tell: Callable[[Observation], None],
+    still: float = 0.5,
+    patience: float = 2.0,
+) -> Snapshot:
+    """The union of everything seen in so many seconds (None: without end), or until ``stop()``.
+
+    ``tell`` gets the union whenever it has grown and then held still for a moment, so that what
+    is only half discovered is not told; it waits no longer than ``patience``.
+    """
+    begin = clock()
+    union = told = Observation()
+    grown = changed = begin
+    while not stop() and (seconds is None or clock() - begin < seconds):
+        news = source.next(_TICK)
+        now = clock()
+        if news is not None:
+            both = union.union(news)
+            if both != union:
+                if told is union:
+                    grown = now
+                union, changed = both, now
+        if union is not told and (now - changed >= still or now - grown >= patience):
+            tell(union)
+            told = union
+    if union is not told:
+        tell(union)
+    return Snapshot(union, clock() - begin, True)
+
+
+_DIGITS = 12
+_FIRST_BIT = 1 << (4 * _DIGITS - 1)
+_SECURED = tuple("89abcdef")
+"""How identifiers of secured participants begin, in hex: with the first bit set."""
+_NOT_SAID = ("/",)
+
+
+def identity_of(subject: bytes) -> str:
+    """The first 6 bytes, in hex, of the participants whose certificate has this subject (DER)."""
+    digest = int(sha256(subject).hexdigest()[:_DIGITS], 16)
+    return f"{_FIRST_BIT | digest >> 1:x}"
+
+
+def identified(observation: Observation, enclaves: Mapping[str, str]) -> Observation:
+    """The observation with the enclaves that the certificates of its participants tell.
+
+    ``enclaves`` are by `identity_of`.  A secured node of which neither they nor the graph tell the
+    enclave has none.
+    """
+    nodes = []
+    for node in observation.nodes:
+        told = enclaves.get(node.participant[:_DIGITS])
+        if told is not None:
+            node = replace(node, enclaves=(told,))
+        elif node.participant.startswith(_SECURED) and node.enclaves == _NOT_SAID:
+            node = replace(node, enclaves=())
+        nodes.append(node)
+    return make_observation(nodes, observation.silent, observation.strays)

@@ -1,0 +1,232 @@
+"""The identity CA and the permissions CA of a keystore: making them, and loading them to sign.
+
+It holds the issuing CA first, for Cyclone DDS 0.10.2 reads nothing else of it (ran); Fast DDS
+2.9.1 trusts all that it holds, and reads a revocation list in it, too (ran).
+"""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TypeVar
+
+from cryptography import x509
+
+from sros_tool.errors import KeystoreError, Note, PkiError
+from sros_tool.keystore.authorities.imported import check_imported
+from sros_tool.keystore.authorities.keyring import Keyring, check_keys_of, check_places
+from sros_tool.keystore.layout import (
+    IDENTITY,
+    PERMISSIONS,
+    PRIVATE,
+    PUBLIC,
+    ROLES,
+    ca_certificate,
+    ca_key,
+    enclave_folder,
+)
+from sros_tool.keystore.template import Template
+from sros_tool.keystore.transaction.stage import STAGE
+from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import (
+    Issuer,
+    common_name,
+    issue_ca,
+    load_certificate,
+    load_certificates,
+    pem,
+    same_key,
+    subject_text,
+    validity_of,
+)
+from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl
+from sros_tool.pki.keys import PrivateKey
+from sros_tool.validity import iso, window
+from sros_tool.xml import read_bytes
+
+Document = TypeVar("Document")
+
+
+@dataclass(frozen=True, slots=True)
+class Authority:
+    """A certificate authority that can sign."""
+
+    certificate: x509.Certificate
+    key: PrivateKey
+
+    def issuer(self) -> Issuer:
+        """What issues the certificates of enclaves in this authority's name."""
+        return Issuer(self.certificate, self.key)
+
+    def sign(
+        self, document: bytes, meant: Document, read: Callable[[bytes], Document], what: str
+    ) -> bytes:
+        """Sign a document and check the result before anybody relies on it.
+
+        The signed message is taken apart again, its digest checked, and what it says (by
+        ``read``) compared with what was ``meant``.  ``what`` names it in errors.
+        """
+        message = smime.sign(document, self.certificate, self.key)
+        signed = smime.parse(message)
+        if not signed.carries_digest() or read(signed.document) != meant:
+            raise PkiError(
+                f"{what} as signed does not say what was meant",
+                "Nothing was written.",
+                "This is a defect of sros: please report it with the policy.",
+            )
+        return message
+
+
+@dataclass(frozen=True, slots=True)
+class Authorities:
+    """The two authorities of a keystore, which may be one and the same."""
+
+    identity: Authority
+    permissions: Authority
+    notes: tuple[Note, ...] = ()
+
+
+def create_authorities(
+    transaction: Transaction,
+    template: Template,
+    keyring: Keyring,
+    now: datetime,
+    imported: Mapping[str, bytes],
+) -> Authorities:
+    """Make the CA or CAs of a new keystore; those whose certificate is ``imported`` exist."""
+    check_places(keyring, template)
+    check_keys_of(imported, keyring, template)
+    validity = window(now, template.authority_validity)
+    # Every keystore's CA has a name of its own, so that messages and pictures can tell them apart.
+    serial = secrets.token_hex(4)
+    notes: list[Note] = []
+
+    def make(file: str, role: str, name: str) -> Authority:
+        key = keyring.make(transaction, f"{PRIVATE}/{file}.key.pem", role, template)
+        if role in imported:
+            found = check_imported(role, imported[role], key, now)
+            certificate, bundle = found.certificate, found.bundle
+            notes.extend(found.notes)
+        else:
+            certificate = issue_ca(key, common_name(name), validity)
+            bundle = pem(certificate)
+        transaction.write(f"{PUBLIC}/{file}.cert.pem", bundle)
+        return Authority(certificate, key)
+
+    if template.separate_authorities:
+        name = template.authority_name
+        return Authorities(
+            make("identity_ca", IDENTITY, f"{name} identity CA {serial}"),
+            make("permissions_ca", PERMISSIONS, f"{name} permissions CA {serial}"),
+            tuple(notes),
+        )
+    authority = make("ca", IDENTITY, template.authority_name)
+    in_keystore = not (keyring.places.get(IDENTITY) or template.identity_key)
+    for role in ROLES:
+        transaction.link(ca_certificate(role), "ca.cert.pem")
+        if in_keystore:
+            transaction.link(ca_key(role), "ca.key.pem")
+    return Authorities(authority, authority, tuple(notes))
+
+
+def load_ca_certificate(root: Path, role: str) -> x509.Certificate:
+    """The certificate of the identity or permissions CA of a keystore."""
+    path = root / ca_certificate(role)
+    return load_certificate(read_bytes(path, f"{role} CA certificate"), f"'{path}'")
+
+
+def load_authorities(
+    root: Path, template: Template, keyring: Keyring, now: datetime
+) -> Authorities:
+    """Both authorities of a keystore, with their keys, checked and ready to sign."""
+    identity = load_authority(root, IDENTITY, template, keyring, now)
+    permissions = load_authority(root, PERMISSIONS, template, keyring, now)
+    return Authorities(identity, permissions)
+
+
+def load_authority(
+    root: Path, role: str, template: Template, keyring: Keyring, now: datetime
+) -> Authority:
+    """The identity or permissions CA of a keystore, with its key, checked and ready to sign."""
+    if not (root / ca_certificate(role)).exists() and not (root / ca_key(role)).exists():
+        raise KeystoreError(
+            f"keystore '{root}' has no {role} CA",
+            "It may be a copy that was made for a robot, which can run enclaves but not make them.",
+            "Use the keystore that it was exported from.",
+        )
+    certificate = load_ca_certificate(root, role)
+    key = keyring.open(root, role, template)
+    if not same_key(certificate, key):
+        raise KeystoreError(
+            f"the key and the certificate of the {role} CA do not belong together",
+            f"'{keyring.place(role, template)}' is not the key of "
+            f"'{root / ca_certificate(role)}', so nothing that it signs could be verified.",
+            "Restore the pair from a backup.",
+        )
+    validity = validity_of(certificate)
+    if not validity.contains(now):
+        raise KeystoreError(
+            f"the {role} CA {subject_text(certificate.subject)} is not valid now",
+            f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}, and DDS "
+            "refuses whatever an expired CA has signed.",
+            "Check the clock of this machine; otherwise make a new keystore.",
+        )
+    return Authority(certificate, key)
+
+
+def authority_files(root: Path) -> dict[str, tuple[str, ...]]:
+    """The stem of each CA file, with the roles for which it serves."""
+    found: dict[str, tuple[str, ...]] = {}
+    for role in ROLES:
+        path = root / ca_certificate(role)
+        file = path
+        # A link into the stage is a file of its own that an interrupted transaction left so.
+        if path.is_symlink() and STAGE not in (to := str(path.readlink())):
+            file = path.with_name(to)
+        if not file.is_file() or file.parent != path.parent:
+            raise KeystoreError(
+                f"keystore '{root}' has no {role} CA of its own",
+                f"'{path}' is missing, or leads out of the keystore.",
+                "Use the keystore that it was exported from.",
+            )
+        stem = file.name.removesuffix(".cert.pem")
+        found[stem] = (*found.get(stem, ()), role)
+    return found
+
+
+def certificates_of(root: Path, file: str) -> tuple[x509.Certificate, ...]:
+    """All certificates of a CA file, the issuing one first."""
+    path = root / PUBLIC / f"{file}.cert.pem"
+    return load_certificates(read_bytes(path, "CA certificate"), f"'{path}'")
+
+
+def carried_crl(root: Path, file: str) -> RevocationList | None:
+    """The revocation list that a CA file carries beside its certificates, or None."""
+    path = root / PUBLIC / f"{file}.cert.pem"
+    data = read_bytes(path, "CA certificate")
+    return load_crl(data, f"in '{path}'") if CRL_MARK in data else None
+
+
+def write_bundle(
+    transaction: Transaction,
+    file: str,
+    roles: Sequence[str],
+    bundle: bytes,
+    names: Sequence[str],
+) -> None:
+    """Stage a CA file, and the copies that enclaves have of it."""
+    transaction.write(f"{PUBLIC}/{file}.cert.pem", bundle)
+    for role in roles:
+        write_copies(transaction, names, f"{role}_ca.cert.pem", bundle)
+
+
+def write_copies(transaction: Transaction, names: Sequence[str], name: str, data: bytes) -> None:
+    """Stage a file in every enclave that has a copy of it, not a link."""
+    for enclave in names:
+        path = f"{enclave_folder(enclave)}/{name}"
+        if (transaction.root / path).is_file() and not (transaction.root / path).is_symlink():
+            transaction.write(path, data)

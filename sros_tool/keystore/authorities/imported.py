@@ -1,0 +1,152 @@
+"""Checks a CA that was made elsewhere before a keystore is built upon it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from datetime import datetime
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec, rsa
+
+from sros_tool.dds.decision import Vendor
+from sros_tool.errors import Note, PkiError
+from sros_tool.keystore.layout import PERMISSIONS
+from sros_tool.keystore.loading import MEASURED, authority_refusals, refusals_text
+from sros_tool.pki.certificates import (
+    UNREADABLE,
+    issued_by,
+    pem,
+    read_in_full,
+    same_key,
+    subject_text,
+    validity_of,
+)
+from sros_tool.pki.chains import purpose_faults
+from sros_tool.pki.keys import PrivateKey, algorithm
+from sros_tool.validity import iso
+
+_MOST_CERTIFICATES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedAuthority:
+    """The certificate that issues, all that lead from it to the root, and remarks.
+
+    ``bundle`` is the PEM for the CA file: the issuing certificate first, the root last.
+    """
+
+    certificate: x509.Certificate
+    bundle: bytes
+    notes: tuple[Note, ...]
+
+
+def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> ImportedAuthority:
+    """Read a CA certificate with its chain (PEM, any order), the CA of ``key``.
+
+    Raises `PkiError` where it cannot serve as the ``role`` CA at all; what only some DDS vendors
+    refuse becomes a remark.
+    """
+    try:
+        certificates = [read_in_full(each) for each in x509.load_pem_x509_certificates(data)]
+    except UNREADABLE as error:
+        raise PkiError(
+            f"the certificate of the {role} CA cannot be read", "It is not PEM, or it is damaged."
+        ) from error
+    own = [each for each in certificates if same_key(each, key)]
+    if not own or len(certificates) > _MOST_CERTIFICATES:
+        raise PkiError(
+            f"the certificate of the {role} CA does not fit its key",
+            f"None of the {len(certificates)} certificates in the file belongs to it.",
+            "Name the certificate and the key of the same CA.",
+        )
+    chain = list(_chain(own[0], certificates, role))
+    for each in chain:
+        _check_ca(each, role, now)
+    refusals = authority_refusals(role, tuple(chain), now)
+    if len(refusals) == len(MEASURED):
+        raise PkiError(
+            f"{subject_text(own[0].subject)} cannot be the {role} CA: no DDS takes it",
+            f"{refusals_text(refusals)}.",
+            "Issue the CA's certificate anew, self-signed with SHA-256 and keyUsage keyCertSign "
+            "and digitalSignature.",
+        )
+    return ImportedAuthority(
+        own[0], b"".join(map(pem, chain)), tuple(_notes(role, chain, refusals))
+    )
+
+
+def _chain(
+    start: x509.Certificate, certificates: list[x509.Certificate], role: str
+) -> Iterator[x509.Certificate]:
+    current, left = start, [each for each in certificates if each != start]
+    yield current
+    while not issued_by(current, current):
+        above = next((each for each in left if issued_by(current, each)), None)
+        if above is None:
+            raise PkiError(
+                f"the chain of the {role} CA has no root",
+                f"The issuer {subject_text(current.issuer)} is not in the file.",
+                "Put all certificates up to the self-signed root into one PEM file.",
+            )
+        left.remove(above)
+        current = above
+        yield current
+
+
+def _check_ca(certificate: x509.Certificate, role: str, now: datetime) -> None:
+    name = subject_text(certificate.subject)
+    extensions = certificate.extensions
+    try:
+        is_ca = extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+    except x509.ExtensionNotFound:
+        is_ca = False
+    try:
+        may_sign = extensions.get_extension_for_class(x509.KeyUsage).value.key_cert_sign
+    except x509.ExtensionNotFound:
+        may_sign = True
+    if not is_ca or not may_sign:
+        raise PkiError(
+            f"{name} cannot be the {role} CA",
+            "Its certificate does not say that it may issue others.",
+        )
+    validity = validity_of(certificate)
+    if not validity.contains(now):
+        raise PkiError(
+            f"{name} cannot be the {role} CA now",
+            f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}.",
+        )
+
+
+def _notes(
+    role: str, chain: list[x509.Certificate], refusals: Mapping[Vendor, str]
+) -> Iterator[Note]:
+    name = subject_text(chain[0].subject)
+    if len(chain) > 1:
+        told = refusals_text(refusals)
+        yield Note("portable.intermediate", f"{name} is below another CA. {told}.")
+    elif role == PERMISSIONS and (fault := next(purpose_faults(chain), "")):
+        yield Note(
+            "portable.ca-purpose",
+            f"{fault}: Fast DDS 2.9.1 and Cyclone DDS 0.10.2 refuse every document that it signs "
+            '("unsuitable certificate purpose"), and only Fast DDS 2.14 takes them. Issue its '
+            "certificate anew with keyUsage digitalSignature and without extendedKeyUsage, unless "
+            "all robots run Fast DDS 2.14.",
+        )
+    for each in chain:
+        key, name = each.public_key(), subject_text(each.subject)
+        fits = (isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name == "secp256r1") or (
+            isinstance(key, rsa.RSAPublicKey) and key.key_size == 2048
+        )
+        if not fits:
+            yield Note(
+                "portable.key-algorithm",
+                f"{name} has a key of {algorithm(key)}; Cyclone DDS takes EC secp256r1 and RSA "
+                "2048 only.",
+            )
+        if not isinstance(each.signature_hash_algorithm, hashes.SHA256):
+            yield Note(
+                "portable.signature-hash",
+                f"{name} is not signed with SHA-256, which Fast DDS rejects in a CA.",
+            )

@@ -1,0 +1,155 @@
+"""Where the keys of the authorities are, and how they are opened: in the keystore, elsewhere, or
+on a token.
+
+The library never asks a person: a secrets handler does, which the caller brings.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from sros_tool.errors import KeystoreError, PkiError, UsageError
+from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key
+from sros_tool.keystore.template import Template
+from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
+from sros_tool.pki.token import SCHEME, create_token_key, holds_token_key, open_token_key
+from sros_tool.xml import read_bytes
+
+Secrets = Callable[[str], str]
+
+
+def no_secrets(what: str) -> str:
+    """A handler that has no secret to give."""
+    raise PkiError(f"{what} is needed, and nobody is there to give it")
+
+
+@dataclass(frozen=True, slots=True)
+class Keyring:
+    """How the keys of the two authorities are reached.
+
+    ``places`` names the key of a role ("identity", "permissions") by URI, ``file:PATH`` or
+    ``pkcs11:...``, where it is not at the place that the keystore's settings say.  ``secrets``
+    answers with passphrases and PINs.  With ``encrypt``, new keys in files get a passphrase.
+    """
+
+    secrets: Secrets = no_secrets
+    places: dict[str, str] = field(default_factory=dict)
+    encrypt: bool = False
+
+    def place(self, role: str, template: Template) -> str:
+        """The URI of the key of a role, or the path of its file within the keystore."""
+        role_key = {IDENTITY: template.identity_key}.get(role, template.permissions_key)
+        return self.places.get(role) or role_key or ca_key(role)
+
+    def open(self, root: Path, role: str, template: Template) -> PrivateKey:
+        """The key of a role; raises `KeystoreError` where it is not there or cannot be used."""
+        place = self.place(role, template)
+        try:
+            if place.startswith(SCHEME):
+                return open_token_key(place, self.secrets)
+            path = _path(place, root)
+            if not path.exists():
+                raise KeystoreError(
+                    f"the key of the {role} CA is not at '{path}'",
+                    "Perhaps it is kept elsewhere on purpose.",
+                    "Put it back for this command, or name its place in "
+                    f"SROS_{role.upper()}_KEY. A new CA would lock out every enclave that "
+                    "exists, so none is made.",
+                )
+            pem = read_bytes(path, f"{role} CA key")
+            return load_key(pem, f"'{path}'", self._passphrase(role))
+        except (KeystoreError, PkiError) as error:
+            raise KeystoreError(error.what, error.why, error.remedy) from error
+
+    def make(
+        self, transaction: Transaction, file: str, role: str, template: Template
+    ) -> PrivateKey:
+        """The key for a new authority: one that is at its place already, or else a new one there.
+
+        ``file`` is where in the keystore it goes, unless a place is named.
+        """
+        place = self.places.get(role) or (
+            template.identity_key if role == IDENTITY else template.permissions_key
+        )
+        if place.startswith(SCHEME):
+            if holds_token_key(place, self.secrets):
+                return open_token_key(place, self.secrets)
+            if transaction.dry_run:
+                return generate_key()
+            return create_token_key(place, self.secrets)
+        if place and _path(place, transaction.root).exists():
+            return self.open(transaction.root, role, template)
+        key = generate_key()
+        pem = key_pem(key, self._passphrase(role)() if self.encrypt else None)
+        if not place:
+            transaction.write(file, pem, private=True)
+        elif not transaction.dry_run:
+            _write_outside(_path(place, transaction.root), pem, transaction)
+        return key
+
+    def remembered(self, template: Template) -> Template:
+        """``template`` with the places of the keys, for the settings of a new keystore."""
+        identity = self.places.get(IDENTITY) or template.identity_key
+        permissions = self.places.get(PERMISSIONS) or template.permissions_key
+        if not template.separate_authorities:
+            permissions = identity
+        return replace(template, identity_key=identity, permissions_key=permissions)
+
+    def _passphrase(self, role: str) -> Callable[[], str]:
+        return lambda: self.secrets(f"the passphrase of the {role} CA key")
+
+
+IN_KEYSTORE = Keyring()
+"""The keys lie in the keystore, unencrypted."""
+
+
+def check_places(keyring: Keyring, template: Template) -> None:
+    """Raise `KeystoreError` where one CA does both jobs and its key is named for one only."""
+    named = {role: keyring.places.get(role) for role in ROLES}
+    if not template.separate_authorities and len({place or "" for place in named.values()}) > 1:
+        raise KeystoreError(
+            "with one CA for both jobs, its key has one place",
+            "Two different places are named.",
+            "Name the same place for both, or use --ca-layout separate.",
+        )
+
+
+def check_keys_of(roles: Iterable[str], keyring: Keyring, template: Template) -> None:
+    """Raise `UsageError` where the certificate of a CA is given, but not where its key is."""
+    for role in roles:
+        if keyring.place(role, template) == ca_key(role):
+            raise UsageError(
+                f"the certificate of the {role} CA is given without its key",
+                "A keystore signs with it.",
+                f"Add --{role}-key file:PATH or --{role}-key pkcs11:...",
+            )
+        if not template.separate_authorities and role != IDENTITY:
+            raise UsageError(
+                "with one CA for both jobs, its certificate is that of the identity CA",
+                "",
+                "Give --identity-ca alone, or --ca-layout separate.",
+            )
+
+
+def _path(place: str, root: Path) -> Path:
+    return root / place.removeprefix("file:").removeprefix("//")
+
+
+def _write_outside(path: Path, pem: bytes, transaction: Transaction) -> None:
+    """Write a key file outside of the keystore; it goes if the keystore does not come."""
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+
+    def undo() -> None:
+        with suppress(OSError):
+            path.unlink()
+
+    transaction.on_failure(undo)
+    with os.fdopen(handle, "wb") as file:
+        file.write(pem)
+        file.flush()
+        os.fsync(file.fileno())

@@ -1,0 +1,1 @@
+"""Bringing enclaves to robots: export, signing request, answer, import."""

@@ -1,0 +1,215 @@
+"""Exports enclaves for a robot: a keystore of real files, without links and without any CA key."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack, staged_file
+from sros_tool.keystore.delivery.arrival import check_same_authority
+from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.layout import (
+    OPTIONAL_FILES,
+    PRIVATE,
+    REQUEST,
+    REQUIRED_FILES,
+    enclave_folder,
+    list_enclaves,
+)
+from sros_tool.keystore.loading import check_enclave
+from sros_tool.keystore.reader import no_such_enclave
+from sros_tool.keystore.transaction.stage import Change
+from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.names import check_enclave_name
+from sros_tool.xml import read_bytes
+
+ARCHIVE_SUFFIXES = SUFFIXES
+_ANSWER_AGAIN = (
+    "Send the robot a new answer, by `sros sign_request --renew` of the request.pem that lies in "
+    "the enclave's folder."
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Export:
+    """What was exported, and where to."""
+
+    target: Path
+    enclaves: tuple[str, ...]
+    changes: tuple[Change, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """The enclaves to export, and those that fit but whose key is on their robot."""
+
+    names: tuple[str, ...]
+    left_out: tuple[str, ...]
+
+
+def select(
+    root: Path, names: Sequence[str], patterns: Sequence[str] = (), *, every: bool = False
+) -> Selection:
+    """The named enclaves, and those of the keystore that fit a pattern, or ``every`` one.
+
+    In a pattern ``*`` stands for any part of a name, "/" included, as in policies.  Those that are
+    found so are left out if their key is not at home; those that are named are refused later.
+    """
+    existing = list_enclaves(root)
+    chosen = list(dict.fromkeys(names))
+    left_out: list[str] = []
+    for pattern in ("*",) if every else patterns:
+        fitting = [name for name in existing if fnmatchcase(name, pattern)]
+        if not fitting:
+            raise KeystoreError(
+                f"no enclave of keystore '{root}' fits {pattern!r}",
+                "",
+                f"See `sros list_enclaves {root}`.",
+            )
+        for name in fitting:
+            if name in chosen or name in left_out:
+                continue
+            (left_out if _born_elsewhere(root, name) else chosen).append(name)
+    if not chosen:
+        raise KeystoreError(
+            f"the keys of {', '.join(left_out)} are not in keystore '{root}'",
+            "They were made on their robots and stay there.",
+            _ANSWER_AGAIN,
+        )
+    return Selection(tuple(chosen), tuple(left_out))
+
+
+def distribute(
+    root: Path,
+    names: Sequence[str],
+    target: Path,
+    *,
+    now: datetime,
+    force: bool = False,
+    dry_run: bool = False,
+) -> Export:
+    """Export enclaves to ``target``: an archive if it is named ``.tar.gz``, else a folder.
+
+    The same enclaves give the same bytes.  An enclave that cannot run is not exported.  In a
+    folder that already is an export, other enclaves stay; files that would change need ``force``.
+    """
+    files = collect(root, names, now)
+    if target.name.endswith(ARCHIVE_SUFFIXES):
+        changes = _write_archive(target, files, force, dry_run)
+    else:
+        changes = _write_folder(root, target, files, force, dry_run)
+    return Export(target, tuple(names), changes)
+
+
+@dataclass(frozen=True, slots=True)
+class Packed:
+    """An archive, and the paths of the files in it."""
+
+    data: bytes
+    paths: tuple[str, ...]
+
+
+def pack_enclaves(root: Path, names: Sequence[str], *, now: datetime) -> Packed:
+    """Export enclaves as the bytes of an archive, for a pipe."""
+    files = collect(root, names, now)
+    return Packed(pack(files), tuple(files))
+
+
+def collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]:
+    """The files that are sent, by their paths; raises `KeystoreError` for what would not run."""
+    existing = set(list_enclaves(root))
+    files: dict[str, bytes] = {}
+    for name in names:
+        check_enclave_name(name)
+        if name not in existing:
+            raise no_such_enclave(root, name, existing)
+        if _born_elsewhere(root, name):
+            raise KeystoreError(
+                f"the key of enclave {name} is not in keystore '{root}'",
+                "It was made on its robot and stays there, so there is nothing that could run.",
+                _ANSWER_AGAIN,
+            )
+        folder = enclave_path(root, name)
+        state = check_enclave(folder, now=now)
+        if state.problems:
+            raise KeystoreError(
+                f"enclave {name} would not run where it is sent",
+                "; ".join(map(str, state.problems)) + ".",
+                f"See `sros inspect {folder}`.",
+            )
+        for file in (*REQUIRED_FILES, *OPTIONAL_FILES):
+            if (folder / file).exists():
+                files[f"{enclave_folder(name)}/{file}"] = read_bytes(folder / file, "file")
+    return dict(sorted(files.items()))
+
+
+def _born_elsewhere(root: Path, name: str) -> bool:
+    folder = enclave_path(root, name)
+    return (folder / REQUEST).exists() and not (folder / "key.pem").exists()
+
+
+def _real(path: Path) -> Path:
+    # Unlike Path.resolve, realpath does not fail at links that lead in a circle.
+    return Path(os.path.realpath(path))
+
+
+def _write_folder(
+    root: Path, target: Path, files: dict[str, bytes], force: bool, dry_run: bool
+) -> tuple[Change, ...]:
+    if _real(target).is_relative_to(_real(root)):
+        raise KeystoreError(
+            f"'{target}' is the keystore itself or lies in it", "", "Choose another folder."
+        )
+    if os.path.lexists(target) and not target.is_dir():
+        raise KeystoreError(f"'{target}' is in the way", "It is not a folder.")
+    if (target / PRIVATE).exists():
+        raise KeystoreError(
+            f"'{target}' holds CA keys",
+            "It is a keystore of its own, not an export.",
+            "Choose another folder.",
+        )
+    check_same_authority(target, files)
+    different = {
+        path: data
+        for path, data in files.items()
+        if not (target / path).is_file() or read_bytes(target / path, "file") != data
+    }
+    replaced = [path for path in different if os.path.lexists(target / path)]
+    if replaced and not force:
+        raise KeystoreError(
+            f"'{target}' already holds another version of {', '.join(replaced)}",
+            "Nothing was changed.",
+            "Add --force to replace it, or choose another folder.",
+        )
+    with Transaction(target, fresh=True, dry_run=dry_run) as transaction:
+        for path, data in different.items():
+            transaction.write(path, data, private=file_mode(path) == 0o600)
+        transaction.commit()
+    return tuple(transaction.changes)
+
+
+def _write_archive(
+    target: Path, files: dict[str, bytes], force: bool, dry_run: bool
+) -> tuple[Change, ...]:
+    data = pack(files)
+    if target.exists():
+        if not target.is_file():
+            raise KeystoreError(f"'{target}' is in the way", "It is not a regular file.")
+        if target.read_bytes() == data:
+            return ()
+        if not force:
+            raise KeystoreError(
+                f"'{target}' already exists and differs",
+                "Nothing was changed.",
+                "Add --force to replace it, or choose another name.",
+            )
+    change = Change("replace" if target.exists() else "create", target.name)
+    if not dry_run:
+        with staged_file(target, data) as put_in_place:
+            put_in_place()
+    return (change,)

@@ -1,0 +1,1 @@
+"""Issuing for enclaves: certificates, permissions, their proof and the ledger."""

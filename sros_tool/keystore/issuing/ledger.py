@@ -1,0 +1,124 @@
+"""The ledger of a keystore: every certificate and signed document that it ever issued.
+
+One JSON object a line, only ever added to; it is part of the transaction that issues, so it knows
+of everything that was put in place and of nothing that was not.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from datetime import datetime
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.pki.certificates import subject_text, validity_of
+from sros_tool.validity import Window, iso
+
+LEDGER = "ledger.jsonl"
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One line: what was issued (or revoked), when, for whom, and how long it is valid.
+
+    ``what`` is ca, certificate, permissions, governance, crl, revocation, or answer (the signed
+    list of what was sent to a robot).  ``sha256`` is that of the DER of a certificate or of the
+    bytes of a document; ``serial`` is hexadecimal; ``policy`` is the SHA-256 of the policy file,
+    with its includes, that permissions were made from.  Moments are ISO 8601 in UTC.
+    """
+
+    time: str
+    what: str
+    enclave: str = ""
+    subject: str = ""
+    serial: str = ""
+    sha256: str = ""
+    not_before: str = ""
+    not_after: str = ""
+    policy: str = ""
+    reason: str = ""
+
+
+_FIELDS = tuple(each.name for each in fields(Entry))
+
+
+def certificate_entry(
+    now: datetime, what: str, certificate: x509.Certificate, enclave: str = ""
+) -> Entry:
+    """The entry of an issued certificate."""
+    validity = validity_of(certificate)
+    return Entry(
+        time=iso(now),
+        what=what,
+        enclave=enclave,
+        subject=subject_text(certificate.subject),
+        serial=f"{certificate.serial_number:x}",
+        sha256=certificate.fingerprint(hashes.SHA256()).hex(),
+        not_before=iso(validity.not_before),
+        not_after=iso(validity.not_after),
+    )
+
+
+def document_entry(
+    now: datetime,
+    what: str,
+    message: bytes,
+    *,
+    enclave: str = "",
+    subject: str = "",
+    validity: Window | None = None,
+    policy: str = "",
+) -> Entry:
+    """The entry of a signed document."""
+    return Entry(
+        time=iso(now),
+        what=what,
+        enclave=enclave,
+        subject=subject,
+        sha256=hashlib.sha256(message).hexdigest(),
+        not_before=iso(validity.not_before) if validity else "",
+        not_after=iso(validity.not_after) if validity else "",
+        policy=policy,
+    )
+
+
+def read_ledger(root: Path) -> tuple[Entry, ...]:
+    """All entries, oldest first; none for a keystore without a ledger (of ros2/sros2)."""
+    path = root / LEDGER
+    if not path.exists():
+        return ()
+    entries = []
+    for number, line in enumerate(path.read_bytes().splitlines(), 1):
+        try:
+            entries.append(Entry(**json.loads(line)))
+        except (ValueError, TypeError) as error:
+            raise KeystoreError(
+                f"the ledger '{path}' cannot be read",
+                f"Line {number} is not an entry.",
+                "Restore it from a backup.",
+            ) from error
+    return tuple(entries)
+
+
+def append(transaction: Transaction, entries: Iterable[Entry]) -> None:
+    """Stage the ledger with further entries."""
+    new = b"".join(_line(entry) for entry in entries)
+    if not new:
+        return
+    path = transaction.root / LEDGER
+    old = path.read_bytes() if path.exists() else b""
+    if old and not old.endswith(b"\n"):
+        old += b"\n"
+    transaction.write(LEDGER, old + new)
+
+
+def _line(entry: Entry) -> bytes:
+    filled = {name: value for name in _FIELDS if (value := getattr(entry, name))}
+    return json.dumps(filled, separators=(",", ":")).encode() + b"\n"

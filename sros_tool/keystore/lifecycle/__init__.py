@@ -1,0 +1,1 @@
+"""The life of a keystore: create, renew, revoke, rotate its CAs."""

@@ -1,0 +1,240 @@
+"""Renews enclaves: new certificates, and the permissions that they have signed anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from sros_tool.errors import KeystoreError, Note, SrosError
+from sros_tool.keystore.authorities.authority import Authorities, load_authorities
+from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.issuing.issuance import Issuance, policies_of, renewed
+from sros_tool.keystore.issuing.ledger import Entry, append, read_ledger
+from sros_tool.keystore.layout import check_keystore, enclave_folder, has_enclave, list_enclaves
+from sros_tool.keystore.lifecycle.revocation_list import Lists
+from sros_tool.keystore.lifecycle.revoke import link_everywhere, still_valid
+from sros_tool.keystore.reader import (
+    Standing,
+    Threshold,
+    Unreadable,
+    describe_lifetime,
+    lifetimes,
+    load_settings,
+    no_such_enclave,
+    parse_threshold,
+    read_standing,
+    refuse,
+)
+from sros_tool.keystore.template import Template
+from sros_tool.keystore.transaction.recovery import tidy
+from sros_tool.keystore.transaction.stage import Change
+from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.names import check_enclave_name
+from sros_tool.parallel import Progress
+from sros_tool.pki.certificates import enclave_subject, issued_by, validity_of
+from sros_tool.pki.crl import Revoked
+from sros_tool.pki.keys import PublicKey, generate_key, key_pem
+from sros_tool.validity import iso
+
+__all__ = ["Renewal", "Threshold", "describe_lifetime", "lifetimes", "parse_threshold", "renew"]
+
+
+@dataclass(frozen=True, slots=True)
+class Renewal:
+    """What was renewed, or with ``dry_run`` would be.
+
+    ``works_until`` is the last end of a certificate that was replaced and not revoked, if there is
+    one that has not ended.  ``restart`` are the enclaves whose processes go on trusting the
+    revoked ones until they are started again.  ``remarks`` are sentences on what is still to be
+    done.
+    """
+
+    root: Path
+    renewed: tuple[str, ...]
+    changes: tuple[Change, ...]
+    notes: tuple[Note, ...] = ()
+    works_until: datetime | None = None
+    revoked: int = 0
+    restart: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Replaced:
+    """A certificate that another took the place of."""
+
+    name: str
+    serial: int
+    subject: str
+    not_after: datetime
+
+
+def renew(
+    root: Path,
+    names: Sequence[str] = (),
+    *,
+    now: datetime,
+    expiring: Threshold | None = None,
+    new_key: bool = False,
+    revoke_old: bool = False,
+    keyring: Keyring = IN_KEYSTORE,
+    dry_run: bool = False,
+    progress: Progress | None = None,
+) -> Renewal:
+    """Renew the named enclaves, or all that are due by ``expiring``; all or nothing.
+
+    The certificate is issued anew for the same key, or with ``new_key`` for a new one; the rights
+    stay as they are signed.  Certificate, key and permissions of an enclave change at one moment.
+    A certificate that is replaced works until it ends, for whoever has its files, unless it is
+    revoked; with ``revoke_old`` all earlier ones of the renewed enclaves are, at the same moment.
+    Raises one error that names every enclave that cannot be renewed.
+    """
+    if not dry_run:
+        tidy(root)
+    check_keystore(root)
+    for name in names:
+        if not has_enclave(root, check_enclave_name(name)):
+            raise no_such_enclave(root, name, list_enclaves(root))
+    with Transaction(root, dry_run=dry_run) as transaction:
+        template = load_settings(root)
+        authorities = load_authorities(root, template, keyring, now)
+        work = _Renewer(transaction, authorities, template, now, new_key)
+        chosen = dict.fromkeys(names, None)
+        existing = list_enclaves(root) if expiring or revoke_old else ()
+        if expiring is not None:
+            chosen |= {name: expiring for name in existing if name not in chosen}
+        replaced = work.renew_all(list(chosen.items()), progress)
+        valid = [each for each in replaced if each.not_after >= now]
+        entries, lists, count = work.issuance.entries, None, 0
+        if revoke_old and replaced:
+            ledger = read_ledger(root)
+            lists = Lists(transaction, authorities.identity, template, keyring, ledger, now)
+            revocations = _superseded(replaced, ledger, lists, now)
+            count = len(revocations)
+            newly = [Revoked(int(each.serial, 16), _moment(now), _REASON) for each in revocations]
+            _, signed = lists.sign(newly, existing, incomplete=False)
+            entries += [*revocations, *signed]
+            link_everywhere(transaction, existing)
+        append(transaction, entries)
+        transaction.commit()
+    return Renewal(
+        root,
+        tuple(each.name for each in replaced),
+        tuple(transaction.changes),
+        work.issuance.notes if replaced else (),
+        max((each.not_after for each in valid), default=None) if lists is None else None,
+        count,
+        existing if lists else (),
+        tuple(lists.remarks) if lists else (),
+    )
+
+
+_REASON = "superseded"
+
+
+def _moment(now: datetime) -> datetime:
+    return now.replace(microsecond=0)
+
+
+def _superseded(
+    replaced: Sequence[_Replaced], ledger: Sequence[Entry], lists: Lists, now: datetime
+) -> list[Entry]:
+    """Ledger entries for all earlier certificates that have not ended and are not revoked yet."""
+    listed = {each.serial for each in lists.present.revoked} if lists.present else set()
+    issued: dict[str, list[Entry]] = {each.name: [] for each in replaced}
+    for entry in ledger:
+        if entry.enclave in issued:
+            issued[entry.enclave].append(entry)
+    found = []
+    for each in replaced:
+        # A keystore of ros2/sros2 has certificates that its ledger does not know.
+        subjects = still_valid(issued[each.name], each.name, now)
+        if each.not_after >= now:
+            subjects[each.serial] = each.subject
+        found += [
+            Entry(iso(now), "revocation", each.name, subject, f"{serial:x}", reason=_REASON)
+            for serial, subject in subjects.items()
+            if serial not in listed
+        ]
+    return found
+
+
+class _Renewer:
+    def __init__(
+        self,
+        transaction: Transaction,
+        authorities: Authorities,
+        template: Template,
+        now: datetime,
+        new_key: bool,
+    ) -> None:
+        self.issuance = Issuance(
+            transaction,
+            template,
+            now,
+            identity=authorities.identity,
+            permissions=authorities.permissions,
+        )
+        self._transaction = transaction
+        self._authorities = authorities
+        self._template = template
+        self._now = now
+        self._new_key = new_key
+        self._policies = policies_of(transaction.root)
+
+    def renew_all(
+        self, items: Sequence[tuple[str, Threshold | None]], progress: Progress | None
+    ) -> list[_Replaced]:
+        """Renew each enclave, or that with a threshold if it is due; all, or none."""
+
+        def told(item: tuple[str, Threshold | None], result: object) -> None:
+            if progress and isinstance(result, _Replaced):
+                progress(item[0])
+
+        done = self.issuance.spread(items, self._attempt, told)
+        refuse(tuple(each for each in done if isinstance(each, Unreadable)), "renewed")
+        return [each for each in done if isinstance(each, _Replaced)]
+
+    def _attempt(self, item: tuple[str, Threshold | None]) -> _Replaced | Unreadable | None:
+        name, threshold = item
+        try:
+            state = read_standing(self._transaction.root, name)
+            if threshold and not state.lifetime().due(threshold, self._now):
+                return None
+            self._renew(state)
+        except SrosError as error:
+            return Unreadable(name, error)
+        old = state.certificate
+        # The grant that DDS reads has the subject of the certificate.
+        until = validity_of(old).not_after
+        return _Replaced(name, old.serial_number, state.grant.subject, until)
+
+    def _renew(self, state: Standing) -> None:
+        name = state.name
+        if not issued_by(state.certificate, self._authorities.identity.certificate):
+            raise KeystoreError(
+                f"the certificate of enclave {name} was not issued by the identity CA of this "
+                "keystore"
+            )
+        state.signed.verify(self._authorities.permissions.certificate)
+        public: PublicKey = state.certificate.public_key()  # type: ignore[assignment]
+        if self._new_key:
+            public = self._make_key(name)
+        subject = enclave_subject(name, unique=self._template.unique_subject)
+        certificate = self.issuance.certificate(name, subject, public)
+        policy = self._policies.get(state.digest, "")
+        self.issuance.permissions(name, certificate, renewed(state.grant), policy)
+
+    def _make_key(self, name: str) -> PublicKey:
+        folder = enclave_folder(name)
+        if not (self._transaction.root / folder / "key.pem").exists():
+            raise KeystoreError(
+                f"the key of enclave {name} is not in this keystore",
+                "It was made on its robot and stays there, so no new one is made here.",
+                "Have a new request made there, and sign it with --renew.",
+            )
+        key = generate_key()
+        self._transaction.write(f"{folder}/key.pem", key_pem(key), private=True)
+        return key.public_key()

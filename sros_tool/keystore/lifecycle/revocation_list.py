@@ -1,0 +1,262 @@
+"""The revocation lists of a keystore: read, carried over, signed, and put where DDS reads them.
+
+The issuing identity CA's list is every enclave's ``crl.pem``.  While CAs are replaced there is a
+second identity CA, whose list travels in the file of the CAs: Fast DDS 2.9.1 trusts both CAs and
+reads lists there, but not a second one in ``crl.pem``; Cyclone DDS 0.10.2 trusts the issuing CA
+alone (all of this ran).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+
+from cryptography import x509
+
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore.authorities.authority import (
+    Authority,
+    authority_files,
+    carried_crl,
+    certificates_of,
+    write_bundle,
+)
+from sros_tool.keystore.authorities.keyring import Keyring
+from sros_tool.keystore.issuing.ledger import Entry, document_entry
+from sros_tool.keystore.layout import CRL, IDENTITY, REVOKED
+from sros_tool.keystore.lifecycle.rotation.state import (
+    Replacement,
+    Stage,
+    lists_confusable,
+    read_rotation,
+)
+from sros_tool.keystore.template import Template
+from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.pki.certificates import (
+    digest,
+    load_certificate,
+    pem,
+    same_key,
+    subject_text,
+    validity_of,
+)
+from sros_tool.pki.crl import RevocationList, Revoked, load_crl, sign_crl
+from sros_tool.validity import BACKDATE, Window, iso
+from sros_tool.xml import read_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class SignedList:
+    """A list as PEM, when it ends, and what the ledger is told of it."""
+
+    document: bytes
+    end: datetime
+    entry: Entry
+
+
+def read_crl(root: Path) -> RevocationList | None:
+    """The list of the issuing identity CA, or None if nothing was ever revoked."""
+    path = root / CRL
+    if not path.exists():
+        return None
+    return load_crl(read_bytes(path, "revocation list"), f"'{path}'")
+
+
+def read_lists(root: Path) -> tuple[RevocationList, ...]:
+    """All lists that DDS reads: that of the issuing identity CA, and one beside a second CA."""
+    file = _identity_file(root)
+    found = (read_crl(root), carried_crl(root, file) if file else None)
+    return tuple(each for each in found if each)
+
+
+def sign_list(
+    authority: Authority,
+    revoked: Iterable[Revoked],
+    *,
+    number: int,
+    template: Template,
+    now: datetime,
+) -> SignedList:
+    """A list that ends with its CA at the latest.  An expired one locks everybody out."""
+    validity = validity_of(authority.certificate)
+    moment = now.replace(microsecond=0)
+    begin = max(moment - BACKDATE, validity.not_before)
+    end = min(moment + template.revocation_validity, validity.not_after)
+    document = sign_crl(
+        authority.certificate,
+        authority.key,
+        revoked,
+        number=number,
+        this_update=begin,
+        next_update=end,
+    )
+    entry = document_entry(now, "crl", document, validity=Window(begin, end))
+    return SignedList(document, end, entry)
+
+
+def carried_over(old: RevocationList | None, ends: Mapping[int, str]) -> list[Revoked]:
+    """What a new list has to say again: all but what ended before the old list was made.
+
+    RFC 5280, 3.3: an entry stays until it was on one list that was issued after its certificate
+    ended.  ``ends`` are the ends of certificates (ISO 8601, UTC) by serial number; one that is not
+    there is kept for ever.
+    """
+    if old is None:
+        return []
+    # The list was issued BACKDATE after it begins, at the latest; so some stay a little longer.
+    issued = iso(old.this_update)
+    return [each for each in old.revoked if ends.get(each.serial, issued) >= issued]
+
+
+class Lists:
+    """Signs the lists of all identity CAs that are trusted, in a transaction.
+
+    ``remarks`` are sentences on what could not be signed.
+    """
+
+    def __init__(
+        self,
+        transaction: Transaction,
+        authority: Authority,
+        template: Template,
+        keyring: Keyring,
+        ledger: Sequence[Entry],
+        now: datetime,
+    ) -> None:
+        self._transaction = transaction
+        self._root = transaction.root
+        self._authority = authority
+        self._template = template
+        self._keyring = keyring
+        self._ledger = ledger
+        self._now = now
+        self.present = read_crl(self._root)
+        self.remarks: list[str] = []
+
+    def sign(
+        self, newly: Sequence[Revoked], names: Sequence[str], *, incomplete: bool
+    ) -> tuple[datetime, list[Entry]]:
+        """Stage the lists with what is ``newly`` revoked; the first end, and ledger entries.
+
+        Each names all: a serial number that another CA has given does no harm, and the ledger does
+        not tell which of two did.  With ``incomplete``, the key of a CA that is being replaced may
+        be missing, which is else a `KeystoreError`.
+        """
+        ends = self._ends()
+        signed = self._sign(self._authority, self.present, newly, ends, 0)
+        self._transaction.write(CRL, signed.document)
+        found = [signed]
+        if beside := self._beside(newly, names, ends, incomplete=incomplete):
+            found.append(beside)
+        return min(each.end for each in found), [each.entry for each in found]
+
+    def _sign(
+        self,
+        authority: Authority,
+        old: RevocationList | None,
+        newly: Sequence[Revoked],
+        ends: Mapping[int, str],
+        least: int,
+    ) -> SignedList:
+        kept = carried_over(old, ends)
+        listed = {each.serial for each in kept}
+        kept += [each for each in newly if each.serial not in listed]
+        number = max(old.number + 1 if old else 1, least)
+        return sign_list(authority, kept, number=number, template=self._template, now=self._now)
+
+    def _ends(self) -> dict[int, str]:
+        """When each certificate ends; of those that no ledger knows, by the files put away."""
+        ends = {
+            int(each.serial, 16): each.not_after
+            for each in self._ledger
+            if each.what == "certificate"
+        }
+        for path in (self._root / REVOKED).glob("*/cert.pem"):
+            if int(path.parent.name, 16) not in ends:
+                found = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+                ends.setdefault(found.serial_number, iso(validity_of(found).not_after))
+        return ends
+
+    # ── the other CA, while one replaces the other ─────────────────────────────────────────
+
+    def _beside(
+        self,
+        newly: Sequence[Revoked],
+        names: Sequence[str],
+        ends: Mapping[int, str],
+        *,
+        incomplete: bool,
+    ) -> SignedList | None:
+        """Stage the list of the identity CA that comes or goes, in the file of the CAs."""
+        rotation = read_rotation(self._root)
+        file = _identity_file(self._root)
+        replaced = next((each for each in rotation.replacements if each.file == file), None)
+        if not replaced or not file:
+            return None
+        coming = rotation.stage is Stage.DISTRIBUTE
+        certificates = certificates_of(self._root, file)
+        wanted = replaced.new if coming else replaced.old
+        (other,) = [each for each in certificates if digest(each) == wanted]
+        if coming and lists_confusable(certificates[0], other):
+            return None  # who trusts both CAs has to be restarted with all others anyway
+        old = carried_crl(self._root, file)
+        try:
+            authority = self._open(other, replaced, coming=coming)
+        except KeystoreError as error:
+            # The CA that comes has issued nothing; the next stage of the rotation sees to it.
+            if not coming:
+                self._without(other, error, newly, old, incomplete=incomplete)
+            return None
+        # As the next stage makes its list the first one, its number has to be above that.
+        least = (self.present.number if self.present else 0) + 2 if coming else 0
+        signed = self._sign(authority, old, () if coming else newly, ends, least)
+        bundle = b"".join(map(pem, certificates)) + signed.document
+        write_bundle(self._transaction, file, authority_files(self._root)[file], bundle, names)
+        return signed
+
+    def _open(
+        self, certificate: x509.Certificate, replaced: Replacement, *, coming: bool
+    ) -> Authority:
+        place = replaced.key if coming else replaced.place_of_old(certificate)
+        # What the environment names is the place of the issuing CA's key.
+        keyring = replace(self._keyring, places={})
+        key = keyring.open(self._root, IDENTITY, replace(self._template, identity_key=place))
+        if not same_key(certificate, key):
+            raise KeystoreError(f"that at '{place}' is another")
+        return Authority(certificate, key)
+
+    def _without(
+        self,
+        old_ca: x509.Certificate,
+        error: KeystoreError,
+        newly: Sequence[Revoked],
+        old: RevocationList | None,
+        *,
+        incomplete: bool,
+    ) -> None:
+        """Say that the CA that goes cannot sign its list, or refuse to revoke without."""
+        name = subject_text(old_ca.subject)
+        if newly and not incomplete:
+            raise KeystoreError(
+                f"the key of the old identity CA {name} is not at hand",
+                f"Until that CA is retired, Fast DDS accepts what it has issued, so it has to sign "
+                f"the revocation, too: {error.what}.",
+                f"Restart all processes and run `sros rotate_ca {self._root} --to retire` first; "
+                "or add --until-retired, and retire it soon.",
+            )
+        text = f"The list of the old identity CA {name} was not signed anew"
+        if newly:
+            text += "; Fast DDS accepts the revoked certificates that it issued until it is retired"
+        elif old:
+            text += f"; it ends at {iso(old.next_update)}, and Fast DDS then refuses who is of it"
+        self.remarks.append(f"{text}: run `sros rotate_ca {self._root} --to retire`.")
+
+
+def _identity_file(root: Path) -> str | None:
+    """The stem of the identity CA's file; None for a copy of a keystore without CAs."""
+    with suppress(KeystoreError):
+        return next(file for file, roles in authority_files(root).items() if IDENTITY in roles)
+    return None

@@ -1,0 +1,190 @@
+"""Revokes enclaves: the list, its way to everybody else, and the files out of the way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from sros_tool.errors import KeystoreError, UsageError
+from sros_tool.keystore.authorities.authority import Authority, load_authority
+from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.issuing.ledger import Entry, append, read_ledger
+from sros_tool.keystore.layout import (
+    CRL,
+    IDENTITY,
+    OPTIONAL_FILES,
+    REQUEST,
+    REQUIRED_FILES,
+    REVOKED,
+    enclave_folder,
+    list_enclaves,
+)
+from sros_tool.keystore.lifecycle.revocation_list import Lists, read_crl
+from sros_tool.keystore.reader import load_settings, no_such_enclave
+from sros_tool.keystore.transaction.recovery import tidy
+from sros_tool.keystore.transaction.stage import Change
+from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.names import check_enclave_name
+from sros_tool.pki.certificates import issued_by, load_certificate, subject_text
+from sros_tool.pki.crl import REASONS, Revoked
+from sros_tool.validity import iso
+from sros_tool.xml import read_bytes
+
+__all__ = ["Revocation", "read_crl", "refresh_crl", "revoke"]
+
+_FILES = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml", REQUEST)
+_PRIVATE = "key.pem"
+
+
+@dataclass(frozen=True, slots=True)
+class Revocation:
+    """What was revoked, and until when the list holds.
+
+    ``restart`` are the enclaves whose processes go on trusting the revoked ones until they are
+    started again.  ``remarks`` are sentences on what is still to be done.
+    """
+
+    root: Path
+    revoked: tuple[str, ...]
+    restart: tuple[str, ...]
+    next_update: datetime
+    changes: tuple[Change, ...]
+    remarks: tuple[str, ...] = ()
+
+
+def revoke(
+    root: Path,
+    names: Sequence[str],
+    *,
+    now: datetime,
+    reason: str = "unspecified",
+    keyring: Keyring = IN_KEYSTORE,
+    until_retired: bool = False,
+    dry_run: bool = False,
+) -> Revocation:
+    """Revoke the certificates of enclaves and move their files to ``revoked`` in the keystore.
+
+    Every certificate of an enclave is revoked that the ledger knows and that has not ended: an
+    earlier one would serve whoever has a copy of it, with the key, just as well.
+    Every other enclave gets ``crl.pem``, a link to the one list.  ``reason`` is one of `REASONS`.
+    While the identity CA is being replaced, both CAs revoke; where the key of the old one is not at
+    hand, ``until_retired`` says that its certificates may be accepted until it is retired.
+    """
+    if reason not in REASONS:
+        raise UsageError(f"{reason!r} is not a reason", f"Reasons are {', '.join(REASONS)}.")
+    if not dry_run:
+        tidy(root)
+    _check_names(root, names)
+    with Transaction(root, dry_run=dry_run) as transaction:
+        existing = _check_names(root, names)  # another process may have been faster
+        template = load_settings(root)
+        authority = load_authority(root, IDENTITY, template, keyring, now)
+        issued = read_ledger(root)
+        lists = Lists(transaction, authority, template, keyring, issued, now)
+        listed = {each.serial for each in lists.present.revoked} if lists.present else set()
+        revoked: list[Revoked] = []
+        entries: list[Entry] = []
+        for name in dict.fromkeys(names):
+            subjects = still_valid(issued, name, now)
+            subjects.update([_move_away(transaction, authority, name)])
+            for serial, subject in subjects.items():
+                if serial not in listed:
+                    listed.add(serial)
+                    revoked.append(Revoked(serial, now.replace(microsecond=0), reason))
+                    entries.append(
+                        Entry(iso(now), "revocation", name, subject, f"{serial:x}", reason=reason)
+                    )
+        remaining = tuple(name for name in existing if name not in names)
+        next_update, signed = lists.sign(revoked, remaining, incomplete=until_retired)
+        entries += signed
+        link_everywhere(transaction, remaining)
+        append(transaction, entries)
+        transaction.commit()
+    return Revocation(
+        root,
+        tuple(dict.fromkeys(names)),
+        remaining,
+        next_update,
+        tuple(transaction.changes),
+        tuple(lists.remarks),
+    )
+
+
+def refresh_crl(
+    root: Path, *, now: datetime, keyring: Keyring = IN_KEYSTORE, dry_run: bool = False
+) -> Revocation:
+    """Sign the revocation list anew, so that it holds for longer.
+
+    What it revokes is kept, but for certificates that have ended and were on it since.
+    """
+    if not dry_run:
+        tidy(root)
+    list_enclaves(root)
+    with Transaction(root, dry_run=dry_run) as transaction:
+        existing = list_enclaves(root)
+        template = load_settings(root)
+        authority = load_authority(root, IDENTITY, template, keyring, now)
+        lists = Lists(transaction, authority, template, keyring, read_ledger(root), now)
+        next_update, entries = lists.sign((), existing, incomplete=True)
+        link_everywhere(transaction, existing)
+        append(transaction, entries)
+        transaction.commit()
+    changes, remarks = tuple(transaction.changes), tuple(lists.remarks)
+    return Revocation(root, (), existing, next_update, changes, remarks)
+
+
+def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
+    """All enclaves of the keystore, after those that are named were found among them."""
+    existing = list_enclaves(root)
+    for name in names:
+        check_enclave_name(name)
+        if name not in existing:
+            raise no_such_enclave(root, name, existing)
+    return existing
+
+
+def still_valid(issued: Sequence[Entry], name: str, now: datetime) -> dict[int, str]:
+    """Serial numbers and subjects of what was issued to an enclave and has not ended."""
+    return {
+        int(each.serial, 16): each.subject
+        for each in issued
+        if each.what == "certificate" and each.enclave == name and each.not_after >= iso(now)
+    }
+
+
+def _move_away(transaction: Transaction, authority: Authority, name: str) -> tuple[int, str]:
+    """Have the files of an enclave moved; the serial number and subject of its certificate."""
+    folder = enclave_folder(name)
+    path = transaction.root / folder / "cert.pem"
+    certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+    if not issued_by(certificate, authority.certificate):
+        raise KeystoreError(
+            f"the certificate of enclave {name} was not issued by the identity CA of this keystore",
+            "Only its own CA can revoke it.",
+        )
+    serial = certificate.serial_number
+    target = f"{REVOKED}/{serial:x}"
+    for file in _FILES:
+        source = transaction.root / folder / file
+        if name == "/" and file == "governance.p7s":
+            continue  # of the enclave / this is the keystore's own
+        if not source.is_symlink() and not source.exists():
+            continue
+        if not source.is_symlink():
+            data = read_bytes(source, "file")
+            transaction.write(f"{target}/{file}", data, private=file == _PRIVATE)
+        transaction.remove(f"{folder}/{file}")
+    return serial, subject_text(certificate.subject)
+
+
+def link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
+    """Have the ``crl.pem`` of each enclave lead to the one list."""
+    for name in names:
+        folder = enclave_folder(name)
+        path = transaction.root / folder / "crl.pem"
+        target = "../" * folder.count("/") + f"../{CRL}"
+        # A copy, as some ways of copying a keystore make of a link, would grow stale.
+        if not path.is_symlink() or str(path.readlink()) != target:
+            transaction.link(f"{folder}/crl.pem", target)

@@ -1,0 +1,1 @@
+"""CA rotation: its state and its stages."""

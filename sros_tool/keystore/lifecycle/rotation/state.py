@@ -1,0 +1,284 @@
+"""How far a rotation of CAs has come: its one small file, and who is on which CA."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import datetime, timedelta
+from enum import StrEnum
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives.asymmetric import ec
+
+from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.keystore.authorities.authority import authority_files, certificates_of
+from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, enclave_folder, list_enclaves
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import (
+    digest,
+    issued_by,
+    load_certificate,
+    subject_text,
+    validity_of,
+)
+from sros_tool.validity import Window, iso
+from sros_tool.xml import read_bytes
+
+ROTATION = "rotation.json"
+"""Which CAs are being replaced; there while a rotation is under way."""
+RETIRED = "retired"
+"""Where certificates and keys of CAs go that issue nothing any more."""
+SOON = timedelta(days=90)
+"""How long before its end a CA should be replaced."""
+
+
+class Stage(StrEnum):
+    """The stages of a rotation, in their order; NONE is before the first and after the last."""
+
+    NONE = "none"
+    DISTRIBUTE = "distribute"
+    """The new CA stands beside the old one, which still issues."""
+    REISSUE = "reissue"
+    """Everything is of the new CA; the old one is still trusted."""
+    RETIRE = "retire"
+    """The old CA is trusted no longer, which ends the rotation."""
+
+
+@dataclass(frozen=True, slots=True)
+class Replacement:
+    """A CA and the one that takes its place.
+
+    ``file`` is the stem of its files ("identity_ca", "permissions_ca", or "ca" for both jobs);
+    ``old`` and ``new`` are SHA-256 of the certificates; ``key`` is where the new key is, by URI or
+    path in the keystore; ``old_key`` the same of the old one, where that is not kept in `RETIRED`.
+    """
+
+    file: str
+    old: str
+    new: str
+    key: str
+    old_key: str = ""
+
+    def place_of_old(self, certificate: x509.Certificate) -> str:
+        """Where the key of the old CA, which has this ``certificate``, is once it was replaced."""
+        return self.old_key or retired_key(certificate)
+
+
+@dataclass(frozen=True, slots=True)
+class Rotation:
+    """The stage that was reached, and the CAs that it is about."""
+
+    stage: Stage = Stage.NONE
+    replacements: tuple[Replacement, ...] = ()
+
+    def following(self) -> Stage:
+        """The next stage."""
+        order = list(Stage)
+        return order[order.index(self.stage) + 1]
+
+
+@dataclass(frozen=True, slots=True)
+class AuthorityState:
+    """A CA that is trusted: ``standing`` is issuing, next or old; ``enclaves`` are on it."""
+
+    file: str
+    roles: tuple[str, ...]
+    standing: str
+    subject: str
+    serial: str
+    validity: Window
+    enclaves: int
+
+
+@dataclass(frozen=True, slots=True)
+class RotationStatus:
+    """The stage of a keystore, its CAs, how many enclaves it has, and what vendors make of it."""
+
+    root: Path
+    rotation: Rotation
+    authorities: tuple[AuthorityState, ...]
+    enclaves: int
+    remarks: tuple[str, ...]
+
+
+def retired_key(certificate: x509.Certificate) -> str:
+    """The path of the key of a CA that was replaced."""
+    return f"{RETIRED}/{certificate.serial_number:x}.key.pem"
+
+
+def read_rotation(root: Path) -> Rotation:
+    """The rotation that is under way, if one is; `KeystoreError` where it does not fit the CAs."""
+    path = root / ROTATION
+    if not path.exists():
+        return Rotation()
+    try:
+        told = json.loads(path.read_bytes())
+        replacements = tuple(Replacement(**each) for each in told["replacements"])
+        rotation = Rotation(Stage(told["stage"]), replacements)
+        for each in replacements:
+            issuing = each.old if rotation.stage is Stage.DISTRIBUTE else each.new
+            there = [digest(found) for found in certificates_of(root, each.file)]
+            if there[0] != issuing or not {each.old, each.new} <= set(there):
+                raise ValueError
+    except (ValueError, TypeError, KeyError, IndexError) as error:
+        raise KeystoreError(
+            f"the rotation of keystore '{root}' cannot be continued",
+            f"'{path}' does not fit the CA certificates, or is damaged.",
+            "Restore the folders 'public' and 'private' and this file from one backup.",
+        ) from error
+    return rotation
+
+
+def render_rotation(rotation: Rotation) -> bytes:
+    """The file of a rotation."""
+    told = {
+        "stage": rotation.stage.value,
+        "replacements": [asdict(each) for each in rotation.replacements],
+    }
+    return json.dumps(told, indent=2).encode() + b"\n"
+
+
+def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
+    """Where the keystore stands: each CA that is trusted, its end, and the enclaves on it."""
+    names = list_enclaves(root)
+    rotation = read_rotation(root)
+    by_file = {each.file: each for each in rotation.replacements}
+    states = []
+    for file, roles in authority_files(root).items():
+        found = certificates_of(root, file)
+        counts = _count(root, names, roles[0], found)
+        for index, certificate in enumerate(found):
+            replaced = by_file.get(file)
+            standing = "issuing" if index == 0 else "old"
+            if replaced and index and digest(certificate) == replaced.new:
+                standing = "next"
+            states.append(
+                AuthorityState(
+                    file,
+                    roles,
+                    standing,
+                    subject_text(certificate.subject),
+                    f"{certificate.serial_number:x}",
+                    validity_of(certificate),
+                    counts[index],
+                )
+            )
+    remarks = _ending(states, now) if rotation.stage is Stage.NONE else _remarks(root, rotation)
+    return RotationStatus(root, rotation, tuple(states), len(names), tuple(remarks))
+
+
+def _count(
+    root: Path, names: Sequence[str], role: str, authorities: tuple[x509.Certificate, ...]
+) -> Counter[int]:
+    """How many enclaves are on each CA, by certificate or else by signature."""
+    counts: Counter[int] = Counter()
+    for name in names:
+        folder = root / enclave_folder(name)
+        try:
+            if role == IDENTITY:
+                path = folder / "cert.pem"
+                own = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+                fits = [issued_by(own, each) for each in authorities]
+            else:
+                signed = smime.parse(read_bytes(folder / "permissions.p7s", "permissions"))
+                signer = signed.signer()
+                fits = [signer == each for each in authorities]
+        except SrosError:  # `sros inspect` says what is wrong with it
+            continue
+        if True in fits:
+            counts[fits.index(True)] += 1
+    return counts
+
+
+# ── what the vendors make of it ────────────────────────────────────────────────────────────
+
+
+def _ending(states: Sequence[AuthorityState], now: datetime) -> list[str]:
+    """What to do about CAs that end soon, or have ended."""
+    remarks = []
+    for each in states:
+        if each.standing != "issuing" or each.validity.not_after - now > SOON:
+            continue
+        name = "CA" if len(each.roles) > 1 else f"{each.roles[0]} CA"
+        end = iso(each.validity.not_after)
+        if each.validity.not_after < now:
+            remarks.append(
+                f"The {name} ended at {end}, and no process starts any more: replace it at once "
+                "with --finish."
+            )
+        elif each.roles == (IDENTITY,):
+            remarks.append(
+                f"The {name} ends at {end}: --same-key gives it a longer life and disturbs nobody; "
+                "--next begins to replace it."
+            )
+        else:
+            remarks.append(
+                f"The {name} ends at {end}: --next begins to replace it. With Fast DDS, robots run "
+                "on; with Cyclone DDS, plan a common restart of all processes."
+            )
+    return remarks
+
+
+def _remarks(root: Path, rotation: Rotation) -> list[str]:
+    """What to restart at this stage, and how, by vendor."""
+    files = [each.file for each in rotation.replacements]
+    if rotation.stage is Stage.DISTRIBUTE:
+        return [
+            "All vendors: restart the processes one by one, when it suits; those restarted and "
+            "those not yet restarted talk with each other. Go on when all have been restarted."
+        ]
+    hindrance = fast_dds_hindrance(root, files)
+    remarks = [
+        f"Fast DDS: {hindrance} Restart all processes together."
+        if hindrance
+        else "Fast DDS: restart the processes one by one, when it suits; those restarted and those "
+        "not yet restarted talk with each other. Go on when all have been restarted.",
+        "Cyclone DDS: it trusts one CA at a time, so restart all processes together; one that is "
+        "restarted does not talk with one that is not.",
+    ]
+    if any(file != "permissions_ca" for file in files):
+        remarks.append(
+            "What is revoked now is revoked by both CAs, as long as the key of the old one is at "
+            "hand."
+        )
+    return remarks
+
+
+def lists_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
+    """Whether a revocation list of the one CA may be taken for one of the other.
+
+    OpenSSL looks for a list by name and key identifier.  Where the old CA has no identifier and the
+    new one has its name, Fast DDS 2.9.1 finds the wrong list and starts no process at all (ran).
+    """
+    return old.subject == new.subject and not _has_identifier(old)
+
+
+def _has_identifier(certificate: x509.Certificate) -> bool:
+    try:
+        certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
+    except x509.ExtensionNotFound:
+        return False
+    return True
+
+
+def fast_dds_hindrance(root: Path, files: Sequence[str]) -> str:
+    """Why Fast DDS cannot trust the old and the new CA at once, as a sentence, or "".
+
+    Fast DDS 2.9.1 (ran): two CAs of one name are told apart by their key identifiers, and
+    permissions CAs need to have one name and one algorithm on both sides.
+    """
+    for file in files:
+        if file == "identity_ca":
+            continue
+        for certificate in certificates_of(root, file):
+            if not isinstance(certificate.public_key(), ec.EllipticCurvePublicKey):
+                return "the old permissions CA has a key of another kind than the new one."
+            if not _has_identifier(certificate):
+                return (
+                    f"the old {'CA' if file == 'ca' else f'{PERMISSIONS} CA'} has no key "
+                    "identifier (ros2/sros2 made it), so it cannot be told from the new one."
+                )
+    return ""

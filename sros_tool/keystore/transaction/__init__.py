@@ -1,0 +1,1 @@
+"""Atomic changes of a keystore: stage, commit, recovery."""

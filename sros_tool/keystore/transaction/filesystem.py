@@ -1,0 +1,154 @@
+"""What a transaction asks of the file system beyond single files: locks, flushes, exchanges."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import fcntl
+import os
+import stat
+import sys
+import time
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore.layout import ENCLAVES, folder_mode
+
+LOCK_SECONDS = 60.0
+_AT_FDCWD = -100
+_RENAME_EXCHANGE = 2
+_NOT_SUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
+
+
+def lock_folder(folder: Path, wait: float | None = None) -> int:
+    """An exclusive lock on a folder itself, so that no lock file is left behind.
+
+    Returns the descriptor that holds it.  Raises `KeystoreError` after ``wait`` seconds.
+    """
+    wait = LOCK_SECONDS if wait is None else wait
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    deadline = time.monotonic() + wait
+    while True:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return handle
+        except BlockingIOError:
+            if time.monotonic() >= deadline:
+                os.close(handle)
+                raise KeystoreError(
+                    f"keystore '{folder}' is busy",
+                    f"Another process has been writing to it for {wait:.0f} seconds.",
+                    "Try again when it is done.",
+                ) from None
+            time.sleep(0.02)
+
+
+def flush_file_system(folder: Path) -> None:
+    """One flush for all files of a transaction: one for each would cost more than all else."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        if _c_library().syncfs(handle) != 0:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number), str(folder))
+    except AttributeError:  # a C library without syncfs
+        os.sync()
+    finally:
+        os.close(handle)
+
+
+def flush_folder(folder: Path) -> None:
+    """Have the names in a folder written down."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def exchange(one: str, other: str) -> bool:
+    """Let two names change their places at one moment (``renameat2``).
+
+    False, and nothing is changed, where the system, its C library or the file system cannot.
+    """
+    try:
+        rename = _c_library().renameat2
+    except AttributeError:
+        return False
+    sys.audit("os.rename", one, other, -1, -1)
+    names = os.fsencode(one), os.fsencode(other)
+    if rename(_AT_FDCWD, names[0], _AT_FDCWD, names[1], _RENAME_EXCHANGE) == 0:
+        return True
+    number = ctypes.get_errno()
+    if number in _NOT_SUPPORTED:
+        return False
+    raise OSError(number, os.strerror(number), one, None, other)
+
+
+@lru_cache(maxsize=1)
+def _c_library() -> ctypes.CDLL:
+    return ctypes.CDLL(None, use_errno=True)
+
+
+def is_folder(path: str | Path) -> bool:
+    """Whether a real folder is at ``path``; raises `KeystoreError` if something else is."""
+    try:
+        mode = os.lstat(path).st_mode
+    except FileNotFoundError:
+        return False
+    if stat.S_ISLNK(mode):
+        raise KeystoreError(
+            f"'{path}' is a symbolic link",
+            "What is written below it would land elsewhere, outside of the keystore.",
+            "Put a real folder in its place.",
+        )
+    if not stat.S_ISDIR(mode):
+        raise KeystoreError(f"'{path}' is in the way", "It is not a folder.")
+    return True
+
+
+def make_folders(root: Path, folders: Iterable[str]) -> None:
+    """See that the folders are there, and real."""
+    seen = {""}
+
+    def see(folder: str) -> None:
+        if folder in seen:
+            return
+        see(folder.rpartition("/")[0])
+        if not is_folder(f"{root}/{folder}"):
+            os.mkdir(f"{root}/{folder}", folder_mode(folder))
+        seen.add(folder)
+
+    for folder in folders:
+        see(folder)
+
+
+def settle_folders(source: Path, target: Path) -> None:
+    """Move everything below ``source``, if it is there, to its place below ``target``.
+
+    The enclaves come last: without them, a new keystore that is not complete yet is none.
+    """
+    if not source.is_dir():
+        return
+    with os.scandir(source) as entries:
+        for entry in sorted(entries, key=lambda each: each.name == ENCLAVES):
+            place = target / entry.name
+            if not entry.is_dir(follow_symlinks=False):
+                os.replace(entry.path, place)
+            elif is_folder(place):
+                settle_folders(Path(entry.path), place)
+            else:
+                os.rename(entry.path, place)
+
+
+def remove_empty_folders(root: Path, paths: Iterable[str]) -> None:
+    """Remove the folders of ``paths`` of which nothing is left; never one of the first level."""
+    for path in paths:
+        folder = path.rpartition("/")[0]
+        with contextlib.suppress(OSError):  # it is not empty
+            while "/" in folder:
+                with contextlib.suppress(FileNotFoundError):  # by whoever was stopped here
+                    os.rmdir(root / folder)
+                folder = folder.rpartition("/")[0]

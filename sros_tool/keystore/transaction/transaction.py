@@ -1,0 +1,371 @@
+"""Lets every file that a transaction changes be reached through one link, before that is turned.
+
+Each path first becomes a link to ``.sros-transaction/live/<number>``, which is still its old
+content: a link that was prepared in ``before`` and the file change their places at one moment.
+
+New files are written below ``.sros-transaction`` of the keystore (`stage`).  Files that already
+exist change together at a single moment: each first becomes a link to
+``.sros-transaction/live/...`` (still its old content), then ``live`` itself, a link, is turned
+from ``before`` to ``after`` (`commit`).  That turn is the commit.  Afterwards the links give way
+to the plain files, and new folders are moved in (`recovery`).  Whatever the moment at which the
+machine stops, DDS finds either all the old files or all the new ones, and the next transaction
+tidies up.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import glob
+import os
+import secrets
+import shutil
+import stat
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.keystore.layout import folder_mode
+from sros_tool.keystore.transaction import filesystem
+from sros_tool.keystore.transaction.filesystem import is_folder
+from sros_tool.keystore.transaction.recovery import recover, tidy
+from sros_tool.keystore.transaction.stage import (
+    ADDED,
+    AFTER,
+    BEFORE,
+    LIVE,
+    STAGE,
+    Change,
+    Move,
+    Staged,
+    bridge_text,
+    number,
+    seen_from_stage,
+    turn,
+    write_manifest,
+)
+from sros_tool.parallel import in_shares
+
+
+def bridge(root: Path, stage: Path, moves: Sequence[Move]) -> None:
+    """Let all that moves be reached through ``live``, which leads to ``before``."""
+    if not moves:
+        return
+    os.mkdir(stage / BEFORE, 0o700)
+    turn(stage, BEFORE)
+    work = _Bridge(f"{root}", f"{stage}")
+    if _can_exchange(stage):
+        in_shares(moves, work.by_exchange)
+        return
+    # Both names at once, or a copy: for file systems that cannot exchange two names.
+    copied = in_shares(moves, work.keep)
+    if any(outcome for _, outcome in copied):
+        filesystem.flush_file_system(stage / BEFORE)
+    in_shares(moves, work.by_replacement)
+
+
+def _can_exchange(stage: Path) -> bool:
+    spare = f"{stage}/spare"
+    os.symlink(BEFORE, spare)  # as `live`, so that it makes no difference which of them is
+    can = filesystem.exchange(spare, f"{stage}/{LIVE}")
+    os.unlink(spare)
+    return can
+
+
+class _Bridge:
+    def __init__(self, root: str, stage: str) -> None:
+        self._root = root
+        self._stage = stage
+
+    def by_exchange(self, moves: Sequence[Move]) -> None:
+        root, before = self._root, f"{self._stage}/{BEFORE}"
+        for move in moves:
+            if move.before != "":
+                self._keep_link(move)
+                self._place(move)
+                continue
+            kept = f"{before}/{number(move.path)}"
+            os.symlink(bridge_text(move.path), kept)
+            if not filesystem.exchange(kept, f"{root}/{move.path}"):
+                raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP), f"{root}/{move.path}")
+
+    def keep(self, moves: Sequence[Move]) -> bool:
+        """Give the old content a second name in the stage; whether it had to be copied."""
+        copied = False
+        for move in moves:
+            if move.before != "":
+                self._keep_link(move)
+                continue
+            real, kept = f"{self._root}/{move.path}", f"{self._stage}/{BEFORE}/{number(move.path)}"
+            try:
+                os.link(real, kept, follow_symlinks=False)
+            except OSError:  # a file system, or an owner, that allows no hard links
+                shutil.copy2(real, kept, follow_symlinks=False)
+                copied = True
+        return copied
+
+    def by_replacement(self, moves: Sequence[Move]) -> None:
+        for move in moves:
+            self._place(move)
+
+    def _keep_link(self, move: Move) -> None:
+        if move.before:
+            kept = f"{self._stage}/{BEFORE}/{number(move.path)}"
+            os.symlink(seen_from_stage(move.path, move.before), kept)
+
+    def _place(self, move: Move) -> None:
+        real = f"{self._root}/{move.path}"
+        if move.before is None:
+            os.symlink(bridge_text(move.path), real)
+            return
+        spare = f"{self._stage}/spare.{os.getpid()}"
+        os.symlink(bridge_text(move.path), spare)
+        os.replace(spare, real)
+
+
+__all__ = ["STAGE", "Change", "Staged", "Transaction", "recover", "tidy"]
+
+
+class Transaction:
+    """A lock on a keystore and the files that will change in it.
+
+    Use as a context manager; without `commit` nothing changes.  If ``fresh``, the keystore must
+    not exist yet (an empty folder may) and appears at once; otherwise it must exist.  With
+    ``dry_run`` nothing is written, and `changes` tells what would be.
+    """
+
+    def __init__(self, root: Path, *, fresh: bool = False, dry_run: bool = False) -> None:
+        self.root = root
+        self.changes: list[Change] = []
+        self.dry_run = dry_run
+        self._new_root = fresh and not root.exists()
+        self._made_parents: list[Path] = []
+        self._lock = -1
+        self._stage = root / STAGE
+        self._added = f"{self._stage}/{ADDED}"
+        self._staged: set[str] = set()
+        self._folders: dict[str, bool] = {}  # whether the folder is there already
+        self._moves: list[Move] = []
+        self._undo: list[Callable[[], None]] = []
+
+    def on_failure(self, undo: Callable[[], None]) -> None:
+        """Have ``undo`` called at the end, unless everything was put in place."""
+        self._undo.append(undo)
+
+    # ── begin and end ──────────────────────────────────────────────────────────────────────
+
+    def __enter__(self) -> Self:
+        if self.dry_run:
+            return self
+        try:
+            self._begin()
+        except BaseException:
+            self._end()
+            raise
+        return self
+
+    def _begin(self) -> None:
+        if self._new_root:
+            self._remove_stale_siblings()
+            self._make_parents()
+            self._make_sibling()
+            return
+        self._lock = filesystem.lock_folder(self.root)
+        recover(self.root)
+        self._stage.mkdir(mode=0o700)
+        os.mkdir(self._added, 0o700)
+        os.mkdir(f"{self._stage}/{AFTER}", 0o700)
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if not self.dry_run:
+            self._end()
+        for undo in self._undo:
+            undo()
+
+    def _end(self) -> None:
+        if self._stage != self.root / STAGE:
+            shutil.rmtree(self._stage, ignore_errors=True)
+        elif self._lock >= 0:
+            recover(self.root)
+        if self._lock >= 0:
+            os.close(self._lock)
+            self._lock = -1
+        for parent in self._made_parents:
+            with contextlib.suppress(OSError):
+                parent.rmdir()
+
+    def _make_parents(self) -> None:
+        missing = []
+        parent = self.root.parent
+        while not parent.exists():
+            missing.append(parent)
+            parent = parent.parent
+        for each in reversed(missing):
+            with contextlib.suppress(FileExistsError):  # another process was faster
+                each.mkdir()
+                self._made_parents.insert(0, each)
+
+    def _make_sibling(self) -> None:
+        while self._lock < 0:
+            self._stage = self.root.parent / f".{self.root.name}.sros-{secrets.token_hex(4)}"
+            self._added = f"{self._stage}"
+            self._stage.mkdir(mode=0o700)
+            # Until it is locked, another process may take it for a stale one and remove it.
+            with contextlib.suppress(FileNotFoundError):
+                lock = filesystem.lock_folder(self._stage)
+                if self._stage.exists():
+                    self._lock = lock
+                else:
+                    os.close(lock)
+
+    def _remove_stale_siblings(self) -> None:
+        for stale in self.root.parent.glob(f".{glob.escape(self.root.name)}.sros-*"):
+            with contextlib.suppress(KeystoreError, OSError):
+                lock = filesystem.lock_folder(stale, wait=0.0)
+                shutil.rmtree(stale, ignore_errors=True)
+                os.close(lock)
+
+    # ── what is to change ──────────────────────────────────────────────────────────────────
+
+    def write(self, path: str, data: bytes, *, private: bool = False) -> None:
+        """Stage a file; ``private`` ones are readable by their owner only, from the first byte."""
+        staged = self._prepare(path, "")
+        if staged is None:
+            return
+        mode = 0o600 if private else 0o644
+        handle = os.open(staged, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
+        try:
+            view = memoryview(data)
+            while view:
+                view = view[os.write(handle, view) :]
+        except OSError as error:
+            error.filename = f"{self.root}/{path}"
+            raise
+        finally:
+            os.close(handle)
+
+    def link(self, path: str, target: str) -> None:
+        """Stage a symbolic link to ``target``, which is relative to the folder of ``path``."""
+        staged = self._prepare(path, target)
+        if staged is not None:
+            flat = self._folders[path.rpartition("/")[0]]
+            os.symlink(seen_from_stage(path, target) if flat else target, staged)
+
+    def remove(self, path: str) -> None:
+        """Have a file or link go, together with the changes of the transaction.
+
+        Folders of which nothing is left go too.
+        """
+        there = self._prepare_folder(path.rpartition("/")[0], wanted=False)
+        before = self._at(path) if there else None
+        if before is None:
+            raise KeystoreError(f"'{self.root}/{path}' does not exist")
+        self._begin_change(path, "remove")
+        self._moves.append(Move(path, before, None))
+
+    def _prepare(self, path: str, after: str) -> str | None:
+        """Where to write what is staged for a path; ``after`` as of `Move`."""
+        exists = self._prepare_folder(path.rpartition("/")[0])
+        before = self._at(path) if exists else None
+        self._begin_change(path, "create" if before is None else "replace")
+        if exists:
+            self._moves.append(Move(path, before, after))
+        if self.dry_run:
+            return None
+        return f"{self._stage}/{AFTER}/{number(path)}" if exists else f"{self._added}/{path}"
+
+    def _begin_change(self, path: str, action: str) -> None:
+        if path in self._staged:
+            raise KeystoreError(f"{path} would be written twice")
+        self._staged.add(path)
+        self.changes.append(Change(action, path))
+
+    def _at(self, path: str) -> str | None:
+        real = f"{self.root}/{path}"
+        try:
+            mode = os.lstat(real).st_mode
+        except FileNotFoundError:
+            return None
+        if stat.S_ISDIR(mode):
+            raise KeystoreError(f"'{real}' is in the way", "It is a folder.")
+        return os.readlink(real) if stat.S_ISLNK(mode) else ""
+
+    def _prepare_folder(self, path: str, *, wanted: bool = True) -> bool:
+        """Tell whether a folder is in the keystore already; if it is not, stage it."""
+        if path in self._folders:
+            return self._folders[path]
+        exists = not self._new_root
+        if path:
+            exists = self._prepare_folder(path.rpartition("/")[0], wanted=wanted) and is_folder(
+                f"{self.root}/{path}"
+            )
+            if not wanted and not exists:
+                return False
+            if not exists and not self.dry_run:
+                self._stage_folder(path)
+        self._folders[path] = exists
+        return exists
+
+    def _stage_folder(self, path: str) -> None:
+        staged, mode = f"{self._added}/{path}", folder_mode(path)
+        os.makedirs(os.path.dirname(staged), 0o700, exist_ok=True)
+        with contextlib.suppress(FileExistsError):  # by a process with another share
+            os.mkdir(staged, mode)
+        if mode != 0o700:
+            os.chmod(staged, mode)
+
+    # ── by several processes ───────────────────────────────────────────────────────────────
+
+    def mark(self) -> tuple[int, int]:
+        """This moment, for `since`."""
+        return len(self.changes), len(self._moves)
+
+    def since(self, mark: tuple[int, int]) -> Staged:
+        """What was staged since `mark`."""
+        return Staged(tuple(self.changes[mark[0] :]), tuple(self._moves[mark[1] :]))
+
+    def absorb(self, staged: Staged) -> None:
+        """Take over what a forked process staged for this transaction."""
+        self._staged.update(change.path for change in staged.changes)
+        self.changes += staged.changes
+        self._moves += staged.moves
+
+    # ── commit ─────────────────────────────────────────────────────────────────────────────
+
+    def commit(self) -> None:
+        """Put everything in place; after this it is on the disk."""
+        if self.dry_run or not self.changes:
+            return
+        if self._new_root:
+            filesystem.flush_file_system(self._stage)
+            self._appear()
+            return
+        write_manifest(self._stage, self._moves)
+        filesystem.flush_file_system(self._stage)
+        bridge(self.root, self._stage, self._moves)
+        turn(self._stage, AFTER)
+        self._undo.clear()
+        with contextlib.suppress(OSError, SrosError):  # it is done; the end tries once more
+            recover(self.root)
+
+    def _appear(self) -> None:
+        os.chmod(self._stage, folder_mode(""))
+        try:
+            os.rename(self._stage, self.root)
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                raise KeystoreError(
+                    f"keystore '{self.root}' already exists", "Another process just made it."
+                ) from error
+            raise
+        self._made_parents.clear()
+        self._undo.clear()
+        with contextlib.suppress(OSError):  # it is there; the system writes it down in time anyway
+            filesystem.flush_folder(self.root.parent)

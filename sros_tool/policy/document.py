@@ -1,0 +1,419 @@
+"""Resolves the ``xi:include`` elements of a policy without ever leaving its root folder.
+
+Included documents are read into the model where they lie; their nodes are never moved into
+another document (a moved node of lxml can crash the interpreter).
+
+The grammar is that of the schema of ros2/sros2, and beyond it every name is checked: a rule that
+can never match anything is an error, for it is a right or a denial that somebody relies on.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from urllib.parse import unquote
+
+from lxml import etree
+
+from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
+from sros_tool.names import check_enclave_name, check_namespace, expression_problem
+from sros_tool.policy.model import (
+    RIGHTS,
+    VERSION,
+    Enclave,
+    Group,
+    Policy,
+    Profile,
+    Profiles,
+    Qualifier,
+    Source,
+)
+from sros_tool.xml import parse, read_bytes, serialize, tag_of
+
+_NAMESPACES = ("http://www.w3.org/2001/XInclude", "http://www.w3.org/2003/XInclude")
+_INCLUDES = frozenset(f"{{{ns}}}include" for ns in _NAMESPACES)
+_FALLBACKS = frozenset(f"{{{ns}}}fallback" for ns in _NAMESPACES)
+_XPOINTER = re.compile(r"xpointer\((.+)\)\Z", re.DOTALL)
+_MAX_INCLUDES = 10_000
+_MAX_DEPTH = 32
+_MAX_BYTES = 64 * 1024 * 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """A document, and the includes through which it was reached."""
+
+    file: Path
+    trail: tuple[tuple[Path, str], ...] = ()
+
+
+@dataclass(slots=True)
+class Includer:
+    """Reads documents below ``root``, each of them once."""
+
+    root: Path
+    _documents: dict[Path, etree._Element] = field(default_factory=dict)
+    _count: int = 0
+    _bytes: int = 0
+    _digests: list[bytes] = field(default_factory=list)
+
+    def digest(self) -> str:
+        """The SHA-256, hexadecimal, of all documents read so far, whatever their order."""
+        return hashlib.sha256(b"".join(sorted(self._digests))).hexdigest()
+
+    def load(self, file: Path) -> etree._Element:
+        """The root element of a document (its real path)."""
+        if file not in self._documents:
+            self.hold(file, read_bytes(file, "policy file"))
+        return self._documents[file]
+
+    def hold(self, file: Path, content: bytes) -> None:
+        """Take ``content`` for what the file (its real path) holds, wherever it is included."""
+        self._bytes += len(content)
+        if self._bytes > _MAX_BYTES:
+            raise PolicyError(
+                f"the policy and its includes are too large at '{file}'",
+                f"Together they have more than {_MAX_BYTES // 1024**2} MiB.",
+            )
+        self._documents[file] = parse(content, f"the policy file '{file}'")
+        self._digests.append(hashlib.sha256(content).digest())
+
+    def children(
+        self, parent: etree._Element, place: Place
+    ) -> Iterator[tuple[etree._Element, Place]]:
+        """The child elements of ``parent`` with includes replaced by what they stand for."""
+        for child in parent:
+            if child.tag in _INCLUDES:
+                yield from self._included(child, place)
+            else:
+                yield child, place
+
+    def _included(
+        self, element: etree._Element, place: Place
+    ) -> Iterator[tuple[etree._Element, Place]]:
+        where = f"{place.file}:{element.sourceline}"
+        self._count += 1
+        if self._count > _MAX_INCLUDES or len(place.trail) >= _MAX_DEPTH:
+            raise PolicyError(f"{where}: there are too many includes, or they are nested too deep")
+        if element.get("parse", "xml") != "xml":
+            raise PolicyError(
+                f"{where}: an include of plain text is not accepted",
+                "It would put any readable file into a signed document.",
+                "Include policy XML, without parse=.",
+            )
+        href, pointer = element.get("href", ""), element.get("xpointer", "")
+        fallback = next((each for each in element if each.tag in _FALLBACKS), None)
+        file = self._resolve(href, place, where)
+        if fallback is not None and not file.exists():
+            yield from self.children(fallback, place)
+            return
+        step = (file, pointer)
+        if step in place.trail:
+            raise PolicyError(f"{where}: the include of '{href}' leads back to itself")
+        try:
+            target = self.load(file)
+        except DocumentError as error:
+            raise PolicyError(f"{where}: {error.what}", error.why, error.remedy) from error
+        inner = Place(file, (*place.trail, step))
+        found = [target] if not pointer else _point(target, pointer, where)
+        for each in found:
+            # What an xpointer selects may itself be an include.
+            if each.tag in _INCLUDES:
+                yield from self._included(each, inner)
+            else:
+                yield each, inner
+
+    def _resolve(self, href: str, place: Place, where: str) -> Path:
+        if not href:
+            return place.file
+        path = Path(unquote(href))
+        try:
+            # Unlike Path.resolve, realpath does not fail at links that lead in a circle.
+            file = Path(os.path.realpath(place.file.parent / path))
+        except (OSError, ValueError) as error:
+            raise PolicyError(f"{where}: the include of {href!r} names no file") from error
+        if "://" in href or href.startswith("file:") or not file.is_relative_to(self.root):
+            raise PolicyError(
+                f"{where}: the include of '{href}' leaves the folder of the policy",
+                f"Includes are read from '{self.root}' and the folders below it only.",
+                "Copy the file there, or put the policy at the top of both.",
+            )
+        return file
+
+
+def _point(target: etree._Element, pointer: str, where: str) -> list[etree._Element]:
+    match = _XPOINTER.match(pointer)
+    try:
+        found = target.getroottree().xpath(match[1]) if match else None
+    except etree.XPathError:
+        found = None
+    if not isinstance(found, list) or not all(isinstance(e, etree._Element) for e in found):
+        raise PolicyError(
+            f"{where}: the xpointer {pointer!r} is not understood",
+            "It must select elements by an XPath.",
+            'Write for example xpointer="xpointer(/profile/*)".',
+        )
+    if not found:
+        raise PolicyError(
+            f"{where}: the xpointer {pointer!r} selects nothing",
+            f"The root element of the included file is <{tag_of(target)}>.",
+        )
+    return found
+
+
+_XML_ATTRIBUTES = ("{http://www.w3.org/XML/1998/namespace}",)
+_VERSION = re.compile(r"0\.2\.[0-9]+\Z")
+_QUALIFIERS = {qualifier.value: qualifier for qualifier in Qualifier}
+
+
+def read_policy(path: Path, content: bytes | None = None) -> Policy:
+    """Read a policy file and its includes, which must lie in its folder or below.
+
+    With ``content``, read that in place of what the file holds; the file need not exist.
+    Raises `PolicyError` (or another `DocumentError`) with file and line for anything that the
+    format does not have, for names that ROS does not have, and for an enclave given twice.
+    """
+    return _Reader(path, content).policy()
+
+
+class _Reader:
+    def __init__(self, path: Path, content: bytes | None) -> None:
+        self._shown = path
+        self._file = Path(os.path.realpath(path))
+        self._includer = Includer(self._file.parent)
+        if content is not None:
+            self._includer.hold(self._file, content)
+        elif not self._file.exists():
+            raise PolicyError(f"the policy file '{path}' does not exist")
+
+    def policy(self) -> Policy:
+        root = self._includer.load(self._file)
+        place = Place(self._file)
+        where = self._where(root, place)
+        if root.tag != "policy":
+            raise PolicyError(
+                f"{where}: the file is not a policy",
+                f"Its root element is <{tag_of(root)}>, not <policy>.",
+                "" if root.tag != "profile" else "It is a fragment for other policies to include.",
+            )
+        self._attributes(root, place, required=("version",))
+        version = root.get("version", "")
+        if not _VERSION.match(version):
+            raise PolicyError(
+                f"{where}: the policy has version {version!r}",
+                f"sros reads version {VERSION} of the SROS2 policy format.",
+                "Version 0.1.0 says contexts and context for enclaves and enclave."
+                if version.startswith("0.1")
+                else "",
+            )
+        enclaves: dict[str, Enclave] = {}
+        blocks = [self._expect(child, at, "enclaves") for child, at in self._children(root, place)]
+        if len(blocks) != 1:
+            raise PolicyError(f"{where}: <policy> must hold exactly one <enclaves>")
+        for child, at in self._children(*blocks[0]):
+            enclave = self._enclave(*self._expect(child, at, "enclave"))
+            if enclave.path in enclaves:
+                raise PolicyError(
+                    f"{enclave.source}: the enclave {enclave.path} is given twice",
+                    f"It stands at {enclaves[enclave.path].source} already, and it would not be "
+                    "clear which one counts.",
+                    "Join the two into one <enclave>.",
+                )
+            enclaves[enclave.path] = enclave
+        if not enclaves:
+            raise PolicyError(f"{where}: the policy has no enclave")
+        digest = self._includer.digest()
+        read = tuple(replace(enclave, digest=digest) for enclave in enclaves.values())
+        return Policy(read, version, str(self._shown))
+
+    def _enclave(self, element: etree._Element, place: Place) -> Enclave:
+        self._attributes(element, place, required=("path",))
+        try:
+            path = check_enclave_name(element.get("path", ""))
+        except InvalidNameError as error:
+            raise PolicyError(
+                f"{self._where(element, place)}: {error.what}", error.why, error.remedy
+            ) from error
+        blocks = tuple(
+            self._profiles(*self._expect(child, at, "profiles"))
+            for child, at in self._children(element, place)
+        )
+        if not blocks:
+            raise PolicyError(
+                f"{self._where(element, place)}: the enclave {path} has no <profiles>"
+            )
+        return Enclave(path, blocks, self._source(element, place))
+
+    def _profiles(self, element: etree._Element, place: Place) -> Profiles:
+        self._attributes(element, place, optional=("type",))
+        profiles: list[Profile] = []
+        metadata = ""
+        for child, at in self._children(element, place):
+            if metadata:
+                raise PolicyError(f"{self._where(child, at)}: nothing may follow <metadata>")
+            if child.tag == "metadata":
+                metadata = etree.tostring(child, encoding="unicode", with_tail=False)
+            else:
+                profiles.append(self._profile(*self._expect(child, at, "profile")))
+        if not profiles:
+            raise PolicyError(f"{self._where(element, place)}: <profiles> holds no <profile>")
+        return Profiles(tuple(profiles), element.get("type", ""), metadata)
+
+    def _profile(self, element: etree._Element, place: Place) -> Profile:
+        self._attributes(element, place, required=("ns", "node"))
+        node = element.get("node", "")
+        try:
+            ns = check_namespace(element.get("ns", ""))
+        except InvalidNameError as error:
+            raise PolicyError(
+                f"{self._where(element, place)}: {error.what}", error.why, error.remedy
+            ) from error
+        if node and ("/" in node or "~" in node or expression_problem(node)):
+            raise PolicyError(
+                f"{self._where(element, place)}: {node!r} is not a valid node name",
+                expression_problem(node)
+                or "A node name has no '/' and no '~'; its namespace stands in ns=.",
+            )
+        groups = tuple(self._group(child, at, node) for child, at in self._children(element, place))
+        return Profile(ns, node, groups, self._source(element, place))
+
+    def _group(self, element: etree._Element, place: Place, node: str) -> Group:
+        kind = tag_of(element)
+        if kind not in RIGHTS:
+            raise PolicyError(
+                f"{self._where(element, place)}: <profile> cannot hold <{kind}>",
+                f"It holds {', '.join(f'<{each}>' for each in RIGHTS)} only.",
+            )
+        self._attributes(element, place, optional=RIGHTS[kind])
+        rights = []
+        for right in RIGHTS[kind]:
+            value = element.get(right)
+            if value is None:
+                continue
+            if value not in _QUALIFIERS:
+                raise PolicyError(
+                    f"{self._where(element, place)}: {right}={value!r} is not understood",
+                    "A right is ALLOW or DENY.",
+                )
+            rights.append((right, _QUALIFIERS[value]))
+        if not rights:
+            raise PolicyError(
+                f"{self._where(element, place)}: the <{kind}> neither allow nor deny anything",
+                f"They lack {' and '.join(RIGHTS[kind])}.",
+                f'Write for example <{kind} {RIGHTS[kind][0]}="ALLOW">, or remove them.',
+            )
+        item = kind.removesuffix("s")
+        items = self._children(element, place)
+        names = tuple(self._name(*self._expect(child, at, item), node) for child, at in items)
+        if not names:
+            raise PolicyError(f"{self._where(element, place)}: the <{kind}> name no {item}")
+        lines: tuple[int, ...] = ()
+        if all(at.file == place.file for _, at in items):  # names can be included one by one
+            lines = tuple(child.sourceline or 0 for child, _ in items)
+        return Group(kind, tuple(rights), names, self._source(element, place), lines)
+
+    def _name(self, element: etree._Element, place: Place, node: str) -> str:
+        name = element.text or ""
+        problem = expression_problem(name)
+        if not problem and name.startswith("~") and not node:
+            problem = "It is private to a node, and the profile has an empty node name."
+        if not problem and name == "/":
+            problem = "It is a namespace, not a name."
+        if not problem and len(element):
+            problem = "It holds other elements."
+        if problem:
+            raise PolicyError(
+                f"{self._where(element, place)}: {name!r} is not a valid {tag_of(element)} name",
+                problem,
+            )
+        self._attributes(element, place)
+        return name
+
+    def _children(
+        self, element: etree._Element, place: Place
+    ) -> list[tuple[etree._Element, Place]]:
+        for text in (element.text, *(child.tail for child in element)):
+            if text and not text.isspace():
+                raise PolicyError(
+                    f"{self._where(element, place)}: <{tag_of(element)}> holds loose text",
+                    f"{text.strip()[:40]!r} stands between its elements.",
+                )
+        return list(self._includer.children(element, place))
+
+    def _expect(
+        self, element: etree._Element, place: Place, tag: str
+    ) -> tuple[etree._Element, Place]:
+        if element.tag != tag:
+            raise PolicyError(
+                f"{self._where(element, place)}: <{tag_of(element)}> stands where <{tag}> must"
+            )
+        return element, place
+
+    def _attributes(
+        self,
+        element: etree._Element,
+        place: Place,
+        *,
+        required: tuple[str, ...] = (),
+        optional: tuple[str, ...] = (),
+    ) -> None:
+        present = element.keys()
+        for name in present:
+            if (
+                name not in required
+                and name not in optional
+                and not name.startswith(_XML_ATTRIBUTES)
+            ):
+                raise PolicyError(
+                    f"{self._where(element, place)}: <{tag_of(element)}> has no attribute {name!r}"
+                )
+        for name in required:
+            if name not in present:
+                raise PolicyError(
+                    f"{self._where(element, place)}: <{tag_of(element)}> lacks its {name}="
+                )
+
+    def _source(self, element: etree._Element, place: Place) -> Source:
+        file = place.file
+        shown = str(self._shown) if file == self._file else str(file)
+        return Source(shown, element.sourceline or 0)
+
+    def _where(self, element: etree._Element, place: Place) -> str:
+        return str(self._source(element, place))
+
+
+def write_policy(policy: Policy) -> bytes:
+    """The policy as XML in UTF-8; `read_policy` gives the same value back."""
+    root = etree.Element("policy", version=policy.version)
+    enclaves = etree.SubElement(root, "enclaves")
+    metadata: list[tuple[etree._Element, str]] = []
+    for enclave in policy.enclaves:
+        element = etree.SubElement(enclaves, "enclave", path=enclave.path)
+        for block in enclave.profiles:
+            profiles = etree.SubElement(element, "profiles")
+            if block.type:
+                profiles.set("type", block.type)
+            for profile in block.profiles:
+                _write_profile(profiles, profile)
+            if block.metadata:
+                metadata.append((profiles, block.metadata))
+    etree.indent(root, space="  ")
+    for profiles, text in metadata:  # after the indentation, which would change what it holds
+        last, element = profiles[-1], parse(text.encode(), "metadata")
+        last.tail, element.tail = profiles.text, last.tail
+        profiles.append(element)
+    return serialize(root, indent=False)
+
+
+def _write_profile(parent: etree._Element, profile: Profile) -> None:
+    element = etree.SubElement(parent, "profile", ns=profile.ns, node=profile.node)
+    for group in profile.groups:
+        child = etree.SubElement(element, group.kind)
+        for right, qualifier in group.rights:
+            child.set(right, qualifier)
+        for name in group.names:
+            etree.SubElement(child, group.kind.removesuffix("s")).text = name

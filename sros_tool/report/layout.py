@@ -1,0 +1,624 @@
+"""A picture placed on paper, as values: senders left, names in the middle, listeners right.
+
+A scene is the same for every format that draws it, and for the page.  Lengths are in pixels at
+the size at which the text is read; x grows to the right and y downwards.
+
+A layered layout of three layers, after Sugiyama: the order of each column follows the barycentre
+of its neighbours, and the heights are those nearest to them that leave everybody's room (found by
+pooling adjacent violators).  It depends on nothing but its input.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, replace
+
+from sros_tool.policy.model import ALLOW, Qualifier
+from sros_tool.report.picture import SENDS, Bundle, Edge, Level, Mark, Picture, Tie, coarsened, fold
+
+SIDE_WIDTH, NAMES_WIDTH, GUTTER = 184, 330, 110
+LINE, PAD, SMALL = 16, 7, 14
+"""The heights of a line of text, of the room around it, and of a line of a note."""
+
+
+@dataclass(frozen=True, slots=True)
+class Card:
+    """A rectangle with text: an enclave, a group of enclaves, or names that are alike.
+
+    ``column`` is 0, 1 or 2; an enclave that sends and listens has a card on either side.
+    ``lines`` are its text, ``notes`` smaller text below.  ``members`` are all the enclaves or
+    names that it stands for; ``kind`` and ``level`` are those of names, else "" and unknown.
+    ``group`` is that of an enclave; ``tags`` are the letters of the onlookers of these names.
+    """
+
+    id: str
+    role: str
+    column: int
+    x: int
+    y: int
+    width: int
+    height: int
+    lines: tuple[str, ...]
+    notes: tuple[str, ...]
+    members: tuple[str, ...]
+    kind: str = ""
+    level: Level = Level.UNKNOWN
+    group: str = ""
+    tags: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Onlooker:
+    """Who reaches so much that lines would hide all others: a letter stands on what it reaches."""
+
+    tag: str
+    enclave: str
+    right: str
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A line from the right edge of a card to the left edge of another one; the arrow is there.
+
+    ``rights`` are what it says, such as publish; ``wildcard`` if only wildcards say so.
+    """
+
+    source: str
+    target: str
+    y1: int
+    y2: int
+    rights: tuple[str, ...]
+    qualifier: Qualifier
+    level: Level
+    wildcard: bool
+    mark: Mark
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """The title of a group of enclaves that stand together, and the room that they take."""
+
+    title: str
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Cards and the links between them.
+
+    ``shown`` names are drawn or counted in the enclave that alone may use them; ``hidden`` ones
+    are not, as only what every node needs is said of them.
+    """
+
+    id: str
+    title: str
+    width: int
+    height: int
+    cards: tuple[Card, ...]
+    links: tuple[Link, ...]
+    frames: tuple[Frame, ...]
+    onlookers: tuple[Onlooker, ...]
+    hidden: int = 0
+    shown: int = 0
+
+
+_SWEEPS = 24
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """Something of a ``height`` in a column; items of one ``group`` stand together."""
+
+    id: str
+    height: float
+    group: str = ""
+
+
+def ordered(
+    left: Sequence[Item],
+    middle: Sequence[Item],
+    right: Sequence[Item],
+    lines: Sequence[tuple[str, str]],
+) -> tuple[list[Item], list[Item], list[Item]]:
+    """The items of the three columns in an order with few crossings.
+
+    ``lines`` are pairs of ids, each of neighbouring columns.  Of all sweeps the best is kept.
+    """
+    near: dict[str, list[str]] = {item.id: [] for item in (*left, *middle, *right)}
+    for one, other in lines:
+        near[one].append(other)
+        near[other].append(one)
+    columns = [list(left), list(middle), list(right)]
+    best, fewest = [list(column) for column in columns], _crossings(columns, lines)
+    for sweep in range(_SWEEPS):
+        outer = (0, 2) if sweep % 2 else (2, 0)
+        for moved in (1, *outer):
+            places = _places(columns)
+            columns[moved] = _by_barycentre(columns[moved], near, places)
+        crossings = _crossings(columns, lines)
+        if crossings < fewest:
+            best, fewest = [list(column) for column in columns], crossings
+    return best[0], best[1], best[2]
+
+
+def _places(columns: Sequence[Sequence[Item]]) -> dict[str, float]:
+    """Where each item stands in its column, from 0 to 1."""
+    return {
+        item.id: (number + 0.5) / len(column)
+        for column in columns
+        for number, item in enumerate(column)
+    }
+
+
+def _by_barycentre(
+    column: Sequence[Item], near: Mapping[str, Sequence[str]], places: Mapping[str, float]
+) -> list[Item]:
+    centre = {
+        item.id: (
+            sum(places[each] for each in near[item.id]) / len(near[item.id])
+            if near[item.id]
+            else places[item.id]
+        )
+        for item in column
+    }
+    groups: dict[str, list[float]] = {}
+    for item in column:
+        groups.setdefault(item.group, []).append(centre[item.id])
+    middle = {group: sum(found) / len(found) for group, found in groups.items()}
+    return sorted(
+        column, key=lambda item: (middle[item.group], item.group, centre[item.id], item.id)
+    )
+
+
+def _crossings(columns: Sequence[Sequence[Item]], lines: Sequence[tuple[str, str]]) -> int:
+    """How often lines cross, counted between each pair of neighbouring columns."""
+    side = {item.id: number for number, column in enumerate(columns) for item in column}
+    place = {item.id: n for column in columns for n, item in enumerate(column)}
+    total = 0
+    for first in (0, 1):
+        pairs = []
+        for one, other in lines:
+            if side[one] > side[other]:
+                one, other = other, one
+            if side[one] == first:
+                pairs.append((place[one], place[other]))
+        total += _inversions([end for _, end in sorted(pairs)], len(columns[first + 1]))
+    return total
+
+
+def _inversions(ends: Sequence[int], size: int) -> int:
+    """How many pairs stand the wrong way round, by a Fenwick tree."""
+    tree = [0] * (size + 1)
+    found = 0
+    for seen, end in enumerate(ends):
+        at, before = end + 1, 0
+        while at:
+            before += tree[at]
+            at -= at & -at
+        found += seen - before
+        at = end + 1
+        while at <= size:
+            tree[at] += 1
+            at += at & -at
+    return found
+
+
+def heights(
+    column: Sequence[Item], wanted: Mapping[str, float], gap: float, top: float, lead: float = 0
+) -> dict[str, float]:
+    """The upper edge of each item: near to what is ``wanted`` for its centre, and without overlap.
+
+    Items keep their order and stand ``gap`` apart, none above ``top``; the first of each group
+    has ``lead`` more room above it.
+    """
+    offsets, at, group = [], 0.0, None
+    for item in column:
+        at += lead if item.group != group else 0
+        group = item.group
+        offsets.append(at)
+        at += item.height + gap
+    # Without the offsets it is least squares under "each not above the one before".
+    blocks: list[list[float]] = []
+    for item, offset in zip(column, offsets, strict=True):
+        target = wanted.get(item.id, 0.0) - item.height / 2 - offset
+        blocks.append([max(target, top), 1])
+        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
+            mean, count = blocks.pop()
+            before = blocks[-1]
+            before[0] = (before[0] * before[1] + mean * count) / (before[1] + count)
+            before[1] += count
+    shifts = [mean for mean, count in blocks for _ in range(int(count))]
+    return {
+        item.id: shift + offset for item, offset, shift in zip(column, offsets, shifts, strict=True)
+    }
+
+
+ONLOOKERS = {
+    "publish": "also written by",
+    "subscribe": "also read by",
+    "request": "also called by",
+    "reply": "also served by",
+    "call": "also called by",
+    "execute": "also carried out by",
+}
+REACHES = {
+    "publish": "writes",
+    "subscribe": "reads",
+    "request": "calls",
+    "reply": "serves",
+    "call": "calls",
+    "execute": "carries out",
+}
+COMMON = {
+    "topics": "used by every node",
+    "services": "served by every node",
+    "actions": "used by every node",
+    "dds": "used by every node",
+}
+"""What a card says of the rights that every node has to its names, where these are not drawn."""
+KIND_NAMES = {"topics": "topic", "services": "service", "actions": "action", "dds": "DDS topic"}
+LEVEL_NAMES = {
+    Level.ENCRYPT: "encrypted",
+    Level.SIGN: "signed, readable",
+    Level.NONE: "not protected",
+    Level.UNKNOWN: "protection unknown",
+}
+OWN = "own:"
+SENDERS, LISTENERS = "may send", "may receive"
+
+
+_MOST, _SHOWN = 8, 4  # so many names stand on a card, and of more than these so many
+
+
+def counted(number: int, thing: str) -> str:
+    """As ``1 topic`` and ``2 topics``."""
+    return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
+def own_text(own: Mapping[str, int]) -> list[str]:
+    """What an enclave alone has, as ``own: 3 topics, 2 services``, on lines that are short."""
+    found = [counted(number, KIND_NAMES[kind]) for kind, number in own.items() if number]
+    lines = [f"{OWN} {', '.join(found[:2])}"]
+    return [*lines, ", ".join(found[2:])] if found[2:] else lines
+
+
+def names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What stands on the card of a bundle: names or the wildcards for them, and small notes."""
+    kind, names = KIND_NAMES[bundle.kind], bundle.names
+    if bundle.partial:
+        return (f"{_common_place(names)}/…",), (
+            f"{counted(len(names), kind)}; a line is for some of them",
+        )
+    if len(names) <= _MOST:
+        return names, ()
+    expressions = sorted({each for tie in bundle.ties for each in tie.by})
+    if expressions and all(tie.by for tie in bundle.ties):
+        return tuple(expressions[:_MOST]), (f"reaches {counted(len(names), kind)}",)
+    return names[:_SHOWN], (f"and {len(names) - _SHOWN} more {kind}s",)
+
+
+def _common_place(names: Sequence[str]) -> str:
+    """The namespace that all names are in, "" for the root."""
+    found = []
+    for parts in zip(*(name.split("/")[:-1] for name in names), strict=False):
+        if len(set(parts)) > 1:
+            break
+        found.append(parts[0])
+    return "/".join(found)
+
+
+def wrapped(text: str, letters: int) -> tuple[str, ...]:
+    """``text`` in lines of so many letters, cut after a slash or underscore where one is near."""
+    lines = []
+    while len(text) > letters:
+        cut = max(
+            text.rfind("/", letters // 2, letters), text.rfind("_", letters // 2, letters - 1)
+        )
+        cut = cut if cut > 0 else letters - 1
+        if text[cut] == "_":
+            cut += 1
+        lines.append(text[:cut])
+        text = "  " + text[cut:]
+    return (*lines, text)
+
+
+_GAP, _LEAD, _TOP, _MARGIN = 9.0, 24.0, 34.0, 14
+_SIDE_LETTERS, _NAMES_LETTERS = 20, 35
+_LEAST_LINES, _MOST_LINES, _MOST_ONLOOKERS = 8, 0.3, 26
+_FEW_BUNDLES, _MOST_BUNDLES = 24, 80
+
+
+class Placing:
+    """Places one scene: draws up its cards, orders and places them, and ties them.
+
+    ``members`` are the enclaves behind each node of the scene, ``everybody`` the nodes that have
+    any right to a name, drawn or not.
+    """
+
+    def __init__(
+        self,
+        picture: Picture,
+        edges: Sequence[Edge],
+        owner: Callable[[str], str],
+        members: Mapping[str, Sequence[str]],
+        everybody: Mapping[tuple[str, str], Set[str]],
+    ) -> None:
+        self._members = members
+        self._everybody = everybody
+        self._groups = {each.path: each.group for each in picture.enclaves}
+        self._unseen = {each.path for each in picture.enclaves if not each.observed}
+        bundles = fold(picture.names, edges, owner)
+        self._looking = _onlookers(bundles)
+        self._tags = {side: chr(ord("A") + n) for n, side in enumerate(self._looking)}
+        self._own: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
+        self._bundles: list[Bundle] = []
+        for bundle in bundles:
+            alone = self._alone(bundle) if len(bundles) > _FEW_BUNDLES else ""
+            if alone:
+                self._own[alone][bundle.kind] += len(bundle.names)
+            else:
+                self._bundles.append(bundle)
+        if len(self._bundles) > _MOST_BUNDLES:
+            self._bundles = list(coarsened(self._bundles))
+        self._ties: dict[tuple[str, str, Qualifier, bool, Mark], set[str]] = defaultdict(set)
+        for number, bundle in enumerate(self._bundles):
+            for tie in bundle.ties:
+                if not self._looks(tie):
+                    side, names = f"{'s' if tie.sends else 'l'}{tie.node}", f"n{number}"
+                    ends = (side, names) if tie.sends else (names, side)
+                    self._ties[(*ends, tie.qualifier, bool(tie.by), tie.mark)].add(tie.right)
+
+    def _looks(self, tie: Tie) -> bool:
+        """Whether the tie is told by a letter, and not by a line."""
+        plain = tie.qualifier is ALLOW and tie.mark is Mark.BOTH
+        return plain and (tie.node, tie.right) in self._looking
+
+    def _alone(self, bundle: Bundle) -> str:
+        """The only node that has to do with these names, onlookers aside; "" if there are more."""
+        looking = {tie.node for tie in bundle.ties if self._looks(tie)}
+        told = {tie.node for tie in bundle.ties if not self._looks(tie)}
+        if any(tie.qualifier is not ALLOW or tie.mark is not Mark.BOTH for tie in bundle.ties):
+            return ""
+        nodes = {each for name in bundle.names for each in self._everybody[bundle.kind, name]}
+        nodes -= looking - told
+        return nodes.pop() if len(nodes) == 1 else ""
+
+    def scene(self, name: str, title: str) -> Scene:
+        """The scene, without its count of names."""
+        cards = {card.id: card for card in self._cards()}
+        columns: list[list[Item]] = [[], [], []]
+        for card in cards.values():
+            columns[card.column].append(Item(card.id, card.height, card.group))
+        lines = sorted({ends[:2] for ends in self._ties})
+        placed = ordered(columns[0], columns[1], columns[2], lines)
+        tops = _tops(placed, lines)
+        cards = {key: replace(card, y=round(tops[key])) for key, card in cards.items()}
+        bottom = max((card.y + card.height for card in cards.values()), default=0)
+        return Scene(
+            id=name,
+            title=title,
+            width=2 * (_MARGIN + SIDE_WIDTH + GUTTER) + NAMES_WIDTH,
+            height=bottom + _MARGIN,
+            cards=tuple(cards[item.id] for column in placed for item in column),
+            links=self._links(cards),
+            frames=tuple(_frames(placed, cards)),
+            onlookers=tuple(
+                Onlooker(tag, node, right) for (node, right), tag in self._tags.items()
+            ),
+        )
+
+    # ── cards ──────────────────────────────────────────────────────────────────────────────
+
+    def _cards(self) -> Iterable[Card]:
+        sides = {end for key in self._ties for end in key[:2] if end[0] in "sl"}
+        sides |= {f"{'s' if SENDS[right] else 'l'}{node}" for node, right in self._looking}
+        # Of a group, all enclaves are shown; of its surroundings, only who has to do with it.
+        inner = {node for node in self._members if not node.startswith(":")}
+        idle = (inner or set(self._members)) - {side[1:] for side in sides}
+        sides |= {f"s{node}" for node in idle}
+        for side in sorted(sides):
+            first = side[0] == "s" or f"s{side[1:]}" not in sides
+            yield self._side_card(side, first=first)
+        for number, bundle in enumerate(self._bundles):
+            yield self._names_card(number, bundle)
+
+    def _side_card(self, side: str, *, first: bool) -> Card:
+        """An enclave or group on one side; what it has alone is told on the ``first`` only."""
+        node, sends = side[1:], side[0] == "s"
+        members = tuple(self._members[node])
+        is_group = node.startswith(":")
+        notes = [counted(len(members), "enclave")] if is_group else []
+        if is_group:
+            label = node[1:]
+        else:
+            group = self._groups[node].rstrip("/") + "/"
+            label = node.removeprefix(group) or node
+        if first and (own := self._own.get(node)):
+            notes += own_text(own)
+        notes += ["never observed"] if node in self._unseen else []
+        notes += [
+            f"{reach} {counted(self._looking[node, right], 'name')}: see {tag}"
+            for (other, right), tag in self._tags.items()
+            for reach in (REACHES[right],)
+            if other == node and SENDS[right] is sends
+        ]
+        lines = wrapped(label, _SIDE_LETTERS)
+        return Card(
+            id=side,
+            role="group" if is_group else "enclave",
+            column=0 if sends else 2,
+            x=_MARGIN if sends else _MARGIN + SIDE_WIDTH + NAMES_WIDTH + 2 * GUTTER,
+            y=0,
+            width=SIDE_WIDTH,
+            height=2 * PAD + LINE * len(lines) + SMALL * len(notes),
+            lines=lines,
+            notes=tuple(notes),
+            members=members,
+            group="" if is_group else self._groups[node],
+        )
+
+    def _names_card(self, number: int, bundle: Bundle) -> Card:
+        titles, notes = names_title(bundle)
+        lines = tuple(line for title in titles for line in wrapped(title, _NAMES_LETTERS))
+        drawn = {tie.node for tie in bundle.ties}
+        if len(self._everybody[bundle.kind, bundle.names[0]] - drawn):
+            notes = (*notes, COMMON[bundle.kind])
+        tags = "".join(
+            sorted({self._tags[tie.node, tie.right] for tie in bundle.ties if self._looks(tie)})
+        )
+        return Card(
+            id=f"n{number}",
+            role="names",
+            column=1,
+            x=_MARGIN + SIDE_WIDTH + GUTTER,
+            y=0,
+            width=NAMES_WIDTH,
+            height=2 * PAD + LINE * len(lines) + SMALL * len(notes),
+            lines=lines,
+            notes=notes,
+            members=bundle.names,
+            kind=bundle.kind,
+            level=bundle.protection.level,
+            tags=tags,
+        )
+
+    # ── links ──────────────────────────────────────────────────────────────────────────────
+
+    def _links(self, cards: dict[str, Card]) -> tuple[Link, ...]:
+        """Links with their ends spread over the edges of the cards, so that they do not meet."""
+        keys = sorted(self._ties)
+        ports: dict[tuple[str, bool], list[tuple[float, int]]] = defaultdict(list)
+        for number, (source, target, *_) in enumerate(keys):
+            for here, there, out in ((source, target, True), (target, source, False)):
+                ports[here, out].append((cards[there].y + cards[there].height / 2, number))
+        where: dict[tuple[int, bool], int] = {}
+        for (card, out), found in ports.items():
+            box = cards[card]
+            step = min(14.0, (box.height - 2 * PAD) / max(1, len(found) - 1))
+            first = box.y + box.height / 2 - step * (len(found) - 1) / 2
+            for place, (_, number) in enumerate(sorted(found)):
+                where[number, out] = round(first + place * step)
+        return tuple(
+            Link(
+                source,
+                target,
+                where[number, True],
+                where[number, False],
+                tuple(sorted(self._ties[key])),
+                qualifier,
+                (cards[source] if cards[source].role == "names" else cards[target]).level,
+                wildcard,
+                mark,
+            )
+            for number, key in enumerate(keys)
+            for source, target, qualifier, wildcard, mark in (key,)
+        )
+
+
+def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
+    """Who reaches so much by wildcards that its lines would hide all others, and how many names.
+
+    By node and right, such as ("/recorder", "subscribe").
+    """
+    reached: dict[tuple[str, str], list[Bundle]] = defaultdict(list)
+    wild: dict[tuple[str, str], int] = defaultdict(int)
+    for bundle in bundles:
+        ties = {(tie.node, tie.right): tie.by for tie in bundle.ties if tie.qualifier is ALLOW}
+        for key, by in ties.items():
+            reached[key].append(bundle)
+            wild[key] += bool(by)
+    most = max(_LEAST_LINES, _MOST_LINES * len(bundles))
+    looking = [
+        (key, sum(len(bundle.names) for bundle in found))
+        for key, found in sorted(reached.items())
+        if len(found) > most and 2 * wild[key] > len(found)
+    ]
+    return dict(looking[:_MOST_ONLOOKERS])  # there are no more letters
+
+
+def _tops(columns: Sequence[Sequence[Item]], lines: Sequence[tuple[str, str]]) -> dict[str, float]:
+    """The upper edges of all cards: the tallest column stands close, the others beside it."""
+    extent = [_extent(column) for column in columns]
+    tallest = max(range(3), key=lambda number: (extent[number], number == 1))
+    tops = heights(columns[tallest], {}, _GAP, _TOP, _LEAD if tallest != 1 else 0)
+    height = {item.id: item.height for column in columns for item in column}
+    order = {1: (0, 2), 0: (1, 2), 2: (1, 0)}[tallest]
+    for number in order:
+        wanted = {}
+        for item in columns[number]:
+            ends = [b if a == item.id else a for a, b in lines if item.id in (a, b)]
+            centres = [tops[end] + height[end] / 2 for end in ends if end in tops]
+            wanted[item.id] = sum(centres) / len(centres) if centres else extent[tallest]
+        tops |= heights(columns[number], wanted, _GAP, _TOP, _LEAD if number != 1 else 0)
+    return tops
+
+
+def _extent(column: Sequence[Item]) -> float:
+    groups = len({item.group for item in column})
+    return sum(item.height + _GAP for item in column) + _LEAD * groups
+
+
+def _frames(columns: Sequence[Sequence[Item]], cards: dict[str, Card]) -> Iterable[Frame]:
+    for column in (columns[0], columns[2]):
+        groups: dict[str, list[Card]] = defaultdict(list)
+        for item in column:
+            groups[item.group].append(cards[item.id])
+        for title, found in groups.items():
+            if all(card.role == "group" for card in found):
+                continue
+            top, bottom = found[0].y - 24, found[-1].y + found[-1].height + 6
+            yield Frame(title, found[0].x - 6, top, SIDE_WIDTH + 12, bottom - top)
+
+
+_MOST_ENCLAVES = 40
+
+
+def scenes_of(picture: Picture) -> tuple[Scene, ...]:
+    """The scenes of a picture, the one to begin with first.
+
+    Of a robot with few enclaves: all but what every node needs, and then everything.  Of many:
+    groups with what passes between them, and then each group with its neighbours.
+    """
+    groups = {each.path: each.group for each in picture.enclaves}
+    titles = sorted(set(groups.values()))
+    essential = [edge for edge in picture.edges if not edge.common]
+    if len(groups) <= _MOST_ENCLAVES or len(titles) < 2 or len(titles) > len(groups) // 2:
+        scenes = [_scene(picture, "essential", "Overview", essential, str)]
+        if len(essential) < len(picture.edges):
+            title = "With what every node needs"
+            scenes.append(_scene(picture, "all", title, picture.edges, str))
+        return tuple(scenes)
+    # The mark of a group is a letter that no enclave begins with.
+    outside = {path: f":{group}" for path, group in groups.items()}
+    scenes = [_scene(picture, "essential", "Overview", essential, outside.__getitem__)]
+    for title in titles:
+
+        def owner(path: str, title: str = title) -> str:
+            return path if groups[path] == title else outside[path]
+
+        touched = {(e.kind, e.name) for e in essential if groups[e.enclave] == title}
+        edges = [edge for edge in essential if (edge.kind, edge.name) in touched]
+        scenes.append(_scene(picture, f"group {title}", title, edges, owner))
+    return tuple(scenes)
+
+
+def _scene(
+    picture: Picture,
+    name: str,
+    title: str,
+    edges: Sequence[Edge],
+    owner: Callable[[str], str],
+) -> Scene:
+    members: dict[str, list[str]] = defaultdict(list)
+    for enclave in picture.enclaves:
+        members[owner(enclave.path)].append(enclave.path)
+    everybody: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for edge in picture.edges:
+        everybody[edge.kind, edge.name].add(owner(edge.enclave))
+    scene = Placing(picture, edges, owner, members, everybody).scene(name, title)
+    shown = len({(edge.kind, edge.name) for edge in edges})
+    return replace(scene, hidden=len(picture.names) - shown, shown=shown)
