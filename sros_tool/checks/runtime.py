@@ -15,13 +15,13 @@ from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
-from sros_tool.keystore.issuing.enclave import enclave_path
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     IDENTITY,
     PERMISSIONS,
     ca_key,
     enclave_names,
+    enclave_path,
     is_keystore,
 )
 from sros_tool.pki import smime

@@ -103,8 +103,7 @@ def signed_material(
     None if there is neither keystore nor folder, or, with ``planned``, no such enclave yet.
     """
     from sros_tool.explain.material import from_folder
-    from sros_tool.keystore.issuing.enclave import enclave_path
-    from sros_tool.keystore.layout import list_enclaves
+    from sros_tool.keystore.layout import enclave_path, list_enclaves
     from sros_tool.keystore.reader import no_such_enclave
 
     if root is None:

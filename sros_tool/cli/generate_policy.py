@@ -102,8 +102,7 @@ def _enclaves_by_identity(environment: Mapping[str, str]) -> dict[str, str]:
     An enclave whose certificate cannot be read is left out.
     """
     from sros_tool.graph.observe import identity_of
-    from sros_tool.keystore.issuing.enclave import enclave_path
-    from sros_tool.keystore.layout import enclave_names, is_keystore
+    from sros_tool.keystore.layout import enclave_names, enclave_path, is_keystore
     from sros_tool.pki.certificates import load_certificate
     from sros_tool.runtime.environment import ENABLE, KEYSTORE
     from sros_tool.xml import read_bytes

@@ -130,8 +130,7 @@ def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict
 
     ``domain_text`` is an option's value; without it $ROS_DOMAIN_ID counts.
     """
-    from sros_tool.keystore.issuing.enclave import enclave_path
-    from sros_tool.keystore.layout import list_enclaves
+    from sros_tool.keystore.layout import enclave_path, list_enclaves
     from sros_tool.keystore.loading import check_enclave
     from sros_tool.keystore.reader import no_such_enclave
     from sros_tool.names import check_enclave_name

@@ -29,8 +29,7 @@ from sros_tool.dds.permissions import (
 from sros_tool.errors import DocumentError, UnavailableError
 from sros_tool.keystore.authorities.authority import Authorities, load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.issuing.enclave import enclave_path
-from sros_tool.keystore.layout import CRL, REQUIRED_FILES
+from sros_tool.keystore.layout import CRL, REQUIRED_FILES, enclave_path
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.reader import load_settings

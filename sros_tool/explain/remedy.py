@@ -9,7 +9,6 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.errors import SrosError
-from sros_tool.keystore.issuing.enclave import enclave_path
 from sros_tool.keystore.issuing.ledger import LEDGER
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
@@ -17,6 +16,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS,
     PRIVATE,
     ca_certificate,
+    enclave_path,
 )
 from sros_tool.keystore.lifecycle.rotation.state import Stage, read_rotation
 

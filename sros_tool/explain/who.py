@@ -12,8 +12,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.explain.answer import Judge, Setting
 from sros_tool.explain.material import Material, from_folder
 from sros_tool.explain.question import Question
-from sros_tool.keystore.issuing.enclave import enclave_path
-from sros_tool.keystore.layout import enclave_names
+from sros_tool.keystore.layout import enclave_names, enclave_path
 from sros_tool.names import is_expression
 from sros_tool.parallel import in_shares
 

@@ -13,7 +13,6 @@ from cryptography.hazmat.primitives import hashes
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, SrosError
-from sros_tool.keystore.issuing.enclave import enclave_path
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     PERMISSIONS,
@@ -23,6 +22,7 @@ from sros_tool.keystore.layout import (
     ca_certificate,
     ca_key,
     enclave_names,
+    enclave_path,
     is_keystore,
 )
 from sros_tool.keystore.loading import EnclaveState, check_enclave

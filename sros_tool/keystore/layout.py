@@ -57,6 +57,11 @@ def enclave_folder(name: str) -> str:
     return ENCLAVES + name.rstrip("/")
 
 
+def enclave_path(root: Path, name: str) -> Path:
+    """Return the folder of an enclave of the keystore at ``root``."""
+    return root / enclave_folder(name)
+
+
 def folder_mode(path: str) -> int:
     """The permission bits of a folder: closed wherever keys may lie."""
     return 0o755 if path in ("", PUBLIC) else 0o700

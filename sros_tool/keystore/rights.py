@@ -15,11 +15,11 @@ from cryptography import x509
 
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, Note, SrosError
-from sros_tool.keystore.issuing.enclave import enclave_path
 from sros_tool.keystore.layout import (
     PERMISSIONS,
     PUBLIC,
     enclave_names,
+    enclave_path,
     is_keystore,
 )
 from sros_tool.pki import smime

@@ -22,8 +22,7 @@ from sros_tool.errors import DocumentError, SrosError
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import from_json
 from sros_tool.keystore.authorities.authority import load_ca_certificate
-from sros_tool.keystore.issuing.enclave import enclave_path
-from sros_tool.keystore.layout import PERMISSIONS, PUBLIC, REQUEST, enclave_names
+from sros_tool.keystore.layout import PERMISSIONS, PUBLIC, REQUEST, enclave_names, enclave_path
 from sros_tool.keystore.lifecycle.revocation_list import read_lists
 from sros_tool.keystore.loading import EnclaveState, check_enclave
 from sros_tool.keystore.reader import load_governance

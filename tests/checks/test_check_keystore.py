@@ -12,7 +12,7 @@ import pytest
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.registry import Selection
 from sros_tool.dds.decision import Access, Vendor
-from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.loading import check_enclave
 from sros_tool.keystore.template import load_template

@@ -20,7 +20,7 @@ import pytest
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY
-from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC

@@ -15,8 +15,7 @@ import pytest
 
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.history import history
-from sros_tool.keystore.issuing.enclave import enclave_path
-from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revocation_list import read_crl

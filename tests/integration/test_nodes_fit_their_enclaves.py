@@ -26,7 +26,7 @@ from sros_tool.demo.keystores import Scenery, Setting, build_scenery
 from sros_tool.demo.model import DENIALS, Party, Relation, Role, Row, Scenario, Status
 from sros_tool.demo.nodes.names import OWN_NAMES
 from sros_tool.demo.scenarios import SCENARIOS
-from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.names import NODE_SERVICES, ROS_DISCOVERY_TOPIC, dds_names, expand

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.template import load_template
 from tests.integration.test_life_on_dds import (

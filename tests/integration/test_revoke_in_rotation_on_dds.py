@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.keystore.history import Status, history
-from sros_tool.keystore.issuing.enclave import enclave_path
-from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.revocation_list import read_lists
 from sros_tool.keystore.lifecycle.rotation.state import rotation_status
 from sros_tool.keystore.loading import check_enclave

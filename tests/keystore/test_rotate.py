@@ -19,9 +19,8 @@ from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.authorities.authority import authority_files, certificates_of
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.delivery.export import distribute
-from sros_tool.keystore.issuing.enclave import enclave_path
 from sros_tool.keystore.issuing.ledger import read_ledger
-from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.revocation_list import read_crl, read_lists
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke

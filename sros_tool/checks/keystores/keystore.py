@@ -30,8 +30,7 @@ from sros_tool.checks.keystores.opened import OpenedEnclave, OpenedKeystore, ope
 from sros_tool.checks.kind import Finding
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
-from sros_tool.keystore.issuing.enclave import enclave_path
-from sros_tool.keystore.layout import GOVERNANCE_P7S, REQUEST
+from sros_tool.keystore.layout import GOVERNANCE_P7S, REQUEST, enclave_path
 from sros_tool.keystore.loading import check_enclave as load_enclave
 from sros_tool.parallel import in_shares
 from sros_tool.pki import smime

@@ -11,7 +11,6 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.errors import SrosError
-from sros_tool.keystore.issuing.enclave import enclave_path
 from sros_tool.keystore.issuing.ledger import LEDGER, Entry, read_ledger
 from sros_tool.keystore.layout import (
     CRL,
@@ -21,6 +20,7 @@ from sros_tool.keystore.layout import (
     ROLES,
     SETTINGS,
     ca_certificate,
+    enclave_path,
     list_enclaves,
 )
 from sros_tool.keystore.loading import EnclaveState

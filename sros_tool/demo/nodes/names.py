@@ -13,7 +13,7 @@ from pathlib import Path
 from sros_tool.dds.permissions import Grant, Rule, parse_permissions
 from sros_tool.demo.model import Role
 from sros_tool.errors import SrosError
-from sros_tool.keystore.issuing.enclave import enclave_path
+from sros_tool.keystore.layout import enclave_path
 from sros_tool.names import NODE_SERVICES, dds_names
 from sros_tool.pki import smime
 from sros_tool.policy.patterns import matches

@@ -12,13 +12,13 @@ from pathlib import Path
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack, staged_file
 from sros_tool.keystore.delivery.arrival import check_same_authority
-from sros_tool.keystore.issuing.enclave import enclave_path
 from sros_tool.keystore.layout import (
     OPTIONAL_FILES,
     PRIVATE,
     REQUEST,
     REQUIRED_FILES,
     enclave_folder,
+    enclave_path,
     list_enclaves,
 )
 from sros_tool.keystore.loading import check_enclave

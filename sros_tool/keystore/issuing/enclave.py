@@ -223,8 +223,3 @@ class Registrar:
         make = proven(enclave, self._domains, ask=self._few)
         permissions, message = self._issuance.permissions(name, certificate, make, enclave.digest)
         notes += document_notes(name, permissions, len(message))
-
-
-def enclave_path(root: Path, name: str) -> Path:
-    """The folder of an enclave of a keystore."""
-    return root / enclave_folder(name)

@@ -12,14 +12,17 @@ from collections.abc import Iterable
 from dataclasses import dataclass, fields
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.validity import Window, iso
+
+if TYPE_CHECKING:
+    from sros_tool.keystore.transaction.transaction import Transaction
 
 LEDGER = "ledger.jsonl"
 
