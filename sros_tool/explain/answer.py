@@ -34,7 +34,8 @@ from sros_tool.errors import SrosError
 from sros_tool.explain.material import Material, from_policy
 from sros_tool.explain.question import OWN_PARTS, Part, Question
 from sros_tool.explain.remedy import remedy
-from sros_tool.keystore.issuing.ledger import LEDGER, read_ledger
+from sros_tool.keystore.layout import LEDGER
+from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.loading import Problem
 from sros_tool.names import dds_names, expand, is_expression
 from sros_tool.policy.document import write_policy

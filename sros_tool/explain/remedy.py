@@ -9,10 +9,10 @@ from pathlib import Path
 from shlex import quote
 
 from sros_tool.errors import SrosError
-from sros_tool.keystore.issuing.ledger import LEDGER
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     IDENTITY,
+    LEDGER,
     PERMISSIONS,
     PRIVATE,
     ca_certificate,

@@ -11,17 +11,17 @@ from datetime import datetime
 from enum import StrEnum
 from pathlib import Path
 
-from sros_tool.keystore.issuing.ledger import Entry, read_ledger
 from sros_tool.keystore.layout import (
     CRL,
     GOVERNANCE_P7S,
     PUBLIC,
+    RETIRED,
     REVOKED,
     enclave_folder,
     list_enclaves,
 )
+from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.keystore.lifecycle.revocation_list import read_lists
-from sros_tool.keystore.lifecycle.rotation.state import RETIRED
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 

@@ -1,4 +1,4 @@
-"""Where things lie in a keystore, as ROS 2 and ros2/sros2 expect them.
+"""Where things lie in a keystore, as ROS 2 and ros2/sros2 expect them, and which enclaves it has.
 
 Paths are relative to the keystore, with "/" between their parts.
 """
@@ -14,6 +14,8 @@ from sros_tool.errors import KeystoreError
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 SETTINGS = "sros.toml"
 """The choices by which the keystore was made; keystores of ros2/sros2 have none."""
+LEDGER = "ledger.jsonl"
+"""Every certificate and signed document that was issued; keystores of ros2/sros2 have none."""
 
 IDENTITY, PERMISSIONS = "identity", "permissions"
 ROLES = (IDENTITY, PERMISSIONS)
@@ -23,47 +25,58 @@ CRL = f"{PUBLIC}/identity_ca.crl.pem"
 REVOKED = "revoked"
 """Where the files of revoked enclaves go."""
 
+ROTATION = "rotation.json"
+"""Which CAs are being replaced; there while a rotation is under way."""
+RETIRED = "retired"
+"""Where certificates and keys of CAs go that issue nothing any more."""
+STAGE = ".sros-transaction"
+"""The folder of a transaction that is under way, or was interrupted."""
+
 GOVERNANCE_XML = f"{ENCLAVES}/governance.xml"
 GOVERNANCE_P7S = f"{ENCLAVES}/governance.p7s"
 
+IDENTITY_CA_FILE, PERMISSIONS_CA_FILE = "identity_ca.cert.pem", "permissions_ca.cert.pem"
+CERTIFICATE_FILE, KEY_FILE = "cert.pem", "key.pem"
+GOVERNANCE_FILE, PERMISSIONS_FILE = "governance.p7s", "permissions.p7s"
 REQUIRED_FILES = (
-    "identity_ca.cert.pem",
-    "permissions_ca.cert.pem",
-    "cert.pem",
-    "key.pem",
-    "governance.p7s",
-    "permissions.p7s",
+    IDENTITY_CA_FILE,
+    PERMISSIONS_CA_FILE,
+    CERTIFICATE_FILE,
+    KEY_FILE,
+    GOVERNANCE_FILE,
+    PERMISSIONS_FILE,
 )
 """The files that rcl and the RMWs read from an enclave; one missing keeps a node from starting."""
 
-OPTIONAL_FILES = ("crl.pem",)
+CRL_FILE = "crl.pem"
+OPTIONAL_FILES = (CRL_FILE,)
 
 REQUEST = "request.pem"
 """The signing request of an enclave whose key was made on its robot and stays there."""
 
 
 def ca_certificate(role: str) -> str:
-    """The certificate of the identity or permissions CA."""
+    """Return the path of the certificate of the identity or permissions CA."""
     return f"{PUBLIC}/{role}_ca.cert.pem"
 
 
 def ca_key(role: str) -> str:
-    """The private key of the identity or permissions CA."""
+    """Return the path of the private key of the identity or permissions CA."""
     return f"{PRIVATE}/{role}_ca.key.pem"
 
 
 def enclave_folder(name: str) -> str:
-    """The folder of an enclave; that of ``/`` is ``enclaves`` itself."""
+    """Return the folder of an enclave, relative to the keystore; for ``/`` it is ``enclaves``."""
     return ENCLAVES + name.rstrip("/")
 
 
 def enclave_path(root: Path, name: str) -> Path:
-    """Return the folder of an enclave of the keystore at ``root``."""
+    """Return the folder of an enclave of the keystore ``root``."""
     return root / enclave_folder(name)
 
 
 def folder_mode(path: str) -> int:
-    """The permission bits of a folder: closed wherever keys may lie."""
+    """Return the permission bits of a folder: closed wherever keys may lie."""
     return 0o755 if path in ("", PUBLIC) else 0o700
 
 
@@ -77,25 +90,43 @@ def is_keystore(root: Path) -> bool:
     )
 
 
+def is_enclave(folder: Path) -> bool:
+    """Whether ``folder`` has a certificate or a key of an enclave."""
+    return any(os.path.lexists(f"{folder}/{file}") for file in (CERTIFICATE_FILE, KEY_FILE))
+
+
 def has_enclave(root: Path, name: str) -> bool:
     """Whether the keystore has an enclave of that name, without a look at all the others."""
-    folder = f"{root}/{enclave_folder(name)}"
-    return os.path.lexists(f"{folder}/cert.pem") or os.path.lexists(f"{folder}/key.pem")
+    return is_enclave(enclave_path(root, name))
+
+
+def key_on_robot(folder: Path) -> bool:
+    """Whether the key of an enclave was made on its robot, where it stays."""
+    return (folder / REQUEST).exists() and not (folder / KEY_FILE).exists()
+
+
+def waits_for_answer(folder: Path) -> bool:
+    """Whether the signing request of an enclave was not answered yet."""
+    return (folder / REQUEST).exists() and not (folder / CERTIFICATE_FILE).exists()
 
 
 def enclave_names(root: Path) -> Iterator[str]:
-    """The names of the enclaves in the keystore: every folder that holds a key, sorted."""
+    """Yield the names of the enclaves in the keystore: every folder that holds a key, sorted."""
     top = os.fspath(root / ENCLAVES)
     found = []
     for folder, folders, files in os.walk(top):
         folders[:] = [each for each in folders if not each.startswith(".")]
-        if "key.pem" in files or "cert.pem" in files:
+        if KEY_FILE in files or CERTIFICATE_FILE in files:
             found.append(folder[len(top) :].replace(os.sep, "/") or "/")
     yield from sorted(found)
 
 
 def list_enclaves(root: Path) -> tuple[str, ...]:
-    """The names of the enclaves of a keystore, sorted; `KeystoreError` if it is none."""
+    """Return the names of the enclaves of a keystore, sorted.
+
+    Raises:
+        KeystoreError: ``root`` is no keystore.
+    """
     check_keystore(root)
     return tuple(enclave_names(root))
 

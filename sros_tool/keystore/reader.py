@@ -16,7 +16,6 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant, parse_permissions
 from sros_tool.errors import InvalidNameError, KeystoreError, SrosError, UsageError
-from sros_tool.keystore.issuing.ledger import Entry, read_ledger
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     PERMISSIONS,
@@ -26,6 +25,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     list_enclaves,
 )
+from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.keystore.template import Template, load_template, read_template
 from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime

@@ -12,7 +12,8 @@ from cryptography.hazmat.primitives import hashes
 
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.history import Status, history
-from sros_tool.keystore.issuing.ledger import LEDGER, Entry, read_ledger
+from sros_tool.keystore.layout import LEDGER
+from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from sros_tool.keystore.history import Status, history
-from sros_tool.keystore.issuing.ledger import LEDGER, read_ledger
-from sros_tool.keystore.layout import enclave_path
+from sros_tool.keystore.layout import LEDGER, enclave_path
+from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revocation_list import read_crl
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke

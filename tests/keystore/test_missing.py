@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore.issuing.ledger import read_ledger
 from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.reader import likely, no_such_enclave
 from sros_tool.pki.certificates import load_certificate
 from tests.support.harness import sros

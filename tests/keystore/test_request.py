@@ -26,8 +26,8 @@ from sros_tool.keystore.delivery.arrival import verify_arrival
 from sros_tool.keystore.delivery.request import create_request
 from sros_tool.keystore.delivery.signing import Signed, sign_request
 from sros_tool.keystore.history import history
-from sros_tool.keystore.issuing.ledger import read_ledger
 from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke

@@ -13,8 +13,8 @@ import pytest
 
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.delivery.export import distribute
-from sros_tool.keystore.issuing.ledger import read_ledger
 from sros_tool.keystore.layout import enclave_path, list_enclaves
+from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revocation_list import read_crl

@@ -19,18 +19,13 @@ from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.authorities.authority import authority_files, certificates_of
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.delivery.export import distribute
-from sros_tool.keystore.issuing.ledger import read_ledger
-from sros_tool.keystore.layout import enclave_path, list_enclaves
+from sros_tool.keystore.layout import ROTATION, enclave_path, list_enclaves
+from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.revocation_list import read_crl, read_lists
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotation.stages import RotationStep, renew_identity_ca, rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import (
-    ROTATION,
-    Stage,
-    retired_key,
-    rotation_status,
-)
+from sros_tool.keystore.lifecycle.rotation.state import Stage, retired_key, rotation_status
 from sros_tool.keystore.loading import check_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import common_name, digest, pem

@@ -19,8 +19,8 @@ from sros_tool.errors import KeystoreError
 from sros_tool.keystore import history as history_of_keystores
 from sros_tool.keystore.authorities.authority import certificates_of
 from sros_tool.keystore.history import Status, history
-from sros_tool.keystore.issuing.ledger import read_ledger
 from sros_tool.keystore.layout import enclave_path
+from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revocation_list import read_crl, read_lists

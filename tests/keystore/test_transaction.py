@@ -18,7 +18,7 @@ import pytest
 
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.delivery.export import distribute
-from sros_tool.keystore.layout import REQUIRED_FILES, enclave_folder, is_keystore
+from sros_tool.keystore.layout import REQUIRED_FILES, STAGE, enclave_folder, is_keystore
 from sros_tool.keystore.lifecycle import create
 from sros_tool.keystore.lifecycle.create import (
     create_enclaves,
@@ -29,7 +29,6 @@ from sros_tool.keystore.lifecycle.create import (
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import filesystem
 from sros_tool.keystore.transaction import stage as stage_of
-from sros_tool.keystore.transaction.stage import STAGE
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.policy import Policy, read_policy
 from tests.support.harness import check_whole, policy_text, publish, remains, snapshot, topics_of

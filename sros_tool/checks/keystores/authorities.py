@@ -12,8 +12,15 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from sros_tool.checks.keystores.opened import OpenedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.errors import SrosError
-from sros_tool.keystore.issuing.ledger import LEDGER
-from sros_tool.keystore.layout import CRL, IDENTITY, PERMISSIONS, SETTINGS, ca_certificate, ca_key
+from sros_tool.keystore.layout import (
+    CRL,
+    IDENTITY,
+    LEDGER,
+    PERMISSIONS,
+    SETTINGS,
+    ca_certificate,
+    ca_key,
+)
 from sros_tool.keystore.loading import authority_refusals, refusals_text
 from sros_tool.pki.certificates import same_key, subject_text, validity_of
 from sros_tool.pki.chains import purpose_faults

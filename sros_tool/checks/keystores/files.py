@@ -10,19 +10,20 @@ from pathlib import Path
 
 from sros_tool.checks.keystores.opened import OpenedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
-from sros_tool.keystore.issuing.ledger import LEDGER
 from sros_tool.keystore.layout import (
     ENCLAVES,
+    LEDGER,
     OPTIONAL_FILES,
     PRIVATE,
     PUBLIC,
     REQUEST,
     REQUIRED_FILES,
+    RETIRED,
     REVOKED,
+    ROTATION,
     SETTINGS,
+    STAGE,
 )
-from sros_tool.keystore.lifecycle.rotation.state import RETIRED, ROTATION
-from sros_tool.keystore.transaction.stage import STAGE
 
 KEY_READABLE = Kind(
     "keystore.key-readable",

@@ -11,10 +11,10 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.errors import SrosError
-from sros_tool.keystore.issuing.ledger import LEDGER, Entry, read_ledger
 from sros_tool.keystore.layout import (
     CRL,
     GOVERNANCE_P7S,
+    LEDGER,
     PRIVATE,
     PUBLIC,
     ROLES,
@@ -23,6 +23,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     list_enclaves,
 )
+from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.keystore.loading import EnclaveState
 from sros_tool.keystore.reader import load_settings
 from sros_tool.keystore.template import Template

@@ -24,12 +24,12 @@ from sros_tool.keystore.layout import (
     PRIVATE,
     PUBLIC,
     ROLES,
+    STAGE,
     ca_certificate,
     ca_key,
     enclave_folder,
 )
 from sros_tool.keystore.template import Template
-from sros_tool.keystore.transaction.stage import STAGE
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (

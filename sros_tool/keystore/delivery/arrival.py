@@ -20,12 +20,12 @@ from sros_tool.keystore.layout import (
     PRIVATE,
     PUBLIC,
     REQUEST,
+    STAGE,
     enclave_folder,
     enclave_names,
     is_keystore,
 )
 from sros_tool.keystore.loading import EnclaveState, check_enclave
-from sros_tool.keystore.transaction.stage import STAGE
 from sros_tool.pki.certificates import UNREADABLE, common_name_of, subject_text, validity_of
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes

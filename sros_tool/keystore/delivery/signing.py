@@ -18,7 +18,6 @@ from sros_tool.keystore.delivery.answer import SEAL, Answer, check_answer, seal
 from sros_tool.keystore.delivery.archive import pack, staged_file
 from sros_tool.keystore.issuing.enclave import default_enclave
 from sros_tool.keystore.issuing.issuance import Issuance, Make, policies_of, renewed
-from sros_tool.keystore.issuing.ledger import Entry, append, document_entry
 from sros_tool.keystore.issuing.proof import proven
 from sros_tool.keystore.layout import (
     CRL,
@@ -31,6 +30,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     list_enclaves,
 )
+from sros_tool.keystore.ledger import Entry, append, document_entry
 from sros_tool.keystore.reader import check_domain, load_governance, load_settings, read_granted
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.recovery import tidy

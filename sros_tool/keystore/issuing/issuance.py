@@ -17,8 +17,8 @@ from cryptography import x509
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions, render_permissions
 from sros_tool.errors import KeystoreError, Note
 from sros_tool.keystore.authorities.authority import Authority
-from sros_tool.keystore.issuing.ledger import Entry, certificate_entry, document_entry, read_ledger
 from sros_tool.keystore.layout import enclave_folder
+from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry, read_ledger
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.stage import Staged
 from sros_tool.keystore.transaction.transaction import Transaction

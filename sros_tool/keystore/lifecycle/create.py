@@ -22,7 +22,6 @@ from sros_tool.keystore.authorities.authority import (
 )
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.enclave import Fate, Registrar
-from sros_tool.keystore.issuing.ledger import Entry, append, certificate_entry, document_entry
 from sros_tool.keystore.layout import (
     ENCLAVES,
     GOVERNANCE_P7S,
@@ -34,6 +33,7 @@ from sros_tool.keystore.layout import (
     enclave_names,
     is_keystore,
 )
+from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
 from sros_tool.keystore.reader import check_domain, load_governance, load_settings, no_such_enclave
 from sros_tool.keystore.template import Template, render_template
 from sros_tool.keystore.transaction.recovery import tidy

@@ -11,8 +11,8 @@ from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.keystore.authorities.authority import Authorities, load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.issuing.issuance import Issuance, policies_of, renewed
-from sros_tool.keystore.issuing.ledger import Entry, append, read_ledger
 from sros_tool.keystore.layout import check_keystore, enclave_folder, has_enclave, list_enclaves
+from sros_tool.keystore.ledger import Entry, append, read_ledger
 from sros_tool.keystore.lifecycle.revocation_list import Lists
 from sros_tool.keystore.lifecycle.revoke import link_everywhere, still_valid
 from sros_tool.keystore.reader import (

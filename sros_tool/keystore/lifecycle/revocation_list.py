@@ -25,8 +25,8 @@ from sros_tool.keystore.authorities.authority import (
     write_bundle,
 )
 from sros_tool.keystore.authorities.keyring import Keyring
-from sros_tool.keystore.issuing.ledger import Entry, document_entry
 from sros_tool.keystore.layout import CRL, IDENTITY, REVOKED
+from sros_tool.keystore.ledger import Entry, document_entry
 from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
     Stage,

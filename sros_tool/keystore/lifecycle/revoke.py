@@ -10,7 +10,6 @@ from pathlib import Path
 from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.keystore.authorities.authority import Authority, load_authority
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.issuing.ledger import Entry, append, read_ledger
 from sros_tool.keystore.layout import (
     CRL,
     IDENTITY,
@@ -21,6 +20,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     list_enclaves,
 )
+from sros_tool.keystore.ledger import Entry, append, read_ledger
 from sros_tool.keystore.lifecycle.revocation_list import Lists, read_crl
 from sros_tool.keystore.reader import load_settings, no_such_enclave
 from sros_tool.keystore.transaction.recovery import tidy

@@ -15,6 +15,7 @@ import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from sros_tool.keystore.layout import STAGE
 from sros_tool.keystore.transaction import filesystem
 from sros_tool.keystore.transaction.filesystem import (
     is_folder,
@@ -27,7 +28,6 @@ from sros_tool.keystore.transaction.stage import (
     AFTER,
     BEFORE,
     LIVE,
-    STAGE,
     Move,
     bridge_text,
     number,

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from sros_tool.errors import KeystoreError
+from sros_tool.keystore.layout import STAGE
 
-STAGE = ".sros-transaction"
 BEFORE, AFTER, LIVE, ADDED, MANIFEST = "before", "after", "live", "added", "manifest.json"
 
 

@@ -27,7 +27,7 @@ from types import TracebackType
 from typing import Self
 
 from sros_tool.errors import KeystoreError, SrosError
-from sros_tool.keystore.layout import folder_mode
+from sros_tool.keystore.layout import STAGE, folder_mode
 from sros_tool.keystore.transaction import filesystem
 from sros_tool.keystore.transaction.filesystem import is_folder
 from sros_tool.keystore.transaction.recovery import recover, tidy
@@ -36,7 +36,6 @@ from sros_tool.keystore.transaction.stage import (
     AFTER,
     BEFORE,
     LIVE,
-    STAGE,
     Change,
     Move,
     Staged,

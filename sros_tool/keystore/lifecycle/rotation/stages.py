@@ -26,7 +26,6 @@ from sros_tool.keystore.authorities.authority import (
 )
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring, check_places
 from sros_tool.keystore.issuing.issuance import Issuance, policies_of, renewed, teller
-from sros_tool.keystore.issuing.ledger import Entry, append, certificate_entry, document_entry
 from sros_tool.keystore.layout import (
     CRL,
     GOVERNANCE_P7S,
@@ -34,16 +33,17 @@ from sros_tool.keystore.layout import (
     PERMISSIONS,
     PRIVATE,
     PUBLIC,
+    RETIRED,
     ROLES,
+    ROTATION,
     SETTINGS,
     ca_key,
     enclave_folder,
     list_enclaves,
 )
+from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.revocation_list import read_crl, sign_list
 from sros_tool.keystore.lifecycle.rotation.state import (
-    RETIRED,
-    ROTATION,
     Replacement,
     Rotation,
     Stage,

@@ -15,7 +15,14 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.authorities.authority import authority_files, certificates_of
-from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, enclave_folder, list_enclaves
+from sros_tool.keystore.layout import (
+    IDENTITY,
+    PERMISSIONS,
+    RETIRED,
+    ROTATION,
+    enclave_folder,
+    list_enclaves,
+)
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     digest,
@@ -27,10 +34,6 @@ from sros_tool.pki.certificates import (
 from sros_tool.validity import Window, iso
 from sros_tool.xml import read_bytes
 
-ROTATION = "rotation.json"
-"""Which CAs are being replaced; there while a rotation is under way."""
-RETIRED = "retired"
-"""Where certificates and keys of CAs go that issue nothing any more."""
 SOON = timedelta(days=90)
 """How long before its end a CA should be replaced."""
 

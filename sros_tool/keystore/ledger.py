@@ -18,13 +18,12 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
 from sros_tool.errors import KeystoreError
+from sros_tool.keystore.layout import LEDGER
 from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.validity import Window, iso
 
 if TYPE_CHECKING:
     from sros_tool.keystore.transaction.transaction import Transaction
-
-LEDGER = "ledger.jsonl"
 
 
 @dataclass(frozen=True, slots=True)
