@@ -75,7 +75,7 @@ def replace_files(folder: Path, files: list[tuple[str, int]], count: int, *, che
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec
 
-    from sros_tool.parallel import in_shares
+    from sros_tool.parallel import map_slices
     from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem
     from sros_tool.pki.keys import generate_key
     from sros_tool.validity import window
@@ -111,9 +111,9 @@ def replace_files(folder: Path, files: list[tuple[str, int]], count: int, *, che
             for file, _ in files:
                 os.replace(spare(place, file), os.path.join(place, file))
 
-    in_shares(range(count), write)
+    map_slices(range(count), write)
     os.sync()
-    in_shares(range(count), rename)
+    map_slices(range(count), rename)
 
 
 def _seconds(action: Callable[[], object]) -> float:

@@ -1,4 +1,4 @@
-"""Replaces a file as a whole: readers find the old content or the new, never a part."""
+"""Replacing a file as a whole, and reading TOML within bounds."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ from typing import Any
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Let the file at ``path`` hold ``data``, on the disk when this returns.
+    """Replace the content of the file at ``path`` by ``data``, on the disk when this returns.
 
-    A file that exists keeps its mode and, where that is allowed, its owner; a symbolic link stays
-    and its target changes.  A device or a pipe (``/dev/null``) is written to, and never replaced.
-    Raises `OSError` if the folder cannot be written; then nothing changed.
+    Whoever reads meanwhile finds the old content or the new one, never a part.  A file that exists
+    keeps its mode and, where that is allowed, its owner; a symbolic link stays and its target
+    changes.  A device or a pipe (``/dev/null``) is written to, and never replaced.
+
+    Raises:
+        OSError: the folder cannot be written; then nothing changed.
     """
     target = Path(os.path.realpath(path))
     spare = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
@@ -48,19 +51,23 @@ def replace_file(path: Path, data: bytes) -> None:
         os.close(folder)
 
 
-LONGEST_LINE = 4000
-"""In characters: the parser takes quadratic time for a key of many dots."""
-LARGEST = 256 * 1024
-"""Of a document, in characters."""
+_LONGEST_LINE = 4000  # characters: the parser takes quadratic time for a key of many dots
+_LONGEST_DOCUMENT = 256 * 1024  # characters
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """The tables of a TOML document; raises `tomllib.TOMLDecodeError`, and nothing else."""
-    if len(text) > LARGEST:
-        raise tomllib.TOMLDecodeError(f"it is longer than {LARGEST // 1024} KiB")
+    """Return the tables of a TOML document.
+
+    Raises:
+        tomllib.TOMLDecodeError: the document is not TOML, too long, or nested too deeply.
+    """
+    if len(text) > _LONGEST_DOCUMENT:
+        raise tomllib.TOMLDecodeError(f"it is longer than {_LONGEST_DOCUMENT // 1024} KiB")
     for number, line in enumerate(text.split("\n"), 1):
-        if len(line) > LONGEST_LINE:
-            raise tomllib.TOMLDecodeError(f"line {number} is longer than {LONGEST_LINE} characters")
+        if len(line) > _LONGEST_LINE:
+            raise tomllib.TOMLDecodeError(
+                f"line {number} is longer than {_LONGEST_LINE} characters"
+            )
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError:

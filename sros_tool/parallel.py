@@ -1,7 +1,7 @@
-"""Does the same work on the shares of a long list, one process for each core.
+"""Run a function over slices of a list in forked workers.
 
-Signing is bound by the processor, and the processes of a fork share everything that was read and
-checked before.  They also share the lock on the keystore: it is held until the last one is gone.
+Signing is bound by the processor, and forked processes share everything that was read and checked
+before.  They also share the lock on the keystore: it is held until the last of them has exited.
 """
 
 from __future__ import annotations
@@ -19,106 +19,111 @@ from typing import TypeVar
 from sros_tool.errors import SrosError
 
 Item = TypeVar("Item")
-Outcome = TypeVar("Outcome")
+Result = TypeVar("Result")
 
 Progress = Callable[[str], None]
-"""Told the name of each enclave when it is done."""
+"""Called with the name of each enclave when it is done."""
 
-_SMALLEST_SHARE = 100
+_SMALLEST_SLICE = 100
 _MOST_PROCESSES = 8
 _PR_SET_PDEATHSIG = 1
-_ENDING = (signal.SIGINT, signal.SIGTERM)
+_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-def in_shares(
-    items: Sequence[Item], work: Callable[[Sequence[Item]], Outcome]
-) -> list[tuple[Sequence[Item], Outcome]]:
-    """Each share of ``items`` with what ``work`` made of it, in order; the first error is raised.
+def map_slices(
+    items: Sequence[Item], work: Callable[[Sequence[Item]], Result]
+) -> list[tuple[Sequence[Item], Result]]:
+    """Return each slice of ``items`` with the result of ``work`` on it, in order.
 
-    Short lists, and programs with several threads (which a fork could stop half-way), get one
-    share and no further process.  Outcomes and errors are pickled.
+    There is one slice for each core; this process does the first, forked workers do the others.
+    A short list, and a program with several threads (a fork could leave their locks held for
+    ever), gets one slice and no worker.  Results and errors of workers are pickled.
+
+    Raises:
+        SrosError: a worker died.  The first error that ``work`` raises is raised here, too.
     """
     cores = len(os.sched_getaffinity(0))
-    count = min(cores, len(items) // _SMALLEST_SHARE, _MOST_PROCESSES)
+    count = min(cores, len(items) // _SMALLEST_SLICE, _MOST_PROCESSES)
     if count < 2 or threading.active_count() > 1:
         return [(items, work(items))]
     bounds = [len(items) * index // count for index in range(count + 1)]
-    shares = [items[begin:end] for begin, end in pairwise(bounds)]
-    children: list[tuple[int, int]] = []
+    slices = [items[begin:end] for begin, end in pairwise(bounds)]
+    workers: list[tuple[int, int]] = []
     try:
-        for share in shares[1:]:
-            _fork(share, work, children)
-        outcomes = [work(shares[0])]
-        while children:
-            outcomes.append(_collect(*children[0]))
-            children.pop(0)
+        for each in slices[1:]:
+            _fork(each, work, workers)
+        results = [work(slices[0])]
+        while workers:
+            results.append(_collect(*workers[0]))
+            workers.pop(0)
     finally:
-        for child, pipe in children:
+        for worker, pipe in workers:
             with contextlib.suppress(OSError):
-                os.kill(child, signal.SIGKILL)
-                os.waitpid(child, 0)
+                os.kill(worker, signal.SIGKILL)
+                os.waitpid(worker, 0)
             with contextlib.suppress(OSError):
                 os.close(pipe)
-    return list(zip(shares, outcomes, strict=True))
+    return list(zip(slices, results, strict=True))
 
 
 def _fork(
-    share: Sequence[Item],
-    work: Callable[[Sequence[Item]], Outcome],
-    children: list[tuple[int, int]],
+    items: Sequence[Item],
+    work: Callable[[Sequence[Item]], Result],
+    workers: list[tuple[int, int]],
 ) -> None:
-    """Start a child and add it, with the pipe for its outcome, to ``children``.
+    """Start a worker and add it, with the pipe for its result, to ``workers``.
 
-    A signal that came between these two would leave a child that nobody ends.
+    A signal between these two steps would leave a worker that nobody stops, so it has to wait.
     """
     parent = os.getpid()
     reader, writer = os.pipe()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _ENDING)
-    child = os.fork()
-    if child:
-        children.append((child, reader))
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOP_SIGNALS)
+    worker = os.fork()
+    if worker:
+        workers.append((worker, reader))
         os.close(writer)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         return
     try:
         os.close(reader)
-        _end_with(parent)
+        _die_with(parent)
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
         with open(writer, "wb") as pipe:
-            pickle.dump(_attempt(share, work), pipe)
+            pickle.dump(_result_or_error(items, work), pipe)
     finally:
-        os._exit(0)  # no handlers, buffers or temporary files of the parent's
+        os._exit(0)  # without the parent's exit handlers, buffers and temporary files
 
 
-def _attempt(
-    share: Sequence[Item], work: Callable[[Sequence[Item]], Outcome]
-) -> Outcome | BaseException:
+def _result_or_error(
+    items: Sequence[Item], work: Callable[[Sequence[Item]], Result]
+) -> Result | BaseException:
     try:
-        return work(share)
+        return work(items)
     except BaseException as error:
         return error
 
 
-def _end_with(parent: int) -> None:
-    """Let this process be killed when its parent dies, so that nothing is written afterwards."""
+def _die_with(parent: int) -> None:
+    """Have this process killed when its parent dies, so that it writes nothing afterwards."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends its children
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it, too, and kills its workers
 
 
-def _collect(child: int, pipe: int) -> Outcome:  # type: ignore[type-var]
+def _collect(worker: int, pipe: int) -> Result:  # type: ignore[type-var]
+    """Wait for a worker; return its result or raise its error."""
     with open(pipe, "rb") as stream:
         message = stream.read()
-    _, status = os.waitpid(child, 0)
+    _, status = os.waitpid(worker, 0)
     if not message:
         raise SrosError(
             "a process that shared the work died",
-            f"It ended with status {status}; perhaps there was too little memory.",
+            f"Its exit status is {status}; perhaps there was too little memory.",
             "Try again.",
         )
-    outcome = pickle.loads(message)  # noqa: S301 - from our own child, through a pipe
-    if isinstance(outcome, BaseException):
-        raise outcome
-    return outcome  # type: ignore[no-any-return]
+    result = pickle.loads(message)  # noqa: S301 - from our own child, through a pipe
+    if isinstance(result, BaseException):
+        raise result
+    return result  # type: ignore[no-any-return]

@@ -14,7 +14,7 @@ from sros_tool.explain.material import Material, from_folder
 from sros_tool.explain.question import Question
 from sros_tool.keystore.layout import enclave_names, enclave_path
 from sros_tool.names import is_expression
-from sros_tool.parallel import in_shares
+from sros_tool.parallel import map_slices
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ def who(
             for name in names
         ]
 
-    found = [each for _, share in in_shares(list(enclave_names(root)), work) for each in share]
+    found = [each for _, share in map_slices(list(enclave_names(root)), work) for each in share]
     return tuple(sorted(found, key=lambda each: each.enclave))
 
 

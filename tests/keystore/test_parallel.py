@@ -15,7 +15,7 @@ ITEMS = range(1000)
 
 def test_the_outcomes_come_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
-    shares = parallel.in_shares(ITEMS, sum)
+    shares = parallel.map_slices(ITEMS, sum)
     assert [outcome for _, outcome in shares] in (
         [sum(ITEMS[:500]), sum(ITEMS[500:])],
         [sum(ITEMS)],  # a test runner with threads of its own
@@ -57,7 +57,7 @@ def write(share):
 signal.signal(signal.SIGTERM, end)
 os.fork = interrupted
 try:
-    parallel.in_shares(range(1000), write)
+    parallel.map_slices(range(1000), write)
 except Ended:
     pass
 (child,) = children

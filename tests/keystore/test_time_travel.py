@@ -31,7 +31,7 @@ from sros_tool.keystore.loading import check_enclave
 from sros_tool.keystore.reader import Threshold, lifetimes
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import filesystem
-from sros_tool.parallel import in_shares
+from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import issued_by, validity_of
 from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.policy import read_policy
@@ -147,7 +147,7 @@ class Verified:
                 found[name] = (Life(state.certificate.serial_number, windows), problems)
             return found
 
-        return {name: each for _, found in in_shares(names, work) for name, each in found.items()}
+        return {name: each for _, found in map_slices(names, work) for name, each in found.items()}
 
     def _real(self, file: str) -> Path:
         place = {"crl.pem": "public/identity_ca.crl.pem", "governance.p7s": "enclaves/" + file}

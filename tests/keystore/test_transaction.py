@@ -27,7 +27,7 @@ from sros_tool.keystore.lifecycle.create import (
     generate_artifacts,
 )
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction import filesystem
+from sros_tool.keystore.transaction import filesystem, recovery
 from sros_tool.keystore.transaction import stage as stage_of
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.policy import Policy, read_policy
@@ -640,10 +640,10 @@ def test_an_interrupted_transaction_of_a_stranger_writes_nowhere_else(
     outside = tmp_path / "outside"
     (keystore / "enclaves").rename(outside)
     (keystore / "enclaves").symlink_to(outside)
-    staged = keystore / STAGE / "new/enclaves"
-    staged.mkdir(parents=True)
+    made_up_stage(keystore, "after", [])
+    staged = keystore / STAGE / "added/enclaves"
+    staged.mkdir()
     (staged / "authorized_keys").write_text("mine")
-    (keystore / STAGE / "live").symlink_to("new")
     before = snapshot(tmp_path)
     with pytest.raises(KeystoreError, match="symbolic link"):
         create_enclaves(keystore, ["/new"], now=NOW)
@@ -701,35 +701,28 @@ def made_up_stage(keystore: Path, live: str, moves: list[list[str | None]]) -> N
     (keystore / STAGE / stage_of.MANIFEST).write_text(text)
 
 
-@pytest.mark.parametrize("committed", [False, True])
-def test_what_an_earlier_version_left_is_recovered(committed: bool, keystore: Path) -> None:
-    """An earlier sros staged trees; this is what it looked like on both sides of the change."""
-    stage, a = keystore / STAGE, keystore / "enclaves/a"
+@pytest.mark.parametrize(
+    ("live", "folder"),
+    [("new", "new"), ("old", "old"), ("new", None), ("/etc", None), (None, "new"), (None, "x")],
+)
+def test_a_stage_of_an_unknown_format_is_refused_and_not_touched(
+    live: str | None, folder: str | None, keystore: Path
+) -> None:
+    stage = keystore / STAGE
+    stage.mkdir()
+    if folder:
+        (stage / folder / "enclaves/a").mkdir(parents=True)
+        (stage / folder / "enclaves/a/cert.pem").write_bytes(b"another")
+    if live:
+        (stage / "live").symlink_to(live)
     before = snapshot(keystore)
-    new = {"enclaves/a/cert.pem": b"new", "enclaves/x/cert.pem": b"x", "ledger.jsonl": b"new"}
-    for path, data in new.items():
-        (stage / "new" / path).parent.mkdir(parents=True, exist_ok=True)
-        (stage / "new" / path).write_bytes(data)
-    for path in ("enclaves/a/cert.pem", "ledger.jsonl", "enclaves/b/permissions.xml"):
-        (stage / "old" / path).parent.mkdir(parents=True, exist_ok=True)
-        os.link(keystore / path, stage / "old" / path)
-        (keystore / path).unlink()
-        (keystore / path).symlink_to("../" * path.count("/") + f"{STAGE}/live/{path}")
-    (stage / "removed").write_text("enclaves/b/permissions.xml")
-    (stage / "live").symlink_to("new" if committed else "old")
-    recover_all(keystore)
-    assert not remains(keystore)
-    if not committed:
+    for verb in (
+        lambda: create_enclaves(keystore, ["/new"], now=NOW),
+        lambda: recovery.tidy(keystore),
+    ):
+        with pytest.raises(KeystoreError, match=r"unknown to this version.*version of sros that"):
+            verb()
         assert snapshot(keystore) == before
-        return
-    assert {path: (keystore / path).read_bytes() for path in new} == new
-    assert not (a / "cert.pem").is_symlink()
-    assert not (keystore / "enclaves/b/permissions.xml").exists()
-
-
-def recover_all(keystore: Path) -> None:
-    with Transaction(keystore):
-        pass
 
 
 def test_a_file_that_is_a_link_is_replaced_and_not_followed(keystore: Path, tmp_path: Path) -> None:

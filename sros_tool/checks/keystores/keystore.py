@@ -32,7 +32,7 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import GOVERNANCE_P7S, REQUEST, enclave_path
 from sros_tool.keystore.loading import check_enclave as load_enclave
-from sros_tool.parallel import in_shares
+from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right
@@ -72,7 +72,7 @@ def keystore_findings(
                 traits.append(each)
         return found, traits
 
-    outcomes = [outcome for _, outcome in in_shares(names, work)]
+    outcomes = [outcome for _, outcome in map_slices(names, work)]
     found = [finding for findings, _ in outcomes for finding in findings]
     if only is None:
         traits = [each for _, all_traits in outcomes for each in all_traits]

@@ -22,7 +22,7 @@ from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry, 
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.stage import Staged
 from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.parallel import Progress, in_shares
+from sros_tool.parallel import Progress, map_slices
 from sros_tool.pki.certificates import pem, subject_text, validity_of
 from sros_tool.pki.keys import PublicKey
 from sros_tool.pki.token import TokenKey
@@ -135,7 +135,7 @@ class Issuance:
             return results, self.entries[first:], self._transaction.since(mark)
 
         found: list[Result] = []
-        shares = [(items, share(items))] if self._alone else in_shares(items, share)
+        shares = [(items, share(items))] if self._alone else map_slices(items, share)
         for index, (part, (results, entries, staged)) in enumerate(shares):
             if index:  # the first share was done here, the others by other processes
                 self._transaction.absorb(staged)

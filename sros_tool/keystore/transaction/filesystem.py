@@ -1,4 +1,4 @@
-"""What a transaction asks of the file system beyond single files: locks, flushes, exchanges."""
+"""What a transaction needs of the file system: locks, flushes, exchanges, moves of folders."""
 
 from __future__ import annotations
 
@@ -24,9 +24,13 @@ _NOT_SUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
 
 
 def lock_folder(folder: Path, wait: float | None = None) -> int:
-    """An exclusive lock on a folder itself, so that no lock file is left behind.
+    """Lock a folder for this process; return the descriptor that holds the lock.
 
-    Returns the descriptor that holds it.  Raises `KeystoreError` after ``wait`` seconds.
+    The lock is on the folder itself, so that no lock file is left behind.  ``wait`` is in seconds
+    (default: `LOCK_SECONDS`).
+
+    Raises:
+        KeystoreError: another process held the lock all the time.
     """
     wait = LOCK_SECONDS if wait is None else wait
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -47,7 +51,7 @@ def lock_folder(folder: Path, wait: float | None = None) -> int:
 
 
 def flush_file_system(folder: Path) -> None:
-    """One flush for all files of a transaction: one for each would cost more than all else."""
+    """Flush the file system of ``folder`` once: a flush for each file would cost far more."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         if _c_library().syncfs(handle) != 0:
@@ -60,7 +64,7 @@ def flush_file_system(folder: Path) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Have the names in a folder written down."""
+    """Flush the names in a folder to the disk."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)
@@ -69,9 +73,9 @@ def flush_folder(folder: Path) -> None:
 
 
 def exchange(one: str, other: str) -> bool:
-    """Let two names change their places at one moment (``renameat2``).
+    """Atomically exchange two names (``renameat2``); return whether that was possible.
 
-    False, and nothing is changed, where the system, its C library or the file system cannot.
+    It is not, and nothing is changed, where the system, its C library or the file system cannot.
     """
     try:
         rename = _c_library().renameat2
@@ -93,7 +97,11 @@ def _c_library() -> ctypes.CDLL:
 
 
 def is_folder(path: str | Path) -> bool:
-    """Whether a real folder is at ``path``; raises `KeystoreError` if something else is."""
+    """Whether a real folder is at ``path``.
+
+    Raises:
+        KeystoreError: something else is there.
+    """
     try:
         mode = os.lstat(path).st_mode
     except FileNotFoundError:
@@ -110,23 +118,23 @@ def is_folder(path: str | Path) -> bool:
 
 
 def make_folders(root: Path, folders: Iterable[str]) -> None:
-    """See that the folders are there, and real."""
+    """Make those of the folders that are missing; raise `KeystoreError` if one is not real."""
     seen = {""}
 
-    def see(folder: str) -> None:
+    def make(folder: str) -> None:
         if folder in seen:
             return
-        see(folder.rpartition("/")[0])
+        make(folder.rpartition("/")[0])
         if not is_folder(f"{root}/{folder}"):
             os.mkdir(f"{root}/{folder}", folder_mode(folder))
         seen.add(folder)
 
     for folder in folders:
-        see(folder)
+        make(folder)
 
 
-def settle_folders(source: Path, target: Path) -> None:
-    """Move everything below ``source``, if it is there, to its place below ``target``.
+def move_into_place(source: Path, target: Path) -> None:
+    """Move everything below ``source``, if it exists, to the same place below ``target``.
 
     The enclaves come last: without them, a new keystore that is not complete yet is none.
     """
@@ -138,17 +146,17 @@ def settle_folders(source: Path, target: Path) -> None:
             if not entry.is_dir(follow_symlinks=False):
                 os.replace(entry.path, place)
             elif is_folder(place):
-                settle_folders(Path(entry.path), place)
+                move_into_place(Path(entry.path), place)
             else:
                 os.rename(entry.path, place)
 
 
 def remove_empty_folders(root: Path, paths: Iterable[str]) -> None:
-    """Remove the folders of ``paths`` of which nothing is left; never one of the first level."""
+    """Remove the folders of ``paths`` that are empty; never one of the first level."""
     for path in paths:
         folder = path.rpartition("/")[0]
         with contextlib.suppress(OSError):  # it is not empty
             while "/" in folder:
-                with contextlib.suppress(FileNotFoundError):  # by whoever was stopped here
+                with contextlib.suppress(FileNotFoundError):  # whoever was stopped here removed it
                     os.rmdir(root / folder)
                 folder = folder.rpartition("/")[0]

@@ -1,96 +1,52 @@
-"""Recovers transactions that an earlier sros left behind: their stage held trees of folders.
+"""Recovery: completes or undoes what a transaction that was stopped left in a keystore.
 
-``new`` and ``old`` had the paths of the keystore, ``removed`` listed what was to go, and ``live``
-led to ``old`` until the moment of the change, then to ``new``.
-
-Both are done by whoever made the transaction, and by the next one where that was stopped.  Each
-step may be done again: it finds what is done already.
+A transaction ends with it as well: after its commit the links into the stage give way to the plain
+files, and new folders move to their places.  Each step may be repeated: it finds what is done
+already, so a recovery that was stopped is recovered, too.
 """
 
 from __future__ import annotations
 
 import contextlib
 import os
+import re
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
+from sros_tool.errors import KeystoreError
 from sros_tool.keystore.layout import STAGE
 from sros_tool.keystore.transaction import filesystem
 from sros_tool.keystore.transaction.filesystem import (
     is_folder,
     make_folders,
+    move_into_place,
     remove_empty_folders,
-    settle_folders,
 )
 from sros_tool.keystore.transaction.stage import (
     ADDED,
     AFTER,
     BEFORE,
     LIVE,
+    MANIFEST,
     Move,
     bridge_text,
     number,
     read_manifest,
 )
-from sros_tool.parallel import in_shares
+from sros_tool.parallel import map_slices
 
-OLD, NEW, _REMOVED = "old", "new", "removed"
-
-
-def earlier_stage_recover(root: Path, stage: Path, *, committed: bool) -> None:
-    """Complete the transaction if its change was ``committed``, or undo it."""
-    if committed:
-        _settle_links(stage / NEW, root)
-        settle_folders(stage / NEW, root)
-        _remove(stage / _REMOVED, root)
-        filesystem.flush_folder(root)
-        return
-    for path in _files_below(stage / OLD):
-        if _earlier_stage_leads_into_stage(root / path):
-            os.replace(stage / OLD / path, root / path)
-    for path in _files_below(stage / NEW):
-        if _earlier_stage_leads_into_stage(root / path):
-            os.unlink(root / path)
-
-
-def _settle_links(source: Path, target: Path) -> None:
-    """Move the links that belong into folders which are there.
-
-    They come first, for a link that is still reached through ``live`` leads to nothing as soon as
-    the file that it names has left the stage.
-    """
-    with os.scandir(source) as entries:
-        for entry in entries:
-            if entry.is_symlink():
-                os.replace(entry.path, target / entry.name)
-            elif entry.is_dir() and is_folder(target / entry.name):
-                _settle_links(Path(entry.path), target / entry.name)
-
-
-def _remove(names: Path, root: Path) -> None:
-    """Remove what a file lists, and the folders that are empty then."""
-    if not names.exists():
-        return
-    paths = names.read_text(encoding="utf-8").split("\0")
-    for path in paths:
-        with contextlib.suppress(FileNotFoundError):
-            os.unlink(root / path)
-    remove_empty_folders(root, paths)
-
-
-def _files_below(folder: Path) -> Iterator[str]:
-    for parent, _, files in os.walk(folder):
-        for file in files:
-            yield os.path.relpath(os.path.join(parent, file), folder)
-
-
-def _earlier_stage_leads_into_stage(path: Path) -> bool:
-    return path.is_symlink() and f"{STAGE}/{LIVE}/" in os.readlink(path)
+_KNOWN = re.compile(
+    rf"{BEFORE}|{AFTER}|{ADDED}|{re.escape(MANIFEST)}|{LIVE}(\.next)?|spare(\.\d+)?"
+)
 
 
 def tidy(root: Path) -> None:
-    """Complete or undo what an interrupted transaction left behind, if there is anything."""
+    """Complete or undo what an interrupted transaction left in the keystore, if there is anything.
+
+    Raises:
+        KeystoreError: the keystore is busy, or the stage is not one of this version.
+    """
     if (root / STAGE).is_dir():
         lock = filesystem.lock_folder(root)
         try:
@@ -100,32 +56,51 @@ def tidy(root: Path) -> None:
 
 
 def recover(root: Path) -> None:
-    """As `tidy`, for a caller that holds the lock."""
+    """Do the work of `tidy`, for a caller that holds the lock."""
     stage = root / STAGE
     if not is_folder(stage):
         return
     live = stage / LIVE
-    to = os.readlink(live) if live.is_symlink() else ""
-    if to in (OLD, NEW):
-        earlier_stage_recover(root, stage, committed=to == NEW)
-    elif to == AFTER:
+    to = _target(stage)
+    if to == AFTER:
         _complete(root, stage, read_manifest(stage))
-        settle_folders(stage / ADDED, root)
+        move_into_place(stage / ADDED, root)
         filesystem.flush_folder(root)
-    elif to:
+    elif to == BEFORE:
         _undo(root, stage, read_manifest(stage))
     with contextlib.suppress(FileNotFoundError):
-        os.unlink(live)  # first, for without it what is left of the stage is only to be removed
+        os.unlink(live)  # first: without it, what is left of the stage is only to be removed
     shutil.rmtree(stage)
 
 
+def _target(stage: Path) -> str | None:
+    """Return where ``live`` leads to: BEFORE, AFTER, or None where nothing was changed yet.
+
+    Raises:
+        KeystoreError: the stage is not of this version's format (`stage`); nothing is touched.
+    """
+    strange = next((name for name in sorted(os.listdir(stage)) if not _KNOWN.fullmatch(name)), "")
+    to = None
+    if not strange and os.path.lexists(stage / LIVE):
+        to = os.readlink(stage / LIVE) if (stage / LIVE).is_symlink() else ""
+        strange = "" if to in (BEFORE, AFTER) else LIVE
+    if strange:
+        raise KeystoreError(
+            f"the interrupted change in '{stage}' can be neither completed nor undone",
+            f"Its format is unknown to this version of sros: {strange!r} is not part of it.",
+            "Complete it with the version of sros that began it, or restore the keystore from a "
+            "backup.",
+        )
+    return to
+
+
 def _complete(root: Path, stage: Path, moves: Sequence[Move]) -> None:
-    """Let plain files and links take the place of those that lead into the stage."""
+    """Replace the links that lead into the stage by the new files and links."""
     make_folders(root, {move.path.rpartition("/")[0] for move in moves})
 
-    def work(share: Sequence[Move]) -> None:
+    def complete(part: Sequence[Move]) -> None:
         spare = f"{stage}/spare.{os.getpid()}"
-        for path, before, after in share:
+        for path, before, after in part:
             real, name = f"{root}/{path}", number(path)
             if after is None:
                 if _leads_into_stage(real, path):
@@ -141,12 +116,12 @@ def _complete(root: Path, stage: Path, moves: Sequence[Move]) -> None:
                 with contextlib.suppress(FileNotFoundError):
                     os.unlink(f"{stage}/{BEFORE}/{name}")
 
-    in_shares(moves, work)
+    map_slices(moves, complete)
     remove_empty_folders(root, (move.path for move in moves if move.after is None))
 
 
 def _undo(root: Path, stage: Path, moves: Sequence[Move]) -> None:
-    """Put everything back that a link into the stage took the place of."""
+    """Put back everything that a link into the stage took the place of."""
     spare = f"{stage}/spare"
     for path, before, _ in moves:
         real = f"{root}/{path}"
@@ -162,7 +137,7 @@ def _undo(root: Path, stage: Path, moves: Sequence[Move]) -> None:
 
 
 def _symlink(text: str, path: str) -> None:
-    with contextlib.suppress(FileNotFoundError):  # that of whoever was stopped here
+    with contextlib.suppress(FileNotFoundError):  # left by whoever was stopped here
         os.unlink(path)
     os.symlink(text, path)
 

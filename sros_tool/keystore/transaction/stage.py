@@ -1,10 +1,10 @@
-"""The folder in which a transaction gathers what is to change, and the list of that.
+"""The stage of a transaction: the folder that holds what is to change, and the list of it.
 
 ``.sros-transaction`` in the keystore holds
 
 - ``after``: new files and links for folders that exist, flat, each by the `number` of its path;
-- ``before``: what they take the place of, by the same numbers, as soon as the change has begun;
-- ``live``: a link to ``before`` or ``after``, whose turn is the moment of the change;
+- ``before``: what they replace, by the same numbers, as soon as the change has begun;
+- ``live``: a link to ``before`` or ``after``; pointing it at the other is the commit;
 - ``added``: new folders, as they will be in the keystore;
 - ``manifest.json``: the paths of all that is in ``after``, or removed, as `Move`.
 """
@@ -23,12 +23,13 @@ from sros_tool.errors import KeystoreError
 from sros_tool.keystore.layout import STAGE
 
 BEFORE, AFTER, LIVE, ADDED, MANIFEST = "before", "after", "live", "added", "manifest.json"
+_VERSION = 2
 
 
 class Move(NamedTuple):
-    """What becomes of a path of the keystore, whose folder exists.
+    """How a path of the keystore changes, where its folder exists.
 
-    ``before`` and ``after`` tell what is there: None for nothing, "" for a file, and of a
+    ``before`` and ``after`` say what is at the path: None for nothing, "" for a file, and for a
     symbolic link its text.
     """
 
@@ -47,46 +48,50 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Staged:
-    """What was staged since some moment, for the process that shares its work with this one."""
+    """What a forked worker staged, for the process that commits."""
 
     changes: tuple[Change, ...]
     moves: tuple[Move, ...]
 
 
 def number(path: str) -> str:
-    """The name in the stage of what belongs to a path; short, so that a link fits its inode."""
+    """Return the name in the stage for a path; short, so that a link to it fits its inode."""
     return hashlib.blake2b(os.fsencode(path), digest_size=8).hexdigest()
 
 
 def bridge_text(path: str) -> str:
-    """The text of the link that stands at ``path`` while it changes."""
+    """Return the text of the link that is at ``path`` while it changes."""
     return "../" * path.count("/") + f"{STAGE}/{LIVE}/{number(path)}"
 
 
 def seen_from_stage(path: str, text: str) -> str:
-    """The text for a link in ``before`` or ``after`` that leads where one at ``path`` would."""
+    """Return the text that a link in the stage needs to lead where one at ``path`` would."""
     return text if text.startswith("/") else f"../../{path.rpartition('/')[0]}/{text}"
 
 
-def turn(stage: Path, to: str) -> None:
-    """Let everything that changes be reached in ``before``, or in ``after``."""
+def point_live(stage: Path, to: str) -> None:
+    """Atomically point the ``live`` symlink at ``to``, which is ``before`` or ``after``."""
     spare = f"{stage}/{LIVE}.next"
     os.symlink(to, spare)
     os.replace(spare, f"{stage}/{LIVE}")
 
 
 def write_manifest(stage: Path, moves: Sequence[Move]) -> None:
-    """Write the list of all moves; it must be on the disk before the first is begun."""
+    """Write the list of all moves; it must be on the disk before the first one begins."""
     with open(stage / MANIFEST, "x", encoding="utf-8") as file:
-        file.write(json.dumps({"version": 2, "moves": moves}))
+        file.write(json.dumps({"version": _VERSION, "moves": moves}))
 
 
 def read_manifest(stage: Path) -> tuple[Move, ...]:
-    """The list of moves; raises `KeystoreError` if it is not one that a transaction wrote."""
+    """Return the list of moves.
+
+    Raises:
+        KeystoreError: it cannot be read, or no transaction of this version wrote it.
+    """
     try:
         read = json.loads((stage / MANIFEST).read_bytes())
-        if read["version"] != 2:
-            raise ValueError("of another version")
+        if read["version"] != _VERSION:
+            raise ValueError(f"it is not of version {_VERSION}")
         return tuple(_move(*each) for each in read["moves"])
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise KeystoreError(

@@ -1,15 +1,14 @@
-"""Lets every file that a transaction changes be reached through one link, before that is turned.
+"""Changes many files of a keystore as one: all of them, or none, whenever the machine stops.
 
-Each path first becomes a link to ``.sros-transaction/live/<number>``, which is still its old
-content: a link that was prepared in ``before`` and the file change their places at one moment.
-
-New files are written below ``.sros-transaction`` of the keystore (`stage`).  Files that already
-exist change together at a single moment: each first becomes a link to
-``.sros-transaction/live/...`` (still its old content), then ``live`` itself, a link, is turned
-from ``before`` to ``after`` (`commit`).  That turn is the commit.  Afterwards the links give way
-to the plain files, and new folders are moved in (`recovery`).  Whatever the moment at which the
-machine stops, DDS finds either all the old files or all the new ones, and the next transaction
+New files are written below ``.sros-transaction`` in the keystore (`stage`).  Files that already
+exist change together at a single moment (`Transaction.commit`): each path first becomes a link to
+``.sros-transaction/live/<number>``, which still is its old content, for ``live`` is a link to
+``before``; then ``live`` is pointed at ``after``.  That is the commit.  Afterwards the links give
+way to the plain files, and new folders are moved in (`recovery`).  Whatever the moment at which
+the machine stops, DDS finds either all the old files or all the new ones, and the next transaction
 tidies up.
+
+A new keystore is made next to its place, and appears by one renaming.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.layout import STAGE, folder_mode
 from sros_tool.keystore.transaction import filesystem
 from sros_tool.keystore.transaction.filesystem import is_folder
-from sros_tool.keystore.transaction.recovery import recover, tidy
+from sros_tool.keystore.transaction.recovery import recover
 from sros_tool.keystore.transaction.stage import (
     ADDED,
     AFTER,
@@ -41,98 +40,19 @@ from sros_tool.keystore.transaction.stage import (
     Staged,
     bridge_text,
     number,
+    point_live,
     seen_from_stage,
-    turn,
     write_manifest,
 )
-from sros_tool.parallel import in_shares
-
-
-def bridge(root: Path, stage: Path, moves: Sequence[Move]) -> None:
-    """Let all that moves be reached through ``live``, which leads to ``before``."""
-    if not moves:
-        return
-    os.mkdir(stage / BEFORE, 0o700)
-    turn(stage, BEFORE)
-    work = _Bridge(f"{root}", f"{stage}")
-    if _can_exchange(stage):
-        in_shares(moves, work.by_exchange)
-        return
-    # Both names at once, or a copy: for file systems that cannot exchange two names.
-    copied = in_shares(moves, work.keep)
-    if any(outcome for _, outcome in copied):
-        filesystem.flush_file_system(stage / BEFORE)
-    in_shares(moves, work.by_replacement)
-
-
-def _can_exchange(stage: Path) -> bool:
-    spare = f"{stage}/spare"
-    os.symlink(BEFORE, spare)  # as `live`, so that it makes no difference which of them is
-    can = filesystem.exchange(spare, f"{stage}/{LIVE}")
-    os.unlink(spare)
-    return can
-
-
-class _Bridge:
-    def __init__(self, root: str, stage: str) -> None:
-        self._root = root
-        self._stage = stage
-
-    def by_exchange(self, moves: Sequence[Move]) -> None:
-        root, before = self._root, f"{self._stage}/{BEFORE}"
-        for move in moves:
-            if move.before != "":
-                self._keep_link(move)
-                self._place(move)
-                continue
-            kept = f"{before}/{number(move.path)}"
-            os.symlink(bridge_text(move.path), kept)
-            if not filesystem.exchange(kept, f"{root}/{move.path}"):
-                raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP), f"{root}/{move.path}")
-
-    def keep(self, moves: Sequence[Move]) -> bool:
-        """Give the old content a second name in the stage; whether it had to be copied."""
-        copied = False
-        for move in moves:
-            if move.before != "":
-                self._keep_link(move)
-                continue
-            real, kept = f"{self._root}/{move.path}", f"{self._stage}/{BEFORE}/{number(move.path)}"
-            try:
-                os.link(real, kept, follow_symlinks=False)
-            except OSError:  # a file system, or an owner, that allows no hard links
-                shutil.copy2(real, kept, follow_symlinks=False)
-                copied = True
-        return copied
-
-    def by_replacement(self, moves: Sequence[Move]) -> None:
-        for move in moves:
-            self._place(move)
-
-    def _keep_link(self, move: Move) -> None:
-        if move.before:
-            kept = f"{self._stage}/{BEFORE}/{number(move.path)}"
-            os.symlink(seen_from_stage(move.path, move.before), kept)
-
-    def _place(self, move: Move) -> None:
-        real = f"{self._root}/{move.path}"
-        if move.before is None:
-            os.symlink(bridge_text(move.path), real)
-            return
-        spare = f"{self._stage}/spare.{os.getpid()}"
-        os.symlink(bridge_text(move.path), spare)
-        os.replace(spare, real)
-
-
-__all__ = ["STAGE", "Change", "Staged", "Transaction", "recover", "tidy"]
+from sros_tool.parallel import map_slices
 
 
 class Transaction:
     """A lock on a keystore and the files that will change in it.
 
-    Use as a context manager; without `commit` nothing changes.  If ``fresh``, the keystore must
-    not exist yet (an empty folder may) and appears at once; otherwise it must exist.  With
-    ``dry_run`` nothing is written, and `changes` tells what would be.
+    Use as a context manager; without `commit` nothing changes.  If ``fresh``, the keystore need not
+    exist yet, and appears as a whole; otherwise it must exist.  With ``dry_run`` nothing is
+    written, and ``changes`` says what would be.
     """
 
     def __init__(self, root: Path, *, fresh: bool = False, dry_run: bool = False) -> None:
@@ -150,7 +70,7 @@ class Transaction:
         self._undo: list[Callable[[], None]] = []
 
     def on_failure(self, undo: Callable[[], None]) -> None:
-        """Have ``undo`` called at the end, unless everything was put in place."""
+        """Have ``undo`` called at the end, unless the transaction was committed."""
         self._undo.append(undo)
 
     # ── begin and end ──────────────────────────────────────────────────────────────────────
@@ -231,10 +151,10 @@ class Transaction:
                 shutil.rmtree(stale, ignore_errors=True)
                 os.close(lock)
 
-    # ── what is to change ──────────────────────────────────────────────────────────────────
+    # ── staging ──────────────────────────────────────────────────────────────────
 
     def write(self, path: str, data: bytes, *, private: bool = False) -> None:
-        """Stage a file; ``private`` ones are readable by their owner only, from the first byte."""
+        """Stage a file; a ``private`` one is its owner's alone, from the first byte."""
         staged = self._prepare(path, "")
         if staged is None:
             return
@@ -258,10 +178,7 @@ class Transaction:
             os.symlink(seen_from_stage(path, target) if flat else target, staged)
 
     def remove(self, path: str) -> None:
-        """Have a file or link go, together with the changes of the transaction.
-
-        Folders of which nothing is left go too.
-        """
+        """Stage the removal of a file or link, and of the folders that are empty then."""
         there = self._prepare_folder(path.rpartition("/")[0], wanted=False)
         before = self._at(path) if there else None
         if before is None:
@@ -270,7 +187,7 @@ class Transaction:
         self._moves.append(Move(path, before, None))
 
     def _prepare(self, path: str, after: str) -> str | None:
-        """Where to write what is staged for a path; ``after`` as of `Move`."""
+        """Return where to write what is staged for a path; ``after`` is that of `Move`."""
         exists = self._prepare_folder(path.rpartition("/")[0])
         before = self._at(path) if exists else None
         self._begin_change(path, "create" if before is None else "replace")
@@ -287,6 +204,7 @@ class Transaction:
         self.changes.append(Change(action, path))
 
     def _at(self, path: str) -> str | None:
+        """Return what is at a path, as `Move` says it."""
         real = f"{self.root}/{path}"
         try:
             mode = os.lstat(real).st_mode
@@ -297,7 +215,7 @@ class Transaction:
         return os.readlink(real) if stat.S_ISLNK(mode) else ""
 
     def _prepare_folder(self, path: str, *, wanted: bool = True) -> bool:
-        """Tell whether a folder is in the keystore already; if it is not, stage it."""
+        """Stage a folder if it is not in the keystore yet; return whether it is."""
         if path in self._folders:
             return self._folders[path]
         exists = not self._new_root
@@ -315,23 +233,23 @@ class Transaction:
     def _stage_folder(self, path: str) -> None:
         staged, mode = f"{self._added}/{path}", folder_mode(path)
         os.makedirs(os.path.dirname(staged), 0o700, exist_ok=True)
-        with contextlib.suppress(FileExistsError):  # by a process with another share
+        with contextlib.suppress(FileExistsError):  # by another worker
             os.mkdir(staged, mode)
         if mode != 0o700:
             os.chmod(staged, mode)
 
-    # ── by several processes ───────────────────────────────────────────────────────────────
+    # ── by forked workers ───────────────────────────────────────────────────────────────
 
     def mark(self) -> tuple[int, int]:
-        """This moment, for `since`."""
+        """Return a mark of this moment, for `since`."""
         return len(self.changes), len(self._moves)
 
     def since(self, mark: tuple[int, int]) -> Staged:
-        """What was staged since `mark`."""
+        """Return what was staged since ``mark``."""
         return Staged(tuple(self.changes[mark[0] :]), tuple(self._moves[mark[1] :]))
 
     def absorb(self, staged: Staged) -> None:
-        """Take over what a forked process staged for this transaction."""
+        """Add what a forked worker staged for this transaction."""
         self._staged.update(change.path for change in staged.changes)
         self.changes += staged.changes
         self._moves += staged.moves
@@ -339,7 +257,7 @@ class Transaction:
     # ── commit ─────────────────────────────────────────────────────────────────────────────
 
     def commit(self) -> None:
-        """Put everything in place; after this it is on the disk."""
+        """Put everything in place; when this returns, it is on the disk."""
         if self.dry_run or not self.changes:
             return
         if self._new_root:
@@ -348,10 +266,10 @@ class Transaction:
             return
         write_manifest(self._stage, self._moves)
         filesystem.flush_file_system(self._stage)
-        bridge(self.root, self._stage, self._moves)
-        turn(self._stage, AFTER)
+        _bridge(self.root, self._stage, self._moves)
+        point_live(self._stage, AFTER)
         self._undo.clear()
-        with contextlib.suppress(OSError, SrosError):  # it is done; the end tries once more
+        with contextlib.suppress(OSError, SrosError):  # it is committed; `_end` tries once more
             recover(self.root)
 
     def _appear(self) -> None:
@@ -366,5 +284,88 @@ class Transaction:
             raise
         self._made_parents.clear()
         self._undo.clear()
-        with contextlib.suppress(OSError):  # it is there; the system writes it down in time anyway
+        with contextlib.suppress(OSError):  # it is there; the system flushes it in time
             filesystem.flush_folder(self.root.parent)
+
+
+# ── links through the stage ────────────────────────────────────────────────────────────────
+
+
+def _bridge(root: Path, stage: Path, moves: Sequence[Move]) -> None:
+    """Replace each path by a link through ``live`` to its old content, in ``before``."""
+    if not moves:
+        return
+    os.mkdir(stage / BEFORE, 0o700)
+    point_live(stage, BEFORE)
+    work = _Bridge(f"{root}", f"{stage}")
+    if _can_exchange(stage):
+        map_slices(moves, work.by_exchange)
+        return
+    # A second name, or a copy: for file systems that cannot exchange two names.
+    if any(copied for _, copied in map_slices(moves, work.keep)):
+        filesystem.flush_file_system(stage / BEFORE)
+    map_slices(moves, work.by_replacement)
+
+
+def _can_exchange(stage: Path) -> bool:
+    """Try whether the file system can exchange two names."""
+    spare = f"{stage}/spare"
+    os.symlink(BEFORE, spare)  # the same as `live`, so that exchanging them changes nothing
+    can = filesystem.exchange(spare, f"{stage}/{LIVE}")
+    os.unlink(spare)
+    return can
+
+
+class _Bridge:
+    """The two ways to replace paths by links, for slices of the moves."""
+
+    def __init__(self, root: str, stage: str) -> None:
+        self._root = root
+        self._stage = stage
+
+    def by_exchange(self, moves: Sequence[Move]) -> None:
+        """Exchange each file and a link that was prepared in ``before``."""
+        root, before = self._root, f"{self._stage}/{BEFORE}"
+        for move in moves:
+            if move.before != "":
+                self._keep_link(move)
+                self._place(move)
+                continue
+            kept = f"{before}/{number(move.path)}"
+            os.symlink(bridge_text(move.path), kept)
+            if not filesystem.exchange(kept, f"{root}/{move.path}"):
+                raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP), f"{root}/{move.path}")
+
+    def keep(self, moves: Sequence[Move]) -> bool:
+        """Give the old content a second name in the stage; return whether it had to be copied."""
+        copied = False
+        for move in moves:
+            if move.before != "":
+                self._keep_link(move)
+                continue
+            real, kept = f"{self._root}/{move.path}", f"{self._stage}/{BEFORE}/{number(move.path)}"
+            try:
+                os.link(real, kept, follow_symlinks=False)
+            except OSError:  # a file system, or an owner, that allows no hard links
+                shutil.copy2(real, kept, follow_symlinks=False)
+                copied = True
+        return copied
+
+    def by_replacement(self, moves: Sequence[Move]) -> None:
+        """Put the link in the place of each file, after `keep`."""
+        for move in moves:
+            self._place(move)
+
+    def _keep_link(self, move: Move) -> None:
+        if move.before:
+            kept = f"{self._stage}/{BEFORE}/{number(move.path)}"
+            os.symlink(seen_from_stage(move.path, move.before), kept)
+
+    def _place(self, move: Move) -> None:
+        real = f"{self._root}/{move.path}"
+        if move.before is None:
+            os.symlink(bridge_text(move.path), real)
+            return
+        spare = f"{self._stage}/spare.{os.getpid()}"
+        os.symlink(bridge_text(move.path), spare)
+        os.replace(spare, real)
