@@ -381,7 +381,7 @@ def _from_logs(
     *,
     flat: bool,
 ) -> int:
-    from sros_tool.graph.denials import as_learned, propose, read_denials
+    from sros_tool.explain.denials import as_learned, propose, read_denials
     from sros_tool.graph.document import draft, render, write
     from sros_tool.graph.learn import common_parts
     from sros_tool.graph.observation import Observation

@@ -13,28 +13,28 @@ from shlex import quote
 
 from sros_tool.dds.decision import Vendor, Verb
 from sros_tool.explain.answer import Answer, Judge, Setting
+from sros_tool.explain.denials import Denial, nodes_served, read_denials, serving_node
 from sros_tool.explain.material import Material
 from sros_tool.explain.question import Part, Question, ask
 from sros_tool.explain.remedy import remedy
-from sros_tool.graph.denials import (
-    PROCESS_LABEL,
-    SECURITY_DIRECTORY,
-    Denial,
-    is_denial,
-    nodes_served,
-    read_denials,
-    serving_node,
-)
 from sros_tool.graph.observation import PUBLISH
 from sros_tool.policy.patterns import covers
-from sros_tool.runtime.vendor_log import MEANINGS, UNKNOWN, Meaning, plain_refusal, plain_text
+from sros_tool.runtime.vendor_log import (
+    CONTINUED,
+    DOMAIN_OF_LINE,
+    PROCESS_LABEL,
+    SECURITY_DIRECTORY,
+    UNKNOWN,
+    LogText,
+    denied_topic,
+    log_text,
+    plain_refusal,
+    plain_text,
+)
 from sros_tool.translate import grant_rights
 
-_CONTINUED = re.compile(r"^(?:[0-9A-F]{8,}:error:|\(code: )")
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
 """As what a topic stands in a line: between punctuation, or with it where it has some itself."""
-_IN_DOMAIN = re.compile(r"\] \S+\|\S+ (\d{1,9}) \w+::\w+ :")
-"""The domain, in the file of ROS_SECURITY_LOG_FILE: behind the participant's identifier."""
 _NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
 _LONGEST = 8000
 """How many characters of a line can be a message: a log may be one line of many megabytes."""
@@ -69,7 +69,7 @@ class _Hit:
     text: str
     process: str
     enclave: str
-    meaning: Meaning
+    meaning: LogText
     said: Mapping[str, str]
 
     @property
@@ -120,7 +120,7 @@ def _joined(lines: list[str]) -> Iterator[tuple[int, str]]:
     """The lines with their numbers; OpenSSL's error stack is one line with what it explains."""
     number, current = 0, ""
     for index, line in enumerate(lines, 1):
-        if current and _CONTINUED.match(line):
+        if current and CONTINUED.match(line):
             if len(current) < _LONGEST:
                 current += " " + line
             continue
@@ -140,19 +140,18 @@ def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
             continue
         text = _without_label(line)
         meaning, match = _meaning_of(line, text)
-        if meaning and match:
+        if match:
             said = {name: found or "" for name, found in match.groupdict().items()}
-            if domain := _IN_DOMAIN.search(line):
+            if domain := DOMAIN_OF_LINE.search(line):
                 said["domain"] = domain[1]
             yield _Hit(number, text, process, enclaves.get(process, ""), meaning, said)
 
 
-def _meaning_of(line: str, text: str) -> tuple[Meaning | None, re.Match[str] | None]:
+def _meaning_of(line: str, text: str) -> tuple[LogText, re.Match[str] | None]:
     """What a line means, which is ``text`` without its label; UNKNOWN where only that is clear."""
-    for meaning in MEANINGS:
-        if match := meaning.pattern.search(line):
-            return meaning, match
-    return UNKNOWN, None if is_denial(line) else UNKNOWN.pattern.search(text)
+    if found := log_text(line):
+        return found
+    return UNKNOWN, None if denied_topic(line) else UNKNOWN.pattern.search(text)
 
 
 def _process(line: str) -> str:
@@ -240,14 +239,13 @@ class _Eye:
         """A topic that was denied, with the lines that name it."""
         line, text = named[0][0], _without_label(named[0][1])
         right, name = _in_ros_terms(denial)
-        vendor = Vendor.CYCLONE if "permi" in text and "denied by" in text else Vendor.FAST
         who = "a peer" if denial.remote else denial.enclave or "the process"
         by = "a rule of the policy denies it" if denial.by_rule else "no rule allows it"
         if node := serving_node(denial):
             by += f"; every node has such a service, and this one is the node {node}"
         finding = Finding(
             "topic-denied",
-            vendor,
+            denial.vendor,
             line,
             len(named),
             text,
@@ -260,7 +258,7 @@ class _Eye:
         if material is None or not denial.direction:
             return finding
         question = _question(denial)
-        answer = self._answer(material, vendor, question)
+        answer = self._answer(material, denial.vendor, question)
         if answer.allowed:
             found = ["the permissions that lie there now allow it"]
             remedy = "Restart the process: it loaded the permissions that were there before."

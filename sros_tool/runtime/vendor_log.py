@@ -1,123 +1,85 @@
-"""Read what the DDS vendors log about security: was it a refusal, or is security not built in?
+"""The table of what DDS vendors, rcl and the RMWs log about security, and what each text means.
 
 Fast DDS writes coloured text to standard output, Cyclone DDS to its log sink or standard error.
-The texts are those of Fast DDS 2.9 to 2.14 (Permissions.cpp, SecurityManager.cpp, PKIDH.cpp) and
-of Cyclone DDS 0.10 (access_control.c, authentication.c, q_omg_security.c).
-
-Each text was seen in a real log of Fast DDS 2.9.1 or 2.14.5, Cyclone DDS 0.10.2, or rcl of Jazzy.
 With ROS_SECURITY_LOG_FILE the reasons of Fast DDS stand in that file, in another form, instead.
-Many stand for several causes; `Meaning.codes` are the faults of an enclave (`Problem.code`) among
-which the true one is found by looking at the enclave.
+Each text was seen in a real log of Fast DDS 2.9.1 or 2.14.5 (Permissions.cpp, SecurityManager.cpp,
+PKIDH.cpp), Cyclone DDS 0.10.2 (access_control.c, authentication.c, q_omg_security.c), or rcl of
+Jazzy.
+
+A vendor is added by its rows in `LOG_TEXTS`, by what it puts around a reason (`_FRAME`), and by
+its words for writers and readers (`DIRECTIONS`).
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum, auto
 
 from sros_tool.dds.decision import Vendor
 
-_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
-
-_FRAME = re.compile(
-    # Fast DDS: when, `[SECURITY Error]`, the place in its sources, and the function.
-    r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d[.\d]* (?=\[)|\[SECURITY\w* (?:Error|Warning)\]\s*"
-    r"|\s*\([^()\s]+\.(?:cpp|h|hpp|ipp):\d+\)|\s*-> Function \w+\Z|, at \S+\.(?:cpp|c):\d+"
-    # The file of ROS_SECURITY_LOG_FILE: when, severity, participant, domain, and the function.
-    r"|^\S+ \[[A-Z]+\] \S+ \d+ \w+::\w+ :\s*"
-    # Cyclone DDS and OpenSSL: when and by which thread, numbers, and places in their sources.
-    r"|^\d+\.\d+ \[\d*\]\s+\S+: |(?:candidate|adjusted)_guid: \S+ "
-    r"|Remote secure participant \S+ not allowed\. ?|[0-9A-F]{16}:error:[0-9A-F]+:[\w ]+:"
-    r"|:\.\./\S+\.c:\d+|\[\w+\] failed: |validate_local_identity: |Error\. (?=Error|validate)"
-)
-"""What is put around the reason of a refusal and says nothing to a person."""
-
-CYCLONE_EXPLAINS = {
-    "CYCLONEDDS_URI": "<CycloneDDS><Domain><Tracing><Category>fatal,error,warning,trace</Category>"
-    "<OutputFile>stderr</OutputFile></Tracing></Domain></CycloneDDS>"
-}
-"""Makes Cyclone DDS say why it denies a topic, which it tells only its trace."""
-
-_NO_REASON = "{}, and Fast DDS gives no reason"
-_FUNCTION = re.compile(r"(?:-> Function |::)(\w+)(?: :)?\s*\Z")
-"""Of a line of Fast DDS that has no text of its own, what did not succeed."""
-
-_ENDPOINT_REFUSALS = (
-    "topic not found in allow rule",
-    "topic denied by deny rule",
-    "partition not found in rule",
-    "not found topic access rule for topic",
-    "not allowed by security",
-    "denied by default rule",
-    "found in deny_rule",
-)
-_PARTICIPANT_REFUSALS = (
-    "validate_local_identity",
-    "error verifying private key",
-    "error obtaining private key",
-    "verifying ca certificate",
-    "pkcs7 data verification failed",
-    "input data has not pkcs7",
-    "not found the identity subject name in permissions file",
-    "not found a rule allowing to use the domain_id",
-    "malformed permissions file",
-    "malformed governance file",
-    "error occurred while validating local permission",
-    "error occurred while validating local identity",
-    "could not find domain",
-    "couldn't find all security files",
-)
-_NOT_BUILT_IN = (
-    "doesn't have the security libraries",
-    "-dsecurity=on",
-    "compiled without security",
-    "security not supported",
-    "security is not supported",
-)
+# ── the kinds of rows ──────────────────────────────────────────────────────────────────────
 
 
-def endpoint_refusal(text: str) -> str:
-    """The words in which DDS Security denies a topic, a writer or a reader, or ""."""
-    return _first_line_with(_ENDPOINT_REFUSALS, text)
+class Refused(Enum):
+    """What a text says is refused."""
 
-
-def participant_refusal(text: str) -> str:
-    """The words in which DDS Security refuses a participant's files or its domain, or ""."""
-    return _first_line_with(_PARTICIPANT_REFUSALS, text)
-
-
-def missing_security(text: str) -> str:
-    """The words in which a DDS says that it was built without DDS Security, or ""."""
-    return _first_line_with(_NOT_BUILT_IN, text)
-
-
-def plain_text(output: str) -> str:
-    """What a process printed, without colours."""
-    return _COLOUR.sub("", output)
-
-
-def plain_refusal(line: str) -> str:
-    """The words of a line of a DDS log: without time, severity, and places in its sources.
-
-    Never empty where the line is not: of a refusal without a reason it says what was refused.
-    """
-    line = " ".join(plain_text(line).split())
-    if words := " ".join(_FRAME.sub("", line).split()):
-        return words
-    function = _FUNCTION.search(line)
-    return _NO_REASON.format(function[1].replace("_", " ") + " failed") if function else line
-
-
-def _first_line_with(marks: tuple[str, ...], text: str) -> str:
-    for line in plain_text(text).splitlines():
-        lowered = line.lower()
-        if any(mark in lowered for mark in marks):
-            return plain_refusal(line)
-    return ""
+    ALL_SECURITY = auto()
+    """DDS Security as such: it is not built in."""
+    PARTICIPANT = auto()
+    """The files of the process's own participant, or its domain."""
+    TOPIC = auto()
+    """A topic, a writer or a reader."""
 
 
 ROS = None
-"""The vendor of messages that rcl prints, whatever DDS lies below."""
+"""The vendor of texts that rcl or an RMW prints, whatever DDS lies below."""
+
+
+@dataclass(frozen=True, slots=True)
+class LogText:
+    """A text of a log and its meaning.
+
+    ``pattern`` is searched in a line without colours; its groups are fields such as ``path``,
+    ``domain`` and ``topic``.  ``cause`` and ``remedy`` may use them in braces; ``cause`` is ""
+    where the text alone does not give one.  Many texts stand for several causes: ``codes`` are the
+    faults of an enclave (`Problem.code`) among which the true one is found by looking at the
+    enclave, and ``unseen`` is what to do where the enclave has none of them.
+
+    ``weak`` is 0 for a text that names a cause, and higher the less it says: of the texts of one
+    process the least weak ones count.  ``refuses`` is None where a text alone does not prove that
+    DDS Security refused something.
+    """
+
+    id: str
+    vendor: Vendor | None
+    pattern: re.Pattern[str]
+    cause: str = ""
+    remedy: str = ""
+    codes: tuple[str, ...] = ()
+    unseen: str = ""
+    weak: int = 0
+    refuses: Refused | None = None
+
+
+def _text(
+    name: str,
+    vendor: Vendor | None,
+    pattern: str,
+    cause: str = "",
+    remedy: str = "",
+    codes: tuple[str, ...] = (),
+    *,
+    unseen: str = "",
+    weak: int = 0,
+    refuses: Refused | None = None,
+) -> LogText:
+    expression = re.compile(pattern, re.IGNORECASE)
+    return LogText(name, vendor, expression, cause, remedy, codes, unseen, weak, refuses)
+
+
+# ── the table ──────────────────────────────────────────────────────────────────────────────
 
 _CERTIFICATE = ("certificate-expired", "certificate-not-yet-valid", "certificate-issuer")
 _CA = ("ca-expired", "ca-not-yet-valid")
@@ -131,42 +93,6 @@ _ALL = (
     *_CERTIFICATE, "certificate-malformed", *_CA, *_CRL, *_FILES, *_KEY, "key-mismatch",
     *_SIGNATURE, *_GRANT, *_DOCUMENT, "governance-domain", "permissions-domain",
 )  # fmt: skip
-
-
-@dataclass(frozen=True, slots=True)
-class Meaning:
-    """What a message means.
-
-    ``cause`` may use the groups of ``pattern``.  ``codes`` are the faults it can stand for, if it
-    is about the enclave of the process itself; ``unseen`` is what to do where it has none of them.
-    ``weak`` is 0 for a message that tells a cause, and higher the less it tells: of the messages
-    of a process the least weak ones count.
-    """
-
-    id: str
-    vendor: Vendor | None
-    pattern: re.Pattern[str]
-    cause: str
-    remedy: str
-    codes: tuple[str, ...] = ()
-    unseen: str = ""
-    weak: int = 0
-
-
-def _meaning(
-    name: str,
-    vendor: Vendor | None,
-    pattern: str,
-    cause: str,
-    remedy: str,
-    codes: tuple[str, ...] = (),
-    *,
-    unseen: str = "",
-    weak: int = 0,
-) -> Meaning:
-    expression = re.compile(pattern, re.IGNORECASE)
-    return Meaning(name, vendor, expression, cause, remedy, codes, unseen, weak)
-
 
 _CHECK = "Name the keystore and the enclave, and the true cause is looked for there."
 _FILE = "Where ROS_SECURITY_LOG_FILE is set, give `sros explain --log` that file."
@@ -187,153 +113,164 @@ _SET_DOMAIN = (
 )
 _PEERS = "Give both sides enclaves of the same keystore; `sros inspect` shows the CA of each."
 _FAST, _CYCLONE = Vendor.FAST, Vendor.CYCLONE
+_DENIED_ENDPOINT = (
+    "a publisher, subscription, client or server is denied by the permissions; this text does "
+    "not say of which topic (`invalid allocator` has nothing to do with memory)"
+)
+_ASK_FOR_TOPIC = (
+    "Look for the line before it that names the topic, on standard output or in the file of "
+    "ROS_SECURITY_LOG_FILE; or ask `sros explain` for each topic of the node."
+)
 
-MEANINGS: tuple[Meaning, ...] = (
+LOG_TEXTS: tuple[LogText, ...] = (
     # ── rcl and the RMWs ───────────────────────────────────────────────────────────────────
-    _meaning(
+    _text(
         "not-built-in", ROS, r"doesn't have the security libraries|compile Fast DDS using the"
-        r"|security (?:is )?not supported|compiled without security",
+        r"|-DSECURITY=ON|security (?:is )?not supported|compiled without security",
         "this DDS was built without DDS Security, so no secured node can start with it",
         "Use the ROS 2 packages of the distribution; `sros doctor` tells which DDS enforces.",
+        refuses=Refused.ALL_SECURITY,
     ),
-    _meaning(
+    _text(
         "enclave-missing", ROS,
         r"rcl: SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
         "the enclave's folder {path} does not exist: ROS_SECURITY_KEYSTORE or the enclave's name "
         "is not right", "Correct it: `sros list_enclaves KEYSTORE` shows the names.",
     ),
-    _meaning(
+    _text(
         "runs-unsecured", ROS, r"SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
         "the enclave's folder {path} does not exist, and as ROS_SECURITY_STRATEGY is not exactly "
         "Enforce, the node GOES ON UNSECURED",
         "Start it by `sros run`, which runs it secured or not at all.",
     ),
-    _meaning(
+    _text(
         "keystore-unset", ROS, r"failed to initialize rcl: error not set",
         "security is on, and ROS_SECURITY_KEYSTORE is unset or empty",
         "Set it to the folder of the keystore: `sros env KEYSTORE ENCLAVE` prints all variables.",
     ),
-    _meaning(
+    _text(
         "files-missing", ROS, r"couldn't find all security files",
         "a file of the enclave is missing or a link to nothing; which one, it does not say",
         "Complete it: `sros create_enclave KEYSTORE ENCLAVE`, or export it again.", _FILES,
+        refuses=Refused.PARTICIPANT,
     ),
     # ── Cyclone DDS, meeting peers ─────────────────────────────────────────────────────────
-    _meaning(
+    _text(
         "peer-refused", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed: "
         r"Certificate not valid: error: (?P<why>[^;]+)",
         "a PEER was refused, not this process: its certificate is not accepted ({why}); with "
         "another CA on either side, the other one logs this or nothing",
         _PEERS,
     ),
-    _meaning(
+    _text(
         "peer-handshake", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed",
         "a PEER failed to prove who it is: most often its key.pem is not the key of its cert.pem, "
         "which Cyclone DDS does not notice on its own side; or it is of another DDS or version",
         "Run `sros verify` or `sros inspect` on the enclave of every peer.", ("key-mismatch",),
     ),
     # ── Cyclone DDS, starting ──────────────────────────────────────────────────────────────
-    _meaning(
+    _text(
         "certificate-expired", _CYCLONE, r"Certificate not valid: error: certificate has expired",
         "the certificate of the enclave or of its identity CA has expired; which, it does not say",
         _RENEW, ("certificate-expired", "ca-expired"),
     ),
-    _meaning(
+    _text(
         "certificate-not-yet-valid", _CYCLONE, r"Certificate not valid: error: certificate is not "
         r"yet valid", "the certificate of the enclave or of its identity CA is not valid yet",
         "Set the clock of the host.", ("certificate-not-yet-valid", "ca-not-yet-valid"),
     ),
-    _meaning(
+    _text(
         "certificate-issuer", _CYCLONE, r"Certificate not valid: error: unable to get "
         r"(?:local )?issuer certificate|Certificate not valid: error: self.signed",
         "the certificate was not issued by the identity CA that lies with it",
         "Use the files of one keystore together.", ("certificate-issuer",),
     ),
-    _meaning(
+    _text(
         "revoked", _CYCLONE, r"Certificate not valid: error: certificate revoked",
         "the certificate of the enclave is revoked",
         "It is meant to be kept out; if it shall run again, make it again with another key: `sros "
         "create_enclave KEYSTORE ENCLAVE`.",
         ("revoked",),
     ),
-    _meaning(
+    _text(
         "crl-expired", _CYCLONE, r"Certificate not valid: error: CRL (?:has expired|is not yet)",
         "the revocation list is out of date, so that everybody is refused",
         "Sign it again: `sros crl KEYSTORE --refresh`.", ("crl-expired", "crl-not-yet-valid"),
     ),
-    _meaning(
+    _text(
         "crl-unreadable", _CYCLONE, r"Failed to read CRL",
         "crl.pem is not a revocation list, so that everybody is refused",
         "Sign it again: `sros crl KEYSTORE --refresh`.", ("crl-malformed",),
     ),
-    _meaning(
+    _text(
         "key-encrypted", _CYCLONE, r"Failed to parse certificate: .*(?:bad decrypt|empty password)",
         "it says certificate and means the key: key.pem is encrypted, and no passphrase is asked",
         "Store key.pem without a passphrase, mode 0600.", ("key-encrypted",),
     ),
-    _meaning(
+    _text(
         "pem-unreadable", _CYCLONE, r"Failed to parse (?:certificate|private key)",
         "cert.pem or key.pem is no PEM file; it says certificate for both",
         "Restore the file.", ("certificate-malformed", *_KEY, *_FILES),
     ),
-    _meaning(
+    _text(
         "signature", _CYCLONE, r"PKCS7_signatureVerify:digest failure",
         "governance.p7s or permissions.p7s was changed after it was signed",
         _SIGN_ONE, _SIGNATURE,
     ),
-    _meaning(
+    _text(
         "signer", _CYCLONE, r"PKCS7_verify:certificate verify error",
         "governance.p7s or permissions.p7s was signed by another CA than the permissions CA that "
         "lies with it", f"Use the files of one keystore together. {_SIGN_ONE}", _SIGNATURE,
     ),
-    _meaning(
+    _text(
         "not-signed", _CYCLONE, r"SMIME_read_ASN1_ex:no content type|SMIME_read_ASN1",
         "governance.p7s or permissions.p7s is plain XML or damaged, and not a signed document",
         _SIGN_ONE, _SIGNATURE,
     ),
-    _meaning(
+    _text(
         "permissions-expired", _CYCLONE, r"Permissions validity period expired(?P<when>[^)]*\))?",
         "the permissions have expired", _RENEW, ("permissions-expired",),
     ),
-    _meaning(
+    _text(
         "permissions-not-yet-valid", _CYCLONE, r"Permissions validity period has not started",
         "the permissions are not valid yet", "Set the clock of the host.",
         ("permissions-not-yet-valid",),
     ),
-    _meaning(
+    _text(
         "permissions-subject", _CYCLONE, r"Subject name is invalid",
         "the permissions have no grant for the subject of this certificate: they belong to another "
         "enclave, or to an earlier certificate", _SIGN, ("permissions-subject",),
     ),
-    _meaning(
+    _text(
         "domain", _CYCLONE, r"Could not find domain (?P<domain>\d{1,9}) in governance",
         "the governance is not for domain {domain}",
         _SET_DOMAIN, ("governance-domain",),
+        refuses=Refused.PARTICIPANT,
     ),
-    _meaning(
+    _text(
         "malformed", _CYCLONE, r"Can not parse (?P<what>governance|permissions) file",
         "the {what} document, although signed, is not one that Cyclone DDS accepts",
         "Have sros write it; `sros check` names what vendors read differently.",
         _DOCUMENT,
     ),
-    _meaning(
+    _text(
         "file-missing", _CYCLONE, r"File could not be found, opened or is empty, path: "
         r"(?P<path>\S+)",
         "the file {path} is missing, empty or not readable", "Restore it.", _FILES,
     ),
     # ── Fast DDS, meeting peers ────────────────────────────────────────────────────────────
-    _meaning(
+    _text(
         "peer-permissions-ca", _FAST, r"Remote participant PermissionsCA differs from local",
         "a PEER was refused: its permissions CA is not that of this process. The two have enclaves "
         "of different keystores, or one was started before the CA was replaced and one after",
         _PEERS + " Restart both after each stage of `sros rotate_ca KEYSTORE`.",
     ),
-    _meaning(
+    _text(
         "peer-version", _FAST, r"Remote participant PermissionsCA algorithm differs from local",
         "a PEER was refused: it runs another version of Fast DDS, or its permissions CA has a key "
         "of another kind", "Run one version of Fast DDS on all hosts of the robot.",
     ),
-    _meaning(
+    _text(
         "peer-permissions", _FAST, r"Remote participant doesn't found in its permissions file",
         "a PEER was refused: by the clock and the time zone of this host its permissions have "
         "expired or are not valid yet, or they have no grant for its certificate",
@@ -341,18 +278,18 @@ MEANINGS: tuple[Meaning, ...] = (
         "`sros inspect KEYSTORE` shows how long each enclave is valid, and `sros renew KEYSTORE "
         "ENCLAVE` renews the peer's.",
     ),
-    _meaning(
+    _text(
         "peer-signature", _FAST, r"Cannot read as PKCS7 the permissions file",
         "a PEER was refused: its permissions are not signed by the permissions CA of this process, "
         "although that has the same name: enclaves of two keystores, or a changed file", _PEERS,
     ),
-    _meaning(
+    _text(
         "peer-malformed", _FAST,
         r"Error validating remote permissions for \S+ \(Malformed permissions file",
         "a PEER was refused: its permissions, although signed, are not such as Fast DDS accepts",
         "Have sros write those of the peer: `sros create_permission KEYSTORE ENCLAVE POLICY`.",
     ),
-    _meaning(
+    _text(
         "peer-domain", _FAST, r"Error checking remote participant"
         r"|Not found a rule allowing to use the domain_id.*check_remote_participant"
         r"|check_remote_participant.*Not found a rule allowing to use the domain_id",
@@ -360,102 +297,112 @@ MEANINGS: tuple[Meaning, ...] = (
         "Sign those of the peer again, with this domain: `sros create_permission KEYSTORE ENCLAVE "
         "POLICY` takes the domains of the keystore.",
     ),
-    _meaning(
+    _text(
         "peer-refused", _FAST, r"Error validating remote permissions for"
         r"|Remote participant doesn't sent the signed permissions|Not receive remote permissions",
         "a PEER was refused, not this process: its permissions did not arrive, or are not accepted",
         _PEERS,
     ),
     # ── Fast DDS, starting ─────────────────────────────────────────────────────────────────
-    _meaning(
+    _text(
         "identity", _FAST, r"SECURITY\s*Error\]\s*->\s*Function validate_local_identity"
         r"|PKIDH::validate_local_identity :\s*\Z",
         "the identity is refused, and the reason is left out: the certificate or its CA is out of "
         "date, of another CA, damaged or revoked, or crl.pem is out of date or damaged",
         _CHECK, (*_CERTIFICATE, "certificate-malformed", *_CA, *_CRL),
     ),
-    _meaning(
+    _text(
         "ca", _FAST, r"Error '(?P<number>\d+)' verifying CA certificate"
         r"(?: for \S.*?: (?P<why>[a-z][\w ,()-]*?))?(?= \(\S+:\d+\)|\Z)",
         "the first certificate of a CA's file is not accepted (OpenSSL's error {number}: {why})",
         _CHECK, (*_CA, "certificate-malformed"),
+        refuses=Refused.PARTICIPANT,
     ),
-    _meaning(
+    _text(
         "key-mismatch", _FAST, r"Error verifying private key",
         "key.pem is not the key of cert.pem",
         "Restore the key, or give the enclave another: `sros renew KEYSTORE ENCLAVE --new-key`.",
         ("key-mismatch",),
+        refuses=Refused.PARTICIPANT,
     ),
-    _meaning(
+    _text(
         "key-unreadable", _FAST, r"Error obtaining private key",
         "key.pem is encrypted, damaged or empty", "Store it as PEM without a passphrase.",
         (*_KEY, *_FILES),
+        refuses=Refused.PARTICIPANT,
     ),
-    _meaning(
+    _text(
         "file-missing", _FAST, r"OpenSSL library cannot read file (?P<path>\S+)",
         "the file {path} is missing or not readable", _READABLE, _FILES, unseen=_READABLE,
     ),
-    _meaning(
+    _text(
         "file-missing", _FAST, r"Cannot (?:read|find) file file://(?P<path>\S+)",
         "the file {path} is missing or not readable", _READABLE, _FILES, unseen=_READABLE,
     ),
-    _meaning(
+    _text(
         "signature", _FAST, r"PKCS7 data verification failed",
         "governance.p7s or permissions.p7s was changed, or signed by another CA than the "
         "permissions CA that lies with it; which of the two, it does not say",
         _SIGN_ONE, _SIGNATURE,
+        refuses=Refused.PARTICIPANT,
     ),
-    _meaning(
+    _text(
         "not-signed", _FAST, r"Input data has not PKCS7 S/MIME format",
         "governance.p7s or permissions.p7s is not a signed document: plain XML, or damaged; which "
         "of the two, it does not say", _SIGN_ONE, _SIGNATURE,
+        refuses=Refused.PARTICIPANT,
     ),
-    _meaning(
+    _text(
         "grant", _FAST, r"Not found the identity subject name in permissions file",
         "one text for three causes: the permissions have expired, are not valid yet, or have no "
         "grant for this subject. Fast DDS reads their dates in the local time of the host",
         _CHECK, _GRANT,
+        refuses=Refused.PARTICIPANT,
     ),
-    _meaning(
+    _text(
         "domain-of-permissions", _FAST, r"Not found a rule allowing to use the domain_id",
         "the permissions are not for the domain of this process", _SET_DOMAIN,
         ("permissions-domain",),
+        refuses=Refused.PARTICIPANT,
     ),
-    _meaning(
+    _text(
         "domain", _FAST, r"Not found topic access rule for topic (?P<topic>[^\s)]+)",
         "the governance has no rule for the topic in the domain of this process: most often "
         "because it does not list that domain (ROS_DOMAIN_ID)", _SET_DOMAIN,
         ("governance-domain",),
+        refuses=Refused.TOPIC,
     ),
-    _meaning(
+    _text(
         "malformed", _FAST, r"Malformed (?P<what>permissions|governance) file"
         r"|Error loading (?:Permissions|Governance) XML|XMLPARSER\s*Error\].*Function "
         r"parse_(?:grant|rule|criteria|permissions|domain|topic|participant|governance)",
         "a document, although signed, is not one that Fast DDS accepts",
         "Have sros write it; `sros check` names what vendors read differently.",
         _DOCUMENT,
+        refuses=Refused.PARTICIPANT,
     ),
-    _meaning(
+    _text(
         "partition", _FAST, r"partition not found in rule",
         "a rule names the topic, but not the partitions of this publisher or subscriber",
         "Say nothing of partitions in permissions; sros never does.",
+        refuses=Refused.TOPIC,
     ),
     # ── what follows on others ─────────────────────────────────────────────────────────────
-    _meaning(
+    _text(
         "participant", _FAST, r"Error while configuring security plugin"
         r"|Participant is not allowed with its own permissions file",
         "the process may not join; Fast DDS 2.14 says why in a line of its own, or in the file of "
         "ROS_SECURITY_LOG_FILE, and neither is in this log", _CHECK_OR_FILE, _ALL,
         unseen=_FILE, weak=1,
     ),
-    _meaning(
+    _text(
         "participant", _FAST, r"Cannot create participant due to initialization error"
         r"|Problem creating RTPSParticipant|failed to create participant",
         "the process may not join, and this log does not say why: Fast DDS 2.9 is silent about "
         "signatures, expired permissions and subjects, 2.14 tells its standard output or the file "
         "of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL, unseen=_FILE, weak=2,
     ),
-    _meaning(
+    _text(
         "service", ROS, r"(?:could not|failed to) create (?:service|client)"
         r"|create_(?:service|client)\(\) failed",
         "a service or client is denied by the permissions, and this text does not say which. Of a "
@@ -464,19 +411,44 @@ MEANINGS: tuple[Meaning, ...] = (
         "Compare the node's name and namespace with the policy's profile (ns, node); the line that "
         "names the topic is on standard output or in the file of ROS_SECURITY_LOG_FILE.", weak=2,
     ),
-    _meaning(
+    _text(
+        "endpoint", ROS, r"Not Allowed By Security", _DENIED_ENDPOINT, _ASK_FOR_TOPIC,
+        weak=3,
+        refuses=Refused.TOPIC,
+    ),
+    _text(
         "endpoint", ROS, r"invalid allocator|Problem creating associated (?:Reader|Writer)"
         r"|(?:could not|failed to) create (?:publisher|subscription|topic)"
-        r"|create_(?:publisher|subscription)\(\) could not create|Not Allowed By Security",
-        "a publisher, subscription, client or server is denied by the permissions; this text does "
-        "not say of which topic (`invalid allocator` has nothing to do with memory)",
-        "Look for the line before it that names the topic, on standard output or in the file of "
-        "ROS_SECURITY_LOG_FILE; or ask `sros explain` for each topic of the node.", weak=3,
+        r"|create_(?:publisher|subscription)\(\) could not create",
+        _DENIED_ENDPOINT, _ASK_FOR_TOPIC, weak=3,
     ),
+    # ── a topic that is denied: its right and its node are found from the lines nearby ─────
+    _text(
+        # Tried only where a word begins: in a line of one long word it would else be tried
+        # everywhere.
+        "topic-denied", _FAST, r"(?<![^\s(])(?P<topic>[^\s(]+) topic "
+        r"(?P<how>not found in allow|denied by deny) rule",
+        refuses=Refused.TOPIC,
+    ),
+    _text(
+        "topic-denied", _CYCLONE,
+        r"(?:Local topic permission denied|Writer is not permitted|Reader is not permitted): "
+        r"(?P<topic>\S+) (?P<how>denied by default rule|found in deny_rule)",
+        refuses=Refused.TOPIC,
+    ),
+    # ── what says that it is a refusal, and nothing of its cause ───────────────────────────
+    _text("refusal", _FAST, r"validate_local_identity|verifying CA certificate",
+          refuses=Refused.PARTICIPANT),
+    _text("refusal", _CYCLONE, r"Error occurred while validating local (?:permission|identity)"
+          r"|validate_local_identity", refuses=Refused.PARTICIPANT),
+    _text("refusal", _FAST, r"topic (?:not found in allow|denied by deny) rule",
+          refuses=Refused.TOPIC),
+    _text("refusal", _CYCLONE, r"denied by default rule|found in deny_rule",
+          refuses=Refused.TOPIC),
 )  # fmt: skip
 """In the order in which they are tried: the first that matches a line counts."""
 
-UNKNOWN = Meaning(
+UNKNOWN = LogText(
     "not-understood",
     ROS,
     re.compile(
@@ -490,4 +462,130 @@ UNKNOWN = Meaning(
     "Read it as it stands; what it is about may matter. If it kept a node from starting, `sros "
     "check KEYSTORE` and `sros explain KEYSTORE ENCLAVE join` look at all that DDS looks at.",
 )
-"""For what looks like a message of DDS Security and is none of `MEANINGS`, nor a denied topic."""
+"""For what looks like a message of DDS Security and is none of `LOG_TEXTS`."""
+
+# ── the lines around a text ────────────────────────────────────────────────────────────────
+
+SECURITY_DIRECTORY = re.compile(
+    r"Found security directory: \S*?/enclaves(?P<enclave>/\S*)?(?:\s|\Z)"
+)
+"""The line in which rcl says, in the group ``enclave``, which enclave a process runs in."""
+
+PROCESS_LABEL = re.compile(
+    r"\[[\w.-]+-\d+\] "  # ros2 launch: [talker-1]
+    r"|(?:\S+ +){3,4}[\w.@-]+\[\d+\]: "  # journald: Nov 21 06:00:00 robot talker[12]:
+    r"|[\w.-]+ +\| "  # Docker Compose: talker-1  |
+)
+"""The start of a line by which the processes are told apart that write into one log."""
+
+DOMAIN_OF_LINE = re.compile(r"\] \S+\|\S+ (\d{1,9}) \w+::\w+ :")
+"""The domain, in a line of ROS_SECURITY_LOG_FILE: behind the participant's identifier."""
+
+CONTINUED = re.compile(r"^(?:[0-9A-F]{8,}:error:|\(code: )")
+"""A line that belongs to the one before it: OpenSSL's error stack."""
+
+PEER = re.compile(r"check_remote_data|remote (?:writer|reader)")
+"""In a line about a denied topic: the permissions of a peer deny it, not those of the process."""
+
+DIRECTIONS: Mapping[str, re.Pattern[str]] = {
+    "writer": re.compile(
+        r"Writer is not|local writer|check_create_datawriter|datawriter_sec"
+        r"|associated Writer|DATA_WRITER|create(?:_p| p|P)ublisher|register_local_writer"
+    ),
+    "reader": re.compile(
+        r"Reader is not|local reader|check_create_datareader|datareader_sec"
+        r"|associated Reader|DATA_READER|create(?:_s| s|S)ubscri|register_local_reader"
+    ),
+    "client": re.compile(r"create(?:_c| c|C)lient"),
+    "server": re.compile(r"create(?:_s| s|S)ervice"),
+}
+"""The words, in lines near a denied topic, for the kind of endpoint that was to be created."""
+
+CYCLONE_EXPLAINS = {
+    "CYCLONEDDS_URI": "<CycloneDDS><Domain><Tracing><Category>fatal,error,warning,trace</Category>"
+    "<OutputFile>stderr</OutputFile></Tracing></Domain></CycloneDDS>"
+}
+"""Variables that make Cyclone DDS say why it denies a topic, which only its trace does."""
+
+# ── reading ────────────────────────────────────────────────────────────────────────────────
+
+
+def missing_security(text: str) -> str:
+    """Return the words in which a DDS says that it was built without DDS Security, or ""."""
+    return _first_refusal(Refused.ALL_SECURITY, text)
+
+
+def participant_refusal(text: str) -> str:
+    """Return the words in which DDS Security refuses a participant's files or domain, or ""."""
+    return _first_refusal(Refused.PARTICIPANT, text)
+
+
+def endpoint_refusal(text: str) -> str:
+    """Return the words in which DDS Security denies a topic, a writer or a reader, or ""."""
+    return _first_refusal(Refused.TOPIC, text)
+
+
+def _first_refusal(refused: Refused, text: str) -> str:
+    patterns = [each.pattern for each in LOG_TEXTS if each.refuses is refused]
+    for line in plain_text(text).splitlines():
+        if any(pattern.search(line) for pattern in patterns):
+            return plain_refusal(line)
+    return ""
+
+
+def denied_topic(line: str) -> tuple[Vendor, re.Match[str]] | None:
+    """Return the vendor that denies a topic in a line, with the groups ``topic`` and ``how``."""
+    for vendor, pattern in _TOPIC_DENIED:
+        if match := pattern.search(line):
+            return vendor, match
+    return None
+
+
+_TOPIC_DENIED = [
+    (each.vendor, each.pattern) for each in LOG_TEXTS if each.id == "topic-denied" and each.vendor
+]
+
+
+def log_text(line: str) -> tuple[LogText, re.Match[str]] | None:
+    """Return the row that gives the cause of a line, or None; denied topics have none."""
+    for text in LOG_TEXTS:
+        if text.cause and (match := text.pattern.search(line)):
+            return text, match
+    return None
+
+
+def plain_text(output: str) -> str:
+    """Return what a process printed, without colours."""
+    return _COLOUR.sub("", output)
+
+
+def plain_refusal(line: str) -> str:
+    """Return the words of a line of a DDS log, without time, severity and places in its sources.
+
+    Never empty where the line is not: of a refusal without a reason it says what was refused.
+    """
+    line = " ".join(plain_text(line).split())
+    if words := " ".join(_FRAME.sub("", line).split()):
+        return words
+    function = _FUNCTION.search(line)
+    return _NO_REASON.format(function[1].replace("_", " ") + " failed") if function else line
+
+
+_COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+
+_FRAME = re.compile(
+    # Fast DDS: when, `[SECURITY Error]`, the place in its sources, and the function.
+    r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d[.\d]* (?=\[)|\[SECURITY\w* (?:Error|Warning)\]\s*"
+    r"|\s*\([^()\s]+\.(?:cpp|h|hpp|ipp):\d+\)|\s*-> Function \w+\Z|, at \S+\.(?:cpp|c):\d+"
+    # The file of ROS_SECURITY_LOG_FILE: when, severity, participant, domain, and the function.
+    r"|^\S+ \[[A-Z]+\] \S+ \d+ \w+::\w+ :\s*"
+    # Cyclone DDS and OpenSSL: when and by which thread, numbers, and places in their sources.
+    r"|^\d+\.\d+ \[\d*\]\s+\S+: |(?:candidate|adjusted)_guid: \S+ "
+    r"|Remote secure participant \S+ not allowed\. ?|[0-9A-F]{16}:error:[0-9A-F]+:[\w ]+:"
+    r"|:\.\./\S+\.c:\d+|\[\w+\] failed: |validate_local_identity: |Error\. (?=Error|validate)"
+)
+"""What vendors put around the reason of a refusal, which says nothing to a person."""
+
+_NO_REASON = "{}, and Fast DDS gives no reason"
+_FUNCTION = re.compile(r"(?:-> Function |::)(\w+)(?: :)?\s*\Z")
+"""The function that failed, in a line of Fast DDS that has no text of its own."""

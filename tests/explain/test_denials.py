@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import UsageError
-from sros_tool.graph.denials import Denial, Proposal, as_learned, propose, read_denials
+from sros_tool.explain.denials import Denial, MissingRights, as_learned, propose, read_denials
 from sros_tool.graph.learn import Right, common_parts
 from sros_tool.policy import ALLOW, Enclave, Group, Policy, Profile, Profiles
 from sros_tool.resources import policies_dir
 from sros_tool.runtime.vendor_log import plain_text
 
-LOGS = Path(__file__).with_name("logs")
+LOGS = Path(__file__).with_name("denial_logs")
 
 
 def log(name: str) -> str:
@@ -211,7 +211,7 @@ def robot(*profiles: Profile) -> Policy:
     return Policy((Enclave("/robot", (Profiles(profiles),)),))
 
 
-def of(topic: str, direction: str = "subscribe") -> Proposal:
+def of(topic: str, direction: str = "subscribe") -> MissingRights:
     return propose([Denial(topic, direction)])
 
 

@@ -1,18 +1,18 @@
-"""Reads what was denied from the logs of secured nodes, and proposes the rules that were missing.
+"""Read the denied topics from the logs of secured nodes, and propose the rules that were missing.
 
-The texts are those of Fast DDS 2.1 to 2.14 (Permissions.cpp, SecurityManager.cpp) and of Cyclone
-DDS 0.10 (access_control.c, q_omg_security.c); each was seen in a real log.  Fast DDS names the
-topic, and near it whether it was a writer or a reader.  Cyclone DDS first asks whether a topic may
-be used at all; that denial has no direction but by what rcl says next.  It says nothing where the
-governance protects the discovery of the topic.
+The texts are in `sros_tool.runtime.vendor_log`.  Fast DDS names the topic, and near it whether it
+was a writer or a reader.  Cyclone DDS first asks whether a topic may be used at all; that denial
+has no direction but by what rcl says next.  It says nothing where the governance protects the
+discovery of the topic.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
+from sros_tool.dds.decision import Vendor
 from sros_tool.errors import Note, UsageError
 from sros_tool.graph.learn import CommonParts, Learned, LearnedProfile, Right, groups_of
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
@@ -20,43 +20,21 @@ from sros_tool.names import NODE_SERVICES, check_enclave_name, expression_proble
 from sros_tool.policy.model import Policy
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.rights import profile_rights
+from sros_tool.runtime.vendor_log import (
+    DIRECTIONS,
+    PEER,
+    PROCESS_LABEL,
+    SECURITY_DIRECTORY,
+    denied_topic,
+)
 
-_FAST = re.compile(
-    # Tried only where a word begins: in a line of one long word it would else be tried everywhere.
-    r"(?<![^\s(])(?P<topic>[^\s(]+) topic (?P<how>not found in allow|denied by deny) rule"
-)
-_CYCLONE = re.compile(
-    r"(?:Local topic permission denied|Writer is not permitted|Reader is not permitted): "
-    r"(?P<topic>\S+) (?P<how>denied by default rule|found in deny_rule)"
-)
-SECURITY_DIRECTORY = re.compile(
-    r"Found security directory: \S*?/enclaves(?P<enclave>/\S*)?(?:\s|\Z)"
-)
-"""In which rcl says, in the group ``enclave``, which enclave a process runs in."""
-_WRITER = re.compile(
-    r"Writer is not|local writer|check_create_datawriter|datawriter_sec"
-    r"|associated Writer|DATA_WRITER|create(?:_p| p|P)ublisher|register_local_writer"
-)
-_READER = re.compile(
-    r"Reader is not|local reader|check_create_datareader|datareader_sec"
-    r"|associated Reader|DATA_READER|create(?:_s| s|S)ubscri|register_local_reader"
-)
-_CLIENT = re.compile(r"create(?:_c| c|C)lient")
-_SERVER = re.compile(r"create(?:_s| s|S)ervice")
-_REMOTE = re.compile(r"check_remote_data|remote (?:writer|reader)")
-PROCESS_LABEL = re.compile(
-    r"\[[\w.-]+-\d+\] "  # ros2 launch: [talker-1]
-    r"|(?:\S+ +){3,4}[\w.@-]+\[\d+\]: "  # journald: Nov 21 06:00:00 robot talker[12]:
-    r"|[\w.-]+ +\| "  # Docker Compose: talker-1  |
-)
-"""What tells the processes apart whose lines are in one log."""
 _NEAR_LINES = 3
-"""How many lines after a denial still speak of it."""
+"""How many lines after a denial are still about it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Denial:
-    """One refusal: a raw DDS topic, "publish", "subscribe" or "" where the log does not tell.
+    """One refusal: a raw DDS topic, "publish", "subscribe" or "" where the log does not say.
 
     ``by_rule`` says that a rule denies it, so that allowing it would not help; ``remote`` that it
     is about the permissions of a peer.  ``enclave`` is "" where the log does not name it.
@@ -67,11 +45,12 @@ class Denial:
     enclave: str = ""
     by_rule: bool = False
     remote: bool = False
+    vendor: Vendor = field(default=Vendor.FAST, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
-class Proposal:
-    """The rights by enclave ("" for those that the log does not name) that denials ask for.
+class MissingRights:
+    """The rights that denials ask for, by enclave ("" where the log does not name it).
 
     ``unclear`` are denials without a direction, ``by_rule`` those by a deny rule, ``remote`` those
     of peers, ``foreign`` those of topics without a ROS name: all of them are left to a person.
@@ -85,10 +64,10 @@ class Proposal:
 
 
 def read_denials(text: str) -> tuple[Denial, ...]:
-    """Every refusal in a log without colours, once, in the order of the log.
+    """Return every denied topic in a log without colours, once, in the order of the log.
 
     Processes that write into one log are told apart by what ros2 launch, journald or Docker
-    Compose puts before their lines; an enclave that one of them names is not that of another.
+    Compose puts before their lines; an enclave that one of them names is not another one's.
     """
     processes: dict[str, list[str]] = {}
     for line in text.splitlines():
@@ -100,46 +79,39 @@ def read_denials(text: str) -> tuple[Denial, ...]:
 
 
 def _denials_of(lines: list[str]) -> Iterator[Denial]:
-    """The refusals of one process."""
+    """Yield the denials in the lines of one process."""
     enclave = ""
     for number, line in enumerate(lines):
-        if said := SECURITY_DIRECTORY.search(line):
-            enclave = said["enclave"] or "/"
-        if match := _denied(line):
+        if named := SECURITY_DIRECTORY.search(line):
+            enclave = named["enclave"] or "/"
+        if found := denied_topic(line):
+            vendor, match = found
             topic = match["topic"]
-            remote, direction = _near(lines, number, topic)
-            by_rule = "deny" in match["how"]
-            yield Denial(topic, direction, enclave, by_rule, remote)
+            remote, direction = _direction(lines[number : number + 1 + _NEAR_LINES], topic)
+            by_rule = "deny" in match["how"].lower()
+            yield Denial(topic, direction, enclave, by_rule, remote, vendor)
 
 
-def is_denial(line: str) -> bool:
-    """Whether a line denies a topic."""
-    return _denied(line) is not None
-
-
-def _denied(line: str) -> re.Match[str] | None:
-    return _FAST.search(line) or _CYCLONE.search(line)
-
-
-def _near(lines: list[str], number: int, topic: str) -> tuple[bool, str]:
-    """Whether a denial is about a peer, and its direction, by its line and those that follow."""
-    for line in lines[number : number + 1 + _NEAR_LINES]:
-        other = _denied(line)
-        if other and other["topic"] != topic:
+def _direction(lines: list[str], topic: str) -> tuple[bool, str]:
+    """Return whether a denial is about a peer, and its direction, from its line and the next."""
+    for line in lines:
+        other = denied_topic(line)
+        if other and other[1]["topic"] != topic:
             break
-        if _REMOTE.search(line):
+        if PEER.search(line):
             return True, PUBLISH if "riter" in line else SUBSCRIBE
-        writer, reader = bool(_WRITER.search(line)), bool(_READER.search(line))
+        named = {kind: bool(words.search(line)) for kind, words in DIRECTIONS.items()}
+        writer, reader = named["writer"], named["reader"]
         if topic.startswith(("rq/", "rr/")) and not (writer or reader):
             # A client writes requests and reads replies, a server does the opposite.
-            client, server = bool(_CLIENT.search(line)), bool(_SERVER.search(line))
+            client, server = named["client"], named["server"]
             writer, reader = (client, server) if topic[1] == "q" else (server, client)
         if writer != reader:
             return False, PUBLISH if writer else SUBSCRIBE
     return False, ""
 
 
-def propose(denials: Iterable[Denial]) -> Proposal:
+def propose(denials: Iterable[Denial]) -> MissingRights:
     """The rights that would have let pass what was denied, as far as the log tells.
 
     A node stops at its first refusal, so one denied half of a service asks for the service, and
@@ -159,7 +131,7 @@ def propose(denials: Iterable[Denial]) -> Proposal:
             rest[kind].append(each)
         else:
             rights.setdefault(each.enclave, set()).add(_right(each))
-    return Proposal(
+    return MissingRights(
         {enclave: _without_parts(found) for enclave, found in rights.items()},
         **{kind: tuple(found) for kind, found in rest.items()},
     )
@@ -240,7 +212,7 @@ NODE_PARTS = ("common/node.xml", "common/node/parameters.xml")
 
 
 def as_learned(
-    proposal: Proposal,
+    proposal: MissingRights,
     enclave: str,
     node: tuple[str, str] | None,
     policy: Policy | None,
@@ -281,7 +253,7 @@ def as_learned(
     return Learned(tuple(profiles), (*_notes(proposal), *notes))
 
 
-def _by_enclave(proposal: Proposal, enclave: str) -> dict[str, frozenset[Right]]:
+def _by_enclave(proposal: MissingRights, enclave: str) -> dict[str, frozenset[Right]]:
     """The rights by enclave: the log may name an enclave that is also given."""
     found: dict[str, frozenset[Right]] = {}
     for named, rights in proposal.rights.items():
@@ -352,7 +324,7 @@ def _profiles(policy: Policy | None, path: str) -> dict[tuple[str, str], frozens
     return found
 
 
-def _notes(proposal: Proposal) -> tuple[Note, ...]:
+def _notes(proposal: MissingRights) -> tuple[Note, ...]:
     texts = {
         "log.unclear": (
             proposal.unclear,
