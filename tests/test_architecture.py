@@ -11,7 +11,17 @@ PROJECT = Path(__file__).parents[1]
 PACKAGE = PROJECT / "sros_tool"
 
 FLOORS = {
-    1: {"__init__", "errors", "names", "validity", "xml", "files", "parallel", "resources"},
+    1: {
+        "__init__",
+        "errors",
+        "names",
+        "validity",
+        "values",
+        "xml",
+        "files",
+        "parallel",
+        "resources",
+    },
     2: {"pki", "policy", "dds"},
     3: {"translate"},
     4: {"keystore", "graph", "runtime"},

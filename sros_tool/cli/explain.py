@@ -24,10 +24,10 @@ from sros_tool.cli.common import (
     ros_domain,
     visible,
 )
-from sros_tool.cli.policy import right_json
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.names import is_expression
 from sros_tool.validity import iso
+from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
     from sros_tool.dds.decision import Vendor
@@ -902,9 +902,7 @@ def explanation_json(case: Case, found: Explanation, policy: Path | None) -> dic
         "protection": _protection_json(answer),
         "until": iso(answer.until) if answer.until else None,
         "until_file": answer.until_file or None,
-        "problems": [
-            {"file": each.file, "text": each.text, "code": each.code} for each in answer.problems
-        ],
+        "problems": as_plain(answer.problems),
         "parts": [_part_json(each) for each in answer.parts],
         "remedy": found.remedy or None,
         "change": _change_json(found.change) if found.change else None,
@@ -976,8 +974,8 @@ def _part_json(each: PartAnswer) -> dict[str, Any]:
 
 def _change_json(change: Change) -> dict[str, Any]:
     return {
-        "add": [right_json(right) for right in change.add],
-        "lift": [right_json(right) for right in change.lift],
+        "add": as_plain(change.add),
+        "lift": as_plain(change.lift),
         "document": change.document or None,
         "edits": [
             {"file": each.source.file, "line": each.source.line, "xml": each.xml}

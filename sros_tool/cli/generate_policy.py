@@ -23,8 +23,8 @@ from sros_tool.cli.common import (
     print_notes,
     read_log,
 )
-from sros_tool.cli.policy import notes_json, right_json
 from sros_tool.errors import SrosError, UnavailableError, UsageError
+from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
     from sros_tool.graph.learn import CommonParts
@@ -402,9 +402,7 @@ def _from_logs(
         return 1
     if file is None and as_json:
         rights = sorted(policy_rights(learned.policy()), key=order)
-        print_json(
-            {"added": [right_json(each) for each in rights], "notes": notes_json(learned.notes)}
-        )
+        print_json({"added": as_plain(rights), "notes": as_plain(learned.notes)})
         return 0
     if file is None:
         print_notes(learned.notes)
@@ -454,9 +452,9 @@ def _show(
                 "changed": plan.changes,
                 "dry_run": dry_run,
                 **to_json(observation),
-                "added": [right_json(each) for each in plan.added],
+                "added": as_plain(plan.added),
                 "copied": sorted(plan.copies),
-                "notes": notes_json(notes),
+                "notes": as_plain(notes),
             }
         )
         return

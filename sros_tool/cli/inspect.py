@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from sros_tool.cli.common import PATH, json_option, now, print_json, visible
+from sros_tool.values import as_plain
 
 _INDENT = "  "
 
@@ -67,8 +68,6 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
 
 
 def _show_history(root: Path, as_json: bool) -> int:
-    from dataclasses import asdict
-
     from sros_tool.keystore.history import history
 
     found = history(root, now=now())
@@ -78,7 +77,7 @@ def _show_history(root: Path, as_json: bool) -> int:
                 "kind": "history",
                 "path": str(root),
                 "entries": [
-                    {**asdict(item.entry), "status": item.status, "path": item.path}
+                    {**as_plain(item.entry), "status": item.status, "path": item.path}
                     for item in found.items
                 ],
                 "unexplained": list(found.unexplained),

@@ -21,6 +21,7 @@ from sros_tool.cli.common import (
     visible,
 )
 from sros_tool.errors import Note, PolicyError, UsageError
+from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
     from sros_tool.errors import Note
@@ -35,22 +36,6 @@ def output_option(help_text: str) -> Callable[[Decorated], Decorated]:
 
 
 force_option = click.option("--force", is_flag=True, help="Let FILE be replaced if it exists.")
-
-
-def right_json(right: Right) -> dict[str, str]:
-    """A right as JSON; ``kind`` is topics, services, actions or dds."""
-    return {
-        "enclave": right.enclave,
-        "qualifier": right.qualifier.value,
-        "kind": right.kind,
-        "right": right.right,
-        "name": right.name,
-    }
-
-
-def notes_json(notes: Sequence[Note]) -> list[dict[str, str]]:
-    """Remarks as JSON."""
-    return [{"id": note.id, "text": note.text} for note in notes]
 
 
 def check_output(output: Path, *, force: bool) -> None:
@@ -163,15 +148,8 @@ def _print_merged_json(policy: Path, merged: Merged, written: Path | None, *, sh
 
     value: dict[str, Any] = {
         "policy": str(policy),
-        "added": [right_json(right) for right in merged.added],
-        "contradictions": [
-            {
-                "denied": right_json(each.denied),
-                "allowed": right_json(each.allowed),
-                "new": each.new,
-            }
-            for each in merged.contradictions
-        ],
+        "added": as_plain(merged.added),
+        "contradictions": as_plain(merged.contradictions),
         "output": str(written) if written else None,
     }
     if show:
@@ -262,15 +240,15 @@ def _difference_json(
                 "kind": source.kind,
                 "enclaves": None if source.scope is None else sorted(source.scope),
                 "sound": source.sound,
-                "notes": notes_json(source.notes),
+                "notes": as_plain(source.notes),
             }
             for side, source in (("a", first), ("b", second))
         },
         "differences": [
             {
                 "only": "a" if sign == "-" else "b",
-                **right_json(right),
-                "covered_by": [right_json(each) for each in difference.covered.get(right, ())],
+                **as_plain(right),
+                "covered_by": as_plain(difference.covered.get(right, ())),
             }
             for sign, right in difference.lines()
         ],
@@ -410,7 +388,7 @@ def minimize_policy(
     saved = save(output, document) if output and not dry_run else ""
     if as_json:
         value = _json(policy, result, measured, output if not dry_run else None)
-        print_json({**value, "notes": notes_json(notes)})
+        print_json({**value, "notes": as_plain(notes)})
     else:
         for use in result.uses:
             for line in _lines(use, measured[use.enclave]):
@@ -526,9 +504,6 @@ def _json(
 ) -> dict[str, Any]:
     from sros_tool.dds.permissions import MAX_SIGNED_BYTES
 
-    def rights(found: Sequence[Right]) -> list[dict[str, str]]:
-        return [right_json(right) for right in found]
-
     return {
         "policy": str(policy),
         "output": str(output) if output else None,
@@ -540,31 +515,16 @@ def _json(
                 "observed": use.observed_pairs,
                 "remaining": use.remaining_pairs,
                 "ratio": use.ratio,
-                "never_observed": rights(use.unused),
-                "kept_for_every_node": rights(use.common),
-                "wildcards": [
-                    {
-                        "rule": right_json(wide.rule),
-                        "used": rights(wide.used),
-                        "replacement": rights(wide.replacement),
-                    }
-                    for wide in use.wide
-                ],
-                "not_allowed": rights(use.refused),
+                "never_observed": as_plain(use.unused),
+                "kept_for_every_node": as_plain(use.common),
+                "wildcards": as_plain(use.wide),
+                "not_allowed": as_plain(use.refused),
                 "bytes": {
                     "before": measured[use.enclave].before,
                     "after": measured[use.enclave].after,
                     "limit": MAX_SIGNED_BYTES,
                 },
-                "proposals": [
-                    {
-                        "rule": right_json(each.rule),
-                        "replaces": rights(each.replaces),
-                        "adds": rights(each.adds),
-                        "saves": each.saves,
-                    }
-                    for each in measured[use.enclave].proposals
-                ],
+                "proposals": as_plain(measured[use.enclave].proposals),
             }
             for use in result.uses
         ],

@@ -16,6 +16,7 @@ from sros_tool.demo.scenarios.isolation import ISOLATION
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.cyclone import INSTALL_ADVICE
 from sros_tool.runtime.stacks import ROS_ADVICE, Stack, survey
+from sros_tool.values import as_plain
 
 _PROBE_DOMAIN = 80
 _TEMPLATE = "production"
@@ -41,7 +42,7 @@ class Diagnosis:
         """The diagnosis as `sros doctor --json` shows it."""
         return {
             "enforces": self.enforces,
-            "stacks": [vars(stack) for stack in self.stacks],
+            "stacks": as_plain(self.stacks),
             "advice": self.advice,
         }
 

@@ -79,10 +79,6 @@ class CastMember:
     enclave: str
     nodes: tuple[str, ...] = ()
 
-    def as_json(self) -> dict[str, Any]:
-        """The member as `sros demo --json` shows it."""
-        return {"part": self.part, "enclave": self.enclave, "nodes": list(self.nodes)}
-
 
 @dataclass(frozen=True)
 class Finding:

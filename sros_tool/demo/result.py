@@ -32,6 +32,7 @@ from sros_tool.demo.backend import Backend
 from sros_tool.demo.cost import CostResult
 from sros_tool.demo.records import CastMember, RowResult
 from sros_tool.runtime.netns import Isolation
+from sros_tool.values import as_plain
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ class ScenarioResult:
             "name": self.name,
             "title": self.title,
             "as_expected": self.as_expected,
-            "cast": [member.as_json() for member in self.cast],
+            "cast": as_plain(self.cast),
             "rows": [{**row.as_json(), "scenario": self.name} for row in self.rows],
             "cost": self.cost.as_json() if self.cost else None,
         }

@@ -15,6 +15,7 @@ from typing import NamedTuple
 from sros_tool.names import expand, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Profile, Qualifier
 from sros_tool.policy.patterns import covers, overlap
+from sros_tool.values import shows
 
 KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
 """The kind of group in which a right stands, such as topics for publish."""
@@ -32,6 +33,7 @@ _PARTS = {
 _WHOLE = {"request": "call", "reply": "execute"}
 
 
+@shows("enclave", "qualifier", "kind", "right", "name")
 class Right(NamedTuple):
     """One right or denial of an enclave; ``name`` is absolute, perhaps with wildcards.
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
-from dataclasses import asdict
 from datetime import datetime
 from html import escape
 from pathlib import Path
@@ -22,6 +21,7 @@ from sros_tool.policy.model import ALLOW
 from sros_tool.report.layout import Scene
 from sros_tool.report.picture import Bundle, Enclave, Picture, fold
 from sros_tool.validity import iso
+from sros_tool.values import as_plain
 
 _ASSETS = Path(__file__).with_name("assets")
 _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
@@ -88,41 +88,41 @@ def _digest(text: str) -> str:
 def _data(picture: Picture, scenes: tuple[Scene, ...]) -> dict[str, Any]:
     """The picture as the script wants it: names by bundles, which is much shorter than edges."""
     return {
-        "overlay": asdict(picture.overlay) if picture.overlay else None,
+        "overlay": as_plain(picture.overlay),
         "enclaves": [_enclave(each) for each in picture.enclaves],
         "bundles": [_bundle(each) for each in fold(picture.names, picture.edges)],
         "scenes": [_scene(each) for each in scenes],
-        "differences": [asdict(each) for each in picture.differences],
-        "validities": [asdict(each) for each in picture.validities],
-        "findings": [asdict(each) for each in picture.findings],
+        "differences": as_plain(picture.differences),
+        "validities": as_plain(picture.validities),
+        "findings": as_plain(picture.findings),
     }
 
 
 def _enclave(enclave: Enclave) -> dict[str, Any]:
     """An enclave; of its rights as written only the wildcards, for the others are names."""
-    wild = [_said(asdict(each)) for each in enclave.statements if is_expression(each.name)]
-    return {**asdict(enclave), "statements": wild}
+    wild = [_said(as_plain(each)) for each in enclave.statements if is_expression(each.name)]
+    return {**as_plain(enclave), "statements": wild}
 
 
 def _said(value: dict[str, Any]) -> dict[str, Any]:
-    value["deny"] = value.pop("qualifier") is not ALLOW
+    value["deny"] = value.pop("qualifier") != ALLOW
     return value
 
 
 def _bundle(bundle: Bundle) -> dict[str, Any]:
-    ties = [_said(asdict(tie)) for tie in bundle.ties]
+    ties = [_said(as_plain(tie)) for tie in bundle.ties]
     for tie in ties:
         tie["enclave"] = tie.pop("node")
     return {
         "kind": bundle.kind,
         "names": bundle.names,
-        "protection": asdict(bundle.protection),
+        "protection": as_plain(bundle.protection),
         "ties": _table(ties),
     }
 
 
 def _scene(scene: Scene) -> dict[str, Any]:
-    value = asdict(scene)
+    value: dict[str, Any] = as_plain(scene)
     value["cards"] = _table(value["cards"])
     value["links"] = _table([_said(link) for link in value["links"]])
     return value

@@ -9,12 +9,12 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
 
 from sros_tool.policy.model import ALLOW, RIGHTS, Qualifier
 from sros_tool.policy.rights import RIGHT_ORDER
+from sros_tool.values import as_plain, shows
 
 SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
     ("subscribe", "reply", "execute"), False
@@ -63,6 +63,10 @@ UNKNOWN = Protection(Level.UNKNOWN)
 """The protection where no governance is known, as that of a policy alone."""
 
 
+@shows(
+    *("enclave", "kind", "name", "right", "qualifier"),
+    *("by", "parts", "mark", "common", "direction"),
+)
 @dataclass(frozen=True, slots=True, order=True)
 class Edge:
     """What one enclave may, or may not, do with one name.
@@ -86,6 +90,11 @@ class Edge:
     def sends(self) -> bool:
         """Whether the arrow leads from the enclave to the name."""
         return SENDS[self.right]
+
+    @property
+    def direction(self) -> str:
+        """The way of the arrow in words."""
+        return "to the name" if self.sends else "from the name"
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,16 +306,4 @@ def _order(tie: Tie) -> tuple[int, str, str, tuple[str, ...], tuple[str, ...], s
 
 def render_json(picture: Picture) -> str:
     """The whole picture: every enclave, name and edge, by the names of `Picture`'s fields."""
-    return json.dumps(as_value(picture), indent=1, ensure_ascii=False) + "\n"
-
-
-def as_value(picture: Picture) -> dict[str, Any]:
-    """The picture as a value of lists, dictionaries and texts."""
-    value = asdict(picture)
-    value["edges"] = [_edge(edge) for edge in picture.edges]
-    return value
-
-
-def _edge(edge: Edge) -> dict[str, Any]:
-    direction = "to the name" if edge.sends else "from the name"
-    return {**asdict(edge), "direction": direction}
+    return json.dumps(as_plain(picture), indent=1, ensure_ascii=False) + "\n"

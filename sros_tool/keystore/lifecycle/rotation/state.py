@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from enum import StrEnum
 from pathlib import Path
@@ -32,6 +32,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.validity import Window, iso
+from sros_tool.values import as_plain
 from sros_tool.xml import read_bytes
 
 SOON = timedelta(days=90)
@@ -139,7 +140,7 @@ def render_rotation(rotation: Rotation) -> bytes:
     """The file of a rotation."""
     told = {
         "stage": rotation.stage.value,
-        "replacements": [asdict(each) for each in rotation.replacements],
+        "replacements": as_plain(rotation.replacements),
     }
     return json.dumps(told, indent=2).encode() + b"\n"
 
