@@ -1,3 +1,92 @@
-"""sros: the security toolkit for ROS 2 robots."""
+"""sros: the security toolkit for ROS 2 robots.
+
+What is named in ``__all__`` is for other programs: it is documented in docs/python.md, and changes
+only with a new minor version and an entry in CHANGELOG.md.  Everything else in this package may
+move at any time.
+
+Example:
+    >>> import sros_tool
+    >>> keystore = sros_tool.create_keystore("ks", template="production")
+    >>> sros_tool.generate(keystore, "policies/talker_listener.xml")
+    >>> sros_tool.explain_access(
+    ...     keystore, "/talker_listener/talker", "publish", "/chatter"
+    ... ).allowed
+    True
+    >>> sros_tool.check(keystore)
+    ()
+
+Importing this module imports nothing else: a name is loaded when it is first used.
+"""
+
+TYPE_CHECKING = False  # type checkers read it as True; to import typing takes longer than all else
+
+if TYPE_CHECKING:
+    from sros_tool.api import (
+        AccessAnswer,
+        Keystore,
+        check,
+        create_keystore,
+        explain_access,
+        export_enclaves,
+        generate,
+        load_template,
+        open_keystore,
+        read_policy,
+    )
+    from sros_tool.checks.kind import Finding
+    from sros_tool.errors import (
+        DocumentError,
+        KeystoreError,
+        PolicyError,
+        SrosError,
+        UsageError,
+    )
+    from sros_tool.keystore.template import Template
+    from sros_tool.policy.model import Policy
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "AccessAnswer",
+    "DocumentError",
+    "Finding",
+    "Keystore",
+    "KeystoreError",
+    "Policy",
+    "PolicyError",
+    "SrosError",
+    "Template",
+    "UsageError",
+    "check",
+    "create_keystore",
+    "explain_access",
+    "export_enclaves",
+    "generate",
+    "load_template",
+    "open_keystore",
+    "read_policy",
+]
+
+_ELSEWHERE = {
+    "Finding": "sros_tool.checks.kind",
+    "Policy": "sros_tool.policy.model",
+    "Template": "sros_tool.keystore.template",
+    **dict.fromkeys((name for name in __all__ if name.endswith("Error")), "sros_tool.errors"),
+}
+"""The modules of the names that are not in `sros_tool.api`."""
+
+
+if not TYPE_CHECKING:  # so that type checkers find names that do not exist
+
+    def __getattr__(name: str) -> object:
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from importlib import import_module
+
+        value = getattr(import_module(_ELSEWHERE.get(name, "sros_tool.api")), name)
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,0 +1,209 @@
+"""The names that other programs may build on: lazy, typed, and enough for a first script."""
+
+from __future__ import annotations
+
+import inspect
+import re
+import subprocess
+import sys
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+import sros_tool
+from sros_tool import DocumentError, KeystoreError, UsageError
+from sros_tool.resources import policies_dir
+
+PROJECT = Path(__file__).parents[1]
+TALKER = "/talker_listener/talker"
+POLICY = policies_dir() / "talker_listener.xml"
+
+
+def first_script() -> tuple[str, str]:
+    """The script of docs/python.md, and what is said there that it prints."""
+    text = (PROJECT / "docs" / "python.md").read_text(encoding="utf-8")
+    found = re.search(r"```python\n(.+?)```.+?```\n(.+?)```", text, re.DOTALL)
+    assert found
+    return found[1], found[2]
+
+
+def in_another_process(code: str, folder: Path) -> str:
+    return subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.path.insert(0, {str(PROJECT)!r})\n{code}"],
+        cwd=folder,
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
+
+
+@pytest.fixture(scope="module")
+def keystore(tmp_path_factory: pytest.TempPathFactory) -> sros_tool.Keystore:
+    made = sros_tool.create_keystore(tmp_path_factory.mktemp("api") / "ks", template="production")
+    sros_tool.generate(made, POLICY)
+    return made
+
+
+def test_the_first_script_prints_what_the_document_says(tmp_path: Path) -> None:
+    script, printed = first_script()
+    (tmp_path / "policies").symlink_to(policies_dir())
+    assert in_another_process(script, tmp_path) == printed
+    assert (tmp_path / "robot.tar.gz").is_file()
+
+
+def test_a_type_checker_knows_the_names_and_finds_a_wrong_call(tmp_path: Path) -> None:
+    api = pytest.importorskip("mypy.api")
+    script = tmp_path / "script.py"
+    wrong = 'sros_tool.generate("ks", 7)\nsros_tool.gnerate("ks")\n'
+    script.write_text(first_script()[0] + wrong, encoding="utf-8")
+    out, _, status = api.run(
+        ["--strict", "--config-file", str(PROJECT / "pyproject.toml"), str(script)]
+    )
+    errors = [line for line in out.splitlines() if "error:" in line]
+    assert status == 1
+    assert len(errors) == 2
+    assert "[arg-type]" in errors[0]
+    assert "[attr-defined]" in errors[1]
+
+
+def test_importing_the_package_imports_nothing_else(tmp_path: Path) -> None:
+    code = "before = set(sys.modules); import sros_tool; print(set(sys.modules) - before)"
+    assert in_another_process(code, tmp_path) == "{'sros_tool'}\n"
+
+
+def test_a_question_imports_nothing_that_writes(
+    keystore: sros_tool.Keystore, tmp_path: Path
+) -> None:
+    code = (
+        f"import sros_tool; sros_tool.check({str(keystore.path)!r})\n"
+        "print('sros_tool.keystore.lifecycle.create' in sys.modules)"
+    )
+    assert in_another_process(code, tmp_path) == "False\n"
+
+
+@pytest.mark.parametrize("name", sros_tool.__all__)
+def test_every_name_is_there_and_documented(name: str) -> None:
+    value = getattr(sros_tool, name)
+    assert name in dir(sros_tool)
+    assert inspect.getdoc(value)
+    assert f"`{name}" in (PROJECT / "docs" / "python.md").read_text(encoding="utf-8")
+    if inspect.isfunction(value):
+        assert all(part in (value.__doc__ or "") for part in ("Raises:", "Example:"))
+
+
+def test_no_name_is_also_that_of_a_room() -> None:
+    rooms = {path.stem for path in (PROJECT / "sros_tool").iterdir()}
+    assert rooms.isdisjoint(sros_tool.__all__)
+
+
+def test_an_unknown_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="has no attribute 'gnerate'"):
+        sros_tool.gnerate  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_a_keystore_is_opened_and_is_a_path(keystore: sros_tool.Keystore) -> None:
+    opened = sros_tool.open_keystore(str(keystore.path))
+    assert opened == keystore
+    assert Path(opened) == keystore.path
+    assert opened.enclaves == ("/talker_listener/listener", TALKER)
+    with pytest.raises(KeystoreError, match="not a valid keystore"):
+        sros_tool.open_keystore(keystore.path / "elsewhere")
+
+
+def test_an_answer_says_by_which_line_and_until_when(keystore: sros_tool.Keystore) -> None:
+    yes = sros_tool.explain_access(keystore, TALKER, "publish", "/chatter", policy=POLICY)
+    assert yes
+    assert (yes.outcome, yes.vendor, yes.expression) == ("allowed", "fastdds", "rt/chatter")
+    assert [line.rpartition(":")[0] for line in yes.policy_lines] == [str(POLICY)]
+    assert yes.until
+    no = sros_tool.explain_access(keystore, TALKER, "subscribe", "/chatter", vendor="cyclonedds")
+    assert not no.allowed
+    assert no.outcome == "denied"
+    later = sros_tool.explain_access(keystore, TALKER, "join", now=yes.until + timedelta(days=1))
+    assert later.outcome == "refused"
+    assert later.remedy
+
+
+def test_a_choice_of_a_template_is_found_only_when_asked_for(tmp_path: Path) -> None:
+    made = sros_tool.create_keystore(tmp_path / "ks", template="sros2", domains="0,7")
+    assert sros_tool.check(made) == ()
+    found = sros_tool.check(made, strict=True)
+    assert "keystore.one-authority" in [each.id for each in found]
+
+
+def test_a_dry_run_changes_nothing(keystore: sros_tool.Keystore) -> None:
+    planned = sros_tool.generate(keystore, enclaves=["/spare"], dry_run=True)
+    assert planned.created == ("/spare",)
+    assert "/spare" not in keystore.enclaves
+
+
+def test_an_encrypted_key_is_asked_for(tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def secrets(what: str) -> str:
+        asked.append(what)
+        return "swordfish"
+
+    made = sros_tool.create_keystore(
+        tmp_path / "ks",
+        sros_tool.load_template("development"),
+        encrypt_ca_keys=True,
+        secrets=secrets,
+    )
+    with pytest.raises(KeystoreError, match="passphrase"):
+        sros_tool.generate(made, enclaves=["/a"])
+    asked.clear()
+    assert sros_tool.generate(made, enclaves=["/a"], secrets=secrets).created == ("/a",)
+    assert "the passphrase of the identity CA key" in asked
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "text"),
+    [
+        (lambda ks: sros_tool.generate(ks), UsageError, "neither"),
+        (lambda ks: sros_tool.generate(ks, enclaves="/spare"), UsageError, "one string"),
+        (lambda ks: sros_tool.generate(ks, POLICY, domain=9), KeystoreError, "domain"),
+        (lambda ks: sros_tool.export_enclaves(ks, [], "robot.tar.gz"), UsageError, "no enclave"),
+        (lambda ks: sros_tool.check(), UsageError, "no path"),
+        (
+            lambda ks: sros_tool.check(ks, severity="bad"),  # type: ignore[arg-type]
+            UsageError,
+            "note, warning, error",
+        ),
+        (lambda ks: sros_tool.check(ks / "private"), DocumentError, "neither a keystore"),
+        (lambda ks: sros_tool.create_keystore(ks), KeystoreError, "already exists"),
+        (lambda ks: sros_tool.create_keystore(ks, "prod"), DocumentError, "no template"),
+        (
+            lambda ks: sros_tool.check(ks, now=datetime(2027, 1, 1)),
+            UsageError,
+            "no time zone",
+        ),
+        (
+            lambda ks: sros_tool.explain_access(ks, TALKER, "publish", "chatter"),
+            UsageError,
+            "Write /chatter",
+        ),
+        (
+            lambda ks: sros_tool.explain_access(ks, "/taker", "join"),
+            KeystoreError,
+            TALKER,
+        ),
+        (
+            lambda ks: sros_tool.explain_access(ks, TALKER, "join", vendor="rti"),
+            UsageError,
+            "unknown vendor",
+        ),
+    ],
+)
+def test_what_cannot_be_meant_is_refused_with_a_remedy(
+    keystore: sros_tool.Keystore, call: object, error: type[Exception], text: str
+) -> None:
+    assert callable(call)
+    with pytest.raises(error, match=text):
+        call(keystore.path)
+
+
+def test_a_moment_of_another_zone_is_as_good(keystore: sros_tool.Keystore) -> None:
+    then = datetime(2090, 1, 1, tzinfo=UTC)
+    assert sros_tool.check(keystore, now=then)
