@@ -26,6 +26,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.pki import smime
 from sros_tool.runtime.environment import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
+from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
@@ -94,8 +95,6 @@ def _boot_time(proc: Path) -> datetime:
         return datetime.fromtimestamp(int(seconds), UTC)
     return datetime.fromtimestamp(0, UTC)
 
-
-RMW = "RMW_IMPLEMENTATION"
 
 RMW_NOT_INSTALLED = Kind(
     "runtime.rmw-not-installed",
@@ -169,7 +168,6 @@ HOST_KINDS = by_id(
     PROCESS_UNSECURED, PROCESS_OUTDATED, MIXED_VENDORS,
 )  # fmt: skip
 
-DEFAULT_RMW = "rmw_fastrtps_cpp"
 _NOT_DDS = ("rmw_zenoh", "rmw_email", "rmw_iceoryx")
 _DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
 _TOLERANCE = timedelta(minutes=2)

@@ -238,7 +238,7 @@ def findings_here(
     """What is found in an environment on this machine; `insecure_rmws` were tried before."""
     from sros_tool.checks.runtime import Setting, running_processes, runtime_findings
     from sros_tool.cli.common import local_zone
-    from sros_tool.runtime.stacks import rmw_implementations
+    from sros_tool.runtime.rmw import rmw_implementations
 
     zone = local_zone(environment)
     rmws, processes = rmw_implementations(environment), tuple(running_processes())

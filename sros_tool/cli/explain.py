@@ -157,12 +157,9 @@ def _planned(stated: Enclave, root: Path | None, place: Place) -> Material:
 def vendor_of(name: str | None) -> tuple[Vendor, str]:
     """The vendor of an option, or else of this machine, and why it is that one."""
     from sros_tool.dds.decision import Vendor
-    from sros_tool.explain.material import vendor_here
+    from sros_tool.runtime.rmw import vendor_here
 
-    if name:
-        return Vendor(name), "as asked"
-    choice = vendor_here(os.environ)
-    return choice.vendor, choice.why
+    return (Vendor(name), "as asked") if name else vendor_here(os.environ)
 
 
 if TYPE_CHECKING:

@@ -16,14 +16,19 @@ from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.policy.patterns import matches
 from sros_tool.runtime.cyclone import INSTALL_ADVICE
+from sros_tool.runtime.rmw import (
+    CYCLONE_EXPLAINS,
+    RMW,
+    middleware_of,
+    rmw_implementations,
+    vendor_of,
+)
 from sros_tool.runtime.stacks import (
     ProbeEnclave,
     Stack,
     cyclone_stack,
     rclpy_stacks,
-    rmw_implementations,
 )
-from sros_tool.runtime.vendor_log import CYCLONE_EXPLAINS
 from sros_tool.translate import governance_for
 
 AUTO, RCLPY, CYCLONE = "auto", "rclpy", "cyclone"
@@ -34,7 +39,6 @@ _NO_RCLPY = (
     "Source a ROS 2 installation from packages (its Fast DDS has DDS Security built in), or use"
     " `--backend cyclone`."
 )
-_SPEAKS_DDS = ("rmw_fastrtps", "rmw_cyclonedds", "rmw_connext")
 _ON_THE_WIRE = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 """Without it, Fast DDS hands messages to a neighbour through shared memory, past the wire."""
 
@@ -91,11 +95,13 @@ class Backend:
         ``wire`` keeps its messages off shared memory; ``denied`` makes it say why.
         """
         on_ros = self.library(role, secured=secured) == RCLPY
-        variables = {"RMW_IMPLEMENTATION": self.rmw} if on_ros and self.rmw else {}
+        variables = {RMW: self.rmw} if on_ros and self.rmw else {}
         if on_ros and wire:
             variables |= _ON_THE_WIRE
-        if denied and (not on_ros or self.rmw.startswith("rmw_cyclonedds")):
+        if denied and not on_ros:
             variables |= CYCLONE_EXPLAINS
+        elif denied and (below := middleware_of(self.rmw)):
+            variables |= below.explains
         return variables
 
 
@@ -135,7 +141,7 @@ def _observing_rmw() -> str | None:
     if importlib.util.find_spec("rclpy") is None:
         return None
     names = rmw_implementations(os.environ)
-    fitting = [name for name in names if name.startswith(_SPEAKS_DDS)]
+    fitting = [name for name in names if vendor_of(name)]
     return fitting[0] if fitting else (None if names else "")
 
 

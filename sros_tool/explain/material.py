@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from sros_tool.dds.decision import Traits, Vendor
+from sros_tool.dds.decision import Traits
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
 from sros_tool.dds.permissions import render_permissions
@@ -19,7 +19,6 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.pki.crl import load_crl
 from sros_tool.policy.model import Enclave
-from sros_tool.runtime.stacks import rmw_implementations
 from sros_tool.translate import permissions_for
 from sros_tool.validity import window
 from sros_tool.xml import read_bytes
@@ -137,34 +136,3 @@ def _ends(state: EnclaveState, folder: Path) -> Iterator[tuple[str, datetime]]:
     if crl.exists():
         with suppress(SrosError):
             yield "crl.pem", load_crl(read_bytes(crl, "revocation list"), "").next_update
-
-
-_BY_RMW = (
-    ("fastrtps", Vendor.FAST),
-    ("cyclonedds", Vendor.CYCLONE),
-    ("connext", Vendor.CONNEXT),
-    ("opendds", Vendor.OPENDDS),
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """A vendor, and in a few words why it was chosen."""
-
-    vendor: Vendor
-    why: str
-
-
-def vendor_here(environment: Mapping[str, str]) -> Choice:
-    """The vendor of $RMW_IMPLEMENTATION, else of the RMW that is installed, else Fast DDS 2.14."""
-    named = environment.get("RMW_IMPLEMENTATION", "")
-    if vendor := _vendor_of(named):
-        return Choice(vendor, f"RMW_IMPLEMENTATION is {named}")
-    for rmw in rmw_implementations(environment):
-        if vendor := _vendor_of(rmw):
-            return Choice(vendor, f"{rmw} is installed here")
-    return Choice(Vendor.FAST, "what ROS 2 Jazzy uses unless told otherwise")
-
-
-def _vendor_of(rmw: str) -> Vendor | None:
-    return next((vendor for part, vendor in _BY_RMW if part in rmw), None)

@@ -26,14 +26,8 @@ from sros_tool.runtime.cyclone import (
 from sros_tool.runtime.events import EventWriter, Kind, Stage
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 from sros_tool.runtime.rcl_security import choose_enclave, domain_of
+from sros_tool.runtime.rmw import MIDDLEWARE
 
-_DDS_LIBRARIES = {
-    "libfastdds.so": "Fast DDS",
-    "libfastrtps.so": "Fast DDS",
-    "libddsc": "Cyclone DDS",
-    "libnddsc.so": "Connext",
-    "libzenohc.so": "Zenoh",
-}
 _LOG_FLUSH_SECONDS = 0.3
 
 Ask = Callable[[str, str], None]
@@ -145,9 +139,10 @@ def _report_failure(events: EventWriter, error: Exception, stage: Stage, asked: 
 
 def _dds_in_memory() -> str:
     """Name, version and file of the DDS that is loaded into this process, one per line; or ""."""
-    for prefix, name in _DDS_LIBRARIES.items():
-        for file in loaded_libraries(prefix):
-            return f"{name}\n{version_of(file)}\n{file}"
+    for each in MIDDLEWARE:
+        for prefix in each.libraries:
+            for file in loaded_libraries(prefix):
+                return f"{each.name}\n{version_of(file)}\n{file}"
     return ""
 
 

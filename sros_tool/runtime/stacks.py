@@ -24,8 +24,8 @@ from tempfile import TemporaryDirectory
 from sros_tool.runtime.cyclone import INSTALL_ADVICE
 from sros_tool.runtime.events import Event, Kind, Stage, read_events
 from sros_tool.runtime.netns import end_with_parent
+from sros_tool.runtime.rmw import RMW, middleware_of, rmw_implementations
 from sros_tool.runtime.vendor_log import (
-    CYCLONE_EXPLAINS,
     endpoint_refusal,
     missing_security,
     participant_refusal,
@@ -137,8 +137,6 @@ def _untried(why: str) -> Verdict:
 
 PROBE_SECONDS = 60.0
 
-_RMW_INDEX = "share/ament_index/resource_index/rmw_typesupport"
-_NOT_AN_RMW = "rmw_implementation"
 ROS_ADVICE = (
     "The ROS 2 packages of Ubuntu (ros-jazzy-ros-base) have DDS Security built in; the wheels on"
     " PyPI do not."
@@ -193,24 +191,6 @@ def rclpy_stacks(probe: ProbeEnclave) -> Iterator[Stack]:
         yield _probe_rmw(probe, name)
 
 
-def rmw_implementations(environment: Mapping[str, str]) -> tuple[str, ...]:
-    """The RMWs in the ament index, the one that rclpy would take first.
-
-    Read from the prefixes in AMENT_PREFIX_PATH, and from the prefix of this Python, in which the
-    wheels install theirs.
-    """
-    prefixes = [*environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
-    found = {
-        file.name
-        for prefix in prefixes
-        if prefix
-        for file in Path(prefix, _RMW_INDEX).glob("*")
-        if file.name != _NOT_AN_RMW
-    }
-    preferred = environment.get("RMW_IMPLEMENTATION") or "rmw_fastrtps_cpp"
-    return tuple(sorted(found, key=lambda name: (name != preferred, name)))
-
-
 def cyclone_stack(probe: ProbeEnclave) -> Stack:
     """The Cyclone DDS that sros itself speaks with."""
     run = _run_probe("cyclone", probe, {})
@@ -261,8 +241,10 @@ def cyclonedds_package_stack(probe: ProbeEnclave) -> Stack:
 
 def _probe_rmw(probe: ProbeEnclave, rmw: str) -> Stack:
     variables = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}  # leaves nothing in shared memory
-    variables |= {"RMW_IMPLEMENTATION": rmw} if rmw else {}
-    variables |= CYCLONE_EXPLAINS if rmw.startswith("rmw_cyclonedds") else {}
+    if rmw:
+        variables[RMW] = rmw
+    if below := middleware_of(rmw):
+        variables |= below.explains
     run = _run_probe("rclpy", probe, variables)
     verdict = judge(run, probe.allowed, probe.denied)
     dds, version, where = _identity(run)

@@ -501,12 +501,6 @@ DIRECTIONS: Mapping[str, re.Pattern[str]] = {
 }
 """The words, in lines near a denied topic, for the kind of endpoint that was to be created."""
 
-CYCLONE_EXPLAINS = {
-    "CYCLONEDDS_URI": "<CycloneDDS><Domain><Tracing><Category>fatal,error,warning,trace</Category>"
-    "<OutputFile>stderr</OutputFile></Tracing></Domain></CycloneDDS>"
-}
-"""Variables that make Cyclone DDS say why it denies a topic, which only its trace does."""
-
 # ── reading ────────────────────────────────────────────────────────────────────────────────
 
 

@@ -10,7 +10,7 @@ import pytest
 from sros_tool.errors import UnavailableError
 from sros_tool.runtime import netns
 from sros_tool.runtime.cyclone import FOLDER_VARIABLE, load_cyclone, version_of
-from sros_tool.runtime.stacks import rmw_implementations
+from sros_tool.runtime.rmw import rmw_implementations
 from tests.support.children import python
 
 
