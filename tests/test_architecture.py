@@ -11,7 +11,8 @@ PROJECT = Path(__file__).parents[1]
 PACKAGE = PROJECT / "sros_tool"
 
 FLOORS = {
-    1: {"errors", "names", "validity", "values", "xml", "files", "parallel", "resources"},
+    1: {"errors", "faults", "names", "validity", "values"}
+    | {"xml", "files", "parallel", "resources"},
     2: {"pki", "policy", "dds"},
     3: {"translate"},
     4: {"keystore", "graph", "runtime"},

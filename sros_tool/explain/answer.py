@@ -34,6 +34,7 @@ from sros_tool.errors import SrosError
 from sros_tool.explain.material import Material, from_policy
 from sros_tool.explain.question import OWN_PARTS, Part, Question
 from sros_tool.explain.remedy import remedy
+from sros_tool.faults import Fault
 from sros_tool.keystore.layout import LEDGER
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.loading import Problem
@@ -61,10 +62,10 @@ _WORST = (
     Outcome.ALLOWED,
 )
 _UNTOLD_LOCALLY = {
-    (Vendor.CYCLONE, "key-mismatch"),
-    (Vendor.FAST, "key-algorithm"),
-    (Vendor.FAST_2_9, "key-algorithm"),
-    (Vendor.FAST_2_9, "document-size"),
+    (Vendor.CYCLONE, Fault.KEY_MISMATCH),
+    (Vendor.FAST, Fault.KEY_ALGORITHM),
+    (Vendor.FAST_2_9, Fault.KEY_ALGORITHM),
+    (Vendor.FAST_2_9, Fault.DOCUMENT_SIZE),
 }
 """What a vendor does not notice itself, but every peer does."""
 
@@ -153,16 +154,16 @@ class Judge:
         material, setting = self._material, self._setting
         if self._problems:
             first = self._problems[0]
-            untold = all((self._vendor, each.code) in _UNTOLD_LOCALLY for each in self._problems)
+            untold = all((self._vendor, each.fault) in _UNTOLD_LOCALLY for each in self._problems)
             outcome = Outcome.PEER_DENIES if untold else Outcome.REFUSED
-            return Decision(outcome, first.code, f"{self._vendor.title}: {first}.")
+            return Decision(outcome, first.fault.id, f"{self._vendor.title}: {first}.")
         governance = _governance_as(self._vendor, material.governance)
         if isinstance(governance, Refusal):
-            return replace(governance.decision(), reason="governance-malformed")
+            return replace(governance.decision(), reason=Fault.GOVERNANCE_MALFORMED.id)
         self._governance = governance
         permissions = read_permissions_as(self._vendor, material.permissions)
         if isinstance(permissions, Refusal):
-            return replace(permissions.decision(), reason="permissions-malformed")
+            return replace(permissions.decision(), reason=Fault.PERMISSIONS_MALFORMED.id)
         self._permissions = permissions
         return Access(
             self._vendor,
@@ -549,7 +550,7 @@ def _change(case: Case, answer: Answer, known: Provenance | None) -> tuple[Chang
 
 def _remedy(case: Case, answer: Answer, reason: str) -> str:
     root = str(case.root) if case.root else ""
-    faulty = (each.file for each in answer.problems if each.code == reason)
+    faulty = (each.file for each in answer.problems if each.fault.id == reason)
     return remedy(reason, root, case.material.enclave, next(faulty, ""))
 
 

@@ -17,6 +17,7 @@ from sros_tool.explain.denials import Denial, nodes_served, read_denials, servin
 from sros_tool.explain.material import Material
 from sros_tool.explain.question import Part, Question, ask
 from sros_tool.explain.remedy import remedy
+from sros_tool.faults import Fault
 from sros_tool.graph.observation import PUBLISH
 from sros_tool.policy.patterns import covers
 from sros_tool.runtime.vendor_log import (
@@ -216,12 +217,12 @@ class _Eye:
             first.cause,
             meaning.remedy.format(**first.quoted),
         )
-        looked_at = meaning.codes or meaning.id == "service"
+        looked_at = meaning.faults or meaning.id == "service"
         material = self._look(first.enclave) if looked_at else None
         if material is None:
             return plain
         answer = self._answer(material, meaning.vendor or Vendor.FAST, ask("join"))
-        causes = list(self._causes(material, answer, meaning.codes))
+        causes = list(self._causes(material, answer, meaning.faults))
         if meaning.id == "service" and not causes:
             return replace(plain, enclave=material.enclave, found=_nodes(answer), checked=True)
         causes = causes or list(self._out_of_domain(material, answer, first))
@@ -276,12 +277,12 @@ class _Eye:
         return Judge(vendor, material, self._setting(material)).answer(question)
 
     def _causes(
-        self, material: Material, answer: Answer, codes: tuple[str, ...]
+        self, material: Material, answer: Answer, faults: tuple[Fault, ...]
     ) -> Iterator[tuple[str, str]]:
         """The faults of an enclave, those first that the message can stand for."""
-        fitting = [each for each in answer.problems if each.code in codes]
+        fitting = [each for each in answer.problems if each.fault in faults]
         for each in fitting or answer.problems:
-            yield str(each), remedy(each.code, self._root, material.enclave, each.file)
+            yield str(each), remedy(each.fault, self._root, material.enclave, each.file)
         if not answer.problems and not answer.allowed:
             decision = answer.deciding.decision
             yield decision.text, remedy(decision.reason, self._root, material.enclave)
@@ -306,7 +307,7 @@ class _Eye:
         yield (
             f"the governance is for domain {governed}: the process was in {where}, or had another "
             "governance then",
-            remedy("governance-domain", self._root, material.enclave).replace(
+            remedy(Fault.GOVERNANCE_DOMAIN, self._root, material.enclave).replace(
                 "domain of the keystore", f"domain of the keystore, such as {next(iter(governed))}"
             ),
         )

@@ -13,7 +13,8 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
 from sros_tool.dds.permissions import render_permissions
 from sros_tool.errors import SrosError
-from sros_tool.keystore.layout import REQUEST
+from sros_tool.faults import Fault
+from sros_tool.keystore.layout import KEY_FILE, REQUEST
 from sros_tool.keystore.loading import EnclaveState, Problem, check_enclave, vendor_problems
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
@@ -25,16 +26,17 @@ from sros_tool.xml import read_bytes
 
 _LEFT_TO_THE_VENDOR = frozenset(
     {
-        "governance-domain",
-        "governance-malformed",
-        "permissions-domain",
-        "permissions-expired",
-        "permissions-malformed",
-        "permissions-not-yet-valid",
-        "permissions-subject",
+        Fault.GOVERNANCE_DOMAIN,
+        Fault.GOVERNANCE_MALFORMED,
+        Fault.PERMISSIONS_DOMAIN,
+        Fault.PERMISSIONS_EXPIRED,
+        Fault.PERMISSIONS_MALFORMED,
+        Fault.PERMISSIONS_NOT_YET_VALID,
+        Fault.PERMISSIONS_SUBJECT,
     }
 )
 """Faults of documents that every vendor judges by rules of its own."""
+_NO_KEY = (Fault.FILE_MISSING, KEY_FILE)
 
 _PLANNED = timedelta(days=365)
 
@@ -65,13 +67,11 @@ class Material:
         """Those that keep a process of a vendor from running, whatever the documents say."""
         if self.state is None or self.at is None:
             return ()
-        passed_over = _LEFT_TO_THE_VENDOR | (
-            {"file-missing key.pem"} if self.key_elsewhere else set()
-        )
         return tuple(
             each
             for each in vendor_problems(traits, self.state, self.at)
-            if each.code not in passed_over and f"{each.code} {each.file}" not in passed_over
+            if each.fault not in _LEFT_TO_THE_VENDOR
+            and not (self.key_elsewhere and (each.fault, each.file) == _NO_KEY)
         )
 
 

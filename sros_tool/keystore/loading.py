@@ -29,6 +29,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions, parse_permissions
 from sros_tool.errors import PkiError, SrosError
+from sros_tool.faults import Fault
 from sros_tool.keystore.layout import IDENTITY, REQUIRED_FILES
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
@@ -43,25 +44,32 @@ from sros_tool.pki.chains import chain_fault
 from sros_tool.pki.crl import signed_by
 from sros_tool.pki.keys import algorithm, load_key
 from sros_tool.validity import Window, iso
+from sros_tool.values import shows
 from sros_tool.xml import read_bytes
 
 Parsed = TypeVar("Parsed")
 
 _OWN = "cert.pem"
+_CERTIFICATE_ENDS = (Fault.CERTIFICATE_EXPIRED, Fault.CERTIFICATE_NOT_YET_VALID)
+_CA_ENDS = (Fault.CA_EXPIRED, Fault.CA_NOT_YET_VALID)
+_PERMISSIONS_ENDS = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
 _ENCRYPTED = re.compile(rb"ENCRYPTED")
 _SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
 
 
+@shows("file", "text", "code")
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """Something that keeps a process from running in an enclave; ``file`` is what it lies in.
-
-    ``code`` is a stable word for programs, such as ``key-mismatch`` or ``certificate-expired``.
-    """
+    """A fault that keeps a process from running in an enclave: in which file, and why there."""
 
     file: str
     text: str
-    code: str = ""
+    fault: Fault
+
+    @property
+    def code(self) -> str:
+        """The stable word for programs, such as ``key-mismatch``."""
+        return self.fault.id
 
     def __str__(self) -> str:
         return f"{self.file}: {self.text}"
@@ -131,15 +139,19 @@ class _Check:
         self._revocation(certificate, identity_ca)
         governance = permissions = None
         if (document := self._signed("governance.p7s", files, permissions_ca)) is not None:
-            governance = self._parsed("governance.p7s", document, _governance)
+            governance = self._parsed(
+                "governance.p7s", document, _governance, Fault.GOVERNANCE_MALFORMED
+            )
         if (document := self._signed("permissions.p7s", files, permissions_ca)) is not None:
             self._permissions_document = document
-            permissions = self._parsed("permissions.p7s", document, parse_permissions)
+            permissions = self._parsed(
+                "permissions.p7s", document, parse_permissions, Fault.PERMISSIONS_MALFORMED
+            )
         if governance and domain is not None and domain not in governance.domains().closed():
             self._fault(
                 "governance.p7s",
                 f"it is for domain {governance.domains().closed()}, not for {domain}",
-                "governance-domain",
+                Fault.GOVERNANCE_DOMAIN,
             )
         if permissions and certificate:
             self._grant(permissions, certificate, domain)
@@ -155,24 +167,26 @@ class _Check:
             self._permissions_document,
         )
 
-    def _fault(self, file: str, text: str, code: str) -> None:
-        self._problems.append(Problem(file, text, code))
+    def _fault(self, file: str, text: str, fault: Fault) -> None:
+        self._problems.append(Problem(file, text, fault))
 
     def _read(self, name: str) -> bytes | None:
         path = self._folder / name
         if not path.exists():
             if path.is_symlink():
-                self._fault(name, f"it is a link to nothing ({path.readlink()})", "link-dangling")
+                self._fault(
+                    name, f"it is a link to nothing ({path.readlink()})", Fault.LINK_DANGLING
+                )
             else:
-                self._fault(name, "missing", "file-missing")
+                self._fault(name, "missing", Fault.FILE_MISSING)
             return None
         try:
             data = read_bytes(path, "file")
         except SrosError as error:
-            self._fault(name, f"it cannot be read: {error.why.rstrip('.')}", "file-unreadable")
+            self._fault(name, f"it cannot be read: {error.why.rstrip('.')}", Fault.FILE_UNREADABLE)
             return None
         if not data:
-            self._fault(name, "it is empty", "file-empty")
+            self._fault(name, "it is empty", Fault.FILE_EMPTY)
             return None
         return data
 
@@ -183,17 +197,21 @@ class _Check:
         try:
             certificate = _certificate(data, name)
         except SrosError as error:
-            self._fault(name, error.why.rstrip("."), "certificate-malformed")
+            self._fault(name, error.why.rstrip("."), Fault.CERTIFICATE_MALFORMED)
             return None
-        self._valid_now(name, validity_of(certificate), "certificate" if name == _OWN else "ca")
+        self._valid_now(
+            name, validity_of(certificate), _CERTIFICATE_ENDS if name == _OWN else _CA_ENDS
+        )
         return certificate
 
-    def _valid_now(self, name: str, validity: Window, what: str) -> None:
+    def _valid_now(self, name: str, validity: Window, faults: tuple[Fault, Fault]) -> None:
+        """Note it if it expired, or is not valid yet: the first or the second of ``faults``."""
+        expired, not_yet_valid = faults
         if self._now > validity.not_after:
-            self._fault(name, f"it expired at {iso(validity.not_after)}", f"{what}-expired")
+            self._fault(name, f"it expired at {iso(validity.not_after)}", expired)
         elif self._now < validity.not_before:
             begin = iso(validity.not_before)
-            self._fault(name, f"it is not valid before {begin}", f"{what}-not-yet-valid")
+            self._fault(name, f"it is not valid before {begin}", not_yet_valid)
 
     def _identity(
         self, certificate: x509.Certificate | None, ca: x509.Certificate | None, key: bytes | None
@@ -203,18 +221,18 @@ class _Check:
                 "cert.pem",
                 f"it was not issued by the identity CA of the enclave ({subject_text(ca.subject)}) "
                 f"but by {subject_text(certificate.issuer)}",
-                "certificate-issuer",
+                Fault.CERTIFICATE_ISSUER,
             )
         if key is None:
             return
         try:
             private = load_key(key, "key.pem")
         except SrosError as error:
-            code = "key-encrypted" if _ENCRYPTED.search(key) else "key-malformed"
-            self._fault("key.pem", error.why.rstrip("."), code)
+            fault = Fault.KEY_ENCRYPTED if _ENCRYPTED.search(key) else Fault.KEY_MALFORMED
+            self._fault("key.pem", error.why.rstrip("."), fault)
             return
         if certificate and not same_key(certificate, private):
-            self._fault("key.pem", "it is not the key of cert.pem", "key-mismatch")
+            self._fault("key.pem", "it is not the key of cert.pem", Fault.KEY_MISMATCH)
 
     def _revocation(
         self, certificate: x509.Certificate | None, ca: x509.Certificate | None
@@ -226,22 +244,22 @@ class _Check:
             crl, authentic = _revocation_list(read_bytes(path, "revocation list"), ca)
         except (SrosError, ValueError):
             text = "it is not a revocation list, and DDS then refuses everybody"
-            self._fault("crl.pem", text, "crl-malformed")
+            self._fault("crl.pem", text, Fault.CRL_MALFORMED)
             return
         if not authentic:
             text = "it is not of the identity CA, and DDS then refuses everybody"
-            self._fault("crl.pem", text, "crl-issuer")
+            self._fault("crl.pem", text, Fault.CRL_ISSUER)
         if crl.last_update_utc > self._now:
             self._fault(
                 "crl.pem",
                 f"it is not valid before {iso(crl.last_update_utc)}: everybody is refused",
-                "crl-not-yet-valid",
+                Fault.CRL_NOT_YET_VALID,
             )
         if crl.next_update_utc and crl.next_update_utc < self._now:
             text = f"it expired at {iso(crl.next_update_utc)}: everybody is refused"
-            self._fault("crl.pem", text, "crl-expired")
+            self._fault("crl.pem", text, Fault.CRL_EXPIRED)
         if certificate and crl.get_revoked_certificate_by_serial_number(certificate.serial_number):
-            self._fault("cert.pem", "it is revoked by crl.pem", "revoked")
+            self._fault("cert.pem", "it is revoked by crl.pem", Fault.REVOKED)
 
     def _signed(
         self, name: str, files: dict[str, bytes | None], authority: x509.Certificate | None
@@ -252,18 +270,21 @@ class _Check:
         try:
             return _content(data, authority)
         except SrosError as error:
-            code = "signature" if _SIGNED.search(data[:1000]) else "not-signed"
-            self._fault(name, str(error), code)
+            fault = Fault.SIGNATURE if _SIGNED.search(data[:1000]) else Fault.NOT_SIGNED
+            self._fault(name, str(error), fault)
             return None
 
     def _parsed(
-        self, name: str, document: bytes, read: Callable[[bytes, str], Parsed]
+        self,
+        name: str,
+        document: bytes,
+        read: Callable[[bytes, str], Parsed],
+        malformed: Fault,
     ) -> Parsed | None:
         try:
             return read(document, name)
         except SrosError as error:
-            code = f"{name.removesuffix('.p7s')}-malformed"
-            self._fault(name, error.why.rstrip(".") or error.what, code)
+            self._fault(name, error.why.rstrip(".") or error.what, malformed)
             return None
 
     def _grant(
@@ -275,17 +296,17 @@ class _Check:
         if not grants:
             others = ", ".join(grant.subject for grant in permissions.grants)
             text = f"it has no grant for {subject}, only for {others or 'nobody'}"
-            self._fault(name, text, "permissions-subject")
+            self._fault(name, text, Fault.PERMISSIONS_SUBJECT)
             return
         grant = grants[0]
         try:
-            self._valid_now(name, grant.validity, "permissions")
+            self._valid_now(name, grant.validity, _PERMISSIONS_ENDS)
         except SrosError as error:  # it ends before it begins
-            self._fault(name, error.what, "permissions-malformed")
+            self._fault(name, error.what, Fault.PERMISSIONS_MALFORMED)
         rules = [rule for rule in grant.rules if rule.allow]
         if domain is not None and not any(domain in rule.domains.closed() for rule in rules):
             text = f"no rule of it allows anything in domain {domain}"
-            self._fault(name, text, "permissions-domain")
+            self._fault(name, text, Fault.PERMISSIONS_DOMAIN)
 
 
 MEASURED = (Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE)
@@ -295,8 +316,10 @@ Certificates = tuple[x509.Certificate, ...]
 IDENTITY_CA, PERMISSIONS_CA = "identity_ca.cert.pem", "permissions_ca.cert.pem"
 CERTIFICATE, GOVERNANCE, PERMISSIONS = "cert.pem", "governance.p7s", "permissions.p7s"
 _SIDES = ((IDENTITY_CA, CERTIFICATE), (PERMISSIONS_CA, GOVERNANCE, PERMISSIONS))
-_JUDGED = frozenset({"ca-expired", "ca-not-yet-valid", "certificate-issuer", "signature"})
-"""Problems that do not hold for every vendor."""
+_JUDGED = frozenset(
+    {Fault.CA_EXPIRED, Fault.CA_NOT_YET_VALID, Fault.CERTIFICATE_ISSUER, Fault.SIGNATURE}
+)
+"""Faults that do not hold for every vendor."""
 
 _certificates = lru_cache(maxsize=16)(load_certificates)
 
@@ -306,14 +329,16 @@ def vendor_problems(traits: Traits, state: EnclaveState, at: datetime) -> tuple[
 
     Those of its documents' content are not among them, beyond what `EnclaveState` says.
     """
-    kept = [each for each in state.problems if each.code not in _JUDGED]
+    kept = [each for each in state.problems if each.fault not in _JUDGED]
     # What is wrong with these for every vendor is not told twice.
-    known = {each.file for each in kept if each.file == CERTIFICATE or each.code == "not-signed"}
+    known = {
+        each.file for each in kept if each.file == CERTIFICATE or each.fault is Fault.NOT_SIGNED
+    }
     faults = [each for each in _faults(traits, state, at) if each.file not in known]
     for side in _SIDES:
         of_side = [each for each in faults if each.file in side]
         files = {each.file for each in of_side} | ({side[0]} if of_side else set())
-        named = [each for each in state.problems if each.code in _JUDGED and each.file in files]
+        named = [each for each in state.problems if each.fault in _JUDGED and each.file in files]
         kept += named or of_side
     return tuple(kept)
 
@@ -335,11 +360,11 @@ def _faults(traits: Traits, state: EnclaveState, at: datetime) -> Iterator[Probl
         if not signers or file not in state.files:
             continue
         if text := _signature_fault(traits, state.files[file], signers, at):
-            yield Problem(file, text, "signature")
+            yield Problem(file, text, Fault.SIGNATURE)
     largest = traits.largest_document
     if largest is not None and state.permissions_bytes > largest:
         text = f"it has {state.permissions_bytes} bytes, and from {MAX_SIGNED_BYTES} on the "
-        yield Problem(PERMISSIONS, f"{text}handshake never ends", "document-size")
+        yield Problem(PERMISSIONS, f"{text}handshake never ends", Fault.DOCUMENT_SIZE)
 
 
 @lru_cache(maxsize=8)
@@ -354,19 +379,19 @@ def _signature_fault(traits: Traits, message: bytes, signers: Certificates, at: 
 @lru_cache(maxsize=16)
 def authority_fault(
     traits: Traits, certificates: Certificates, at: datetime
-) -> tuple[str, str] | None:
-    """Why the vendor refuses a CA file as such, and the code of the problem.
+) -> tuple[str, Fault] | None:
+    """Why the vendor refuses a CA file as such, and the fault.
 
     ``certificates`` are those of the file, in their order.
     """
     trusted = _trusted(traits, certificates)
     if not trusted:
         name = subject_text(certificates[0].subject)
-        return f"{name} is not signed with SHA-256", "signature-hash"
+        return f"{name} is not signed with SHA-256", Fault.SIGNATURE_HASH
     if traits.verifies_authorities:
         fault = chain_fault(certificates[0], trusted, at=at, strict=True)
         if fault:
-            return f"it is refused: {fault}", "ca-chain"
+            return f"it is refused: {fault}", Fault.CA_CHAIN
     return None
 
 
@@ -455,13 +480,13 @@ def _identity_faults(
     traits: Traits, certificate: x509.Certificate, authorities: Certificates, at: datetime
 ) -> Iterator[Problem]:
     if not _hash_fits(traits, certificate):
-        yield Problem(CERTIFICATE, "it is not signed with SHA-256", "signature-hash")
+        yield Problem(CERTIFICATE, "it is not signed with SHA-256", Fault.SIGNATURE_HASH)
     for file, each in ((CERTIFICATE, certificate), (IDENTITY_CA, authorities[0])):
         if not _key_fits(traits, each):
             text = f"it has a key of {algorithm(each.public_key())}"
-            yield Problem(file, text, "key-algorithm")
+            yield Problem(file, text, Fault.KEY_ALGORITHM)
     if fault := chain_fault(certificate, _trusted(traits, authorities), at=at):
-        yield Problem(CERTIFICATE, fault, "certificate-issuer")
+        yield Problem(CERTIFICATE, fault, Fault.CERTIFICATE_ISSUER)
 
 
 def _key_fits(traits: Traits, certificate: x509.Certificate) -> bool:

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 from sros_tool.dds.decision import Vendor
+from sros_tool.faults import Fault
 
 # ── the kinds of rows ──────────────────────────────────────────────────────────────────────
 
@@ -43,8 +44,8 @@ class LogText:
 
     ``pattern`` is searched in a line without colours; its groups are fields such as ``path``,
     ``domain`` and ``topic``.  ``cause`` and ``remedy`` may use them in braces; ``cause`` is ""
-    where the text alone does not give one.  Many texts stand for several causes: ``codes`` are the
-    faults of an enclave (`Problem.code`) among which the true one is found by looking at the
+    where the text alone does not give one.  Many texts stand for several causes: ``faults`` are the
+    faults of an enclave among which the true one is found by looking at the
     enclave, and ``unseen`` is what to do where the enclave has none of them.
 
     ``weak`` is 0 for a text that names a cause, and higher the less it says: of the texts of one
@@ -57,7 +58,7 @@ class LogText:
     pattern: re.Pattern[str]
     cause: str = ""
     remedy: str = ""
-    codes: tuple[str, ...] = ()
+    faults: tuple[Fault, ...] = ()
     unseen: str = ""
     weak: int = 0
     refuses: Refused | None = None
@@ -69,29 +70,39 @@ def _text(
     pattern: str,
     cause: str = "",
     remedy: str = "",
-    codes: tuple[str, ...] = (),
+    faults: tuple[Fault, ...] = (),
     *,
     unseen: str = "",
     weak: int = 0,
     refuses: Refused | None = None,
 ) -> LogText:
     expression = re.compile(pattern, re.IGNORECASE)
-    return LogText(name, vendor, expression, cause, remedy, codes, unseen, weak, refuses)
+    return LogText(name, vendor, expression, cause, remedy, faults, unseen, weak, refuses)
 
 
 # ── the table ──────────────────────────────────────────────────────────────────────────────
 
-_CERTIFICATE = ("certificate-expired", "certificate-not-yet-valid", "certificate-issuer")
-_CA = ("ca-expired", "ca-not-yet-valid")
-_CRL = ("crl-expired", "crl-malformed", "crl-issuer", "crl-not-yet-valid", "revoked")
-_FILES = ("file-missing", "file-empty", "file-unreadable", "link-dangling")
-_KEY = ("key-encrypted", "key-malformed")
-_SIGNATURE = ("signature", "not-signed")
-_GRANT = ("permissions-expired", "permissions-not-yet-valid", "permissions-subject")
-_DOCUMENT = ("permissions-malformed", "governance-malformed")
+_CERTIFICATE = (
+    Fault.CERTIFICATE_EXPIRED,
+    Fault.CERTIFICATE_NOT_YET_VALID,
+    Fault.CERTIFICATE_ISSUER,
+)
+_CA = (Fault.CA_EXPIRED, Fault.CA_NOT_YET_VALID)
+_CRL = (
+    Fault.CRL_EXPIRED,
+    Fault.CRL_MALFORMED,
+    Fault.CRL_ISSUER,
+    Fault.CRL_NOT_YET_VALID,
+    Fault.REVOKED,
+)
+_FILES = (Fault.FILE_MISSING, Fault.FILE_EMPTY, Fault.FILE_UNREADABLE, Fault.LINK_DANGLING)
+_KEY = (Fault.KEY_ENCRYPTED, Fault.KEY_MALFORMED)
+_SIGNATURE = (Fault.SIGNATURE, Fault.NOT_SIGNED)
+_GRANT = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID, Fault.PERMISSIONS_SUBJECT)
+_DOCUMENT = (Fault.PERMISSIONS_MALFORMED, Fault.GOVERNANCE_MALFORMED)
 _ALL = (
-    *_CERTIFICATE, "certificate-malformed", *_CA, *_CRL, *_FILES, *_KEY, "key-mismatch",
-    *_SIGNATURE, *_GRANT, *_DOCUMENT, "governance-domain", "permissions-domain",
+    *_CERTIFICATE, Fault.CERTIFICATE_MALFORMED, *_CA, *_CRL, *_FILES, *_KEY, Fault.KEY_MISMATCH,
+    *_SIGNATURE, *_GRANT, *_DOCUMENT, Fault.GOVERNANCE_DOMAIN, Fault.PERMISSIONS_DOMAIN,
 )  # fmt: skip
 
 _CHECK = "Name the keystore and the enclave, and the true cause is looked for there."
@@ -166,51 +177,52 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "peer-handshake", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed",
         "a PEER failed to prove who it is: most often its key.pem is not the key of its cert.pem, "
         "which Cyclone DDS does not notice on its own side; or it is of another DDS or version",
-        "Run `sros verify` or `sros inspect` on the enclave of every peer.", ("key-mismatch",),
+        "Run `sros verify` or `sros inspect` on the enclave of every peer.", (Fault.KEY_MISMATCH,),
     ),
     # ── Cyclone DDS, starting ──────────────────────────────────────────────────────────────
     _text(
         "certificate-expired", _CYCLONE, r"Certificate not valid: error: certificate has expired",
         "the certificate of the enclave or of its identity CA has expired; which, it does not say",
-        _RENEW, ("certificate-expired", "ca-expired"),
+        _RENEW, (Fault.CERTIFICATE_EXPIRED, Fault.CA_EXPIRED),
     ),
     _text(
         "certificate-not-yet-valid", _CYCLONE, r"Certificate not valid: error: certificate is not "
         r"yet valid", "the certificate of the enclave or of its identity CA is not valid yet",
-        "Set the clock of the host.", ("certificate-not-yet-valid", "ca-not-yet-valid"),
+        "Set the clock of the host.", (Fault.CERTIFICATE_NOT_YET_VALID, Fault.CA_NOT_YET_VALID),
     ),
     _text(
         "certificate-issuer", _CYCLONE, r"Certificate not valid: error: unable to get "
         r"(?:local )?issuer certificate|Certificate not valid: error: self.signed",
         "the certificate was not issued by the identity CA that lies with it",
-        "Use the files of one keystore together.", ("certificate-issuer",),
+        "Use the files of one keystore together.", (Fault.CERTIFICATE_ISSUER,),
     ),
     _text(
         "revoked", _CYCLONE, r"Certificate not valid: error: certificate revoked",
         "the certificate of the enclave is revoked",
         "It is meant to be kept out; if it shall run again, make it again with another key: `sros "
         "create_enclave KEYSTORE ENCLAVE`.",
-        ("revoked",),
+        (Fault.REVOKED,),
     ),
     _text(
         "crl-expired", _CYCLONE, r"Certificate not valid: error: CRL (?:has expired|is not yet)",
         "the revocation list is out of date, so that everybody is refused",
-        "Sign it again: `sros crl KEYSTORE --refresh`.", ("crl-expired", "crl-not-yet-valid"),
+        "Sign it again: `sros crl KEYSTORE --refresh`.",
+        (Fault.CRL_EXPIRED, Fault.CRL_NOT_YET_VALID),
     ),
     _text(
         "crl-unreadable", _CYCLONE, r"Failed to read CRL",
         "crl.pem is not a revocation list, so that everybody is refused",
-        "Sign it again: `sros crl KEYSTORE --refresh`.", ("crl-malformed",),
+        "Sign it again: `sros crl KEYSTORE --refresh`.", (Fault.CRL_MALFORMED,),
     ),
     _text(
         "key-encrypted", _CYCLONE, r"Failed to parse certificate: .*(?:bad decrypt|empty password)",
         "it says certificate and means the key: key.pem is encrypted, and no passphrase is asked",
-        "Store key.pem without a passphrase, mode 0600.", ("key-encrypted",),
+        "Store key.pem without a passphrase, mode 0600.", (Fault.KEY_ENCRYPTED,),
     ),
     _text(
         "pem-unreadable", _CYCLONE, r"Failed to parse (?:certificate|private key)",
         "cert.pem or key.pem is no PEM file; it says certificate for both",
-        "Restore the file.", ("certificate-malformed", *_KEY, *_FILES),
+        "Restore the file.", (Fault.CERTIFICATE_MALFORMED, *_KEY, *_FILES),
     ),
     _text(
         "signature", _CYCLONE, r"PKCS7_signatureVerify:digest failure",
@@ -229,22 +241,22 @@ LOG_TEXTS: tuple[LogText, ...] = (
     ),
     _text(
         "permissions-expired", _CYCLONE, r"Permissions validity period expired(?P<when>[^)]*\))?",
-        "the permissions have expired", _RENEW, ("permissions-expired",),
+        "the permissions have expired", _RENEW, (Fault.PERMISSIONS_EXPIRED,),
     ),
     _text(
         "permissions-not-yet-valid", _CYCLONE, r"Permissions validity period has not started",
         "the permissions are not valid yet", "Set the clock of the host.",
-        ("permissions-not-yet-valid",),
+        (Fault.PERMISSIONS_NOT_YET_VALID,),
     ),
     _text(
         "permissions-subject", _CYCLONE, r"Subject name is invalid",
         "the permissions have no grant for the subject of this certificate: they belong to another "
-        "enclave, or to an earlier certificate", _SIGN, ("permissions-subject",),
+        "enclave, or to an earlier certificate", _SIGN, (Fault.PERMISSIONS_SUBJECT,),
     ),
     _text(
         "domain", _CYCLONE, r"Could not find domain (?P<domain>\d{1,9}) in governance",
         "the governance is not for domain {domain}",
-        _SET_DOMAIN, ("governance-domain",),
+        _SET_DOMAIN, (Fault.GOVERNANCE_DOMAIN,),
         refuses=Refused.PARTICIPANT,
     ),
     _text(
@@ -309,20 +321,20 @@ LOG_TEXTS: tuple[LogText, ...] = (
         r"|PKIDH::validate_local_identity :\s*\Z",
         "the identity is refused, and the reason is left out: the certificate or its CA is out of "
         "date, of another CA, damaged or revoked, or crl.pem is out of date or damaged",
-        _CHECK, (*_CERTIFICATE, "certificate-malformed", *_CA, *_CRL),
+        _CHECK, (*_CERTIFICATE, Fault.CERTIFICATE_MALFORMED, *_CA, *_CRL),
     ),
     _text(
         "ca", _FAST, r"Error '(?P<number>\d+)' verifying CA certificate"
         r"(?: for \S.*?: (?P<why>[a-z][\w ,()-]*?))?(?= \(\S+:\d+\)|\Z)",
         "the first certificate of a CA's file is not accepted (OpenSSL's error {number}: {why})",
-        _CHECK, (*_CA, "certificate-malformed"),
+        _CHECK, (*_CA, Fault.CERTIFICATE_MALFORMED),
         refuses=Refused.PARTICIPANT,
     ),
     _text(
         "key-mismatch", _FAST, r"Error verifying private key",
         "key.pem is not the key of cert.pem",
         "Restore the key, or give the enclave another: `sros renew KEYSTORE ENCLAVE --new-key`.",
-        ("key-mismatch",),
+        (Fault.KEY_MISMATCH,),
         refuses=Refused.PARTICIPANT,
     ),
     _text(
@@ -362,14 +374,14 @@ LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "domain-of-permissions", _FAST, r"Not found a rule allowing to use the domain_id",
         "the permissions are not for the domain of this process", _SET_DOMAIN,
-        ("permissions-domain",),
+        (Fault.PERMISSIONS_DOMAIN,),
         refuses=Refused.PARTICIPANT,
     ),
     _text(
         "domain", _FAST, r"Not found topic access rule for topic (?P<topic>[^\s)]+)",
         "the governance has no rule for the topic in the domain of this process: most often "
         "because it does not list that domain (ROS_DOMAIN_ID)", _SET_DOMAIN,
-        ("governance-domain",),
+        (Fault.GOVERNANCE_DOMAIN,),
         refuses=Refused.TOPIC,
     ),
     _text(

@@ -9,11 +9,11 @@ from pathlib import Path
 import pytest
 
 import sros_tool.dds.decision as decision
-import sros_tool.keystore.loading as verify
 from sros_tool.dds.decision import Verb
 from sros_tool.errors import UsageError
 from sros_tool.explain.question import TYPES, WORDS, ask
-from sros_tool.explain.remedy import known_words, remedy
+from sros_tool.explain.remedy import known_causes, remedy
+from sros_tool.faults import FAULTS, Fault
 from sros_tool.names import dds_names
 
 MEANT = {
@@ -68,9 +68,9 @@ def sources(module: object) -> str:
 
 
 def test_every_fault_of_an_enclave_has_a_remedy() -> None:
-    codes = set(re.findall(r'"((?:[a-z]+-)+[a-z]+|revoked|signature)"', sources(verify)))
-    assert {"key-mismatch", "crl-expired", "revoked", "file-missing"} <= codes
-    assert codes <= known_words()
+    assert {"key-mismatch", "crl-expired", "revoked", "file-missing"} <= set(FAULTS)
+    assert set(FAULTS) <= known_causes()
+    assert all(remedy(fault, "ks", "/a") for fault in Fault)
 
 
 def test_every_reason_of_a_decision_is_of_the_policy_or_has_a_remedy() -> None:
@@ -80,13 +80,13 @@ def test_every_reason_of_a_decision_is_of_the_policy_or_has_a_remedy() -> None:
         sources(decision),
     )
     assert {"no-grant", "expired", "domain-not-in-governance"} <= set(found)
-    assert set(found) - of_the_policy <= known_words()
+    assert set(found) - of_the_policy <= known_causes()
 
 
 def test_remedies_name_the_keystore_and_the_enclave() -> None:
     assert remedy("expired", "ks", "/a") == "Renew it: `sros renew ks /a`."
     assert remedy("no-rule", "ks", "/a") == ""
-    for word in known_words():
+    for word in known_causes():
         assert "{" not in remedy(word, "ks", "/a")
 
 

@@ -1,0 +1,328 @@
+"""What can be wrong with the files of an enclave, each with its title, its reason and its remedy.
+
+Keystores are read, checked and explained with these faults, and the messages of DDS vendors stand
+for some of them.  A command in a remedy is one that runs on a keystore with that fault, and mends
+it.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+
+_RCL = "rcl 9 (security.c) and the RMWs of ROS 2 Jazzy."
+_MEASURED = "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured."
+_CLOCK_BEHIND = "Often the clock of the robot is behind."
+
+_RENEW = "Renew it: `sros renew {root} {enclave}`."
+_NEW_KEY = "Give the enclave another key: `sros renew {root} {enclave} --new-key`."
+_CLOCK = "Set the clock of this host; if it is right, sign again: `sros renew {root} {enclave}`."
+_SIGN = "Sign the permissions again: `sros create_permission {root} {enclave} POLICY`."
+_COMPLETE = "Make what is missing: `sros create_enclave {root} {enclave}`."
+REPLACE = (
+    "Put a good one in its place: `rm {path} && sros create_enclave {root} {enclave}` takes that "
+    "of the keystore, or issues it again."
+)
+_RESTORE = "Restore {path} from a backup."
+_GOVERNANCE = (
+    "Every enclave depends on it: restore {root}/enclaves/governance.p7s from a backup, or, once "
+    "you have read {root}/enclaves/governance.xml, sign that again: `openssl smime -sign -text -in "
+    "{root}/enclaves/governance.xml -out {root}/enclaves/governance.p7s -signer "
+    "{root}/public/permissions_ca.cert.pem -inkey {root}/private/permissions_ca.key.pem`."
+)
+_AUTHORITY = (
+    "Replace the CA and what expired with it: `sros rotate_ca {root} --finish && sros renew {root} "
+    "--all-expiring 30d`; then restart all processes together."
+)
+_CRL = "Sign the list again: `sros crl {root} --refresh`, and export it to the robots again."
+_AUTHORITY_FILES = ("identity_ca.cert.pem", "permissions_ca.cert.pem")
+
+
+class Fault(Enum):
+    """A fault of an enclave's files that keeps a process from running in it.
+
+    ``id`` is stable, for programs.  ``title`` is a clause; ``why``, ``source`` and ``remedy`` are
+    sentences: what DDS makes of it, where that is specified or was measured, and what to do, with
+    ``{root}``, ``{enclave}`` and ``{path}`` for the keystore, the enclave and the file.
+    """
+
+    FILE_MISSING = (
+        "file-missing",
+        "a file that an enclave needs is missing",
+        "The node fails, or without Enforce runs unsecured; Fast DDS says \"couldn't find all "
+        'security files!" and never which.',
+        _RCL,
+        _COMPLETE,
+        {"permissions.p7s": _SIGN},
+    )
+    LINK_DANGLING = (
+        "link-dangling",
+        "a file of an enclave is a link to nothing",
+        "It counts as missing. It happens where an enclave is copied without what it links to; "
+        "`sros distribute_key` exports files in place of links.",
+        _RCL,
+        _COMPLETE,
+        {"permissions.p7s": _SIGN},
+    )
+    FILE_UNREADABLE = (
+        "file-unreadable",
+        "a file of an enclave cannot be read",
+        "DDS cannot read it either.",
+        _RCL,
+        "Let the user that runs the node read the file.",
+    )
+    FILE_EMPTY = (
+        "file-empty",
+        "a file of an enclave is empty",
+        "It was lost, perhaps on a full disk.",
+        _RCL,
+        REPLACE,
+        {
+            "governance.p7s": _GOVERNANCE,
+            "key.pem": _NEW_KEY,
+            "permissions.p7s": _SIGN,
+            **dict.fromkeys(_AUTHORITY_FILES, _RESTORE),
+        },
+    )
+    CERTIFICATE_MALFORMED = (
+        "certificate-malformed",
+        "a certificate that cannot be read",
+        "Every vendor refuses it.",
+        "RFC 5280; RFC 7468 (PEM).",
+        REPLACE,
+        dict.fromkeys(_AUTHORITY_FILES, _RESTORE),
+    )
+    CERTIFICATE_EXPIRED = (
+        "certificate-expired",
+        "the certificate of an enclave has expired",
+        "Fast DDS refuses it with an empty reason, Cyclone DDS with code 200.",
+        _MEASURED,
+        _RENEW,
+    )
+    CERTIFICATE_NOT_YET_VALID = (
+        "certificate-not-yet-valid",
+        "the certificate of an enclave is not valid yet",
+        f"Fast DDS refuses it with an empty reason. {_CLOCK_BEHIND}",
+        _MEASURED,
+        _CLOCK,
+    )
+    CERTIFICATE_ISSUER = (
+        "certificate-issuer",
+        "a certificate that another CA issued",
+        "Its own node refuses it; Fast DDS with an empty reason.",
+        "DDS-Security 1.1, 9.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
+        REPLACE,
+    )
+    CA_EXPIRED = (
+        "ca-expired",
+        "a CA that an enclave trusts has expired",
+        "Nothing that it issued or signed is accepted any more (Fast DDS: Error '10' verifying "
+        "CA certificate).",
+        _MEASURED,
+        _AUTHORITY,
+    )
+    CA_NOT_YET_VALID = (
+        "ca-not-yet-valid",
+        "a CA that an enclave trusts is not valid yet",
+        f"Nothing that it issued or signed is accepted. {_CLOCK_BEHIND}",
+        _MEASURED,
+        "Set the clock of this host.",
+    )
+    KEY_MALFORMED = (
+        "key-malformed",
+        "a private key that cannot be read",
+        'Fast DDS says "Error obtaining private key".',
+        _MEASURED,
+        _NEW_KEY,
+    )
+    KEY_ENCRYPTED = (
+        "key-encrypted",
+        "a private key that is protected by a passphrase",
+        'No RMW can give a passphrase, so no node can use it (Fast DDS: "Error obtaining private '
+        'key").',
+        "rmw_fastrtps 8.4 and rmw_cyclonedds 2.2 (they set no password property).",
+        f"{_NEW_KEY} Or keep it without a passphrase, which DDS never asks for: `openssl pkey -in "
+        "{path} -out FILE`, and protect it by mode 0600.",
+    )
+    KEY_MISMATCH = (
+        "key-mismatch",
+        "a private key that is not that of the certificate",
+        "Fast DDS refuses it; Cyclone DDS starts, and every peer ends the handshake.",
+        'Fast DDS 2.14.5 ("Error verifying private key"), Cyclone DDS 0.10.2; measured.',
+        _NEW_KEY,
+    )
+    CRL_MALFORMED = (
+        "crl-malformed",
+        "a revocation list that cannot be read",
+        "Fast DDS refuses itself and everybody, with an empty reason.",
+        "Fast DDS 2.14.5 (PKIDH.cpp); measured.",
+        _CRL,
+    )
+    CRL_ISSUER = (
+        "crl-issuer",
+        "a revocation list of another CA",
+        "No certificate can be verified with it, so everybody is refused.",
+        "RFC 5280, 6.3.3; Fast DDS 2.14.5; measured.",
+        _CRL,
+    )
+    CRL_NOT_YET_VALID = (
+        "crl-not-yet-valid",
+        "a revocation list that is not valid yet",
+        f"Everybody is refused. {_CLOCK_BEHIND}",
+        "RFC 5280, 5.1.2.4; Fast DDS 2.14.5.",
+        _CLOCK,
+    )
+    CRL_EXPIRED = (
+        "crl-expired",
+        "a revocation list that has expired",
+        "Everybody is refused, and Fast DDS says nothing about it.",
+        "RFC 5280, 5.1.2.5; Fast DDS 2.14.5; measured.",
+        _CRL,
+    )
+    REVOKED = (
+        "revoked",
+        "an enclave whose certificate is revoked",
+        "Everybody who reads crl.pem drops it, Fast DDS in silence.",
+        "RFC 5280, 5; Fast DDS 2.14.5; measured.",
+        "It is meant to be kept out. If not, give it a new key and certificate: `sros renew {root} "
+        "{enclave} --new-key`.",
+    )
+    NOT_SIGNED = (
+        "not-signed",
+        "a document that is not signed",
+        'Fast DDS says "Input data has not PKCS7 S/MIME format".',
+        "DDS-Security 1.1, 9.4.1.1; measured.",
+        _SIGN,
+        {"governance.p7s": _GOVERNANCE},
+    )
+    SIGNATURE = (
+        "signature",
+        "a document whose signature does not verify",
+        "It was changed, or another CA signed it: find out who did. The node fails (Fast DDS: "
+        "PKCS7 data verification failed). With one CA for both jobs it may be an enclave that "
+        "signed for itself, which DDS accepts.",
+        "DDS-Security 1.1, 9.4.1.1; Fast DDS 2.14.5; CVE-2023-24011 for Cyclone DDS 0.10.2.",
+        _SIGN,
+        {"governance.p7s": _GOVERNANCE},
+    )
+    GOVERNANCE_MALFORMED = (
+        "governance-malformed",
+        "a governance document that cannot be read",
+        'The node fails (Fast DDS: "Malformed governance file").',
+        "DDS-Security 1.1, 9.4.1.2 and omg_shared_ca_governance.xsd.",
+        _GOVERNANCE,
+    )
+    PERMISSIONS_MALFORMED = (
+        "permissions-malformed",
+        "a permissions document that cannot be read",
+        'The node fails (Fast DDS: "Malformed permissions file"; Cyclone DDS: code 137, 138).',
+        "DDS-Security 1.1, 9.4.1.3 and omg_shared_ca_permissions.xsd.",
+        _SIGN,
+    )
+    GOVERNANCE_DOMAIN = (
+        "governance-domain",
+        "governance that does not name the domain",
+        'The node dies with "Not found topic access rule for topic ros_discovery_info" (Fast '
+        'DDS) or "Could not find domain in governance" (Cyclone DDS, code 141).',
+        "DDS-Security 1.1, 9.4.1.2; measured.",
+        "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env {root} {enclave} --domain ID` "
+        "prints the variables; for another domain, make a keystore with `sros create_keystore "
+        "--domain`.",
+    )
+    PERMISSIONS_EXPIRED = (
+        "permissions-expired",
+        "permissions that have expired",
+        'Fast DDS says "Not found the identity subject name in permissions file", Cyclone DDS '
+        "code 147.",
+        _MEASURED,
+        _RENEW,
+    )
+    PERMISSIONS_NOT_YET_VALID = (
+        "permissions-not-yet-valid",
+        "permissions that are not valid yet",
+        f'Fast DDS says "Not found the identity subject name in permissions file". {_CLOCK_BEHIND}',
+        _MEASURED,
+        _CLOCK,
+    )
+    PERMISSIONS_SUBJECT = (
+        "permissions-subject",
+        "permissions for another subject",
+        "No grant fits the certificate. It happens where permissions of an earlier certificate, "
+        "or of another enclave, were put in place.",
+        'DDS-Security 1.1, 9.4.1.3; Fast DDS ("Not found the identity subject name"), Cyclone '
+        "DDS code 146.",
+        _SIGN,
+    )
+    PERMISSIONS_DOMAIN = (
+        "permissions-domain",
+        "permissions that allow nothing in the domain",
+        "The node starts on Fast DDS, and every peer refuses it; Cyclone DDS refuses it itself.",
+        "DDS-Security 1.1, 9.4.1.3; measured.",
+        f"Set ROS_DOMAIN_ID to a domain that they name, or sign them for this one. {_SIGN}",
+    )
+    CA_CHAIN = (
+        "ca-chain",
+        "a CA that a vendor does not accept as such",
+        "Fast DDS 2.14 verifies the CA itself, strictly.",
+        "RFC 5280, 6.1; Fast DDS 2.14.5 (FileProvider.cpp); measured.",
+        "Use a self-signed CA with keyCertSign, first in its file.",
+    )
+    SIGNATURE_HASH = (
+        "signature-hash",
+        "a certificate that is not signed with SHA-256",
+        "Fast DDS refuses other digests in a CA and in an enclave's certificate.",
+        "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp); measured.",
+        "Issue the certificate again with SHA-256, which every vendor takes.",
+    )
+    KEY_ALGORITHM = (
+        "key-algorithm",
+        "a key that not every vendor takes",
+        "Cyclone DDS takes EC prime256v1 and RSA of exactly 2048 bits alone; Fast DDS fails in its "
+        "handshake with Ed25519.",
+        "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5; measured.",
+        "Use keys of EC prime256v1, which every vendor takes.",
+    )
+    DOCUMENT_SIZE = (
+        "document-size",
+        "permissions that are too large for a handshake",
+        "The node starts, and its handshake with peers never finishes.",
+        "Fast DDS 2.9.1; measured.",
+        "Make the permissions smaller, with wildcards, or split the enclave.",
+    )
+
+    def __new__(cls, identifier: str, *_: object) -> Fault:
+        """Make the identifier the value."""
+        fault = object.__new__(cls)
+        fault._value_ = identifier
+        return fault
+
+    def __init__(
+        self,
+        identifier: str,
+        title: str,
+        why: str,
+        source: str,
+        remedy: str,
+        remedies: dict[str, str] | None = None,
+    ) -> None:
+        self.id = identifier
+        self.title = title
+        self.why = why
+        self.source = source
+        self.remedy = remedy
+        self._remedies = remedies or {}
+
+    def remedy_in(self, file: str) -> str:
+        """Return what to do where the fault lies in ``file``, with the fields of ``remedy``."""
+        return self._remedies.get(file, self.remedy)
+
+
+FAULTS = {fault.id: fault for fault in Fault}
+"""All faults by their ids."""
+
+VENDOR_FAULTS = (
+    Fault.CA_CHAIN,
+    Fault.SIGNATURE_HASH,
+    Fault.KEY_ALGORITHM,
+    Fault.DOCUMENT_SIZE,
+)
+"""Those that some vendors only find when they load an enclave."""
