@@ -292,7 +292,7 @@ def explain_access(
     from sros_tool.explain.material import from_folder
     from sros_tool.explain.question import ask
     from sros_tool.keystore.layout import enclave_path, list_enclaves
-    from sros_tool.keystore.reader import no_such_enclave
+    from sros_tool.keystore.missing import no_such_enclave
     from sros_tool.runtime.environment import choose_domain
 
     question = ask(action, name, kind)

@@ -255,7 +255,7 @@ def _shown(finding: Finding) -> Finding:
 
 
 def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> int:
-    from sros_tool.keystore.reader import describe_lifetime, parse_threshold, survey
+    from sros_tool.keystore.expiry import describe_lifetime, parse_threshold, survey
     from sros_tool.validity import iso
 
     threshold = parse_threshold(text)

@@ -104,7 +104,7 @@ def signed_material(
     """
     from sros_tool.explain.material import from_folder
     from sros_tool.keystore.layout import enclave_path, list_enclaves
-    from sros_tool.keystore.reader import no_such_enclave
+    from sros_tool.keystore.missing import no_such_enclave
 
     if root is None:
         folder = Path(name)
@@ -130,10 +130,10 @@ def _is_enclave(folder: Path) -> bool:
 
 def _name_of(folder: Path, place: Place) -> str:
     """The name of the enclave whose folder this is: the common name of its certificate."""
-    from sros_tool.keystore.loading import check_enclave
+    from sros_tool.keystore.reader import open_enclave
     from sros_tool.pki.certificates import common_name_of
 
-    certificate = check_enclave(folder, now=place.at).certificate
+    certificate = open_enclave(folder, now=place.at).certificate
     return common_name_of(certificate.subject) if certificate else ""
 
 
@@ -262,7 +262,7 @@ def show_reach(
 
 def _check_there(root: Path, enclave: str) -> None:
     from sros_tool.keystore.layout import enclave_names
-    from sros_tool.keystore.reader import no_such_enclave
+    from sros_tool.keystore.missing import no_such_enclave
 
     there = tuple(enclave_names(root))
     if enclave not in there:

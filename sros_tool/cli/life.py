@@ -72,8 +72,8 @@ def renew(
     for whoever has a copy of the files.  With --revoke-old nobody who reads the new crl.pem
     accepts it: restart the renewed processes first, then the others.
     """
+    from sros_tool.keystore.expiry import parse_threshold
     from sros_tool.keystore.lifecycle.renew import renew as work
-    from sros_tool.keystore.reader import parse_threshold
 
     root, names = split_root(words)
     if not names and all_expiring is None:

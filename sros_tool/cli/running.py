@@ -131,8 +131,8 @@ def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict
     ``domain_text`` is an option's value; without it $ROS_DOMAIN_ID counts.
     """
     from sros_tool.keystore.layout import enclave_path, list_enclaves
-    from sros_tool.keystore.loading import check_enclave
-    from sros_tool.keystore.reader import no_such_enclave
+    from sros_tool.keystore.missing import no_such_enclave
+    from sros_tool.keystore.reader import open_enclave
     from sros_tool.names import check_enclave_name
     from sros_tool.runtime.environment import (
         DOMAIN,
@@ -149,10 +149,10 @@ def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict
     if name not in names:
         raise no_such_enclave(root, name, names)
     folder = enclave_path(root, name)
-    state = check_enclave(folder, now=now())
+    state = open_enclave(folder, now=now())
     domains = state.domains()
     domain = choose_domain(domains, wanted, root) if domains else 0
-    state = check_enclave(folder, now=now(), domain=domain)
+    state = open_enclave(folder, now=now(), domain=domain)
     if state.problems:
         raise KeystoreError(
             f"a process cannot run in enclave {name}",

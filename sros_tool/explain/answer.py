@@ -37,7 +37,7 @@ from sros_tool.explain.remedy import remedy
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import LEDGER
 from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.loading import Problem
+from sros_tool.keystore.reader import Problem
 from sros_tool.names import dds_names, expand, is_expression
 from sros_tool.policy.document import write_policy
 from sros_tool.policy.model import (

@@ -15,7 +15,8 @@ from sros_tool.dds.permissions import render_permissions
 from sros_tool.errors import SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import KEY_FILE, REQUEST
-from sros_tool.keystore.loading import EnclaveState, Problem, check_enclave, vendor_problems
+from sros_tool.keystore.loading import vendor_problems
+from sros_tool.keystore.reader import OpenedEnclave, Problem, open_enclave
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.pki.crl import load_crl
@@ -58,7 +59,7 @@ class Material:
     domains: DomainSet | None
     signed: bytes = b""
     ends: tuple[tuple[str, datetime], ...] = ()
-    state: EnclaveState | None = None
+    state: OpenedEnclave | None = None
     at: datetime | None = None
     key_elsewhere: bool = False
     """Its key is on the robot on which it was made."""
@@ -77,7 +78,7 @@ class Material:
 
 def from_folder(name: str, folder: Path, *, at: datetime) -> Material:
     """What lies in the folder of an enclave, as it is at a moment."""
-    state = check_enclave(folder, now=at)
+    state = open_enclave(folder, now=at)
     governance, permissions = (
         _document(state.files.get(file, b"")) for file in ("governance.p7s", "permissions.p7s")
     )
@@ -123,7 +124,7 @@ def _domains(governance: bytes) -> DomainSet | None:
     return None
 
 
-def _ends(state: EnclaveState, folder: Path) -> Iterator[tuple[str, datetime]]:
+def _ends(state: OpenedEnclave, folder: Path) -> Iterator[tuple[str, datetime]]:
     certificates = {
         "cert.pem": state.certificate,
         "identity_ca.cert.pem": state.identity_ca,

@@ -25,8 +25,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     is_keystore,
 )
-from sros_tool.keystore.loading import EnclaveState, check_enclave
-from sros_tool.keystore.reader import load_settings
+from sros_tool.keystore.reader import OpenedEnclave, load_settings, open_enclave
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     load_certificate,
@@ -58,7 +57,7 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
             return {
                 "kind": "enclave",
                 "path": str(path),
-                **describe_enclave(check_enclave(path, now=now)),
+                **describe_enclave(open_enclave(path, now=now)),
             }
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
@@ -128,14 +127,14 @@ def _keystore(root: Path, now: datetime) -> Description:
 def _enclave_of(root: Path, name: str, now: datetime) -> Description:
     """An enclave of a keystore; that its key was made on its robot, where it stays, is no fault."""
     folder = enclave_path(root, name)
-    described = describe_enclave(check_enclave(folder, now=now))
+    described = describe_enclave(open_enclave(folder, now=now))
     elsewhere = (folder / REQUEST).exists() and not (folder / "key.pem").exists()
     if elsewhere and (folder / "cert.pem").exists():
         described["problems"] = [p for p in described["problems"] if p != "key.pem: missing"]
     return {"name": name, "key_on_robot": elsewhere, **described}
 
 
-def describe_enclave(state: EnclaveState) -> Description:
+def describe_enclave(state: OpenedEnclave) -> Description:
     """The state of an enclave: ``loadable`` says whether a process can run in it now."""
     domains = state.domains()
     return {

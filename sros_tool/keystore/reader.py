@@ -1,36 +1,43 @@
-"""Reads what a keystore says of itself: its choices, its governance, its domains."""
+"""The one way to read a keystore and an enclave: its parts, its grant, and what is wrong."""
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import re
-from collections.abc import Collection
-from dataclasses import dataclass
-from datetime import datetime, timedelta
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime
+from functools import lru_cache
 from pathlib import Path
+from typing import TypeVar
 
 from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
-from sros_tool.dds.permissions import Grant, parse_permissions
-from sros_tool.errors import InvalidNameError, KeystoreError, SrosError, UsageError
+from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
+from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     PERMISSIONS,
-    REVOKED,
+    REQUIRED_FILES,
     SETTINGS,
     ca_certificate,
-    enclave_folder,
-    list_enclaves,
 )
-from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.keystore.template import Template, load_template, read_template
-from sros_tool.names import check_enclave_name
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import load_certificate, subject_text, validity_of
-from sros_tool.validity import BACKDATE, Window, iso, parse_duration
+from sros_tool.pki.certificates import (
+    issued_by,
+    load_certificate,
+    same_key,
+    subject_text,
+    validity_of,
+)
+from sros_tool.pki.crl import signed_by
+from sros_tool.pki.keys import load_key
+from sros_tool.validity import Window, iso
+from sros_tool.values import shows
 from sros_tool.xml import read_bytes
 
 
@@ -93,212 +100,276 @@ def read_granted(path: Path, subject: str) -> Granted:
     return Granted(signed, hashlib.sha256(message).hexdigest(), grant)
 
 
+Parsed = TypeVar("Parsed")
+
+
+_OWN = "cert.pem"
+
+
+_CERTIFICATE_ENDS = (Fault.CERTIFICATE_EXPIRED, Fault.CERTIFICATE_NOT_YET_VALID)
+
+
+_CA_ENDS = (Fault.CA_EXPIRED, Fault.CA_NOT_YET_VALID)
+
+
+_PERMISSIONS_ENDS = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
+
+
+_ENCRYPTED = re.compile(rb"ENCRYPTED")
+
+
+_SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
+
+
+@shows("file", "text", "code")
 @dataclass(frozen=True, slots=True)
-class Lifetime:
-    """When what an enclave consists of ends, and how much of its life is over."""
+class Problem:
+    """A fault that keeps a process from running in an enclave: in which file, and why there."""
 
-    name: str
-    certificate: Window
-    permissions: Window
+    file: str
+    text: str
+    fault: Fault
 
-    def ends(self) -> datetime:
-        """The earlier of both ends."""
-        return min(self.certificate.not_after, self.permissions.not_after)
+    @property
+    def code(self) -> str:
+        """The stable word for programs, such as ``key-mismatch``."""
+        return self.fault.id
 
-    def due(self, threshold: Threshold, now: datetime) -> bool:
-        """Whether it is to be renewed by ``threshold``."""
-        if threshold.remaining is not None:
-            return self.ends() - now <= threshold.remaining
-        assert threshold.elapsed is not None
-        return any(
-            _elapsed(each, now) >= threshold.elapsed
-            for each in (self.certificate, self.permissions)
+    def __str__(self) -> str:
+        return f"{self.file}: {self.text}"
+
+
+@dataclass(frozen=True, slots=True)
+class OpenedEnclave:
+    """What the files of an enclave say, as far as they can be read, and what is wrong with them."""
+
+    certificate: x509.Certificate | None
+    identity_ca: x509.Certificate | None
+    permissions_ca: x509.Certificate | None
+    governance: Governance | None
+    permissions: Permissions | None
+    permissions_bytes: int
+    problems: tuple[Problem, ...]
+    files: Mapping[str, bytes] = field(default_factory=dict, repr=False)
+    """The bytes of the required files, of those that can be read."""
+    permissions_document: bytes = field(default=b"", repr=False)
+    """The XML within ``permissions.p7s``, also where it cannot be read as permissions."""
+
+    def domains(self) -> DomainSet | None:
+        """The domains that governance names, or None without governance."""
+        return self.governance.domains().closed() if self.governance else None
+
+
+# The enclaves of a keystore have all but their own files in common: these are read once.
+_certificate = lru_cache(maxsize=8)(load_certificate)
+
+
+_governance = lru_cache(maxsize=8)(parse_governance)
+
+
+@lru_cache(maxsize=8)
+def _content(message: bytes, authority: x509.Certificate | None) -> bytes:
+    signed = smime.parse(message)
+    if authority:
+        signed.verify(authority)
+    return signed.document
+
+
+@lru_cache(maxsize=8)
+def _revocation_list(
+    data: bytes, authority: x509.Certificate | None
+) -> tuple[x509.CertificateRevocationList, bool]:
+    """A revocation list, and whether it is of that authority."""
+    crl = x509.load_pem_x509_crl(data)
+    return crl, authority is None or signed_by(crl, authority)
+
+
+def open_enclave(folder: Path, *, now: datetime, domain: int | None = None) -> OpenedEnclave:
+    """Read and check the files of an enclave; with ``domain``, also whether it may join that."""
+    return _EnclaveFiles(folder, now).run(domain)
+
+
+class _EnclaveFiles:
+    def __init__(self, folder: Path, now: datetime) -> None:
+        self._folder = folder
+        self._now = now
+        self._problems: list[Problem] = []
+        self._permissions_document = b""
+
+    def run(self, domain: int | None) -> OpenedEnclave:
+        files = {name: self._read(name) for name in REQUIRED_FILES}
+        identity_ca = self._certificate("identity_ca.cert.pem", files)
+        permissions_ca = self._certificate("permissions_ca.cert.pem", files)
+        certificate = self._certificate("cert.pem", files)
+        self._identity(certificate, identity_ca, files["key.pem"])
+        self._revocation(certificate, identity_ca)
+        governance = permissions = None
+        if (document := self._signed("governance.p7s", files, permissions_ca)) is not None:
+            governance = self._parsed(
+                "governance.p7s", document, _governance, Fault.GOVERNANCE_MALFORMED
+            )
+        if (document := self._signed("permissions.p7s", files, permissions_ca)) is not None:
+            self._permissions_document = document
+            permissions = self._parsed(
+                "permissions.p7s", document, parse_permissions, Fault.PERMISSIONS_MALFORMED
+            )
+        if governance and domain is not None and domain not in governance.domains().closed():
+            self._fault(
+                "governance.p7s",
+                f"it is for domain {governance.domains().closed()}, not for {domain}",
+                Fault.GOVERNANCE_DOMAIN,
+            )
+        if permissions and certificate:
+            self._grant(permissions, certificate, domain)
+        return OpenedEnclave(
+            certificate,
+            identity_ca,
+            permissions_ca,
+            governance,
+            permissions,
+            len(files["permissions.p7s"] or b""),
+            tuple(self._problems),
+            {name: data for name, data in files.items() if data is not None},
+            self._permissions_document,
         )
 
+    def _fault(self, file: str, text: str, fault: Fault) -> None:
+        self._problems.append(Problem(file, text, fault))
 
-@dataclass(frozen=True, slots=True)
-class Threshold:
-    """When a thing is to be renewed: at so much ``remaining``, or ``elapsed`` (0 to 1) of it."""
-
-    remaining: timedelta | None = None
-    elapsed: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Standing:
-    """What an enclave has: a certificate, and the grant that DDS reads, neither verified yet.
-
-    ``digest`` is the SHA-256 of the signed permissions.
-    """
-
-    name: str
-    certificate: x509.Certificate
-    signed: smime.SignedDocument
-    digest: str
-    grant: Grant
-
-    def lifetime(self) -> Lifetime:
-        """When both end."""
-        return Lifetime(self.name, validity_of(self.certificate), self.grant.validity)
-
-
-@dataclass(frozen=True, slots=True)
-class Unreadable:
-    """An enclave of which nobody can tell when it ends, and why."""
-
-    name: str
-    error: SrosError
-
-
-def _elapsed(validity: Window, now: datetime) -> float:
-    """How much of a life is over, from 0 to 1; the time by which it was back-dated is no life."""
-    begin = validity.not_before
-    if validity.not_after - begin > BACKDATE:
-        begin += BACKDATE
-    return (now - begin) / (validity.not_after - begin)
-
-
-def parse_threshold(text: str) -> Threshold:
-    """Read ``30d`` (that much is left) or ``66%`` (that much is over)."""
-    match = re.fullmatch(r"(\d{1,3})%", text.strip(), re.ASCII)
-    if not match:
-        return Threshold(remaining=parse_duration(text))
-    if int(match[1]) > 100:
-        raise UsageError(f"{text!r} is more than all of a lifetime")
-    return Threshold(elapsed=int(match[1]) / 100)
-
-
-def lifetimes(root: Path) -> tuple[Lifetime, ...]:
-    """When each enclave of a keystore ends, in the order of names.
-
-    Raises one `KeystoreError` that names every enclave that cannot be read.
-    """
-    found, unreadable = survey(root)
-    refuse(unreadable, "read")
-    return found
-
-
-def survey(root: Path) -> tuple[tuple[Lifetime, ...], tuple[Unreadable, ...]]:
-    """As `lifetimes`, with those that cannot be read beside those that can."""
-    found, unreadable = [], []
-    for name in list_enclaves(root):
+    def _read(self, name: str) -> bytes | None:
+        path = self._folder / name
+        if not path.exists():
+            if path.is_symlink():
+                self._fault(
+                    name, f"it is a link to nothing ({path.readlink()})", Fault.LINK_DANGLING
+                )
+            else:
+                self._fault(name, "missing", Fault.FILE_MISSING)
+            return None
         try:
-            found.append(read_standing(root, name).lifetime())
+            data = read_bytes(path, "file")
         except SrosError as error:
-            unreadable.append(Unreadable(name, error))
-    return tuple(found), tuple(unreadable)
+            self._fault(name, f"it cannot be read: {error.why.rstrip('.')}", Fault.FILE_UNREADABLE)
+            return None
+        if not data:
+            self._fault(name, "it is empty", Fault.FILE_EMPTY)
+            return None
+        return data
 
-
-def refuse(unreadable: tuple[Unreadable, ...], verb: str) -> None:
-    """Raise one error that names every one of the enclaves, if there are any."""
-    if len(unreadable) == 1:
-        raise unreadable[0].error
-    if unreadable:
-        names = ", ".join(each.name for each in unreadable)
-        told = " ".join(f"{each.error.what}." for each in unreadable)
-        raise KeystoreError(
-            f"{len(unreadable)} enclaves cannot be {verb}: {names}",
-            f"{told} Nothing was changed.",
-            "Mend or revoke them, or name those that are meant.",
+    def _certificate(self, name: str, files: dict[str, bytes | None]) -> x509.Certificate | None:
+        data = files[name]
+        if data is None:
+            return None
+        try:
+            certificate = _certificate(data, name)
+        except SrosError as error:
+            self._fault(name, error.why.rstrip("."), Fault.CERTIFICATE_MALFORMED)
+            return None
+        self._valid_now(
+            name, validity_of(certificate), _CERTIFICATE_ENDS if name == _OWN else _CA_ENDS
         )
+        return certificate
 
+    def _valid_now(self, name: str, validity: Window, faults: tuple[Fault, Fault]) -> None:
+        """Note it if it expired, or is not valid yet: the first or the second of ``faults``."""
+        expired, not_yet_valid = faults
+        if self._now > validity.not_after:
+            self._fault(name, f"it expired at {iso(validity.not_after)}", expired)
+        elif self._now < validity.not_before:
+            begin = iso(validity.not_before)
+            self._fault(name, f"it is not valid before {begin}", not_yet_valid)
 
-def read_standing(root: Path, name: str) -> Standing:
-    """What an enclave has; raises `KeystoreError` where that is not to be read."""
-    folder = root / enclave_folder(name)
-    try:
-        path = folder / "cert.pem"
-        certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+    def _identity(
+        self, certificate: x509.Certificate | None, ca: x509.Certificate | None, key: bytes | None
+    ) -> None:
+        if certificate and ca and not issued_by(certificate, ca):
+            self._fault(
+                "cert.pem",
+                f"it was not issued by the identity CA of the enclave ({subject_text(ca.subject)}) "
+                f"but by {subject_text(certificate.issuer)}",
+                Fault.CERTIFICATE_ISSUER,
+            )
+        if key is None:
+            return
+        try:
+            private = load_key(key, "key.pem")
+        except SrosError as error:
+            fault = Fault.KEY_ENCRYPTED if _ENCRYPTED.search(key) else Fault.KEY_MALFORMED
+            self._fault("key.pem", error.why.rstrip("."), fault)
+            return
+        if certificate and not same_key(certificate, private):
+            self._fault("key.pem", "it is not the key of cert.pem", Fault.KEY_MISMATCH)
+
+    def _revocation(
+        self, certificate: x509.Certificate | None, ca: x509.Certificate | None
+    ) -> None:
+        path = self._folder / "crl.pem"
+        if not path.exists():
+            return
+        try:
+            crl, authentic = _revocation_list(read_bytes(path, "revocation list"), ca)
+        except (SrosError, ValueError):
+            text = "it is not a revocation list, and DDS then refuses everybody"
+            self._fault("crl.pem", text, Fault.CRL_MALFORMED)
+            return
+        if not authentic:
+            text = "it is not of the identity CA, and DDS then refuses everybody"
+            self._fault("crl.pem", text, Fault.CRL_ISSUER)
+        if crl.last_update_utc > self._now:
+            self._fault(
+                "crl.pem",
+                f"it is not valid before {iso(crl.last_update_utc)}: everybody is refused",
+                Fault.CRL_NOT_YET_VALID,
+            )
+        if crl.next_update_utc and crl.next_update_utc < self._now:
+            text = f"it expired at {iso(crl.next_update_utc)}: everybody is refused"
+            self._fault("crl.pem", text, Fault.CRL_EXPIRED)
+        if certificate and crl.get_revoked_certificate_by_serial_number(certificate.serial_number):
+            self._fault("cert.pem", "it is revoked by crl.pem", Fault.REVOKED)
+
+    def _signed(
+        self, name: str, files: dict[str, bytes | None], authority: x509.Certificate | None
+    ) -> bytes | None:
+        data = files[name]
+        if data is None:
+            return None
+        try:
+            return _content(data, authority)
+        except SrosError as error:
+            fault = Fault.SIGNATURE if _SIGNED.search(data[:1000]) else Fault.NOT_SIGNED
+            self._fault(name, str(error), fault)
+            return None
+
+    def _parsed(
+        self,
+        name: str,
+        document: bytes,
+        read: Callable[[bytes, str], Parsed],
+        malformed: Fault,
+    ) -> Parsed | None:
+        try:
+            return read(document, name)
+        except SrosError as error:
+            self._fault(name, error.why.rstrip(".") or error.what, malformed)
+            return None
+
+    def _grant(
+        self, permissions: Permissions, certificate: x509.Certificate, domain: int | None
+    ) -> None:
+        name = "permissions.p7s"
         subject = subject_text(certificate.subject)
-        granted = read_granted(folder / "permissions.p7s", subject)
-    except SrosError as error:
-        raise KeystoreError(
-            f"enclave {name} cannot be read: {error.what}",
-            error.why,
-            error.remedy or f"See `sros inspect {folder}`.",
-        ) from error
-    if granted.grant is None:
-        raise KeystoreError(
-            f"the permissions of enclave {name} have no grant for {subject}",
-            "They belong to another certificate.",
-            f"Sign them anew with `sros create_permission {root} {name} POLICY_FILE`.",
-        )
-    return Standing(name, certificate, granted.signed, granted.digest, granted.grant)
-
-
-def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
-    """In words: which part ends first, and when."""
-    first = (
-        "certificate"
-        if lifetime.certificate.not_after <= lifetime.permissions.not_after
-        else "permissions"
-    )
-    word = "ended" if lifetime.ends() < now else "until"
-    return f"{lifetime.name}  {first} {word} {iso(lifetime.ends())}"
-
-
-_FEW = 5
-"""So many enclaves are told before the rest is counted."""
-_ALIKE = 0.75
-"""The least likeness (`difflib`) of a slip of the keyboard: one letter of four, or two of eight."""
-
-
-def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
-    """The error for ``name``, which is none of the enclaves that are ``there``."""
-    if revocation := _revocation(root, name):
-        return _was_revoked(root, revocation)
-    what = f"enclave {name} does not exist in keystore '{root}'"
-    meant = likely(name, there)
-    if meant:
-        return KeystoreError(what, "", f"Perhaps {' or '.join(meant)} is meant.")
-    try:
-        check_enclave_name(name)
-    except InvalidNameError as error:
-        return error
-    names = sorted(there)
-    more = f" and {len(names) - _FEW} more" if len(names) > _FEW else ""
-    why = f"It has {', '.join(names[:_FEW]) or 'none'}{more}."
-    return KeystoreError(what, why, f"Make it with `sros create_enclave {root} {name}`.")
-
-
-def _revocation(root: Path, name: str) -> Entry | None:
-    """How the ledger says that an enclave was revoked, if nothing was issued for it since."""
-    try:
-        entries = read_ledger(root)
-    except SrosError:
-        return None  # that the enclave is missing is what counts here
-    of_it = [e for e in entries if e.enclave == name and e.what in ("certificate", "revocation")]
-    if not of_it or of_it[-1].what != "revocation":
-        return None
-    # Earlier certificates of it were revoked with it; the files are those of one.
-    kept = (e for e in reversed(of_it) if e.serial and (root / REVOKED / e.serial).is_dir())
-    return next(kept, of_it[-1])
-
-
-def _was_revoked(root: Path, entry: Entry) -> SrosError:
-    reason = "" if entry.reason in ("", "unspecified") else f" ({entry.reason})"
-    folder = root / REVOKED / entry.serial
-    return KeystoreError(
-        f"enclave {entry.enclave} of keystore '{root}' was revoked at {entry.time}{reason}",
-        f"Its files lie in '{folder}'." if folder.is_dir() else "",
-        f"If it is needed again, make it anew with `sros create_enclave {root} {entry.enclave}`.",
-    )
-
-
-def likely(name: str, there: Collection[str]) -> tuple[str, ...]:
-    """The enclaves that someone who wrote ``name`` may have meant, at most three.
-
-    Those that end in it, for its beginning is what one leaves out; otherwise those whose last part
-    is spelt alike.
-    """
-    end = "/" + name.strip("/")
-    if end == "/":
-        return ()
-    found = [each for each in there if each.endswith(end)]
-    if not found:
-        last = {each: each.rpartition("/")[2] for each in there}
-        alike = difflib.get_close_matches(
-            end.rpartition("/")[2], set(last.values()), n=3, cutoff=_ALIKE
-        )
-        found = [each for each in there if last[each] in alike]
-    return tuple(sorted(found)[:3])
+        grants = [grant for grant in permissions.grants if grant.subject == subject]
+        if not grants:
+            others = ", ".join(grant.subject for grant in permissions.grants)
+            text = f"it has no grant for {subject}, only for {others or 'nobody'}"
+            self._fault(name, text, Fault.PERMISSIONS_SUBJECT)
+            return
+        grant = grants[0]
+        try:
+            self._valid_now(name, grant.validity, _PERMISSIONS_ENDS)
+        except SrosError as error:  # it ends before it begins
+            self._fault(name, error.what, Fault.PERMISSIONS_MALFORMED)
+        rules = [rule for rule in grant.rules if rule.allow]
+        if domain is not None and not any(domain in rule.domains.closed() for rule in rules):
+            text = f"no rule of it allows anything in domain {domain}"
+            self._fault(name, text, Fault.PERMISSIONS_DOMAIN)

@@ -24,8 +24,7 @@ from sros_tool.graph.observation import from_json
 from sros_tool.keystore.authorities.authority import load_ca_certificate
 from sros_tool.keystore.layout import PERMISSIONS, PUBLIC, REQUEST, enclave_names, enclave_path
 from sros_tool.keystore.lifecycle.revocation_list import read_lists
-from sros_tool.keystore.loading import EnclaveState, check_enclave
-from sros_tool.keystore.reader import load_governance
+from sros_tool.keystore.reader import OpenedEnclave, load_governance, open_enclave
 from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import load_certificates, subject_text, validity_of
@@ -144,7 +143,7 @@ def _with_keystore(source: Source, root: Path, now: datetime) -> Source:
     enclaves, validities = [], set()
     for name in enclave_names(root):
         folder = enclave_path(root, name)
-        state = check_enclave(folder, now=now)
+        state = open_enclave(folder, now=now)
         away = (folder / REQUEST).exists() and not (folder / "key.pem").exists()
         enclaves.append(_described(name, state, key_elsewhere=away))
         validities |= set(_validities_of(name, state))
@@ -162,7 +161,7 @@ def _with_keystore(source: Source, root: Path, now: datetime) -> Source:
 
 
 def _with_enclave(source: Source, folder: Path, now: datetime) -> Source:
-    state = check_enclave(folder, now=now)
+    state = open_enclave(folder, now=now)
     name = next(iter(sorted(source.scope or ())), base_name(folder))
     return replace(
         source,
@@ -172,7 +171,7 @@ def _with_enclave(source: Source, folder: Path, now: datetime) -> Source:
     )
 
 
-def _described(name: str, state: EnclaveState, *, key_elsewhere: bool) -> Enclave:
+def _described(name: str, state: OpenedEnclave, *, key_elsewhere: bool) -> Enclave:
     problems = tuple(
         str(each)
         for each in state.problems
@@ -192,7 +191,7 @@ def _described(name: str, state: EnclaveState, *, key_elsewhere: bool) -> Enclav
     )
 
 
-def _validities_of(name: str, state: EnclaveState) -> Iterator[Validity]:
+def _validities_of(name: str, state: OpenedEnclave) -> Iterator[Validity]:
     if state.certificate:
         yield _certificate(state.certificate, "certificate", name, name)
     for grant in state.permissions.grants if state.permissions else ():

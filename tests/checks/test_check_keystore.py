@@ -14,7 +14,7 @@ from sros_tool.checks.registry import Selection
 from sros_tool.dds.decision import Access, Vendor
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
-from sros_tool.keystore.loading import check_enclave
+from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, subject_text
@@ -147,7 +147,7 @@ def test_local_time_is_standard_time_in_summer_too(
     create_enclaves(root, ["/a"], now=signed)
     at = signed - timedelta(days=1) + timedelta(hours=hours)
     zone = ZoneInfo("America/Los_Angeles")
-    state = check_enclave(enclave_path(root, "/a"), now=at)
+    state = open_enclave(enclave_path(root, "/a"), now=at)
     assert state.governance and state.permissions and state.certificate
     subject = subject_text(state.certificate.subject)
     fast, cyclone = (

@@ -17,7 +17,7 @@ from sros_tool.keystore.delivery.request import create_request
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.loading import check_enclave
+from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import filesystem
 from tests.integration.kills import Moments, Server, server
@@ -58,7 +58,7 @@ def see(robot: Path, before: Path) -> bool:
     if files == old:
         return False
     assert files.keys() >= old.keys()
-    assert not check_enclave(now, now=LATER).problems
+    assert not open_enclave(now, now=LATER).problems
     return True
 
 

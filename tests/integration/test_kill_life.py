@@ -20,7 +20,7 @@ from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revocation_list import read_crl
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.loading import check_enclave
+from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.transaction import filesystem
 from tests.integration.kills import Moments, Server, server
 from tests.support.harness import check_whole, remains
@@ -53,7 +53,7 @@ def see(root: Path) -> Seen:
         if not (folder / "cert.pem").exists():
             assert not (folder / "key.pem").exists(), name
             continue
-        assert not check_enclave(folder, now=LATER).problems, name
+        assert not open_enclave(folder, now=LATER).problems, name
         loadable.append((name, (folder / "cert.pem").read_bytes()))
         lists.add((folder / "crl.pem").read_bytes() if (folder / "crl.pem").exists() else b"")
     assert len(lists) == 1, "some refuse the revoked, others do not"

@@ -15,7 +15,7 @@ from sros_tool.keystore.lifecycle.revocation_list import read_lists
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.lifecycle.rotation.state import Stage, read_rotation, rotation_status
-from sros_tool.keystore.loading import check_enclave
+from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import filesystem
 from tests.integration.kills import Moments, Server, server
@@ -48,7 +48,7 @@ def see(root: Path) -> State:
         folder = enclave_path(root, name)
         if (folder / "cert.pem").exists():
             check_enclave_whole(folder)
-            assert not check_enclave(folder, now=LATER).problems, name
+            assert not open_enclave(folder, now=LATER).problems, name
             names.append(name)
     for path in (*root.glob("private/*.pem"), *root.glob("retired/*.key.pem")):
         # One that is on its way out may be a link to nothing for a moment.

@@ -13,7 +13,7 @@ from sros_tool.keystore.history import Status, history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.revocation_list import read_lists
 from sros_tool.keystore.lifecycle.rotation.state import rotation_status
-from sros_tool.keystore.loading import check_enclave
+from sros_tool.keystore.reader import open_enclave
 from tests.support.harness import certificate, check_enclave_whole, remains, snapshot, sros
 from tests.support.made_by_ros2 import make
 
@@ -33,7 +33,7 @@ def check(root: Path, *names: str) -> None:
     crl = root / "public/identity_ca.crl.pem"
     for name in names:
         folder = enclave_path(root, name)
-        assert not check_enclave(folder, now=datetime.now(UTC), domain=0).problems, name
+        assert not open_enclave(folder, now=datetime.now(UTC), domain=0).problems, name
         (folder / "key.pem").chmod(0o600)  # ros2/sros2 leaves it open
         check_enclave_whole(folder)
         words = ["verify", "-CAfile", folder / "identity_ca.cert.pem"]
@@ -82,7 +82,7 @@ def test_revoking(root: Path, tmp_path: Path) -> None:
     (crl,) = read_lists(root)
     assert [each.serial for each in crl.revoked] == [certificate(stolen / "cert.pem").serial_number]
     shutil.copy(root / "public/identity_ca.crl.pem", stolen / "crl.pem")
-    found = [str(each) for each in check_enclave(stolen, now=datetime.now(UTC)).problems]
+    found = [str(each) for each in open_enclave(stolen, now=datetime.now(UTC)).problems]
     assert found == ["cert.pem: it is revoked by crl.pem"]
     sros("crl", root, "--refresh").ok()
     check(root, "/a", "/b/c")

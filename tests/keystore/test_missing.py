@@ -8,7 +8,7 @@ import pytest
 
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.ledger import read_ledger
-from sros_tool.keystore.reader import likely, no_such_enclave
+from sros_tool.keystore.missing import likely_names, no_such_enclave
 from sros_tool.pki.certificates import load_certificate
 from tests.support.harness import sros
 
@@ -31,7 +31,7 @@ THERE = ("/mobile_robot/base", "/mobile_robot/teleop", "/mobile_robot/velocity_m
     ],
 )
 def test_who_may_be_meant(name: str, meant: tuple[str, ...]) -> None:
-    assert likely(name, THERE) == meant
+    assert likely_names(name, THERE) == meant
 
 
 def test_the_error_names_who_may_be_meant_and_does_not_say_to_make_it() -> None:

@@ -12,14 +12,14 @@ import pytest
 
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.keystore.expiry import Threshold, lifetimes, parse_threshold
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revocation_list import read_crl
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.loading import check_enclave
-from sros_tool.keystore.reader import Threshold, lifetimes, parse_threshold
+from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
 from sros_tool.policy import read_policy
@@ -51,7 +51,7 @@ def changed(before: dict[str, tuple[int, bytes]], root: Path) -> set[str]:
 
 
 def problems(root: Path, name: str, now: datetime) -> list[str]:
-    return [str(each) for each in check_enclave(enclave_path(root, name), now=now).problems]
+    return [str(each) for each in open_enclave(enclave_path(root, name), now=now).problems]
 
 
 @pytest.mark.parametrize("template", ["production", "development", "sros2"])

@@ -19,7 +19,7 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revocation_list import read_crl
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.loading import check_enclave
+from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.crl import REASONS, RevocationList
 from tests.support.harness import certificate, check_whole, snapshot, sros
@@ -46,7 +46,7 @@ def crl_of(root: Path) -> RevocationList:
 
 
 def problems(folder: Path, now: datetime = NOW) -> list[str]:
-    return [str(each) for each in check_enclave(folder, now=now).problems]
+    return [str(each) for each in open_enclave(folder, now=now).problems]
 
 
 @pytest.mark.parametrize("template", ["production", "development", "sros2"])
@@ -189,7 +189,7 @@ def test_a_list_that_would_grow_stale_becomes_a_link(there: str, tmp_path: Path)
         path.symlink_to(tmp_path / ("elsewhere" if there == "another link" else "nowhere"))
     revoke(root, ["/c"], now=NOW)
     assert os.readlink(path) == "../../public/identity_ca.crl.pem"
-    check = check_enclave(root / "enclaves/b", now=NOW)
+    check = open_enclave(root / "enclaves/b", now=NOW)
     assert not check.problems
 
 

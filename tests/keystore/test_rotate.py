@@ -26,7 +26,7 @@ from sros_tool.keystore.lifecycle.revocation_list import read_crl, read_lists
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotation.stages import RotationStep, renew_identity_ca, rotate_ca
 from sros_tool.keystore.lifecycle.rotation.state import Stage, retired_key, rotation_status
-from sros_tool.keystore.loading import check_enclave
+from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import common_name, digest, pem
 from sros_tool.pki.keys import generate_key, key_pem
@@ -62,7 +62,7 @@ def check(root: Path, now: datetime = NOW) -> None:
     assert not remains(root.parent)
     for name in list_enclaves(root):
         folder = enclave_path(root, name)
-        assert check_enclave(folder, now=now).problems == (), name
+        assert open_enclave(folder, now=now).problems == (), name
         check_enclave_whole(folder)
         identity, permissions = (folder / f"{r}_ca.cert.pem" for r in ("identity", "permissions"))
         openssl("verify", "-x509_strict", "-CAfile", identity, folder / "cert.pem")
@@ -185,7 +185,7 @@ def test_an_expired_ca_is_replaced(separate: Path) -> None:
     with pytest.raises(KeystoreError, match="not valid now"):
         create_enclaves(separate, ["/c"], now=later)
     rotate_ca(separate, finish=True, now=later)
-    check_at = [check_enclave(enclave_path(separate, name), now=later) for name in NAMES]
+    check_at = [open_enclave(enclave_path(separate, name), now=later) for name in NAMES]
     assert all(state.problems == () for state in check_at)
     create_enclaves(separate, ["/c"], now=later)
 
@@ -520,7 +520,7 @@ def test_death_at_every_step(stage: Stage | None, tmp_path: Path) -> None:
         root = fresh()
         assert in_child(verb(root), step)[0] == DIED, step
         for name in NAMES:
-            assert check_enclave(enclave_path(root, name), now=NOW).problems == (), (step, name)
+            assert open_enclave(enclave_path(root, name), now=NOW).problems == (), (step, name)
             check_enclave_whole(enclave_path(root, name))
         rotation_status(root, now=NOW)
         if stage is not None or shape_after_tidy(root) == start:
@@ -599,7 +599,7 @@ def test_exports_can_be_replaced_during_a_rotation(separate: Path, tmp_path: Pat
         for name in ("/a", "/b"):
             distribute(separate, [name], tmp_path / "robot", now=NOW, force=True)
             folder = enclave_path(tmp_path / "robot", name)
-            assert check_enclave(folder, now=NOW).problems == ()
+            assert open_enclave(folder, now=NOW).problems == ()
 
 
 # ── the verb ───────────────────────────────────────────────────────────────────────────────

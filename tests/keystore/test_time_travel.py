@@ -18,6 +18,7 @@ from cryptography import x509
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore import history as history_of_keystores
 from sros_tool.keystore.authorities.authority import certificates_of
+from sros_tool.keystore.expiry import Threshold, lifetimes
 from sros_tool.keystore.history import Status, history
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.ledger import read_ledger
@@ -27,8 +28,7 @@ from sros_tool.keystore.lifecycle.revocation_list import read_crl, read_lists
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.lifecycle.rotation.state import Stage, read_rotation
-from sros_tool.keystore.loading import check_enclave
-from sros_tool.keystore.reader import Threshold, lifetimes
+from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import filesystem
 from sros_tool.parallel import map_slices
@@ -135,7 +135,7 @@ class Verified:
             found = {}
             for name in share:
                 folder = enclave_path(self._root, name)
-                state = check_enclave(folder, now=now, domain=0)
+                state = open_enclave(folder, now=now, domain=0)
                 assert state.certificate
                 assert state.permissions
                 windows = [validity_of(state.certificate)]
@@ -348,7 +348,7 @@ def test_without_renewal_the_checks_of_ten_years_would_fail(tmp_path: Path) -> N
         (331, ["cert.pem", "crl.pem", "permissions.p7s"]),
     ):
         now = BEGIN + timedelta(days=days)
-        found = check_enclave(enclave_path(root, "/a"), now=now).problems
+        found = open_enclave(enclave_path(root, "/a"), now=now).problems
         # What was checked once is found to end by its dates alone, as all else that ends.
         assert not early.problems(["/a"], BEGIN)
         assert bool(early.problems(["/a"], now)) == bool(expected), days

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from sros_tool.errors import PkiError, SrosError
 from sros_tool.keystore.describe import describe
 from sros_tool.keystore.lifecycle.create import create_enclaves
-from sros_tool.keystore.loading import check_enclave
+from sros_tool.keystore.reader import open_enclave
 from sros_tool.pki import der
 
 FILES = (
@@ -66,7 +66,7 @@ def test_damage(name: str, keystore: Path) -> None:
     looks: dict[str, Callable[[], object]] = {
         "describe the file": lambda: describe(path, now=now),
         "describe the keystore": lambda: describe(keystore, now=now),
-        "check": lambda: check_enclave(keystore / "enclaves/a", now=now, domain=0),
+        "check": lambda: open_enclave(keystore / "enclaves/a", now=now, domain=0),
         "add": lambda: create_enclaves(keystore, ["/a", "/new"], now=now, dry_run=True),
     }
     if name == "sros.toml":

@@ -9,7 +9,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
-from sros_tool.checks.keystores.opened import OpenedKeystore
+from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
@@ -241,7 +241,7 @@ _SOON = timedelta(days=90)
 _LIST_SOON = timedelta(days=30)
 
 
-def check_authorities(keystore: OpenedKeystore) -> Iterator[Finding]:
+def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
     """The certificates of the CAs, their keys where these lie in the keystore, and the list."""
     for each in keystore.unread:
         why = f"{each.error.what}. {each.error.why}".strip()
@@ -264,7 +264,7 @@ def check_authorities(keystore: OpenedKeystore) -> Iterator[Finding]:
     yield from _revocation_list(keystore)
 
 
-def _records(keystore: OpenedKeystore) -> Iterator[Finding]:
+def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Keystores of ros2/sros2 have neither settings nor a ledger, those of sros have both."""
     settings, ledger = ((keystore.root / name).exists() for name in (SETTINGS, LEDGER))
     if ledger and not settings:
@@ -274,7 +274,7 @@ def _records(keystore: OpenedKeystore) -> Iterator[Finding]:
 
 
 def _authority(
-    keystore: OpenedKeystore, role: str, chain: tuple[x509.Certificate, ...]
+    keystore: CheckedKeystore, role: str, chain: tuple[x509.Certificate, ...]
 ) -> Iterator[Finding]:
     certificate = chain[0]
     file, subject = keystore.shown(ca_certificate(role)), f"{role} CA"
@@ -288,7 +288,7 @@ def _authority(
     yield from _key(keystore, role, certificate)
 
 
-def _key(keystore: OpenedKeystore, role: str, certificate: x509.Certificate) -> Iterator[Finding]:
+def _key(keystore: CheckedKeystore, role: str, certificate: x509.Certificate) -> Iterator[Finding]:
     path = keystore.root / ca_key(role)
     if not path.exists():
         return  # it is kept elsewhere
@@ -313,7 +313,7 @@ def _locked() -> str:
     raise _LockedError
 
 
-def _one_for_both(keystore: OpenedKeystore) -> Iterator[Finding]:
+def _one_for_both(keystore: CheckedKeystore) -> Iterator[Finding]:
     found = [chain[0] for chain in keystore.authorities.values()]
     if len(found) == 2:
         yield from one_for_both(
@@ -322,7 +322,7 @@ def _one_for_both(keystore: OpenedKeystore) -> Iterator[Finding]:
 
 
 def one_for_both(
-    keystore: OpenedKeystore, identity: x509.Certificate, permissions: x509.Certificate, file: str
+    keystore: CheckedKeystore, identity: x509.Certificate, permissions: x509.Certificate, file: str
 ) -> Iterator[Finding]:
     """Whether one CA does both jobs."""
     if identity.public_key() == permissions.public_key():
@@ -331,7 +331,7 @@ def one_for_both(
         yield ONE_AUTHORITY.found("the CAs", text, file, accepted=accepted)
 
 
-def _revocation_list(keystore: OpenedKeystore) -> Iterator[Finding]:
+def _revocation_list(keystore: CheckedKeystore) -> Iterator[Finding]:
     crl = keystore.crl
     if crl is None:
         return

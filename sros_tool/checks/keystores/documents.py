@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 from math import isfinite
 
 from sros_tool.checks.keystores.enclaves import grant_of, plain, plain_file
-from sros_tool.checks.keystores.opened import OpenedEnclave, OpenedKeystore
+from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.checks.policies import outside_findings
 from sros_tool.dds.decision import Access, Refusal, Vendor, Verb
@@ -175,7 +175,7 @@ _WEST, _EAST = timedelta(hours=12), timedelta(hours=14)
 _DIRECTIONS = ("publish", "subscribe")
 
 
-def check_documents(enclave: OpenedEnclave) -> Iterator[Finding]:
+def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
     """The permissions of an enclave, whoever signed them."""
     permissions = enclave.state.permissions
     if permissions is None:
@@ -231,7 +231,7 @@ def _is_odd(topic: str) -> bool:
     return "[^" in topic or "[:" in topic or topic != topic.strip()
 
 
-def _times(enclave: OpenedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
+def _times(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
     now, window = enclave.keystore.now, grant.validity
     if not window.contains(now):
         return
@@ -283,7 +283,7 @@ def _topics(criteria: tuple[Criteria, ...]) -> list[str]:
     return [topic for each in criteria for topic in each.topics]
 
 
-def _domains(enclave: OpenedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
+def _domains(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding]:
     governed = enclave.state.domains()
     if governed is None:
         return
@@ -424,7 +424,7 @@ _SIGNING = (Protection.SIGN, Protection.SIGN_WITH_ORIGIN_AUTHENTICATION)
 _NONE = (Protection.NONE,)
 
 
-def check_governance(enclave: OpenedEnclave, *, alone: bool) -> Iterator[Finding]:
+def check_governance(enclave: CheckedEnclave, *, alone: bool) -> Iterator[Finding]:
     """The governance that an enclave loads.
 
     It is told once for a keystore, by the first enclave; ``alone`` says that this one is not the
@@ -444,7 +444,7 @@ def check_governance(enclave: OpenedEnclave, *, alone: bool) -> Iterator[Finding
 
 
 def governance_findings(
-    keystore: OpenedKeystore, governance: Governance, file: str
+    keystore: CheckedKeystore, governance: Governance, file: str
 ) -> Iterator[Finding]:
     """What a governance document leaves open; ``file`` is where it stands."""
     domains = governance.domains().closed()
@@ -534,7 +534,7 @@ def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[Kind, str]
         yield LIVELINESS_OPEN, f"enable_liveliness_protection is false for {name}"
 
 
-def _copy(keystore: OpenedKeystore) -> Iterator[Finding]:
+def _copy(keystore: CheckedKeystore) -> Iterator[Finding]:
     xml, signed = keystore.root / GOVERNANCE_XML, keystore.governance
     if signed and xml.is_file() and plain_file(xml) != _content(signed):
         text = "governance.xml is not what governance.p7s holds"
@@ -565,7 +565,7 @@ _UNHEARD_OF = "rt/sros_nobody_has_this"
 _MANY = 3
 
 
-def check_vendors(enclave: OpenedEnclave, *, outside: bool) -> Iterator[Finding]:
+def check_vendors(enclave: CheckedEnclave, *, outside: bool) -> Iterator[Finding]:
     """Ask every vendor about every topic that the permissions name.
 
     Documents just as sros writes them are decided alike, unless something ``outside`` of the
@@ -597,7 +597,7 @@ def check_vendors(enclave: OpenedEnclave, *, outside: bool) -> Iterator[Finding]
         yield DIFFER.found(enclave.name, text, enclave.file("permissions.p7s"))
 
 
-def _is_as_sros_writes(enclave: OpenedEnclave) -> bool:
+def _is_as_sros_writes(enclave: CheckedEnclave) -> bool:
     permissions = enclave.state.permissions
     written = enclave.state.permissions_document.replace(b"\r\n", b"\n").strip()
     return permissions is not None and render_permissions(permissions).strip() == written
@@ -620,7 +620,7 @@ def _differences(answers: dict[Vendor, Access | Refusal], topics: list[str]) -> 
                 return  # everything else differs, too
 
 
-def _vendors_topics(enclave: OpenedEnclave) -> list[str]:
+def _vendors_topics(enclave: CheckedEnclave) -> list[str]:
     """The topics that are named, an example for each wildcard, and one that nobody names."""
     grant = grant_of(enclave)
     named: dict[str, None] = {ROS_DISCOVERY_TOPIC: None}

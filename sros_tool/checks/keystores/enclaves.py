@@ -10,7 +10,7 @@ from shlex import quote
 from cryptography import x509
 
 from sros_tool.checks.keystores.authorities import key_findings, one_for_both
-from sros_tool.checks.keystores.opened import OpenedEnclave
+from sros_tool.checks.keystores.opened import CheckedEnclave
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
@@ -40,7 +40,7 @@ LOADING_KINDS = by_id(
 )
 
 
-def check_loading(enclave: OpenedEnclave) -> Iterator[Finding]:
+def check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
     """Every problem of an enclave; that its key is on its robot, where it stays, is none."""
     for problem in enclave.state.problems:
         if enclave.born_elsewhere and problem.file == "key.pem":
@@ -154,7 +154,7 @@ _LONG = timedelta(days=2 * 366)
 _EVERY_TOPIC = frozenset({"*", "rt/*"})
 
 
-def check_enclave(enclave: OpenedEnclave) -> Iterator[Finding]:
+def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
     """An enclave by itself."""
     if (enclave.folder / REQUEST).exists() and not (enclave.folder / "cert.pem").exists():
         yield WAITS.found(enclave.name, "its certificate is missing", enclave.file(REQUEST))
@@ -174,7 +174,7 @@ def check_enclave(enclave: OpenedEnclave) -> Iterator[Finding]:
     yield from _copies(enclave)
 
 
-def grant_of(enclave: OpenedEnclave) -> Grant | None:
+def grant_of(enclave: CheckedEnclave) -> Grant | None:
     """The grant that is for the certificate of the enclave, if it is valid at any time."""
     state = enclave.state
     if not (state.certificate and state.permissions):
@@ -186,7 +186,7 @@ def grant_of(enclave: OpenedEnclave) -> Grant | None:
     return grant
 
 
-def _certificate(enclave: OpenedEnclave, certificate: x509.Certificate) -> Iterator[Finding]:
+def _certificate(enclave: CheckedEnclave, certificate: x509.Certificate) -> Iterator[Finding]:
     name, file = enclave.name, enclave.file("cert.pem")
     if common_name_of(certificate.subject) != name:
         text = f"it is of {subject_text(certificate.subject)}"
@@ -209,7 +209,7 @@ def _certificate(enclave: OpenedEnclave, certificate: x509.Certificate) -> Itera
 
 
 def _ends(
-    enclave: OpenedEnclave, certificate: x509.Certificate, grant: Grant | None
+    enclave: CheckedEnclave, certificate: x509.Certificate, grant: Grant | None
 ) -> Iterator[Finding]:
     now, validity = enclave.keystore.now, validity_of(certificate)
     windows = [("cert.pem", "the certificate", validity)]
@@ -231,7 +231,7 @@ def _ends_soon(window: Window, now: datetime) -> bool:
     return window.not_after - now < min(_SOON, (window.not_after - window.not_before) / 3)
 
 
-def _rights(enclave: OpenedEnclave, grant: Grant) -> Iterator[Finding]:
+def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
     file, keystore = enclave.file("permissions.p7s"), enclave.keystore
     allowed = [rule for rule in grant.rules if rule.allow]
     wide = [
@@ -259,7 +259,7 @@ def _is_as_long(chosen: Span, length: timedelta) -> bool:
     return not isinstance(chosen, timedelta) or length <= chosen + BACKDATE
 
 
-def _copies(enclave: OpenedEnclave) -> Iterator[Finding]:
+def _copies(enclave: CheckedEnclave) -> Iterator[Finding]:
     xml, signed = enclave.folder / "permissions.xml", enclave.state.permissions_document
     if signed and xml.is_file() and plain_file(xml) != plain(signed):
         text = "permissions.xml is not what permissions.p7s holds"

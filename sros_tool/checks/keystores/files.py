@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
-from sros_tool.checks.keystores.opened import OpenedKeystore
+from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.keystore.layout import (
     ENCLAVES,
@@ -123,7 +123,7 @@ _KNOWN_ANYWHERE = re.compile(
 )
 
 
-def check_files(keystore: OpenedKeystore) -> Iterator[Finding]:
+def check_files(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Every file, folder and link of a keystore, without reading what DDS reads."""
     root = os.fspath(keystore.root)
     links = _Links(root)

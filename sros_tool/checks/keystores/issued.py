@@ -13,7 +13,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 
 from sros_tool.checks.keystores.documents import DIFFERS as GOVERNANCE_DIFFERS
 from sros_tool.checks.keystores.enclaves import grant_of
-from sros_tool.checks.keystores.opened import OpenedEnclave, OpenedKeystore
+from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.checks.policies import ENCLAVE_NAMES
 from sros_tool.dds.portable import mistaken_names, some_pairs
@@ -123,7 +123,7 @@ class Traits:
     trusted: tuple[frozenset[str], ...]
 
 
-def traits_of(enclave: OpenedEnclave) -> Traits | None:
+def traits_of(enclave: CheckedEnclave) -> Traits | None:
     """Those of an enclave that has a certificate."""
     certificate = enclave.state.certificate
     if certificate is None:
@@ -156,7 +156,7 @@ def _trusted(data: bytes) -> frozenset[str]:
         return frozenset()
 
 
-def check_issued(keystore: OpenedKeystore, all_traits: Sequence[Traits]) -> Iterator[Finding]:
+def check_issued(keystore: CheckedKeystore, all_traits: Sequence[Traits]) -> Iterator[Finding]:
     """All enclaves together."""
     for (_, serial), names in _twice(((t.issuer, t.serial), t.name) for t in all_traits):
         yield SERIAL_TWICE.found(", ".join(names), f"the serial number is {serial:x}")
@@ -185,7 +185,7 @@ def _twice(pairs: Iterable[tuple[Key, str]]) -> Iterator[tuple[Key, list[str]]]:
     return ((key, names) for key, names in found.items() if len(names) > 1)
 
 
-def _trust(keystore: OpenedKeystore, all_traits: Sequence[Traits]) -> Iterator[Finding]:
+def _trust(keystore: CheckedKeystore, all_traits: Sequence[Traits]) -> Iterator[Finding]:
     """Enclaves that have no CA in common; while one is replaced, each trusts the old and the new.
 
     The CAs of the keystore are the right ones; in an export, those of most enclaves.
@@ -207,7 +207,7 @@ def _trust(keystore: OpenedKeystore, all_traits: Sequence[Traits]) -> Iterator[F
 
 
 def _exported_governance(
-    keystore: OpenedKeystore, all_traits: Sequence[Traits]
+    keystore: CheckedKeystore, all_traits: Sequence[Traits]
 ) -> Iterator[Finding]:
     """Exported enclaves have copies of the governance, and each may be from another time."""
     copies = [each for each in all_traits if each.governance]
@@ -218,7 +218,7 @@ def _exported_governance(
             yield GOVERNANCE_DIFFERS.found(each.name, text, file)
 
 
-def _ledger(keystore: OpenedKeystore, all_traits: Sequence[Traits]) -> Iterator[Finding]:
+def _ledger(keystore: CheckedKeystore, all_traits: Sequence[Traits]) -> Iterator[Finding]:
     if not keystore.ledger:
         return
     known = {entry.sha256 for entry in keystore.ledger}
@@ -240,7 +240,7 @@ def _ledger(keystore: OpenedKeystore, all_traits: Sequence[Traits]) -> Iterator[
             yield OLD_PERMISSIONS.found(each.name, text, f"{place}/permissions.p7s")
 
 
-def check_policy(enclave: OpenedEnclave, wanted: dict[str, frozenset[Right]]) -> Iterator[Finding]:
+def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -> Iterator[Finding]:
     """The rights of an enclave beside those that the policies state for it."""
     if not wanted:
         return
@@ -258,7 +258,7 @@ def check_policy(enclave: OpenedEnclave, wanted: dict[str, frozenset[Right]]) ->
         yield STALE.found(name, text, enclave.file("permissions.p7s"))
 
 
-def wanted_rights(keystore: OpenedKeystore) -> dict[str, frozenset[Right]]:
+def wanted_rights(keystore: CheckedKeystore) -> dict[str, frozenset[Right]]:
     """The rights of every enclave that the policies speak of."""
     found: dict[str, frozenset[Right]] = {}
     for policy in keystore.policies:

@@ -26,12 +26,12 @@ from sros_tool.checks.keystores.issued import (
     traits_of,
     wanted_rights,
 )
-from sros_tool.checks.keystores.opened import OpenedEnclave, OpenedKeystore, open_keystore
+from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore, read_keystore
 from sros_tool.checks.kind import Finding
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import GOVERNANCE_P7S, REQUEST, enclave_path
-from sros_tool.keystore.loading import check_enclave as load_enclave
+from sros_tool.keystore.reader import open_enclave as load_enclave
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.policy.model import Policy
@@ -57,7 +57,7 @@ def keystore_findings(
     ``zone`` is the time zone of the host on which its enclaves run, ``domain`` the one that they
     have to join; with ``policies``, their rights are compared with those.
     """
-    keystore = open_keystore(root, now=now, zone=zone, policies=policies)
+    keystore = read_keystore(root, now=now, zone=zone, policies=policies)
     names = keystore.names if only is None else tuple(only)
     wanted = wanted_rights(keystore)
     first = next((name for name in names if (enclave_path(root, name) / _GOVERNANCE).exists()), "")
@@ -86,7 +86,7 @@ def keystore_findings(
 
 
 def enclave_findings(
-    enclave: OpenedEnclave, wanted: dict[str, frozenset[Right]], *, alone: bool
+    enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]], *, alone: bool
 ) -> Iterator[Finding]:
     """Everything that is found in one enclave."""
     yield from check_enclave(enclave)
@@ -107,7 +107,7 @@ def joined(findings: Sequence[Finding]) -> list[Finding]:
     return [_one_of(group) for group in together.values()]
 
 
-def _governance_alone(keystore: OpenedKeystore) -> Iterator[Finding]:
+def _governance_alone(keystore: CheckedKeystore) -> Iterator[Finding]:
     """The governance of a keystore that has no enclave yet."""
     with suppress(SrosError):  # whoever makes an enclave is told
         document = smime.parse(keystore.governance).document
@@ -142,8 +142,8 @@ def _one_of(group: list[Finding]) -> Finding:
     return replace(group[0], subject=shown + more)
 
 
-def _open(keystore: OpenedKeystore, name: str, domain: int | None) -> OpenedEnclave:
+def _open(keystore: CheckedKeystore, name: str, domain: int | None) -> CheckedEnclave:
     folder = enclave_path(keystore.root, name)
     state = load_enclave(folder, now=keystore.now, domain=domain)
     elsewhere = (folder / REQUEST).exists() and not (folder / "key.pem").exists()
-    return OpenedEnclave(keystore, name, state, elsewhere and keystore.is_home)
+    return CheckedEnclave(keystore, name, state, elsewhere and keystore.is_home)

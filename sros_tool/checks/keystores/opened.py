@@ -24,8 +24,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.ledger import Entry, read_ledger
-from sros_tool.keystore.loading import EnclaveState
-from sros_tool.keystore.reader import load_settings
+from sros_tool.keystore.reader import OpenedEnclave, load_settings
 from sros_tool.keystore.template import Template
 from sros_tool.pki.certificates import load_certificates
 from sros_tool.pki.crl import RevocationList, load_crl
@@ -42,7 +41,7 @@ class Unread:
 
 
 @dataclass(frozen=True, slots=True)
-class OpenedKeystore:
+class CheckedKeystore:
     """A keystore, or the part of one that was exported for a robot.
 
     ``settings`` are None where ros2/sros2 made it.  ``authorities`` has the certificates of a CA
@@ -83,12 +82,12 @@ class OpenedKeystore:
 
 
 @dataclass(frozen=True, slots=True)
-class OpenedEnclave:
+class CheckedEnclave:
     """An enclave, what its files say, and the keystore that it is of."""
 
-    keystore: OpenedKeystore
+    keystore: CheckedKeystore
     name: str
-    state: EnclaveState
+    state: OpenedEnclave
     born_elsewhere: bool = False
     """Its key was made on its robot, and stays there."""
 
@@ -102,9 +101,9 @@ class OpenedEnclave:
         return f"{self.folder}/{name}"
 
 
-def open_keystore(
+def read_keystore(
     root: Path, *, now: datetime, zone: tzinfo = UTC, policies: tuple[Policy, ...] = ()
-) -> OpenedKeystore:
+) -> CheckedKeystore:
     """Read what a keystore says of itself; `KeystoreError` if it is none."""
     names = list_enclaves(root)
     unread: list[Unread] = []
@@ -136,7 +135,7 @@ def open_keystore(
         except SrosError as error:
             unread.append(Unread(path, error))
     governance = root / GOVERNANCE_P7S
-    return OpenedKeystore(
+    return CheckedKeystore(
         root,
         now,
         names,

@@ -16,7 +16,7 @@ from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.arrival import check_same_authority, refuse_home, trusted_in
 from sros_tool.keystore.layout import ENCLAVES, OPTIONAL_FILES, REQUIRED_FILES, enclave_folder
-from sros_tool.keystore.loading import EnclaveState, check_enclave
+from sros_tool.keystore.reader import OpenedEnclave, open_enclave
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
@@ -117,7 +117,7 @@ def read_answer(data: bytes) -> Answer:
     return Answer(name, files, signed)
 
 
-def check_answer(answer: Answer, key: PublicKey, *, now: datetime) -> EnclaveState:
+def check_answer(answer: Answer, key: PublicKey, *, now: datetime) -> OpenedEnclave:
     """Check that DDS would load an answer together with the private half of ``key``.
 
     Raises `PkiError` with all that is wrong: another key's certificate, another enclave's, a
@@ -127,7 +127,7 @@ def check_answer(answer: Answer, key: PublicKey, *, now: datetime) -> EnclaveSta
     with tempfile.TemporaryDirectory(prefix="sros-") as folder:
         for path, data in answer.files.items():
             Path(folder, path.rpartition("/")[2]).write_bytes(data)
-        state = check_enclave(Path(folder), now=now)
+        state = open_enclave(Path(folder), now=now)
     problems = [str(each) for each in state.problems if each.file != _KEY]
     certificate = state.certificate
     if certificate and certificate.public_key() != key:

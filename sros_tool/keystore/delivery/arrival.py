@@ -25,7 +25,7 @@ from sros_tool.keystore.layout import (
     enclave_names,
     is_keystore,
 )
-from sros_tool.keystore.loading import EnclaveState, check_enclave
+from sros_tool.keystore.reader import OpenedEnclave, open_enclave
 from sros_tool.pki.certificates import UNREADABLE, common_name_of, subject_text, validity_of
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
@@ -174,7 +174,7 @@ def verify_arrival(path: Path, *, now: datetime, domain: int | None = None) -> A
     """
     root, names = _what(path)
     enclaves, findings = [], []
-    states: dict[str, EnclaveState] = {}
+    states: dict[str, OpenedEnclave] = {}
     for name in names:
         folder = root / enclave_folder(name)
         found = []
@@ -183,7 +183,7 @@ def verify_arrival(path: Path, *, now: datetime, domain: int | None = None) -> A
             found.append(Finding(name, REQUEST, text))
             enclaves.append(Arrived(name, False, "", None))
         else:
-            states[name] = state = check_enclave(folder, now=now, domain=domain)
+            states[name] = state = open_enclave(folder, now=now, domain=domain)
             found += [Finding(name, each.file, each.text) for each in state.problems]
             enclaves.append(Arrived(name, not found, str(state.domains() or ""), _until(state)))
             found += _name(name, state)
@@ -219,7 +219,7 @@ def _what(path: Path) -> tuple[Path, tuple[str, ...]]:
     )
 
 
-def _until(state: EnclaveState) -> datetime | None:
+def _until(state: OpenedEnclave) -> datetime | None:
     """When the enclave stops being loadable: the first end of anything that it consists of."""
     if not (state.certificate and state.permissions):
         return None
@@ -232,7 +232,7 @@ def _until(state: EnclaveState) -> datetime | None:
     )
 
 
-def _name(name: str, state: EnclaveState) -> Iterator[Finding]:
+def _name(name: str, state: OpenedEnclave) -> Iterator[Finding]:
     """DDS does not ask where a certificate lies; that it is another's shows a mix-up."""
     if state.certificate and common_name_of(state.certificate.subject) != name:
         text = f"it is of {subject_text(state.certificate.subject)}, not of this enclave"
@@ -248,7 +248,7 @@ def _key(name: str, folder: Path) -> Iterator[Finding]:
         yield Finding(name, "key.pem", f"others have access to it (mode {mode:04o}): chmod 600")
 
 
-def _trust(root: Path, states: dict[str, EnclaveState]) -> Iterator[Finding]:
+def _trust(root: Path, states: dict[str, OpenedEnclave]) -> Iterator[Finding]:
     """Enclaves that have no CA in common would not talk to each other."""
     for file in _AUTHORITIES:
         first: tuple[str, frozenset[str]] | None = None

@@ -21,8 +21,8 @@ from sros_tool.keystore.layout import (
     enclave_path,
     list_enclaves,
 )
-from sros_tool.keystore.loading import check_enclave
-from sros_tool.keystore.reader import no_such_enclave
+from sros_tool.keystore.missing import no_such_enclave
+from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
@@ -135,7 +135,7 @@ def collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]
                 _ANSWER_AGAIN,
             )
         folder = enclave_path(root, name)
-        state = check_enclave(folder, now=now)
+        state = open_enclave(folder, now=now)
         if state.problems:
             raise KeystoreError(
                 f"enclave {name} would not run where it is sent",

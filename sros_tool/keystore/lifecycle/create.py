@@ -34,7 +34,8 @@ from sros_tool.keystore.layout import (
     is_keystore,
 )
 from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
-from sros_tool.keystore.reader import check_domain, load_governance, load_settings, no_such_enclave
+from sros_tool.keystore.missing import no_such_enclave
+from sros_tool.keystore.reader import check_domain, load_governance, load_settings
 from sros_tool.keystore.template import Template, render_template
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change

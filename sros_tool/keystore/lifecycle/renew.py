@@ -10,23 +10,23 @@ from pathlib import Path
 from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.keystore.authorities.authority import Authorities, load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.expiry import (
+    Credentials,
+    Threshold,
+    UnreadableEnclave,
+    describe_lifetime,
+    lifetimes,
+    parse_threshold,
+    read_credentials,
+    refuse_unreadable,
+)
 from sros_tool.keystore.issuing.issuance import Issuance, policies_of, renewed
 from sros_tool.keystore.layout import check_keystore, enclave_folder, has_enclave, list_enclaves
 from sros_tool.keystore.ledger import Entry, append, read_ledger
 from sros_tool.keystore.lifecycle.revocation_list import Lists
 from sros_tool.keystore.lifecycle.revoke import link_everywhere, still_valid
-from sros_tool.keystore.reader import (
-    Standing,
-    Threshold,
-    Unreadable,
-    describe_lifetime,
-    lifetimes,
-    load_settings,
-    no_such_enclave,
-    parse_threshold,
-    read_standing,
-    refuse,
-)
+from sros_tool.keystore.missing import no_such_enclave
+from sros_tool.keystore.reader import load_settings
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
@@ -194,24 +194,26 @@ class _Renewer:
                 progress(item[0])
 
         done = self.issuance.spread(items, self._attempt, told)
-        refuse(tuple(each for each in done if isinstance(each, Unreadable)), "renewed")
+        refuse_unreadable(
+            tuple(each for each in done if isinstance(each, UnreadableEnclave)), "renewed"
+        )
         return [each for each in done if isinstance(each, _Replaced)]
 
-    def _attempt(self, item: tuple[str, Threshold | None]) -> _Replaced | Unreadable | None:
+    def _attempt(self, item: tuple[str, Threshold | None]) -> _Replaced | UnreadableEnclave | None:
         name, threshold = item
         try:
-            state = read_standing(self._transaction.root, name)
+            state = read_credentials(self._transaction.root, name)
             if threshold and not state.lifetime().due(threshold, self._now):
                 return None
             self._renew(state)
         except SrosError as error:
-            return Unreadable(name, error)
+            return UnreadableEnclave(name, error)
         old = state.certificate
         # The grant that DDS reads has the subject of the certificate.
         until = validity_of(old).not_after
         return _Replaced(name, old.serial_number, state.grant.subject, until)
 
-    def _renew(self, state: Standing) -> None:
+    def _renew(self, state: Credentials) -> None:
         name = state.name
         if not issued_by(state.certificate, self._authorities.identity.certificate):
             raise KeystoreError(

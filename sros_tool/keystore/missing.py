@@ -1,0 +1,80 @@
+"""The error for an enclave that a keystore does not have: was it revoked, or is another meant?"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Collection
+from pathlib import Path
+
+from sros_tool.errors import InvalidNameError, KeystoreError, SrosError
+from sros_tool.keystore.layout import REVOKED
+from sros_tool.keystore.ledger import Entry, read_ledger
+from sros_tool.names import check_enclave_name
+
+_FEW = 5
+"""So many enclaves are told before the rest is counted."""
+
+
+_ALIKE = 0.75
+"""The least likeness (`difflib`) of a slip of the keyboard: one letter of four, or two of eight."""
+
+
+def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
+    """The error for ``name``, which is none of the enclaves that are ``there``."""
+    if revocation := _revocation(root, name):
+        return _was_revoked(root, revocation)
+    what = f"enclave {name} does not exist in keystore '{root}'"
+    meant = likely_names(name, there)
+    if meant:
+        return KeystoreError(what, "", f"Perhaps {' or '.join(meant)} is meant.")
+    try:
+        check_enclave_name(name)
+    except InvalidNameError as error:
+        return error
+    names = sorted(there)
+    more = f" and {len(names) - _FEW} more" if len(names) > _FEW else ""
+    why = f"It has {', '.join(names[:_FEW]) or 'none'}{more}."
+    return KeystoreError(what, why, f"Make it with `sros create_enclave {root} {name}`.")
+
+
+def _revocation(root: Path, name: str) -> Entry | None:
+    """How the ledger says that an enclave was revoked, if nothing was issued for it since."""
+    try:
+        entries = read_ledger(root)
+    except SrosError:
+        return None  # that the enclave is missing is what counts here
+    of_it = [e for e in entries if e.enclave == name and e.what in ("certificate", "revocation")]
+    if not of_it or of_it[-1].what != "revocation":
+        return None
+    # Earlier certificates of it were revoked with it; the files are those of one.
+    kept = (e for e in reversed(of_it) if e.serial and (root / REVOKED / e.serial).is_dir())
+    return next(kept, of_it[-1])
+
+
+def _was_revoked(root: Path, entry: Entry) -> SrosError:
+    reason = "" if entry.reason in ("", "unspecified") else f" ({entry.reason})"
+    folder = root / REVOKED / entry.serial
+    return KeystoreError(
+        f"enclave {entry.enclave} of keystore '{root}' was revoked at {entry.time}{reason}",
+        f"Its files lie in '{folder}'." if folder.is_dir() else "",
+        f"If it is needed again, make it anew with `sros create_enclave {root} {entry.enclave}`.",
+    )
+
+
+def likely_names(name: str, there: Collection[str]) -> tuple[str, ...]:
+    """The enclaves that someone who wrote ``name`` may have meant, at most three.
+
+    Those that end in it, for its beginning is what one leaves out; otherwise those whose last part
+    is spelt alike.
+    """
+    end = "/" + name.strip("/")
+    if end == "/":
+        return ()
+    found = [each for each in there if each.endswith(end)]
+    if not found:
+        last = {each: each.rpartition("/")[2] for each in there}
+        alike = difflib.get_close_matches(
+            end.rpartition("/")[2], set(last.values()), n=3, cutoff=_ALIKE
+        )
+        found = [each for each in there if last[each] in alike]
+    return tuple(sorted(found)[:3])
