@@ -56,37 +56,43 @@ Example:
   $ sros check --needs-renewal 30d keystore || \\
         sros renew keystore --all-expiring 30d
 
-What the template of a keystore chose openly is accepted: it counts as a note, and is named in
-one line. --strict lets it count. Exit status: 1 if something of the level of --fail-on is
-shown.""",
+What the template of a keystore chose on purpose is accepted: it counts as a note, and is named
+in one line; --strict reports it as a finding. Exit status: 1 if a finding of the severity of
+--fail-on or higher is shown.""",
 )
 @click.argument("targets", metavar="[policy|keystore|runtime] [PATH]...", nargs=-1, type=PATH)
-@click.option("--list", "as_list", is_flag=True, help="List all findings that there are.")
+@click.option("--list", "as_list", is_flag=True, help="List all kinds of findings.")
 @click.option(
     "--include",
     metavar="ID",
     multiple=True,
     shell_complete=_complete_id,
-    help="Only these; * and ? are wildcards.",
+    help="Report only findings with this id; * and ? are wildcards.",
 )
 @click.option(
-    "--exclude", metavar="ID", multiple=True, shell_complete=_complete_id, help="All but these."
+    "--exclude",
+    metavar="ID",
+    multiple=True,
+    shell_complete=_complete_id,
+    help="Leave out findings with this id.",
 )
 @click.option(
     "--severity",
     type=_LEVELS,
     default="warning",
     show_default=True,
-    help="The least that is shown.",
+    help="Lowest severity that is shown.",
 )
 @click.option(
     "--fail-on",
     type=click.Choice(["note", "warning", "error", "never"]),
     default="warning",
     show_default=True,
-    help="The least by which the exit status becomes 1.",
+    help="Lowest severity that makes the exit status 1.",
 )
-@click.option("--strict", is_flag=True, help="Let count what the template chose.")
+@click.option(
+    "--strict", is_flag=True, help="Report findings that the keystore's template accepts."
+)
 @click.option(
     "--policy",
     "policies",
@@ -98,11 +104,13 @@ shown.""",
 @click.option(
     "--vendor",
     type=click.Choice(["fastdds", "fastdds-2.9", "cyclonedds"]),
-    help="All nodes run this DDS; leave out what concerns others.",
+    help="Leave out findings that concern only other DDS vendors.",
 )
-@click.option("--domain", metavar="ID", help="The domain that enclaves have to join.")
 @click.option(
-    "--at", "moment", metavar="MOMENT", help="As if it were then: 2027-06-01, or 90d from now."
+    "--domain", metavar="ID", help="The ROS domain that the enclaves must be able to join."
+)
+@click.option(
+    "--at", "moment", metavar="MOMENT", help="Check as of this moment: 2027-06-01, or 90d from now."
 )
 @click.option(
     "--format",
@@ -110,14 +118,14 @@ shown.""",
     type=click.Choice(["text", "json", "sarif"]),
     default="text",
     show_default=True,
-    help="For people, programs, or code hosts.",
+    help="Output for people, programs, or code hosts.",
 )
 @json_option
 @click.option("--sarif", "as_sarif", is_flag=True, help="The same as --format sarif.")
 @click.option(
     "--needs-renewal",
     metavar="DURATION|PERCENT",
-    help="List only what ends within 30d, or of whose life 66% is over.",
+    help="List only what expires within 30d, or has used 66% of its validity.",
 )
 def check(
     targets: tuple[Path, ...],
@@ -358,22 +366,22 @@ SHOW: Mapping[str, Callable[[Chosen, Selection], None]] = {
 Example:
   $ sros doctor
   rclpy with rmw_fastrtps_cpp  does not enforce   Fast DDS 2.14.5
-      a secured participant fails: RCLError: error creating node: This Fast DDS version
-      doesn't have the security libraries
+      a secured participant fails: RCLError: error creating node: This Fast
+      DDS version doesn't have the security libraries
   Cyclone DDS (libddsc)        enforces security  Cyclone DDS 0.10.2
-      in an enclave made by sros it created the allowed writer on /chatter, and refused
-      writer and reader on /sros_not_allowed: ... Not Allowed By Security
+      in an enclave made by sros it created the allowed writer on /chatter,
+      and refused writer and reader on /sros_not_allowed: ...
   DDS Security can be enforced here.
 
 Exit status: 1 if nothing here enforces security, or if a finding is an error; else 0.""",
 )
 @json_option
 def doctor(as_json: bool) -> None:
-    """Find the DDS stacks and RMWs of this machine that enforce security.
+    """Find out which DDS stacks and RMWs of this machine enforce security.
 
     Each is tried, in a process of its own and in an enclave made for the purpose; a name or a
-    version says nothing about how it was built. Also tells what `sros check runtime` finds:
-    misspelt ROS_SECURITY_* values, files that are missing, a clock that is off.
+    version says nothing about how it was built. Also shows what `sros check runtime` finds:
+    misspelt ROS_SECURITY_* values, missing files, a clock that is wrong.
     """
     from sros_tool.checks.kind import ERROR, WARNING
     from sros_tool.demo.doctor import diagnosis_text, examine

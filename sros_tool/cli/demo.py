@@ -33,14 +33,14 @@ def _complete_scenario(
 Example:
   $ sros demo --topic /camera/image
   Cyclone DDS 0.10.2, topic /camera/image, in a network namespace of its own
-        what was tried                                  expected      observed
-  ok    secured talker to secured listener              heard         heard
-        secured listener heard 49 of 50 messages of the secured talker in 5.0 s
-  ok    secured talker to unsecured listener            not heard     not heard
-        unsecured listener heard 0 of 50 messages of the secured talker in 5.0 s; ...
+        what was tried                        expected      observed
+  ok    secured talker to secured listener    heard         heard
+        secured listener heard 49 of 50 messages of the secured talker ...
+  ok    secured talker to unsecured listener  not heard     not heard
+        unsecured listener heard 0 of 50 messages of the secured talker ...
   ...
   11 of 11 rows as expected.
-  $ sros demo --scenario attacks --keystore ~/robot_keystore --summary attacks.md
+  $ sros demo --scenario attacks --keystore ~/robot --summary attacks.md
   $ sros demo --scenario governance --plot cost.svg
   $ sros demo --scenario all
 

@@ -37,7 +37,8 @@ Example:
   $ sros distribute_key keystore /talker talker.tar.gz
   exported enclave /talker to 'talker.tar.gz'
   $ tar -xzf talker.tar.gz -C /etc/robot/keystore      # on the robot
-  $ sros distribute_key keystore --match '/arm/*' - | ssh robot tar -xz -C robot
+  $ sros distribute_key keystore --match '/arm/*' - | \\
+        ssh robot tar -xz -C robot
   exported enclave /arm/gripper to standard output
   exported enclave /arm/wrist to standard output
   left out enclave /arm/camera: its key was made on its robot""",
@@ -146,8 +147,10 @@ Example:
   $ sros verify robot --at 2027-06-01 || echo 'renew before June'""",
 )
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
-@click.option("--domain", metavar="ID", help="Ask also whether it may join this ROS domain.")
-@click.option("--at", metavar="MOMENT", help="As if it were then: 2027-06-01, or 90d from now.")
+@click.option("--domain", metavar="ID", help="Check also whether it may join this ROS domain.")
+@click.option(
+    "--at", metavar="MOMENT", help="Check as of this moment: 2027-06-01, or 90d from now."
+)
 @json_option
 def verify(folder: Path | None, domain: str | None, at: str | None, as_json: bool) -> int:
     """On a robot: say whether the enclaves in DIR, or the enclave DIR, can be used as they are.
@@ -188,20 +191,20 @@ if TYPE_CHECKING:
 Example:
   $ sros create_request /arm/camera robot
   made the key of enclave /arm/camera, which stays in 'robot'
-    its SHA-256 is 6f5bbd292e91c5d0fbf579aa0d036ac044cdd9788c6efdbc730a4b3a2a2809da
+    its SHA-256 is 6f5bbd292e91c5d0fbf579aa0d036ac044cdd9788c6efdbc730a...
     have 'robot/enclaves/arm/camera/request.pem' signed: sros sign_request
-  $ ssh robot cat robot/enclaves/arm/camera/request.pem |          # all the rest, from home
-      sros sign_request keystore - | ssh robot sros import - robot""",
+  $ ssh robot cat robot/enclaves/arm/camera/request.pem |   # or all from home
+        sros sign_request keystore - | ssh robot sros import - robot""",
 )
 @click.argument("name")
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
-@click.option("--again", is_flag=True, help="Make the request anew, for the key that is there.")
+@click.option("--again", is_flag=True, help="Make the request again, for the existing key.")
 @dry_run_option
 def create_request(name: str, folder: Path | None, again: bool, dry_run: bool) -> None:
     """On a robot: make the key of the enclave NAME in the folder DIR, and a signing request.
 
     The key never leaves DIR.  Send the request home, where `sros sign_request` answers it; `sros
-    import` puts the answer beside the key.
+    import` installs the answer next to the key.
     """
     from sros_tool.keystore.delivery.request import create_request as create
 
@@ -223,11 +226,12 @@ def create_request(name: str, folder: Path | None, again: bool, dry_run: bool) -
     epilog="""\b
 Example:
   $ sros sign_request keystore request.pem -p camera.xml
-  signed the request of enclave /arm/camera for the key 6f5bbd292e91c5d0fbf579aa0d036ac044cdd978...
-    the robot will trust CN=sros identity CA 4f122aed, SHA-256 5fe417aaed47cccd3f4a6b3e8e94db18...
-    and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91a...
-    send 'request.answer.tar.gz' to the robot: sros import request.answer.tar.gz DIR --ca e15ab4...
-  $ sros sign_request keystore keystore/enclaves/arm/camera/request.pem --renew -o camera.tgz""",
+  signed the request of enclave /arm/camera for the key 6f5bbd292e91c5d0...
+    the robot will trust CN=sros identity CA 4f122aed, SHA-256 5fe417aa...
+    and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af...
+    send 'request.answer.tar.gz' to the robot: sros import ...
+  $ sros sign_request keystore keystore/enclaves/arm/camera/request.pem \\
+        --renew -o camera.tgz""",
 )
 @click.argument("words", metavar="[ROOT] REQUEST", nargs=-1, required=True)
 @click.option(
@@ -317,10 +321,10 @@ def sign_request(
 Example:
   $ sros import request.answer.tar.gz robot
   imported enclave /arm/camera, which can run until 2027-05-20T07:45:12Z
-    it trusts CN=sros identity CA 4f122aed, SHA-256 5fe417aaed47cccd3f4a6b3e8e94db185bfc8e10...
-    and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd9...
-    compare both with what sign_request said, or say --ca: nothing else vouches for them
-  $ sros import request.answer.tar.gz robot --ca e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91...
+    it trusts CN=sros identity CA 4f122aed, SHA-256 5fe417aa...
+    and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af...
+    compare both with what sign_request said, or say --ca: ...
+  $ sros import request.answer.tar.gz robot --ca e15ab4af9ee8c94bd8a5e4c6c1...
   $ sros run robot /arm/camera -- ros2 run camera driver""",
 )
 @click.argument("answer", type=PATH)
@@ -337,7 +341,7 @@ Example:
 def import_verb(
     answer: Path, folder: Path | None, force: bool, pin: str | None, dry_run: bool
 ) -> None:
-    """On a robot: put the file ANSWER (or -) beside the key that waits in DIR, or change nothing.
+    """On a robot: install the file ANSWER (or -) next to the key in DIR, or change nothing.
 
     All of it is checked first: that the certificate is for this key, the chain, the signatures,
     the dates, and that the archive holds nothing else.  The first answer tells the robot whom to

@@ -492,7 +492,7 @@ def _complete_enclave(
     epilog="""\b
 Example:
   $ sros explain keystore /talker publish /chatter --policy robot.xml
-  yes: /talker may publish topic /chatter, on Fast DDS 2.14 (rmw_fastrtps_cpp is installed here)
+  yes: /talker may publish topic /chatter, on Fast DDS 2.14 (...)
     why       rule 1 allows publish rt/chatter by rt/chatter
     rule      allow rule 1 of grant /talker: rt/chatter
     from      robot.xml:12: ALLOW publish chatter
@@ -501,7 +501,8 @@ Example:
   $ sros explain keystore /talker call /add_two_ints --all-vendors
   $ sros explain keystore --who publish /cmd_vel
   $ sros explain keystore --reach /mobile_robot/teleop
-  $ ros2 run demo_nodes_cpp talker 2>&1 | sros explain keystore /talker --log -""",
+  $ ros2 run demo_nodes_cpp talker 2>&1 | \\
+        sros explain keystore /talker --log -""",
 )
 @click.argument(
     "words",

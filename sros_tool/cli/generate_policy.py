@@ -256,13 +256,14 @@ class _Words(click.Command):
 Example:
   $ sros generate_policy robot.xml
   wrote 'robot.xml': 2 enclaves, 2 nodes, 20 rights
-  copied common/node/logging.xml, common/node/types.xml, common/rclpy_node.xml beside it
+  copied common/node/logging.xml, common/node/types.xml, ... next to it
   $ sros generate_policy robot.xml --watch 10m
   watching for 600 s, or until Ctrl-C; then the policy is written
   new: /talker (/talker_listener/talker)
   new: /talker (/talker_listener/talker) publish /chatter
   ...
-  $ sros generate_policy robot.xml --enclave /talker_listener/talker --from-log talker.log
+  $ sros generate_policy robot.xml --enclave /talker_listener/talker \\
+        --from-log talker.log
   added 1 right to 'robot.xml'
     /talker_listener/talker ALLOW publish topic /nope
 
@@ -274,16 +275,23 @@ observe with --keystore ROOT --enclave /sros_observer.""",
 @click.option(
     "--watch",
     metavar="[DURATION]",
-    help="Keep everything seen within DURATION, as 10m, or until Ctrl-C.",
+    help="Collect everything seen for DURATION, such as 10m, or until Ctrl-C.",
 )
-@click.option("--spin-time", type=click.FloatRange(0.1, 86400), metavar="S", help="Look S seconds.")
+@click.option(
+    "--spin-time", type=click.FloatRange(0.1, 86400), metavar="S", help="Look for S seconds."
+)
 @click.option("--flat", is_flag=True, help="One file, without includes of common parts.")
 @click.option("--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or 0]")
 @click.option(
-    "--enclave", metavar="NAME", help="Observe in this enclave; for --from-log, the node's."
+    "--enclave",
+    metavar="NAME",
+    help="Observe in this enclave; with --from-log, the enclave of the node.",
 )
 @click.option(
-    "--keystore", type=PATH, metavar="ROOT", help="Its keystore. [default: $ROS_SECURITY_KEYSTORE]"
+    "--keystore",
+    type=PATH,
+    metavar="ROOT",
+    help="The keystore of that enclave. [default: $ROS_SECURITY_KEYSTORE]",
 )
 @click.option(
     "--from-log",
@@ -291,7 +299,7 @@ observe with --keystore ROOT --enclave /sros_observer.""",
     multiple=True,
     type=PATH,
     metavar="LOG...",
-    help="Propose what was denied in these logs of Fast DDS or Cyclone DDS (- is stdin) instead.",
+    help="Do not observe; propose what Fast DDS or Cyclone DDS denied by these logs (- is stdin).",
 )
 @click.option("--node", metavar="/NS/NAME", help="The node whose profile --from-log adds to.")
 @click.option("-s", "--use-sim-time", is_flag=True, help="Accepted; observing needs no clock.")

@@ -20,14 +20,14 @@ _INDENT = "  "
 Example:
   $ sros inspect keystore/enclaves/talker/permissions.p7s
   permissions keystore/enclaves/talker/permissions.p7s
-    signed by CN=sros permissions CA 5f0c3a1e, sha256, 2154 bytes: signature verified
+    signed by CN=sros permissions CA 5f0c3a1e, sha256, 2154 bytes: ...
     grant /talker for CN=/talker
       valid from 2026-11-20T05:59:44Z to 2027-05-20T05:59:44Z
       ALLOW in domain 0
         publish topics: /chatter, /parameter_events, /rosout
         ...
   $ sros inspect keystore --history
-  2026-11-20T05:59:44Z  certificate  current     /talker  until 2027-11-20T05:59:44Z  4f1c9a
+  2026-11-20T05:59:44Z  certificate  current     /talker  until 2027-11-20...
   ...""",
 )
 @click.argument("path", type=PATH)
@@ -40,7 +40,7 @@ Example:
 @click.option(
     "--history",
     is_flag=True,
-    help="Show everything that the keystore PATH ever issued, and what became of it.",
+    help="Show everything that the keystore PATH ever issued, and its present state.",
 )
 @json_option
 def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) -> int:

@@ -114,7 +114,8 @@ class _SeveralEnclavesAndPolicies(SeveralValues):
     cls=_SeveralEnclavesAndPolicies,
     epilog="""\b
 Example:
-  $ sros generate_artifacts -k keystore -e /spare -p talker_listener.xml mobile_robot.xml
+  $ sros generate_artifacts -k keystore -e /spare \\
+        -p talker_listener.xml mobile_robot.xml
   created enclave /spare
   created enclave /talker_listener/talker
   ...""",
@@ -233,11 +234,10 @@ if TYPE_CHECKING:
 Example:
   $ sros create_keystore keystore
   created keystore 'keystore' for domain 0
-    template development: encrypted and authenticated; every enclave may do everything until it
-    gets a policy
-    identity CA and permissions CA: separate, valid for 3650d; certificates 3650d, permissions 3650d
-    identity CA SHA-256 5fe417aaed47cccd3f4a6b3e8e94db185bfc8e1003ee5b8c8a4cb3dc1dc9a4e6
-    permissions CA SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91a0f5ac3e5ef1b0c4e47
+    template development: encrypted and authenticated; every enclave may ...
+    identity CA and permissions CA: separate, valid for 3650d; ...
+    identity CA SHA-256 5fe417aaed47cccd3f4a6b3e8e94db185bfc8e1003ee5b8c...
+    permissions CA SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91...
   $ sros create_keystore fleet --template production --domain 10-19""",
 )
 @click.argument("root", type=PATH)

@@ -35,7 +35,7 @@ _MANY = 5
 Example:
   $ sros renew keystore /talker
   renewed enclave /talker
-  the replaced certificate works until 2027-11-21T09:00:00Z, unless revoked: see --revoke-old
+  the replaced certificate works until 2027-11-21T09:00:00Z, unless ...
   $ sros renew keystore --all-expiring 30d --revoke-old""",
 )
 @click.argument(
@@ -47,9 +47,9 @@ Example:
 @click.option(
     "--all-expiring",
     metavar="DURATION|PERCENT",
-    help="Renew also all that end within 30d, or of whose life 66% is over.",
+    help="Renew also all that expire within 30d, or have used 66% of their validity.",
 )
-@click.option("--new-key", is_flag=True, help="Make new keys, too.")
+@click.option("--new-key", is_flag=True, help="Make new keys as well.")
 @click.option(
     "--revoke-old",
     is_flag=True,
@@ -63,14 +63,14 @@ def renew(
     revoke_old: bool,
     dry_run: bool,
 ) -> None:
-    """Issue new certificates for the enclaves NAME..., and sign their permissions anew.
+    """Issue new certificates for the enclaves NAME..., and sign their permissions again.
 
     The rights stay as they are.  Processes that run go on with what they have loaded; restart
-    them before it ends.
+    them before it expires.
 
-    A certificate that is replaced works until it ends, together with the permissions of its time,
-    for whoever has a copy of the files.  With --revoke-old nobody who reads the new crl.pem
-    accepts it: restart the renewed processes first, then the others.
+    A certificate that is replaced works until it expires, with the permissions of its time, for
+    whoever has a copy of the files.  --revoke-old revokes it: nobody who reads the new crl.pem
+    accepts it. Then restart the renewed processes first, and after them the others.
     """
     from sros_tool.keystore.expiry import parse_threshold
     from sros_tool.keystore.lifecycle.renew import renew as work
@@ -134,7 +134,7 @@ def _complete_reason(
 Example:
   $ sros revoke keystore /talker --reason key_compromise
   revoked enclave /talker
-  restart the processes of 2 enclaves for it to take effect: /listener, /monitor""",
+  restart the processes of 2 enclaves for it to take effect: /listener, ...""",
 )
 @click.argument(
     "words",
@@ -198,15 +198,15 @@ def revoke(words: tuple[str, ...], reason: str, until_retired: bool, dry_run: bo
 Example:
   $ sros crl keystore
   revocation list 3, until 2036-11-18T06:05:29Z
-    69aa94992b4cf7d761cf3c3e06f16849896e24a3  2026-11-21T07:00:00Z  keyCompromise
+    69aa94992b4cf7d761cf3c3e06f16849896e24a3  2026-11-21T07:00:00Z  ...
   $ sros crl keystore --refresh""",
 )
 @click.argument("root", type=PATH, required=False)
-@click.option("--refresh", is_flag=True, help="Sign it anew, so that it holds for longer.")
+@click.option("--refresh", is_flag=True, help="Sign it again, so that it is valid for longer.")
 @json_option
 @dry_run_option
 def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
-    """Show the revocation list of the keystore ROOT, or sign it anew.
+    """Show the revocation list of the keystore ROOT, or sign it again.
 
     An expired list makes DDS refuse everybody, so the exit status is 1 when it ends within 30
     days.
@@ -304,13 +304,13 @@ Example:
   distributed the new CA beside the old one: identity_ca, permissions_ca
   $ sros rotate_ca keystore --status
   stage: distribute, next: reissue
-    identity CA    issuing 2 of 2 enclaves  until 2036-11-18T07:37:42Z  CN=sros identity CA b6d1525f
-    identity CA    next    0 of 2 enclaves  until 2036-11-18T07:37:45Z  CN=sros identity CA 45aff1c0
+    identity CA    issuing 2 of 2 enclaves  until 2036-11-18T07:37:42Z  ...
+    identity CA    next    0 of 2 enclaves  until 2036-11-18T07:37:45Z  ...
   $ sros rotate_ca keystore --next     # once all processes were restarted
   issued and signed everything anew by the new CA: identity_ca, permissions_ca
-  $ sros rotate_ca keystore --next     # once more, all processes were restarted
+  $ sros rotate_ca keystore --next     # once they were restarted again
   retired the old CA: identity_ca, permissions_ca
-  $ sros rotate_ca keystore --finish   # or all stages at once; then restart all together""",
+  $ sros rotate_ca keystore --finish   # or all at once; then restart all""",
 )
 @click.argument("root", type=PATH, required=False)
 @click.option("--identity", is_flag=True, help="Only the identity CA.")
@@ -354,9 +354,9 @@ def rotate_ca(
 ) -> None:
     """Replace the CAs of the keystore ROOT while its robots run.
 
-    Stage 1, distribute: a new CA is trusted beside the old one. Stage 2, reissue: certificates,
-    governance and permissions are made anew by the new CA. Stage 3, retire: the old CA is trusted
-    no longer. Processes notice nothing before they are restarted; restart them all after each
+    Stage 1, distribute: a new CA is trusted next to the old one. Stage 2, reissue: the new CA
+    issues all certificates, governance and permissions again. Stage 3, retire: the old CA is no
+    longer trusted. Processes notice nothing before they are restarted; restart them all after each
     stage, and export again what was exported.
 
     Fast DDS (2.9.1) lets processes talk at every moment of this. Cyclone DDS (0.10.2) trusts one

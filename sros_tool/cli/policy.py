@@ -35,7 +35,7 @@ def output_option(help_text: str) -> Callable[[Decorated], Decorated]:
     return click.option("-o", "--output", type=PATH, metavar="FILE", help=help_text)
 
 
-force_option = click.option("--force", is_flag=True, help="Let FILE be replaced if it exists.")
+force_option = click.option("--force", is_flag=True, help="Replace FILE if it exists.")
 
 
 def check_output(output: Path, *, force: bool) -> None:
@@ -73,8 +73,7 @@ Example:
   added 2 rights
     /talker ALLOW publish topic /diagnostics
     /talker ALLOW subscribe topic /tf
-  note [merge.still-denied]: /talker DENY publish topic /cmd_vel stays, and counts before what was
-  asked for: publish topic /cmd_vel.
+  note [merge.still-denied]: /talker DENY publish topic /cmd_vel stays ...
   replaced 'robot.xml'""",
 )
 @click.argument("policy", metavar="POLICY", type=PATH)
@@ -97,8 +96,8 @@ def merge_policy(
 
     Comments, includes, metadata and layout of POLICY stay as they are; those of the others are
     not taken over. A right is added for its one direction only, and only where the enclave does
-    not have it yet, be it through an include or a wildcard. A DENY always stays and always counts
-    before an ALLOW; where the policies contradict each other, it is said.
+    not have it yet, be it through an include or a wildcard. A DENY always stays and always wins
+    over an ALLOW; contradictions between the policies are reported.
     """
     from sros_tool.policy.document import read_policy
     from sros_tool.policy.merge import merge_all, merge_notes
@@ -183,7 +182,7 @@ Example:
   $ sros diff_policy robot.xml keystore
   - /talker ALLOW publish topic /status
   - /talker ALLOW request service /*
-  + /talker ALLOW request service /add_two_ints  (A has it by request service /*)
+  + /talker ALLOW request service /add_two_ints  (A has it by request ...
   3 rights differ
   $ sros diff_policy robot.xml keystore/enclaves/talker/permissions.p7s""",
 )
@@ -194,7 +193,7 @@ def diff_policy(a: Path, b: Path, as_json: bool) -> int:
     """Compare the rights that A and B give: "-" has only A, "+" only B.
 
     Each is a policy file, a permissions.p7s or permissions.xml, the folder of an enclave, or a
-    keystore. Permissions are told in ROS terms, and their signature is verified where the
+    keystore. Permissions are shown in ROS terms, and their signature is verified where the
     permissions CA lies with them. If one side is for a single enclave, only that is compared.
 
     The exit status is 1 if they differ, or if DDS would refuse one of them.
@@ -361,7 +360,7 @@ def minimize_policy(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Tell what POLICY allows and nobody was observed to use, and narrow it.
+    """Show what POLICY allows and nobody was observed to use, and narrow it.
 
     The number behind "allowed" and "observed" counts pairs of a right and an exact name; a
     wildcard counts as the names it matches among all that are known: from the policy, from the

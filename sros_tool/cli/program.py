@@ -39,18 +39,18 @@ FAMILIES: dict[str, dict[str, Verb]] = {
         "renew": Verb("life", "Renew certificates and permissions of enclaves."),
         "revoke": Verb("life", "Revoke enclaves."),
         "rotate_ca": Verb("life", "Replace the CAs, stage by stage."),
-        "crl": Verb("life", "Show the revocation list, or sign it anew."),
+        "crl": Verb("life", "Show the revocation list, or sign it again."),
     },
     "Deployment": {
         "distribute_key": Verb(
             "deployment", "Export enclaves for the robot they run on.", ("export_enclave",)
         ),
-        "verify": Verb("deployment", "Say whether what arrived on a robot can be used."),
-        "create_request": Verb(
-            "deployment", "Make a key on the robot, and the request to certify it."
+        "verify": Verb("deployment", "Check whether a robot's enclaves can be used."),
+        "create_request": Verb("deployment", "Make a key on the robot, and a request to sign it."),
+        "sign_request": Verb("deployment", "Sign the request of a robot."),
+        "import": Verb(
+            "deployment", "Install a signed answer next to its key.", attribute="import_verb"
         ),
-        "sign_request": Verb("deployment", "Answer the request of a robot."),
-        "import": Verb("deployment", "Put an answer beside its key.", attribute="import_verb"),
     },
     "Policy": {
         "generate_policy": Verb("generate_policy", "Learn a policy from the running robot."),
@@ -58,14 +58,16 @@ FAMILIES: dict[str, dict[str, Verb]] = {
         "diff_policy": Verb("policy", "Compare the rights of policies, permissions, keystores."),
         "minimize_policy": Verb("policy", "Narrow a policy to what was observed."),
         "explain": Verb("explain", "Say what DDS will decide, by which rule, and why."),
-        "view": Verb("view", "Draw who may do what, as a page, SVG, DOT, Mermaid or JSON."),
+        "view": Verb("view", "Draw who may do what, as a page, SVG, DOT or Mermaid."),
         "policies": Verb("policy", "List or copy the policies that ship with sros."),
+    },
+    "Checks": {
+        "check": Verb("check", "Find what is wrong or weak in policies, keystores, the runtime."),
+        "doctor": Verb("check", "Find out which DDS here enforces security."),
     },
     "Running": {
         "env": Verb("running", "Print the environment of an enclave."),
         "run": Verb("running", "Run a command in an enclave."),
-        "check": Verb("check", "Find what is wrong or weak in policies, keystores, the runtime."),
-        "doctor": Verb("check", "Find out which DDS here enforces security."),
         "demo": Verb("demo", "Show on a real DDS that secured nodes are isolated."),
         "completion": Verb("running", "Print the completion script of a shell."),
     },
@@ -123,7 +125,7 @@ Exit status: 0 yes or done; 1 no, denied or failed; 2 wrong usage."""
 @click.group(
     cls=Program,
     epilog=EPILOG,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 80},
     no_args_is_help=True,
 )
 @click.version_option(__version__, "--version", "-V", message="sros %(version)s")

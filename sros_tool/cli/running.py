@@ -79,7 +79,8 @@ class _WithCommand(click.Command):
     cls=_WithCommand,
     epilog="""\b
 Example:
-  $ sros run keystore /talker_listener/talker -- python3 -m sros_tool.demo.nodes.talker
+  $ sros run keystore /talker_listener/talker -- \\
+        python3 -m sros_tool.demo.nodes.talker
   [INFO] [talker]: Publishing: 'Hello World: 1'""",
 )
 @click.argument(
@@ -96,10 +97,10 @@ Example:
 def run(ctx: click.Context, words: tuple[str, ...], domain: str | None, no_ros_args: bool) -> None:
     """Run COMMAND in the enclave NAME of the keystore ROOT, or not at all (strategy Enforce).
 
-    The enclave is checked first; what would keep the command from starting is said here, not
-    by an obscure message of the middleware. Where COMMAND is known to start a ROS node (`ros2
-    run`, or an executable of a ROS package), `--ros-args --enclave NAME` is added to it, so that
-    the ROS graph shows the enclave.
+    The enclave is checked first; what would keep the command from starting is reported here, not
+    by an obscure message of the middleware. A COMMAND that is known to start a ROS node (`ros2
+    run`, or an executable of a ROS package) gets the arguments `--ros-args --enclave NAME`, so
+    that the ROS graph shows the enclave.
     """
     from sros_tool.runtime.environment import with_enclave
 

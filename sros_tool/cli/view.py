@@ -51,19 +51,19 @@ Examples:
     "--format",
     "form",
     type=click.Choice(FORMATS),
-    help="What to write. [default: by the ending of FILE, else html]",
+    help="What to write. [default: by the suffix of FILE, else html]",
 )
 @click.option("--json", "as_json", is_flag=True, help="The same as --format json.")
 @click.option(
-    "-o", "--output", type=PATH, metavar="FILE", help="Write to FILE, and not to standard output."
+    "-o", "--output", type=PATH, metavar="FILE", help="Write to FILE instead of standard output."
 )
-@click.option("--open", "show", is_flag=True, help="Show what was written, in the browser.")
+@click.option("--open", "show", is_flag=True, help="Open the result in the browser.")
 @click.option(
     "--observed",
     multiple=True,
     type=PATH,
     metavar="OBSERVED...",
-    help="What was observed, to lay over SOURCE: policies or JSON by generate_policy.",
+    help="What was observed, to compare with SOURCE: policies or JSON by generate_policy.",
 )
 @click.option(
     "--template",
@@ -76,10 +76,10 @@ Examples:
     "hosts",
     multiple=True,
     metavar="HOST=ENCLAVE",
-    help="Group ENCLAVE, and what is below it, by the host that it runs on.",
+    help="Group ENCLAVE, and the enclaves below it, by the host they run on.",
 )
 @click.option("--all", "everything", is_flag=True, help="Draw also what every node needs.")
-@click.option("--graphviz", is_flag=True, help="Let Graphviz place the SVG.")
+@click.option("--graphviz", is_flag=True, help="Lay out the SVG with Graphviz.")
 @force_option
 @dry_run_option
 def view(
@@ -96,7 +96,7 @@ def view(
     force: bool,
     dry_run: bool,
 ) -> None:
-    """Draw who may do what in SOURCE, or in two of them laid over each other.
+    """Draw who may do what in SOURCE, or compare two of them in one drawing.
 
     A SOURCE is a policy file, a keystore (what was really signed), the folder of an enclave, its
     permissions, or what `sros generate_policy --json` has printed. Two sources are compared: two

@@ -1,0 +1,55 @@
+"""The help of every verb fits a terminal of 80 columns, and shows an example."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+import pytest
+from click.testing import CliRunner
+
+from sros_tool.cli.program import FAMILIES, program
+
+VERBS = {name: verb for family in FAMILIES.values() for name, verb in family.items()}
+
+
+def help_of(*words: str, width: int = 80) -> str:
+    runner = CliRunner(env={"COLUMNS": str(width)})
+    done = runner.invoke(program, [*words, "--help"], prog_name="sros")
+    assert done.exit_code == 0
+    return done.output
+
+
+@pytest.mark.parametrize("width", [80, 200])
+@pytest.mark.parametrize("verb", ["", *VERBS])
+def test_no_line_of_a_help_is_longer_than_80_columns(verb: str, width: int) -> None:
+    lines = help_of(*filter(None, [verb]), width=width).splitlines()
+    assert [line for line in lines if len(line) > 80] == [], f"in `sros {verb} --help`"
+
+
+@pytest.mark.parametrize("verb", ["", *VERBS])
+def test_a_help_shows_an_example(verb: str) -> None:
+    shown = help_of(*filter(None, [verb]))
+    assert "Example" in shown
+    assert f"$ sros {verb}".rstrip() in shown or f"$(sros {verb}" in shown
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_no_word_of_an_option_is_broken(verb: str) -> None:
+    """A line that ends with a hyphen would cut an option such as --revoke-old in two."""
+    lines = help_of(verb).splitlines()
+    assert [line for line in lines if line.endswith("-") and line.split()[-1] != "-"] == []
+
+
+def test_every_verb_of_a_module_is_in_one_family() -> None:
+    homes: dict[str, set[str]] = {}
+    for family, verbs in FAMILIES.items():
+        for verb in verbs.values():
+            homes.setdefault(verb.module, set()).add(family)
+    assert {name: families for name, families in homes.items() if len(families) > 1} == {}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_the_summary_of_a_verb_is_one_sentence_that_fits_its_line(verb: str) -> None:
+    assert VERBS[verb].help.endswith(".")
+    module = import_module(f"sros_tool.cli.{VERBS[verb].module}")
+    assert getattr(module, VERBS[verb].attribute or verb).help
