@@ -266,9 +266,9 @@ def sign_request(
     permissions, governance, the certificates of the CAs, and what was revoked.  The keystore knows
     the enclave from then on, without its key.  Compare the key's SHA-256 with what the robot says.
     """
-    from sros_tool.keystore.authorities.authority import load_ca_certificate
     from sros_tool.keystore.delivery.signing import sign_request as sign
     from sros_tool.keystore.layout import PERMISSIONS
+    from sros_tool.keystore.reader import load_ca_certificate
     from sros_tool.pki.certificates import digest
     from sros_tool.policy import read_policy
     from sros_tool.runtime.environment import domain_from

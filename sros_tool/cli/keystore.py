@@ -369,8 +369,8 @@ def _imported(files: dict[str, Path | None]) -> dict[str, bytes]:
 
 def say_new_keystore(root: Path, template: Template, domains: DomainSet) -> None:
     """Say what was made, and by which choices."""
-    from sros_tool.keystore.authorities.authority import load_ca_certificate
     from sros_tool.keystore.layout import ROLES
+    from sros_tool.keystore.reader import load_ca_certificate
     from sros_tool.pki.certificates import digest
     from sros_tool.validity import span_text
 

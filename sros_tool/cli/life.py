@@ -214,8 +214,8 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
     from datetime import timedelta
 
     from sros_tool.keystore.layout import list_enclaves
-    from sros_tool.keystore.lifecycle.revocation_list import read_lists
     from sros_tool.keystore.lifecycle.revoke import refresh_crl
+    from sros_tool.keystore.reader import read_lists
     from sros_tool.pki.certificates import subject_text
     from sros_tool.validity import iso
 

@@ -67,6 +67,10 @@ class Permissions:
 
     grants: tuple[Grant, ...]
 
+    def grant_of(self, subject: str) -> Grant | None:
+        """Return the first grant for a subject, which is the one that DDS reads, or None."""
+        return next((each for each in self.grants if each.subject == subject), None)
+
 
 def grant(name: str, subject: str, validity: Window, rules: tuple[Rule, ...]) -> Grant:
     """A grant of the portable profile: UTC moments, and what no rule names is denied."""

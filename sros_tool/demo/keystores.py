@@ -21,11 +21,10 @@ from sros_tool.demo.nodes.names import enclave_grant, may, node_names, topics_of
 from sros_tool.demo.policies import DENIED_TOPIC, SERVICE
 from sros_tool.demo.records import CastMember
 from sros_tool.errors import KeystoreError, SrosError
-from sros_tool.keystore.authorities.authority import load_ca_certificate
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import ENCLAVES, PERMISSIONS, PRIVATE, ROLES, ca_key, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
-from sros_tool.keystore.reader import load_governance, load_settings
+from sros_tool.keystore.reader import load_ca_certificate, load_governance, load_settings
 from sros_tool.keystore.template import Template
 from sros_tool.names import dds_names
 from sros_tool.runtime.environment import DOMAIN, secured_environment

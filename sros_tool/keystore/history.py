@@ -21,7 +21,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.ledger import Entry, read_ledger
-from sros_tool.keystore.lifecycle.revocation_list import read_lists
+from sros_tool.keystore.reader import read_lists
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 

@@ -1,15 +1,21 @@
-"""The one way to read a keystore and an enclave: its parts, its grant, and what is wrong."""
+"""The one way to read a keystore and an enclave: its parts, its grant, and what is wrong.
+
+What DDS checks when a participant is created is checked here by name, after Fast DDS 2.14.5 and
+Cyclone DDS 0.10, which name the cause seldom.  Where vendors differ, see
+`sros_tool.keystore.loading`.
+"""
 
 from __future__ import annotations
 
 import hashlib
 import re
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from cryptography import x509
 
@@ -19,36 +25,137 @@ from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    CRL,
+    CRL_FILE,
+    GOVERNANCE_FILE,
     GOVERNANCE_P7S,
+    IDENTITY,
+    IDENTITY_CA_FILE,
+    KEY_FILE,
     PERMISSIONS,
+    PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
+    PRIVATE,
+    PUBLIC,
     REQUIRED_FILES,
+    ROLES,
     SETTINGS,
+    STAGE,
     ca_certificate,
+    check_keystore,
+    enclave_names,
+    enclave_path,
+    key_on_robot,
 )
-from sros_tool.keystore.template import Template, load_template, read_template
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     issued_by,
     load_certificate,
+    load_certificates,
     same_key,
     subject_text,
     validity_of,
 )
-from sros_tool.pki.crl import signed_by
+from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl, signed_by
 from sros_tool.pki.keys import load_key
 from sros_tool.validity import Window, iso
 from sros_tool.values import shows
 from sros_tool.xml import read_bytes
 
+if TYPE_CHECKING:
+    from sros_tool.keystore.ledger import Entry
+    from sros_tool.keystore.template import Template
+
+_Parsed = TypeVar("_Parsed")
+
+
+# ── a keystore ─────────────────────────────────────────────────────────────────────────────
+
+
+class OpenedKeystore:
+    """A keystore opened for reading: each part is read when it is first asked for.
+
+    It may be the part of a keystore that was exported for a robot.  Every part raises `SrosError`
+    where it is there and cannot be read.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+
+    @property
+    def is_home(self) -> bool:
+        """Whether it has a place for CAs; else it was exported for a robot."""
+        return any((self.root / part).exists() for part in (PUBLIC, PRIVATE, SETTINGS))
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """The names of its enclaves, sorted."""
+        return tuple(enclave_names(self.root))
+
+    @cached_property
+    def settings(self) -> Template | None:
+        """The choices it was made by; None where ros2/sros2 made it, or in an export."""
+        return load_settings(self.root) if (self.root / SETTINGS).exists() else None
+
+    @cached_property
+    def governance(self) -> Governance:
+        """The governance that DDS loads, its signature verified."""
+        return load_governance(self.root, load_ca_certificate(self.root, PERMISSIONS))
+
+    @cached_property
+    def domains(self) -> DomainSet:
+        """The ROS domains that its governance is for."""
+        return self.governance.domains().closed()
+
+    @cached_property
+    def revocation_list(self) -> RevocationList | None:
+        """The list of the issuing identity CA, if anything was ever revoked."""
+        return read_crl(self.root)
+
+    @cached_property
+    def ledger(self) -> tuple[Entry, ...]:
+        """Everything that was issued, oldest first; nothing where there is no ledger."""
+        from sros_tool.keystore.ledger import read_ledger
+
+        return read_ledger(self.root)
+
+    def authority(self, role: str) -> tuple[x509.Certificate, ...]:
+        """Return the certificates of a CA's file, the issuing one first; none without a file."""
+        path = self.root / ca_certificate(role)
+        if not path.exists():
+            return ()
+        return load_certificates(read_bytes(path, "certificate"), f"'{path}'")
+
+    def enclave(self, name: str, *, now: datetime, domain: int | None = None) -> OpenedEnclave:
+        """Return an enclave of it, as `open_enclave` does."""
+        return open_enclave(enclave_path(self.root, name), now=now, domain=domain)
+
+
+def open_keystore(root: Path) -> OpenedKeystore:
+    """Return the keystore ``root``, opened for reading.
+
+    Raises:
+        KeystoreError: ``root`` is no keystore.
+    """
+    check_keystore(root)
+    return OpenedKeystore(root)
+
 
 def load_settings(root: Path) -> Template:
-    """The choices that the keystore was made by; those of ros2/sros2 where it has none."""
+    """Return the choices that the keystore was made by; those of ros2/sros2 where it has none."""
+    from sros_tool.keystore.template import load_template, read_template
+
     path = root / SETTINGS
     return read_template(path) if path.exists() else load_template("sros2")
 
 
 def load_governance(root: Path, authority: x509.Certificate) -> Governance:
-    """The governance that DDS loads, after its signature by the permissions CA was verified."""
+    """Return the governance that DDS loads, its signature verified by a permissions CA.
+
+    Raises:
+        KeystoreError: it is missing or malformed, or the signature is not that CA's.
+    """
     path = root / GOVERNANCE_P7S
     try:
         signed = smime.parse(read_bytes(path, "governance document"))
@@ -63,9 +170,8 @@ def load_governance(root: Path, authority: x509.Certificate) -> Governance:
 
 
 def governance_of(root: Path) -> Governance:
-    """The governance that DDS loads, by the permissions CA that lies in the keystore."""
-    path = root / ca_certificate(PERMISSIONS)
-    return load_governance(root, load_certificate(read_bytes(path, "certificate"), f"'{path}'"))
+    """Return the governance that DDS loads, verified by the keystore's own permissions CA."""
+    return load_governance(root, load_ca_certificate(root, PERMISSIONS))
 
 
 def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
@@ -79,11 +185,86 @@ def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class Granted:
-    """A signed permissions document, not verified yet, with its SHA-256.
+# ── its authorities ────────────────────────────────────────────────────────────────────────
 
-    ``grant`` is the first that fits a subject, which is the one that DDS reads, or None.
+
+def read_certificate(path: Path, what: str = "certificate") -> x509.Certificate:
+    """Return the first certificate of a PEM file; ``what`` names it in errors.
+
+    Raises:
+        SrosError: the file is missing, or holds none.
+    """
+    return load_certificate(read_bytes(path, what), f"'{path}'")
+
+
+def load_ca_certificate(root: Path, role: str) -> x509.Certificate:
+    """Return the certificate of the identity or permissions CA of a keystore."""
+    return read_certificate(root / ca_certificate(role), f"{role} CA certificate")
+
+
+def authority_files(root: Path) -> dict[str, tuple[str, ...]]:
+    """Return the stem of each CA file, with the roles for which it serves."""
+    found: dict[str, tuple[str, ...]] = {}
+    for role in ROLES:
+        path = root / ca_certificate(role)
+        file = path
+        # A link into the stage is a file of its own that an interrupted transaction left so.
+        if path.is_symlink() and STAGE not in (to := str(path.readlink())):
+            file = path.with_name(to)
+        if not file.is_file() or file.parent != path.parent:
+            raise KeystoreError(
+                f"keystore '{root}' has no {role} CA of its own",
+                f"'{path}' is missing, or leads out of the keystore.",
+                "Use the keystore that it was exported from.",
+            )
+        stem = file.name.removesuffix(".cert.pem")
+        found[stem] = (*found.get(stem, ()), role)
+    return found
+
+
+def identity_file(root: Path) -> str | None:
+    """Return the stem of the identity CA's file; None for a copy of a keystore without CAs."""
+    with suppress(KeystoreError):
+        return next(file for file, roles in authority_files(root).items() if IDENTITY in roles)
+    return None
+
+
+def certificates_of(root: Path, file: str) -> tuple[x509.Certificate, ...]:
+    """Return all certificates of a CA file, the issuing one first."""
+    path = root / PUBLIC / f"{file}.cert.pem"
+    return load_certificates(read_bytes(path, "CA certificate"), f"'{path}'")
+
+
+def carried_crl(root: Path, file: str) -> RevocationList | None:
+    """Return the revocation list that a CA file carries next to its certificates, or None."""
+    path = root / PUBLIC / f"{file}.cert.pem"
+    data = read_bytes(path, "CA certificate")
+    return load_crl(data, f"in '{path}'") if CRL_MARK in data else None
+
+
+def read_crl(root: Path) -> RevocationList | None:
+    """Return the list of the issuing identity CA, or None if nothing was ever revoked."""
+    path = root / CRL
+    if not path.exists():
+        return None
+    return load_crl(read_bytes(path, "revocation list"), f"'{path}'")
+
+
+def read_lists(root: Path) -> tuple[RevocationList, ...]:
+    """Return all lists that DDS reads: the issuing identity CA's, and one next to a second CA."""
+    file = identity_file(root)
+    found = (read_crl(root), carried_crl(root, file) if file else None)
+    return tuple(each for each in found if each)
+
+
+# ── signed permissions ─────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class SignedGrant:
+    """A signed permissions document, not verified yet, with its SHA-256 in hexadecimal.
+
+    ``grant`` is the first for the subject, which is the one that DDS reads, or None.
     """
 
     signed: smime.SignedDocument
@@ -91,34 +272,19 @@ class Granted:
     grant: Grant | None
 
 
-def read_granted(path: Path, subject: str) -> Granted:
-    """Read what a ``permissions.p7s`` grants to a subject; raises where it is no such document."""
+def read_granted(path: Path, subject: str) -> SignedGrant:
+    """Return what a ``permissions.p7s`` grants to a subject, without verifying its signature.
+
+    Raises:
+        SrosError: it is no signed permissions document.
+    """
     message = read_bytes(path, "permissions document")
     signed = smime.parse(message)
-    grants = parse_permissions(signed.document, f"'{path}'").grants
-    grant = next((each for each in grants if each.subject == subject), None)
-    return Granted(signed, hashlib.sha256(message).hexdigest(), grant)
+    permissions = parse_permissions(signed.document, f"'{path}'")
+    return SignedGrant(signed, hashlib.sha256(message).hexdigest(), permissions.grant_of(subject))
 
 
-Parsed = TypeVar("Parsed")
-
-
-_OWN = "cert.pem"
-
-
-_CERTIFICATE_ENDS = (Fault.CERTIFICATE_EXPIRED, Fault.CERTIFICATE_NOT_YET_VALID)
-
-
-_CA_ENDS = (Fault.CA_EXPIRED, Fault.CA_NOT_YET_VALID)
-
-
-_PERMISSIONS_ENDS = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
-
-
-_ENCRYPTED = re.compile(rb"ENCRYPTED")
-
-
-_SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
+# ── an enclave ─────────────────────────────────────────────────────────────────────────────
 
 
 @shows("file", "text", "code")
@@ -154,21 +320,67 @@ class OpenedEnclave:
     """The bytes of the required files, of those that can be read."""
     permissions_document: bytes = field(default=b"", repr=False)
     """The XML within ``permissions.p7s``, also where it cannot be read as permissions."""
+    key_on_robot: bool = False
+    """Its key was made on its robot, and stays there."""
+
+    @property
+    def subject(self) -> str:
+        """The subject of its certificate, or ""."""
+        return subject_text(self.certificate.subject) if self.certificate else ""
+
+    @property
+    def grant(self) -> Grant | None:
+        """The grant that DDS reads: the first for the subject of the certificate."""
+        return self.permissions.grant_of(self.subject) if self.permissions else None
+
+    @property
+    def problems_at_home(self) -> tuple[Problem, ...]:
+        """Its problems, but for the key that is on its robot."""
+        if not self.key_on_robot:
+            return self.problems
+        return tuple(
+            each
+            for each in self.problems
+            if (each.file, each.fault) != (KEY_FILE, Fault.FILE_MISSING)
+        )
 
     def domains(self) -> DomainSet | None:
-        """The domains that governance names, or None without governance."""
+        """Return the domains that governance names, or None without governance."""
         return self.governance.domains().closed() if self.governance else None
 
+    def valid_until(self) -> datetime | None:
+        """Return when it stops being loadable: the first expiry of anything it consists of."""
+        if not (self.certificate and self.permissions):
+            return None
+        certificates = (self.certificate, self.identity_ca, self.permissions_ca)
+        moments = [validity_of(each).not_after for each in certificates if each]
+        with suppress(SrosError):  # a grant that ends before it begins
+            moments += [self.grant.validity.not_after] if self.grant else []
+        return min(moments)
+
+
+def open_enclave(folder: Path, *, now: datetime, domain: int | None = None) -> OpenedEnclave:
+    """Return what the files of an enclave say at ``now``, and what is wrong with them.
+
+    With ``domain``, also whether it may join that ROS domain.
+    """
+    return _EnclaveFiles(folder, now).check(domain)
+
+
+_EXPIRY_OF_CERTIFICATE = (Fault.CERTIFICATE_EXPIRED, Fault.CERTIFICATE_NOT_YET_VALID)
+_EXPIRY_OF_CA = (Fault.CA_EXPIRED, Fault.CA_NOT_YET_VALID)
+_EXPIRY_OF_PERMISSIONS = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
+
+_ENCRYPTED = re.compile(rb"ENCRYPTED")
+_SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
 
 # The enclaves of a keystore have all but their own files in common: these are read once.
-_certificate = lru_cache(maxsize=8)(load_certificate)
-
-
-_governance = lru_cache(maxsize=8)(parse_governance)
+_load_certificate = lru_cache(maxsize=8)(load_certificate)
+_parse_governance = lru_cache(maxsize=8)(parse_governance)
 
 
 @lru_cache(maxsize=8)
-def _content(message: bytes, authority: x509.Certificate | None) -> bytes:
+def _signed_document(message: bytes, authority: x509.Certificate | None) -> bytes:
     signed = smime.parse(message)
     if authority:
         signed.verify(authority)
@@ -176,83 +388,77 @@ def _content(message: bytes, authority: x509.Certificate | None) -> bytes:
 
 
 @lru_cache(maxsize=8)
-def _revocation_list(
+def _load_crl(
     data: bytes, authority: x509.Certificate | None
 ) -> tuple[x509.CertificateRevocationList, bool]:
-    """A revocation list, and whether it is of that authority."""
+    """Return a revocation list, and whether that authority signed it."""
     crl = x509.load_pem_x509_crl(data)
     return crl, authority is None or signed_by(crl, authority)
 
 
-def open_enclave(folder: Path, *, now: datetime, domain: int | None = None) -> OpenedEnclave:
-    """Read and check the files of an enclave; with ``domain``, also whether it may join that."""
-    return _EnclaveFiles(folder, now).run(domain)
-
-
 class _EnclaveFiles:
+    """Checks the files of one enclave, and collects its problems."""
+
     def __init__(self, folder: Path, now: datetime) -> None:
         self._folder = folder
         self._now = now
         self._problems: list[Problem] = []
-        self._permissions_document = b""
 
-    def run(self, domain: int | None) -> OpenedEnclave:
+    def check(self, domain: int | None) -> OpenedEnclave:
         files = {name: self._read(name) for name in REQUIRED_FILES}
-        identity_ca = self._certificate("identity_ca.cert.pem", files)
-        permissions_ca = self._certificate("permissions_ca.cert.pem", files)
-        certificate = self._certificate("cert.pem", files)
-        self._identity(certificate, identity_ca, files["key.pem"])
-        self._revocation(certificate, identity_ca)
+        identity_ca = self._certificate(IDENTITY_CA_FILE, files)
+        permissions_ca = self._certificate(PERMISSIONS_CA_FILE, files)
+        certificate = self._certificate(CERTIFICATE_FILE, files)
+        self._check_identity(certificate, identity_ca, files[KEY_FILE])
+        self._check_revocation(certificate, identity_ca)
         governance = permissions = None
-        if (document := self._signed("governance.p7s", files, permissions_ca)) is not None:
+        document = self._signed(GOVERNANCE_FILE, files, permissions_ca)
+        if document is not None:
             governance = self._parsed(
-                "governance.p7s", document, _governance, Fault.GOVERNANCE_MALFORMED
+                GOVERNANCE_FILE, document, _parse_governance, Fault.GOVERNANCE_MALFORMED
             )
-        if (document := self._signed("permissions.p7s", files, permissions_ca)) is not None:
-            self._permissions_document = document
+        document = self._signed(PERMISSIONS_FILE, files, permissions_ca)
+        if document is not None:
             permissions = self._parsed(
-                "permissions.p7s", document, parse_permissions, Fault.PERMISSIONS_MALFORMED
+                PERMISSIONS_FILE, document, parse_permissions, Fault.PERMISSIONS_MALFORMED
             )
         if governance and domain is not None and domain not in governance.domains().closed():
-            self._fault(
-                "governance.p7s",
-                f"it is for domain {governance.domains().closed()}, not for {domain}",
-                Fault.GOVERNANCE_DOMAIN,
-            )
+            text = f"it is for domain {governance.domains().closed()}, not for {domain}"
+            self._add(GOVERNANCE_FILE, text, Fault.GOVERNANCE_DOMAIN)
         if permissions and certificate:
-            self._grant(permissions, certificate, domain)
+            self._check_grant(permissions, certificate, domain)
         return OpenedEnclave(
             certificate,
             identity_ca,
             permissions_ca,
             governance,
             permissions,
-            len(files["permissions.p7s"] or b""),
+            len(files[PERMISSIONS_FILE] or b""),
             tuple(self._problems),
             {name: data for name, data in files.items() if data is not None},
-            self._permissions_document,
+            document or b"",
+            key_on_robot(self._folder),
         )
 
-    def _fault(self, file: str, text: str, fault: Fault) -> None:
+    def _add(self, file: str, text: str, fault: Fault) -> None:
         self._problems.append(Problem(file, text, fault))
 
     def _read(self, name: str) -> bytes | None:
         path = self._folder / name
         if not path.exists():
             if path.is_symlink():
-                self._fault(
-                    name, f"it is a link to nothing ({path.readlink()})", Fault.LINK_DANGLING
-                )
+                text = f"it is a link to nothing ({path.readlink()})"
+                self._add(name, text, Fault.LINK_DANGLING)
             else:
-                self._fault(name, "missing", Fault.FILE_MISSING)
+                self._add(name, "missing", Fault.FILE_MISSING)
             return None
         try:
             data = read_bytes(path, "file")
         except SrosError as error:
-            self._fault(name, f"it cannot be read: {error.why.rstrip('.')}", Fault.FILE_UNREADABLE)
+            self._add(name, f"it cannot be read: {error.why.rstrip('.')}", Fault.FILE_UNREADABLE)
             return None
         if not data:
-            self._fault(name, "it is empty", Fault.FILE_EMPTY)
+            self._add(name, "it is empty", Fault.FILE_EMPTY)
             return None
         return data
 
@@ -261,30 +467,28 @@ class _EnclaveFiles:
         if data is None:
             return None
         try:
-            certificate = _certificate(data, name)
+            certificate = _load_certificate(data, name)
         except SrosError as error:
-            self._fault(name, error.why.rstrip("."), Fault.CERTIFICATE_MALFORMED)
+            self._add(name, error.why.rstrip("."), Fault.CERTIFICATE_MALFORMED)
             return None
-        self._valid_now(
-            name, validity_of(certificate), _CERTIFICATE_ENDS if name == _OWN else _CA_ENDS
-        )
+        faults = _EXPIRY_OF_CERTIFICATE if name == CERTIFICATE_FILE else _EXPIRY_OF_CA
+        self._check_validity(name, validity_of(certificate), faults)
         return certificate
 
-    def _valid_now(self, name: str, validity: Window, faults: tuple[Fault, Fault]) -> None:
-        """Note it if it expired, or is not valid yet: the first or the second of ``faults``."""
+    def _check_validity(self, name: str, validity: Window, faults: tuple[Fault, Fault]) -> None:
+        """Note the first of ``faults`` if it expired, the second if it is not valid yet."""
         expired, not_yet_valid = faults
         if self._now > validity.not_after:
-            self._fault(name, f"it expired at {iso(validity.not_after)}", expired)
+            self._add(name, f"it expired at {iso(validity.not_after)}", expired)
         elif self._now < validity.not_before:
-            begin = iso(validity.not_before)
-            self._fault(name, f"it is not valid before {begin}", not_yet_valid)
+            self._add(name, f"it is not valid before {iso(validity.not_before)}", not_yet_valid)
 
-    def _identity(
+    def _check_identity(
         self, certificate: x509.Certificate | None, ca: x509.Certificate | None, key: bytes | None
     ) -> None:
         if certificate and ca and not issued_by(certificate, ca):
-            self._fault(
-                "cert.pem",
+            self._add(
+                CERTIFICATE_FILE,
                 f"it was not issued by the identity CA of the enclave ({subject_text(ca.subject)}) "
                 f"but by {subject_text(certificate.issuer)}",
                 Fault.CERTIFICATE_ISSUER,
@@ -292,40 +496,37 @@ class _EnclaveFiles:
         if key is None:
             return
         try:
-            private = load_key(key, "key.pem")
+            private = load_key(key, KEY_FILE)
         except SrosError as error:
             fault = Fault.KEY_ENCRYPTED if _ENCRYPTED.search(key) else Fault.KEY_MALFORMED
-            self._fault("key.pem", error.why.rstrip("."), fault)
+            self._add(KEY_FILE, error.why.rstrip("."), fault)
             return
         if certificate and not same_key(certificate, private):
-            self._fault("key.pem", "it is not the key of cert.pem", Fault.KEY_MISMATCH)
+            self._add(KEY_FILE, "it is not the key of cert.pem", Fault.KEY_MISMATCH)
 
-    def _revocation(
+    def _check_revocation(
         self, certificate: x509.Certificate | None, ca: x509.Certificate | None
     ) -> None:
-        path = self._folder / "crl.pem"
+        path = self._folder / CRL_FILE
         if not path.exists():
             return
         try:
-            crl, authentic = _revocation_list(read_bytes(path, "revocation list"), ca)
+            crl, authentic = _load_crl(read_bytes(path, "revocation list"), ca)
         except (SrosError, ValueError):
             text = "it is not a revocation list, and DDS then refuses everybody"
-            self._fault("crl.pem", text, Fault.CRL_MALFORMED)
+            self._add(CRL_FILE, text, Fault.CRL_MALFORMED)
             return
         if not authentic:
             text = "it is not of the identity CA, and DDS then refuses everybody"
-            self._fault("crl.pem", text, Fault.CRL_ISSUER)
+            self._add(CRL_FILE, text, Fault.CRL_ISSUER)
         if crl.last_update_utc > self._now:
-            self._fault(
-                "crl.pem",
-                f"it is not valid before {iso(crl.last_update_utc)}: everybody is refused",
-                Fault.CRL_NOT_YET_VALID,
-            )
+            text = f"it is not valid before {iso(crl.last_update_utc)}: everybody is refused"
+            self._add(CRL_FILE, text, Fault.CRL_NOT_YET_VALID)
         if crl.next_update_utc and crl.next_update_utc < self._now:
             text = f"it expired at {iso(crl.next_update_utc)}: everybody is refused"
-            self._fault("crl.pem", text, Fault.CRL_EXPIRED)
+            self._add(CRL_FILE, text, Fault.CRL_EXPIRED)
         if certificate and crl.get_revoked_certificate_by_serial_number(certificate.serial_number):
-            self._fault("cert.pem", "it is revoked by crl.pem", Fault.REVOKED)
+            self._add(CERTIFICATE_FILE, "it is revoked by crl.pem", Fault.REVOKED)
 
     def _signed(
         self, name: str, files: dict[str, bytes | None], authority: x509.Certificate | None
@@ -334,42 +535,41 @@ class _EnclaveFiles:
         if data is None:
             return None
         try:
-            return _content(data, authority)
+            return _signed_document(data, authority)
         except SrosError as error:
             fault = Fault.SIGNATURE if _SIGNED.search(data[:1000]) else Fault.NOT_SIGNED
-            self._fault(name, str(error), fault)
+            self._add(name, str(error), fault)
             return None
 
     def _parsed(
         self,
         name: str,
         document: bytes,
-        read: Callable[[bytes, str], Parsed],
+        read: Callable[[bytes, str], _Parsed],
         malformed: Fault,
-    ) -> Parsed | None:
+    ) -> _Parsed | None:
         try:
             return read(document, name)
         except SrosError as error:
-            self._fault(name, error.why.rstrip(".") or error.what, malformed)
+            self._add(name, error.why.rstrip(".") or error.what, malformed)
             return None
 
-    def _grant(
+    def _check_grant(
         self, permissions: Permissions, certificate: x509.Certificate, domain: int | None
     ) -> None:
-        name = "permissions.p7s"
+        name = PERMISSIONS_FILE
         subject = subject_text(certificate.subject)
-        grants = [grant for grant in permissions.grants if grant.subject == subject]
-        if not grants:
-            others = ", ".join(grant.subject for grant in permissions.grants)
+        grant = permissions.grant_of(subject)
+        if grant is None:
+            others = ", ".join(each.subject for each in permissions.grants)
             text = f"it has no grant for {subject}, only for {others or 'nobody'}"
-            self._fault(name, text, Fault.PERMISSIONS_SUBJECT)
+            self._add(name, text, Fault.PERMISSIONS_SUBJECT)
             return
-        grant = grants[0]
         try:
-            self._valid_now(name, grant.validity, _PERMISSIONS_ENDS)
+            self._check_validity(name, grant.validity, _EXPIRY_OF_PERMISSIONS)
         except SrosError as error:  # it ends before it begins
-            self._fault(name, error.what, Fault.PERMISSIONS_MALFORMED)
+            self._add(name, error.what, Fault.PERMISSIONS_MALFORMED)
         rules = [rule for rule in grant.rules if rule.allow]
         if domain is not None and not any(domain in rule.domains.closed() for rule in rules):
             text = f"no rule of it allows anything in domain {domain}"
-            self._fault(name, text, Fault.PERMISSIONS_DOMAIN)
+            self._add(name, text, Fault.PERMISSIONS_DOMAIN)

@@ -21,10 +21,14 @@ from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import from_json
-from sros_tool.keystore.authorities.authority import load_ca_certificate
 from sros_tool.keystore.layout import PERMISSIONS, PUBLIC, REQUEST, enclave_names, enclave_path
-from sros_tool.keystore.lifecycle.revocation_list import read_lists
-from sros_tool.keystore.reader import OpenedEnclave, load_governance, open_enclave
+from sros_tool.keystore.reader import (
+    OpenedEnclave,
+    load_ca_certificate,
+    load_governance,
+    open_enclave,
+    read_lists,
+)
 from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import load_certificates, subject_text, validity_of

@@ -18,9 +18,8 @@ from sros_tool.keystore.history import history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
-from sros_tool.keystore.lifecycle.revocation_list import read_crl
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.reader import open_enclave, read_crl
 from sros_tool.keystore.transaction import filesystem
 from tests.integration.kills import Moments, Server, server
 from tests.support.harness import check_whole, remains

@@ -11,11 +11,10 @@ from sros_tool.errors import KeystoreError
 from sros_tool.keystore.history import history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
-from sros_tool.keystore.lifecycle.revocation_list import read_lists
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.lifecycle.rotation.state import Stage, read_rotation, rotation_status
-from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.reader import open_enclave, read_lists
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import filesystem
 from tests.integration.kills import Moments, Server, server

@@ -11,9 +11,8 @@ import pytest
 
 from sros_tool.keystore.history import Status, history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
-from sros_tool.keystore.lifecycle.revocation_list import read_lists
 from sros_tool.keystore.lifecycle.rotation.state import rotation_status
-from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.reader import open_enclave, read_lists
 from tests.support.harness import certificate, check_enclave_whole, remains, snapshot, sros
 from tests.support.made_by_ros2 import make
 

@@ -12,8 +12,8 @@ from sros_tool.keystore.history import Status, history
 from sros_tool.keystore.layout import LEDGER, enclave_path
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
-from sros_tool.keystore.lifecycle.revocation_list import read_crl
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
+from sros_tool.keystore.reader import read_crl
 from sros_tool.keystore.template import load_template
 from tests.support.harness import certificate
 

@@ -17,9 +17,8 @@ from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
-from sros_tool.keystore.lifecycle.revocation_list import read_crl
 from sros_tool.keystore.lifecycle.revoke import revoke
-from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.reader import open_enclave, read_crl
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
 from sros_tool.policy import read_policy

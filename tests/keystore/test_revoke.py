@@ -17,9 +17,8 @@ from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
-from sros_tool.keystore.lifecycle.revocation_list import read_crl
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
-from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.reader import open_enclave, read_crl
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.crl import REASONS, RevocationList
 from tests.support.harness import certificate, check_whole, snapshot, sros

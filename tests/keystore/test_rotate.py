@@ -16,17 +16,21 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import rsa
 
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore.authorities.authority import authority_files, certificates_of
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.layout import ROTATION, enclave_path, list_enclaves
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
-from sros_tool.keystore.lifecycle.revocation_list import read_crl, read_lists
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotation.stages import RotationStep, renew_identity_ca, rotate_ca
 from sros_tool.keystore.lifecycle.rotation.state import Stage, retired_key, rotation_status
-from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.reader import (
+    authority_files,
+    certificates_of,
+    open_enclave,
+    read_crl,
+    read_lists,
+)
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import common_name, digest, pem
 from sros_tool.pki.keys import generate_key, key_pem

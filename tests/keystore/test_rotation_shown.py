@@ -9,12 +9,12 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore.authorities.authority import authority_files, certificates_of
 from sros_tool.keystore.history import Status, history
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
 from sros_tool.keystore.lifecycle.rotation.state import Stage
+from sros_tool.keystore.reader import authority_files, certificates_of
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import digest
 from tests.support.harness import sros

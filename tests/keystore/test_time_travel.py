@@ -17,18 +17,16 @@ from cryptography import x509
 
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore import history as history_of_keystores
-from sros_tool.keystore.authorities.authority import certificates_of
 from sros_tool.keystore.expiry import Threshold, lifetimes
 from sros_tool.keystore.history import Status, history
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.renew import renew
-from sros_tool.keystore.lifecycle.revocation_list import read_crl, read_lists
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.lifecycle.rotation.state import Stage, read_rotation
-from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.reader import certificates_of, open_enclave, read_crl, read_lists
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import filesystem
 from sros_tool.parallel import map_slices

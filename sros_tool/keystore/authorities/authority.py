@@ -24,11 +24,11 @@ from sros_tool.keystore.layout import (
     PRIVATE,
     PUBLIC,
     ROLES,
-    STAGE,
     ca_certificate,
     ca_key,
     enclave_folder,
 )
+from sros_tool.keystore.reader import load_ca_certificate
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki import smime
@@ -36,17 +36,13 @@ from sros_tool.pki.certificates import (
     Issuer,
     common_name,
     issue_ca,
-    load_certificate,
-    load_certificates,
     pem,
     same_key,
     subject_text,
     validity_of,
 )
-from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl
 from sros_tool.pki.keys import PrivateKey
 from sros_tool.validity import iso, window
-from sros_tool.xml import read_bytes
 
 Document = TypeVar("Document")
 
@@ -133,12 +129,6 @@ def create_authorities(
     return Authorities(authority, authority, tuple(notes))
 
 
-def load_ca_certificate(root: Path, role: str) -> x509.Certificate:
-    """The certificate of the identity or permissions CA of a keystore."""
-    path = root / ca_certificate(role)
-    return load_certificate(read_bytes(path, f"{role} CA certificate"), f"'{path}'")
-
-
 def load_authorities(
     root: Path, template: Template, keyring: Keyring, now: datetime
 ) -> Authorities:
@@ -176,39 +166,6 @@ def load_authority(
             "Check the clock of this machine; otherwise make a new keystore.",
         )
     return Authority(certificate, key)
-
-
-def authority_files(root: Path) -> dict[str, tuple[str, ...]]:
-    """The stem of each CA file, with the roles for which it serves."""
-    found: dict[str, tuple[str, ...]] = {}
-    for role in ROLES:
-        path = root / ca_certificate(role)
-        file = path
-        # A link into the stage is a file of its own that an interrupted transaction left so.
-        if path.is_symlink() and STAGE not in (to := str(path.readlink())):
-            file = path.with_name(to)
-        if not file.is_file() or file.parent != path.parent:
-            raise KeystoreError(
-                f"keystore '{root}' has no {role} CA of its own",
-                f"'{path}' is missing, or leads out of the keystore.",
-                "Use the keystore that it was exported from.",
-            )
-        stem = file.name.removesuffix(".cert.pem")
-        found[stem] = (*found.get(stem, ()), role)
-    return found
-
-
-def certificates_of(root: Path, file: str) -> tuple[x509.Certificate, ...]:
-    """All certificates of a CA file, the issuing one first."""
-    path = root / PUBLIC / f"{file}.cert.pem"
-    return load_certificates(read_bytes(path, "CA certificate"), f"'{path}'")
-
-
-def carried_crl(root: Path, file: str) -> RevocationList | None:
-    """The revocation list that a CA file carries beside its certificates, or None."""
-    path = root / PUBLIC / f"{file}.cert.pem"
-    data = read_bytes(path, "CA certificate")
-    return load_crl(data, f"in '{path}'") if CRL_MARK in data else None
 
 
 def write_bundle(

@@ -9,21 +9,13 @@ alone (all of this ran).
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
-from pathlib import Path
 
 from cryptography import x509
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.authorities.authority import (
-    Authority,
-    authority_files,
-    carried_crl,
-    certificates_of,
-    write_bundle,
-)
+from sros_tool.keystore.authorities.authority import Authority, write_bundle
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.layout import CRL, IDENTITY, REVOKED
 from sros_tool.keystore.ledger import Entry, document_entry
@@ -32,6 +24,13 @@ from sros_tool.keystore.lifecycle.rotation.state import (
     Stage,
     lists_confusable,
     read_rotation,
+)
+from sros_tool.keystore.reader import (
+    authority_files,
+    carried_crl,
+    certificates_of,
+    identity_file,
+    read_crl,
 )
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
@@ -43,7 +42,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
-from sros_tool.pki.crl import RevocationList, Revoked, load_crl, sign_crl
+from sros_tool.pki.crl import RevocationList, Revoked, sign_crl
 from sros_tool.validity import BACKDATE, Window, iso
 from sros_tool.xml import read_bytes
 
@@ -55,21 +54,6 @@ class SignedList:
     document: bytes
     end: datetime
     entry: Entry
-
-
-def read_crl(root: Path) -> RevocationList | None:
-    """The list of the issuing identity CA, or None if nothing was ever revoked."""
-    path = root / CRL
-    if not path.exists():
-        return None
-    return load_crl(read_bytes(path, "revocation list"), f"'{path}'")
-
-
-def read_lists(root: Path) -> tuple[RevocationList, ...]:
-    """All lists that DDS reads: that of the issuing identity CA, and one beside a second CA."""
-    file = _identity_file(root)
-    found = (read_crl(root), carried_crl(root, file) if file else None)
-    return tuple(each for each in found if each)
 
 
 def sign_list(
@@ -192,7 +176,7 @@ class Lists:
     ) -> SignedList | None:
         """Stage the list of the identity CA that comes or goes, in the file of the CAs."""
         rotation = read_rotation(self._root)
-        file = _identity_file(self._root)
+        file = identity_file(self._root)
         replaced = next((each for each in rotation.replacements if each.file == file), None)
         if not replaced or not file:
             return None
@@ -253,10 +237,3 @@ class Lists:
         elif old:
             text += f"; it ends at {iso(old.next_update)}, and Fast DDS then refuses who is of it"
         self.remarks.append(f"{text}: run `sros rotate_ca {self._root} --to retire`.")
-
-
-def _identity_file(root: Path) -> str | None:
-    """The stem of the identity CA's file; None for a copy of a keystore without CAs."""
-    with suppress(KeystoreError):
-        return next(file for file, roles in authority_files(root).items() if IDENTITY in roles)
-    return None

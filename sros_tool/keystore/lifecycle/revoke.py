@@ -21,9 +21,9 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.ledger import Entry, append, read_ledger
-from sros_tool.keystore.lifecycle.revocation_list import Lists, read_crl
+from sros_tool.keystore.lifecycle.revocation_list import Lists
 from sros_tool.keystore.missing import no_such_enclave
-from sros_tool.keystore.reader import load_settings
+from sros_tool.keystore.reader import load_settings, read_crl
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction

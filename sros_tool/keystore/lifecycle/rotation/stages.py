@@ -16,14 +16,7 @@ from cryptography import x509
 
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
-from sros_tool.keystore.authorities.authority import (
-    Authority,
-    authority_files,
-    carried_crl,
-    certificates_of,
-    write_bundle,
-    write_copies,
-)
+from sros_tool.keystore.authorities.authority import Authority, write_bundle, write_copies
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring, check_places
 from sros_tool.keystore.issuing.issuance import Issuance, policies_of, renewed, teller
 from sros_tool.keystore.layout import (
@@ -42,7 +35,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
-from sros_tool.keystore.lifecycle.revocation_list import read_crl, sign_list
+from sros_tool.keystore.lifecycle.revocation_list import sign_list
 from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
     Rotation,
@@ -52,7 +45,14 @@ from sros_tool.keystore.lifecycle.rotation.state import (
     render_rotation,
     retired_key,
 )
-from sros_tool.keystore.reader import load_settings, read_granted
+from sros_tool.keystore.reader import (
+    authority_files,
+    carried_crl,
+    certificates_of,
+    load_settings,
+    read_crl,
+    read_granted,
+)
 from sros_tool.keystore.template import Template, render_template
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change

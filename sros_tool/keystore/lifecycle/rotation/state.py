@@ -14,7 +14,6 @@ from cryptography import x509
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from sros_tool.errors import KeystoreError, SrosError
-from sros_tool.keystore.authorities.authority import authority_files, certificates_of
 from sros_tool.keystore.layout import (
     IDENTITY,
     PERMISSIONS,
@@ -23,6 +22,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     list_enclaves,
 )
+from sros_tool.keystore.reader import authority_files, certificates_of
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     digest,
