@@ -87,7 +87,6 @@ def test_every_name_is_there_and_documented(name: str) -> None:
     value = getattr(sros_tool, name)
     assert name in dir(sros_tool)
     assert inspect.getdoc(value)
-    assert f"`{name}" in (PROJECT / "docs" / "python.md").read_text(encoding="utf-8")
     if inspect.isfunction(value):
         assert all(part in (value.__doc__ or "") for part in ("Raises:", "Example:"))
 

@@ -1,0 +1,84 @@
+"""What the documents say of the program is so: verbs, attacks, files, and where links lead."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import sros_tool
+from sros_tool.cli.program import FAMILIES
+from sros_tool.demo.scenarios.attacks import ATTACKS
+
+PROJECT = Path(__file__).parents[1]
+DOCUMENTS = sorted(
+    path.relative_to(PROJECT)
+    for path in (*PROJECT.glob("*.md"), *PROJECT.glob("docs/*.md"), *PROJECT.glob("policies/*.md"))
+)
+FENCE = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)
+
+
+def read(document: Path | str) -> str:
+    return (PROJECT / document).read_text(encoding="utf-8")
+
+
+def anchors(document: Path) -> set[str]:
+    """The anchors of a document's headings, as code hosts make them."""
+    headings = re.findall(r"^#+ (.+)$", FENCE.sub("", read(document)), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", each.lower()).replace(" ", "-") for each in headings}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=str)
+def test_links_lead_somewhere(document: Path) -> None:
+    links = re.findall(r"\]\(([^)]+)\)", FENCE.sub("", read(document)))
+    for link in links:
+        if "://" in link:
+            continue
+        path, _, anchor = link.partition("#")
+        target = (PROJECT / document).parent / path if path else PROJECT / document
+        assert target.exists(), link
+        if anchor:
+            assert anchor in anchors(target.resolve().relative_to(PROJECT)), link
+
+
+def test_the_readme_begins_with_the_two_commands_and_is_short() -> None:
+    lines = read("README.md").splitlines()
+    assert [line.split("#")[0].strip() for line in lines[3:5]] == ["./dev demo", "./dev test"]
+    assert len(lines) <= 150
+
+
+def test_every_verb_is_described_and_in_the_readme() -> None:
+    verbs = {name for family in FAMILIES.values() for name in family}
+    rows = re.findall(r"^\| (`.+?) \| ", read("docs/verbs.md"), re.MULTILINE)
+    assert {word for row in rows for word in re.findall(r"`([a-z_]+)", row)} >= verbs
+    readme = read("README.md")
+    assert [
+        verb for verb in verbs if f"`{verb}`" not in readme and f"sros {verb}" not in readme
+    ] == []
+
+
+def test_every_attack_is_in_the_table_of_attacks() -> None:
+    text = read("docs/attacks.md")
+    rows = [row.name for row in ATTACKS.rows if not row.removed]
+    assert len(rows) > 30
+    assert [name for name in rows if f"| {name} |" not in text] == []
+
+
+def test_every_name_of_the_public_face_is_in_its_document() -> None:
+    text = read("docs/python.md")
+    assert [name for name in sros_tool.__all__ if f"`{name}" not in text] == []
+
+
+def test_the_files_that_a_contributor_is_sent_to_are_there() -> None:
+    named = set(re.findall(r"`([\w./*]+(?:\.py|\.md|\.toml|\.cpp|/))`", read("CONTRIBUTING.md")))
+    assert len(named) > 20
+    assert [each for each in sorted(named) if not any(PROJECT.glob(each))] == []
+
+
+def test_the_changelog_is_about_this_version() -> None:
+    version = tomllib.loads(read("pyproject.toml"))["project"]["version"]
+    changelog = read("CHANGELOG.md")
+    assert "## [Unreleased]" in changelog or f"## [{version}]" in changelog
+    assert version in changelog
