@@ -10,9 +10,11 @@ import time
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 
-from sros_tool.dds.decision import Access, Decision, Outcome, Vendor
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import Decision, Outcome
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import DomainRule, Governance, Protection, TopicRule
+from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 
 _NOW = datetime(2026, 6, 15, 12, tzinfo=UTC)
@@ -82,7 +84,7 @@ def _access(vendor: Vendor, topics: int, wildcards: int) -> Access:
     )
     window = ("2026-01-01T00:00:00Z", "2027-01-01T00:00:00Z")
     permissions = Permissions((Grant("g", "CN=/robot", *window, rules),))
-    kind = Protection.ENCRYPT
+    kind = ProtectionKind.ENCRYPT
     topic_rule = TopicRule("*", True, True, True, True, kind, kind)
     domain_rule = DomainRule(_DOMAINS, False, True, kind, kind, kind, (topic_rule,))
     governance = Governance((domain_rule,))

@@ -16,7 +16,7 @@ Figure = tuple[str, float, str, bool]
 
 def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Figure]:
     """Seconds of ``sros explain --who`` and ``--reach``, and of proving what is signed."""
-    from sros_tool.dds.decision import Vendor
+    from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.answer import Setting
     from sros_tool.explain.question import ask

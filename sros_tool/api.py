@@ -287,7 +287,7 @@ def explain_access(
         >>> answer.allowed, answer.reason
         (True, 'rule 1 allows publish rt/chatter by rt/chatter')
     """
-    from sros_tool.dds.decision import Vendor
+    from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.explain.answer import Case, Setting, explain
     from sros_tool.explain.material import from_folder
     from sros_tool.explain.question import ask

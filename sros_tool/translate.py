@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import DomainRule, Governance, Protection, TopicRule
+from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, grant
 from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expand
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Qualifier
@@ -89,12 +90,8 @@ def governance_for(protection: DomainProtection, domains: DomainSet) -> Governan
         (
             DomainRule(
                 domains=domains,
-                allow_unauthenticated_participants=protection.allow_unauthenticated_participants,
-                enable_join_access_control=protection.join_access_control,
-                discovery_protection_kind=Protection(protection.discovery),
-                liveliness_protection_kind=Protection(protection.liveliness),
-                rtps_protection_kind=Protection(protection.rtps),
                 topic_access_rules=tuple(rules),
+                **_values(protection, DomainRule),
             ),
         )
     )
@@ -110,15 +107,18 @@ def _expressions(named: NamedProtection) -> list[str]:
 
 
 def _topic_rule(expression: str, protection: TopicProtection) -> TopicRule:
-    return TopicRule(
-        topic_expression=expression,
-        enable_discovery_protection=protection.discovery,
-        enable_liveliness_protection=protection.liveliness,
-        enable_read_access_control=protection.read_access_control,
-        enable_write_access_control=protection.write_access_control,
-        metadata_protection_kind=Protection(protection.metadata),
-        data_protection_kind=Protection(protection.data),
-    )
+    return TopicRule(topic_expression=expression, **_values(protection, TopicRule))
+
+
+def _values(
+    protection: DomainProtection | TopicProtection, rule: type[DomainRule | TopicRule]
+) -> dict[str, Any]:
+    """Return the attributes of a rule, each made from the field of its own ``term``."""
+    chosen = {each: getattr(protection, each.term) for each in attributes(rule)}
+    return {
+        each.name: value if each.is_flag else ProtectionKind(value)
+        for each, value in chosen.items()
+    }
 
 
 def _narrow_first(rules: list[TopicRule]) -> list[TopicRule]:

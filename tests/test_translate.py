@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from datetime import UTC, datetime, timedelta
 from itertools import combinations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import TopicRule
+from sros_tool.dds.governance import DomainRule, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Permissions, Rule
 from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expand
 from sros_tool.policy import ALLOW, DENY, RIGHTS, Enclave, Group, Profile, Profiles, Qualifier
@@ -199,3 +201,17 @@ def test_no_topic_rule_is_hidden_by_a_wider_one(protection: DomainProtection) ->
                 assert found.topic_expression == topic
                 assert str(found.metadata_protection_kind) == str(each.protection.metadata)
                 assert found.enable_read_access_control == each.protection.read_access_control
+
+
+@pytest.mark.parametrize(
+    ("rule", "protection", "others"),
+    [(DomainRule, DomainProtection, {"default", "named"}), (TopicRule, TopicProtection, set())],
+)
+def test_each_attribute_is_made_from_a_field_of_its_own(
+    rule: type[DomainRule | TopicRule],
+    protection: type[DomainProtection | TopicProtection],
+    others: set[str],
+) -> None:
+    terms = [each.term for each in attributes(rule)]
+    assert len(set(terms)) == len(terms)
+    assert set(terms) | others == {each.name for each in fields(protection)}

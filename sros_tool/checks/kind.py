@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
+from sros_tool.dds.decision.vendors import Vendor
+
 
 class Severity(IntEnum):
     """How bad it is; the words of `--severity` and `--fail-on` are the names in small letters."""
@@ -44,7 +46,7 @@ class Kind:
     source: str
     remedy: str
     group: str = ""
-    vendors: tuple[str, ...] = ()
+    vendors: tuple[Vendor, ...] = ()
 
     @property
     def family(self) -> str:

@@ -15,6 +15,7 @@ from urllib.parse import unquote
 from lxml import etree
 
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
 from sros_tool.dds.portable import mistaken_names, outside, some_pairs
@@ -358,7 +359,7 @@ DOCUMENT_SIZE = Kind(
     "ros2/sros2 issue 228; Fast DDS 2.9.1 (SecurityManager.cpp) and 2.14.5, Cyclone DDS 0.10.2; "
     "measured.",
     "Use wildcards (`sros minimize_policy` proposes them), or split the enclave.",
-    vendors=("fastdds-2.9",),
+    vendors=(Vendor.FAST_2_9,),
 )
 LONG_NAME = Kind(
     "portable.long-name",
@@ -368,7 +369,7 @@ LONG_NAME = Kind(
     "matched; Cyclone DDS takes it.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Use shorter namespaces and names.",
-    vendors=("fastdds", "fastdds-2.9"),
+    vendors=FAST_DDS,
 )
 DENY_BLOCKS = Kind(
     "portable.deny-blocks-topic",
@@ -378,7 +379,7 @@ DENY_BLOCKS = Kind(
     "answers no; Fast DDS allows it.",
     "Cyclone DDS 0.10.2 (access_control.c), Fast DDS 2.9.1 and 2.14.5; measured.",
     "Remove the denial: what no rule allows is denied anyway.",
-    vendors=("cyclonedds",),
+    vendors=(Vendor.CYCLONE,),
 )
 CHARACTER_SET = Kind(
     "portable.character-set",
@@ -397,7 +398,7 @@ ENCLAVE_NAMES = Kind(
     "Cyclone DDS 0.10.2 (access_control.c); an enclave did so here and was heard.",
     "Choose names none of which is made of parts of another, such as /robot_admin, or subjects "
     "with a part of their own (template production).",
-    vendors=("cyclonedds",),
+    vendors=(Vendor.CYCLONE,),
 )
 SEVERAL_PROFILES = Kind(
     "policy.several-profiles",

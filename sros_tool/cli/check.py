@@ -26,6 +26,7 @@ from sros_tool.cli.common import (
     print_json,
     visible,
 )
+from sros_tool.dds.decision.vendors import MEASURED
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
@@ -103,7 +104,7 @@ in one line; --strict reports it as a finding. Exit status: 1 if a finding of th
 )
 @click.option(
     "--vendor",
-    type=click.Choice(["fastdds", "fastdds-2.9", "cyclonedds"]),
+    type=click.Choice([each.value for each in MEASURED]),
     help="Leave out findings that concern only other DDS vendors.",
 )
 @click.option(

@@ -24,13 +24,13 @@ from sros_tool.cli.common import (
     ros_domain,
     visible,
 )
+from sros_tool.dds.decision.vendors import NEWEST, Vendor
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.names import is_expression
 from sros_tool.validity import iso
 from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
-    from sros_tool.dds.decision import Vendor
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.answer import Case, Setting
     from sros_tool.explain.material import Material
@@ -156,7 +156,6 @@ def _planned(stated: Enclave, root: Path | None, place: Place) -> Material:
 
 def vendor_of(name: str | None) -> tuple[Vendor, str]:
     """The vendor of an option, or else of this machine, and why it is that one."""
-    from sros_tool.dds.decision import Vendor
     from sros_tool.runtime.rmw import vendor_here
 
     return (Vendor(name), "as asked") if name else vendor_here(os.environ)
@@ -447,12 +446,10 @@ def refuse_ignored(mode: str) -> None:
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
-    from sros_tool.dds.decision import Vendor
     from sros_tool.errors import Note
     from sros_tool.explain.answer import Case, Explanation
     from sros_tool.explain.question import Question
 
-_VENDORS = ("standard", "fastdds", "fastdds-2.9", "cyclonedds", "opendds", "connext")
 _WORDS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply", "join")
 
 
@@ -522,7 +519,7 @@ Example:
 )
 @click.option(
     "--vendor",
-    type=click.Choice(_VENDORS),
+    type=click.Choice([each.value for each in Vendor]),
     help="Whose decision counts. [default: that of this machine's RMW]",
 )
 @click.option("--all-vendors", is_flag=True, help="Compare what the vendors decide.")
@@ -628,7 +625,6 @@ def _one(
     place: Place,
     as_json: bool,
 ) -> int:
-    from sros_tool.dds.decision import Vendor
     from sros_tool.explain.answer import explain as explain_case
     from sros_tool.explain.question import ask
 
@@ -655,8 +651,8 @@ def _one(
             click.echo(visible(line))
     notes = [*_provenance_notes(found[0], policy), *_other_type(case, question, kind, chosen)]
     if not all_vendors:
-        measured = [explain_case(case, question, v) for v in (Vendor.FAST, Vendor.CYCLONE)]
-        if measured[0].answer.outcome is not measured[1].answer.outcome:
+        measured = [explain_case(case, question, v) for v in NEWEST]
+        if len({each.answer.outcome for each in measured}) > 1:
             notes.append(_note("explain.vendors-differ", differences(measured) + "."))
     print_notes(notes)
     return 0 if answer.allowed else 1
@@ -700,7 +696,7 @@ def _note(name: str, text: str) -> Note:
 
 
 if TYPE_CHECKING:
-    from sros_tool.dds.decision import Decision
+    from sros_tool.dds.decision.answers import Decision
     from sros_tool.explain.answer import Answer, Case, Change, Explanation, PartAnswer
     from sros_tool.policy.model import Source
 

@@ -6,7 +6,9 @@ omg_shared_ca_governance of 20170901).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from collections.abc import Iterator
+from dataclasses import MISSING, dataclass, field, fields
 from enum import StrEnum
 from typing import Any
 from xml.sax.saxutils import escape
@@ -21,8 +23,8 @@ from sros_tool.xml import parse, tag_of
 SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_governance.xsd"
 
 
-class Protection(StrEnum):
-    """A protection kind; data protection knows only the first three."""
+class ProtectionKind(StrEnum):
+    """How messages are protected; the long forms also prove which writer a message came from."""
 
     NONE = "NONE"
     SIGN = "SIGN"
@@ -31,7 +33,51 @@ class Protection(StrEnum):
     ENCRYPT_WITH_ORIGIN_AUTHENTICATION = "ENCRYPT_WITH_ORIGIN_AUTHENTICATION"
 
 
-DATA_PROTECTIONS = (Protection.NONE, Protection.SIGN, Protection.ENCRYPT)
+_DATA_KINDS = (ProtectionKind.NONE, ProtectionKind.SIGN, ProtectionKind.ENCRYPT)
+Value = bool | ProtectionKind
+
+
+@dataclass(frozen=True, slots=True)
+class Attribute:
+    """One setting of a domain rule or a topic rule, as its field below declares it.
+
+    Reading, rendering, describing, translating, the readers of the vendors and the proof of a
+    signed document go through `attributes`, in the order of the schema, which is that of the
+    fields: an attribute is added by adding its field.
+
+    ``name`` is its element and its field; ``term`` is the field of `sros_tool.policy.protection`
+    from which it is made.  ``values`` are those it may have.  ``open`` is the value that protects
+    nothing, ``portable`` the one that protects and that all vendors enforce alike.  ``default``
+    holds where a document lacks the element; None where the schema requires it.
+    """
+
+    name: str
+    term: str
+    values: tuple[Value, ...]
+    open: Value
+    portable: Value
+    default: Value | None = None
+
+    @property
+    def is_flag(self) -> bool:
+        """Whether it is true or false, and not a protection kind."""
+        return isinstance(self.open, bool)
+
+    def is_open(self, rule: DomainRule | TopicRule) -> bool:
+        """Return whether the rule has the value that protects nothing."""
+        return bool(getattr(rule, self.name) == self.open)
+
+
+def _flag(term: str, *, protects: bool = True) -> dict[str, Any]:
+    """Declare an attribute that is true or false; ``protects`` is the value that protects."""
+    values = (False, True)
+    return {"term": term, "values": values, "open": not protects, "portable": protects}
+
+
+def _kind(term: str, values: tuple[ProtectionKind, ...] = tuple(ProtectionKind)) -> dict[str, Any]:
+    """Declare an attribute that is a protection kind."""
+    kinds = {"open": ProtectionKind.NONE, "portable": ProtectionKind.ENCRYPT}
+    return {"term": term, "values": values, **kinds}
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +85,12 @@ class TopicRule:
     """How the topics that match an expression are protected."""
 
     topic_expression: str
-    enable_discovery_protection: bool
-    enable_liveliness_protection: bool
-    enable_read_access_control: bool
-    enable_write_access_control: bool
-    metadata_protection_kind: Protection
-    data_protection_kind: Protection
+    enable_discovery_protection: bool = field(metadata=_flag("discovery"))
+    enable_liveliness_protection: bool = field(metadata=_flag("liveliness"))
+    enable_read_access_control: bool = field(metadata=_flag("read_access_control"))
+    enable_write_access_control: bool = field(metadata=_flag("write_access_control"))
+    metadata_protection_kind: ProtectionKind = field(metadata=_kind("metadata"))
+    data_protection_kind: ProtectionKind = field(metadata=_kind("data", _DATA_KINDS))
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,12 +98,45 @@ class DomainRule:
     """How some domains are protected; the first topic rule that matches a topic decides."""
 
     domains: DomainSet
-    allow_unauthenticated_participants: bool
-    enable_join_access_control: bool
-    discovery_protection_kind: Protection
-    liveliness_protection_kind: Protection
-    rtps_protection_kind: Protection
+    allow_unauthenticated_participants: bool = field(
+        metadata=_flag("allow_unauthenticated_participants", protects=False)
+    )
+    enable_join_access_control: bool = field(metadata=_flag("join_access_control"))
+    discovery_protection_kind: ProtectionKind = field(metadata=_kind("discovery"))
+    liveliness_protection_kind: ProtectionKind = field(metadata=_kind("liveliness"))
+    rtps_protection_kind: ProtectionKind = field(metadata=_kind("rtps"))
     topic_access_rules: tuple[TopicRule, ...]
+
+
+def _declared(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
+    return tuple(
+        Attribute(
+            each.name, **each.metadata, default=None if each.default is MISSING else each.default
+        )
+        for each in fields(rule)
+        if each.metadata
+    )
+
+
+_ATTRIBUTES: dict[type, tuple[Attribute, ...]] = {
+    rule: _declared(rule) for rule in (DomainRule, TopicRule)
+}
+
+
+def attributes(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
+    """Return the attributes of domain rules or of topic rules, in the order of the schema."""
+    return _ATTRIBUTES[rule]
+
+
+def values_of(rule: DomainRule | TopicRule) -> dict[str, bool | str]:
+    """Return the attributes of a rule by their names, protection kinds as texts."""
+    values = ((each.name, getattr(rule, each.name)) for each in attributes(type(rule)))
+    return {name: value if isinstance(value, bool) else str(value) for name, value in values}
+
+
+def settings(rule: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, Any]:
+    """Return all attributes of a rule with the values that protect, or those that do not."""
+    return {each.name: each.portable if protect else each.open for each in attributes(rule)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,33 +146,15 @@ class Governance:
     domain_access_rules: tuple[DomainRule, ...]
 
     def domains(self) -> DomainSet:
-        """All domains that some rule names."""
+        """Return all domains that some rule names."""
         return DomainSet(tuple(p for r in self.domain_access_rules for p in r.domains.ranges))
 
 
-Fields = tuple[tuple[str, type], ...]
-
-# The elements between <domains> and <topic_access_rules>, and those of a topic rule, in order.
-_DOMAIN_FIELDS: Fields = (
-    ("allow_unauthenticated_participants", bool),
-    ("enable_join_access_control", bool),
-    ("discovery_protection_kind", Protection),
-    ("liveliness_protection_kind", Protection),
-    ("rtps_protection_kind", Protection),
-)
-_TOPIC_FIELDS: Fields = (
-    ("topic_expression", str),
-    ("enable_discovery_protection", bool),
-    ("enable_liveliness_protection", bool),
-    ("enable_read_access_control", bool),
-    ("enable_write_access_control", bool),
-    ("metadata_protection_kind", Protection),
-    ("data_protection_kind", Protection),
-)
+# ── writing ────────────────────────────────────────────────────────────────────────────────
 
 
 def render_governance(governance: Governance) -> bytes:
-    """The document as XML in UTF-8, with its elements in the order of the schema."""
+    """Return the document as XML in UTF-8, with its elements in the order of the schema."""
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         f'<dds xmlns:xsi="{XSI}" xsi:noNamespaceSchemaLocation="{SCHEMA}">',
@@ -102,24 +163,29 @@ def render_governance(governance: Governance) -> bytes:
     for rule in governance.domain_access_rules:
         lines.append("    <domain_rule>")
         lines += [f"      {line}" for line in domain_lines(rule.domains)]
-        lines += [f"      {line}" for line in _field_lines(rule, _DOMAIN_FIELDS)]
+        lines += [f"      {line}" for line in _attribute_lines(rule)]
         lines.append("      <topic_access_rules>")
         for topic in rule.topic_access_rules:
             lines.append("        <topic_rule>")
-            lines += [f"          {line}" for line in _field_lines(topic, _TOPIC_FIELDS)]
+            expression = escape(topic.topic_expression)
+            lines.append(f"          <topic_expression>{expression}</topic_expression>")
+            lines += [f"          {line}" for line in _attribute_lines(topic)]
             lines.append("        </topic_rule>")
         lines += ["      </topic_access_rules>", "    </domain_rule>"]
     lines += ["  </domain_access_rules>", "</dds>", ""]
     return "\n".join(lines).encode()
 
 
-def _field_lines(value: object, fields: Fields) -> list[str]:
-    lines = []
-    for name, kind in fields:
-        content = getattr(value, name)
-        text = ("true" if content else "false") if kind is bool else escape(str(content))
-        lines.append(f"<{name}>{text}</{name}>")
-    return lines
+def _attribute_lines(rule: DomainRule | TopicRule) -> Iterator[str]:
+    for each in attributes(type(rule)):
+        value = getattr(rule, each.name)
+        # Vendors refuse elements that they do not know: one that may be left out is.
+        if each.default is None or value != each.default:
+            text = json.dumps(value) if each.is_flag else str(value)
+            yield f"<{each.name}>{text}</{each.name}>"
+
+
+# ── reading ────────────────────────────────────────────────────────────────────────────────
 
 
 def parse_governance(data: bytes, name: str = "the governance document") -> Governance:
@@ -143,32 +209,39 @@ def _read_domain_rule(element: etree._Element) -> DomainRule:
     for topic in topics:
         if topic.tag != "topic_rule":
             raise DocumentError(f"<topic_access_rules> holds an unknown element <{tag_of(topic)}>")
-    rules = tuple(TopicRule(**_read_fields(topic, _TOPIC_FIELDS)) for topic in topics)
+    rules = tuple(
+        TopicRule(topic_expression=_text(topic, "topic_expression"), **_read(topic, TopicRule))
+        for topic in topics
+    )
     return DomainRule(
         domains=read_domains(domains),
         topic_access_rules=rules,
-        **_read_fields(element, _DOMAIN_FIELDS),
+        **_read(element, DomainRule),
     )
 
 
-def _read_fields(element: etree._Element, fields: Fields) -> dict[str, Any]:
+def _read(element: etree._Element, rule: type[DomainRule | TopicRule]) -> dict[str, Any]:
     values: dict[str, Any] = {}
-    for name, kind in fields:
-        text = element.findtext(name)
-        if text is None:
-            raise DocumentError(f"a <{tag_of(element)}> lacks its <{name}>")
-        values[name] = _read_value(text.strip(), name, kind)
+    for each in attributes(rule):
+        if each.default is not None and element.find(each.name) is None:
+            values[each.name] = each.default
+            continue
+        text = _text(element, each.name)
+        if each.is_flag:
+            if text.lower() not in ("true", "false", "1", "0"):
+                raise DocumentError(
+                    f"<{each.name}> holds {text!r}, which is neither true nor false"
+                )
+            values[each.name] = text.lower() in ("true", "1")
+        elif text.upper() in ProtectionKind.__members__:
+            values[each.name] = ProtectionKind(text.upper())
+        else:
+            raise DocumentError(f"<{each.name}> holds {text!r}, which is no protection kind")
     return values
 
 
-def _read_value(text: str, name: str, kind: type) -> object:
-    if kind is bool:
-        if text.lower() not in ("true", "false", "1", "0"):
-            raise DocumentError(f"<{name}> holds {text!r}, which is neither true nor false")
-        return text.lower() in ("true", "1")
-    if kind is Protection:
-        try:
-            return Protection(text.upper())
-        except ValueError as error:
-            raise DocumentError(f"<{name}> holds {text!r}, which is no protection kind") from error
-    return text
+def _text(element: etree._Element, name: str) -> str:
+    text = element.findtext(name)
+    if text is None:
+        raise DocumentError(f"a <{tag_of(element)}> lacks its <{name}>")
+    return text.strip()

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import Protection
+from sros_tool.dds.governance import ProtectionKind
 from sros_tool.demo.model import Condition, Role
 from sros_tool.demo.nodes.names import naming_arguments
 from sros_tool.errors import UnavailableError
@@ -160,7 +160,7 @@ _SIGNERS_CHECKED = ((2, 1, 4), (2, 6, 5), (2, 8, 2), (2, 9, 2))
 """The first release of each older line of Fast DDS that takes no signer but those in the file of
 the permissions CA (CVE-2023-24010); all do from 2.10 on.  From the tags of its repository."""
 
-_ENCRYPTING = (Protection.ENCRYPT, Protection.ENCRYPT_WITH_ORIGIN_AUTHENTICATION)
+_ENCRYPTING = (ProtectionKind.ENCRYPT, ProtectionKind.ENCRYPT_WITH_ORIGIN_AUTHENTICATION)
 
 
 def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Condition]:
@@ -173,7 +173,7 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
         rule.data_protection_kind,
     )
     strangers = domain.allow_unauthenticated_participants
-    bare = all(kind is Protection.NONE for kind in kinds)
+    bare = all(kind is ProtectionKind.NONE for kind in kinds)
     uncontrolled = not (rule.enable_read_access_control or rule.enable_write_access_control)
     found = {
         Condition.ONE_CA: not template.separate_authorities,

@@ -17,7 +17,14 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import Governance, Protection, parse_governance, render_governance
+from sros_tool.dds.governance import (
+    DomainRule,
+    Governance,
+    TopicRule,
+    parse_governance,
+    render_governance,
+    settings,
+)
 from sros_tool.dds.permissions import (
     Criteria,
     Grant,
@@ -174,21 +181,9 @@ def _weak(bench: Bench) -> bytes:
             tuple(
                 replace(
                     rule,
-                    allow_unauthenticated_participants=True,
-                    enable_join_access_control=False,
-                    discovery_protection_kind=Protection.NONE,
-                    liveliness_protection_kind=Protection.NONE,
-                    rtps_protection_kind=Protection.NONE,
+                    **settings(DomainRule, protect=False),
                     topic_access_rules=tuple(
-                        replace(
-                            topic,
-                            enable_discovery_protection=False,
-                            enable_liveliness_protection=False,
-                            enable_read_access_control=False,
-                            enable_write_access_control=False,
-                            metadata_protection_kind=Protection.NONE,
-                            data_protection_kind=Protection.NONE,
-                        )
+                        replace(topic, **settings(TopicRule, protect=False))
                         for topic in rule.topic_access_rules
                     ),
                 )

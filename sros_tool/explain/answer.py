@@ -16,18 +16,11 @@ from pathlib import Path
 
 from lxml import etree
 
-from sros_tool.dds.decision import (
-    TRAITS,
-    Access,
-    Decision,
-    Outcome,
-    Refusal,
-    Vendor,
-    Verb,
-    read_governance_as,
-    read_permissions_as,
-)
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import Decision, Outcome, Refusal, Verb
+from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
 from sros_tool.dds.decision.matching import read_moment
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import DomainRule, Governance, parse_governance
 from sros_tool.dds.permissions import Grant, Permissions
 from sros_tool.errors import SrosError
@@ -135,7 +128,7 @@ class Judge:
         self._setting = setting
         self._governance: Governance | None = None
         self._permissions: Permissions | None = None
-        self._problems = material.problems(TRAITS[vendor])
+        self._problems = material.problems(vendor.traits)
         self._before = self._prepare()
         self._until = self._end()
 
@@ -211,7 +204,7 @@ class Judge:
         if self._permissions and isinstance(self._before, Access):
             index = self._before.join().grant
             text = "" if index is None else self._permissions.grants[index].not_after
-            moment = read_moment(TRAITS[self._vendor].moments, text, self._setting.zone)
+            moment = read_moment(self._vendor.traits.moments, text, self._setting.zone)
             if self._material.signed and moment is not None and 0 < moment < 2**40:
                 ends.append(("permissions.p7s", datetime.fromtimestamp(moment, UTC)))
         return min(ends, key=lambda each: each[1], default=("", None))

@@ -12,7 +12,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
-from sros_tool.dds.decision import Vendor
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, UsageError
 from sros_tool.graph.learn import CommonParts, Learned, LearnedProfile, Right, groups_of
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE

@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from shlex import quote
 
-from sros_tool.dds.decision import Vendor, Verb
+from sros_tool.dds.decision.answers import Verb
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain.answer import Answer, Judge, Setting
 from sros_tool.explain.denials import Denial, nodes_served, read_denials, serving_node
 from sros_tool.explain.material import Material

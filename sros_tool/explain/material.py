@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 
-from sros_tool.dds.decision import Traits
+from sros_tool.dds.decision.vendors import VendorTraits
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance, render_governance
 from sros_tool.dds.permissions import render_permissions
@@ -64,7 +64,7 @@ class Material:
     key_elsewhere: bool = False
     """Its key is on the robot on which it was made."""
 
-    def problems(self, traits: Traits) -> tuple[Problem, ...]:
+    def problems(self, traits: VendorTraits) -> tuple[Problem, ...]:
         """Those that keep a process of a vendor from running, whatever the documents say."""
         if self.state is None or self.at is None:
             return ()

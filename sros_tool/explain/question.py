@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sros_tool.dds.decision import Verb
+from sros_tool.dds.decision.answers import Verb
 from sros_tool.errors import UsageError
 from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expression_problem, is_expression
 from sros_tool.policy.model import ALLOW

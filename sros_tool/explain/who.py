@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from sros_tool.dds.decision import Outcome, Vendor
+from sros_tool.dds.decision.answers import Outcome
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.explain.answer import Judge, Setting
 from sros_tool.explain.material import Material, from_folder

@@ -10,7 +10,7 @@ from typing import Any
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
-from sros_tool.dds.governance import Governance, parse_governance
+from sros_tool.dds.governance import Governance, parse_governance, values_of
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.keystore.layout import (
@@ -276,21 +276,9 @@ def _governance(governance: Governance) -> Description:
         "domain_rules": [
             {
                 "domains": str(rule.domains),
-                "allow_unauthenticated_participants": rule.allow_unauthenticated_participants,
-                "enable_join_access_control": rule.enable_join_access_control,
-                "discovery_protection_kind": str(rule.discovery_protection_kind),
-                "liveliness_protection_kind": str(rule.liveliness_protection_kind),
-                "rtps_protection_kind": str(rule.rtps_protection_kind),
+                **values_of(rule),
                 "topic_rules": [
-                    {
-                        "topic_expression": topic.topic_expression,
-                        "data_protection_kind": str(topic.data_protection_kind),
-                        "metadata_protection_kind": str(topic.metadata_protection_kind),
-                        "enable_read_access_control": topic.enable_read_access_control,
-                        "enable_write_access_control": topic.enable_write_access_control,
-                        "enable_discovery_protection": topic.enable_discovery_protection,
-                        "enable_liveliness_protection": topic.enable_liveliness_protection,
-                    }
+                    {"topic_expression": topic.topic_expression, **values_of(topic)}
                     for topic in rule.topic_access_rules
                 ],
             }

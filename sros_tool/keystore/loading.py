@@ -16,8 +16,8 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
-from sros_tool.dds.decision import TRAITS, Traits, Vendor
-from sros_tool.dds.decision.vendors import Hashes, Keys, Signers
+from sros_tool.dds.decision.vendors import VendorTraits, Vendor
+from sros_tool.dds.decision.vendors import MEASURED, Hashes, Keys, Signers
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES
 from sros_tool.errors import PkiError
 from sros_tool.faults import Fault
@@ -31,8 +31,6 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.chains import chain_fault
 from sros_tool.pki.keys import algorithm
 
-MEASURED = (Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE)
-"""The vendors whose loading of CAs and signatures was measured."""
 Certificates = tuple[x509.Certificate, ...]
 
 IDENTITY_CA, PERMISSIONS_CA = "identity_ca.cert.pem", "permissions_ca.cert.pem"
@@ -46,7 +44,7 @@ _JUDGED = frozenset(
 _certificates = lru_cache(maxsize=16)(load_certificates)
 
 
-def vendor_problems(traits: Traits, state: OpenedEnclave, at: datetime) -> tuple[Problem, ...]:
+def vendor_problems(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> tuple[Problem, ...]:
     """The problems that a vendor has with an enclave when it loads it, at the moment ``at``.
 
     Those of its documents' content are not among them, beyond what `EnclaveState` says.
@@ -65,7 +63,7 @@ def vendor_problems(traits: Traits, state: OpenedEnclave, at: datetime) -> tuple
     return tuple(kept)
 
 
-def _faults(traits: Traits, state: OpenedEnclave, at: datetime) -> Iterator[Problem]:
+def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterator[Problem]:
     read: dict[str, Certificates] = {}
     for file in (IDENTITY_CA, PERMISSIONS_CA):
         if file in state.files:
@@ -90,7 +88,9 @@ def _faults(traits: Traits, state: OpenedEnclave, at: datetime) -> Iterator[Prob
 
 
 @lru_cache(maxsize=8)
-def _signature_fault(traits: Traits, message: bytes, signers: Certificates, at: datetime) -> str:
+def _signature_fault(
+    traits: VendorTraits, message: bytes, signers: Certificates, at: datetime
+) -> str:
     # The enclaves of a keystore have their governance in common.
     try:
         return signer_fault(traits, smime.parse(message), signers, at)
@@ -100,7 +100,7 @@ def _signature_fault(traits: Traits, message: bytes, signers: Certificates, at: 
 
 @lru_cache(maxsize=16)
 def authority_fault(
-    traits: Traits, certificates: Certificates, at: datetime
+    traits: VendorTraits, certificates: Certificates, at: datetime
 ) -> tuple[str, Fault] | None:
     """Why the vendor refuses a CA file as such, and the fault.
 
@@ -125,7 +125,7 @@ def authority_refusals(role: str, certificates: Certificates, at: datetime) -> d
     """
     refusals = {}
     for vendor in MEASURED:
-        traits = TRAITS[vendor]
+        traits = vendor.traits
         fault = authority_fault(traits, certificates, at)
         if fault:
             refusals[vendor] = fault[0]
@@ -156,7 +156,7 @@ def refusals_text(refusals: Mapping[Vendor, str]) -> str:
 
 
 def signer_fault(
-    traits: Traits, signed: smime.SignedDocument, certificates: Certificates, at: datetime
+    traits: VendorTraits, signed: smime.SignedDocument, certificates: Certificates, at: datetime
 ) -> str:
     """Why the vendor does not take the signature of a document, or "".
 
@@ -182,13 +182,13 @@ def signer_fault(
     return f"its signer is not accepted: {fault}" if fault else ""
 
 
-def _trusted(traits: Traits, certificates: Certificates) -> Certificates:
+def _trusted(traits: VendorTraits, certificates: Certificates) -> Certificates:
     if traits.reads_first_authority:
         return certificates[:1]
     return tuple(dropwhile(lambda each: not _hash_fits(traits, each), certificates))
 
 
-def _hash_fits(traits: Traits, certificate: x509.Certificate) -> bool:
+def _hash_fits(traits: VendorTraits, certificate: x509.Certificate) -> bool:
     digest = certificate.signature_hash_algorithm
     if traits.hashes is Hashes.ANY or isinstance(digest, hashes.SHA256):
         return True
@@ -199,7 +199,7 @@ _RSA_SHA1 = {x509.SignatureAlgorithmOID.RSA_WITH_SHA1}
 
 
 def _identity_faults(
-    traits: Traits, certificate: x509.Certificate, authorities: Certificates, at: datetime
+    traits: VendorTraits, certificate: x509.Certificate, authorities: Certificates, at: datetime
 ) -> Iterator[Problem]:
     if not _hash_fits(traits, certificate):
         yield Problem(CERTIFICATE, "it is not signed with SHA-256", Fault.SIGNATURE_HASH)
@@ -211,7 +211,7 @@ def _identity_faults(
         yield Problem(CERTIFICATE, fault, Fault.CERTIFICATE_ISSUER)
 
 
-def _key_fits(traits: Traits, certificate: x509.Certificate) -> bool:
+def _key_fits(traits: VendorTraits, certificate: x509.Certificate) -> bool:
     key = certificate.public_key()
     if isinstance(key, ec.EllipticCurvePublicKey):
         return traits.keys is not Keys.SMALL or key.key_size == 256

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from sros_tool.dds.decision import Vendor
+from sros_tool.dds.decision.vendors import Vendor
 
 RMW = "RMW_IMPLEMENTATION"
 """The variable that names the RMW of a process."""

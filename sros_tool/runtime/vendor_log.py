@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, auto
 
-from sros_tool.dds.decision import Vendor
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.faults import Fault
 
 # ── the kinds of rows ──────────────────────────────────────────────────────────────────────

@@ -11,7 +11,8 @@ import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.registry import Selection
-from sros_tool.dds.decision import Access, Vendor
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.reader import open_enclave

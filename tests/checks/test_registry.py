@@ -12,7 +12,7 @@ import pytest
 from sros_tool.checks import runtime
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Severity
 from sros_tool.checks.registry import KINDS, Selection
-from sros_tool.dds.decision import Vendor
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UsageError
 from tests.checks import keystore_cases, policy_cases, runtime_cases, test_policy_findings
 from tests.checks.bench import Bench

@@ -16,7 +16,7 @@ from random import Random
 
 from hypothesis import strategies as st
 
-from sros_tool.dds.decision import Verb
+from sros_tool.dds.decision.answers import Verb
 from tests.dds.decision_documents import NOW
 from tests.dds.drawn_words import (
     DOMAINS,

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.dds.decision import Access, Outcome, Vendor
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import Outcome
+from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import (
     NOW,
     SUBJECT,

@@ -11,16 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 
-from sros_tool.dds.decision import (
-    REASONS,
-    Access,
-    Decision,
-    Outcome,
-    Refusal,
-    Vendor,
-    read_governance_as,
-    read_permissions_as,
-)
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import REASONS, Decision, Outcome, Refusal
+from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Criteria, Permissions, Rule
 from tests.dds.decision_documents import NOW

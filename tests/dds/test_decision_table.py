@@ -12,7 +12,9 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
-from sros_tool.dds.decision import Access, Outcome, Refusal, Vendor, Verb
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import Outcome, Refusal, Verb
+from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import (
     NOW,
     allow,

@@ -13,11 +13,11 @@ from lxml import etree
 
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import (
-    DATA_PROTECTIONS,
     DomainRule,
     Governance,
-    Protection,
+    ProtectionKind,
     TopicRule,
+    attributes,
     parse_governance,
     render_governance,
 )
@@ -52,23 +52,21 @@ dates = st.sampled_from(
 grants = st.builds(Grant, texts, texts, dates, dates, rules.map(tuple), st.booleans())
 permissions = st.lists(grants, min_size=1, max_size=2).map(lambda each: Permissions(tuple(each)))
 
-kinds = st.sampled_from(Protection)
+
+def attribute_values(rule: type[DomainRule | TopicRule]) -> dict[str, st.SearchStrategy[object]]:
+    return {each.name: st.sampled_from(each.values) for each in attributes(rule)}
+
+
 topic_rules = st.builds(
     TopicRule,
-    texts.filter(lambda text: text == text.strip()),
-    *[st.booleans()] * 4,
-    kinds,
-    st.sampled_from(DATA_PROTECTIONS),
+    topic_expression=texts.filter(lambda text: text == text.strip()),
+    **attribute_values(TopicRule),
 )
 domain_rules = st.builds(
     DomainRule,
-    domains,
-    st.booleans(),
-    st.booleans(),
-    kinds,
-    kinds,
-    kinds,
-    st.lists(topic_rules, min_size=1, max_size=4).map(tuple),
+    domains=domains,
+    topic_access_rules=st.lists(topic_rules, min_size=1, max_size=4).map(tuple),
+    **attribute_values(DomainRule),
 )
 governances = st.lists(domain_rules, min_size=1, max_size=2).map(
     lambda each: Governance(tuple(each))
@@ -149,10 +147,20 @@ def test_any_bytes_are_a_document_or_an_error(data: bytes) -> None:
 
 def test_governance_with_something_else_in_place_of_a_topic_rule() -> None:
     """Both vendors refuse it."""
-    rule = TopicRule("*", True, True, True, True, Protection.NONE, Protection.NONE)
-    kinds = (Protection.NONE,) * 3
+    rule = TopicRule("*", True, True, True, True, ProtectionKind.NONE, ProtectionKind.NONE)
+    kinds = (ProtectionKind.NONE,) * 3
     domain = DomainRule(DomainSet.of((0, 0)), False, True, *kinds, (rule,))
     good = render_governance(Governance((domain,)))
     assert parse_governance(good)
     with pytest.raises(DocumentError, match="topic_role"):
         parse_governance(good.replace(b"topic_rule>", b"topic_role>"))
+
+
+@pytest.mark.parametrize("rule", [DomainRule, TopicRule])
+def test_each_attribute_can_have_the_values_that_it_declares(
+    rule: type[DomainRule | TopicRule],
+) -> None:
+    for each in attributes(rule):
+        assert {each.open, each.portable} <= set(each.values)
+        assert each.open != each.portable
+        assert each.default is None or each.default in each.values

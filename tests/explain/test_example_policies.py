@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision import Outcome, Vendor
+from sros_tool.dds.decision.answers import Outcome
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.explain.answer import Case, Judge, Setting, as_policy, explain
 from sros_tool.explain.material import from_policy

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.cli.common import now
-from sros_tool.dds.decision import Vendor
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain.answer import Judge, Setting
 from sros_tool.explain.material import from_folder
 from sros_tool.explain.question import Part, Question, ask

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import sros_tool.dds.decision as decision
-from sros_tool.dds.decision import Verb
+from sros_tool.dds.decision.answers import Verb
 from sros_tool.errors import UsageError
 from sros_tool.explain.question import TYPES, WORDS, ask
 from sros_tool.explain.remedy import known_causes, remedy

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision import Vendor
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.runtime.netns import try_isolation
 from tests.support.children import run
 

@@ -13,7 +13,7 @@ from zoneinfo import ZoneInfo
 
 import pytest
 
-from sros_tool.dds.decision import Vendor
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain.answer import Judge, Setting
 from sros_tool.explain.material import from_folder
 from sros_tool.explain.question import ask as question

@@ -19,7 +19,9 @@ from typing import Any
 
 import pytest
 
-from sros_tool.dds.decision import Access, Outcome, Vendor, Verb
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import Outcome, Verb
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY, Backend, conditions
 from sros_tool.demo.keystores import Scenery, Setting, build_scenery

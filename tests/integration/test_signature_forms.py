@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision import TRAITS, Vendor
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import PkiError
 from sros_tool.explain.material import from_folder
 from sros_tool.pki import smime
@@ -107,7 +107,7 @@ def test_sros_explains_what_the_vendors_do(name: str, enclaves: dict[str, Path])
         Vendor.FAST_2_9: FORMS[name][1],
         Vendor.CYCLONE: FORMS[name][1],
     }
-    found = {vendor: not material.problems(TRAITS[vendor]) for vendor in taken}
+    found = {vendor: not material.problems(vendor.traits) for vendor in taken}
     assert found == taken
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision import Vendor
+from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import allow, grant, permissions, publish, subscribe
 from tests.dds.signer_rows import YES, rows, write_enclave
 from tests.integration.fastdds import fastdds_vendor

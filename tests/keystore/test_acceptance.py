@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision import TRAITS, Vendor
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain.answer import Judge, Setting
 from sros_tool.explain.material import from_folder
 from sros_tool.explain.question import ask
@@ -25,7 +25,7 @@ def test_each_vendor(row: Row, tmp_path: Path) -> None:
         Vendor.CYCLONE: row.cyclone,
     }
     for vendor, answer in expected.items():
-        problems = [str(each) for each in material.problems(TRAITS[vendor])]
+        problems = [str(each) for each in material.problems(vendor.traits)]
         assert (not problems) == (answer == YES), (vendor, problems)
         said = Judge(vendor, material, Setting(42, NOW)).answer(ask("join"))
         assert said.allowed == (answer == YES), (vendor, said)

@@ -9,7 +9,7 @@ import pytest
 from cryptography.hazmat.primitives import hashes
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
-from sros_tool.dds.decision import Vendor
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UsageError
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem

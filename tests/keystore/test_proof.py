@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sros_tool.dds.decision import Vendor
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, parse_permissions
 from sros_tool.errors import KeystoreError

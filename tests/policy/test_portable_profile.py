@@ -10,7 +10,9 @@ from datetime import UTC, datetime, timedelta, timezone
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sros_tool.dds.decision import Access, Vendor, Verb
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import Verb
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import render_governance
 from sros_tool.dds.permissions import render_permissions

@@ -11,6 +11,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
     CRL,
@@ -65,7 +66,7 @@ CA_PURPOSE = Kind(
     "emailProtection, if they are there. Fast DDS 2.14 does not look at them.",
     "RFC 8550, 4.4.2; Fast DDS 2.9.1 and 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
     "Replace it with `sros rotate_ca ROOT`, or issue its certificate anew with digitalSignature.",
-    vendors=("fastdds-2.9", "cyclonedds"),
+    vendors=(Vendor.FAST_2_9, Vendor.CYCLONE),
 )
 KEY_ALGORITHM = Kind(
     "portable.key-algorithm",
@@ -83,7 +84,7 @@ SIGNATURE_HASH = Kind(
     "Fast DDS refuses SHA-384 in a CA and in an enclave's certificate; Cyclone DDS takes it.",
     "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp), Cyclone DDS 0.10.2; measured.",
     "Issue it with SHA-256, as sros does.",
-    vendors=("fastdds", "fastdds-2.9"),
+    vendors=FAST_DDS,
 )
 
 CERTIFICATES_KINDS = by_id(

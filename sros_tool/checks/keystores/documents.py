@@ -11,11 +11,12 @@ from sros_tool.checks.keystores.enclaves import grant_of, plain, plain_file
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.checks.policies import outside_findings
-from sros_tool.dds.decision import Access, Refusal, Vendor, Verb
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import Refusal, Verb
 from sros_tool.dds.decision.matching import read_moment
-from sros_tool.dds.decision.vendors import Moments
+from sros_tool.dds.decision.vendors import FAST_DDS, MEASURED, Moments, Vendor
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
-from sros_tool.dds.governance import DomainRule, Governance, Protection, TopicRule
+from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule
 from sros_tool.dds.permissions import Criteria, Grant, Rule, render_permissions
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import GOVERNANCE_XML
@@ -51,7 +52,7 @@ ALLOW_RULES = Kind(
     "DDS goes on to a rule in which both match.",
     "Fast DDS 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
     "Put all topics into one allow rule.",
-    vendors=("fastdds", "fastdds-2.9"),
+    vendors=FAST_DDS,
 )
 PARTITIONS = Kind(
     "portable.partitions",
@@ -78,7 +79,7 @@ GRANT_NAME = Kind(
     "Fast DDS refuses the document; Cyclone DDS takes it.",
     "omg_shared_ca_permissions.xsd; Fast DDS 2.14.5; measured.",
     'Write <grant name="...">.',
-    vendors=("fastdds", "fastdds-2.9"),
+    vendors=FAST_DDS,
 )
 SUBJECT = Kind(
     "portable.subject",
@@ -106,7 +107,7 @@ TIME_WINDOW = Kind(
     "late in the west, and end up to 14 hours early in the east.",
     "Fast DDS 2.9.1 and 2.14.5 (mktime); measured in Los Angeles and Tokyo.",
     "Sign them with a beginning 14 hours back or more, as sros does, and renew them in time.",
-    vendors=("fastdds", "fastdds-2.9"),
+    vendors=FAST_DDS,
 )
 LOCAL_TIME = Kind(
     "enclave.permissions-local-time",
@@ -116,7 +117,7 @@ LOCAL_TIME = Kind(
     'permissions file".',
     "Fast DDS 2.9.1 and 2.14.5 (mktime); measured.",
     "Run `sros renew ROOT NAME`, or let the host run in UTC.",
-    vendors=("fastdds", "fastdds-2.9"),
+    vendors=FAST_DDS,
 )
 CHARACTER_CLASS = Kind(
     "portable.character-class",
@@ -420,8 +421,8 @@ GOVERNANCE_KINDS = by_id(
     GOVERNANCE_DOMAIN_RANGE, DIFFERS, XML_DIFFERS,
 )  # fmt: skip
 
-_SIGNING = (Protection.SIGN, Protection.SIGN_WITH_ORIGIN_AUTHENTICATION)
-_NONE = (Protection.NONE,)
+_SIGNING = (ProtectionKind.SIGN, ProtectionKind.SIGN_WITH_ORIGIN_AUTHENTICATION)
+_NONE = (ProtectionKind.NONE,)
 
 
 def check_governance(enclave: CheckedEnclave, *, alone: bool) -> Iterator[Finding]:
@@ -462,16 +463,16 @@ def governance_findings(
 
 def _let_in(rule: DomainRule) -> str:
     """What comes of unauthenticated participants on Fast DDS 2.14, which heeds them; measured."""
-    if rule.rtps_protection_kind is not Protection.NONE:
+    if rule.rtps_protection_kind is not ProtectionKind.NONE:
         return "with protected RTPS messages Fast DDS 2.14 refuses the document"
-    hidden = rule.discovery_protection_kind is not Protection.NONE
+    hidden = rule.discovery_protection_kind is not ProtectionKind.NONE
     opened = [
         each.topic_expression
         for each in rule.topic_access_rules
         if not (each.enable_read_access_control or each.enable_write_access_control)
         and not (each.enable_discovery_protection and hidden)
-        and each.metadata_protection_kind is Protection.NONE
-        and each.data_protection_kind is Protection.NONE
+        and each.metadata_protection_kind is ProtectionKind.NONE
+        and each.data_protection_kind is ProtectionKind.NONE
     ]
     if not opened:
         return "every topic is controlled or protected, so on Fast DDS they reach none"
@@ -483,9 +484,9 @@ def _domain_rule(rule: DomainRule) -> Iterator[tuple[Kind, str]]:
         yield UNAUTHENTICATED, f"allow_unauthenticated_participants is true: {_let_in(rule)}"
     if not rule.enable_join_access_control:
         yield NO_JOIN_CONTROL, "enable_join_access_control is false"
-    if rule.discovery_protection_kind is Protection.NONE:
+    if rule.discovery_protection_kind is ProtectionKind.NONE:
         yield DISCOVERY_OPEN, "discovery_protection_kind is NONE"
-    if rule.liveliness_protection_kind is Protection.NONE:
+    if rule.liveliness_protection_kind is ProtectionKind.NONE:
         yield LIVELINESS_OPEN, "liveliness_protection_kind is NONE"
 
 
@@ -560,7 +561,6 @@ DIFFER = Kind(
 
 VENDORS_KINDS = by_id(DIFFER)
 
-_COMPARED = (Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE)
 _UNHEARD_OF = "rt/sros_nobody_has_this"
 _MANY = 3
 
@@ -588,7 +588,7 @@ def check_vendors(enclave: CheckedEnclave, *, outside: bool) -> Iterator[Finding
             at=enclave.keystore.now,
             zone=enclave.keystore.zone,
         )
-        for vendor in _COMPARED
+        for vendor in MEASURED
     }
     differing = list(_differences(answers, _vendors_topics(enclave)))
     if differing:

@@ -1,24 +1,6 @@
 """What DDS decides: who may join, publish and subscribe, by vendor, and why.
 
+`access` decides, by the rules that `vendors` declares, on documents as `documents` reads them.
 The rules are those of the vendors' code and were compared with what Fast DDS 2.9.1 and 2.14.5 and
-Cyclone DDS 0.10.2 really do; OpenDDS and Connext are as documented.
+Cyclone DDS 0.10.2 really do; a vendor that was never measured decides by the standard.
 """
-
-from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import REASONS, Decision, Outcome, Refusal, Verb
-from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
-from sros_tool.dds.decision.vendors import TRAITS, Traits, Vendor
-
-__all__ = [
-    "REASONS",
-    "TRAITS",
-    "Access",
-    "Decision",
-    "Outcome",
-    "Refusal",
-    "Traits",
-    "Vendor",
-    "Verb",
-    "read_governance_as",
-    "read_permissions_as",
-]

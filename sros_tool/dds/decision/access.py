@@ -11,21 +11,20 @@ from sros_tool.dds.decision.answers import Decision, Outcome, Refusal, Verb
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
 from sros_tool.dds.decision.matching import Expressions, escaped, matches, read_moment, same_subject
 from sros_tool.dds.decision.vendors import (
-    TRAITS,
     DenyPartitions,
     Moments,
     OpenRange,
     Style,
-    Traits,
     Vendor,
+    VendorTraits,
 )
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import DomainRule, Governance, Protection, TopicRule
+from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 
 
 def choose_grant(
-    traits: Traits, permissions: Permissions, subject: str, *, at: datetime, zone: tzinfo
+    traits: VendorTraits, permissions: Permissions, subject: str, *, at: datetime, zone: tzinfo
 ) -> int | Refusal:
     """The index of the grant, or why there is none."""
     now = at.timestamp()
@@ -51,7 +50,9 @@ def choose_grant(
     )
 
 
-def _state(traits: Traits, index: int, grant: Grant, now: float, zone: tzinfo) -> Refusal | None:
+def _state(
+    traits: VendorTraits, index: int, grant: Grant, now: float, zone: tzinfo
+) -> Refusal | None:
     """Why the grant does not hold now, if so."""
     begin = read_moment(traits.moments, grant.not_before, zone)
     end = read_moment(traits.moments, grant.not_after, zone)
@@ -129,7 +130,7 @@ class _Entry:
         return Verdict(Outcome.ALLOWED, "allow-rule", self.rule, self.expression)
 
 
-def rules_for(traits: Traits, grant: Grant, domain: int) -> tuple[list[Numbered], Verdict]:
+def rules_for(traits: VendorTraits, grant: Grant, domain: int) -> tuple[list[Numbered], Verdict]:
     """The rules of the grant for ``domain``, and the verdict where none of them matches."""
     found: list[Numbered] = []
     for index, rule in enumerate(grant.rules):
@@ -142,7 +143,7 @@ def rules_for(traits: Traits, grant: Grant, domain: int) -> tuple[list[Numbered]
     return found, last_word(traits, grant)
 
 
-def last_word(traits: Traits, grant: Grant) -> Verdict:
+def last_word(traits: VendorTraits, grant: Grant) -> Verdict:
     """The verdict where no rule matches."""
     if not traits.honours_default:
         return Verdict(Outcome.DENIED, "no-rule")
@@ -155,7 +156,7 @@ class Rights:
     """Rules in their order, for one verb, or for both where only the topic is asked for."""
 
     def __init__(
-        self, traits: Traits, rules: Iterable[Numbered], otherwise: Verdict, *verbs: str
+        self, traits: VendorTraits, rules: Iterable[Numbered], otherwise: Verdict, *verbs: str
     ) -> None:
         """``otherwise`` is the verdict where no rule matches."""
         self._traits = traits
@@ -213,18 +214,20 @@ def _named(style: Style, expressions: tuple[str, ...], partition: str) -> bool:
     return any(matches(style, expression, partition) for expression in expressions)
 
 
-def stand_in(traits: Traits, text: str) -> str:
+def stand_in(traits: VendorTraits, text: str) -> str:
     """An expression that matches every name, for one over which the vendor crashes."""
     text = trimmed(traits, text)
     return text or "*" if traits.crashes_on_empty_texts else text
 
 
-def trimmed(traits: Traits, text: str) -> str:
+def trimmed(traits: VendorTraits, text: str) -> str:
     """The text as the vendor takes it from its element."""
     return text.strip(" \t\v\r\n") if traits.trims_texts else text
 
 
-def _partitions(traits: Traits, rule: Rule, criteria: tuple[Criteria, ...]) -> tuple[str, ...]:
+def _partitions(
+    traits: VendorTraits, rule: Rule, criteria: tuple[Criteria, ...]
+) -> tuple[str, ...]:
     """The partitions that ``criteria`` of ``rule`` name; without any, what the vendor implies."""
     everywhere = not rule.allow and traits.deny_partitions is DenyPartitions.ANY_OR_ALL
     implied = ("*",) if everywhere else DEFAULT_PARTITION
@@ -237,7 +240,7 @@ def _partitions(traits: Traits, rule: Rule, criteria: tuple[Criteria, ...]) -> t
 class Governed:
     """The first domain rule that lists the domain (``rule``, None without one), and its topics."""
 
-    def __init__(self, traits: Traits, governance: Governance, domain: int) -> None:
+    def __init__(self, traits: VendorTraits, governance: Governance, domain: int) -> None:
         self.rule: DomainRule | None = None
         for rule in governance.domain_access_rules:
             if holds_for(traits.open_range, rule.domains, domain):
@@ -300,7 +303,7 @@ class Joining:
 
 
 def decide_join(
-    traits: Traits,
+    traits: VendorTraits,
     governed: Governed,
     grant: Grant,
     rules: list[Numbered],
@@ -320,7 +323,7 @@ def decide_join(
         text += "; the participant starts, but no endpoint can be created"
         return Joining(Outcome.ALLOWED, "domain-not-in-governance", text)
     open_door = rule.allow_unauthenticated_participants
-    if traits.refuses_open_rtps and open_door and rule.rtps_protection_kind != Protection.NONE:
+    if traits.refuses_open_rtps and open_door and rule.rtps_protection_kind != ProtectionKind.NONE:
         text = "the governance lets unauthenticated participants in and protects RTPS"
         return Joining(Outcome.REFUSED, "unauthenticated-with-rtps-protection", text)
     if not rule.enable_join_access_control:
@@ -364,7 +367,7 @@ class Access:
 
         ``zone`` is the host's time zone.  No error is raised: what is wrong is answered.
         """
-        self._traits = TRAITS[vendor]
+        self._traits = vendor.traits
         self._domain = domain
         self._governed = Governed(self._traits, governance, domain)
         self._grant: int | None = None
@@ -485,14 +488,14 @@ class Access:
         return (
             self._traits.shares_open_topics
             and domain is not None
-            and domain.rtps_protection_kind is Protection.NONE
+            and domain.rtps_protection_kind is ProtectionKind.NONE
             and not (rule.enable_read_access_control or rule.enable_write_access_control)
             and not (
                 rule.enable_discovery_protection
-                and domain.discovery_protection_kind is not Protection.NONE
+                and domain.discovery_protection_kind is not ProtectionKind.NONE
             )
-            and rule.metadata_protection_kind is Protection.NONE
-            and rule.data_protection_kind is Protection.NONE
+            and rule.metadata_protection_kind is ProtectionKind.NONE
+            and rule.data_protection_kind is ProtectionKind.NONE
         )
 
     def _without_topic_rule(self, topic: str) -> Decision:

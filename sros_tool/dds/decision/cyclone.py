@@ -10,12 +10,20 @@ texts do not.  Any element or attribute that it does not know makes the document
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
-from typing import TypeVar
+from collections.abc import Mapping
+from typing import Any
 
 from sros_tool.dds.decision.elements import Element, UnreadableError
 from sros_tool.dds.domains import MAX_DOMAIN, DomainRange, DomainSet
-from sros_tool.dds.governance import DATA_PROTECTIONS, DomainRule, Governance, Protection, TopicRule
+from sros_tool.dds.governance import (
+    Attribute,
+    DomainRule,
+    Governance,
+    ProtectionKind,
+    TopicRule,
+    Value,
+    attributes,
+)
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 
 BLANKS = " \t\v\r\n"
@@ -181,34 +189,25 @@ def _decoded(text: str) -> str:
     return text if text.isascii() else text.encode("latin-1").decode("utf-8", "surrogateescape")
 
 
-Read = TypeVar("Read")
 _SCHEMA_ATTRIBUTES = ("xmlns:xsi", "xsi:nonamespaceschemalocation")
 _IGNORED = ("relay", "value", "name", "tag", "data_tags")
 _NOTHING = "["
 """An expression that nothing matches: a set that does not end."""
 _INTEGER = re.compile(r"[+-]?(?:0[xX][0-9a-fA-F]+|0[0-7]*|[1-9]\d*)\Z", re.ASCII)
 
+
+def _names(rule: type[DomainRule | TopicRule]) -> tuple[str, ...]:
+    return tuple(each.name for each in attributes(rule))
+
+
 # What may stand in what; without an entry, only text may.
 _DOMAINS = {"domains": ("id", "id_range"), "id_range": ("min", "max")}
-_DOMAIN_FLAGS = ("allow_unauthenticated_participants", "enable_join_access_control")
-_DOMAIN_KINDS = (
-    "discovery_protection_kind",
-    "liveliness_protection_kind",
-    "rtps_protection_kind",
-)
-_TOPIC_FLAGS = (
-    "enable_discovery_protection",
-    "enable_liveliness_protection",
-    "enable_read_access_control",
-    "enable_write_access_control",
-)
-_TOPIC_KINDS = ("metadata_protection_kind", "data_protection_kind")
 _GOVERNANCE = _DOMAINS | {
     "dds": ("domain_access_rules",),
     "domain_access_rules": ("domain_rule",),
-    "domain_rule": ("domains", "topic_access_rules", *_DOMAIN_FLAGS, *_DOMAIN_KINDS),
+    "domain_rule": ("domains", "topic_access_rules", *_names(DomainRule)),
     "topic_access_rules": ("topic_rule",),
-    "topic_rule": ("topic_expression", *_TOPIC_FLAGS, *_TOPIC_KINDS),
+    "topic_rule": ("topic_expression", *_names(TopicRule)),
 }
 _RULE = ("domains", "publish", "subscribe")
 _PERMISSIONS = _DOMAINS | {
@@ -331,15 +330,14 @@ def _flag(node: _Node) -> bool:
     return word in ("true", "1")
 
 
-def _kind(node: _Node) -> Protection:
-    known: tuple[str, ...] = tuple(Protection)
-    if node.tag == "data_protection_kind":
-        known = DATA_PROTECTIONS
-    if node.text and node.text not in known:
+def _value(node: _Node, attribute: Attribute) -> Value:
+    if attribute.is_flag:
+        return _flag(node)
+    if node.text and node.text not in attribute.values:
         raise UnreadableError(
             f"<{node.tag}> holds {node.text!r}, which is no protection kind there"
         )
-    return Protection(node.text) if node.text else Protection.NONE
+    return ProtectionKind(node.text) if node.text else ProtectionKind.NONE
 
 
 def _domains(node: _Node | None) -> DomainSet:
@@ -377,33 +375,26 @@ def _domain_rule(node: _Node) -> DomainRule:
         raise UnreadableError("a <domain_rule> has no topic rules")
     return DomainRule(
         domains=read,
-        allow_unauthenticated_participants=_field(node, _DOMAIN_FLAGS[0], _flag),
-        enable_join_access_control=_field(node, _DOMAIN_FLAGS[1], _flag),
-        discovery_protection_kind=_field(node, _DOMAIN_KINDS[0], _kind),
-        liveliness_protection_kind=_field(node, _DOMAIN_KINDS[1], _kind),
-        rtps_protection_kind=_field(node, _DOMAIN_KINDS[2], _kind),
         topic_access_rules=tuple(_topic_rule(each) for each in rules),
+        **_values(node, DomainRule),
     )
 
 
 def _topic_rule(node: _Node) -> TopicRule:
     expression = node.last("topic_expression")
     return TopicRule(
-        topic_expression=expression.text if expression else "",
-        enable_discovery_protection=_field(node, _TOPIC_FLAGS[0], _flag),
-        enable_liveliness_protection=_field(node, _TOPIC_FLAGS[1], _flag),
-        enable_read_access_control=_field(node, _TOPIC_FLAGS[2], _flag),
-        enable_write_access_control=_field(node, _TOPIC_FLAGS[3], _flag),
-        metadata_protection_kind=_field(node, _TOPIC_KINDS[0], _kind),
-        data_protection_kind=_field(node, _TOPIC_KINDS[1], _kind),
+        topic_expression=expression.text if expression else "", **_values(node, TopicRule)
     )
 
 
-def _field(node: _Node, name: str, read: Callable[[_Node], Read]) -> Read:
-    child = node.last(name)
-    if child is None:
-        raise UnreadableError(f"a <{node.tag}> lacks its <{name}>")
-    return read(child)
+def _values(node: _Node, rule: type[DomainRule | TopicRule]) -> dict[str, Any]:
+    values = {}
+    for each in attributes(rule):
+        child = node.last(each.name)
+        if child is None:
+            raise UnreadableError(f"a <{node.tag}> lacks its <{each.name}>")
+        values[each.name] = _value(child, each)
+    return values
 
 
 # ── permissions ────────────────────────────────────────────────────────────────────────────

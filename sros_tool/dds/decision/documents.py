@@ -2,50 +2,53 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 from sros_tool.dds.decision import cyclone, elements, fastdds
 from sros_tool.dds.decision.answers import Refusal
 from sros_tool.dds.decision.elements import UnreadableError
-from sros_tool.dds.decision.vendors import TRAITS, Vendor
+from sros_tool.dds.decision.vendors import DocumentReader, Vendor
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Permissions, parse_permissions
 from sros_tool.errors import DocumentError
 
-_PERMISSIONS = "permissions"
-_GOVERNANCE = "governance"
+_Document = TypeVar("_Document", Governance, Permissions)
 
 
-def read_permissions_as(vendor: Vendor, xml: bytes) -> Permissions | Refusal:
-    """The permissions that ``vendor`` finds in ``xml``, or why it refuses them.
+def _standard_governance(xml: bytes) -> Governance:
+    elements.check_governance(xml)
+    return parse_governance(xml, "governance")
 
-    The standard's reading, also taken for vendors without one of their own here, is its schema's.
-    """
-    try:
-        match vendor:
-            case Vendor.FAST | Vendor.FAST_2_9:
-                return fastdds.read_permissions(xml)
-            case Vendor.CYCLONE:
-                return cyclone.read_permissions(xml)
-            case _:
-                elements.check_permissions(xml)
-                return parse_permissions(xml, _PERMISSIONS)
-    except UnreadableError as error:
-        return error.refusal(TRAITS[vendor].title, _PERMISSIONS)
-    except DocumentError as error:
-        return Refusal("malformed", f"{TRAITS[vendor].title}: {error}")
+
+def _standard_permissions(xml: bytes) -> Permissions:
+    elements.check_permissions(xml)
+    return parse_permissions(xml, "permissions")
+
+
+_READERS = {
+    DocumentReader.STANDARD: (_standard_governance, _standard_permissions),
+    DocumentReader.FAST: (fastdds.read_governance, fastdds.read_permissions),
+    DocumentReader.CYCLONE: (cyclone.read_governance, cyclone.read_permissions),
+}
 
 
 def read_governance_as(vendor: Vendor, xml: bytes) -> Governance | Refusal:
-    """The governance that ``vendor`` finds in ``xml``, or why it refuses it."""
+    """Return the governance that ``vendor`` finds in ``xml``, or why it refuses it."""
+    return _read(vendor, "governance", _READERS[vendor.traits.reader][0], xml)
+
+
+def read_permissions_as(vendor: Vendor, xml: bytes) -> Permissions | Refusal:
+    """Return the permissions that ``vendor`` finds in ``xml``, or why it refuses them."""
+    return _read(vendor, "permissions", _READERS[vendor.traits.reader][1], xml)
+
+
+def _read(
+    vendor: Vendor, what: str, read: Callable[[bytes], _Document], xml: bytes
+) -> _Document | Refusal:
     try:
-        match vendor:
-            case Vendor.FAST | Vendor.FAST_2_9:
-                return fastdds.read_governance(xml)
-            case Vendor.CYCLONE:
-                return cyclone.read_governance(xml)
-            case _:
-                elements.check_governance(xml)
-                return parse_governance(xml, _GOVERNANCE)
+        return read(xml)
     except UnreadableError as error:
-        return error.refusal(TRAITS[vendor].title, _GOVERNANCE)
+        return error.refusal(vendor.title, what)
     except DocumentError as error:
-        return Refusal("malformed", f"{TRAITS[vendor].title}: {error}")
+        return Refusal("malformed", f"{vendor.title}: {error}")

@@ -12,6 +12,7 @@ from enum import Enum, auto
 from lxml import etree
 
 from sros_tool.dds.decision.answers import Outcome, Refusal
+from sros_tool.dds.governance import DomainRule, TopicRule, attributes
 from sros_tool.xml import tag_of
 
 
@@ -55,6 +56,12 @@ class Element:
         return [child for child in self.children if isinstance(child, Element)]
 
 
+def _attributes(rule: type[DomainRule | TopicRule]) -> str:
+    return "".join(
+        f"{each.name}," if each.default is None else f"({each.name},)?" for each in attributes(rule)
+    )
+
+
 # The children of each element as an expression over "name,"; the others hold text.
 _DOMAINS = {
     "domains": "(id,|id_range,)+",
@@ -81,16 +88,11 @@ _PERMISSIONS = _DOMAINS | {
 _GOVERNANCE = _DOMAINS | {
     "dds": "domain_access_rules,",
     "domain_access_rules": "(domain_rule,)+",
-    "domain_rule": "domains,allow_unauthenticated_participants,enable_join_access_control,"
-    "discovery_protection_kind,liveliness_protection_kind,rtps_protection_kind,"
-    "topic_access_rules,",
+    "domain_rule": f"domains,{_attributes(DomainRule)}topic_access_rules,",
     "topic_access_rules": "(topic_rule,)+",
-    "topic_rule": "topic_expression,enable_discovery_protection,enable_liveliness_protection,"
-    "enable_read_access_control,enable_write_access_control,metadata_protection_kind,"
-    "data_protection_kind,",
+    "topic_rule": f"topic_expression,{_attributes(TopicRule)}",
 }
 
-_KIND = r"(NONE|(SIGN|ENCRYPT)(_WITH_ORIGIN_AUTHENTICATION)?)"
 _NUMBER = r"\s*\+?\d+\s*"
 _FLAG = r"\s*(true|false|0|1)\s*"
 _DATE = r"\s*-?\d{4,}-\d\d-\d\dT\d\d:\d\d:\d\d(\.\d+)?(Z|[+-]\d\d:\d\d)?\s*"
@@ -101,17 +103,10 @@ _TEXTS = {
     "not_before": _DATE,
     "not_after": _DATE,
     "default": "ALLOW|DENY",
-    "allow_unauthenticated_participants": _FLAG,
-    "enable_join_access_control": _FLAG,
-    "enable_discovery_protection": _FLAG,
-    "enable_liveliness_protection": _FLAG,
-    "enable_read_access_control": _FLAG,
-    "enable_write_access_control": _FLAG,
-    "discovery_protection_kind": _KIND,
-    "liveliness_protection_kind": _KIND,
-    "rtps_protection_kind": _KIND,
-    "metadata_protection_kind": _KIND,
-    "data_protection_kind": "NONE|SIGN|ENCRYPT",
+} | {
+    each.name: _FLAG if each.is_flag else "|".join(map(str, each.values))
+    for rule in (DomainRule, TopicRule)
+    for each in attributes(rule)
 }
 _EVERYWHERE = "{http://www.w3.org/2001/XMLSchema-instance}"
 

@@ -10,13 +10,20 @@ What stands behind the last element that it looks for goes unread.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from typing import TypeVar
+from typing import Any
 
 from sros_tool.dds.decision.answers import Outcome
 from sros_tool.dds.decision.elements import Element, Mark, UnreadableError
 from sros_tool.dds.domains import DomainRange, DomainSet
-from sros_tool.dds.governance import DATA_PROTECTIONS, DomainRule, Governance, Protection, TopicRule
+from sros_tool.dds.governance import (
+    Attribute,
+    DomainRule,
+    Governance,
+    ProtectionKind,
+    TopicRule,
+    Value,
+    attributes,
+)
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 
 _BLANKS = " \t\n\v\f\r"
@@ -182,7 +189,6 @@ def _utf8(number: int) -> str:
 
 _INTEGER = re.compile(r"\s*(?:0[xX]([0-9a-fA-F]+)|([+-]?\d+))", re.ASCII)
 _TRUE, _FALSE = ("true", "True", "TRUE"), ("false", "False", "FALSE")
-Read = TypeVar("Read")
 
 
 def read_governance(xml: bytes) -> Governance:
@@ -299,18 +305,15 @@ def _flag(element: Element) -> bool:
     return text in _TRUE
 
 
-def _kind(element: Element) -> Protection:
+def _value(element: Element, attribute: Attribute) -> Value:
+    if attribute.is_flag:
+        return _flag(element)
     text = _required(element)
-    if text not in list(Protection):
+    if text not in list(ProtectionKind):
         raise UnreadableError(f"<{element.name}> holds {text!r}, which is no protection kind")
-    return Protection(text)
-
-
-def _data_kind(element: Element) -> Protection:
-    kind = _kind(element)
-    if kind not in DATA_PROTECTIONS:
-        raise UnreadableError(f"<{element.name}> holds {kind}, which is for metadata only")
-    return kind
+    if text not in attribute.values:
+        raise UnreadableError(f"<{element.name}> holds {text}, which is for metadata only")
+    return ProtectionKind(text)
 
 
 def _domains(element: Element) -> DomainSet:
@@ -345,23 +348,11 @@ def _range(element: Element) -> DomainRange:
 
 def _domain_rule(element: Element) -> DomainRule:
     take = _Sequence(element)
-
-    def field(name: str, read: Callable[[Element], Read]) -> Read:
-        return read(take.next(name))
-
-    rule = DomainRule(
-        domains=field("domains", _domains),
-        allow_unauthenticated_participants=field("allow_unauthenticated_participants", _flag),
-        enable_join_access_control=field("enable_join_access_control", _flag),
-        discovery_protection_kind=field("discovery_protection_kind", _kind),
-        liveliness_protection_kind=field("liveliness_protection_kind", _kind),
-        rtps_protection_kind=field("rtps_protection_kind", _kind),
-        topic_access_rules=field(
-            "topic_access_rules", lambda each: tuple(map(_topic_rule, _all(each, "topic_rule")))
-        ),
-    )
+    domains = _domains(take.next("domains"))
+    values = _values(take, DomainRule)
+    rules = tuple(map(_topic_rule, _all(take.next("topic_access_rules"), "topic_rule")))
     take.end()
-    return rule
+    return DomainRule(domains=domains, topic_access_rules=rules, **values)
 
 
 def _topic_rule(element: Element) -> TopicRule:
@@ -369,21 +360,13 @@ def _topic_rule(element: Element) -> TopicRule:
     expression = _text(take.next("topic_expression"))
     if expression is None:
         raise UnreadableError("<topic_expression> is empty", Outcome.CRASHES)
-
-    def field(name: str, read: Callable[[Element], Read]) -> Read:
-        return read(take.next(name))
-
-    rule = TopicRule(
-        topic_expression=expression,
-        enable_discovery_protection=field("enable_discovery_protection", _flag),
-        enable_liveliness_protection=field("enable_liveliness_protection", _flag),
-        enable_read_access_control=field("enable_read_access_control", _flag),
-        enable_write_access_control=field("enable_write_access_control", _flag),
-        metadata_protection_kind=field("metadata_protection_kind", _kind),
-        data_protection_kind=field("data_protection_kind", _data_kind),
-    )
+    rule = TopicRule(topic_expression=expression, **_values(take, TopicRule))
     take.end()
     return rule
+
+
+def _values(take: _Sequence, rule: type[DomainRule | TopicRule]) -> dict[str, Any]:
+    return {each.name: _value(take.next(each.name), each) for each in attributes(rule)}
 
 
 # ── permissions ────────────────────────────────────────────────────────────────────────────

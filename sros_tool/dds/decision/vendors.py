@@ -1,34 +1,13 @@
 """The vendors of DDS Security, and in what their decisions differ, as data.
 
-Measured on the real libraries where `Vendor.documented_only` is false: Fast DDS 2.9.1 and 2.14.5,
-and Cyclone DDS 0.10.2.  OpenDDS and Connext are as their manuals say.
+Fast DDS 2.9.1 and 2.14.5 and Cyclone DDS 0.10.2 were measured on the real libraries.  Vendors that
+were never measured, as OpenDDS and Connext, decide by the standard, which their manuals follow.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum, StrEnum, auto
-
-
-class Vendor(StrEnum):
-    """A DDS implementation, or the specification itself."""
-
-    STANDARD = "standard"
-    FAST = "fastdds"
-    FAST_2_9 = "fastdds-2.9"
-    CYCLONE = "cyclonedds"
-    OPENDDS = "opendds"
-    CONNEXT = "connext"
-
-    @property
-    def title(self) -> str:  # type: ignore[override]
-        """The name and version for people, as in ``Fast DDS 2.14``."""
-        return TRAITS[self].title
-
-    @property
-    def documented_only(self) -> bool:
-        """Whether its rules come from documentation alone and were never measured."""
-        return TRAITS[self].documented_only
 
 
 class Style(Enum):
@@ -114,12 +93,31 @@ class Keys(Enum):
     """EC of 256 bits, and RSA of 2048 (Cyclone DDS)."""
 
 
+class DocumentReader(Enum):
+    """Which parser reads the documents (`sros_tool.dds.decision.documents`)."""
+
+    STANDARD = auto()
+    """That of the schema."""
+    FAST = auto()
+    """TinyXML-2 and Fast DDS."""
+    CYCLONE = auto()
+    """Cyclone DDS' own."""
+
+
 @dataclass(frozen=True, slots=True)
-class Traits:
-    """The rules by which one vendor decides, where vendors differ."""
+class VendorTraits:
+    """All that is known of one vendor: its names, and its rules where vendors differ.
+
+    The rules are those of the standard unless another one is given.
+    """
 
     title: str
-    documented_only: bool = False
+    """The name and version for people."""
+    product: str = ""
+    """The name without a version, which its releases share."""
+    measured: bool = False
+    """Whether these rules were compared with the decisions of the real library."""
+    reader: DocumentReader = DocumentReader.STANDARD
     style: Style = Style.FNMATCH
     governance_both_ways: bool = False
     """A topic's name is also taken as an expression for the governance's expressions."""
@@ -165,8 +163,12 @@ class Traits:
     """With larger signed permissions, in bytes, a handshake never ends."""
 
 
-_FAST = Traits(
+_STANDARD = VendorTraits("DDS-Security 1.1")
+_FAST_2_14 = VendorTraits(
     "Fast DDS 2.14",
+    product="Fast DDS",
+    measured=True,
+    reader=DocumentReader.FAST,
     governance_both_ways=True,
     subjects=Subjects.ANY_ORDER,
     moments=Moments.LOCAL,
@@ -187,35 +189,79 @@ _FAST = Traits(
     keys=Keys.EC_AND_RSA,
 )
 
-TRAITS = {
-    Vendor.STANDARD: Traits("DDS-Security 1.1"),
-    Vendor.FAST: _FAST,
-    Vendor.FAST_2_9: replace(
-        _FAST,
-        title="Fast DDS 2.9.1",
-        subjects=Subjects.WHOLE_ATTRIBUTES,
-        refuses_open_rtps=False,
-        signers=Signers.CHAIN,
-        verifies_authorities=False,
-        largest_document=64 * 1024 - 1,
-    ),
-    Vendor.CYCLONE: Traits(
-        "Cyclone DDS 0.10.2",
-        style=Style.CYCLONE,
-        trims_texts=True,
-        subjects=Subjects.SUBSET,
-        escapes_subjects=True,
-        moments=Moments.CYCLONE,
-        open_range=OpenRange.CRASHES,
-        deny_partitions=DenyPartitions.ANY_OR_DEFAULT,
-        crashes_on_empty_texts=True,
-        creates_topics=True,
-        shares_open_topics=True,
-        signers=Signers.CHAIN,
-        reads_first_authority=True,
-        keys=Keys.SMALL,
-    ),
-    Vendor.OPENDDS: Traits("OpenDDS", documented_only=True),
-    Vendor.CONNEXT: Traits("Connext 6.1.1 and later", documented_only=True),
-}
-"""The rules of every vendor."""
+
+class Vendor(StrEnum):
+    """A DDS implementation, or the specification itself.
+
+    An entry is all that it takes to add a vendor that decides by the standard: options, texts and
+    comparisons follow, and `sros_tool.runtime.rmw` says which RMW uses it.  Of several releases of
+    a product the newest stands first.
+    """
+
+    traits: VendorTraits
+
+    def __new__(cls, word: str, traits: VendorTraits = _STANDARD) -> Vendor:
+        """Make the member whose value is ``word``."""
+        member = str.__new__(cls, word)
+        member._value_ = word
+        member.traits = traits
+        return member
+
+    STANDARD = "standard"
+    FAST = "fastdds", _FAST_2_14
+    FAST_2_9 = (
+        "fastdds-2.9",
+        replace(
+            _FAST_2_14,
+            title="Fast DDS 2.9.1",
+            subjects=Subjects.WHOLE_ATTRIBUTES,
+            refuses_open_rtps=False,
+            signers=Signers.CHAIN,
+            verifies_authorities=False,
+            largest_document=64 * 1024 - 1,
+        ),
+    )
+    CYCLONE = (
+        "cyclonedds",
+        VendorTraits(
+            "Cyclone DDS 0.10.2",
+            product="Cyclone DDS",
+            measured=True,
+            reader=DocumentReader.CYCLONE,
+            style=Style.CYCLONE,
+            trims_texts=True,
+            subjects=Subjects.SUBSET,
+            escapes_subjects=True,
+            moments=Moments.CYCLONE,
+            open_range=OpenRange.CRASHES,
+            deny_partitions=DenyPartitions.ANY_OR_DEFAULT,
+            crashes_on_empty_texts=True,
+            creates_topics=True,
+            shares_open_topics=True,
+            signers=Signers.CHAIN,
+            reads_first_authority=True,
+            keys=Keys.SMALL,
+        ),
+    )
+    OPENDDS = "opendds", VendorTraits("OpenDDS", product="OpenDDS")
+    CONNEXT = "connext", VendorTraits("Connext 6.1.1 and later", product="Connext")
+
+    @property
+    def title(self) -> str:  # type: ignore[override]
+        """The name and version for people, as in ``Fast DDS 2.14``."""
+        return self.traits.title
+
+    @property
+    def documented_only(self) -> bool:
+        """Whether the standard answers for a vendor that was never measured."""
+        return not self.traits.measured and self is not Vendor.STANDARD
+
+
+MEASURED = tuple(each for each in Vendor if each.traits.measured)
+"""The vendors whose decisions were compared with the real library."""
+
+NEWEST = tuple({each.traits.product: each for each in reversed(MEASURED)}.values())[::-1]
+"""The newest measured release of each implementation."""
+
+FAST_DDS = tuple(each for each in Vendor if each.traits.product == Vendor.FAST.traits.product)
+"""All releases of Fast DDS."""

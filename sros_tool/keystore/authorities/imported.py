@@ -10,10 +10,10 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
-from sros_tool.dds.decision import Vendor
+from sros_tool.dds.decision.vendors import MEASURED, Vendor
 from sros_tool.errors import Note, PkiError
 from sros_tool.keystore.layout import PERMISSIONS
-from sros_tool.keystore.loading import MEASURED, authority_refusals, refusals_text
+from sros_tool.keystore.loading import authority_refusals, refusals_text
 from sros_tool.pki.certificates import (
     UNREADABLE,
     issued_by,

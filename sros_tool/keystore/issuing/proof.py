@@ -18,9 +18,11 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-from sros_tool.dds.decision import Access, Outcome, Vendor, Verb
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import Outcome, Verb
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import DomainRule, Governance, Protection, TopicRule
+from sros_tool.dds.governance import DomainRule, Governance, TopicRule, settings
 from sros_tool.dds.permissions import Permissions
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.issuing.issuance import Make
@@ -265,20 +267,13 @@ def _access(vendor: Vendor, permissions: Permissions, domain: int) -> Access:
 
 
 def _everything_controlled(domain: int) -> Governance:
-    topic = TopicRule("*", True, True, True, True, Protection.ENCRYPT, Protection.ENCRYPT)
-    return Governance(
-        (
-            DomainRule(
-                DomainSet.of((domain, domain)),
-                False,
-                True,
-                Protection.ENCRYPT,
-                Protection.ENCRYPT,
-                Protection.ENCRYPT,
-                (topic,),
-            ),
-        )
+    topic = TopicRule("*", **settings(TopicRule, protect=True))
+    rule = DomainRule(
+        domains=DomainSet.of((domain, domain)),
+        topic_access_rules=(topic,),
+        **settings(DomainRule, protect=True),
     )
+    return Governance((rule,))
 
 
 def _topics(permissions: Permissions) -> Iterator[str]:

@@ -1,0 +1,20 @@
+"""Vendors: what follows from an entry in their table."""
+
+import pytest
+
+from sros_tool.dds.decision.vendors import FAST_DDS, MEASURED, NEWEST, Vendor
+
+
+def test_the_measured_vendors() -> None:
+    assert MEASURED == (Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE)
+    assert NEWEST == (Vendor.FAST, Vendor.CYCLONE)
+    assert FAST_DDS == (Vendor.FAST, Vendor.FAST_2_9)
+
+
+@pytest.mark.parametrize("vendor", [each for each in Vendor if each not in MEASURED])
+def test_vendors_that_were_not_measured_decide_by_the_standard(vendor: Vendor) -> None:
+    names = {"title", "product"}
+    for name in set(type(vendor.traits).__slots__) - names:
+        assert getattr(vendor.traits, name) == getattr(Vendor.STANDARD.traits, name)
+    assert vendor.documented_only is (vendor is not Vendor.STANDARD)
+
