@@ -17,4 +17,3 @@ def test_vendors_that_were_not_measured_decide_by_the_standard(vendor: Vendor) -
     for name in set(type(vendor.traits).__slots__) - names:
         assert getattr(vendor.traits, name) == getattr(Vendor.STANDARD.traits, name)
     assert vendor.documented_only is (vendor is not Vendor.STANDARD)
-
