@@ -16,8 +16,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
-from sros_tool.dds.decision.vendors import VendorTraits, Vendor
-from sros_tool.dds.decision.vendors import MEASURED, Hashes, Keys, Signers
+from sros_tool.dds.decision.vendors import MEASURED, Hashes, Keys, Signers, Vendor, VendorTraits
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES
 from sros_tool.errors import PkiError
 from sros_tool.faults import Fault
@@ -44,7 +43,9 @@ _JUDGED = frozenset(
 _certificates = lru_cache(maxsize=16)(load_certificates)
 
 
-def vendor_problems(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> tuple[Problem, ...]:
+def vendor_problems(
+    traits: VendorTraits, state: OpenedEnclave, at: datetime
+) -> tuple[Problem, ...]:
     """The problems that a vendor has with an enclave when it loads it, at the moment ``at``.
 
     Those of its documents' content are not among them, beyond what `EnclaveState` says.
