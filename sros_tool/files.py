@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import secrets
 import stat
 import tomllib
 from pathlib import Path
 from typing import Any
+
+_LOG = logging.getLogger(__name__)
 
 
 def replace_file(path: Path, data: bytes) -> None:
@@ -49,6 +52,7 @@ def replace_file(path: Path, data: bytes) -> None:
         os.fsync(folder)
     finally:
         os.close(folder)
+    _LOG.info("%s '%s', %d bytes", "replaced" if present else "wrote", target, len(data))
 
 
 _LONGEST_LINE = 4000  # characters: the parser takes quadratic time for a key of many dots

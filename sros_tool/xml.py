@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import stat
 from functools import cache
@@ -11,6 +12,8 @@ from pathlib import Path
 from lxml import etree
 
 from sros_tool.errors import DocumentError
+
+_LOG = logging.getLogger(__name__)
 
 MAX_BYTES = 16 * 1024 * 1024
 """Largest document that is read, in bytes."""
@@ -50,6 +53,7 @@ def read_bytes(path: Path, what: str) -> bytes:
         raise DocumentError(
             f"the {what} '{path}' is too large", f"More than {MAX_BYTES // 1024**2} MiB."
         )
+    _LOG.debug("read the %s '%s', %d bytes", what, path, len(data))
     return data
 
 

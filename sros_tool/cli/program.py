@@ -76,6 +76,47 @@ _VERBS = {name: verb for family in FAMILIES.values() for name, verb in family.it
 _NAMES = {alias: name for name, verb in _VERBS.items() for alias in (name, *verb.aliases)}
 
 
+def _report_steps(ctx: click.Context, _parameter: click.Parameter, count: int) -> None:
+    """Log steps on standard error until the program ends: INFO for one -v in all, DEBUG for more.
+
+    Nothing else in sros configures `logging`; libraries of others stay silent.
+    """
+    if not count:
+        return
+    import logging
+
+    count += ctx.meta.get(_VERBOSITY, 0)
+    ctx.meta[_VERBOSITY] = count
+    logger = logging.getLogger("sros_tool")
+    logger.setLevel(logging.INFO if count == 1 else logging.DEBUG)
+    if _HANDLER in ctx.meta:
+        return
+
+    def make_visible(record: logging.LogRecord) -> bool:
+        record.msg, record.args = visible(record.getMessage()), ()
+        return True
+
+    def stop() -> None:
+        logger.removeHandler(handler)
+        logger.setLevel(logging.NOTSET)
+
+    ctx.meta[_HANDLER] = handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(name)s: %(message)s"))
+    handler.addFilter(make_visible)
+    logger.addHandler(handler)
+    ctx.find_root().call_on_close(stop)
+
+
+_VERBOSITY, _HANDLER = "sros.verbosity", "sros.handler"
+_VERBOSE = click.Option(
+    ["-v", "--verbose"],
+    count=True,
+    expose_value=False,
+    callback=_report_steps,
+    help="Report each step on standard error; -vv in detail.",
+)
+
+
 class Program(click.Group):
     """A group whose commands are found by table; hyphen and underscore are the same letter."""
 
@@ -91,6 +132,8 @@ class Program(click.Group):
         module = importlib.import_module(f"sros_tool.cli.{_VERBS[name].module}")
         command = getattr(module, _VERBS[name].attribute or name)
         assert isinstance(command, click.Command)
+        if _VERBOSE not in command.params:
+            command.params.append(_VERBOSE)
         return command
 
     def resolve_command(
@@ -131,6 +174,9 @@ Exit status: 0 yes or done; 1 no, denied or failed; 2 wrong usage."""
 @click.version_option(__version__, "--version", "-V", message="sros %(version)s")
 def program() -> None:
     """Secure ROS 2 robots: keystores, enclaves and permissions from policies in ROS terms."""
+
+
+program.params.append(_VERBOSE)
 
 
 _PHRASES = {

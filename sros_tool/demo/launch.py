@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import shlex
 import signal
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -14,6 +16,8 @@ from sros_tool.demo.wire import udp_ports
 from sros_tool.runtime.events import Event, EventReader, Kind
 from sros_tool.runtime.netns import end_with_parent
 from sros_tool.runtime.vendor_log import plain_text
+
+_LOG = logging.getLogger(__name__)
 
 _LEFT_OUT_PREFIXES = ("ROS_SECURITY_",)
 _LEFT_OUT = frozenset(
@@ -85,6 +89,7 @@ class PartyProcess:
                 start_new_session=True,
                 preexec_fn=before,
             )
+        _LOG.info("started process %d, %s: %s", self._process.pid, name, shlex.join(command))
 
     def look(self) -> list[Event]:
         """Everything that the process has reported so far, oldest first."""

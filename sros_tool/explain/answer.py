@@ -7,6 +7,7 @@ way; the result is tried out on the decision engine before it is proposed.
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
@@ -46,6 +47,8 @@ from sros_tool.policy.model import (
 )
 from sros_tool.policy.rights import Right, profile_rights
 from sros_tool.translate import grant_rights
+
+_LOG = logging.getLogger(__name__)
 
 _WORST = (
     Outcome.CRASHES,
@@ -478,6 +481,13 @@ class Explanation:
 def explain(case: Case, question: Question, vendor: Vendor) -> Explanation:
     """What one vendor answers, and why."""
     answer = Judge(vendor, case.material, case.setting).answer(question)
+    _LOG.info(
+        "asked %s: %s of enclave %s: %s",
+        vendor.title,
+        " ".join(filter(None, (question.word, question.name))),
+        case.material.enclave,
+        answer.outcome,
+    )
     decision = answer.deciding.decision
     known = _provenance(case)
     change, sign = None, False

@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import json
+import logging
 import os
 import selectors
 import subprocess
@@ -31,6 +32,8 @@ from typing import Any, Protocol, Self
 
 from sros_tool.errors import UnavailableError
 from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, make_observation
+
+_LOG = logging.getLogger(__name__)
 
 Listed = tuple[str, str, str]
 """A node as it is announced: enclave, namespace, name."""
@@ -208,6 +211,7 @@ class RosGraph:
             raise
         finally:
             os.close(write_end)
+        _LOG.info("started the observer, process %d", self._process.pid)
         self._report = read_end
         self._rest = b""
         try:

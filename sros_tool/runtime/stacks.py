@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
+import logging
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -31,6 +33,8 @@ from sros_tool.runtime.vendor_log import (
     participant_refusal,
     plain_text,
 )
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -295,7 +299,9 @@ def _run_probe(kind: str, probe: ProbeEnclave, extra: Mapping[str, str]) -> Prob
                 start_new_session=True,
                 preexec_fn=end_with_parent,
             )
+            _LOG.info("started process %d: %s", process.pid, shlex.join(command))
             status = _wait(process)
+            _LOG.info("process %d ended with status %s", process.pid, status)
         printed = plain_text(log.read_text(encoding="utf-8", errors="replace"))
         return ProbeRun(tuple(read_events(report)), printed, status)
 

@@ -6,6 +6,7 @@ The library never asks a person: a secrets handler does, which the caller brings
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Iterable
 from contextlib import suppress
@@ -19,6 +20,8 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.pki.token import SCHEME, create_token_key, holds_token_key, open_token_key
 from sros_tool.xml import read_bytes
+
+_LOG = logging.getLogger(__name__)
 
 Secrets = Callable[[str], str]
 
@@ -51,7 +54,9 @@ class Keyring:
         place = self.place(role, template)
         try:
             if place.startswith(SCHEME):
-                return open_token_key(place, self.secrets)
+                token_key = open_token_key(place, self.secrets)
+                _LOG.info("opened the key of the %s CA, on the token at %s", role, place)
+                return token_key
             path = _path(place, root)
             if not path.exists():
                 raise KeystoreError(
@@ -62,7 +67,9 @@ class Keyring:
                     "exists, so none is made.",
                 )
             pem = read_bytes(path, f"{role} CA key")
-            return load_key(pem, f"'{path}'", self._passphrase(role))
+            key = load_key(pem, f"'{path}'", self._passphrase(role))
+            _LOG.info("opened the key of the %s CA, '%s'", role, path)
+            return key
         except (KeystoreError, PkiError) as error:
             raise KeystoreError(error.what, error.why, error.remedy) from error
 

@@ -8,6 +8,7 @@ already, so a recovery that was stopped is recovered, too.
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import re
 import shutil
@@ -36,6 +37,8 @@ from sros_tool.keystore.transaction.stage import (
 )
 from sros_tool.parallel import map_slices
 
+_LOG = logging.getLogger(__name__)
+
 _KNOWN = re.compile(
     rf"{BEFORE}|{AFTER}|{ADDED}|{re.escape(MANIFEST)}|{LIVE}(\.next)?|spare(\.\d+)?"
 )
@@ -63,10 +66,12 @@ def recover(root: Path) -> None:
     live = stage / LIVE
     to = _target(stage)
     if to == AFTER:
+        _LOG.info("moving what was committed to its place in the keystore '%s'", root)
         _complete(root, stage, read_manifest(stage))
         move_into_place(stage / ADDED, root)
         filesystem.flush_folder(root)
     elif to == BEFORE:
+        _LOG.info("undoing the transaction that was not committed in the keystore '%s'", root)
         _undo(root, stage, read_manifest(stage))
     with contextlib.suppress(FileNotFoundError):
         os.unlink(live)  # first: without it, what is left of the stage is only to be removed

@@ -16,6 +16,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import glob
+import logging
 import os
 import secrets
 import shutil
@@ -45,6 +46,8 @@ from sros_tool.keystore.transaction.stage import (
     write_manifest,
 )
 from sros_tool.parallel import map_slices
+
+_LOG = logging.getLogger(__name__)
 
 
 class Transaction:
@@ -90,12 +93,14 @@ class Transaction:
             self._remove_stale_siblings()
             self._make_parents()
             self._make_sibling()
+            _LOG.info("began to make the keystore '%s'", self.root)
             return
         self._lock = filesystem.lock_folder(self.root)
         recover(self.root)
         self._stage.mkdir(mode=0o700)
         os.mkdir(self._added, 0o700)
         os.mkdir(f"{self._stage}/{AFTER}", 0o700)
+        _LOG.info("began a transaction in the keystore '%s'", self.root)
 
     def __exit__(
         self,
@@ -263,14 +268,22 @@ class Transaction:
         if self._new_root:
             filesystem.flush_file_system(self._stage)
             self._appear()
+            self._report_commit()
             return
         write_manifest(self._stage, self._moves)
         filesystem.flush_file_system(self._stage)
         _bridge(self.root, self._stage, self._moves)
         point_live(self._stage, AFTER)
+        self._report_commit()
         self._undo.clear()
         with contextlib.suppress(OSError, SrosError):  # it is committed; `_end` tries once more
             recover(self.root)
+
+    def _report_commit(self) -> None:
+        _LOG.info("committed %d changes to the keystore '%s'", len(self.changes), self.root)
+        if _LOG.isEnabledFor(logging.DEBUG):
+            for change in self.changes:
+                _LOG.debug("%s %s", change.action, change.path)
 
     def _appear(self) -> None:
         os.chmod(self._stage, folder_mode(""))
