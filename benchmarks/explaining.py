@@ -18,7 +18,7 @@ def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fig
     """Seconds of ``sros explain --who`` and ``--reach``, and of proving what is signed."""
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.dds.domains import DomainSet
-    from sros_tool.explain.answer import Setting
+    from sros_tool.explain.evaluator import JoinContext
     from sros_tool.explain.question import ask
     from sros_tool.explain.reach import Network
     from sros_tool.explain.who import who
@@ -46,7 +46,7 @@ def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fig
 
     def ask_all() -> None:
         question = ask("publish", "/robot7/topic_0")
-        found = who(root, question, Vendor.FAST, lambda _: Setting(0, now), at=now)
+        found = who(root, question, Vendor.FAST, lambda _: JoinContext(0, now), at=now)
         assert [each.enclave for each in found if each.outcome.ok] == ["/robot7/part"]
 
     def follow() -> None:

@@ -8,7 +8,7 @@ Nothing here prints, asks a person, or reads an environment variable.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, tzinfo
 from os import PathLike, fspath
 from pathlib import Path
@@ -288,8 +288,7 @@ def explain_access(
         (True, 'rule 1 allows publish rt/chatter by rt/chatter')
     """
     from sros_tool.dds.decision.vendors import Vendor
-    from sros_tool.explain.answer import Case, Setting, explain
-    from sros_tool.explain.material import from_folder
+    from sros_tool.explain.evaluator import Evaluator, JoinContext, load_enclave
     from sros_tool.explain.question import ask
     from sros_tool.keystore.layout import enclave_path, list_enclaves
     from sros_tool.keystore.missing import no_such_enclave
@@ -304,24 +303,24 @@ def explain_access(
     if enclave not in names:
         raise no_such_enclave(root, enclave, names)
     at = _moment(now)
-    material = from_folder(enclave, enclave_path(root, enclave), at=at)
-    if domain is None:
-        domain = choose_domain(material.domains, None, root) if material.domains else 0
-    stated = _policy(policy).enclave(enclave) if policy is not None else None
-    found = explain(
-        Case(material, Setting(domain, at, zone), root, stated), question, Vendor(vendor)
+    own = _policy(policy).enclave(enclave) if policy is not None else None
+    loaded = replace(
+        load_enclave(enclave, enclave_path(root, enclave), at=at), root=root, policy=own
     )
-    decision = found.answer.deciding.decision
+    if domain is None:
+        domain = choose_domain(loaded.domains, None, root) if loaded.domains else 0
+    answer = Evaluator(Vendor(vendor), loaded, JoinContext(domain, at, zone)).explain(question)
+    decision = answer.decision
     _, colon, reason = decision.text.partition(": ")
     return AccessAnswer(
-        found.answer.allowed,
-        found.answer.outcome.value,
+        answer.allowed,
+        answer.outcome.value,
         (reason if colon else decision.text).removesuffix("."),
         vendor,
         decision.expression or "",
-        tuple(str(each.source) for each in found.origins),
-        found.answer.until,
-        found.remedy,
+        tuple(str(each.source) for each in answer.lines),
+        answer.until,
+        answer.remedy,
     )
 
 

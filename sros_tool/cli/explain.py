@@ -1,4 +1,4 @@
-"""Of what, where and when ``sros explain`` is asked: its words and options as values."""
+"""``sros explain``: from options to a question, from the question to an answer, text or JSON."""
 
 from __future__ import annotations
 
@@ -25,438 +25,37 @@ from sros_tool.cli.common import (
     visible,
 )
 from sros_tool.dds.decision.vendors import NEWEST, Vendor
-from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.names import is_expression
 from sros_tool.validity import iso
 from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
-    from sros_tool.dds.domains import DomainSet
-    from sros_tool.explain.answer import Case, Setting
-    from sros_tool.explain.material import Material
-    from sros_tool.policy.model import Enclave
-
-
-class Place:
-    """The options that say where and when."""
-
-    def __init__(self, moment: str | None, domain: str | None, zone: str | None) -> None:
-        self.at = moment_of(moment)
-        self._domain = ros_domain() if domain is None else domain_of(domain)
-        self._zone = _zone(zone)
-
-    def setting(self, domains: DomainSet | None) -> Setting:
-        """Where a question is asked of an enclave that is made for these domains."""
-        from sros_tool.explain.answer import Setting
-        from sros_tool.runtime.environment import choose_domain
-
-        chosen = self._domain
-        if chosen is None:
-            chosen = choose_domain(domains, None, Path()) if domains else 0
-        return Setting(chosen, self.at, self._zone)
-
-
-def _zone(name: str | None) -> tzinfo:
-    from sros_tool.cli.common import local_zone, named_zone
-
-    return local_zone(os.environ) if name is None else named_zone(name)
-
-
-def case_of(root: Path | None, enclave: str, policy: Path | None, place: Place) -> Case:
-    """What is asked: the enclave of a keystore, of a folder, or of a policy alone."""
-    from sros_tool.explain.answer import Case
-
-    stated = _stated(policy, enclave)
-    if root is None and not policy and not _is_enclave(Path(enclave)):
-        root = keystore_from_environment()
-    material = signed_material(root, enclave, place, planned=stated is not None)
-    if material is None:
-        assert stated is not None
-        material = _planned(stated, root, place)
-    elif stated is None and policy:
-        stated = _stated(policy, material.enclave)
-    return Case(material, place.setting(material.domains), root, stated)
-
-
-def _stated(policy: Path | None, enclave: str) -> Enclave | None:
-    """What the policy file says of the enclave, where there is a file."""
-    from sros_tool.errors import PolicyError
-    from sros_tool.policy.document import read_policy
-
-    if policy is None:
-        return None
-    read = read_policy(policy)
-    found = read.enclave(enclave)
-    if found is None and not _is_enclave(Path(enclave)):
-        there = ", ".join(each.path for each in read.enclaves)
-        raise PolicyError(
-            f"unable to find enclave {enclave} in the policy '{policy}'", f"It has {there}."
-        )
-    return found
-
-
-def signed_material(
-    root: Path | None, name: str, place: Place, *, planned: bool = False
-) -> Material | None:
-    """What is signed for an enclave of a keystore, or in a folder of that name.
-
-    None if there is neither keystore nor folder, or, with ``planned``, no such enclave yet.
-    """
-    from sros_tool.explain.material import from_folder
-    from sros_tool.keystore.layout import enclave_path, list_enclaves
-    from sros_tool.keystore.missing import no_such_enclave
-
-    if root is None:
-        folder = Path(name)
-        if not _is_enclave(folder):
-            return None
-        return from_folder(_name_of(folder, place), folder, at=place.at)
-    if _is_enclave(root) and not (root / "enclaves").is_dir():
-        own = _name_of(root, place)
-        if own != name:
-            raise KeystoreError(f"'{root}' is the folder of {own or 'no enclave'}, not of {name}")
-        return from_folder(own, root, at=place.at)
-    names = list_enclaves(root)
-    if name in names:
-        return from_folder(name, enclave_path(root, name), at=place.at)
-    if planned:
-        return None
-    raise no_such_enclave(root, name, names)
-
-
-def _is_enclave(folder: Path) -> bool:
-    return any((folder / name).exists() for name in ("cert.pem", "permissions.p7s"))
-
-
-def _name_of(folder: Path, place: Place) -> str:
-    """The name of the enclave whose folder this is: the common name of its certificate."""
-    from sros_tool.keystore.reader import open_enclave
-    from sros_tool.pki.certificates import common_name_of
-
-    certificate = open_enclave(folder, now=place.at).certificate
-    return common_name_of(certificate.subject) if certificate else ""
-
-
-def _planned(stated: Enclave, root: Path | None, place: Place) -> Material:
-    """What the policy would give, under the governance of the keystore or of a new one."""
-    from sros_tool.dds.domains import DomainSet
-    from sros_tool.explain.material import from_policy
-    from sros_tool.keystore.reader import governance_of
-    from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
-    from sros_tool.translate import governance_for
-
-    if root is not None:
-        return from_policy(stated, governance_of(root), at=place.at)
-    domain = place.setting(None).domain
-    protection = load_template(DEFAULT_TEMPLATE).protection
-    return from_policy(
-        stated, governance_for(protection, DomainSet.of((domain, domain))), at=place.at
-    )
-
-
-def vendor_of(name: str | None) -> tuple[Vendor, str]:
-    """The vendor of an option, or else of this machine, and why it is that one."""
-    from sros_tool.runtime.rmw import vendor_here
-
-    return (Vendor(name), "as asked") if name else vendor_here(os.environ)
-
-
-if TYPE_CHECKING:
-    from sros_tool.explain.reach import Path as FlowPath
-    from sros_tool.explain.reach import Reach
-    from sros_tool.explain.who import Standing
-    from sros_tool.keystore.rights import RightsSource
-
-
-def _keystore(root: Path | None) -> Path:
-    from sros_tool.keystore.layout import list_enclaves
-
-    found = root or keystore_from_environment()
-    list_enclaves(found)
-    return found
-
-
-def show_who(
-    root: Path | None,
-    rest: tuple[str, ...],
-    kind: str | None,
-    vendor: str | None,
-    place: Place,
-    as_json: bool,
-) -> int:
-    """Say which enclaves of the keystore may; 0 if any may."""
-    from sros_tool.errors import Note
-    from sros_tool.explain.question import ask
-    from sros_tool.explain.who import who
-
-    if not 1 <= len(rest) <= 2:
-        raise UsageError(
-            "--who takes what is to be done, and a name", "", "As in publish /cmd_vel."
-        )
-    question = ask(rest[0], rest[1] if len(rest) > 1 else "", kind)
-    chosen, why = vendor_of(vendor)
-    keystore = _keystore(root)
-    found = who(keystore, question, chosen, place.setting, at=place.at)
-    if as_json:
-        print_json(
-            {
-                "question": str(question),
-                "vendor": chosen.value,
-                "vendor_why": why,
-                "documented_only": chosen.documented_only,
-                "enclaves": [_who_json(each) for each in found],
-            }
-        )
-    else:
-        for line in _who_lines(found):
-            click.echo(line)
-        documented = ", as documented" if chosen.documented_only else ""
-        click.echo(f"{question}, on {chosen.title} ({why}{documented})", err=True)
-        if question.word == "call" and not kind and not any(each.outcome.ok for each in found):
-            action = ask("call", question.name, "action")
-            if any(e.outcome.ok for e in who(keystore, action, chosen, place.setting, at=place.at)):
-                told = f"enclaves may {action}: add --type action if that is what it is."
-                print_notes([Note("explain.an-action", told)])
-    return 0 if any(each.outcome.ok for each in found) else 1
-
-
-def show_reach(
-    enclave: str,
-    root: Path | None,
-    rest: tuple[str, ...],
-    policy: Path | None,
-    infrastructure: bool,
-    as_json: bool,
-) -> int:
-    """Say whom an enclave can influence and learn from."""
-    from sros_tool.explain.reach import OF_EVERY_NODE, Network
-    from sros_tool.keystore.rights import load_rights
-
-    if root is None and len(rest) == 1:
-        root, rest = Path(rest[0]), ()
-    if rest:
-        raise UsageError("--reach takes one enclave, and no question")
-    source = load_rights(root or policy or keystore_from_environment())
-    without = () if infrastructure else OF_EVERY_NODE
-    network = Network(source.rights, without=without, **_opened(source))
-    if source.kind == "keystore":
-        _check_there(source.path, enclave)
-    if enclave not in network.enclaves:
-        raise KeystoreError(
-            f"enclave {enclave} has no rights in '{source.path}'",
-            f"There are {', '.join(network.enclaves[:5]) or 'none'}.",
-        )
-    reach = network.reach(enclave)
-    if as_json:
-        print_json({"path": str(source.path), "left_out": list(without), **_reach_json(reach)})
-    else:
-        for line in _reach_lines(reach):
-            click.echo(line)
-    print_notes(source.notes)
-    if without and not as_json:
-        told = f"left out: {', '.join(without)}, which every node writes and reads"
-        click.echo(f"{told} (--infrastructure counts it)", err=True)
-    return 0
-
-
-def _check_there(root: Path, enclave: str) -> None:
-    from sros_tool.keystore.layout import enclave_names
-    from sros_tool.keystore.missing import no_such_enclave
-
-    there = tuple(enclave_names(root))
-    if enclave not in there:
-        raise no_such_enclave(root, enclave, there)
-
-
-def _opened(source: RightsSource) -> dict[str, Any]:
-    """What everybody in a keystore may do, because its governance does not control access."""
-    if source.kind != "keystore":
-        return {}
-    from sros_tool.explain.reach import unguarded
-    from sros_tool.keystore.layout import enclave_names
-    from sros_tool.keystore.reader import governance_of
-
-    return {
-        "unguarded": unguarded(governance_of(source.path)),
-        "everybody": enclave_names(source.path),
-    }
-
-
-# ── telling ───────────────────────────────────────────────────────────────────────────────
-
-
-def _who_lines(found: Sequence[Standing]) -> Iterator[str]:
-    """The enclaves that may, by which wildcard, and how many may not."""
-    able = [each for each in found if each.outcome.ok]
-    for each in able:
-        yield each.enclave + (f"  by the wildcard {each.wildcard}" if each.wildcard else "")
-    broken = [each for each in found if each.outcome in ("refused", "crashes")]
-    for each in broken:
-        yield f"  not now: {each.enclave}  {each.text.partition(': ')[2]}"
-    yield f"{len(able)} of {len(found)} enclaves may"
-
-
-def _who_json(each: Standing) -> dict[str, Any]:
-    """How one enclave stands to a question."""
-    return {
-        "enclave": each.enclave,
-        "allowed": each.outcome.ok,
-        "outcome": each.outcome.value,
-        "reason": each.reason,
-        "expression": each.expression or None,
-        "wildcard": each.wildcard or None,
-    }
-
-
-def _reach_lines(reach: Reach) -> Iterator[str]:
-    """Whom an enclave influences and learns from, each with a shortest path."""
-    from sros_tool.explain.reach import path_text
-
-    for what, paths in (
-        ("can influence", reach.influences),
-        ("can learn from", reach.learns_from),
-    ):
-        count = f"{len(paths)} enclave{'' if len(paths) == 1 else 's'}"
-        yield f"{reach.enclave} {what} {count}"
-        for _, path in sorted(paths.items(), key=lambda item: (len(item[1]), item[0])):
-            yield f"  {path_text(path)}"
-
-
-def _reach_json(reach: Reach) -> dict[str, Any]:
-    """Whom an enclave influences and learns from, with the hops of a shortest path."""
-    return {
-        "enclave": reach.enclave,
-        "influences": _paths_json(reach.influences),
-        "learns_from": _paths_json(reach.learns_from),
-    }
-
-
-def _paths_json(paths: dict[str, FlowPath]) -> list[dict[str, Any]]:
-    return [
-        {
-            "enclave": enclave,
-            "path": [
-                {
-                    "from": hop.source,
-                    "to": hop.target,
-                    "kind": hop.kind,
-                    "right": hop.right,
-                    "name": hop.name,
-                    "said": hop.said,
-                    "heard": hop.heard,
-                }
-                for hop in path
-            ],
-        }
-        for enclave, path in sorted(paths.items())
-    ]
-
-
-if TYPE_CHECKING:
-    from sros_tool.explain.log import Finding
-    from sros_tool.explain.material import Material
-
-
-def show_log(
-    log: str, root: Path | None, rest: tuple[str, ...], place: Place, *, as_json: bool
-) -> int:
-    """Explain the lines of a file, or of standard input for "-"; 1 if they tell of a fault."""
-    from sros_tool.explain.log import explain_log
-
-    if len(rest) > 1:
-        raise UsageError("--log takes a keystore and an enclave at most, and no question")
-    named = rest[0] if rest else ""
-    given: Material | None = None
-    if named:
-        given = signed_material(root, named, place)
-        if given is None:
-            raise UsageError(
-                f"no keystore is named to look for {named} in", "", "Write it before the enclave."
-            )
-
-    def look(enclave: str) -> Material | None:
-        if given is not None and enclave in ("", given.enclave):
-            return given
-        if root is None or not enclave:
-            return None
-        try:
-            return signed_material(root, enclave, place)
-        except SrosError:  # of another keystore
-            return None
-
-    findings = explain_log(
-        read_log(log), look, lambda material: place.setting(material.domains), str(root or "")
-    )
-    if as_json:
-        print_json({"log": log, "findings": [_json(each) for each in findings]})
-    else:
-        for finding in findings:
-            for line in _lines(finding):
-                click.echo(visible(line))
-        if not findings:
-            click.echo("nothing in it tells of DDS Security refusing anything", err=True)
-    return 1 if findings else 0
-
-
-def _lines(finding: Finding) -> Iterator[str]:
-    times = f"  ({finding.count} times)" if finding.count > 1 else ""
-    yield f"line {finding.line}: {finding.text[:160]}{times}"
-    of = f" [{finding.enclave}]" if finding.enclave else ""
-    source = finding.vendor.title.split()[0] + " DDS" if finding.vendor else "ROS 2"
-    yield f"  means     {source}{of}: {finding.cause}"
-    yield from (f"  found     {each}" for each in finding.found)
-    yield f"  remedy    {finding.remedy}"
-
-
-def _json(finding: Finding) -> dict[str, Any]:
-    return {
-        "id": finding.id,
-        "vendor": finding.vendor.value if finding.vendor else None,
-        "line": finding.line,
-        "count": finding.count,
-        "text": finding.text,
-        "enclave": finding.enclave or None,
-        "cause": finding.cause,
-        "checked": finding.checked,
-        "found": list(finding.found),
-        "remedy": finding.remedy,
-    }
-
-
-_IGNORED = {
-    "": ("infrastructure",),
-    "--who": ("infrastructure", "policy", "all_vendors"),
-    "--reach": ("kind", "vendor", "all_vendors", "moment", "domain", "time_zone"),
-    "--log": ("infrastructure", "kind", "policy", "vendor", "all_vendors"),
-}
-"""The options that have no meaning in each way of asking, by the names of their parameters."""
-
-
-def refuse_ignored(mode: str) -> None:
-    """Raise `UsageError` for an option that would change nothing."""
-    context = click.get_current_context()
-    for parameter in context.command.params:
-        name = parameter.name or ""
-        if name in _IGNORED[mode] and context.params[name]:
-            option = parameter.opts[0]
-            said = f"{mode} takes no {option}" if mode else f"{option} goes with --reach only"
-            raise UsageError(said, "", "Leave it out.")
-
-
-if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
-    from sros_tool.errors import Note
-    from sros_tool.explain.answer import Case, Explanation
-    from sros_tool.explain.question import Question
+    from sros_tool.dds.decision.answers import Decision
+    from sros_tool.dds.domains import DomainSet
+    from sros_tool.explain.answer import Answer
+    from sros_tool.explain.change import PolicyChange
+    from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave
+    from sros_tool.explain.log import LogFinding
+    from sros_tool.explain.question import Part, Question
+    from sros_tool.explain.reach import Path as FlowPath
+    from sros_tool.explain.reach import Reach
+    from sros_tool.explain.who import EnclaveOutcome
+    from sros_tool.keystore.rights import RightsSource
+    from sros_tool.policy.model import Enclave, Source
 
 _WORDS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply", "join")
+
+
+# ── options ────────────────────────────────────────────────────────────────────────────────
 
 
 def _complete_words(
     ctx: click.Context, parameter: click.Parameter, incomplete: str
 ) -> list[CompletionItem | str]:
-    """Completes the keystore, then its enclaves, then what they could do."""
+    """Complete the keystore, then its enclaves, then what they could do."""
     from sros_tool.keystore.layout import is_keystore
 
     given: tuple[str, ...] = ctx.params.get("words") or ()
@@ -474,7 +73,7 @@ def _complete_words(
 def _complete_enclave(
     ctx: click.Context, _parameter: click.Parameter, incomplete: str
 ) -> list[CompletionItem | str]:
-    """Completes the enclaves of the keystore that is named, or else of the environment's."""
+    """Complete the enclaves of the keystore that is named, or else of the environment's."""
     from sros_tool.keystore.layout import enclave_names, is_keystore
 
     given = ctx.params.get("words") or ctx.args  # args, where an option still lacks its value
@@ -482,6 +81,26 @@ def _complete_enclave(
     root = Path(named or os.environ.get(KEYSTORE_VARIABLE, ""))
     names = enclave_names(root) if is_keystore(root) else ()
     return [name for name in names if name.startswith(incomplete)]
+
+
+_IGNORED = {
+    "": ("infrastructure",),
+    "--who": ("infrastructure", "policy", "all_vendors"),
+    "--reach": ("kind", "vendor", "all_vendors", "moment", "domain", "time_zone"),
+    "--log": ("infrastructure", "kind", "policy", "vendor", "all_vendors"),
+}
+"""The options that have no meaning in each way of asking, by the names of their parameters."""
+
+
+def _refuse_ignored(mode: str) -> None:
+    """Raise `UsageError` for an option that would change nothing."""
+    context = click.get_current_context()
+    for parameter in context.command.params:
+        name = parameter.name or ""
+        if name in _IGNORED[mode] and context.params[name]:
+            option = parameter.opts[0]
+            text = f"{mode} takes no {option}" if mode else f"{option} goes with --reach only"
+            raise UsageError(text, "", "Leave it out.")
 
 
 @click.command(
@@ -578,22 +197,22 @@ def explain(
     if sum((who, bool(reach), log is not None)) > 1:
         raise UsageError("--who, --reach and --log exclude each other")
     mode = "--who" if who else "--reach" if reach else "--log" if log is not None else ""
-    refuse_ignored(mode)
+    _refuse_ignored(mode)
     root, rest = _split(words, keystore, verb=0 if who else 1)
-    if log is not None:
-        return show_log(log, root, rest, Place(moment, domain, time_zone), as_json=as_json)
     if reach:
-        return show_reach(reach, root, rest, policy, infrastructure, as_json)
-    place = Place(moment, domain, time_zone)
+        return _show_reach(reach, root, rest, policy, infrastructure, as_json)
+    context = _ContextOptions(moment, domain, time_zone)
+    if log is not None:
+        return _show_log(log, root, rest, context, as_json)
     if who:
-        return show_who(root, rest, kind, vendor, place, as_json)
-    return _one(root, rest, kind, policy, vendor, all_vendors, place, as_json)
+        return _show_who(root, rest, kind, vendor, context, as_json)
+    return _show_answer(root, rest, kind, policy, vendor, all_vendors, context, as_json)
 
 
 def _split(
     words: tuple[str, ...], keystore: Path | None, *, verb: int
 ) -> tuple[Path | None, tuple[str, ...]]:
-    """The keystore, if one is named before the other words or by the option, and those words.
+    """Return the keystore, if it is the first word or named by the option, and the other words.
 
     ``verb`` is the place of what is to be done, where no keystore is named.
     """
@@ -612,20 +231,49 @@ def _is_word(words: tuple[str, ...], place: int) -> bool:
     return words[place : place + 1] != () and words[place] in _WORDS
 
 
+class _ContextOptions:
+    """The options that say where and when."""
+
+    def __init__(self, moment: str | None, domain: str | None, zone: str | None) -> None:
+        from sros_tool.cli.common import local_zone, named_zone
+
+        self.at = moment_of(moment)
+        self._domain = ros_domain() if domain is None else domain_of(domain)
+        self._zone: tzinfo = local_zone(os.environ) if zone is None else named_zone(zone)
+
+    def context(self, domains: DomainSet | None) -> JoinContext:
+        """Return where a question is asked of an enclave that is made for these domains."""
+        from sros_tool.explain.evaluator import JoinContext
+        from sros_tool.runtime.environment import choose_domain
+
+        chosen = self._domain
+        if chosen is None:
+            chosen = choose_domain(domains, None, Path()) if domains else 0
+        return JoinContext(chosen, self.at, self._zone)
+
+
+def _vendor_of(name: str | None) -> tuple[Vendor, str]:
+    """Return the vendor of the option, or else of this machine, and why it is that one."""
+    from sros_tool.runtime.rmw import vendor_here
+
+    return (Vendor(name), "as asked") if name else vendor_here(os.environ)
+
+
 # ── one question ───────────────────────────────────────────────────────────────────────────
 
 
-def _one(
+def _show_answer(
     root: Path | None,
     rest: tuple[str, ...],
     kind: str | None,
     policy: Path | None,
     vendor: str | None,
     all_vendors: bool,
-    place: Place,
+    options: _ContextOptions,
     as_json: bool,
 ) -> int:
-    from sros_tool.explain.answer import explain as explain_case
+    """Say whether an enclave may; 0 if the chosen vendor allows it."""
+    from sros_tool.explain.evaluator import Evaluator
     from sros_tool.explain.question import ask
 
     if not 2 <= len(rest) <= 3:
@@ -635,33 +283,140 @@ def _one(
             "Write for example `sros explain /talker publish /chatter`.",
         )
     question = ask(rest[1], rest[2] if len(rest) > 2 else "", kind)
-    case = case_of(root, rest[0], policy, place)
-    chosen, why = vendor_of(vendor)
-    wanted = list(Vendor) if all_vendors else [chosen]
-    found = [explain_case(case, question, each) for each in wanted]
-    answer = next(each.answer for each in found if each.answer.vendor is chosen)
-    if as_json:
-        told = [explanation_json(case, each, policy) for each in found]
-        one = {**told[0], "vendor_why": why}
-        shown = {"vendors": told, "differ": len({each["outcome"] for each in told}) > 1}
-        print_json({**asked_json(case, answer), **(shown if all_vendors else one)})
+    enclave = _enclave(root, rest[0], policy, options)
+    context = options.context(enclave.domains)
+    chosen, why = _vendor_of(vendor)
+    evaluator = Evaluator(chosen, enclave, context)
+    answer = evaluator.explain(question)
+    if all_vendors:
+        others = {v: Evaluator(v, enclave, context) for v in Vendor if v is not chosen}
+        answers = [answer if v is chosen else others[v].explain(question) for v in Vendor]
+        if as_json:
+            shown = [_answer_json(enclave, each, policy) for each in answers]
+            differ = len({each["outcome"] for each in shown}) > 1
+            asked = _question_json(enclave, context, question)
+            print_json({**asked, "vendors": shown, "differ": differ})
+        else:
+            _echo(_table_lines(enclave, answers))
+    elif as_json:
+        asked = _question_json(enclave, context, question)
+        print_json({**asked, **_answer_json(enclave, answer, policy), "vendor_why": why})
     else:
-        lines = table_lines(case, found) if all_vendors else lines_of(case, found[0], why, policy)
-        for line in lines:
-            click.echo(visible(line))
-    notes = [*_provenance_notes(found[0], policy), *_other_type(case, question, kind, chosen)]
+        _echo(_answer_lines(enclave, answer, why, policy))
+    notes = [*_provenance_notes(answer, policy), *_other_type(evaluator, answer, kind)]
     if not all_vendors:
-        measured = [explain_case(case, question, v) for v in NEWEST]
-        if len({each.answer.outcome for each in measured}) > 1:
-            notes.append(_note("explain.vendors-differ", differences(measured) + "."))
+        measured = [
+            answer if v is chosen else Evaluator(v, enclave, context).answer(question)
+            for v in NEWEST
+        ]
+        if len({each.outcome for each in measured}) > 1:
+            notes.append(Note("explain.vendors-differ", f"{_differences(measured)}."))
     print_notes(notes)
     return 0 if answer.allowed else 1
 
 
-def _provenance_notes(found: Explanation, policy: Path | None) -> list[Note]:
+def _echo(lines: Iterator[str]) -> None:
+    for line in lines:
+        click.echo(visible(line))
+
+
+def _enclave(
+    root: Path | None, name: str, policy: Path | None, options: _ContextOptions
+) -> LoadedEnclave:
+    """Return the enclave of a keystore, of a folder, or of a policy alone."""
+    from dataclasses import replace
+
+    own = _policy_of(policy, name)
+    if root is None and not policy and not _is_enclave(Path(name)):
+        root = keystore_from_environment()
+    enclave = _signed_enclave(root, name, options, planned=own is not None)
+    if enclave is None:
+        assert own is not None
+        enclave = _planned_enclave(own, root, options)
+    elif own is None and policy:
+        own = _policy_of(policy, enclave.name)
+    return replace(enclave, root=root, policy=own)
+
+
+def _policy_of(policy: Path | None, enclave: str) -> Enclave | None:
+    """Return the part of the policy file, where there is a file, that is about the enclave."""
+    from sros_tool.errors import PolicyError
+    from sros_tool.policy.document import read_policy
+
+    if policy is None:
+        return None
+    read = read_policy(policy)
+    found = read.enclave(enclave)
+    if found is None and not _is_enclave(Path(enclave)):
+        there = ", ".join(each.path for each in read.enclaves)
+        raise PolicyError(
+            f"unable to find enclave {enclave} in the policy '{policy}'", f"It has {there}."
+        )
+    return found
+
+
+def _signed_enclave(
+    root: Path | None, name: str, options: _ContextOptions, *, planned: bool = False
+) -> LoadedEnclave | None:
+    """Return an enclave of a keystore, or in a folder of that name.
+
+    None if there is neither keystore nor folder, or, with ``planned``, no such enclave yet.
+    """
+    from sros_tool.explain.evaluator import load_enclave
+    from sros_tool.keystore.layout import enclave_path, list_enclaves
+    from sros_tool.keystore.missing import no_such_enclave
+
+    if root is None:
+        folder = Path(name)
+        if not _is_enclave(folder):
+            return None
+        return load_enclave(_name_of(folder, options), folder, at=options.at)
+    if _is_enclave(root) and not (root / "enclaves").is_dir():
+        own = _name_of(root, options)
+        if own != name:
+            raise KeystoreError(f"'{root}' is the folder of {own or 'no enclave'}, not of {name}")
+        return load_enclave(own, root, at=options.at)
+    names = list_enclaves(root)
+    if name in names:
+        return load_enclave(name, enclave_path(root, name), at=options.at)
+    if planned:
+        return None
+    raise no_such_enclave(root, name, names)
+
+
+def _is_enclave(folder: Path) -> bool:
+    return any((folder / name).exists() for name in ("cert.pem", "permissions.p7s"))
+
+
+def _name_of(folder: Path, options: _ContextOptions) -> str:
+    """Return the name of the enclave of a folder: the common name of its certificate."""
+    from sros_tool.keystore.reader import open_enclave
+    from sros_tool.pki.certificates import common_name_of
+
+    certificate = open_enclave(folder, now=options.at).certificate
+    return common_name_of(certificate.subject) if certificate else ""
+
+
+def _planned_enclave(policy: Enclave, root: Path | None, options: _ContextOptions) -> LoadedEnclave:
+    """Return what the policy would give, under the governance of the keystore or a new one."""
+    from sros_tool.dds.domains import DomainSet
+    from sros_tool.explain.evaluator import plan_enclave
+    from sros_tool.keystore.reader import governance_of
+    from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
+    from sros_tool.translate import governance_for
+
+    if root is not None:
+        return plan_enclave(policy, governance_of(root), at=options.at)
+    domain = options.context(None).domain
+    protection = load_template(DEFAULT_TEMPLATE).protection
+    governance = governance_for(protection, DomainSet.of((domain, domain)))
+    return plan_enclave(policy, governance, at=options.at)
+
+
+def _provenance_notes(answer: Answer, policy: Path | None) -> list[Note]:
     from sros_tool.explain.answer import Provenance
 
-    match found.provenance:
+    match answer.provenance:
         case Provenance.CHANGED:
             text = (
                 f"the permissions were not made from '{policy}' as it is now: it has changed "
@@ -671,98 +426,84 @@ def _provenance_notes(found: Explanation, policy: Path | None) -> list[Note]:
             text = f"whether the permissions were made from '{policy}' is not recorded."
         case _:
             return []
-    return [_note(f"explain.policy-{found.provenance}", text)]
+    return [Note(f"explain.policy-{answer.provenance}", text)]
 
 
-def _other_type(case: Case, question: Question, kind: str | None, vendor: Vendor) -> list[Note]:
-    """A remark where a service was asked for that the enclave knows as an action."""
-    from sros_tool.explain.answer import Judge
+def _other_type(evaluator: Evaluator, answer: Answer, kind: str | None) -> list[Note]:
+    """Return a note where a service was asked for that the enclave may call as an action."""
     from sros_tool.explain.question import ask
 
-    if question.word != "call" or kind:
+    question = answer.question
+    if question.word != "call" or kind or answer.allowed:
         return []
-    judge = Judge(vendor, case.material, case.setting)
     action = ask("call", question.name, "action")
-    if judge.answer(question).allowed or not judge.answer(action).allowed:
+    if not evaluator.answer(action).allowed:
         return []
     text = f"it may {action}: add --type action if that is what {question.name} is."
-    return [_note("explain.an-action", text)]
+    return [Note("explain.an-action", text)]
 
 
-def _note(name: str, text: str) -> Note:
-    from sros_tool.errors import Note
-
-    return Note(name, text)
-
-
-if TYPE_CHECKING:
-    from sros_tool.dds.decision.answers import Decision
-    from sros_tool.explain.answer import Answer, Case, Change, Explanation, PartAnswer
-    from sros_tool.policy.model import Source
+# ── the answer as text ─────────────────────────────────────────────────────────────────────
 
 _ADDITION = "allow.xml"
-_WIDTH = 10
+"""The name in the commands of the file that holds the rights to add."""
+_LABEL_WIDTH = 10
 
 
-# ── one question ───────────────────────────────────────────────────────────────────────────
-
-
-def lines_of(case: Case, found: Explanation, why: str, policy: Path | None) -> Iterator[str]:
-    """The answer of one vendor, with its reasons; ``why`` says why it is this vendor's."""
-    answer = found.answer
-    decision = answer.deciding.decision
-    name, vendor = case.material.enclave, answer.vendor.title
-    said = f"yes: {name} may" if answer.allowed else f"no: {name} may not"
+def _answer_lines(
+    enclave: LoadedEnclave, answer: Answer, why: str, policy: Path | None
+) -> Iterator[str]:
+    """Yield the answer of one vendor, with its reasons; ``why`` is why it is this vendor's."""
+    decision, grant = answer.decision, answer.grant
+    may = f"yes: {enclave.name} may" if answer.allowed else f"no: {enclave.name} may not"
     documented = ", as documented" if answer.as_documented else ""
-    yield f"{said} {answer.question}, on {vendor} ({why}{documented})"
+    yield f"{may} {answer.question}, on {answer.vendor.title} ({why}{documented})"
     yield _row("why", _reason(decision))
-    if len(answer.problems) > 1:
-        yield from (_row("and", str(each)) for each in answer.problems[1:])
-    if (answer.outcome, len(answer.failing)) != ("allowed", 0) and len(answer.parts) > 1:
-        yield from _parts(answer)
-    if decision.rule is not None and answer.grant:
-        rule = answer.grant.rules[decision.rule]
-        what = f"{'allow' if rule.allow else 'deny'} rule {decision.rule + 1}"
-        yield _row("rule", f"{what} of grant {answer.grant.name}: {decision.expression}")
-    if found.wildcard:
-        yield _row("wildcard", f"{found.wildcard} stands for more than this name")
-    for each in found.origins:
-        said = f"{each.qualifier.value} {each.right} {each.name}"
-        yield _row("from", f"{_shown(each.source)}: {said}")
-    if found.recorded and policy is None and decision.rule is not None:
-        yield _row(
-            "from", f"a policy file with the digest {found.recorded[:12]}; name it by --policy"
-        )
+    yield from (_row("and", str(each)) for each in answer.problems[1:])
+    if len(answer.parts) > 1 and not answer.allowed:
+        for part, decided in answer.parts:
+            sign = "ok" if decided.outcome.ok else str(decided.outcome)
+            yield _row("part", f"{part}: {sign}")
+    if decision.rule is not None and grant:
+        what = f"{'allow' if grant.rules[decision.rule].allow else 'deny'} rule {decision.rule + 1}"
+        yield _row("rule", f"{what} of grant {grant.name}: {decision.expression}")
+    if answer.wildcard:
+        yield _row("wildcard", f"{answer.wildcard} stands for more than this name")
+    for line in answer.lines:
+        stated = f"{line.qualifier.value} {line.right} {line.name}"
+        yield _row("from", f"{_shown(line.source)}: {stated}")
+    if answer.policy_sha256 and policy is None and decision.rule is not None:
+        digest = answer.policy_sha256[:12]
+        yield _row("from", f"a policy file with the digest {digest}; name it by --policy")
     if answer.allowed:
         yield _row("protected", ", ".join(_protection_words(answer)))
-    elif found.who_denies:
-        yield _row("denied by", found.who_denies)
+    elif answer.denied_by:
+        yield _row("denied by", answer.denied_by)
     if answer.until and answer.allowed:
         yield _row("until", f"{iso(answer.until)}, when {answer.until_file} expires")
-    yield from _what_to_do(case, found, policy)
+    if answer.change:
+        yield from _change_lines(answer.change)
+    if answer.remedy:
+        yield _row("remedy", answer.remedy)
+    for number, command in enumerate(_commands(enclave, answer, policy)):
+        yield _row("run" if not number else "", command)
 
 
 def _row(label: str, text: str) -> str:
-    return f"  {label:{_WIDTH}}{text}"
-
-
-def _shown(source: Source) -> str:
-    """Where something stands, relative to here if it lies below."""
-    here = Path.cwd()
-    file = Path(source.file)
-    return f"{file.relative_to(here) if file.is_relative_to(here) else file}:{source.line}"
+    return f"  {label:{_LABEL_WIDTH}}{text}"
 
 
 def _reason(decision: Decision) -> str:
+    """Return the text of a decision without the vendor's name before it."""
     _, colon, text = decision.text.partition(": ")
     return (text if colon else decision.text).removesuffix(".")
 
 
-def _parts(answer: Answer) -> Iterator[str]:
-    for each in answer.parts:
-        if each.part:
-            sign = "ok" if each.decision.outcome.ok else str(each.decision.outcome)
-            yield _row("part", f"{each.part}: {sign}")
+def _shown(source: Source) -> str:
+    """Return file and line, relative to this folder if the file lies below it."""
+    here = Path.cwd()
+    file = Path(source.file)
+    return f"{file.relative_to(here) if file.is_relative_to(here) else file}:{source.line}"
 
 
 def _protection_words(answer: Answer) -> Iterator[str]:
@@ -772,38 +513,25 @@ def _protection_words(answer: Answer) -> Iterator[str]:
         yield f"submessages {topic.metadata_protection_kind}"
     if domain:
         yield f"RTPS messages {domain.rtps_protection_kind}"
-    if topic and not (topic.enable_read_access_control and topic.enable_write_access_control):
-        off = [
-            word
-            for word, on in (
-                ("reading", topic.enable_read_access_control),
-                ("writing", topic.enable_write_access_control),
-            )
-            if not on
-        ]
-        yield f"ACCESS CONTROL OFF for {' and '.join(off)}"
+    if topic:
+        controlled = {
+            "reading": topic.enable_read_access_control,
+            "writing": topic.enable_write_access_control,
+        }
+        if off := [word for word, on in controlled.items() if not on]:
+            yield f"ACCESS CONTROL OFF for {' and '.join(off)}"
 
 
 def _topic_rule(answer: Answer) -> Any:
-    rules = (each.decision.topic_rule for each in (answer.deciding, *answer.parts))
-    return next((rule for rule in rules if rule), None)
+    decisions = (answer.decision, *(decision for _, decision in answer.parts))
+    return next((each.topic_rule for each in decisions if each.topic_rule), None)
 
 
-def _what_to_do(case: Case, found: Explanation, policy: Path | None) -> Iterator[str]:
-    if found.change:
-        yield from _change_lines(found.change)
-    if found.remedy:
-        yield _row("remedy", found.remedy)
-    commands = commands_of(case, found, policy)
-    for number, command in enumerate(commands):
-        yield _row("run" if not number else "", command)
-
-
-def _change_lines(change: Change) -> Iterator[str]:
+def _change_lines(change: PolicyChange) -> Iterator[str]:
     yield _row("change", "the smallest change of the policy that would allow it:")
     for edit in change.edits:
-        group = edit.xml.partition(" ")[0].removeprefix("<") if edit.xml else "group"
         if edit.xml:
+            group = edit.xml.partition(" ")[0].removeprefix("<")
             yield f"    at {_shown(edit.source)}, let the <{group}> read"
             yield from (f"      {line}" for line in edit.xml.splitlines())
         else:
@@ -818,68 +546,64 @@ def _change_lines(change: Change) -> Iterator[str]:
         yield from (f"      {line}" for line in change.document.splitlines())
 
 
-def commands_of(case: Case, found: Explanation, policy: Path | None) -> list[str]:
-    """The commands that put a change into force, in their order."""
-    if not found.change and not found.sign:
+def _commands(enclave: LoadedEnclave, answer: Answer, policy: Path | None) -> list[str]:
+    """Return the commands that put a change into force, in their order."""
+    if not answer.change and not answer.sign:
         return []
     file = str(policy) if policy else "POLICY"
     commands = []
-    if found.change and found.change.document:
+    if answer.change and answer.change.document:
         commands.append(f"sros merge_policy {file} {_ADDITION} --in-place")
-    root = str(case.root) if case.root else "KEYSTORE"
-    commands.append(f"sros create_permission {root} {case.material.enclave} {file}")
+    root = str(enclave.root) if enclave.root else "KEYSTORE"
+    commands.append(f"sros create_permission {root} {enclave.name} {file}")
     return commands
 
 
-# ── all vendors ────────────────────────────────────────────────────────────────────────────
-
-
-def table_lines(case: Case, found: Sequence[Explanation]) -> Iterator[str]:
-    """One line for each vendor, and where they differ."""
-    answers = [each.answer for each in found]
-    yield f"may {case.material.enclave} {answers[0].question}?"
+def _table_lines(enclave: LoadedEnclave, answers: Sequence[Answer]) -> Iterator[str]:
+    """Yield one line for each vendor, and where they differ."""
+    yield f"may {enclave.name} {answers[0].question}?"
     width = max(len(each.vendor.title) for each in answers)
     for answer in answers:
         remark = " (as documented)" if answer.as_documented else ""
-        reason = _reason(answer.deciding.decision)
+        reason = _reason(answer.decision)
         yield f"  {answer.vendor.title:{width}}  {answer.outcome:11}  {reason}{remark}"
-    yield differences(found)
+    yield _differences(answers)
 
 
-def differences(found: Sequence[Explanation]) -> str:
-    """Which vendors answer otherwise than the first of them, in a sentence."""
-    first = found[0].answer
-    others = [e.answer for e in found if e.answer.outcome is not first.outcome]
+def _differences(answers: Sequence[Answer]) -> str:
+    """Return a sentence: which vendors answer otherwise than the first of them."""
+    first = answers[0]
+    others = [each for each in answers if each.outcome is not first.outcome]
     if not others:
         return "all of them decide alike"
-    told = ", ".join(f"{each.vendor.title} ({each.outcome})" for each in others)
-    return f"THEY DIFFER: {first.vendor.title} says {first.outcome}, otherwise decide {told}"
+    listed = ", ".join(f"{each.vendor.title} ({each.outcome})" for each in others)
+    return f"THEY DIFFER: {first.vendor.title} says {first.outcome}, otherwise decide {listed}"
 
 
-# ── JSON ───────────────────────────────────────────────────────────────────────────────────
+# ── the answer as JSON ─────────────────────────────────────────────────────────────────────
 
 
-def asked_json(case: Case, answer: Answer) -> dict[str, Any]:
-    """What was asked, where and when."""
-    question = answer.question
+def _question_json(
+    enclave: LoadedEnclave, context: JoinContext, question: Question
+) -> dict[str, Any]:
+    """Return what was asked, where and when."""
     return {
-        "enclave": case.material.enclave,
+        "enclave": enclave.name,
         "question": {
             "word": question.word,
             "type": question.type or None,
             "right": question.right or None,
             "name": question.name or None,
         },
-        "domain": case.setting.domain,
-        "at": iso(case.setting.at),
-        "time_zone": str(case.setting.zone),
+        "domain": context.domain,
+        "at": iso(context.at),
+        "time_zone": str(context.zone),
     }
 
 
-def explanation_json(case: Case, found: Explanation, policy: Path | None) -> dict[str, Any]:
-    """The answer of one vendor."""
-    answer = found.answer
-    decision = answer.deciding.decision
+def _answer_json(enclave: LoadedEnclave, answer: Answer, policy: Path | None) -> dict[str, Any]:
+    """Return the answer of one vendor."""
+    decision = answer.decision
     return {
         "vendor": answer.vendor.value,
         "vendor_title": answer.vendor.title,
@@ -888,24 +612,24 @@ def explanation_json(case: Case, found: Explanation, policy: Path | None) -> dic
         "outcome": answer.outcome.value,
         "reason": decision.reason,
         "text": decision.text,
-        "denied_by": found.who_denies or None,
+        "denied_by": answer.denied_by or None,
         "rule": _rule_json(answer),
-        "wildcard": found.wildcard or None,
-        "policy": _policy_json(found, policy),
-        "policy_sha256": found.recorded or None,
+        "wildcard": answer.wildcard or None,
+        "policy": _policy_json(answer, policy),
+        "policy_sha256": answer.policy_sha256 or None,
         "protection": _protection_json(answer),
         "until": iso(answer.until) if answer.until else None,
         "until_file": answer.until_file or None,
         "problems": as_plain(answer.problems),
-        "parts": [_part_json(each) for each in answer.parts],
-        "remedy": found.remedy or None,
-        "change": _change_json(found.change) if found.change else None,
-        "commands": commands_of(case, found, policy),
+        "parts": [_part_json(part, decided) for part, decided in answer.parts],
+        "remedy": answer.remedy or None,
+        "change": _change_json(answer.change) if answer.change else None,
+        "commands": _commands(enclave, answer, policy),
     }
 
 
 def _rule_json(answer: Answer) -> dict[str, Any] | None:
-    decision = answer.deciding.decision
+    decision = answer.decision
     if decision.rule is None or answer.grant is None:
         return None
     return {
@@ -917,12 +641,12 @@ def _rule_json(answer: Answer) -> dict[str, Any] | None:
     }
 
 
-def _policy_json(found: Explanation, policy: Path | None) -> dict[str, Any] | None:
-    if found.provenance is None:
+def _policy_json(answer: Answer, policy: Path | None) -> dict[str, Any] | None:
+    if answer.provenance is None:
         return None
     return {
         "file": str(policy),
-        "provenance": found.provenance.value,
+        "provenance": answer.provenance.value,
         "lines": [
             {
                 "file": each.source.file,
@@ -931,9 +655,9 @@ def _policy_json(found: Explanation, policy: Path | None) -> dict[str, Any] | No
                 "right": each.right,
                 "name": each.name,
             }
-            for each in found.origins
+            for each in answer.lines
         ],
-        "would_allow": found.sign,
+        "would_allow": answer.sign,
     }
 
 
@@ -953,20 +677,18 @@ def _protection_json(answer: Answer) -> dict[str, Any] | None:
     }
 
 
-def _part_json(each: PartAnswer) -> dict[str, Any]:
-    part = each.part
-    assert part is not None
+def _part_json(part: Part, decision: Decision) -> dict[str, Any]:
     return {
         "verb": part.verb.value,
         "topic": part.topic,
         "role": part.role or None,
-        "outcome": each.decision.outcome.value,
-        "reason": each.decision.reason,
-        "expression": each.decision.expression,
+        "outcome": decision.outcome.value,
+        "reason": decision.reason,
+        "expression": decision.expression,
     }
 
 
-def _change_json(change: Change) -> dict[str, Any]:
+def _change_json(change: PolicyChange) -> dict[str, Any]:
     return {
         "add": as_plain(change.add),
         "lift": as_plain(change.lift),
@@ -975,4 +697,254 @@ def _change_json(change: Change) -> dict[str, Any]:
             {"file": each.source.file, "line": each.source.line, "xml": each.xml}
             for each in change.edits
         ],
+    }
+
+
+# ── --who ──────────────────────────────────────────────────────────────────────────────────
+
+
+def _show_who(
+    root: Path | None,
+    rest: tuple[str, ...],
+    kind: str | None,
+    vendor: str | None,
+    options: _ContextOptions,
+    as_json: bool,
+) -> int:
+    """Say which enclaves of the keystore may; 0 if any may."""
+    from sros_tool.explain.question import ask
+    from sros_tool.explain.who import who
+    from sros_tool.keystore.layout import check_keystore
+
+    if not 1 <= len(rest) <= 2:
+        raise UsageError(
+            "--who takes what is to be done, and a name", "", "As in publish /cmd_vel."
+        )
+    question = ask(rest[0], rest[1] if len(rest) > 1 else "", kind)
+    chosen, why = _vendor_of(vendor)
+    keystore = root or keystore_from_environment()
+    check_keystore(keystore)
+    found = who(keystore, question, chosen, options.context, at=options.at)
+    allowed = any(each.outcome.ok for each in found)
+    if as_json:
+        print_json(
+            {
+                "question": str(question),
+                "vendor": chosen.value,
+                "vendor_why": why,
+                "documented_only": chosen.documented_only,
+                "enclaves": [_outcome_json(each) for each in found],
+            }
+        )
+    else:
+        for line in _who_lines(found):
+            click.echo(line)
+        documented = ", as documented" if chosen.documented_only else ""
+        click.echo(f"{question}, on {chosen.title} ({why}{documented})", err=True)
+        if question.word == "call" and not kind and not allowed:
+            action = ask("call", question.name, "action")
+            as_action = who(keystore, action, chosen, options.context, at=options.at)
+            if any(each.outcome.ok for each in as_action):
+                text = f"enclaves may {action}: add --type action if that is what it is."
+                print_notes([Note("explain.an-action", text)])
+    return 0 if allowed else 1
+
+
+def _who_lines(found: Sequence[EnclaveOutcome]) -> Iterator[str]:
+    """Yield the enclaves that may, by which wildcard, and how many may not."""
+    able = [each for each in found if each.outcome.ok]
+    for each in able:
+        yield each.enclave + (f"  by the wildcard {each.wildcard}" if each.wildcard else "")
+    for each in found:
+        if each.outcome in ("refused", "crashes"):
+            yield f"  not now: {each.enclave}  {each.text.partition(': ')[2]}"
+    yield f"{len(able)} of {len(found)} enclaves may"
+
+
+def _outcome_json(each: EnclaveOutcome) -> dict[str, Any]:
+    return {
+        "enclave": each.enclave,
+        "allowed": each.outcome.ok,
+        "outcome": each.outcome.value,
+        "reason": each.reason,
+        "expression": each.expression or None,
+        "wildcard": each.wildcard or None,
+    }
+
+
+# ── --reach ────────────────────────────────────────────────────────────────────────────────
+
+
+def _show_reach(
+    enclave: str,
+    root: Path | None,
+    rest: tuple[str, ...],
+    policy: Path | None,
+    infrastructure: bool,
+    as_json: bool,
+) -> int:
+    """Say whom an enclave can influence and learn from."""
+    from sros_tool.explain.reach import OF_EVERY_NODE, Network
+    from sros_tool.keystore.rights import load_rights
+
+    if root is None and len(rest) == 1:
+        root, rest = Path(rest[0]), ()
+    if rest:
+        raise UsageError("--reach takes one enclave, and no question")
+    source = load_rights(root or policy or keystore_from_environment())
+    without = () if infrastructure else OF_EVERY_NODE
+    network = Network(source.rights, without=without, **_uncontrolled(source))
+    if source.kind == "keystore":
+        _check_there(source.path, enclave)
+    if enclave not in network.enclaves:
+        raise KeystoreError(
+            f"enclave {enclave} has no rights in '{source.path}'",
+            f"There are {', '.join(network.enclaves[:5]) or 'none'}.",
+        )
+    reach = network.reach(enclave)
+    if as_json:
+        print_json({"path": str(source.path), "left_out": list(without), **_reach_json(reach)})
+    else:
+        for line in _reach_lines(reach):
+            click.echo(line)
+    print_notes(source.notes)
+    if without and not as_json:
+        text = f"left out: {', '.join(without)}, which every node writes and reads"
+        click.echo(f"{text} (--infrastructure counts it)", err=True)
+    return 0
+
+
+def _check_there(root: Path, enclave: str) -> None:
+    from sros_tool.keystore.layout import enclave_names
+    from sros_tool.keystore.missing import no_such_enclave
+
+    there = tuple(enclave_names(root))
+    if enclave not in there:
+        raise no_such_enclave(root, enclave, there)
+
+
+def _uncontrolled(source: RightsSource) -> dict[str, Any]:
+    """Return what everybody in a keystore may do, as its governance does not control access."""
+    if source.kind != "keystore":
+        return {}
+    from sros_tool.explain.reach import unguarded
+    from sros_tool.keystore.layout import enclave_names
+    from sros_tool.keystore.reader import governance_of
+
+    return {
+        "unguarded": unguarded(governance_of(source.path)),
+        "everybody": enclave_names(source.path),
+    }
+
+
+def _reach_lines(reach: Reach) -> Iterator[str]:
+    """Yield whom an enclave influences and learns from, each with a shortest path."""
+    from sros_tool.explain.reach import path_text
+
+    for what, paths in (
+        ("can influence", reach.influences),
+        ("can learn from", reach.learns_from),
+    ):
+        count = f"{len(paths)} enclave{'' if len(paths) == 1 else 's'}"
+        yield f"{reach.enclave} {what} {count}"
+        for _, path in sorted(paths.items(), key=lambda item: (len(item[1]), item[0])):
+            yield f"  {path_text(path)}"
+
+
+def _reach_json(reach: Reach) -> dict[str, Any]:
+    """Return whom an enclave influences and learns from, with the hops of a shortest path."""
+    return {
+        "enclave": reach.enclave,
+        "influences": _paths_json(reach.influences),
+        "learns_from": _paths_json(reach.learns_from),
+    }
+
+
+def _paths_json(paths: dict[str, FlowPath]) -> list[dict[str, Any]]:
+    return [
+        {
+            "enclave": enclave,
+            "path": [
+                {
+                    "from": hop.source,
+                    "to": hop.target,
+                    "kind": hop.kind,
+                    "right": hop.right,
+                    "name": hop.name,
+                    "said": hop.said,
+                    "heard": hop.heard,
+                }
+                for hop in path
+            ],
+        }
+        for enclave, path in sorted(paths.items())
+    ]
+
+
+# ── --log ──────────────────────────────────────────────────────────────────────────────────
+
+
+def _show_log(
+    log: str, root: Path | None, rest: tuple[str, ...], options: _ContextOptions, as_json: bool
+) -> int:
+    """Explain the lines of a file, or of standard input for "-"; 1 if they report a fault."""
+    from sros_tool.explain.log import explain_log
+
+    if len(rest) > 1:
+        raise UsageError("--log takes a keystore and an enclave at most, and no question")
+    named: LoadedEnclave | None = None
+    if rest:
+        named = _signed_enclave(root, rest[0], options)
+        if named is None:
+            raise UsageError(
+                f"no keystore is named to look for {rest[0]} in",
+                "",
+                "Write it before the enclave.",
+            )
+
+    def find(enclave: str) -> LoadedEnclave | None:
+        if named is not None and enclave in ("", named.name):
+            return named
+        if root is None or not enclave:
+            return None
+        try:
+            return _signed_enclave(root, enclave, options)
+        except SrosError:  # of another keystore
+            return None
+
+    findings = explain_log(
+        read_log(log), find, lambda enclave: options.context(enclave.domains), str(root or "")
+    )
+    if as_json:
+        print_json({"log": log, "findings": [_finding_json(each) for each in findings]})
+    else:
+        for finding in findings:
+            _echo(_finding_lines(finding))
+        if not findings:
+            click.echo("nothing in it tells of DDS Security refusing anything", err=True)
+    return 1 if findings else 0
+
+
+def _finding_lines(finding: LogFinding) -> Iterator[str]:
+    times = f"  ({finding.count} times)" if finding.count > 1 else ""
+    yield f"line {finding.line}: {finding.text[:160]}{times}"
+    of = f" [{finding.enclave}]" if finding.enclave else ""
+    source = finding.vendor.title.split()[0] + " DDS" if finding.vendor else "ROS 2"
+    yield f"  means     {source}{of}: {finding.cause}"
+    yield from (f"  found     {each}" for each in finding.found)
+    yield f"  remedy    {finding.remedy}"
+
+
+def _finding_json(finding: LogFinding) -> dict[str, Any]:
+    return {
+        "id": finding.id,
+        "vendor": finding.vendor.value if finding.vendor else None,
+        "line": finding.line,
+        "count": finding.count,
+        "text": finding.text,
+        "enclave": finding.enclave or None,
+        "cause": finding.cause,
+        "checked": finding.checked,
+        "found": list(finding.found),
+        "remedy": finding.remedy,
     }

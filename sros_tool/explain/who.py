@@ -1,4 +1,4 @@
-"""Turns the question round: which enclaves of a keystore may do something with a name."""
+"""The question the other way round: which enclaves of a keystore may do something with a name."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from pathlib import Path
 from sros_tool.dds.decision.answers import Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.explain.answer import Judge, Setting
-from sros_tool.explain.material import Material, from_folder
+from sros_tool.explain.evaluator import Evaluator, JoinContext, load_enclave
 from sros_tool.explain.question import Question
 from sros_tool.keystore.layout import enclave_names, enclave_path
 from sros_tool.names import is_expression
@@ -19,7 +18,7 @@ from sros_tool.parallel import map_slices
 
 
 @dataclass(frozen=True, slots=True)
-class Standing:
+class EnclaveOutcome:
     """What one enclave may do: the outcome, why, and by which expression of its permissions."""
 
     enclave: str
@@ -27,7 +26,6 @@ class Standing:
     reason: str
     text: str
     expression: str
-    topic: str
 
     @property
     def wildcard(self) -> str:
@@ -39,39 +37,26 @@ def who(
     root: Path,
     question: Question,
     vendor: Vendor,
-    setting: Callable[[DomainSet | None], Setting],
+    context: Callable[[DomainSet | None], JoinContext],
     *,
     at: datetime,
-) -> tuple[Standing, ...]:
-    """How every enclave of a keystore stands to a question, sorted by name.
+) -> tuple[EnclaveOutcome, ...]:
+    """Return the outcome of a question for every enclave of a keystore, sorted by name.
 
-    ``setting`` tells where the question is asked of an enclave made for these domains.
+    ``context`` gives where the question is asked of an enclave that is made for these domains;
+    ``at`` is the moment at which the files are checked.
     """
 
-    def work(names: Sequence[str]) -> list[Standing]:
-        return [
-            standing(from_folder(name, enclave_path(root, name), at=at), question, vendor, setting)
-            for name in names
-        ]
+    def work(names: Sequence[str]) -> list[EnclaveOutcome]:
+        return [_outcome(name) for name in names]
 
-    found = [each for _, share in map_slices(list(enclave_names(root)), work) for each in share]
+    def _outcome(name: str) -> EnclaveOutcome:
+        enclave = load_enclave(name, enclave_path(root, name), at=at)
+        answer = Evaluator(vendor, enclave, context(enclave.domains)).answer(question)
+        decision = answer.decision
+        return EnclaveOutcome(
+            name, answer.outcome, decision.reason, decision.text, decision.expression or ""
+        )
+
+    found = [each for _, part in map_slices(list(enclave_names(root)), work) for each in part]
     return tuple(sorted(found, key=lambda each: each.enclave))
-
-
-def standing(
-    material: Material,
-    question: Question,
-    vendor: Vendor,
-    setting: Callable[[DomainSet | None], Setting],
-) -> Standing:
-    """How one enclave stands to a question."""
-    answer = Judge(vendor, material, setting(material.domains)).answer(question)
-    deciding = answer.deciding
-    return Standing(
-        material.enclave,
-        answer.outcome,
-        deciding.decision.reason,
-        deciding.decision.text,
-        deciding.decision.expression or "",
-        deciding.part.topic if deciding.part else "",
-    )

@@ -7,6 +7,7 @@ twin with a change of the policy after which it is allowed, and nothing else is.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -16,8 +17,8 @@ import pytest
 from sros_tool.dds.decision.answers import Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
-from sros_tool.explain.answer import Case, Judge, Setting, as_policy, explain
-from sros_tool.explain.material import from_policy
+from sros_tool.explain.change import policy_of
+from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave, plan_enclave
 from sros_tool.explain.question import Question, ask
 from sros_tool.keystore.template import load_template
 from sros_tool.names import is_expression
@@ -30,7 +31,7 @@ from sros_tool.translate import governance_for
 FILES = sorted(policies_dir().glob("*.xml")) + sorted(policies_dir().glob("defaults/*.xml"))
 VENDORS = [Vendor.FAST, Vendor.CYCLONE, Vendor.FAST_2_9]
 NOW = datetime(2026, 11, 21, 12, tzinfo=UTC)
-SETTING = Setting(0, NOW)
+CONTEXT = JoinContext(0, NOW)
 GOVERNANCE = governance_for(load_template("production").protection, DomainSet.parse("0"))
 WORDS = {
     "publish": ("publish", "topic"),
@@ -55,6 +56,10 @@ def enclaves() -> Iterator[tuple[Path, Enclave]]:
             yield file, enclave
 
 
+def planned(enclave: Enclave) -> LoadedEnclave:
+    return replace(plan_enclave(enclave, GOVERNANCE, at=NOW), policy=enclave)
+
+
 def question(right: str, name: str) -> Question:
     word, kind = WORDS[right]
     return ask(word, name, kind)
@@ -74,28 +79,24 @@ def test_there_are_policies_of_every_kind() -> None:
 def test_every_rule(file: Path, enclave: Enclave, vendor: Vendor) -> None:
     rights = sorted(each for each in policy_rights(policy(file)) if each.enclave == enclave.path)
     rules = Rules(rights)
-    material = from_policy(enclave, GOVERNANCE, at=NOW)
-    case = Case(material, SETTING, policy=enclave)
-    judge = Judge(vendor, material, SETTING)
+    evaluator = Evaluator(vendor, planned(enclave), CONTEXT)
     denials = [each.name for each in rights if each.qualifier is DENY]
     for right in rights:
         if right.qualifier is DENY:
             continue
         name = common_name([right.name], denials)
         assert name is not None
-        found = explain(case, question(right.right, name), vendor)
-        assert found.answer.outcome is Outcome.ALLOWED, (right, found.answer.deciding)
-        assert bool(found.wildcard) == is_expression(
-            found.answer.deciding.decision.expression or ""
-        )
+        found = evaluator.explain(question(right.right, name))
+        assert found.outcome is Outcome.ALLOWED, (right, found.decision)
+        assert bool(found.wildcard) == is_expression(found.decision.expression or "")
         assert found.change is None
-        if not is_expression(found.answer.deciding.decision.expression or ""):
-            lines = Path(found.origins[0].source.file).read_text().splitlines()
-            stands = lines[found.origins[0].source.line - 1]
-            assert f">{found.origins[0].name}</" in stands, (right, stands)
+        if not is_expression(found.decision.expression or ""):
+            lines = Path(found.lines[0].source.file).read_text().splitlines()
+            stands = lines[found.lines[0].source.line - 1]
+            assert f">{found.lines[0].name}</" in stands, (right, stands)
         # The other direction is what the policy says it is, by its own meaning.
         other = OPPOSITE[right.right]
-        answer = judge.answer(question(other, name))
+        answer = evaluator.answer(question(other, name))
         assert answer.allowed == rules.allow(enclave.path, other, name), (other, name)
 
 
@@ -106,7 +107,7 @@ def test_every_rule(file: Path, enclave: Enclave, vendor: Vendor) -> None:
 def test_every_denied_twin(file: Path, enclave: Enclave, vendor: Vendor) -> None:
     rights = {each for each in policy_rights(policy(file)) if each.enclave == enclave.path}
     rules = Rules(rights)
-    case = Case(from_policy(enclave, GOVERNANCE, at=NOW), SETTING, policy=enclave)
+    evaluator = Evaluator(vendor, planned(enclave), CONTEXT)
     for right in sorted(rights):
         expressions = [each.name for each in rights if is_expression(each.name)]
         name = f"{right.name.replace('*', 'any')}_twin"
@@ -115,17 +116,17 @@ def test_every_denied_twin(file: Path, enclave: Enclave, vendor: Vendor) -> None
         if any(matches(each, name) for each in expressions):
             continue  # a wildcard for everything has no twin that is denied
         asked = question(right.right, name)
-        found = explain(case, asked, vendor)
-        assert found.answer.outcome is Outcome.DENIED, (right, found.answer.deciding)
+        found = evaluator.explain(asked)
+        assert found.outcome is Outcome.DENIED, (right, found.decision)
         assert not rules.allow(enclave.path, right.right, name)
         assert found.change is not None and found.change.lift == ()
         assert found.change.add == (Right(enclave.path, ALLOW, right.right, name),)
-        changed = from_policy(
-            as_policy(enclave.path, rights.union(found.change.add)), GOVERNANCE, at=NOW
+        changed = plan_enclave(
+            policy_of(enclave.path, rights.union(found.change.add)), GOVERNANCE, at=NOW
         )
-        assert Judge(vendor, changed, SETTING).answer(asked).allowed
+        assert Evaluator(vendor, changed, CONTEXT).answer(asked).allowed
         still = question(OPPOSITE[right.right], name)
-        assert not Judge(vendor, changed, SETTING).answer(still).allowed
+        assert not Evaluator(vendor, changed, CONTEXT).answer(still).allowed
 
 
 def denials() -> Iterator[tuple[Enclave, Right]]:
@@ -140,18 +141,18 @@ def denials() -> Iterator[tuple[Enclave, Right]]:
 def test_every_denial(enclave: Enclave, right: Right, vendor: Vendor) -> None:
     name = common_name([right.name])
     assert name
-    case = Case(from_policy(enclave, GOVERNANCE, at=NOW), SETTING, policy=enclave)
-    found = explain(case, question(right.right, name), vendor)
-    assert (found.answer.outcome, found.answer.deciding.decision.reason) == ("denied", "deny-rule")
-    assert [(each.qualifier, each.right) for each in found.origins] == [(DENY, right.right)]
+    evaluator = Evaluator(vendor, planned(enclave), CONTEXT)
+    found = evaluator.explain(question(right.right, name))
+    assert (found.outcome, found.decision.reason) == ("denied", "deny-rule")
+    assert [(each.qualifier, each.right) for each in found.lines] == [(DENY, right.right)]
     assert found.change is not None
     assert (found.change.lift, found.change.add) == ((right,), ())
-    assert [edit.source for edit in found.change.edits] == [found.origins[0].group.source]
+    assert [edit.source for edit in found.change.edits] == [found.lines[0].group.source]
     rights = {
         r for each in FILES for r in policy_rights(policy(each)) if r.enclave == right.enclave
     }
-    lifted = from_policy(as_policy(enclave.path, rights - {right}), GOVERNANCE, at=NOW)
-    assert Judge(vendor, lifted, SETTING).answer(question(right.right, name)).allowed
+    lifted = plan_enclave(policy_of(enclave.path, rights - {right}), GOVERNANCE, at=NOW)
+    assert Evaluator(vendor, lifted, CONTEXT).answer(question(right.right, name)).allowed
 
 
 def test_there_is_a_denial() -> None:

@@ -12,8 +12,7 @@ import pytest
 
 from sros_tool.cli.common import now
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.explain.answer import Judge, Setting
-from sros_tool.explain.material import from_folder
+from sros_tool.explain.evaluator import Evaluator, JoinContext, load_enclave
 from sros_tool.explain.question import Part, Question, ask
 from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
 from sros_tool.keystore.template import load_template
@@ -69,12 +68,11 @@ def test_cyclone_does_as_told(policy: str, tmp_path: Path) -> None:
             found = sros("explain", keystore, enclave, *words, *kind, "--vendor", "cyclonedds")
             assert found.status == (0 if expected else 1), (found, allowed)
             seen.add(expected)
-        setting = Setting(0, now())
-        judge = Judge(Vendor.CYCLONE, from_folder(enclave, folder, at=now()), setting)
+        context = JoinContext(0, now())
+        evaluator = Evaluator(Vendor.CYCLONE, load_enclave(enclave, folder, at=now()), context)
         for question in questions:
-            for each in judge.answer(question).parts:
-                assert each.part is not None
-                assert each.decision.outcome.ok == allowed[_key(each.part)], each
+            for part, decision in evaluator.answer(question).parts:
+                assert decision.outcome.ok == allowed[_key(part)], part
     assert seen == {True, False}
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.explain.log import Finding, explain_log
+from sros_tool.explain.log import LogFinding, explain_log
 from sros_tool.resources import policies_dir
 from tests.explain.broken import BREAKAGES, ENCLAVE, Enclave, make_keystore
 from tests.support.children import python, run
@@ -62,7 +62,7 @@ def nothing(_: str) -> None:
     return None
 
 
-def explained(text: str) -> tuple[Finding, ...]:
+def explained(text: str) -> tuple[LogFinding, ...]:
     return explain_log(text, nothing, lambda _: pytest.fail("nothing is there to be looked at"))
 
 

@@ -14,8 +14,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.explain.answer import Judge, Setting
-from sros_tool.explain.material import from_folder
+from sros_tool.explain.evaluator import Evaluator, JoinContext, load_enclave
 from sros_tool.explain.question import ask as question
 from tests.checks.bench import SECRET, Bench
 from tests.integration.broken_keystores import HARMLESS, MATCHED, MORE, ROWS, Breakage
@@ -147,15 +146,15 @@ AT_PEERS = {"peers of different CAs", "revoked at its peers"}
 @pytest.mark.parametrize("each", ALL, ids=lambda each: each.name)
 def test_explain_says_what_each_vendor_does(each: Breakage, broken: dict[str, Bench]) -> None:
     bench = broken[each.name]
-    material = from_folder("/base", bench.path("enclaves/base"), at=bench.now)
-    setting = Setting(0, bench.now, ZoneInfo(each.zone))
+    material = load_enclave("/base", bench.path("enclaves/base"), at=bench.now)
+    setting = JoinContext(0, bench.now, ZoneInfo(each.zone))
     does = {
         Vendor.FAST: each.later or each.fast,
         Vendor.FAST_2_9: each.fast,
         Vendor.CYCLONE: each.cyclone,
     }
     for vendor, word in does.items():
-        said = Judge(vendor, material, setting).answer(question("publish", "/chatter"))
+        said = Evaluator(vendor, material, setting).answer(question("publish", "/chatter"))
         assert said.allowed == (word == MATCHED or each.name in AT_PEERS), (vendor, said)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import PkiError
-from sros_tool.explain.material import from_folder
+from sros_tool.explain.evaluator import load_enclave
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem
@@ -101,7 +101,7 @@ def test_what_the_vendors_take(vendor: str, workshop: Workshop, enclaves: dict[s
 
 @pytest.mark.parametrize("name", FORMS)
 def test_sros_explains_what_the_vendors_do(name: str, enclaves: dict[str, Path]) -> None:
-    material = from_folder("/t", enclaves[name], at=datetime.now(UTC))
+    material = load_enclave("/t", enclaves[name], at=datetime.now(UTC))
     taken = {
         Vendor.FAST: FORMS[name][1] or name in TAKEN_LATER,
         Vendor.FAST_2_9: FORMS[name][1],

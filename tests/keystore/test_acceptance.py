@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.explain.answer import Judge, Setting
-from sros_tool.explain.material import from_folder
+from sros_tool.explain.evaluator import Evaluator, JoinContext, load_enclave
 from sros_tool.explain.question import ask
 from tests.dds.decision_documents import allow, governance, grant, permissions, publish, subscribe
 from tests.dds.signer_rows import NOW, YES, Row, rows, write_enclave
@@ -18,7 +17,7 @@ from tests.dds.signer_rows import NOW, YES, Row, rows, write_enclave
 def test_each_vendor(row: Row, tmp_path: Path) -> None:
     granted = permissions(grant(allow(publish("*"), subscribe("*"))))
     write_enclave(row, tmp_path / "t", "CN=/t", governance(), granted)
-    material = from_folder("/t", tmp_path / "t", at=NOW)
+    material = load_enclave("/t", tmp_path / "t", at=NOW)
     expected = {
         Vendor.FAST_2_9: row.fast,
         Vendor.FAST: row.later,
@@ -27,5 +26,5 @@ def test_each_vendor(row: Row, tmp_path: Path) -> None:
     for vendor, answer in expected.items():
         problems = [str(each) for each in material.problems(vendor.traits)]
         assert (not problems) == (answer == YES), (vendor, problems)
-        said = Judge(vendor, material, Setting(42, NOW)).answer(ask("join"))
+        said = Evaluator(vendor, material, JoinContext(42, NOW)).answer(ask("join"))
         assert said.allowed == (answer == YES), (vendor, said)

@@ -1,0 +1,171 @@
+"""The smallest change of a policy after which a vendor allows what it denies.
+
+A right is added only if none covers the question, and a denial is lifted only if it stands in the
+way; the result is tried out on the decision engine before it is proposed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+from lxml import etree
+
+from sros_tool.dds.decision.answers import Verb
+from sros_tool.dds.governance import parse_governance
+from sros_tool.errors import SrosError
+from sros_tool.explain.answer import Answer, lines_of_right
+from sros_tool.explain.evaluator import Evaluator, plan_enclave
+from sros_tool.names import dds_names
+from sros_tool.policy.document import write_policy
+from sros_tool.policy.model import DENY, Enclave, Group, Policy, Profile, Profiles, Source
+from sros_tool.policy.rights import Right, profile_rights
+from sros_tool.translate import grant_rights
+
+_NO_RULE = frozenset({"no-rule", "default"})
+
+
+@dataclass(frozen=True, slots=True)
+class GroupEdit:
+    """A group of a policy file that is to be replaced; ``xml`` is "" where nothing is left."""
+
+    source: Source
+    xml: str
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyChange:
+    """Rights to add and denials to lift; both are empty where the policy needs no change.
+
+    ``document`` is a policy of the additions alone, for ``sros merge_policy``; ``edits`` are how
+    the groups that deny have to read, where the policy file is known.
+    """
+
+    add: tuple[Right, ...]
+    lift: tuple[Right, ...]
+    document: str
+    edits: tuple[GroupEdit, ...]
+
+
+def smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | None:
+    """Return the change that makes the evaluator's vendor allow a denied question.
+
+    It starts from the policy of the enclave, or where that is not known from the rights of its
+    permissions.  Returns None if no policy could allow it.
+    """
+    enclave, question = evaluator.enclave, answer.question
+    if not question.right:
+        return None
+    try:
+        governance = parse_governance(enclave.governance)
+    except SrosError:
+        return None
+    wanted = question.allowed(enclave.name)
+    present = _present_rights(enclave.policy, enclave.name, answer)
+    add: list[Right] = []
+    lift: list[Right] = []
+    while True:
+        planned = plan_enclave(
+            policy_of(enclave.name, present), governance, at=evaluator.context.at
+        )
+        tried = Evaluator(evaluator.vendor, planned, evaluator.context).answer(question)
+        if tried.allowed:
+            return PolicyChange(
+                tuple(add),
+                tuple(lift),
+                _addition(add[0], enclave.policy) if add else "",
+                tuple(_edits(lift, enclave.policy)) if enclave.policy else (),
+            )
+        if tried.decision.reason in _NO_RULE and wanted not in present:
+            present.add(wanted)
+            add.append(wanted)
+            continue
+        blocking = _blocking(present, tried) if tried.decision.reason == "deny-rule" else []
+        if not blocking:
+            return None
+        present.difference_update(blocking)
+        lift += sorted(blocking)
+
+
+def policy_of(name: str, rights: Iterable[Right]) -> Enclave:
+    """Return the policy of an enclave with one nameless node that has these rights."""
+    groups = tuple(
+        Group(right.kind, ((right.right, right.qualifier),), (right.name,))
+        for right in sorted(rights)
+    )
+    return Enclave(name, (Profiles((Profile("/", "", groups),)),))
+
+
+def _present_rights(policy: Enclave | None, name: str, answer: Answer) -> set[Right]:
+    """Return the rights that an enclave has now, but for those that no policy can state."""
+    found: Iterable[Right] = ()
+    if policy:
+        found = (r for each in policy.all_profiles() for r in profile_rights(name, each))
+    elif answer.grant:
+        found = grant_rights(name, answer.grant)
+    return {right for right in found if right.kind != "dds"}
+
+
+def _blocking(rights: Iterable[Right], answer: Answer) -> list[Right]:
+    """Return the denials that the deciding expression of an answer comes from.
+
+    Those of the other direction only if there is no other: Cyclone DDS denies a topic as a whole
+    by a denial of either direction.
+    """
+    expression = answer.decision.expression or ""
+    publishes = answer.part is not None and answer.part.verb is Verb.PUBLISH
+    own: list[Right] = []
+    other: list[Right] = []
+    for right in rights:
+        if right.qualifier is DENY:
+            names = dds_names(right.right, right.name)
+            if expression in (names.publish if publishes else names.subscribe):
+                own.append(right)
+            elif expression in names.publish + names.subscribe:
+                other.append(right)
+    return own or other
+
+
+def _addition(right: Right, policy: Enclave | None) -> str:
+    """Return a policy of one right, in the node that it belongs to."""
+    ns, node = _node_for(right, policy)
+    group = Group(right.kind, ((right.right, right.qualifier),), (right.name,))
+    enclave = Enclave(right.enclave, (Profiles((Profile(ns, node, (group,)),)),))
+    return write_policy(Policy((enclave,))).decode().rstrip()
+
+
+def _node_for(right: Right, policy: Enclave | None) -> tuple[str, str]:
+    """Return namespace and name of the innermost node whose namespace the right's name lies in."""
+    profiles = policy.all_profiles() if policy else ()
+    fitting = [
+        each for each in profiles if right.name.startswith(each.ns.rstrip("/") + "/")
+    ] or list(profiles)
+    if not fitting:
+        return "/", right.enclave.rpartition("/")[2] or "node"
+    best = max(fitting, key=lambda each: len(each.ns))
+    return best.ns, best.node
+
+
+def _edits(lift: list[Right], policy: Enclave) -> Iterator[GroupEdit]:
+    """Yield how each group that denies has to read without these denials."""
+    groups: dict[Source, Group] = {}
+    lifted: dict[Source, set[tuple[str, str]]] = {}
+    for right in lift:
+        for line in lines_of_right(policy, right):
+            groups[line.group.source] = line.group
+            lifted.setdefault(line.group.source, set()).add((line.name, line.right))
+    for source, group in groups.items():
+        kept: dict[tuple[tuple[str, str], ...], list[str]] = {}
+        for name in group.names:
+            rights = tuple(each for each in group.rights if (name, each[0]) not in lifted[source])
+            if rights:
+                kept.setdefault(rights, []).append(name)
+        yield GroupEdit(source, "\n".join(_xml(group.kind, *each) for each in kept.items()))
+
+
+def _xml(kind: str, rights: tuple[tuple[str, str], ...], names: list[str]) -> str:
+    element = etree.Element(kind, dict(rights))
+    for name in names:
+        etree.SubElement(element, kind.removesuffix("s")).text = name
+    etree.indent(element, space="  ")
+    return etree.tostring(element, encoding="unicode")
