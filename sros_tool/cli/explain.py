@@ -340,11 +340,11 @@ def _enclave(
 
 def _policy_of(policy: Path | None, enclave: str) -> Enclave | None:
     """Return the part of the policy file, where there is a file, that is about the enclave."""
+    if policy is None:
+        return None
     from sros_tool.errors import PolicyError
     from sros_tool.policy.document import read_policy
 
-    if policy is None:
-        return None
     read = read_policy(policy)
     found = read.enclave(enclave)
     if found is None and not _is_enclave(Path(enclave)):
@@ -364,7 +364,6 @@ def _signed_enclave(
     """
     from sros_tool.explain.evaluator import load_enclave
     from sros_tool.keystore.layout import enclave_path, list_enclaves
-    from sros_tool.keystore.missing import no_such_enclave
 
     if root is None:
         folder = Path(name)
@@ -381,6 +380,8 @@ def _signed_enclave(
         return load_enclave(name, enclave_path(root, name), at=options.at)
     if planned:
         return None
+    from sros_tool.keystore.missing import no_such_enclave
+
     raise no_such_enclave(root, name, names)
 
 

@@ -39,8 +39,6 @@ from sros_tool.keystore.reader import OpenedEnclave, Problem, open_enclave
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.policy.model import Enclave
-from sros_tool.translate import permissions_for
-from sros_tool.validity import window
 from sros_tool.xml import read_bytes
 
 _LOG = logging.getLogger(__name__)
@@ -124,6 +122,9 @@ def load_enclave(name: str, folder: Path, *, at: datetime) -> LoadedEnclave:
 
 def plan_enclave(policy: Enclave, governance: Governance, *, at: datetime) -> LoadedEnclave:
     """Return what DDS would load for an enclave if its policy were signed at the moment ``at``."""
+    from sros_tool.translate import permissions_for
+    from sros_tool.validity import window
+
     subject = f"CN={policy.path}"
     domains = governance.domains().closed()
     permissions = permissions_for(

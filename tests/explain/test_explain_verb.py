@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from sros_tool.policy import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.resources import policies_dir
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore
-from tests.support.children import python
+from tests.support.children import python, run
 from tests.support.harness import Ended, policy_text, publish, sros, with_includes
 
 POLICY = policies_dir() / "talker_listener.xml"
@@ -51,6 +52,21 @@ def test_yes_with_its_reasons(whole: Path) -> None:
     assert "RTPS messages SIGN" in found.out
     assert "until" in found.out
     assert found.err == ""
+
+
+def test_a_question_loads_only_what_answers_it(whole: Path) -> None:
+    code = (
+        "import sys; from sros_tool.cli import main\n"
+        f"try: main(['explain', {str(whole)!r}, {ENCLAVE!r}, 'publish', '/chatter'])\n"
+        "except SystemExit: print(*(name for name in sys.modules if name.startswith('sros_tool')))"
+    )
+    *lines, names = run([sys.executable, "-c", code]).stdout.splitlines()
+    assert lines[0].startswith("yes")
+    assert len(names.split()) <= 50
+    assert not set(names.split()).intersection(
+        f"sros_tool.{each}"
+        for each in ("explain.change", "explain.remedy", "keystore.transaction", "runtime.stacks")
+    )
 
 
 def test_no_with_a_change_that_works(keystore: Path, tmp_path: Path) -> None:
