@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
@@ -12,7 +11,7 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
 from sros_tool.checks.policies import policy_file_findings
 from sros_tool.errors import DocumentError, SrosError
-from sros_tool.keystore.layout import ENCLAVES, REQUIRED_FILES, is_keystore
+from sros_tool.keystore.layout import REQUIRED_FILES, is_keystore, locate_enclave
 from sros_tool.policy.model import Policy
 from sros_tool.xml import parse, read_bytes
 
@@ -40,7 +39,7 @@ def path_findings(path: Path, at: Circumstances) -> list[Finding]:
     if any((enclave / name).exists() for name in ("cert.pem", "key.pem", "permissions.p7s")) and (
         path.is_dir() or path.name in _OF_AN_ENCLAVE
     ):
-        root, name = _place_of(enclave)
+        root, name = locate_enclave(enclave)
         return _keystore(root, at, name)
     if path.is_dir():
         policies = list(policies_below(path))
@@ -73,17 +72,4 @@ def _keystore(root: Path, at: Circumstances, only: str | None) -> list[Finding]:
         domain=at.domain,
         policies=at.policies,
         only=None if only is None else (only,),
-    )
-
-
-def _place_of(folder: Path) -> tuple[Path, str]:
-    """The keystore that an enclave's folder lies in, and the name of the enclave."""
-    whole = Path(os.path.abspath(folder))  # noqa: PTH100 - a link is not followed to elsewhere
-    for above in (whole, *whole.parents):
-        if above.name == ENCLAVES:
-            return above.parent, f"/{'/'.join(whole.relative_to(above).parts)}"
-    raise DocumentError(
-        f"'{folder}' lies in no folder named {ENCLAVES}",
-        "rcl looks for an enclave below that, by its name.",
-        "Name the keystore, or the enclave's folder in it.",
     )

@@ -23,6 +23,7 @@ from sros_tool.cli.common import (
     print_notes,
     print_plan,
     split_root,
+    visible,
 )
 from sros_tool.errors import DocumentError, UsageError
 
@@ -142,42 +143,40 @@ Example:
   /arm/camera  loadable in domain 0 until 2027-05-20T07:45:12Z
   /arm/gripper  loadable in domain 0 until 2027-05-20T07:45:12Z
   /arm/wrist  NOT LOADABLE
-    permissions.p7s: missing
-    key.pem: others have access to it (mode 0644): chmod 600
+  robot/enclaves/arm/wrist/key.pem: error: a private key that others can read [keystore.key-rea...
+      its mode is 0644
+      Run `chmod 600 robot/enclaves/arm/wrist/key.pem`.
+  ...
   $ sros verify robot --at 2027-06-01 || echo 'renew before June'""",
 )
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
-@click.option("--domain", metavar="ID", help="Check also whether it may join this ROS domain.")
-@click.option(
-    "--at", metavar="MOMENT", help="Check as of this moment: 2027-06-01, or 90d from now."
-)
+@click.option("--domain", metavar="ID", help="Ask also whether it may join this ROS domain.")
+@click.option("--at", metavar="MOMENT", help="As if it were then: 2027-06-01, or 90d from now.")
 @json_option
 def verify(folder: Path | None, domain: str | None, at: str | None, as_json: bool) -> int:
     """On a robot: say whether the enclaves in DIR, or the enclave DIR, can be used as they are.
 
-    Checks that they are complete, consistent, in date and loadable; that nobody else can read the
-    keys; that no CA key came with them; and that they trust the same CAs.  The exit status is 0 if
-    all is well.
+    It is `sros check` of what was exported: enclaves that are complete, consistent, in date and
+    loadable; keys that nobody else can read; no key of a CA; and CAs that all enclaves trust.  The
+    exit status is 0 if it finds nothing.
     """
-    from sros_tool.keystore.delivery.arrival import verify_arrival
+    from sros_tool.checks.keystores.arrival import verify_arrival
+    from sros_tool.cli.check import finding_lines
+    from sros_tool.cli.common import local_zone
     from sros_tool.validity import iso
 
     folder = folder or keystore_from_environment()
     wanted, moment = domain_of(domain), moment_of(at)
-    arrival = verify_arrival(folder, now=moment, domain=wanted)
+    arrival = verify_arrival(folder, now=moment, domain=wanted, zone=local_zone(os.environ))
     if as_json:
-        print_json({**arrival.describe(), "at": iso(moment), "domain": wanted})
+        print_json({**arrival.as_json(), "at": iso(moment), "domain": wanted})
         return 1 if arrival.findings else 0
     for each in arrival.enclaves:
         until = f" until {iso(each.until)}" if each.until else ""
-        said = f"loadable in domain {each.domains}{until}" if each.loadable else "NOT LOADABLE"
-        click.echo(f"{each.name}  {said}")
-        for finding in arrival.findings:
-            if finding.enclave == each.name:
-                click.echo(f"  {finding.file}: {finding.text}")
+        state = f"loadable in domain {each.domains}{until}" if each.loadable else "NOT LOADABLE"
+        click.echo(f"{each.name}  {state}")
     for finding in arrival.findings:
-        if not finding.enclave:
-            click.echo(f"{finding.file}: {finding.text}")
+        click.echo(visible("\n".join(finding_lines(finding))))
     return 1 if arrival.findings else 0
 
 
@@ -349,7 +348,7 @@ def import_verb(
     ones have to come from the same CAs.
     """
     from sros_tool.keystore.delivery.answer import import_answer
-    from sros_tool.keystore.delivery.arrival import read_pin
+    from sros_tool.keystore.delivery.trust import read_pin
 
     folder = folder or keystore_from_environment()
     pinned = read_pin(pin) if pin is not None else frozenset[str]()

@@ -9,7 +9,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from sros_tool.errors import KeystoreError
+from sros_tool.errors import DocumentError, KeystoreError
 
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 SETTINGS = "sros.toml"
@@ -139,3 +139,16 @@ def check_keystore(root: Path) -> None:
             "It does not exist." if not root.exists() else f"It has no {ENCLAVES} folder in use.",
             f"Make one with `sros create_keystore {root}`.",
         )
+
+
+def locate_enclave(folder: Path) -> tuple[Path, str]:
+    """The keystore that an enclave's folder lies in, and the name of the enclave."""
+    whole = Path(os.path.abspath(folder))  # noqa: PTH100 - a link is not followed to elsewhere
+    for above in (whole, *whole.parents):
+        if above.name == ENCLAVES:
+            return above.parent, f"/{'/'.join(whole.relative_to(above).parts)}"
+    raise DocumentError(
+        f"'{folder}' lies in no folder named {ENCLAVES}",
+        "rcl looks for an enclave below that, by its name.",
+        "Name the keystore, or the enclave's folder in it.",
+    )

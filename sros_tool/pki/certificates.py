@@ -268,3 +268,8 @@ def common_name_of(name: x509.Name) -> str:
     """The common name of a distinguished name, or ""."""
     attributes = name.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(attributes[0].value) if attributes else ""
+
+
+def fingerprints(pem: bytes) -> frozenset[str]:
+    """Return the SHA-256 of every certificate of a CA file: more than one while it is rotated."""
+    return frozenset(map(digest, load_certificates(pem, "the certificate of a CA")))

@@ -132,7 +132,7 @@ def test_from_the_request_to_a_process_that_runs(keystore: Path, tmp_path: Path)
     digest = ended.out.splitlines()[1].split()[-1]
     request = tmp_path / "robot" / FOLDER / "request.pem"
     assert str(request) in ended.out
-    assert "waits for the answer" in sros("verify", tmp_path / "robot").out
+    assert "waits-for-answer" in sros("verify", tmp_path / "robot").out
     shutil.copy(request, tmp_path / "r.pem")
     (tmp_path / "p.xml").write_text(policy_text({NAME: publish("image")}))
     ended = sros("sign_request", keystore, "r.pem", "-p", "p.xml", cwd=tmp_path).ok()
@@ -269,8 +269,10 @@ def test_verify_says_what_is_wrong_and_answers_by_its_status(
     (out / "enclaves/b/cert.pem").unlink()
     ended = sros("verify", out)
     assert ended.status == 1
-    assert "/b  NOT LOADABLE\n  cert.pem: missing\n" in ended.out
-    assert "  key.pem: others have access to it (mode 0644): chmod 600\n" in ended.out
+    assert "/b  NOT LOADABLE\n" in ended.out
+    assert f"{out}/enclaves/b/cert.pem: error: a file that an enclave needs is miss" in ended.out
+    assert f"{out}/enclaves/a/key.pem: error: a private key that others can read" in ended.out
+    assert f"chmod 600 '{out}/enclaves/a/key.pem'" in ended.out
     said = json.loads(sros("verify", out, "--json", "--at", "2026-12-24", "--domain", "7").out)
     assert (said["ok"], said["kind"], said["domain"]) == (False, "keystore", 7)
     assert said["at"] == "2026-12-24T00:00:00Z"

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.keystore.delivery.archive import unpack
-from sros_tool.keystore.delivery.arrival import verify_arrival
 from sros_tool.keystore.delivery.export import Selection, distribute, pack_enclaves, select
 from sros_tool.keystore.delivery.request import create_request
 from sros_tool.keystore.delivery.signing import sign_request
@@ -140,7 +140,7 @@ def test_what_arrived_as_it_was_sent_is_fine(arrived: Path) -> None:
     one = verify_arrival(arrived / "enclaves/arm/camera", now=NOW)
     assert (one.kind, [each.name for each in one.enclaves]) == ("enclave", ["/arm/camera"])
     assert not one.findings
-    assert arrival.describe()["ok"] is True
+    assert arrival.as_json()["ok"] is True
 
 
 def _mix_up(robot: Path) -> None:
@@ -187,17 +187,17 @@ FINDINGS: dict[str, tuple[Callable[[Path], object], str, str, str]] = {
     ),
     "a folder that all can change": (
         lambda robot: (robot / "enclaves/base").chmod(0o777),
-        *("", "enclaves/base", "everybody can change it"),
+        *("", "enclaves/base", "everybody can change"),
     ),
-    "another name": (_mix_up, "/spare", "cert.pem", "not of this enclave"),
-    "another CA": (_other_ca, "/zebra", "identity_ca.cert.pem", "another CA than that of"),
+    "another name": (_mix_up, "/spare", "cert.pem", "the name of another enclave"),
+    "another CA": (_other_ca, "/zebra", "identity_ca.cert.pem", "do not trust the same CAs"),
     "a link that leads out": (
         lambda robot: (robot / "enclaves/base/notes").symlink_to("/etc/hostname"),
-        *("", "enclaves/base/notes", "leads out"),
+        *("", "enclaves/base/notes", "leads out of the keystore"),
     ),
     "a folder that is elsewhere": (
         lambda robot: (robot / "enclaves/more").symlink_to("/etc"),
-        *("", "enclaves/more", "leads out"),
+        *("", "enclaves/more", "leads out of the keystore"),
     ),
     "a key too many": (
         lambda robot: shutil.copy(robot / "enclaves/base/key.pem", robot / "enclaves/ca.key.pem"),
@@ -205,7 +205,7 @@ FINDINGS: dict[str, tuple[Callable[[Path], object], str, str, str]] = {
     ),
     "an answer that is not here yet": (
         lambda robot: create_request(robot, "/late"),
-        *("/late", "request.pem", "waits for the answer"),
+        *("/late", "request.pem", "not answered yet"),
     ),
 }
 
@@ -215,10 +215,14 @@ def test_findings(case: str, arrived: Path) -> None:
     spoil, enclave, file, text = FINDINGS[case]
     spoil(arrived)
     arrival = verify_arrival(arrived, now=NOW)
-    assert arrival.describe()["ok"] is False
-    found = [each for each in arrival.findings if (each.enclave, each.file) == (enclave, file)]
-    assert any(text in each.text for each in found), arrival.findings
-    others = {each.enclave for each in arrival.findings} - {enclave, ""}
+    assert arrival.as_json()["ok"] is False
+    found = [
+        each
+        for each in arrival.findings
+        if (arrival.enclave_of(each), arrival.file_of(each)) == (enclave, file)
+    ]
+    assert any(text in f"{each.kind.title}: {each.text}" for each in found), arrival.findings
+    others = {arrival.enclave_of(each) for each in arrival.findings} - {enclave, ""}
     assert not others, arrival.findings
     good = next(each for each in arrival.enclaves if each.name == "/arm/camera")
     assert good.loadable
@@ -240,10 +244,13 @@ def test_another_domain(arrived: Path) -> None:
 
 def test_a_copy_of_the_whole_keystore_has_ca_keys(fleet: Path) -> None:
     findings = verify_arrival(fleet, now=NOW).findings
-    assert {each.file for each in findings if not each.enclave} == {
+    keys = [each for each in findings if each.id == "keystore.ca-key-on-robot"]
+    assert {str(Path(each.file).relative_to(fleet)) for each in keys} == {
         "private/identity_ca.key.pem",
         "private/permissions_ca.key.pem",
     }
+    # The key of one enclave is on its robot, and missing here.
+    assert {each.subject for each in findings if each not in keys} == {BORN}
     # The links of an enclave lead out of its folder, but not out of the keystore.
     assert not verify_arrival(fleet / "enclaves/base", now=NOW).findings
 

@@ -9,14 +9,15 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.authorities.authority import load_authority
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
 from sros_tool.keystore.delivery.answer import SEAL, import_answer, seal
 from sros_tool.keystore.delivery.archive import pack, unpack
-from sros_tool.keystore.delivery.arrival import read_pin, verify_arrival
 from sros_tool.keystore.delivery.request import create_request
 from sros_tool.keystore.delivery.signing import sign_request
+from sros_tool.keystore.delivery.trust import read_pin
 from sros_tool.keystore.layout import PERMISSIONS
 from sros_tool.keystore.lifecycle.create import create_keystore
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca

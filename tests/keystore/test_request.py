@@ -19,10 +19,10 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from cryptography.x509.oid import NameOID
 
+from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.errors import KeystoreError, PkiError, PolicyError, SrosError
 from sros_tool.keystore.delivery.answer import SEAL, import_answer
 from sros_tool.keystore.delivery.archive import MAX_MEMBER, MAX_UNPACKED, pack, unpack
-from sros_tool.keystore.delivery.arrival import verify_arrival
 from sros_tool.keystore.delivery.request import create_request
 from sros_tool.keystore.delivery.signing import Signed, sign_request
 from sros_tool.keystore.history import history

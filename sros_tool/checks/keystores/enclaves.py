@@ -1,4 +1,4 @@
-"""What keeps a process from running in an enclave: each of the checks that DDS makes, by name."""
+"""Checks of an enclave by itself: what keeps a process from running in it, and what is weak."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
 from sros_tool.faults import VENDOR_FAULTS, Fault
-from sros_tool.keystore.layout import REQUEST
+from sros_tool.keystore.layout import REQUEST, waits_for_answer
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
 from sros_tool.xml import read_bytes
@@ -40,11 +40,10 @@ LOADING_KINDS = by_id(
 )
 
 
-def check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """Every problem of an enclave; that its key is on its robot, where it stays, is none."""
-    for problem in enclave.state.problems:
-        if enclave.born_elsewhere and problem.file == "key.pem":
-            continue
+def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
+    """Every problem of an enclave; at home, that its key stays on its robot is none."""
+    state = enclave.state
+    for problem in state.problems_at_home if enclave.keystore.is_home else state.problems:
         kind = LOADING_KINDS[f"enclave.{problem.fault.id}"]
         text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
         file = enclave.file(problem.file)
@@ -155,15 +154,15 @@ _EVERY_TOPIC = frozenset({"*", "rt/*"})
 
 
 def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """An enclave by itself."""
-    if (enclave.folder / REQUEST).exists() and not (enclave.folder / "cert.pem").exists():
+    """Yield what is found in an enclave by itself."""
+    if waits_for_answer(enclave.folder):
         yield WAITS.found(enclave.name, "its certificate is missing", enclave.file(REQUEST))
         return
-    yield from check_loading(enclave)
+    yield from _check_loading(enclave)
     grant = grant_of(enclave)
     if certificate := enclave.state.certificate:
         yield from _certificate(enclave, certificate)
-        yield from _ends(enclave, certificate, grant)
+        yield from _expiry(enclave, certificate, grant)
     if grant:
         yield from _rights(enclave, grant)
     state = enclave.state
@@ -175,12 +174,8 @@ def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
 
 
 def grant_of(enclave: CheckedEnclave) -> Grant | None:
-    """The grant that is for the certificate of the enclave, if it is valid at any time."""
-    state = enclave.state
-    if not (state.certificate and state.permissions):
-        return None
-    subject = subject_text(state.certificate.subject)
-    grant = next((each for each in state.permissions.grants if each.subject == subject), None)
+    """Return the grant that DDS reads for the enclave, if it is valid at any time."""
+    grant = enclave.state.grant
     if grant is None or parse_iso(grant.not_after) <= parse_iso(grant.not_before):
         return None
     return grant
@@ -208,7 +203,7 @@ def _certificate(enclave: CheckedEnclave, certificate: x509.Certificate) -> Iter
         yield NOT_UNIQUE.found(name, text, file)
 
 
-def _ends(
+def _expiry(
     enclave: CheckedEnclave, certificate: x509.Certificate, grant: Grant | None
 ) -> Iterator[Finding]:
     now, validity = enclave.keystore.now, validity_of(certificate)
@@ -270,12 +265,12 @@ def _copies(enclave: CheckedEnclave) -> Iterator[Finding]:
 
 
 def plain(document: bytes) -> bytes:
-    """A document as it is compared: line ends, and space around it, do not count."""
+    """Return a document as it is compared: line endings and surrounding space do not count."""
     return document.replace(b"\r\n", b"\n").strip()
 
 
 def plain_file(path: Path) -> bytes:
-    """The same of a file; b"" where it cannot be read."""
+    """Return a file as it is compared; b"" where it cannot be read."""
     try:
         return plain(read_bytes(path, "file"))
     except SrosError:

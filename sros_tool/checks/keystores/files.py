@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
@@ -23,6 +23,7 @@ from sros_tool.keystore.layout import (
     ROTATION,
     SETTINGS,
     STAGE,
+    enclave_folder,
 )
 
 KEY_READABLE = Kind(
@@ -123,14 +124,28 @@ _KNOWN_ANYWHERE = re.compile(
 )
 
 
-def check_files(keystore: CheckedKeystore) -> Iterator[Finding]:
-    """Every file, folder and link of a keystore, without reading what DDS reads."""
+def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -> Iterator[Finding]:
+    """Yield what is found in every file, folder and link, without reading what DDS reads.
+
+    Args:
+        keystore: the keystore.
+        names: the enclaves whose folders are looked at; None for the whole keystore.
+    """
     root = os.fspath(keystore.root)
     links = _Links(root)
+    if names is None:
+        yield from _below(root, keystore, links)
+        return
+    for name in names:
+        yield from _below(os.path.join(root, enclave_folder(name)), keystore, links)
+
+
+def _below(start: str, keystore: CheckedKeystore, links: _Links) -> Iterator[Finding]:
+    root = os.fspath(keystore.root)
     keys = {os.path.join(root, ENCLAVES, name[1:], "key.pem") for name in keystore.names}
     keys |= {os.path.join(root, ENCLAVES, "key.pem")}
     home = keystore.is_home
-    for parent, folders, files in os.walk(root):
+    for parent, folders, files in os.walk(start):
         folders.sort()
         if STAGE in folders:
             folders.remove(STAGE)

@@ -18,8 +18,8 @@ from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
 from sros_tool.checks.policies import ENCLAVE_NAMES
 from sros_tool.dds.portable import mistaken_names, some_pairs
 from sros_tool.errors import SrosError
-from sros_tool.keystore.delivery.arrival import fingerprints
-from sros_tool.keystore.layout import ROLES, enclave_folder
+from sros_tool.keystore.layout import IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, ROLES, enclave_folder
+from sros_tool.pki.certificates import fingerprints
 from sros_tool.policy.rights import Right, compare, policy_rights
 from sros_tool.translate import grant_rights
 
@@ -101,15 +101,15 @@ KINDS = by_id(
     NOT_IN_KEYSTORE,
 )
 
-Key = TypeVar("Key")
+_Key = TypeVar("_Key")
 
-_MANY = 3
-AUTHORITIES = ("identity_ca.cert.pem", "permissions_ca.cert.pem")
+_RIGHTS_SHOWN = 3
+_AUTHORITY_FILES = (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 """The files of an enclave that say whom it trusts."""
 
 
 @dataclass(frozen=True, slots=True)
-class Traits:
+class EnclaveSummary:
     """What is compared among enclaves: small, for it is carried between processes."""
 
     name: str
@@ -123,7 +123,7 @@ class Traits:
     trusted: tuple[frozenset[str], ...]
 
 
-def traits_of(enclave: CheckedEnclave) -> Traits | None:
+def summary_of(enclave: CheckedEnclave) -> EnclaveSummary | None:
     """Those of an enclave that has a certificate."""
     certificate = enclave.state.certificate
     if certificate is None:
@@ -132,7 +132,7 @@ def traits_of(enclave: CheckedEnclave) -> Traits | None:
         serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
     )
     message = enclave.state.files.get("permissions.p7s")
-    return Traits(
+    return EnclaveSummary(
         enclave.name,
         certificate.serial_number,
         certificate.issuer.rfc4514_string(),
@@ -143,7 +143,7 @@ def traits_of(enclave: CheckedEnclave) -> Traits | None:
         if enclave.state.governance and not enclave.keystore.governance
         else "",
         len(certificate.subject.rdns) > 1,
-        tuple(_trusted(enclave.state.files.get(name, b"")) for name in AUTHORITIES),
+        tuple(_trusted(enclave.state.files.get(name, b"")) for name in _AUTHORITY_FILES),
     )
 
 
@@ -156,42 +156,44 @@ def _trusted(data: bytes) -> frozenset[str]:
         return frozenset()
 
 
-def check_issued(keystore: CheckedKeystore, all_traits: Sequence[Traits]) -> Iterator[Finding]:
-    """All enclaves together."""
-    for (_, serial), names in _twice(((t.issuer, t.serial), t.name) for t in all_traits):
+def check_issued(
+    keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
+) -> Iterator[Finding]:
+    """Yield what is found in all enclaves together."""
+    for (_, serial), names in _twice(((t.issuer, t.serial), t.name) for t in summaries):
         yield SERIAL_TWICE.found(", ".join(names), f"the serial number is {serial:x}")
-    for _, names in _twice((each.key, each.name) for each in all_traits):
+    for _, names in _twice((each.key, each.name) for each in summaries):
         yield KEY_TWICE.found(", ".join(names), "their certificates are for one key")
     # A part of its own in the subject keeps it from being a part of another.
-    plain = {each.name for each in all_traits if not each.unique}
-    names = [each.name for each in all_traits]
+    plain = {each.name for each in summaries if not each.unique}
+    names = [each.name for each in summaries]
     pairs = [(inner, outer) for inner, outer in mistaken_names(names) if inner in plain]
     if pairs:
         text = f"Cyclone DDS takes {some_pairs(pairs)}"
         yield ENCLAVE_NAMES.found(pairs[0][0], text, str(keystore.root))
-    yield from _trust(keystore, all_traits)
-    yield from _exported_governance(keystore, all_traits)
-    yield from _ledger(keystore, all_traits)
+    yield from _trust(keystore, summaries)
+    yield from _exported_governance(keystore, summaries)
+    yield from _ledger(keystore, summaries)
     if keystore.policies:
         wanted = {each.path for policy in keystore.policies for each in policy.enclaves}
         for name in sorted(wanted.difference(keystore.names)):
             yield NOT_IN_KEYSTORE.found(name, "the keystore does not have it", str(keystore.root))
 
 
-def _twice(pairs: Iterable[tuple[Key, str]]) -> Iterator[tuple[Key, list[str]]]:
-    found: dict[Key, list[str]] = defaultdict(list)
+def _twice(pairs: Iterable[tuple[_Key, str]]) -> Iterator[tuple[_Key, list[str]]]:
+    found: dict[_Key, list[str]] = defaultdict(list)
     for key, name in pairs:
         found[key].append(name)
     return ((key, names) for key, names in found.items() if len(names) > 1)
 
 
-def _trust(keystore: CheckedKeystore, all_traits: Sequence[Traits]) -> Iterator[Finding]:
+def _trust(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:
     """Enclaves that have no CA in common; while one is replaced, each trusts the old and the new.
 
     The CAs of the keystore are the right ones; in an export, those of most enclaves.
     """
-    for index, (role, file) in enumerate(zip(ROLES, AUTHORITIES, strict=True)):
-        everyone = [each for each in all_traits if each.trusted[index]]
+    for index, (role, file) in enumerate(zip(ROLES, _AUTHORITY_FILES, strict=True)):
+        everyone = [each for each in summaries if each.trusted[index]]
         if not everyone:
             continue
         usual, _ = Counter(each.trusted[index] for each in everyone).most_common(1)[0]
@@ -207,10 +209,10 @@ def _trust(keystore: CheckedKeystore, all_traits: Sequence[Traits]) -> Iterator[
 
 
 def _exported_governance(
-    keystore: CheckedKeystore, all_traits: Sequence[Traits]
+    keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
     """Exported enclaves have copies of the governance, and each may be from another time."""
-    copies = [each for each in all_traits if each.governance]
+    copies = [each for each in summaries if each.governance]
     for each in copies[1:]:
         if each.governance != copies[0].governance:
             file = f"{keystore.root}/{enclave_folder(each.name)}/governance.p7s"
@@ -218,7 +220,7 @@ def _exported_governance(
             yield GOVERNANCE_DIFFERS.found(each.name, text, file)
 
 
-def _ledger(keystore: CheckedKeystore, all_traits: Sequence[Traits]) -> Iterator[Finding]:
+def _ledger(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:
     if not keystore.ledger:
         return
     known = {entry.sha256 for entry in keystore.ledger}
@@ -226,7 +228,7 @@ def _ledger(keystore: CheckedKeystore, all_traits: Sequence[Traits]) -> Iterator
     for entry in keystore.ledger:
         if entry.what == "permissions":
             signed[entry.enclave].append(entry.sha256)
-    for each in all_traits:
+    for each in summaries:
         place = f"{keystore.root}/{enclave_folder(each.name)}"
         for file, digest in (
             ("cert.pem", each.certificate),
@@ -253,8 +255,8 @@ def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -
     difference = compare(wanted[name], grant_rights(name, grant))
     if difference:
         shown = [f"{sign} {right.qualifier} {right.told()}" for sign, right in difference.lines()]
-        more = f" and {len(shown) - _MANY} more" if len(shown) > _MANY else ""
-        text = f"policy (-) and permissions (+) differ: {'; '.join(shown[:_MANY])}{more}"
+        more = f" and {len(shown) - _RIGHTS_SHOWN} more" if len(shown) > _RIGHTS_SHOWN else ""
+        text = f"policy (-) and permissions (+) differ: {'; '.join(shown[:_RIGHTS_SHOWN])}{more}"
         yield STALE.found(name, text, enclave.file("permissions.p7s"))
 
 

@@ -1,4 +1,4 @@
-"""All checks of a keystore, over its enclaves by all cores."""
+"""All checks of a keystore, its enclaves divided among all cores."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.checks.keystores.authorities import check_authorities
 from sros_tool.checks.keystores.documents import (
@@ -20,26 +21,25 @@ from sros_tool.checks.keystores.documents import (
 from sros_tool.checks.keystores.enclaves import EVERYTHING, LONG_PERMISSIONS, check_enclave
 from sros_tool.checks.keystores.files import check_files
 from sros_tool.checks.keystores.issued import (
-    Traits,
+    EnclaveSummary,
     check_issued,
     check_policy,
-    traits_of,
+    summary_of,
     wanted_rights,
 )
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore, read_keystore
 from sros_tool.checks.kind import Finding
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
-from sros_tool.keystore.layout import GOVERNANCE_P7S, REQUEST, enclave_path
-from sros_tool.keystore.reader import open_enclave as load_enclave
+from sros_tool.keystore.layout import GOVERNANCE_FILE, GOVERNANCE_P7S, enclave_path
+from sros_tool.keystore.reader import open_enclave
 from sros_tool.parallel import map_slices
 from sros_tool.pki import smime
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right
 
-_MANY = 3
-_GOVERNANCE = "governance.p7s"
-_OF_THE_WHOLE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id})
+_NAMES_SHOWN = 3
+_OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id})
 """What enclaves have in common by the way in which their keystore was made."""
 
 
@@ -51,35 +51,50 @@ def keystore_findings(
     domain: int | None = None,
     policies: tuple[Policy, ...] = (),
     only: Sequence[str] | None = None,
+    on_robot: bool = False,
 ) -> list[Finding]:
-    """Everything that is found in a keystore, or in the enclaves ``only``; `KeystoreError` if none.
+    """Return everything that is found in a keystore, or in some of its enclaves.
 
-    ``zone`` is the time zone of the host on which its enclaves run, ``domain`` the one that they
-    have to join; with ``policies``, their rights are compared with those.
+    Args:
+        root: the keystore.
+        now: the moment for which it is checked.
+        zone: the time zone of the host on which its enclaves run.
+        domain: the ROS domain that its enclaves have to join.
+        policies: policies with which its permissions are compared.
+        only: the enclaves to look at; None for all, and the keystore itself.
+        on_robot: whether it lies on a robot, where keys of CAs have no place.
+
+    Raises:
+        KeystoreError: ``root`` is no keystore.
     """
-    keystore = read_keystore(root, now=now, zone=zone, policies=policies)
+    keystore = read_keystore(root, now=now, zone=zone, policies=policies, on_robot=on_robot)
     names = keystore.names if only is None else tuple(only)
     wanted = wanted_rights(keystore)
-    first = next((name for name in names if (enclave_path(root, name) / _GOVERNANCE).exists()), "")
+    first = next(
+        (name for name in names if (enclave_path(root, name) / GOVERNANCE_FILE).exists()), ""
+    )
 
-    def work(share: Sequence[str]) -> tuple[list[Finding], list[Traits]]:
+    def work(share: Sequence[str]) -> tuple[list[Finding], list[EnclaveSummary]]:
         found: list[Finding] = []
-        traits: list[Traits] = []
+        issued: list[EnclaveSummary] = []
         for name in share:
-            enclave = _open(keystore, name, domain)
+            state = open_enclave(enclave_path(root, name), now=now, domain=domain)
+            enclave = CheckedEnclave(keystore, name, state)
             found += enclave_findings(enclave, wanted, alone=name != first)
-            if each := traits_of(enclave):
-                traits.append(each)
-        return found, traits
+            if each := summary_of(enclave):
+                issued.append(each)
+        return found, issued
 
     outcomes = [outcome for _, outcome in map_slices(names, work)]
     found = [finding for findings, _ in outcomes for finding in findings]
     if only is None:
-        traits = [each for _, all_traits in outcomes for each in all_traits]
+        issued = [each for _, share in outcomes for each in share]
         common = [*check_files(keystore), *check_authorities(keystore)]
         if not first and keystore.governance:
             common += _governance_alone(keystore)
-        found = [*common, *check_issued(keystore, traits), *found]
+        found = [*common, *check_issued(keystore, issued), *found]
+    else:
+        found = [*check_files(keystore, names), *found]
     real_root = os.path.realpath(root)
     located = (_at_real_file(each, root, real_root) for each in found)
     return joined([_with_names(each, root) for each in located])
@@ -88,7 +103,7 @@ def keystore_findings(
 def enclave_findings(
     enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]], *, alone: bool
 ) -> Iterator[Finding]:
-    """Everything that is found in one enclave."""
+    """Yield everything that is found in one enclave."""
     yield from check_enclave(enclave)
     documents = list(check_documents(enclave))
     yield from documents
@@ -98,10 +113,10 @@ def enclave_findings(
 
 
 def joined(findings: Sequence[Finding]) -> list[Finding]:
-    """``findings`` with one in place of many that say the same of one file, or by one choice."""
+    """Return ``findings`` with one for all that say the same of one file, or by one choice."""
     together: dict[tuple[object, ...], list[Finding]] = {}
     for each in findings:
-        one = each.accepted or each.id in _OF_THE_WHOLE
+        one = each.accepted or each.id in _OF_THE_KEYSTORE
         place = (each.accepted,) if one else (each.file, each.line, each.text)
         together.setdefault((each.id, *place), []).append(each)
     return [_one_of(group) for group in together.values()]
@@ -116,7 +131,7 @@ def _governance_alone(keystore: CheckedKeystore) -> Iterator[Finding]:
 
 
 def _at_real_file(finding: Finding, root: Path, real_root: str) -> Finding:
-    """``finding``, at the file that all enclaves share where theirs is a link to that."""
+    """Return ``finding`` at the file that all enclaves share, if theirs is a link to it."""
     if "/enclaves/" not in finding.file or finding.id.startswith("keystore.link"):
         return finding
     real = Path(os.path.realpath(finding.file))
@@ -126,10 +141,10 @@ def _at_real_file(finding: Finding, root: Path, real_root: str) -> Finding:
 
 
 def _with_names(finding: Finding, root: Path) -> Finding:
-    """``finding`` with what the commands of its remedy are to name."""
-    remedy = re.sub(r"\bROOT\b", lambda _: str(root), finding.remedy)
+    """Return ``finding`` with the keystore and the enclave in the commands of its remedy."""
+    remedy = re.sub(r"\bROOT\b", lambda _: quote(str(root)), finding.remedy)
     if finding.subject.startswith("/") and "," not in finding.subject:
-        remedy = re.sub(r"\bNAME\b", finding.subject, remedy)
+        remedy = re.sub(r"\bNAME\b", lambda _: quote(finding.subject), remedy)
     return finding if remedy == finding.remedy else replace(finding, own_remedy=remedy)
 
 
@@ -137,13 +152,6 @@ def _one_of(group: list[Finding]) -> Finding:
     subjects = list(dict.fromkeys(each.subject for each in group))
     if len(subjects) == 1:
         return group[0]
-    shown = ", ".join(subjects[:_MANY])
-    more = f" and {len(subjects) - _MANY} more" if len(subjects) > _MANY else ""
+    shown = ", ".join(subjects[:_NAMES_SHOWN])
+    more = f" and {len(subjects) - _NAMES_SHOWN} more" if len(subjects) > _NAMES_SHOWN else ""
     return replace(group[0], subject=shown + more)
-
-
-def _open(keystore: CheckedKeystore, name: str, domain: int | None) -> CheckedEnclave:
-    folder = enclave_path(keystore.root, name)
-    state = load_enclave(folder, now=keystore.now, domain=domain)
-    elsewhere = (folder / REQUEST).exists() and not (folder / "key.pem").exists()
-    return CheckedEnclave(keystore, name, state, elsewhere and keystore.is_home)

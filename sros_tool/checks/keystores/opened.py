@@ -1,4 +1,4 @@
-"""A keystore made ready for checks: what its files say, as far as they can be read."""
+"""A keystore made ready for checks: every part that can be read, and those that cannot."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
+from typing import TypeVar
 
 from cryptography import x509
 
@@ -15,25 +16,23 @@ from sros_tool.keystore.layout import (
     CRL,
     GOVERNANCE_P7S,
     LEDGER,
-    PRIVATE,
-    PUBLIC,
     ROLES,
     SETTINGS,
     ca_certificate,
     enclave_path,
-    list_enclaves,
 )
-from sros_tool.keystore.ledger import Entry, read_ledger
-from sros_tool.keystore.reader import OpenedEnclave, load_settings
+from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.reader import OpenedEnclave, open_keystore
 from sros_tool.keystore.template import Template
-from sros_tool.pki.certificates import load_certificates
-from sros_tool.pki.crl import RevocationList, load_crl
+from sros_tool.pki.crl import RevocationList
 from sros_tool.policy.model import Policy
 from sros_tool.xml import read_bytes
 
+_Part = TypeVar("_Part")
+
 
 @dataclass(frozen=True, slots=True)
-class Unread:
+class UnreadablePart:
     """A file that is there and cannot be read as what it is; ``path`` is relative to the root."""
 
     path: str
@@ -42,12 +41,13 @@ class Unread:
 
 @dataclass(frozen=True, slots=True)
 class CheckedKeystore:
-    """A keystore, or the part of one that was exported for a robot.
+    """A keystore, or the part of one that was exported for a robot, as it is checked.
 
     ``settings`` are None where ros2/sros2 made it.  ``authorities`` has the certificates of a CA
-    file by role, the issuing one first.  ``policies`` are those that its permissions are compared
-    with; ``zone`` is that of the host on which its enclaves run.  ``governance`` are the bytes
-    of the document that its enclaves share, where there is one.
+    file by role, the issuing one first.  ``governance`` are the bytes of the document that its
+    enclaves share, where there is one.  Without ``is_home`` it lies on a robot, where keys of CAs
+    have no place.  ``policies`` are compared with its permissions; ``zone`` is the time zone of
+    the host on which its enclaves run.
     """
 
     root: Path
@@ -58,17 +58,13 @@ class CheckedKeystore:
     crl: RevocationList | None
     ledger: tuple[Entry, ...]
     governance: bytes = b""
-    unread: tuple[Unread, ...] = ()
+    unread: tuple[UnreadablePart, ...] = ()
     policies: tuple[Policy, ...] = ()
     zone: tzinfo = UTC
-
-    @property
-    def is_home(self) -> bool:
-        """Whether it has a place for CAs; else it was exported for a robot."""
-        return any((self.root / part).exists() for part in (PUBLIC, PRIVATE, SETTINGS))
+    is_home: bool = True
 
     def accepts(self, chosen: Callable[[Template], bool]) -> str:
-        """Who accepted what was ``chosen``: a template, or the keystore of which this is an export.
+        """Return who accepted what was ``chosen``: a template, or the keystore that exported it.
 
         "" where nobody did, by its settings, or in a keystore of ros2/sros2, which has none.
         """
@@ -77,19 +73,17 @@ class CheckedKeystore:
         return "" if self.is_home else "keystore that it was exported from"
 
     def shown(self, path: str | Path) -> str:
-        """A path below the root as it is told."""
+        """Return a path below the root as findings show it."""
         return os.path.join(self.root, path)
 
 
 @dataclass(frozen=True, slots=True)
 class CheckedEnclave:
-    """An enclave, what its files say, and the keystore that it is of."""
+    """An enclave, what its files say, and the keystore that it is in."""
 
     keystore: CheckedKeystore
     name: str
     state: OpenedEnclave
-    born_elsewhere: bool = False
-    """Its key was made on its robot, and stays there."""
 
     @property
     def folder(self) -> Path:
@@ -97,48 +91,55 @@ class CheckedEnclave:
         return enclave_path(self.keystore.root, self.name)
 
     def file(self, name: str) -> str:
-        """The path of one of its files."""
+        """Return the path of one of its files."""
         return f"{self.folder}/{name}"
 
 
 def read_keystore(
-    root: Path, *, now: datetime, zone: tzinfo = UTC, policies: tuple[Policy, ...] = ()
+    root: Path,
+    *,
+    now: datetime,
+    zone: tzinfo = UTC,
+    policies: tuple[Policy, ...] = (),
+    on_robot: bool = False,
 ) -> CheckedKeystore:
-    """Read what a keystore says of itself; `KeystoreError` if it is none."""
-    names = list_enclaves(root)
-    unread: list[Unread] = []
-    settings: Template | None = None
-    ledger: tuple[Entry, ...] = ()
-    crl: RevocationList | None = None
-    authorities: dict[str, tuple[x509.Certificate, ...]] = {}
-    try:
-        settings = load_settings(root) if (root / SETTINGS).exists() else None
-    except SrosError as error:
-        unread.append(Unread(SETTINGS, error))
-    try:
-        ledger = read_ledger(root)
-    except SrosError as error:
-        unread.append(Unread(LEDGER, error))
-    except OSError as error:
-        unread.append(Unread(LEDGER, SrosError("the ledger cannot be read", f"{error.strerror}.")))
-    try:
-        if (root / CRL).exists():
-            crl = load_crl(read_bytes(root / CRL, "revocation list"), f"'{root / CRL}'")
-    except SrosError as error:
-        unread.append(Unread(CRL, error))
-    for role in ROLES:
-        path = ca_certificate(role)
+    """Return every part of a keystore, and what cannot be read of it.
+
+    Args:
+        root: the keystore, or an export of it.
+        now: the moment for which it is checked.
+        zone: the time zone of the host on which its enclaves run.
+        policies: policies with which its permissions are compared.
+        on_robot: whether it lies on a robot, whatever it holds.
+
+    Raises:
+        KeystoreError: ``root`` is no keystore.
+    """
+    keystore = open_keystore(root)
+    unread: list[UnreadablePart] = []
+
+    def part(path: str, read: Callable[[], _Part], otherwise: _Part) -> _Part:
         try:
-            if (root / path).exists():
-                data = read_bytes(root / path, "certificate")
-                authorities[role] = load_certificates(data, f"'{root / path}'")
+            return read()
         except SrosError as error:
-            unread.append(Unread(path, error))
+            unread.append(UnreadablePart(path, error))
+        except OSError as error:
+            why = SrosError(f"'{path}' cannot be read", f"{error.strerror}.")
+            unread.append(UnreadablePart(path, why))
+        return otherwise
+
+    def authority(role: str) -> tuple[x509.Certificate, ...]:
+        return part(ca_certificate(role), lambda: keystore.authority(role), ())
+
     governance = root / GOVERNANCE_P7S
+    settings = part(SETTINGS, lambda: keystore.settings, None)
+    ledger: tuple[Entry, ...] = part(LEDGER, lambda: keystore.ledger, ())
+    crl = part(CRL, lambda: keystore.revocation_list, None)
+    authorities = {role: chain for role in ROLES if (chain := authority(role))}
     return CheckedKeystore(
         root,
         now,
-        names,
+        keystore.names,
         settings,
         authorities,
         crl,
@@ -147,4 +148,5 @@ def read_keystore(
         tuple(unread),
         policies,
         zone,
+        keystore.is_home and not on_robot,
     )

@@ -14,7 +14,7 @@ from cryptography import x509
 from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
 from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.delivery.archive import unpack
-from sros_tool.keystore.delivery.arrival import check_same_authority, refuse_home, trusted_in
+from sros_tool.keystore.delivery.trust import check_same_authority, refuse_home, trusted_in
 from sros_tool.keystore.layout import ENCLAVES, OPTIONAL_FILES, REQUIRED_FILES, enclave_folder
 from sros_tool.keystore.reader import OpenedEnclave, open_enclave
 from sros_tool.keystore.transaction.recovery import tidy

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack, staged_file
-from sros_tool.keystore.delivery.arrival import check_same_authority
+from sros_tool.keystore.delivery.trust import check_same_authority
 from sros_tool.keystore.layout import (
     OPTIONAL_FILES,
     PRIVATE,

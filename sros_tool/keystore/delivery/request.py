@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.delivery.arrival import refuse_home
+from sros_tool.keystore.delivery.trust import refuse_home
 from sros_tool.keystore.layout import REQUEST, enclave_folder
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change

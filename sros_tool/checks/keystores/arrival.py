@@ -1,0 +1,138 @@
+"""What arrived on a robot: which enclaves can be used there, until when, and all that is wrong."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from datetime import UTC, datetime, tzinfo
+from pathlib import Path
+from typing import Any
+
+from sros_tool.checks.keystores.enclaves import WAITS
+from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.kind import Finding
+from sros_tool.checks.registry import Selection
+from sros_tool.errors import DocumentError
+from sros_tool.keystore.layout import (
+    OPTIONAL_FILES,
+    REQUIRED_FILES,
+    enclave_names,
+    enclave_path,
+    is_enclave,
+    is_keystore,
+    locate_enclave,
+    waits_for_answer,
+)
+from sros_tool.keystore.reader import open_enclave
+from sros_tool.validity import iso
+
+_FILES = (*REQUIRED_FILES, *OPTIONAL_FILES)
+
+
+@dataclass(frozen=True, slots=True)
+class ArrivedEnclave:
+    """An enclave that arrived: whether a process can run in it, where, and until when."""
+
+    name: str
+    loadable: bool
+    domains: str
+    until: datetime | None
+
+
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """All enclaves of a folder, or the one that it is, and everything that is wrong.
+
+    ``root`` is the folder that has the enclaves folder in it; ``kind`` is keystore or enclave.
+    """
+
+    path: Path
+    root: Path
+    kind: str
+    enclaves: tuple[ArrivedEnclave, ...]
+    findings: tuple[Finding, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return it as `sros verify --json` shows it."""
+        return {
+            "path": str(self.path),
+            "kind": self.kind,
+            "ok": not self.findings,
+            "enclaves": [
+                {
+                    "name": each.name,
+                    "loadable": each.loadable,
+                    "domains": each.domains or None,
+                    "valid_until": iso(each.until) if each.until else None,
+                }
+                for each in self.enclaves
+            ],
+            "findings": [
+                {"enclave": self.enclave_of(each) or None, "file": self.file_of(each), "text": text}
+                for each in self.findings
+                for text in (f"{each.kind.title}: {each.text}",)
+            ],
+        }
+
+    def enclave_of(self, finding: Finding) -> str:
+        """Return the enclave that a finding is about, or ""."""
+        file = Path(finding.file)
+        for each in self.enclaves:
+            of_enclave = file.name in _FILES and file.parent == enclave_path(self.root, each.name)
+            if each.name == finding.subject or of_enclave:
+                return each.name
+        return ""
+
+    def file_of(self, finding: Finding) -> str:
+        """Return the file of a finding, relative to its enclave's folder or to the root."""
+        name = self.enclave_of(finding)
+        return os.path.relpath(finding.file, enclave_path(self.root, name) if name else self.root)
+
+
+def verify_arrival(
+    path: Path, *, now: datetime, domain: int | None = None, zone: tzinfo = UTC
+) -> Arrival:
+    """Return what `sros check` shows of a robot's folder, or of the folder of one enclave.
+
+    A request that was not answered yet is shown as well: on a robot nothing works before.
+
+    Args:
+        path: a folder with enclaves, or the folder of an enclave.
+        now: the moment for which it is checked.
+        domain: the ROS domain that the enclaves have to join.
+        zone: the time zone of the robot.
+
+    Raises:
+        DocumentError: ``path`` is neither.
+    """
+    if is_keystore(path):
+        root, names, only = path, tuple(enclave_names(path)), None
+    elif path.is_dir() and is_enclave(path):
+        root, name = locate_enclave(path)
+        names = only = (name,)
+    else:
+        raise DocumentError(
+            f"'{path}' is neither a keystore nor an enclave",
+            "It does not exist."
+            if not path.exists()
+            else "It has no enclaves folder in use, and neither cert.pem nor key.pem.",
+            "Name the folder into which `sros distribute_key` or `sros import` has written.",
+        )
+    found = keystore_findings(root, now=now, zone=zone, domain=domain, only=only, on_robot=True)
+    shown = Selection().choose(found).shown
+    return Arrival(
+        path,
+        root,
+        "enclave" if only else "keystore",
+        tuple(_enclave(root, name, now, domain) for name in names),
+        tuple(each for each in found if each in shown or each.kind is WAITS),
+    )
+
+
+def _enclave(root: Path, name: str, now: datetime, domain: int | None) -> ArrivedEnclave:
+    folder = enclave_path(root, name)
+    if waits_for_answer(folder):
+        return ArrivedEnclave(name, False, "", None)
+    state = open_enclave(folder, now=now, domain=domain)
+    domains = str(state.domains() or "")
+    return ArrivedEnclave(name, not state.problems, domains, state.valid_until())
