@@ -18,10 +18,10 @@ from pathlib import Path
 
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.report.compose import Context, Source, compose
+from sros_tool.report.compose import Context, PictureSource, compose
 from sros_tool.report.layout import scenes_of
 from sros_tool.report.page import render_page
-from sros_tool.report.picture import Origin
+from sros_tool.report.picture import SourceTitle
 from sros_tool.report.sources import common_rights
 from sros_tool.report.svg import render_svg
 
@@ -55,8 +55,10 @@ def picturing(folder: Path, rounds: int) -> Iterator[Figure]:
             yield "... opened in Chromium", opened, None, limit, opened < _LIMIT_SECONDS, "s"
 
 
-def _picture(file: Path) -> tuple[str, Source]:
-    return file.name, Source(Origin(file.name, "policy"), policy_rights(read_policy(file)))
+def _picture(file: Path) -> tuple[str, PictureSource]:
+    return file.name, PictureSource(
+        SourceTitle(file.name, "policy"), policy_rights(read_policy(file))
+    )
 
 
 def _page(file: Path) -> str:

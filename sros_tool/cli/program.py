@@ -17,7 +17,7 @@ from sros_tool.errors import SrosError, UsageError
 
 
 @dataclass(frozen=True, slots=True)
-class Verb:
+class VerbEntry:
     """A verb: the module that holds it, what it does, other names, and its name in the module."""
 
     module: str
@@ -26,50 +26,58 @@ class Verb:
     attribute: str = ""
 
 
-FAMILIES: dict[str, dict[str, Verb]] = {
+FAMILIES: dict[str, dict[str, VerbEntry]] = {
     "Keystore": {
-        "create_keystore": Verb("keystore", "Create a keystore."),
-        "create_enclave": Verb("keystore", "Create enclaves in a keystore.", ("create_key",)),
-        "create_permission": Verb("keystore", "Give an enclave the permissions of a policy."),
-        "generate_artifacts": Verb("keystore", "Create enclaves and permissions from policies."),
-        "list_enclaves": Verb("keystore", "List the enclaves of a keystore.", ("list_keys",)),
-        "inspect": Verb("inspect", "Show what a keystore, certificate or document says."),
+        "create_keystore": VerbEntry("keystore", "Create a keystore."),
+        "create_enclave": VerbEntry("keystore", "Create enclaves in a keystore.", ("create_key",)),
+        "create_permission": VerbEntry("keystore", "Give an enclave the permissions of a policy."),
+        "generate_artifacts": VerbEntry(
+            "keystore", "Create enclaves and permissions from policies."
+        ),
+        "list_enclaves": VerbEntry("keystore", "List the enclaves of a keystore.", ("list_keys",)),
+        "inspect": VerbEntry("inspect", "Show what a keystore, certificate or document says."),
     },
     "Life of keys": {
-        "renew": Verb("life", "Renew certificates and permissions of enclaves."),
-        "revoke": Verb("life", "Revoke enclaves."),
-        "rotate_ca": Verb("life", "Replace the CAs, stage by stage."),
-        "crl": Verb("life", "Show the revocation list, or sign it again."),
+        "renew": VerbEntry("life", "Renew certificates and permissions of enclaves."),
+        "revoke": VerbEntry("life", "Revoke enclaves."),
+        "rotate_ca": VerbEntry("life", "Replace the CAs, stage by stage."),
+        "crl": VerbEntry("life", "Show the revocation list, or sign it again."),
     },
     "Deployment": {
-        "distribute_key": Verb(
+        "distribute_key": VerbEntry(
             "deployment", "Export enclaves for the robot they run on.", ("export_enclave",)
         ),
-        "verify": Verb("deployment", "Check whether a robot's enclaves can be used."),
-        "create_request": Verb("deployment", "Make a key on the robot, and a request to sign it."),
-        "sign_request": Verb("deployment", "Sign the request of a robot."),
-        "import": Verb(
+        "verify": VerbEntry("deployment", "Check whether a robot's enclaves can be used."),
+        "create_request": VerbEntry(
+            "deployment", "Make a key on the robot, and a request to sign it."
+        ),
+        "sign_request": VerbEntry("deployment", "Sign the request of a robot."),
+        "import": VerbEntry(
             "deployment", "Install a signed answer next to its key.", attribute="import_verb"
         ),
     },
     "Policy": {
-        "generate_policy": Verb("generate_policy", "Learn a policy from the running robot."),
-        "merge_policy": Verb("policy", "Add the rights of policies to a policy file."),
-        "diff_policy": Verb("policy", "Compare the rights of policies, permissions, keystores."),
-        "minimize_policy": Verb("policy", "Narrow a policy to what was observed."),
-        "explain": Verb("explain", "Say what DDS will decide, by which rule, and why."),
-        "view": Verb("view", "Draw who may do what, as a page, SVG, DOT or Mermaid."),
-        "policies": Verb("policy", "List or copy the policies that ship with sros."),
+        "generate_policy": VerbEntry("generate_policy", "Learn a policy from the running robot."),
+        "merge_policy": VerbEntry("policy", "Add the rights of policies to a policy file."),
+        "diff_policy": VerbEntry(
+            "policy", "Compare the rights of policies, permissions, keystores."
+        ),
+        "minimize_policy": VerbEntry("policy", "Narrow a policy to what was observed."),
+        "explain": VerbEntry("explain", "Say what DDS will decide, by which rule, and why."),
+        "view": VerbEntry("view", "Draw who may do what, as a page, SVG, DOT or Mermaid."),
+        "policies": VerbEntry("policy", "List or copy the policies that ship with sros."),
     },
     "Checks": {
-        "check": Verb("check", "Find what is wrong or weak in policies, keystores, the runtime."),
-        "doctor": Verb("check", "Find out which DDS here enforces security."),
+        "check": VerbEntry(
+            "check", "Find what is wrong or weak in policies, keystores, the runtime."
+        ),
+        "doctor": VerbEntry("check", "Find out which DDS here enforces security."),
     },
     "Running": {
-        "env": Verb("running", "Print the environment of an enclave."),
-        "run": Verb("running", "Run a command in an enclave."),
-        "demo": Verb("demo", "Show on a real DDS that secured nodes are isolated."),
-        "completion": Verb("running", "Print the completion script of a shell."),
+        "env": VerbEntry("running", "Print the environment of an enclave."),
+        "run": VerbEntry("running", "Run a command in an enclave."),
+        "demo": VerbEntry("demo", "Show on a real DDS that secured nodes are isolated."),
+        "completion": VerbEntry("running", "Print the completion script of a shell."),
     },
 }
 _VERBS = {name: verb for family in FAMILIES.values() for name, verb in family.items()}
@@ -117,7 +125,7 @@ _VERBOSE = click.Option(
 )
 
 
-class Program(click.Group):
+class _Program(click.Group):
     """A group whose commands are found by table; hyphen and underscore are the same letter."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -155,7 +163,7 @@ class Program(click.Group):
                 )
 
 
-EPILOG = """\b
+_EPILOG = """\b
 Example:
   $ sros create_keystore keystore
   $ sros create_enclave keystore /talker
@@ -166,8 +174,8 @@ Exit status: 0 yes or done; 1 no, denied or failed; 2 wrong usage."""
 
 
 @click.group(
-    cls=Program,
-    epilog=EPILOG,
+    cls=_Program,
+    epilog=_EPILOG,
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 80},
     no_args_is_help=True,
 )

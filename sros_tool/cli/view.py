@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from sros_tool.checks.kind import Finding as Checked
-    from sros_tool.report.compose import Source
-    from sros_tool.report.picture import Finding, Picture
+    from sros_tool.report.compose import PictureSource
+    from sros_tool.report.picture import Picture, PicturedFinding
 
 FORMATS = ("html", "svg", "dot", "mermaid", "json")
 _ENDINGS = {".htm": "html", ".mmd": "mermaid", ".gv": "dot"}
@@ -174,7 +174,7 @@ def _picture(
     return overlay(first, second, "drift", context)
 
 
-def _check_no_governance(sources: tuple[Path, ...], read: list[Source]) -> None:
+def _check_no_governance(sources: tuple[Path, ...], read: list[PictureSource]) -> None:
     """Refuse a template where a source has been signed with a governance, which would hold."""
     for path, each in zip(sources, read, strict=True):
         if each.origin.kind in ("keystore", "enclave"):
@@ -186,19 +186,19 @@ def _check_no_governance(sources: tuple[Path, ...], read: list[Source]) -> None:
             )
 
 
-def _checked(path: Path, moment: datetime) -> list[Finding]:
+def _checked(path: Path, moment: datetime) -> list[PicturedFinding]:
     """What `sros check` finds there; of permissions or an enclave alone, what it can."""
     from sros_tool.checks.targets import Circumstances, path_findings
     from sros_tool.cli.common import local_zone
     from sros_tool.errors import SrosError
-    from sros_tool.report.picture import Finding
+    from sros_tool.report.picture import PicturedFinding
 
     try:
         found = path_findings(path, Circumstances(moment, local_zone(os.environ)))
     except SrosError:
         return []
     return [
-        Finding(each.id, each.severity.word, _told(each), each.remedy, each.subject)
+        PicturedFinding(each.id, each.severity.word, _told(each), each.remedy, each.subject)
         for each in found
     ]
 

@@ -27,19 +27,19 @@ from sros_tool.policy.rights import (
 )
 from sros_tool.report.picture import (
     UNKNOWN,
-    Difference,
     Edge,
-    Enclave,
-    Finding,
-    Level,
-    Mark,
     Name,
-    Origin,
     Overlay,
+    OverlayDifference,
+    OverlaySide,
     Picture,
+    PicturedEnclave,
+    PicturedFinding,
     Protection,
+    SourceTitle,
     Statement,
     Validity,
+    WireLevel,
 )
 
 _INSIDE = "/_action/"
@@ -184,7 +184,7 @@ def _is_common(right: str, name: str, common: Sequence[Right]) -> bool:
     )
 
 
-_ORDER = list(Level)
+_ORDER = list(WireLevel)
 
 
 def protection_of(governance: Governance | None, kind: str, name: str) -> Protection:
@@ -205,7 +205,9 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
         for topic in topics
         for rule in _rules_for(each, topic)
     ]
-    weakest = min(found, key=lambda each: _ORDER.index(each.level), default=Protection(Level.NONE))
+    weakest = min(
+        found, key=lambda each: _ORDER.index(each.level), default=Protection(WireLevel.NONE)
+    )
     return replace(
         weakest,
         read_control=all(rule.enable_read_access_control for rule in anywhere),
@@ -240,8 +242,8 @@ def _protection(domain: DomainRule, rule: TopicRule) -> Protection:
     )
 
 
-def _level(kind: str) -> Level:
-    return Level(str(kind).partition("_")[0].lower())
+def _level(kind: str) -> WireLevel:
+    return WireLevel(str(kind).partition("_")[0].lower())
 
 
 OVERLAYS = {
@@ -253,20 +255,20 @@ OVERLAYS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class PictureSource:
     """What was read of one source.
 
     ``nodes`` are the nodes of each enclave, ``enclaves`` what is known of their certificates;
     ``scope`` are the enclaves of which the source can speak, None for all.
     """
 
-    origin: Origin
+    origin: SourceTitle
     rights: frozenset[Right]
     nodes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    enclaves: tuple[Enclave, ...] = ()
+    enclaves: tuple[PicturedEnclave, ...] = ()
     governance: Governance | None = None
     validities: tuple[Validity, ...] = ()
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[PicturedFinding, ...] = ()
     scope: frozenset[str] | None = None
 
 
@@ -282,30 +284,32 @@ class Context:
     hosts: Mapping[str, str] = field(default_factory=dict)
 
 
-def compose(first: Source, context: Context = Context()) -> Picture:
+def compose(first: PictureSource, context: Context = Context()) -> Picture:
     """The picture of one source."""
     known = Known(first.rights)
     edges = edges_of(first.rights, known, context.common)
-    stated = dict.fromkeys(folded(first.rights), Mark.BOTH)
+    stated = dict.fromkeys(folded(first.rights), OverlaySide.BOTH)
     return _picture((first,), edges, stated, known, context)
 
 
-def union(sources: Sequence[Source]) -> Source:
+def union(sources: Sequence[PictureSource]) -> PictureSource:
     """Several observations as one source."""
     nodes: dict[str, set[str]] = defaultdict(set)
     for source in sources:
         for path, found in source.nodes.items():
             nodes[path].update(found)
     title = " and ".join(source.origin.title for source in sources)
-    return Source(
-        Origin(title, "observation"),
+    return PictureSource(
+        SourceTitle(title, "observation"),
         frozenset(right for source in sources for right in source.rights),
         {path: tuple(sorted(found)) for path, found in nodes.items()},
         findings=tuple(each for source in sources for each in source.findings),
     )
 
 
-def overlay(first: Source, second: Source, kind: str, context: Context = Context()) -> Picture:
+def overlay(
+    first: PictureSource, second: PictureSource, kind: str, context: Context = Context()
+) -> Picture:
     """The picture of two sources; ``kind`` is a key of `OVERLAYS`."""
     scope = first.scope if second.scope is None else second.scope
     rights = [
@@ -317,9 +321,9 @@ def overlay(first: Source, second: Source, kind: str, context: Context = Context
     edges = _marked(*sides, allowed_by=kind == "use")
     normal = [folded(each) for each in rights]
     stated = {
-        right: Mark.BOTH
+        right: OverlaySide.BOTH
         if right in normal[0] and right in normal[1]
-        else (Mark.FIRST if right in normal[0] else Mark.SECOND)
+        else (OverlaySide.FIRST if right in normal[0] else OverlaySide.SECOND)
         for right in normal[0] | normal[1]
     }
     unseen: frozenset[str] = frozenset()
@@ -337,9 +341,9 @@ def overlay(first: Source, second: Source, kind: str, context: Context = Context
 
 
 def _picture(
-    sources: Sequence[Source],
+    sources: Sequence[PictureSource],
     edges: Iterable[Edge],
-    stated: Mapping[Right, Mark],
+    stated: Mapping[Right, OverlaySide],
     known: Known,
     context: Context,
 ) -> Picture:
@@ -390,8 +394,11 @@ def group_of(enclave: str, hosts: Mapping[str, str]) -> str:
 
 
 def _enclaves(
-    sources: Sequence[Source], stated: Mapping[Right, Mark], known: Known, context: Context
-) -> tuple[Enclave, ...]:
+    sources: Sequence[PictureSource],
+    stated: Mapping[Right, OverlaySide],
+    known: Known,
+    context: Context,
+) -> tuple[PicturedEnclave, ...]:
     described = {each.path: each for source in sources for each in source.enclaves}
     statements: dict[str, list[Statement]] = defaultdict(list)
     for right in sorted(stated, key=order):
@@ -405,7 +412,7 @@ def _enclaves(
             nodes[path].update(found)
     return tuple(
         replace(
-            described.get(path, Enclave(path, "")),
+            described.get(path, PicturedEnclave(path, "")),
             group=group_of(path, context.hosts),
             nodes=tuple(sorted(nodes.get(path, ()))),
             statements=tuple(statements.get(path, ())),
@@ -431,27 +438,27 @@ def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) 
             both = tuple(sorted({*one.by, *other.by})) if one.by and other.by else ()
             found.append(one if allowed_by else replace(one, by=both))
         elif one:
-            found.append(replace(one, mark=Mark.FIRST))
+            found.append(replace(one, mark=OverlaySide.FIRST))
         elif other:
-            found.append(replace(other, mark=Mark.SECOND))
+            found.append(replace(other, mark=OverlaySide.SECOND))
     return found
 
 
 def _neutral(edge: Edge, unseen: frozenset[str]) -> Edge:
     """A denial is never observed, and of an enclave that was not observed nothing is known."""
     neutral = edge.qualifier is not ALLOW or edge.enclave in unseen
-    return replace(edge, mark=Mark.BOTH) if neutral else edge
+    return replace(edge, mark=OverlaySide.BOTH) if neutral else edge
 
 
 def _identity(edge: Edge) -> tuple[object, ...]:
     return edge.enclave, edge.kind, edge.name, edge.right, edge.qualifier, edge.parts
 
 
-def _changed(first: frozenset[Right], second: frozenset[Right]) -> tuple[Difference, ...]:
+def _changed(first: frozenset[Right], second: frozenset[Right]) -> tuple[OverlayDifference, ...]:
     difference = compare(first, second)
     return tuple(
-        Difference(
-            Mark.FIRST if sign == "-" else Mark.SECOND,
+        OverlayDifference(
+            OverlaySide.FIRST if sign == "-" else OverlaySide.SECOND,
             str(right),
             tuple(
                 f"the other has it by {each.told()}" for each in difference.covered.get(right, ())
@@ -461,25 +468,25 @@ def _changed(first: frozenset[Right], second: frozenset[Right]) -> tuple[Differe
     )
 
 
-def _unused(edges: Iterable[Edge]) -> tuple[Difference, ...]:
+def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
     """What was allowed and never observed, without what every node needs; and the other way.
 
     What wildcards reach is counted: a recorder of everything would fill pages.
     """
-    found: dict[tuple[Mark, Right], tuple[str, ...]] = {}
+    found: dict[tuple[OverlaySide, Right], tuple[str, ...]] = {}
     reached: dict[Right, list[bool]] = defaultdict(list)
     for edge in sorted(edges, key=_edge_order):
         for name in edge.by:
             right = Right(edge.enclave, edge.qualifier, edge.right, name)
-            reached[right].append(edge.mark is Mark.FIRST and not edge.common)
-        if edge.mark is not Mark.BOTH and not edge.common and not edge.by:
+            reached[right].append(edge.mark is OverlaySide.FIRST and not edge.common)
+        if edge.mark is not OverlaySide.BOTH and not edge.common and not edge.by:
             right = Right(edge.enclave, edge.qualifier, edge.right, edge.name)
             found[edge.mark, right] = ()
     for right, unused in reached.items():
         if any(unused):
             told = f"{sum(unused)} of the {len(unused)} names that it reaches were never observed"
-            found[Mark.FIRST, right] = (told,)
+            found[OverlaySide.FIRST, right] = (told,)
     return tuple(
-        Difference(mark, str(right), notes)
+        OverlayDifference(mark, str(right), notes)
         for (mark, right), notes in sorted(found.items(), key=lambda each: order(each[0][1]))
     )

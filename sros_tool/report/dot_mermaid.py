@@ -10,10 +10,14 @@ from collections.abc import Iterable, Mapping
 from sros_tool.errors import UnavailableError
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.layout import KIND_NAMES, LEVEL_NAMES, ONLOOKERS, Card, Link, Scene
-from sros_tool.report.picture import Level, Mark, Picture
+from sros_tool.report.picture import OverlaySide, Picture, WireLevel
 
 _DOT_STYLES = {"encrypt": "solid", "sign": "dashed", "none": "dotted", "unknown": "solid"}
-_COLOURS = {Mark.BOTH: "#5d7590", Mark.FIRST: "#a34a00", Mark.SECOND: "#176b3a"}
+_COLOURS = {
+    OverlaySide.BOTH: "#5d7590",
+    OverlaySide.FIRST: "#a34a00",
+    OverlaySide.SECOND: "#176b3a",
+}
 _DENIED = "#b3261e"
 _MERMAID_ARROWS = {"encrypt": "==>", "sign": "-->", "none": "-.->", "unknown": "-->"}
 _WAIT = 60
@@ -118,7 +122,7 @@ def _texts(scene: Scene, card: Card) -> Iterable[str]:
 
 
 def _protected(card: Card) -> str:
-    return "" if card.level is Level.UNKNOWN else f", {LEVEL_NAMES[card.level]}"
+    return "" if card.level is WireLevel.UNKNOWN else f", {LEVEL_NAMES[card.level]}"
 
 
 def _link_label(picture: Picture, link: Link) -> str:
@@ -127,8 +131,8 @@ def _link_label(picture: Picture, link: Link) -> str:
         text = f"DENY {text}"
     if link.wildcard:
         text += " by *"
-    if picture.overlay and link.mark is not Mark.BOTH:
-        said = picture.overlay.first if link.mark is Mark.FIRST else picture.overlay.second
+    if picture.overlay and link.mark is not OverlaySide.BOTH:
+        said = picture.overlay.first if link.mark is OverlaySide.FIRST else picture.overlay.second
         text += f": {said}"
     return text
 

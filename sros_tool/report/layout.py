@@ -15,7 +15,17 @@ from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 from sros_tool.policy.model import ALLOW, Qualifier
-from sros_tool.report.picture import SENDS, Bundle, Edge, Level, Mark, Picture, Tie, coarsened, fold
+from sros_tool.report.picture import (
+    SENDS,
+    Bundle,
+    Edge,
+    OverlaySide,
+    Picture,
+    Tie,
+    WireLevel,
+    coarsened,
+    fold,
+)
 
 SIDE_WIDTH, NAMES_WIDTH, GUTTER = 184, 330, 110
 LINE, PAD, SMALL = 16, 7, 14
@@ -43,7 +53,7 @@ class Card:
     notes: tuple[str, ...]
     members: tuple[str, ...]
     kind: str = ""
-    level: Level = Level.UNKNOWN
+    level: WireLevel = WireLevel.UNKNOWN
     group: str = ""
     tags: str = ""
 
@@ -70,9 +80,9 @@ class Link:
     y2: int
     rights: tuple[str, ...]
     qualifier: Qualifier
-    level: Level
+    level: WireLevel
     wildcard: bool
-    mark: Mark
+    mark: OverlaySide
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,7 +120,7 @@ _SWEEPS = 24
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
+class ColumnItem:
     """Something of a ``height`` in a column; items of one ``group`` stand together."""
 
     id: str
@@ -118,12 +128,12 @@ class Item:
     group: str = ""
 
 
-def ordered(
-    left: Sequence[Item],
-    middle: Sequence[Item],
-    right: Sequence[Item],
+def order_columns(
+    left: Sequence[ColumnItem],
+    middle: Sequence[ColumnItem],
+    right: Sequence[ColumnItem],
     lines: Sequence[tuple[str, str]],
-) -> tuple[list[Item], list[Item], list[Item]]:
+) -> tuple[list[ColumnItem], list[ColumnItem], list[ColumnItem]]:
     """The items of the three columns in an order with few crossings.
 
     ``lines`` are pairs of ids, each of neighbouring columns.  Of all sweeps the best is kept.
@@ -145,7 +155,7 @@ def ordered(
     return best[0], best[1], best[2]
 
 
-def _places(columns: Sequence[Sequence[Item]]) -> dict[str, float]:
+def _places(columns: Sequence[Sequence[ColumnItem]]) -> dict[str, float]:
     """Where each item stands in its column, from 0 to 1."""
     return {
         item.id: (number + 0.5) / len(column)
@@ -155,8 +165,8 @@ def _places(columns: Sequence[Sequence[Item]]) -> dict[str, float]:
 
 
 def _by_barycentre(
-    column: Sequence[Item], near: Mapping[str, Sequence[str]], places: Mapping[str, float]
-) -> list[Item]:
+    column: Sequence[ColumnItem], near: Mapping[str, Sequence[str]], places: Mapping[str, float]
+) -> list[ColumnItem]:
     centre = {
         item.id: (
             sum(places[each] for each in near[item.id]) / len(near[item.id])
@@ -174,7 +184,7 @@ def _by_barycentre(
     )
 
 
-def _crossings(columns: Sequence[Sequence[Item]], lines: Sequence[tuple[str, str]]) -> int:
+def _crossings(columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]) -> int:
     """How often lines cross, counted between each pair of neighbouring columns."""
     side = {item.id: number for number, column in enumerate(columns) for item in column}
     place = {item.id: n for column in columns for n, item in enumerate(column)}
@@ -207,8 +217,12 @@ def _inversions(ends: Sequence[int], size: int) -> int:
     return found
 
 
-def heights(
-    column: Sequence[Item], wanted: Mapping[str, float], gap: float, top: float, lead: float = 0
+def place_column(
+    column: Sequence[ColumnItem],
+    wanted: Mapping[str, float],
+    gap: float,
+    top: float,
+    lead: float = 0,
 ) -> dict[str, float]:
     """The upper edge of each item: near to what is ``wanted`` for its centre, and without overlap.
 
@@ -262,10 +276,10 @@ COMMON = {
 """What a card says of the rights that every node has to its names, where these are not drawn."""
 KIND_NAMES = {"topics": "topic", "services": "service", "actions": "action", "dds": "DDS topic"}
 LEVEL_NAMES = {
-    Level.ENCRYPT: "encrypted",
-    Level.SIGN: "signed, readable",
-    Level.NONE: "not protected",
-    Level.UNKNOWN: "protection unknown",
+    WireLevel.ENCRYPT: "encrypted",
+    WireLevel.SIGN: "signed, readable",
+    WireLevel.NONE: "not protected",
+    WireLevel.UNKNOWN: "protection unknown",
 }
 OWN = "own:"
 SENDERS, LISTENERS = "may send", "may receive"
@@ -279,14 +293,14 @@ def counted(number: int, thing: str) -> str:
     return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
-def own_text(own: Mapping[str, int]) -> list[str]:
+def _own_text(own: Mapping[str, int]) -> list[str]:
     """What an enclave alone has, as ``own: 3 topics, 2 services``, on lines that are short."""
     found = [counted(number, KIND_NAMES[kind]) for kind, number in own.items() if number]
     lines = [f"{OWN} {', '.join(found[:2])}"]
     return [*lines, ", ".join(found[2:])] if found[2:] else lines
 
 
-def names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
+def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """What stands on the card of a bundle: names or the wildcards for them, and small notes."""
     kind, names = KIND_NAMES[bundle.kind], bundle.names
     if bundle.partial:
@@ -332,7 +346,7 @@ _LEAST_LINES, _MOST_LINES, _MOST_ONLOOKERS = 8, 0.3, 26
 _FEW_BUNDLES, _MOST_BUNDLES = 24, 80
 
 
-class Placing:
+class _Placing:
     """Places one scene: draws up its cards, orders and places them, and ties them.
 
     ``members`` are the enclaves behind each node of the scene, ``everybody`` the nodes that have
@@ -364,7 +378,7 @@ class Placing:
                 self._bundles.append(bundle)
         if len(self._bundles) > _MOST_BUNDLES:
             self._bundles = list(coarsened(self._bundles))
-        self._ties: dict[tuple[str, str, Qualifier, bool, Mark], set[str]] = defaultdict(set)
+        self._ties: dict[tuple[str, str, Qualifier, bool, OverlaySide], set[str]] = defaultdict(set)
         for number, bundle in enumerate(self._bundles):
             for tie in bundle.ties:
                 if not self._looks(tie):
@@ -374,14 +388,16 @@ class Placing:
 
     def _looks(self, tie: Tie) -> bool:
         """Whether the tie is told by a letter, and not by a line."""
-        plain = tie.qualifier is ALLOW and tie.mark is Mark.BOTH
+        plain = tie.qualifier is ALLOW and tie.mark is OverlaySide.BOTH
         return plain and (tie.node, tie.right) in self._looking
 
     def _alone(self, bundle: Bundle) -> str:
         """The only node that has to do with these names, onlookers aside; "" if there are more."""
         looking = {tie.node for tie in bundle.ties if self._looks(tie)}
         told = {tie.node for tie in bundle.ties if not self._looks(tie)}
-        if any(tie.qualifier is not ALLOW or tie.mark is not Mark.BOTH for tie in bundle.ties):
+        if any(
+            tie.qualifier is not ALLOW or tie.mark is not OverlaySide.BOTH for tie in bundle.ties
+        ):
             return ""
         nodes = {each for name in bundle.names for each in self._everybody[bundle.kind, name]}
         nodes -= looking - told
@@ -390,11 +406,11 @@ class Placing:
     def scene(self, name: str, title: str) -> Scene:
         """The scene, without its count of names."""
         cards = {card.id: card for card in self._cards()}
-        columns: list[list[Item]] = [[], [], []]
+        columns: list[list[ColumnItem]] = [[], [], []]
         for card in cards.values():
-            columns[card.column].append(Item(card.id, card.height, card.group))
+            columns[card.column].append(ColumnItem(card.id, card.height, card.group))
         lines = sorted({ends[:2] for ends in self._ties})
-        placed = ordered(columns[0], columns[1], columns[2], lines)
+        placed = order_columns(columns[0], columns[1], columns[2], lines)
         tops = _tops(placed, lines)
         cards = {key: replace(card, y=round(tops[key])) for key, card in cards.items()}
         bottom = max((card.y + card.height for card in cards.values()), default=0)
@@ -438,7 +454,7 @@ class Placing:
             group = self._groups[node].rstrip("/") + "/"
             label = node.removeprefix(group) or node
         if first and (own := self._own.get(node)):
-            notes += own_text(own)
+            notes += _own_text(own)
         notes += ["never observed"] if node in self._unseen else []
         notes += [
             f"{reach} {counted(self._looking[node, right], 'name')}: see {tag}"
@@ -462,7 +478,7 @@ class Placing:
         )
 
     def _names_card(self, number: int, bundle: Bundle) -> Card:
-        titles, notes = names_title(bundle)
+        titles, notes = _names_title(bundle)
         lines = tuple(line for title in titles for line in wrapped(title, _NAMES_LETTERS))
         drawn = {tie.node for tie in bundle.ties}
         if len(self._everybody[bundle.kind, bundle.names[0]] - drawn):
@@ -540,11 +556,13 @@ def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
     return dict(looking[:_MOST_ONLOOKERS])  # there are no more letters
 
 
-def _tops(columns: Sequence[Sequence[Item]], lines: Sequence[tuple[str, str]]) -> dict[str, float]:
+def _tops(
+    columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]
+) -> dict[str, float]:
     """The upper edges of all cards: the tallest column stands close, the others beside it."""
     extent = [_extent(column) for column in columns]
     tallest = max(range(3), key=lambda number: (extent[number], number == 1))
-    tops = heights(columns[tallest], {}, _GAP, _TOP, _LEAD if tallest != 1 else 0)
+    tops = place_column(columns[tallest], {}, _GAP, _TOP, _LEAD if tallest != 1 else 0)
     height = {item.id: item.height for column in columns for item in column}
     order = {1: (0, 2), 0: (1, 2), 2: (1, 0)}[tallest]
     for number in order:
@@ -553,16 +571,16 @@ def _tops(columns: Sequence[Sequence[Item]], lines: Sequence[tuple[str, str]]) -
             ends = [b if a == item.id else a for a, b in lines if item.id in (a, b)]
             centres = [tops[end] + height[end] / 2 for end in ends if end in tops]
             wanted[item.id] = sum(centres) / len(centres) if centres else extent[tallest]
-        tops |= heights(columns[number], wanted, _GAP, _TOP, _LEAD if number != 1 else 0)
+        tops |= place_column(columns[number], wanted, _GAP, _TOP, _LEAD if number != 1 else 0)
     return tops
 
 
-def _extent(column: Sequence[Item]) -> float:
+def _extent(column: Sequence[ColumnItem]) -> float:
     groups = len({item.group for item in column})
     return sum(item.height + _GAP for item in column) + _LEAD * groups
 
 
-def _frames(columns: Sequence[Sequence[Item]], cards: dict[str, Card]) -> Iterable[Frame]:
+def _frames(columns: Sequence[Sequence[ColumnItem]], cards: dict[str, Card]) -> Iterable[Frame]:
     for column in (columns[0], columns[2]):
         groups: dict[str, list[Card]] = defaultdict(list)
         for item in column:
@@ -619,6 +637,6 @@ def _scene(
     everybody: dict[tuple[str, str], set[str]] = defaultdict(set)
     for edge in picture.edges:
         everybody[edge.kind, edge.name].add(owner(edge.enclave))
-    scene = Placing(picture, edges, owner, members, everybody).scene(name, title)
+    scene = _Placing(picture, edges, owner, members, everybody).scene(name, title)
     shown = len({(edge.kind, edge.name) for edge in edges})
     return replace(scene, hidden=len(picture.names) - shown, shown=shown)

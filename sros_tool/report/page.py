@@ -19,7 +19,7 @@ from typing import Any
 from sros_tool.names import is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.report.layout import Scene
-from sros_tool.report.picture import Bundle, Enclave, Picture, fold
+from sros_tool.report.picture import Bundle, Picture, PicturedEnclave, fold
 from sros_tool.validity import iso
 from sros_tool.values import as_plain
 
@@ -98,7 +98,7 @@ def _data(picture: Picture, scenes: tuple[Scene, ...]) -> dict[str, Any]:
     }
 
 
-def _enclave(enclave: Enclave) -> dict[str, Any]:
+def _enclave(enclave: PicturedEnclave) -> dict[str, Any]:
     """An enclave; of its rights as written only the wildcards, for the others are names."""
     wild = [_said(as_plain(each)) for each in enclave.statements if is_expression(each.name)]
     return {**as_plain(enclave), "statements": wild}

@@ -25,7 +25,7 @@ KINDS = (*RIGHTS, "dds")
 """The kinds of names in the order of telling; dds is a topic that ROS has no word for."""
 
 
-class Mark(StrEnum):
+class OverlaySide(StrEnum):
     """On which side of an overlay something stands; always BOTH where nothing is laid over."""
 
     BOTH = "both"
@@ -33,7 +33,7 @@ class Mark(StrEnum):
     SECOND = "second"
 
 
-class Level(StrEnum):
+class WireLevel(StrEnum):
     """How strongly messages are protected on the wire, at least; from the weakest on."""
 
     UNKNOWN = "unknown"
@@ -51,7 +51,7 @@ class Protection:
     ``write_control`` anybody may write.
     """
 
-    level: Level
+    level: WireLevel
     data: str = ""
     metadata: str = ""
     rtps: str = ""
@@ -59,7 +59,7 @@ class Protection:
     write_control: bool = True
 
 
-UNKNOWN = Protection(Level.UNKNOWN)
+UNKNOWN = Protection(WireLevel.UNKNOWN)
 """The protection where no governance is known, as that of a policy alone."""
 
 
@@ -83,7 +83,7 @@ class Edge:
     qualifier: Qualifier
     by: tuple[str, ...] = ()
     parts: tuple[str, ...] = ()
-    mark: Mark = Mark.BOTH
+    mark: OverlaySide = OverlaySide.BOTH
     common: bool = False
 
     @property
@@ -117,11 +117,11 @@ class Statement:
     kind: str
     name: str
     reaches: int
-    mark: Mark = Mark.BOTH
+    mark: OverlaySide = OverlaySide.BOTH
 
 
 @dataclass(frozen=True, slots=True)
-class Enclave:
+class PicturedEnclave:
     """An enclave with what is known of it; ``group`` is its host or its namespace.
 
     ``subject``, ``issuer``, ``serial`` and ``key`` describe its certificate, "" without one.
@@ -156,7 +156,7 @@ class Validity:
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class PicturedFinding:
     """Something that is wrong or weak; ``severity`` is error, warning or note."""
 
     id: str
@@ -167,7 +167,7 @@ class Finding:
 
 
 @dataclass(frozen=True, slots=True)
-class Origin:
+class SourceTitle:
     """A source as it is called in the picture: its base name, and what kind of thing it is."""
 
     title: str
@@ -188,14 +188,14 @@ class Overlay:
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class OverlayDifference:
     """A right that only one side has; ``notes`` say more of it.
 
     Of a change, the wildcards by which the other side has it all the same; of use, how many of the
     names that a wildcard reaches were never observed.
     """
 
-    mark: Mark
+    mark: OverlaySide
     text: str
     notes: tuple[str, ...] = ()
 
@@ -205,14 +205,14 @@ class Picture:
     """Who may do what, how it is protected, how long it holds, and what is wrong with it."""
 
     title: str
-    origins: tuple[Origin, ...]
-    enclaves: tuple[Enclave, ...]
+    origins: tuple[SourceTitle, ...]
+    enclaves: tuple[PicturedEnclave, ...]
     names: tuple[Name, ...]
     edges: tuple[Edge, ...]
     overlay: Overlay | None = None
-    differences: tuple[Difference, ...] = ()
+    differences: tuple[OverlayDifference, ...] = ()
     validities: tuple[Validity, ...] = ()
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[PicturedFinding, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -224,7 +224,7 @@ class Tie:
     qualifier: Qualifier
     by: tuple[str, ...]
     parts: tuple[str, ...]
-    mark: Mark
+    mark: OverlaySide
     common: bool
 
     @property
@@ -285,7 +285,7 @@ def coarsened(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
     """
     found: dict[tuple[object, ...], list[Bundle]] = defaultdict(list)
     for bundle in bundles:
-        plain = all(t.qualifier is ALLOW and t.mark is Mark.BOTH for t in bundle.ties)
+        plain = all(t.qualifier is ALLOW and t.mark is OverlaySide.BOTH for t in bundle.ties)
         senders = frozenset((tie.node, tie.right) for tie in bundle.ties if tie.sends)
         apart = None if plain and senders else bundle.ties
         found[bundle.kind, bundle.protection, senders, apart].append(bundle)

@@ -36,8 +36,8 @@ from sros_tool.pki.keys import algorithm
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import Right, policy_rights
-from sros_tool.report.compose import Source
-from sros_tool.report.picture import Enclave, Finding, Origin, Validity
+from sros_tool.report.compose import PictureSource
+from sros_tool.report.picture import PicturedEnclave, PicturedFinding, SourceTitle, Validity
 from sros_tool.resources import policies_dir
 from sros_tool.translate import governance_for
 from sros_tool.validity import iso
@@ -47,7 +47,7 @@ _LINK = re.compile(r"(it is a link to nothing) \([^)]*\)")
 _AUTHORITY_FILES = "*_ca.cert.pem"
 
 
-def read_source(path: Path, *, now: datetime) -> Source:
+def read_source(path: Path, *, now: datetime) -> PictureSource:
     """What lies at ``path``: a policy, permissions, an enclave, a keystore, or an observation.
 
     An observation is a policy that was learned, or what ``sros generate_policy --json`` prints.
@@ -56,9 +56,9 @@ def read_source(path: Path, *, now: datetime) -> Source:
     if path.is_file() and read_bytes(path, "file").lstrip()[:1] == b"{":
         return _observation(path)
     read = load_rights(path)
-    findings = tuple(Finding(note.id, "warning", note.text) for note in read.notes)
-    source = Source(
-        Origin(base_name(path), read.kind), read.rights, findings=findings, scope=read.scope
+    findings = tuple(PicturedFinding(note.id, "warning", note.text) for note in read.notes)
+    source = PictureSource(
+        SourceTitle(base_name(path), read.kind), read.rights, findings=findings, scope=read.scope
     )
     if read.kind == "policy":
         source = replace(source, nodes=_nodes(read_policy(path)))
@@ -75,7 +75,9 @@ def read_source(path: Path, *, now: datetime) -> Source:
     )
 
 
-def with_findings(source: Source, path: Path, findings: Iterable[Finding]) -> Source:
+def with_findings(
+    source: PictureSource, path: Path, findings: Iterable[PicturedFinding]
+) -> PictureSource:
     """``source``, which lies at ``path``, with more findings, which then name no other place.
 
     A finding is of an enclave only if the source has one of that name.
@@ -115,7 +117,7 @@ def _nodes(policy: Policy) -> dict[str, tuple[str, ...]]:
     }
 
 
-def _observation(path: Path) -> Source:
+def _observation(path: Path) -> PictureSource:
     try:
         observed = from_json(json.loads(read_bytes(path, "file")))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
@@ -125,9 +127,9 @@ def _observation(path: Path) -> Source:
         ) from error
     learned = learn(observed)
     policy = learned.policy()
-    notes = tuple(Finding(note.id, "note", note.text) for note in learned.notes)
-    return Source(
-        Origin(base_name(path), "observation"),
+    notes = tuple(PicturedFinding(note.id, "note", note.text) for note in learned.notes)
+    return PictureSource(
+        SourceTitle(base_name(path), "observation"),
         policy_rights(policy),
         _nodes(policy),
         findings=notes,
@@ -137,13 +139,13 @@ def _observation(path: Path) -> Source:
 # ── keystores ──────────────────────────────────────────────────────────────────────────────
 
 
-def _with_keystore(source: Source, root: Path, now: datetime) -> Source:
+def _with_keystore(source: PictureSource, root: Path, now: datetime) -> PictureSource:
     findings = list(source.findings)
     governance = None
     try:
         governance = load_governance(root, load_ca_certificate(root, PERMISSIONS))
     except SrosError as error:
-        findings.append(Finding("view.no-governance", "error", str(error)))
+        findings.append(PicturedFinding("view.no-governance", "error", str(error)))
     enclaves, validities = [], set()
     for name in enclave_names(root):
         folder = enclave_path(root, name)
@@ -154,7 +156,7 @@ def _with_keystore(source: Source, root: Path, now: datetime) -> Source:
     try:
         validities |= set(_authorities(root))
     except SrosError as error:
-        findings.append(Finding("view.no-authorities", "error", str(error)))
+        findings.append(PicturedFinding("view.no-authorities", "error", str(error)))
     return replace(
         source,
         enclaves=tuple(enclaves),
@@ -164,7 +166,7 @@ def _with_keystore(source: Source, root: Path, now: datetime) -> Source:
     )
 
 
-def _with_enclave(source: Source, folder: Path, now: datetime) -> Source:
+def _with_enclave(source: PictureSource, folder: Path, now: datetime) -> PictureSource:
     state = open_enclave(folder, now=now)
     name = next(iter(sorted(source.scope or ())), base_name(folder))
     return replace(
@@ -175,7 +177,7 @@ def _with_enclave(source: Source, folder: Path, now: datetime) -> Source:
     )
 
 
-def _described(name: str, state: OpenedEnclave, *, key_elsewhere: bool) -> Enclave:
+def _described(name: str, state: OpenedEnclave, *, key_elsewhere: bool) -> PicturedEnclave:
     problems = tuple(
         str(each)
         for each in state.problems
@@ -183,8 +185,8 @@ def _described(name: str, state: OpenedEnclave, *, key_elsewhere: bool) -> Encla
     )
     certificate = state.certificate
     if certificate is None:
-        return Enclave(name, "", problems=problems)
-    return Enclave(
+        return PicturedEnclave(name, "", problems=problems)
+    return PicturedEnclave(
         name,
         "",
         subject=subject_text(certificate.subject),
@@ -231,13 +233,13 @@ def _authorities(root: Path) -> Iterator[Validity]:
 # ── nothing of the machine ─────────────────────────────────────────────────────────────────
 
 
-def _placed(finding: Finding, known: Set[str]) -> Finding:
+def _placed(finding: PicturedFinding, known: Set[str]) -> PicturedFinding:
     if not finding.enclave or finding.enclave in known:
         return finding
     return replace(finding, enclave="", text=f"{finding.enclave}: {finding.text}")
 
 
-def _without_paths(finding: Finding, path: Path) -> Finding:
+def _without_paths(finding: PicturedFinding, path: Path) -> PicturedFinding:
     text, remedy = (_without_path(each, path) for each in (finding.text, finding.remedy))
     return replace(finding, text=text, remedy=remedy)
 

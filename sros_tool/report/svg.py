@@ -21,7 +21,7 @@ from sros_tool.report.layout import (
     Scene,
     counted,
 )
-from sros_tool.report.picture import Level, Mark, Overlay, Picture
+from sros_tool.report.picture import Overlay, OverlaySide, Picture, WireLevel
 
 _HEAD = 40
 _STYLE = """\
@@ -72,9 +72,9 @@ GLYPHS = {
 }
 """What stands for a kind of names, 13 by 13: lines, two arrows, a target, a rhombus."""
 LOCKS = {
-    Level.ENCRYPT: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 5 0V6M6.5 8.3v2",
-    Level.SIGN: "M1.5 12h10M2.5 9.5l1-2.6L9.3 1.2l1.8 1.8L5.2 8.7z",
-    Level.NONE: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 4.8-1",
+    WireLevel.ENCRYPT: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 5 0V6M6.5 8.3v2",
+    WireLevel.SIGN: "M1.5 12h10M2.5 9.5l1-2.6L9.3 1.2l1.8 1.8L5.2 8.7z",
+    WireLevel.NONE: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 4.8-1",
 }
 """What stands for a protection, 13 by 13: a lock, a pen, an open lock."""
 
@@ -105,7 +105,7 @@ def render_svg(picture: Picture, scene: Scene) -> str:
             f'<text class="small" x="{frame.x + 8}" y="{frame.y + 16}">{escape(frame.title)}</text>'
         )
     # What must not be overlooked is drawn last.
-    rank = {Mark.BOTH: 0, Mark.FIRST: 1, Mark.SECOND: 2}
+    rank = {OverlaySide.BOTH: 0, OverlaySide.FIRST: 1, OverlaySide.SECOND: 2}
     for link in sorted(
         scene.links, key=lambda each: (each.qualifier is not ALLOW, rank[each.mark])
     ):
@@ -145,8 +145,8 @@ def link_text(link: Link, overlay: Overlay | None) -> str:
     text = f"{link.qualifier.value} {', '.join(link.rights)}"
     if link.wildcard:
         text += " (by a wildcard)"
-    if overlay and link.mark is not Mark.BOTH:
-        text += f": {overlay.first if link.mark is Mark.FIRST else overlay.second}"
+    if overlay and link.mark is not OverlaySide.BOTH:
+        text += f": {overlay.first if link.mark is OverlaySide.FIRST else overlay.second}"
     return f"{text}, {LEVEL_NAMES[link.level]}"
 
 
@@ -154,7 +154,7 @@ def link_classes(link: Link) -> str:
     """The classes of a link: how it is protected, said, marked."""
     classes = ["link", link.level.value]
     classes += ["wild"] if link.wildcard else []
-    classes += [link.mark.value] if link.mark is not Mark.BOTH else []
+    classes += [link.mark.value] if link.mark is not OverlaySide.BOTH else []
     classes += ["deny"] if link.qualifier is not ALLOW else []
     return " ".join(classes)
 

@@ -9,8 +9,8 @@ from xml.sax.saxutils import escape
 
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.report.compose import Context, Source, compose
-from sros_tool.report.picture import Edge, Origin, Picture
+from sros_tool.report.compose import Context, PictureSource, compose
+from sros_tool.report.picture import Edge, Picture, SourceTitle
 from sros_tool.report.sources import common_rights
 from sros_tool.resources import policies_dir
 from tests.support.children import PATIENCE
@@ -43,11 +43,11 @@ def group(kind: str, right: str, *names: str, qualifier: str = "ALLOW") -> str:
     return f'<{kind} {right}="{qualifier}">{listed}</{kind}>'
 
 
-def source_of(folder: Path, enclaves: dict[str, str], name: str = "policy.xml") -> Source:
+def source_of(folder: Path, enclaves: dict[str, str], name: str = "policy.xml") -> PictureSource:
     """A source from groups by enclave."""
     path = folder / name
     path.write_text(policy_text(enclaves))
-    return Source(Origin(name, "policy"), policy_rights(read_policy(path)))
+    return PictureSource(SourceTitle(name, "policy"), policy_rights(read_policy(path)))
 
 
 def picture_of(folder: Path, enclaves: dict[str, str]) -> Picture:
@@ -58,7 +58,9 @@ def picture_of(folder: Path, enclaves: dict[str, str]) -> Picture:
 def mobile_robot() -> Picture:
     """The picture of the mobile robot."""
     rights = policy_rights(read_policy(MOBILE_ROBOT))
-    return compose(Source(Origin("mobile_robot.xml", "policy"), rights), Context(common_rights()))
+    return compose(
+        PictureSource(SourceTitle("mobile_robot.xml", "policy"), rights), Context(common_rights())
+    )
 
 
 def edges(picture: Picture, enclave: str) -> set[tuple[str, str, str]]:

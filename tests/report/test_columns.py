@@ -7,7 +7,7 @@ from itertools import combinations, pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.report.layout import Item, _crossings, heights, ordered
+from sros_tool.report.layout import ColumnItem, _crossings, order_columns, place_column
 
 ITEMS = st.lists(
     st.tuples(st.integers(20, 90), st.sampled_from("abc"), st.integers(-200, 900)), max_size=12
@@ -19,9 +19,9 @@ def test_items_keep_order_distance_and_the_top(
     drawn: list[tuple[int, str, int]],
 ) -> None:
     drawn.sort(key=lambda each: each[1])
-    column = [Item(str(n), height, group) for n, (height, group, _) in enumerate(drawn)]
+    column = [ColumnItem(str(n), height, group) for n, (height, group, _) in enumerate(drawn)]
     wanted = {str(n): float(centre) for n, (_, _, centre) in enumerate(drawn)}
-    tops = heights(column, wanted, gap=10, top=30, lead=24)
+    tops = place_column(column, wanted, gap=10, top=30, lead=24)
     for before, after in pairwise(column):
         room = 10 + (24 if before.group != after.group else 0)
         assert tops[after.id] >= tops[before.id] + before.height + room - 1e-6
@@ -29,8 +29,8 @@ def test_items_keep_order_distance_and_the_top(
 
 
 def test_an_item_with_room_stands_where_it_is_wanted() -> None:
-    column = [Item("a", 20), Item("b", 20)]
-    tops = heights(column, {"a": 100, "b": 300}, gap=10, top=0)
+    column = [ColumnItem("a", 20), ColumnItem("b", 20)]
+    tops = place_column(column, {"a": 100, "b": 300}, gap=10, top=0)
     assert tops == {"a": 90, "b": 290}
 
 
@@ -48,11 +48,11 @@ LINES = st.lists(
 def test_ordering_never_makes_more_crossings_and_counts_them_right(
     lines: list[tuple[str, str]],
 ) -> None:
-    left, right = ([Item(f"{side}{n}", 20, "ab"[n % 2]) for n in range(6)] for side in "lr")
+    left, right = ([ColumnItem(f"{side}{n}", 20, "ab"[n % 2]) for n in range(6)] for side in "lr")
     left.sort(key=lambda item: item.group)
     right.sort(key=lambda item: item.group)
-    middle = [Item(f"m{n}", 20) for n in range(8)]
-    columns = ordered(left, middle, right, lines)
+    middle = [ColumnItem(f"m{n}", 20) for n in range(8)]
+    columns = order_columns(left, middle, right, lines)
     place = {item.id: number for column in columns for number, item in enumerate(column)}
     crossing = sum(
         (place[a] - place[c]) * (place[b] - place[d]) < 0

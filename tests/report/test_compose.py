@@ -12,8 +12,8 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.minimize import minimize
 from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.report.compose import Context, compose, group_of, overlay, protection_of
-from sros_tool.report.picture import Level as Shown
-from sros_tool.report.picture import Mark
+from sros_tool.report.picture import OverlaySide
+from sros_tool.report.picture import WireLevel as Shown
 from sros_tool.translate import governance_for
 from tests.report.pictures import edge, group, mobile_robot, source_of
 
@@ -23,10 +23,10 @@ def test_before_and_after_are_marked_and_listed(tmp_path: Path) -> None:
     after = source_of(tmp_path, {"/a": group("topics", "publish", "/x", "/new")}, "new.xml")
     picture = overlay(before, after, "change")
     marks = {e.name: e.mark for e in picture.edges}
-    assert marks == {"/x": Mark.BOTH, "/gone": Mark.FIRST, "/new": Mark.SECOND}
+    assert marks == {"/x": OverlaySide.BOTH, "/gone": OverlaySide.FIRST, "/new": OverlaySide.SECOND}
     assert [(d.mark, d.text) for d in picture.differences] == [
-        (Mark.FIRST, "/a ALLOW publish topic /gone"),
-        (Mark.SECOND, "/a ALLOW publish topic /new"),
+        (OverlaySide.FIRST, "/a ALLOW publish topic /gone"),
+        (OverlaySide.SECOND, "/a ALLOW publish topic /new"),
     ]
     assert picture.title == "old.xml and new.xml"
 
@@ -35,7 +35,7 @@ def test_a_wildcard_that_became_names_is_a_difference_though_nothing_moved(tmp_p
     before = source_of(tmp_path, {"/a": group("topics", "publish", "/*")}, "old.xml")
     after = source_of(tmp_path, {"/a": group("topics", "publish", "/x")}, "new.xml")
     picture = overlay(before, after, "change")
-    assert edge(picture, "/a", "publish", "/x").mark is Mark.BOTH
+    assert edge(picture, "/a", "publish", "/x").mark is OverlaySide.BOTH
     assert {d.text: d.notes for d in picture.differences} == {
         "/a ALLOW publish topic /*": (),
         "/a ALLOW publish topic /x": ("the other has it by publish topic /*",),
@@ -53,18 +53,18 @@ def test_over_privilege_stands_out_and_agrees_with_minimize_policy(tmp_path: Pat
     picture = overlay(first, second, "use")
     marks = {(e.enclave, e.name): e.mark for e in picture.edges}
     assert marks == {
-        ("/talker", "/chatter"): Mark.BOTH,
-        ("/talker", "/log1"): Mark.BOTH,
-        ("/talker", "/status"): Mark.FIRST,
-        ("/talker", "/cmd_vel"): Mark.SECOND,
-        ("/talker", "/secret"): Mark.BOTH,  # a denial is never observed
-        ("/idle", "/other"): Mark.BOTH,  # nothing is known of it
+        ("/talker", "/chatter"): OverlaySide.BOTH,
+        ("/talker", "/log1"): OverlaySide.BOTH,
+        ("/talker", "/status"): OverlaySide.FIRST,
+        ("/talker", "/cmd_vel"): OverlaySide.SECOND,
+        ("/talker", "/secret"): OverlaySide.BOTH,  # a denial is never observed
+        ("/idle", "/other"): OverlaySide.BOTH,  # nothing is known of it
     }
     assert {e.path: e.observed for e in picture.enclaves} == {"/talker": True, "/idle": False}
     use = minimize(read_policy(tmp_path / "policy.xml"), second.rights).uses[0]
     talker = [e for e in picture.edges if e.enclave == "/talker" and e.name != "/secret"]
-    assert use.allowed_pairs == sum(e.mark is not Mark.SECOND for e in talker)
-    assert use.observed_pairs == sum(e.mark is Mark.BOTH for e in talker)
+    assert use.allowed_pairs == sum(e.mark is not OverlaySide.SECOND for e in talker)
+    assert use.observed_pairs == sum(e.mark is OverlaySide.BOTH for e in talker)
 
 
 def test_what_a_wildcard_reaches_and_nobody_used_is_counted(tmp_path: Path) -> None:
@@ -77,11 +77,11 @@ def test_what_a_wildcard_reaches_and_nobody_used_is_counted(tmp_path: Path) -> N
     picture = overlay(source_of(tmp_path, allowed), source_of(tmp_path, used, "seen.xml"), "use")
     assert [(d.mark, d.text, d.notes) for d in picture.differences] == [
         (
-            Mark.FIRST,
+            OverlaySide.FIRST,
             "/r ALLOW subscribe topic /*",
             ("4 of the 6 names that it reaches were never observed",),
         ),
-        (Mark.FIRST, "/w ALLOW publish topic /t0", ()),
+        (OverlaySide.FIRST, "/w ALLOW publish topic /t0", ()),
     ]
 
 

@@ -17,10 +17,10 @@ from sros_tool.keystore.reader import governance_of
 from sros_tool.keystore.rights import load_rights
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
-from sros_tool.report.compose import Source, compose
+from sros_tool.report.compose import PictureSource, compose
 from sros_tool.report.layout import scenes_of
 from sros_tool.report.page import render_page
-from sros_tool.report.picture import Origin, Validity
+from sros_tool.report.picture import SourceTitle, Validity
 from sros_tool.resources import policies_dir
 from tests.report.pictures import (
     HOSTILE,
@@ -266,7 +266,9 @@ def test_what_ends_at_the_same_moment_is_one_row_where_there_is_much(
 ) -> None:
     source = tmp_path / "large.xml"
     source.write_text(large_policy(10, 10, 2))
-    picture = compose(Source(Origin("large", "keystore"), policy_rights(read_policy(source))))
+    picture = compose(
+        PictureSource(SourceTitle("large", "keystore"), policy_rights(read_policy(source)))
+    )
     paths = [enclave.path for enclave in picture.enclaves]
     begin, end = "2026-01-01T00:00:00Z", "2036-01-01T00:00:00Z"
     validities = [

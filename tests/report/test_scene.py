@@ -10,9 +10,9 @@ import pytest
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import DENY
 from sros_tool.policy.rights import policy_rights
-from sros_tool.report.compose import Source, compose, overlay
+from sros_tool.report.compose import PictureSource, compose, overlay
 from sros_tool.report.layout import Scene, scenes_of
-from sros_tool.report.picture import Origin, Picture
+from sros_tool.report.picture import Picture, SourceTitle
 from tests.report.pictures import group, large_policy, mobile_robot, picture_of, source_of
 
 
@@ -20,7 +20,9 @@ from tests.report.pictures import group, large_policy, mobile_robot, picture_of,
 def large(tmp_path_factory: pytest.TempPathFactory) -> Picture:
     path = tmp_path_factory.mktemp("large") / "large.xml"
     path.write_text(large_policy(10, 10, 10))
-    return compose(Source(Origin("large.xml", "policy"), policy_rights(read_policy(path))))
+    return compose(
+        PictureSource(SourceTitle("large.xml", "policy"), policy_rights(read_policy(path)))
+    )
 
 
 def check(scene: Scene) -> None:
