@@ -233,7 +233,7 @@ def _rendered(
         from sros_tool.report.picture import render_json
 
         return render_json(picture)
-    scenes = scenes_of(picture)
+    scenes = scenes_of(picture, placed=form in ("html", "svg") and not graphviz)
     if form == "html":
         from sros_tool.report.page import render_page
 

@@ -1,7 +1,8 @@
-"""What rights really reach: wildcards become the known names that they match, denials count first.
+"""Compose the picture of one source, or of two over each other, from rights and governance.
 
-Known are the exact names that any right of any source says.  An action is told as one name; a
-right to some of its parts, as a recorder has that subscribes to ``/*``, leads there all the same.
+Wildcards become the known names that they match, and denials win over permissions.  Known are the
+exact names that any right of any source has.  An action is shown as one name; a right to some of
+its parts only, such as that of a recorder that subscribes to ``/*``, leads to the action too.
 """
 
 from __future__ import annotations
@@ -42,20 +43,254 @@ from sros_tool.report.picture import (
     WireLevel,
 )
 
-_INSIDE = "/_action/"
-_NO_ACTION = Right("", ALLOW, "call", "")
-_WHOLE: dict[str, frozenset[tuple[str, str]]] = {
-    right: frozenset(
-        (part.right, part.name.removeprefix(_INSIDE))
-        for part in parts(_NO_ACTION._replace(right=right))
-    )
-    for right in ("call", "execute")
+_OVERLAYS = {
+    "use": Overlay("use", "allowed, never observed", "observed, not allowed"),
+    "change": Overlay("change", "removed", "added"),
+    "drift": Overlay("drift", "only in the policy", "only in what was signed"),
 }
-_Found = dict[Qualifier, set[str]]
+"""The meaning of two sources over each other, by the kind of overlay."""
+
+
+@dataclass(frozen=True, slots=True)
+class PictureSource:
+    """What was read of one source.
+
+    ``nodes`` are the nodes of each enclave, ``enclaves`` what is known of their certificates;
+    ``scope`` are the enclaves of which the source can speak, None for all.
+    """
+
+    origin: SourceTitle
+    rights: frozenset[Right]
+    nodes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    enclaves: tuple[PicturedEnclave, ...] = ()
+    governance: Governance | None = None
+    validities: tuple[Validity, ...] = ()
+    findings: tuple[PicturedFinding, ...] = ()
+    scope: frozenset[str] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What is known in addition to the sources.
+
+    ``common`` are the rights that every node needs; ``hosts`` says which host an enclave runs on,
+    by the enclave or by the namespace that it is in.
+    """
+
+    common: Sequence[Right] = ()
+    hosts: Mapping[str, str] = field(default_factory=dict)
+
+
+def compose(first: PictureSource, context: Context = Context()) -> Picture:
+    """Return the picture of one source."""
+    known = Known(first.rights)
+    edges = edges_of(first.rights, known, context.common)
+    stated = dict.fromkeys(folded(first.rights), OverlaySide.BOTH)
+    return _picture((first,), edges, stated, known, context)
+
+
+def overlay(
+    first: PictureSource, second: PictureSource, kind: str, context: Context = Context()
+) -> Picture:
+    """Return the picture of two sources over each other; ``kind`` is a key of `_OVERLAYS`."""
+    scope = first.scope if second.scope is None else second.scope
+    rights = [
+        frozenset(each for each in side.rights if scope is None or each.enclave in scope)
+        for side in (first, second)
+    ]
+    known = Known(rights[0] | rights[1])
+    sides = [edges_of(each, known, context.common) for each in rights]
+    edges = _marked(*sides, allowed_by=kind == "use")
+    normal = [folded(each) for each in rights]
+    stated = {
+        right: OverlaySide.BOTH
+        if right in normal[0] and right in normal[1]
+        else (OverlaySide.FIRST if right in normal[0] else OverlaySide.SECOND)
+        for right in normal[0] | normal[1]
+    }
+    unseen: frozenset[str] = frozenset()
+    if kind == "use":
+        unseen = frozenset(each.enclave for each in rights[0] - rights[1])
+        unseen -= {each.enclave for each in rights[1]}
+        edges = [_neutral(edge, unseen) for edge in edges]
+    picture = _picture((first, second), edges, stated, known, context)
+    return replace(
+        picture,
+        overlay=_OVERLAYS[kind],
+        differences=_unused(edges) if kind == "use" else _changed(*rights),
+        enclaves=tuple(replace(e, observed=e.path not in unseen) for e in picture.enclaves),
+    )
+
+
+def union(sources: Sequence[PictureSource]) -> PictureSource:
+    """Return several observations as one source."""
+    nodes: dict[str, set[str]] = defaultdict(set)
+    for source in sources:
+        for path, found in source.nodes.items():
+            nodes[path].update(found)
+    title = " and ".join(source.origin.title for source in sources)
+    return PictureSource(
+        SourceTitle(title, "observation"),
+        frozenset(right for source in sources for right in source.rights),
+        {path: tuple(sorted(found)) for path, found in nodes.items()},
+        findings=tuple(each for source in sources for each in source.findings),
+    )
+
+
+def _picture(
+    sources: Sequence[PictureSource],
+    edges: Iterable[Edge],
+    stated: Mapping[Right, OverlaySide],
+    known: Known,
+    context: Context,
+) -> Picture:
+    edges = tuple(sorted(edges, key=_edge_order))
+    governance = next((each.governance for each in reversed(sources) if each.governance), None)
+    names = sorted({(edge.kind, edge.name) for edge in edges})
+    return Picture(
+        title=" and ".join(each.origin.title for each in sources),
+        origins=tuple(each.origin for each in sources),
+        enclaves=_enclaves(sources, stated, known, context),
+        names=tuple(
+            Name(
+                kind,
+                name,
+                namespace_of(name),
+                protection_of(governance, kind, name),
+                is_expression(name),
+            )
+            for kind, name in names
+        ),
+        edges=edges,
+        validities=tuple(sorted({each for source in sources for each in source.validities})),
+        findings=tuple(dict.fromkeys(each for source in sources for each in source.findings)),
+    )
+
+
+def _edge_order(edge: Edge) -> tuple[str, int, str, str, tuple[str, ...], str]:
+    right = RIGHT_ORDER[edge.right]
+    return edge.enclave, right, edge.name, edge.qualifier, edge.parts, edge.mark
+
+
+def _enclaves(
+    sources: Sequence[PictureSource],
+    stated: Mapping[Right, OverlaySide],
+    known: Known,
+    context: Context,
+) -> tuple[PicturedEnclave, ...]:
+    described = {each.path: each for source in sources for each in source.enclaves}
+    statements: dict[str, list[Statement]] = defaultdict(list)
+    for right in sorted(stated, key=order):
+        reaches = len(known.reached(right.kind, right.name))
+        statements[right.enclave].append(
+            Statement(right.qualifier, right.right, right.kind, right.name, reaches, stated[right])
+        )
+    nodes: dict[str, set[str]] = defaultdict(set)
+    for source in sources:
+        for path, found in source.nodes.items():
+            nodes[path].update(found)
+    return tuple(
+        replace(
+            described.get(path, PicturedEnclave(path, "")),
+            group=group_of(path, context.hosts),
+            nodes=tuple(sorted(nodes.get(path, ()))),
+            statements=tuple(statements.get(path, ())),
+        )
+        for path in sorted({*described, *statements, *nodes})
+    )
+
+
+def group_of(enclave: str, hosts: Mapping[str, str]) -> str:
+    """Return the host of an enclave if it is known, else the namespace of the enclave."""
+    place = enclave
+    while place:
+        if place in hosts:
+            return hosts[place]
+        place = place.rpartition("/")[0]
+    return hosts.get("/", namespace_of(enclave))
+
+
+def namespace_of(name: str) -> str:
+    """Return the namespace of a name: the part before its last slash."""
+    return name.rpartition("/")[0] or "/"
+
+
+# ── two sources over each other ─────────────────────────────────────────────────────────
+
+
+def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) -> list[Edge]:
+    """Return the edges of both sides, each marked with its side.
+
+    An edge that both have is by a wildcard only if it is on both sides; with ``allowed_by``, if it
+    is on the first: an observed right always has its exact name.
+    """
+    sides = [{_identity(edge): edge for edge in side} for side in (first, second)]
+    found = []
+    for key in {**sides[0], **sides[1]}:
+        one, other = sides[0].get(key), sides[1].get(key)
+        if one and other:
+            both = tuple(sorted({*one.by, *other.by})) if one.by and other.by else ()
+            found.append(one if allowed_by else replace(one, by=both))
+        elif one:
+            found.append(replace(one, mark=OverlaySide.FIRST))
+        elif other:
+            found.append(replace(other, mark=OverlaySide.SECOND))
+    return found
+
+
+def _neutral(edge: Edge, unseen: frozenset[str]) -> Edge:
+    """Return ``edge`` marked as of both sides if it is a denial or of an ``unseen`` enclave."""
+    neutral = edge.qualifier is not ALLOW or edge.enclave in unseen
+    return replace(edge, mark=OverlaySide.BOTH) if neutral else edge
+
+
+def _identity(edge: Edge) -> tuple[object, ...]:
+    return edge.enclave, edge.kind, edge.name, edge.right, edge.qualifier, edge.parts
+
+
+def _changed(first: frozenset[Right], second: frozenset[Right]) -> tuple[OverlayDifference, ...]:
+    difference = compare(first, second)
+    return tuple(
+        OverlayDifference(
+            OverlaySide.FIRST if sign == "-" else OverlaySide.SECOND,
+            str(right),
+            tuple(
+                f"the other has it by {each.told()}" for each in difference.covered.get(right, ())
+            ),
+        )
+        for sign, right in difference.lines()
+    )
+
+
+def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
+    """Return what was allowed and never observed (without what every node needs), and vice versa.
+
+    Names that wildcards reach are counted: a recorder of everything would fill pages.
+    """
+    found: dict[tuple[OverlaySide, Right], tuple[str, ...]] = {}
+    reached: dict[Right, list[bool]] = defaultdict(list)
+    for edge in sorted(edges, key=_edge_order):
+        for name in edge.by:
+            right = Right(edge.enclave, edge.qualifier, edge.right, name)
+            reached[right].append(edge.mark is OverlaySide.FIRST and not edge.common)
+        if edge.mark is not OverlaySide.BOTH and not edge.common and not edge.by:
+            right = Right(edge.enclave, edge.qualifier, edge.right, edge.name)
+            found[edge.mark, right] = ()
+    for right, unused in reached.items():
+        if any(unused):
+            note = f"{sum(unused)} of the {len(unused)} names that it reaches were never observed"
+            found[OverlaySide.FIRST, right] = (note,)
+    return tuple(
+        OverlayDifference(mark, str(right), notes)
+        for (mark, right), notes in sorted(found.items(), key=lambda each: order(each[0][1]))
+    )
+
+
+# ── the names that rights reach ─────────────────────────────────────────────────────────
 
 
 class Known:
-    """The exact names that rights say: of topics and services, and which of them are actions."""
+    """The exact names in rights: of topics and services, and which of them are actions."""
 
     def __init__(self, rights: Iterable[Right]) -> None:
         rights = frozenset(rights)
@@ -76,7 +311,7 @@ class Known:
                 self._open[part.kind].append(part.name)
 
     def reached(self, kind: str, name: str) -> tuple[str, ...]:
-        """The known topics, services or actions that a name means: itself, if it is no wildcard."""
+        """Return the known names that a wildcard matches; an exact name is returned itself."""
         if not is_expression(name):
             return (name,)
         key = (kind, name)
@@ -85,7 +320,7 @@ class Known:
         return self._matched[key]
 
     def drawn(self, right: Right) -> tuple[str, ...]:
-        """The names to which a right leads: known ones, and wildcards that reach none of those.
+        """Return the names to which a right leads: known ones, and wildcards that match none.
 
         An ALLOW leads to such a wildcard where they have names in common, a DENY where nothing
         of it is left.
@@ -109,8 +344,20 @@ class Known:
         return found
 
 
+_INSIDE = "/_action/"
+_NO_ACTION = Right("", ALLOW, "call", "")
+_WHOLE: dict[str, frozenset[tuple[str, str]]] = {
+    right: frozenset(
+        (part.right, part.name.removeprefix(_INSIDE))
+        for part in parts(_NO_ACTION._replace(right=right))
+    )
+    for right in ("call", "execute")
+}
+_Found = dict[Qualifier, set[str]]
+
+
 def edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = ()) -> list[Edge]:
-    """Every right and denial as edges to the names that it reaches; unsorted.
+    """Return every right and denial as edges to the names that it reaches; unsorted.
 
     A wildcard that reaches no known name leads to a name of its own.  ``common`` are the rights
     that every node needs, of whatever enclave.
@@ -152,7 +399,7 @@ def _action_edges(
     qualifier: Qualifier,
     members: dict[tuple[str, str], set[str]],
 ) -> Iterable[Edge]:
-    """One edge for all of an action's parts, and one for each right to some of them."""
+    """Yield one edge for all parts of an action, and one for each right to some of them."""
     remaining = dict(members)
     for right, needed in _WHOLE.items():
         if needed <= members.keys():
@@ -169,7 +416,7 @@ def _action_edges(
 
 
 def _by(names: set[str], *, action: bool = False) -> tuple[str, ...]:
-    """The expressions among ``names``, or none where the name is also said by itself."""
+    """Return the expressions among ``names``, or none if the exact name is among them."""
     if "" in names:
         return ()
     return tuple(
@@ -184,11 +431,11 @@ def _is_common(right: str, name: str, common: Sequence[Right]) -> bool:
     )
 
 
-_ORDER = list(WireLevel)
+# ── protection ──────────────────────────────────────────────────────────────────────────
 
 
 def protection_of(governance: Governance | None, kind: str, name: str) -> Protection:
-    """The weakest protection of the DDS topics of a name, in the governance's first domain rule.
+    """Return the weakest protection of the DDS topics of a name, by the first domain rule.
 
     Whatever protects whole RTPS messages protects every topic in them.  A topic that no rule
     names is not protected: vendors refuse it.  Access is controlled where it is for each of the
@@ -198,12 +445,12 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
         return UNKNOWN
     domain = governance.domain_access_rules[0]
     topics = _topics(kind, name)
-    found = [_protection(domain, rule) for topic in topics for rule in _rules_for(domain, topic)]
+    found = [_protection(domain, rule) for topic in topics for rule in _rules_of(domain, topic)]
     anywhere = [
         rule
         for each in governance.domain_access_rules
         for topic in topics
-        for rule in _rules_for(each, topic)
+        for rule in _rules_of(each, topic)
     ]
     weakest = min(
         found, key=lambda each: _ORDER.index(each.level), default=Protection(WireLevel.NONE)
@@ -215,6 +462,9 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
     )
 
 
+_ORDER = list(WireLevel)
+
+
 def _topics(kind: str, name: str) -> tuple[str, ...]:
     if kind == "dds":
         return (name,)
@@ -222,8 +472,8 @@ def _topics(kind: str, name: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(topic for each in found for topic in each.publish + each.subscribe))
 
 
-def _rules_for(domain: DomainRule, topic: str) -> Iterator[TopicRule]:
-    """The rule for a topic; for a wildcard every rule that may hold for a topic of it."""
+def _rules_of(domain: DomainRule, topic: str) -> Iterator[TopicRule]:
+    """Yield the rule of a topic; for a wildcard, every rule that may apply to a topic of it."""
     for rule in domain.topic_access_rules:
         if overlap(rule.topic_expression, topic):
             yield rule
@@ -244,249 +494,3 @@ def _protection(domain: DomainRule, rule: TopicRule) -> Protection:
 
 def _level(kind: str) -> WireLevel:
     return WireLevel(str(kind).partition("_")[0].lower())
-
-
-OVERLAYS = {
-    "use": Overlay("use", "allowed, never observed", "observed, not allowed"),
-    "change": Overlay("change", "removed", "added"),
-    "drift": Overlay("drift", "only in the policy", "only in what was signed"),
-}
-"""What two sources mean together, by what was laid over what."""
-
-
-@dataclass(frozen=True, slots=True)
-class PictureSource:
-    """What was read of one source.
-
-    ``nodes`` are the nodes of each enclave, ``enclaves`` what is known of their certificates;
-    ``scope`` are the enclaves of which the source can speak, None for all.
-    """
-
-    origin: SourceTitle
-    rights: frozenset[Right]
-    nodes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    enclaves: tuple[PicturedEnclave, ...] = ()
-    governance: Governance | None = None
-    validities: tuple[Validity, ...] = ()
-    findings: tuple[PicturedFinding, ...] = ()
-    scope: frozenset[str] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Context:
-    """What is known beside the sources.
-
-    ``common`` are the rights that every node needs; ``hosts`` says which host an enclave runs on,
-    by the enclave or by the namespace that it is in.
-    """
-
-    common: Sequence[Right] = ()
-    hosts: Mapping[str, str] = field(default_factory=dict)
-
-
-def compose(first: PictureSource, context: Context = Context()) -> Picture:
-    """The picture of one source."""
-    known = Known(first.rights)
-    edges = edges_of(first.rights, known, context.common)
-    stated = dict.fromkeys(folded(first.rights), OverlaySide.BOTH)
-    return _picture((first,), edges, stated, known, context)
-
-
-def union(sources: Sequence[PictureSource]) -> PictureSource:
-    """Several observations as one source."""
-    nodes: dict[str, set[str]] = defaultdict(set)
-    for source in sources:
-        for path, found in source.nodes.items():
-            nodes[path].update(found)
-    title = " and ".join(source.origin.title for source in sources)
-    return PictureSource(
-        SourceTitle(title, "observation"),
-        frozenset(right for source in sources for right in source.rights),
-        {path: tuple(sorted(found)) for path, found in nodes.items()},
-        findings=tuple(each for source in sources for each in source.findings),
-    )
-
-
-def overlay(
-    first: PictureSource, second: PictureSource, kind: str, context: Context = Context()
-) -> Picture:
-    """The picture of two sources; ``kind`` is a key of `OVERLAYS`."""
-    scope = first.scope if second.scope is None else second.scope
-    rights = [
-        frozenset(each for each in side.rights if scope is None or each.enclave in scope)
-        for side in (first, second)
-    ]
-    known = Known(rights[0] | rights[1])
-    sides = [edges_of(each, known, context.common) for each in rights]
-    edges = _marked(*sides, allowed_by=kind == "use")
-    normal = [folded(each) for each in rights]
-    stated = {
-        right: OverlaySide.BOTH
-        if right in normal[0] and right in normal[1]
-        else (OverlaySide.FIRST if right in normal[0] else OverlaySide.SECOND)
-        for right in normal[0] | normal[1]
-    }
-    unseen: frozenset[str] = frozenset()
-    if kind == "use":
-        unseen = frozenset(each.enclave for each in rights[0] - rights[1])
-        unseen -= {each.enclave for each in rights[1]}
-        edges = [_neutral(edge, unseen) for edge in edges]
-    picture = _picture((first, second), edges, stated, known, context)
-    return replace(
-        picture,
-        overlay=OVERLAYS[kind],
-        differences=_unused(edges) if kind == "use" else _changed(*rights),
-        enclaves=tuple(replace(e, observed=e.path not in unseen) for e in picture.enclaves),
-    )
-
-
-def _picture(
-    sources: Sequence[PictureSource],
-    edges: Iterable[Edge],
-    stated: Mapping[Right, OverlaySide],
-    known: Known,
-    context: Context,
-) -> Picture:
-    edges = tuple(sorted(edges, key=_edge_order))
-    governance = next((each.governance for each in reversed(sources) if each.governance), None)
-    names = sorted({(edge.kind, edge.name) for edge in edges})
-    return Picture(
-        title=" and ".join(each.origin.title for each in sources),
-        origins=tuple(each.origin for each in sources),
-        enclaves=_enclaves(sources, stated, known, context),
-        names=tuple(
-            Name(
-                kind,
-                name,
-                namespace_of(name),
-                protection_of(governance, kind, name),
-                is_expression(name),
-            )
-            for kind, name in names
-        ),
-        edges=edges,
-        validities=tuple(sorted({each for source in sources for each in source.validities})),
-        findings=tuple(dict.fromkeys(each for source in sources for each in source.findings)),
-    )
-
-
-def _edge_order(edge: Edge) -> tuple[str, int, str, str, tuple[str, ...], str]:
-    right = RIGHT_ORDER[edge.right]
-    return edge.enclave, right, edge.name, edge.qualifier, edge.parts, edge.mark
-
-
-def namespace_of(name: str) -> str:
-    """The namespace of a name: what stands before its last part."""
-    return name.rpartition("/")[0] or "/"
-
-
-def group_of(enclave: str, hosts: Mapping[str, str]) -> str:
-    """The host of an enclave where it is known, else the namespace that the enclave is in."""
-    place = enclave
-    while place:
-        if place in hosts:
-            return hosts[place]
-        place = place.rpartition("/")[0]
-    return hosts.get("/", namespace_of(enclave))
-
-
-# ── enclaves ───────────────────────────────────────────────────────────────────────────────
-
-
-def _enclaves(
-    sources: Sequence[PictureSource],
-    stated: Mapping[Right, OverlaySide],
-    known: Known,
-    context: Context,
-) -> tuple[PicturedEnclave, ...]:
-    described = {each.path: each for source in sources for each in source.enclaves}
-    statements: dict[str, list[Statement]] = defaultdict(list)
-    for right in sorted(stated, key=order):
-        reaches = len(known.reached(right.kind, right.name))
-        statements[right.enclave].append(
-            Statement(right.qualifier, right.right, right.kind, right.name, reaches, stated[right])
-        )
-    nodes: dict[str, set[str]] = defaultdict(set)
-    for source in sources:
-        for path, found in source.nodes.items():
-            nodes[path].update(found)
-    return tuple(
-        replace(
-            described.get(path, PicturedEnclave(path, "")),
-            group=group_of(path, context.hosts),
-            nodes=tuple(sorted(nodes.get(path, ()))),
-            statements=tuple(statements.get(path, ())),
-        )
-        for path in sorted({*described, *statements, *nodes})
-    )
-
-
-# ── one over the other ─────────────────────────────────────────────────────────────────────
-
-
-def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) -> list[Edge]:
-    """The edges of both sides, each with where it stands.
-
-    What both have is reached by a wildcard only if both say so; with ``allowed_by``, if the first
-    does: what was observed always has a name of its own.
-    """
-    sides = [{_identity(edge): edge for edge in side} for side in (first, second)]
-    found = []
-    for key in {**sides[0], **sides[1]}:
-        one, other = sides[0].get(key), sides[1].get(key)
-        if one and other:
-            both = tuple(sorted({*one.by, *other.by})) if one.by and other.by else ()
-            found.append(one if allowed_by else replace(one, by=both))
-        elif one:
-            found.append(replace(one, mark=OverlaySide.FIRST))
-        elif other:
-            found.append(replace(other, mark=OverlaySide.SECOND))
-    return found
-
-
-def _neutral(edge: Edge, unseen: frozenset[str]) -> Edge:
-    """A denial is never observed, and of an enclave that was not observed nothing is known."""
-    neutral = edge.qualifier is not ALLOW or edge.enclave in unseen
-    return replace(edge, mark=OverlaySide.BOTH) if neutral else edge
-
-
-def _identity(edge: Edge) -> tuple[object, ...]:
-    return edge.enclave, edge.kind, edge.name, edge.right, edge.qualifier, edge.parts
-
-
-def _changed(first: frozenset[Right], second: frozenset[Right]) -> tuple[OverlayDifference, ...]:
-    difference = compare(first, second)
-    return tuple(
-        OverlayDifference(
-            OverlaySide.FIRST if sign == "-" else OverlaySide.SECOND,
-            str(right),
-            tuple(
-                f"the other has it by {each.told()}" for each in difference.covered.get(right, ())
-            ),
-        )
-        for sign, right in difference.lines()
-    )
-
-
-def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
-    """What was allowed and never observed, without what every node needs; and the other way.
-
-    What wildcards reach is counted: a recorder of everything would fill pages.
-    """
-    found: dict[tuple[OverlaySide, Right], tuple[str, ...]] = {}
-    reached: dict[Right, list[bool]] = defaultdict(list)
-    for edge in sorted(edges, key=_edge_order):
-        for name in edge.by:
-            right = Right(edge.enclave, edge.qualifier, edge.right, name)
-            reached[right].append(edge.mark is OverlaySide.FIRST and not edge.common)
-        if edge.mark is not OverlaySide.BOTH and not edge.common and not edge.by:
-            right = Right(edge.enclave, edge.qualifier, edge.right, edge.name)
-            found[edge.mark, right] = ()
-    for right, unused in reached.items():
-        if any(unused):
-            told = f"{sum(unused)} of the {len(unused)} names that it reaches were never observed"
-            found[OverlaySide.FIRST, right] = (told,)
-    return tuple(
-        OverlayDifference(mark, str(right), notes)
-        for (mark, right), notes in sorted(found.items(), key=lambda each: order(each[0][1]))
-    )

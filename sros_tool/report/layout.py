@@ -1,11 +1,12 @@
-"""A picture placed on paper, as values: senders left, names in the middle, listeners right.
+"""Lay out a picture in three columns: senders left, names in the middle, listeners right.
 
-A scene is the same for every format that draws it, and for the page.  Lengths are in pixels at
-the size at which the text is read; x grows to the right and y downwards.
+A scene is the same for SVG and the page; Graphviz and Mermaid take the cards and place them
+themselves.  Lengths are in pixels at the size at which the text is read; x grows to the right and
+y downwards.
 
 A layered layout of three layers, after Sugiyama: the order of each column follows the barycentre
-of its neighbours, and the heights are those nearest to them that leave everybody's room (found by
-pooling adjacent violators).  It depends on nothing but its input.
+of its neighbours, and each card stands as near to its neighbours as the others leave room (found
+by pooling adjacent violators).  It depends on nothing but its input.
 """
 
 from __future__ import annotations
@@ -30,6 +31,67 @@ from sros_tool.report.picture import (
 SIDE_WIDTH, NAMES_WIDTH, GUTTER = 184, 330, 110
 LINE, PAD, SMALL = 16, 7, 14
 """The heights of a line of text, of the room around it, and of a line of a note."""
+_GAP, _LEAD, _TOP, _MARGIN = 9.0, 24.0, 34.0, 14
+_SIDE_LETTERS, _NAMES_LETTERS = 20, 35  # letters of a line on a card
+_ONLOOKER_LINES, _ONLOOKER_SHARE = 8, 0.3  # an onlooker reaches more bundles, and more of them all
+_MOST_ONLOOKERS = 26  # as there are letters
+_FEW_BUNDLES, _MOST_BUNDLES = 24, 80  # above these, own names are counted, and bundles joined
+_MOST_ENCLAVES = 40  # more are drawn by groups
+_MOST_NAMES, _SHOWN_NAMES = 8, 4  # all names are on a card up to 8, and 4 of them if more
+_SWEEPS = 24
+
+KIND_NAMES = {"topics": "topic", "services": "service", "actions": "action", "dds": "DDS topic"}
+LEVEL_NAMES = {
+    WireLevel.ENCRYPT: "encrypted",
+    WireLevel.SIGN: "signed, readable",
+    WireLevel.NONE: "not protected",
+    WireLevel.UNKNOWN: "protection unknown",
+}
+ONLOOKERS = {
+    "publish": "also written by",
+    "subscribe": "also read by",
+    "request": "also called by",
+    "reply": "also served by",
+    "call": "also called by",
+    "execute": "also carried out by",
+}
+REACHES = {
+    "publish": "writes",
+    "subscribe": "reads",
+    "request": "calls",
+    "reply": "serves",
+    "call": "calls",
+    "execute": "carries out",
+}
+COMMON = {
+    "topics": "used by every node",
+    "services": "served by every node",
+    "actions": "used by every node",
+    "dds": "used by every node",
+}
+"""The note on a card whose names every node may use, where those rights are not drawn."""
+OWN = "own:"
+SENDERS, LISTENERS = "may send", "may receive"
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Cards and the links between them.
+
+    ``shown`` names are drawn or counted in the enclave that alone may use them; ``hidden`` ones
+    are not, as only what every node needs is said of them.
+    """
+
+    id: str
+    title: str
+    width: int
+    height: int
+    cards: tuple[Card, ...]
+    links: tuple[Link, ...]
+    frames: tuple[Frame, ...]
+    onlookers: tuple[Onlooker, ...]
+    hidden: int = 0
+    shown: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,15 +121,6 @@ class Card:
 
 
 @dataclass(frozen=True, slots=True)
-class Onlooker:
-    """Who reaches so much that lines would hide all others: a letter stands on what it reaches."""
-
-    tag: str
-    enclave: str
-    right: str
-
-
-@dataclass(frozen=True, slots=True)
 class Link:
     """A line from the right edge of a card to the left edge of another one; the arrow is there.
 
@@ -86,6 +139,15 @@ class Link:
 
 
 @dataclass(frozen=True, slots=True)
+class Onlooker:
+    """Who reaches so much that lines would hide all others; its letter is on what it reaches."""
+
+    tag: str
+    enclave: str
+    right: str
+
+
+@dataclass(frozen=True, slots=True)
 class Frame:
     """The title of a group of enclaves that stand together, and the room that they take."""
 
@@ -96,258 +158,60 @@ class Frame:
     height: int
 
 
-@dataclass(frozen=True, slots=True)
-class Scene:
-    """Cards and the links between them.
+def scenes_of(picture: Picture, *, placed: bool = True) -> tuple[Scene, ...]:
+    """Return the scenes of a picture, the one to begin with first.
 
-    ``shown`` names are drawn or counted in the enclave that alone may use them; ``hidden`` ones
-    are not, as only what every node needs is said of them.
+    Of a robot with few enclaves: all but what every node needs, and then everything.  Of many:
+    groups with what passes between them, and then each group with its neighbours.  Without
+    ``placed``, every y and the frames are left out, for formats that place cards themselves.
     """
+    groups = {each.path: each.group for each in picture.enclaves}
+    titles = sorted(set(groups.values()))
+    essential = [edge for edge in picture.edges if not edge.common]
+    if len(groups) <= _MOST_ENCLAVES or len(titles) < 2 or len(titles) > len(groups) // 2:
+        scenes = [_scene(picture, "essential", "Overview", essential, str, placed=placed)]
+        if len(essential) < len(picture.edges):
+            title = "With what every node needs"
+            scenes.append(_scene(picture, "all", title, picture.edges, str, placed=placed))
+        return tuple(scenes)
+    # The mark of a group is a letter that no enclave begins with.
+    outside = {path: f":{group}" for path, group in groups.items()}
+    overview = outside.__getitem__
+    scenes = [_scene(picture, "essential", "Overview", essential, overview, placed=placed)]
+    for title in titles:
 
-    id: str
-    title: str
-    width: int
-    height: int
-    cards: tuple[Card, ...]
-    links: tuple[Link, ...]
-    frames: tuple[Frame, ...]
-    onlookers: tuple[Onlooker, ...]
-    hidden: int = 0
-    shown: int = 0
+        def owner(path: str, title: str = title) -> str:
+            return path if groups[path] == title else outside[path]
 
-
-_SWEEPS = 24
-
-
-@dataclass(frozen=True, slots=True)
-class ColumnItem:
-    """Something of a ``height`` in a column; items of one ``group`` stand together."""
-
-    id: str
-    height: float
-    group: str = ""
-
-
-def order_columns(
-    left: Sequence[ColumnItem],
-    middle: Sequence[ColumnItem],
-    right: Sequence[ColumnItem],
-    lines: Sequence[tuple[str, str]],
-) -> tuple[list[ColumnItem], list[ColumnItem], list[ColumnItem]]:
-    """The items of the three columns in an order with few crossings.
-
-    ``lines`` are pairs of ids, each of neighbouring columns.  Of all sweeps the best is kept.
-    """
-    near: dict[str, list[str]] = {item.id: [] for item in (*left, *middle, *right)}
-    for one, other in lines:
-        near[one].append(other)
-        near[other].append(one)
-    columns = [list(left), list(middle), list(right)]
-    best, fewest = [list(column) for column in columns], _crossings(columns, lines)
-    for sweep in range(_SWEEPS):
-        outer = (0, 2) if sweep % 2 else (2, 0)
-        for moved in (1, *outer):
-            places = _places(columns)
-            columns[moved] = _by_barycentre(columns[moved], near, places)
-        crossings = _crossings(columns, lines)
-        if crossings < fewest:
-            best, fewest = [list(column) for column in columns], crossings
-    return best[0], best[1], best[2]
+        touched = {(e.kind, e.name) for e in essential if groups[e.enclave] == title}
+        edges = [edge for edge in essential if (edge.kind, edge.name) in touched]
+        scenes.append(_scene(picture, f"group {title}", title, edges, owner, placed=placed))
+    return tuple(scenes)
 
 
-def _places(columns: Sequence[Sequence[ColumnItem]]) -> dict[str, float]:
-    """Where each item stands in its column, from 0 to 1."""
-    return {
-        item.id: (number + 0.5) / len(column)
-        for column in columns
-        for number, item in enumerate(column)
-    }
+def _scene(
+    picture: Picture,
+    name: str,
+    title: str,
+    edges: Sequence[Edge],
+    owner: Callable[[str], str],
+    *,
+    placed: bool,
+) -> Scene:
+    members: dict[str, list[str]] = defaultdict(list)
+    for enclave in picture.enclaves:
+        members[owner(enclave.path)].append(enclave.path)
+    everybody: dict[tuple[str, str], set[str]] = defaultdict(set)
+    for edge in picture.edges:
+        everybody[edge.kind, edge.name].add(owner(edge.enclave))
+    draft = _Draft(picture, edges, owner, members, everybody)
+    scene = draft.placed(name, title) if placed else draft.scene(name, title)
+    shown = len({(edge.kind, edge.name) for edge in edges})
+    return replace(scene, hidden=len(picture.names) - shown, shown=shown)
 
 
-def _by_barycentre(
-    column: Sequence[ColumnItem], near: Mapping[str, Sequence[str]], places: Mapping[str, float]
-) -> list[ColumnItem]:
-    centre = {
-        item.id: (
-            sum(places[each] for each in near[item.id]) / len(near[item.id])
-            if near[item.id]
-            else places[item.id]
-        )
-        for item in column
-    }
-    groups: dict[str, list[float]] = {}
-    for item in column:
-        groups.setdefault(item.group, []).append(centre[item.id])
-    middle = {group: sum(found) / len(found) for group, found in groups.items()}
-    return sorted(
-        column, key=lambda item: (middle[item.group], item.group, centre[item.id], item.id)
-    )
-
-
-def _crossings(columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]) -> int:
-    """How often lines cross, counted between each pair of neighbouring columns."""
-    side = {item.id: number for number, column in enumerate(columns) for item in column}
-    place = {item.id: n for column in columns for n, item in enumerate(column)}
-    total = 0
-    for first in (0, 1):
-        pairs = []
-        for one, other in lines:
-            if side[one] > side[other]:
-                one, other = other, one
-            if side[one] == first:
-                pairs.append((place[one], place[other]))
-        total += _inversions([end for _, end in sorted(pairs)], len(columns[first + 1]))
-    return total
-
-
-def _inversions(ends: Sequence[int], size: int) -> int:
-    """How many pairs stand the wrong way round, by a Fenwick tree."""
-    tree = [0] * (size + 1)
-    found = 0
-    for seen, end in enumerate(ends):
-        at, before = end + 1, 0
-        while at:
-            before += tree[at]
-            at -= at & -at
-        found += seen - before
-        at = end + 1
-        while at <= size:
-            tree[at] += 1
-            at += at & -at
-    return found
-
-
-def place_column(
-    column: Sequence[ColumnItem],
-    wanted: Mapping[str, float],
-    gap: float,
-    top: float,
-    lead: float = 0,
-) -> dict[str, float]:
-    """The upper edge of each item: near to what is ``wanted`` for its centre, and without overlap.
-
-    Items keep their order and stand ``gap`` apart, none above ``top``; the first of each group
-    has ``lead`` more room above it.
-    """
-    offsets, at, group = [], 0.0, None
-    for item in column:
-        at += lead if item.group != group else 0
-        group = item.group
-        offsets.append(at)
-        at += item.height + gap
-    # Without the offsets it is least squares under "each not above the one before".
-    blocks: list[list[float]] = []
-    for item, offset in zip(column, offsets, strict=True):
-        target = wanted.get(item.id, 0.0) - item.height / 2 - offset
-        blocks.append([max(target, top), 1])
-        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
-            mean, count = blocks.pop()
-            before = blocks[-1]
-            before[0] = (before[0] * before[1] + mean * count) / (before[1] + count)
-            before[1] += count
-    shifts = [mean for mean, count in blocks for _ in range(int(count))]
-    return {
-        item.id: shift + offset for item, offset, shift in zip(column, offsets, shifts, strict=True)
-    }
-
-
-ONLOOKERS = {
-    "publish": "also written by",
-    "subscribe": "also read by",
-    "request": "also called by",
-    "reply": "also served by",
-    "call": "also called by",
-    "execute": "also carried out by",
-}
-REACHES = {
-    "publish": "writes",
-    "subscribe": "reads",
-    "request": "calls",
-    "reply": "serves",
-    "call": "calls",
-    "execute": "carries out",
-}
-COMMON = {
-    "topics": "used by every node",
-    "services": "served by every node",
-    "actions": "used by every node",
-    "dds": "used by every node",
-}
-"""What a card says of the rights that every node has to its names, where these are not drawn."""
-KIND_NAMES = {"topics": "topic", "services": "service", "actions": "action", "dds": "DDS topic"}
-LEVEL_NAMES = {
-    WireLevel.ENCRYPT: "encrypted",
-    WireLevel.SIGN: "signed, readable",
-    WireLevel.NONE: "not protected",
-    WireLevel.UNKNOWN: "protection unknown",
-}
-OWN = "own:"
-SENDERS, LISTENERS = "may send", "may receive"
-
-
-_MOST, _SHOWN = 8, 4  # so many names stand on a card, and of more than these so many
-
-
-def counted(number: int, thing: str) -> str:
-    """As ``1 topic`` and ``2 topics``."""
-    return f"{number} {thing}{'' if number == 1 else 's'}"
-
-
-def _own_text(own: Mapping[str, int]) -> list[str]:
-    """What an enclave alone has, as ``own: 3 topics, 2 services``, on lines that are short."""
-    found = [counted(number, KIND_NAMES[kind]) for kind, number in own.items() if number]
-    lines = [f"{OWN} {', '.join(found[:2])}"]
-    return [*lines, ", ".join(found[2:])] if found[2:] else lines
-
-
-def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """What stands on the card of a bundle: names or the wildcards for them, and small notes."""
-    kind, names = KIND_NAMES[bundle.kind], bundle.names
-    if bundle.partial:
-        return (f"{_common_place(names)}/…",), (
-            f"{counted(len(names), kind)}; a line is for some of them",
-        )
-    if len(names) <= _MOST:
-        return names, ()
-    expressions = sorted({each for tie in bundle.ties for each in tie.by})
-    if expressions and all(tie.by for tie in bundle.ties):
-        return tuple(expressions[:_MOST]), (f"reaches {counted(len(names), kind)}",)
-    return names[:_SHOWN], (f"and {len(names) - _SHOWN} more {kind}s",)
-
-
-def _common_place(names: Sequence[str]) -> str:
-    """The namespace that all names are in, "" for the root."""
-    found = []
-    for parts in zip(*(name.split("/")[:-1] for name in names), strict=False):
-        if len(set(parts)) > 1:
-            break
-        found.append(parts[0])
-    return "/".join(found)
-
-
-def wrapped(text: str, letters: int) -> tuple[str, ...]:
-    """``text`` in lines of so many letters, cut after a slash or underscore where one is near."""
-    lines = []
-    while len(text) > letters:
-        cut = max(
-            text.rfind("/", letters // 2, letters), text.rfind("_", letters // 2, letters - 1)
-        )
-        cut = cut if cut > 0 else letters - 1
-        if text[cut] == "_":
-            cut += 1
-        lines.append(text[:cut])
-        text = "  " + text[cut:]
-    return (*lines, text)
-
-
-_GAP, _LEAD, _TOP, _MARGIN = 9.0, 24.0, 34.0, 14
-_SIDE_LETTERS, _NAMES_LETTERS = 20, 35
-_LEAST_LINES, _MOST_LINES, _MOST_ONLOOKERS = 8, 0.3, 26
-_FEW_BUNDLES, _MOST_BUNDLES = 24, 80
-
-
-class _Placing:
-    """Places one scene: draws up its cards, orders and places them, and ties them.
+class _Draft:
+    """A scene in the making: its cards and the ties between them, and then their places.
 
     ``members`` are the enclaves behind each node of the scene, ``everybody`` the nodes that have
     any right to a name, drawn or not.
@@ -387,44 +251,56 @@ class _Placing:
                     self._ties[(*ends, tie.qualifier, bool(tie.by), tie.mark)].add(tie.right)
 
     def _looks(self, tie: Tie) -> bool:
-        """Whether the tie is told by a letter, and not by a line."""
+        """Whether the tie is shown by a letter, and not by a line."""
         plain = tie.qualifier is ALLOW and tie.mark is OverlaySide.BOTH
         return plain and (tie.node, tie.right) in self._looking
 
     def _alone(self, bundle: Bundle) -> str:
-        """The only node that has to do with these names, onlookers aside; "" if there are more."""
+        """Return the only node with ties to these names, onlookers aside; "" if there are more."""
         looking = {tie.node for tie in bundle.ties if self._looks(tie)}
-        told = {tie.node for tie in bundle.ties if not self._looks(tie)}
+        drawn = {tie.node for tie in bundle.ties if not self._looks(tie)}
         if any(
             tie.qualifier is not ALLOW or tie.mark is not OverlaySide.BOTH for tie in bundle.ties
         ):
             return ""
         nodes = {each for name in bundle.names for each in self._everybody[bundle.kind, name]}
-        nodes -= looking - told
+        nodes -= looking - drawn
         return nodes.pop() if len(nodes) == 1 else ""
 
     def scene(self, name: str, title: str) -> Scene:
-        """The scene, without its count of names."""
+        """Return the scene with every y at 0, without frames and without its count of names."""
         cards = {card.id: card for card in self._cards()}
-        columns: list[list[ColumnItem]] = [[], [], []]
-        for card in cards.values():
-            columns[card.column].append(ColumnItem(card.id, card.height, card.group))
-        lines = sorted({ends[:2] for ends in self._ties})
-        placed = order_columns(columns[0], columns[1], columns[2], lines)
-        tops = _tops(placed, lines)
-        cards = {key: replace(card, y=round(tops[key])) for key, card in cards.items()}
-        bottom = max((card.y + card.height for card in cards.values()), default=0)
         return Scene(
             id=name,
             title=title,
             width=2 * (_MARGIN + SIDE_WIDTH + GUTTER) + NAMES_WIDTH,
-            height=bottom + _MARGIN,
-            cards=tuple(cards[item.id] for column in placed for item in column),
+            height=0,
+            cards=tuple(cards.values()),
             links=self._links(cards),
-            frames=tuple(_frames(placed, cards)),
+            frames=(),
             onlookers=tuple(
                 Onlooker(tag, node, right) for (node, right), tag in self._tags.items()
             ),
+        )
+
+    def placed(self, name: str, title: str) -> Scene:
+        """Return the scene with all cards, links and frames in their places."""
+        scene = self.scene(name, title)
+        cards = {card.id: card for card in scene.cards}
+        columns: list[list[ColumnItem]] = [[], [], []]
+        for card in cards.values():
+            columns[card.column].append(ColumnItem(card.id, card.height, card.group))
+        lines = sorted({ends[:2] for ends in self._ties})
+        ordered = order_columns(columns[0], columns[1], columns[2], lines)
+        tops = _tops(ordered, lines)
+        cards = {key: replace(card, y=round(tops[key])) for key, card in cards.items()}
+        bottom = max((card.y + card.height for card in cards.values()), default=0)
+        return replace(
+            scene,
+            height=bottom + _MARGIN,
+            cards=tuple(cards[item.id] for column in ordered for item in column),
+            links=self._links(cards),
+            frames=tuple(_frames(ordered, cards)),
         )
 
     # ── cards ──────────────────────────────────────────────────────────────────────────────
@@ -443,7 +319,7 @@ class _Placing:
             yield self._names_card(number, bundle)
 
     def _side_card(self, side: str, *, first: bool) -> Card:
-        """An enclave or group on one side; what it has alone is told on the ``first`` only."""
+        """Return the card of an enclave or group on one side; the ``first`` notes its own names."""
         node, sends = side[1:], side[0] == "s"
         members = tuple(self._members[node])
         is_group = node.startswith(":")
@@ -505,7 +381,7 @@ class _Placing:
     # ── links ──────────────────────────────────────────────────────────────────────────────
 
     def _links(self, cards: dict[str, Card]) -> tuple[Link, ...]:
-        """Links with their ends spread over the edges of the cards, so that they do not meet."""
+        """Return the links, with their ends spread over the edges of the cards."""
         keys = sorted(self._ties)
         ports: dict[tuple[str, bool], list[tuple[float, int]]] = defaultdict(list)
         for number, (source, target, *_) in enumerate(keys):
@@ -536,7 +412,7 @@ class _Placing:
 
 
 def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
-    """Who reaches so much by wildcards that its lines would hide all others, and how many names.
+    """Return who reaches so much by wildcards that its lines would hide all others: how many names.
 
     By node and right, such as ("/recorder", "subscribe").
     """
@@ -547,19 +423,77 @@ def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
         for key, by in ties.items():
             reached[key].append(bundle)
             wild[key] += bool(by)
-    most = max(_LEAST_LINES, _MOST_LINES * len(bundles))
+    most = max(_ONLOOKER_LINES, _ONLOOKER_SHARE * len(bundles))
     looking = [
         (key, sum(len(bundle.names) for bundle in found))
         for key, found in sorted(reached.items())
         if len(found) > most and 2 * wild[key] > len(found)
     ]
-    return dict(looking[:_MOST_ONLOOKERS])  # there are no more letters
+    return dict(looking[:_MOST_ONLOOKERS])
+
+
+# ── text on cards ───────────────────────────────────────────────────────────────────────
+
+
+def counted(number: int, thing: str) -> str:
+    """Return a number with its thing, as ``1 topic`` and ``2 topics``."""
+    return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
+def _own_text(own: Mapping[str, int]) -> list[str]:
+    """Return what only this enclave may use, as ``own: 3 topics, 2 services``, in short lines."""
+    found = [counted(number, KIND_NAMES[kind]) for kind, number in own.items() if number]
+    lines = [f"{OWN} {', '.join(found[:2])}"]
+    return [*lines, ", ".join(found[2:])] if found[2:] else lines
+
+
+def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the text of the card of a bundle: names or the wildcards for them, and notes."""
+    kind, names = KIND_NAMES[bundle.kind], bundle.names
+    if bundle.partial:
+        return (f"{_common_namespace(names)}/…",), (
+            f"{counted(len(names), kind)}; a line is for some of them",
+        )
+    if len(names) <= _MOST_NAMES:
+        return names, ()
+    expressions = sorted({each for tie in bundle.ties for each in tie.by})
+    if expressions and all(tie.by for tie in bundle.ties):
+        return tuple(expressions[:_MOST_NAMES]), (f"reaches {counted(len(names), kind)}",)
+    return names[:_SHOWN_NAMES], (f"and {len(names) - _SHOWN_NAMES} more {kind}s",)
+
+
+def _common_namespace(names: Sequence[str]) -> str:
+    """Return the namespace that all names are in, "" for the root."""
+    found = []
+    for parts in zip(*(name.split("/")[:-1] for name in names), strict=False):
+        if len(set(parts)) > 1:
+            break
+        found.append(parts[0])
+    return "/".join(found)
+
+
+def wrapped(text: str, letters: int) -> tuple[str, ...]:
+    """Return ``text`` in lines of so many letters, cut at a slash or underscore if one is near."""
+    lines = []
+    while len(text) > letters:
+        cut = max(
+            text.rfind("/", letters // 2, letters), text.rfind("_", letters // 2, letters - 1)
+        )
+        cut = cut if cut > 0 else letters - 1
+        if text[cut] == "_":
+            cut += 1
+        lines.append(text[:cut])
+        text = "  " + text[cut:]
+    return (*lines, text)
+
+
+# ── places ─────────────────────────────────────────────────────────────────────────────
 
 
 def _tops(
     columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]
 ) -> dict[str, float]:
-    """The upper edges of all cards: the tallest column stands close, the others beside it."""
+    """Return the y of all cards: the tallest column is packed, the others are aligned with it."""
     extent = [_extent(column) for column in columns]
     tallest = max(range(3), key=lambda number: (extent[number], number == 1))
     tops = place_column(columns[tallest], {}, _GAP, _TOP, _LEAD if tallest != 1 else 0)
@@ -592,51 +526,133 @@ def _frames(columns: Sequence[Sequence[ColumnItem]], cards: dict[str, Card]) -> 
             yield Frame(title, found[0].x - 6, top, SIDE_WIDTH + 12, bottom - top)
 
 
-_MOST_ENCLAVES = 40
+@dataclass(frozen=True, slots=True)
+class ColumnItem:
+    """Something of a ``height`` that stands in a column; items of one ``group`` stand together."""
+
+    id: str
+    height: float
+    group: str = ""
 
 
-def scenes_of(picture: Picture) -> tuple[Scene, ...]:
-    """The scenes of a picture, the one to begin with first.
+def order_columns(
+    left: Sequence[ColumnItem],
+    middle: Sequence[ColumnItem],
+    right: Sequence[ColumnItem],
+    lines: Sequence[tuple[str, str]],
+) -> tuple[list[ColumnItem], list[ColumnItem], list[ColumnItem]]:
+    """Return the items of the three columns in an order with few crossings of lines.
 
-    Of a robot with few enclaves: all but what every node needs, and then everything.  Of many:
-    groups with what passes between them, and then each group with its neighbours.
+    ``lines`` are pairs of ids, each of neighbouring columns.  Of all sweeps the best is kept.
     """
-    groups = {each.path: each.group for each in picture.enclaves}
-    titles = sorted(set(groups.values()))
-    essential = [edge for edge in picture.edges if not edge.common]
-    if len(groups) <= _MOST_ENCLAVES or len(titles) < 2 or len(titles) > len(groups) // 2:
-        scenes = [_scene(picture, "essential", "Overview", essential, str)]
-        if len(essential) < len(picture.edges):
-            title = "With what every node needs"
-            scenes.append(_scene(picture, "all", title, picture.edges, str))
-        return tuple(scenes)
-    # The mark of a group is a letter that no enclave begins with.
-    outside = {path: f":{group}" for path, group in groups.items()}
-    scenes = [_scene(picture, "essential", "Overview", essential, outside.__getitem__)]
-    for title in titles:
-
-        def owner(path: str, title: str = title) -> str:
-            return path if groups[path] == title else outside[path]
-
-        touched = {(e.kind, e.name) for e in essential if groups[e.enclave] == title}
-        edges = [edge for edge in essential if (edge.kind, edge.name) in touched]
-        scenes.append(_scene(picture, f"group {title}", title, edges, owner))
-    return tuple(scenes)
+    near: dict[str, list[str]] = {item.id: [] for item in (*left, *middle, *right)}
+    for one, other in lines:
+        near[one].append(other)
+        near[other].append(one)
+    columns = [list(left), list(middle), list(right)]
+    best, fewest = [list(column) for column in columns], _crossings(columns, lines)
+    for sweep in range(_SWEEPS):
+        outer = (0, 2) if sweep % 2 else (2, 0)
+        for moved in (1, *outer):
+            places = _places(columns)
+            columns[moved] = _by_barycentre(columns[moved], near, places)
+        crossings = _crossings(columns, lines)
+        if crossings < fewest:
+            best, fewest = [list(column) for column in columns], crossings
+    return best[0], best[1], best[2]
 
 
-def _scene(
-    picture: Picture,
-    name: str,
-    title: str,
-    edges: Sequence[Edge],
-    owner: Callable[[str], str],
-) -> Scene:
-    members: dict[str, list[str]] = defaultdict(list)
-    for enclave in picture.enclaves:
-        members[owner(enclave.path)].append(enclave.path)
-    everybody: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for edge in picture.edges:
-        everybody[edge.kind, edge.name].add(owner(edge.enclave))
-    scene = _Placing(picture, edges, owner, members, everybody).scene(name, title)
-    shown = len({(edge.kind, edge.name) for edge in edges})
-    return replace(scene, hidden=len(picture.names) - shown, shown=shown)
+def _places(columns: Sequence[Sequence[ColumnItem]]) -> dict[str, float]:
+    """Return the position of each item in its column, from 0 to 1."""
+    return {
+        item.id: (number + 0.5) / len(column)
+        for column in columns
+        for number, item in enumerate(column)
+    }
+
+
+def _by_barycentre(
+    column: Sequence[ColumnItem], near: Mapping[str, Sequence[str]], places: Mapping[str, float]
+) -> list[ColumnItem]:
+    centre = {
+        item.id: (
+            sum(places[each] for each in near[item.id]) / len(near[item.id])
+            if near[item.id]
+            else places[item.id]
+        )
+        for item in column
+    }
+    groups: dict[str, list[float]] = {}
+    for item in column:
+        groups.setdefault(item.group, []).append(centre[item.id])
+    middle = {group: sum(found) / len(found) for group, found in groups.items()}
+    return sorted(
+        column, key=lambda item: (middle[item.group], item.group, centre[item.id], item.id)
+    )
+
+
+def _crossings(columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]) -> int:
+    """Count how often lines cross between neighbouring columns."""
+    side = {item.id: number for number, column in enumerate(columns) for item in column}
+    place = {item.id: n for column in columns for n, item in enumerate(column)}
+    total = 0
+    for first in (0, 1):
+        pairs = []
+        for one, other in lines:
+            if side[one] > side[other]:
+                one, other = other, one
+            if side[one] == first:
+                pairs.append((place[one], place[other]))
+        total += _inversions([end for _, end in sorted(pairs)], len(columns[first + 1]))
+    return total
+
+
+def _inversions(ends: Sequence[int], size: int) -> int:
+    """Count the pairs in the wrong order, with a Fenwick tree."""
+    tree = [0] * (size + 1)
+    found = 0
+    for seen, end in enumerate(ends):
+        at, before = end + 1, 0
+        while at:
+            before += tree[at]
+            at -= at & -at
+        found += seen - before
+        at = end + 1
+        while at <= size:
+            tree[at] += 1
+            at += at & -at
+    return found
+
+
+def place_column(
+    column: Sequence[ColumnItem],
+    wanted: Mapping[str, float],
+    gap: float,
+    top: float,
+    lead: float = 0,
+) -> dict[str, float]:
+    """Return the y of each item: near the y ``wanted`` for its centre, and without overlap.
+
+    Items keep their order and stand ``gap`` apart, none above ``top``; the first of each group
+    has ``lead`` more room above it.
+    """
+    offsets, at, group = [], 0.0, None
+    for item in column:
+        at += lead if item.group != group else 0
+        group = item.group
+        offsets.append(at)
+        at += item.height + gap
+    # Without the offsets it is least squares under "each not above the one before".
+    blocks: list[list[float]] = []
+    for item, offset in zip(column, offsets, strict=True):
+        target = wanted.get(item.id, 0.0) - item.height / 2 - offset
+        blocks.append([max(target, top), 1])
+        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
+            mean, count = blocks.pop()
+            before = blocks[-1]
+            before[0] = (before[0] * before[1] + mean * count) / (before[1] + count)
+            before[1] += count
+    shifts = [mean for mean, count in blocks for _ in range(int(count))]
+    return {
+        item.id: shift + offset for item, offset, shift in zip(column, offsets, shifts, strict=True)
+    }
