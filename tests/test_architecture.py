@@ -1,8 +1,13 @@
-"""The floors of docs/architecture.md hold: who imports whom, and where rclpy may be."""
+"""The floors of docs/architecture.md hold, no import is circular, and public names are needed."""
+
+from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -145,3 +150,229 @@ def test_the_documentation_has_the_same_floors() -> None:
         for room in re.findall(r"`([^`]+)`", rooms)
     }
     assert told == {room: floor for room, floor in FLOOR_OF.items() if not room.startswith("__")}
+
+
+# ── every module of a tree by its name, and the names in it ────────────────────────────────
+
+Modules = Mapping[str, ast.Module]
+"""Parsed modules by their full names; a package has the name of its folder."""
+
+
+@cache
+def modules_of(folder: str) -> Modules:
+    """Parse every module below a folder of the project."""
+    found = {}
+    for path in sorted((PROJECT / folder).rglob("*.py")):
+        parts = path.relative_to(PROJECT).with_suffix("").parts
+        found[".".join(part for part in parts if part != "__init__")] = ast.parse(path.read_text())
+    return found
+
+
+def parse(**sources: str) -> Modules:
+    """Parse modules that are given as text; `__` in a name stands for a dot."""
+    return {name.replace("__", "."): ast.parse(text) for name, text in sources.items()}
+
+
+def statements(body: Sequence[ast.stmt]) -> Iterator[ast.stmt]:
+    """Yield the statements that run when a module is imported, also those in an `if` or a `try`."""
+    for node in body:
+        yield node
+        if isinstance(node, (ast.If, ast.Try, ast.With)):
+            for_types = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
+            for name in ("body", "orelse", "handlers", "finalbody"):
+                inner = getattr(node, name, []) if not for_types or name != "body" else []
+                for each in inner:
+                    handler = isinstance(each, ast.excepthandler)
+                    yield from statements(each.body if handler else [each])
+
+
+# ── no import circle ───────────────────────────────────────────────────────────────────────
+
+
+def imported_at_once(name: str, modules: Modules) -> set[str]:
+    """Return the modules that have to be there before `name` can be imported."""
+    found = set()
+    for node in statements(modules[name].body):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            inside = {f"{node.module}.{alias.name}" for alias in node.names}
+            found |= inside & modules.keys()
+            if not inside <= modules.keys():
+                found.add(node.module)
+    # With a module the packages that it is in are imported, but for those `name` is in itself.
+    for each in list(found):
+        parts = each.split(".")
+        found |= {".".join(parts[:length]) for length in range(1, len(parts))}
+    return {each for each in found & modules.keys() if not f"{name}.".startswith(f"{each}.")}
+
+
+def circle(modules: Modules) -> list[str]:
+    """Return modules each of which needs the next one at import time, the last one the first."""
+    graph = {name: imported_at_once(name, modules) for name in modules}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return list(error.args[1][::-1])
+    return []
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    assert circle(modules_of("sros_tool")) == []
+
+
+def test_a_circle_is_seen_where_it_would_stop_an_import_and_only_there() -> None:
+    def found(second: str, package: str = "") -> set[str]:
+        modules = parse(p=package, p__a="from p.b import x", p__b=second, q="import p.a")
+        return set(circle(modules))
+
+    assert found("from p.a import y") == {"p.a", "p.b"}
+    assert found("import p.a") == {"p.a", "p.b"}
+    assert found("from p import a") == {"p.a", "p.b"}
+    assert found("try:\n    import p.a\nexcept ImportError:\n    pass") == {"p.a", "p.b"}
+    assert found("import q") == {"p.a", "p.b", "q"}
+    assert found("def late():\n    from p.a import y") == set()
+    assert found("if TYPE_CHECKING:\n    from p.a import y\nelse:\n    y = 1") == set()
+    assert found("x = 1", package="from p.a import x") == set()
+
+
+# ── a public class has one name, and the name one meaning ──────────────────────────────────
+
+
+def meanings(modules: Modules) -> dict[str, list[str]]:
+    """Return the public class names that are defined in several places, with the modules."""
+    found = defaultdict(list)
+    for name, tree in modules.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                found[node.name].append(name)
+    return {name: places for name, places in found.items() if len(places) > 1}
+
+
+def test_a_class_name_with_two_meanings_is_seen() -> None:
+    text = "class Plan: ...\nclass _Own: ..."
+    assert meanings(parse(p__a=text, p__b=text, p__c="Plan = 1")) == {"Plan": ["p.a", "p.b"]}
+
+
+# ── a public name is used by another module ────────────────────────────────────────────────
+
+
+def public_names(tree: ast.Module) -> set[str]:
+    """Return the public names that a module defines, or passes on in its `__all__`."""
+    found = set()
+    for node in statements(tree.body):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            found.add(node.name)
+        elif isinstance(node, (ast.Assign, ast.AnnAssign)):
+            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+            names = {
+                each.id
+                for target in targets
+                for each in ast.walk(target)
+                if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)
+            }
+            found |= set(ast.literal_eval(node.value)) if names == {"__all__"} else names
+    return {each for each in found if not each.startswith("_")}
+
+
+def used_names(name: str, modules: Modules, known: Modules) -> set[tuple[str, str]]:
+    """Return what the module `name` takes from each of the `known` modules, also later on."""
+    tree = modules[name]
+    found: set[tuple[str, str]] = set()
+    aliases: dict[str, str] = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                aliases[alias.asname or alias.name] = alias.name
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                found.add((node.module, alias.name))
+                aliases[alias.asname or alias.name] = f"{node.module}.{alias.name}"
+    whole = [module for module in aliases.values() if module in known]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute):
+            # Of any module that is here whole: it may be asked as the variable of a loop.
+            found |= {(module, node.attr) for module in whole}
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            # A table of verbs, or of what is imported late, names what stands next to it.
+            beside = f"{name.rpartition('.')[0]}."
+            found |= {
+                (each, node.value)
+                for each in known
+                if node.value.isidentifier() and each.startswith(beside) and each != name
+            }
+    return {(module, each) for module, each in found if module != name}
+
+
+def loaded_names(*trees: ast.AST) -> set[str]:
+    """Return the names that are read anywhere in the trees."""
+    return {
+        node.id
+        for tree in trees
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Load)
+    }
+
+
+def types_of_signatures(tree: ast.Module) -> set[str]:
+    """Return the names that stand in the annotations of a module."""
+    found = set()
+    for node in ast.walk(tree):
+        for field in ("annotation", "returns"):
+            if annotation := getattr(node, field, None):
+                found |= loaded_names(annotation)
+    return found
+
+
+def unused(modules: Modules, users: Modules, tests: Modules) -> set[str]:
+    """Return the public names that no other module and no user needs, as `module:name`.
+
+    A name that the tests take is needed only where its own module uses it, too, and a type that
+    its own module returns or takes is needed. What the first module of all passes on is for
+    others, and `main` is for the interpreter.
+    """
+    everything = {**modules, **users}
+    needed = {each for name in everything for each in used_names(name, everything, modules)}
+    tested = {each for name in tests for each in used_names(name, tests, modules)}
+    found = set()
+    for name, tree in modules.items():
+        loaded, types = loaded_names(tree), types_of_signatures(tree)
+        for public in public_names(tree) - types - {"main"}:
+            own = public in loaded and (name, public) in tested
+            if "." in name and (name, public) not in needed and not own:
+                found.add(f"{name}:{public}")
+    return found
+
+
+def test_a_public_name_that_nobody_needs_is_seen() -> None:
+    modules = parse(
+        p="from p.a import exported\n__all__ = ['exported']",
+        p__a="""
+def exported(): ...
+def taken(): ...
+def by_module(): ...
+def by_benchmark(): ...
+def by_verb(): ...
+def tested_and_own(): ...
+def main(): ...
+def tested_only(): ...
+def own_only(): ...
+def passed_on(): ...
+def nobody() -> Returned: ...
+class Returned: ...
+_private = own_only, tested_and_own
+if _private:
+    also, nobody_either = 1, 2
+""",
+        p__b="""
+from p import a as other
+from p.a import taken, also, passed_on
+VERBS = ["by_verb"]
+def used(): return other.by_module
+__all__ = ["passed_on"]
+""",
+    )
+    users = parse(bench="import p.a\np.a.by_benchmark\nfrom p.b import used, VERBS")
+    tests = parse(tests="from p.a import tested_and_own, tested_only")
+    names = {"tested_only", "own_only", "nobody", "nobody_either"}
+    assert unused(modules, users, tests) == {f"p.a:{name}" for name in names} | {"p.b:passed_on"}
