@@ -271,7 +271,9 @@ def public_names(tree: ast.Module) -> set[str]:
                 for each in ast.walk(target)
                 if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store)
             }
-            found |= set(ast.literal_eval(node.value)) if names == {"__all__"} else names
+            if names == {"__all__"} and node.value:
+                names = set(ast.literal_eval(node.value))
+            found |= names
     return {each for each in found if not each.startswith("_")}
 
 

@@ -26,7 +26,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name, issue_ca, pem
 from sros_tool.pki.keys import generate_key, key_pem, load_key
 from sros_tool.validity import Window
-from tests.support.harness import Ended, policy_text, publish, snapshot, sros, with_includes
+from tests.support.harness import Ended, forked, policy_text, publish, snapshot, sros, with_includes
 
 Words = list[object]
 Files = dict[str, tuple[int, bytes]]
@@ -805,6 +805,8 @@ def program(
     *words: object, preexec: Callable[[], object] | None = None, prefix: tuple[str, ...] = ()
 ) -> Ended:
     """Run the program in a process of its own."""
+    if not prefix:
+        return forked(*words, first=preexec)
     command = [*prefix, sys.executable, "-m", "sros_tool", *map(str, words)]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     ended = subprocess.run(

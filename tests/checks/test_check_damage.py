@@ -13,10 +13,11 @@ from sros_tool.checks.policies import policy_file_findings
 from sros_tool.errors import KeystoreError
 from sros_tool.resources import policies_dir
 from tests.checks.bench import DAY, Bench
+from tests.support.children import LONG
 
 pytest_plugins = ["tests.checks.sound_keystore"]
 
-ROUNDS = 120
+ROUNDS = 120 if LONG else 40
 
 
 def damage(path: Path, chance: random.Random) -> None:

@@ -349,8 +349,8 @@ def calls_of(work: Callable[[], object]) -> int:
 def test_four_times_as_large_policies_take_four_times_the_effort(folder: Path) -> None:
     """Sixteen times would be quadratic; what is there anyway makes it less than four."""
     policies: dict[str, Callable[[int], tuple[str, str]]] = {
-        "enclaves": lambda n: (enclaves_policy(100 * n, 20), enclaves_policy(100 * n, 24)),
-        "topics": lambda n: (topics_policy(2000 * n), topics_policy(2040 * n)),
+        "enclaves": lambda n: (enclaves_policy(50 * n, 20), enclaves_policy(50 * n, 24)),
+        "topics": lambda n: (topics_policy(1000 * n), topics_policy(1020 * n)),
     }
     for made in policies.values():
         for verb in ("diff_policy", "merge_policy"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import shutil
 import sys
 from datetime import UTC, datetime, timedelta
@@ -141,6 +142,10 @@ def test_the_remedy_runs_and_mends_it(breakage: str, keystore: Path) -> None:
 
 def in_shell(command: str) -> None:
     """Run a command of a shell, in which sros is the program under test."""
+    words = shlex.split(command)
+    if words[0] == "sros" and shlex.join(words) == command:  # a shell would do no more with it
+        sros(*words[1:]).ok()
+        return
     path = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     run(["sh", "-c", command], env={**os.environ, "PATH": path})
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests.support.children import run
+from tests.support.harness import forked
 
 MODULES = ("/usr/lib/softhsm/libsofthsm2.so", "/usr/lib/x86_64-linux-gnu/softhsm/libsofthsm2.so")
 MODULE = next((path for path in MODULES if Path(path).exists()), "")
@@ -35,8 +35,9 @@ def token(tmp_path: Path) -> dict[str, str]:
 
 
 def sros(environment: dict[str, str], *words: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "sros_tool", *map(str, words)]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, stdin=-3)
+    """Run the program in a process of its own, in which the token's library is loaded."""
+    ended = forked(*words, env=environment)
+    return subprocess.CompletedProcess(list(map(str, words)), ended.status, ended.out, ended.err)
 
 
 def uri(name: str) -> str:

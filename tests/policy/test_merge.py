@@ -6,7 +6,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 
 from sros_tool.policy import ALLOW, DENY, Group, Policy, read_policy, write_policy
 from sros_tool.policy.merge import merge_all, merge_into, merge_notes, plan_merge
@@ -39,7 +39,6 @@ def merged(first: Policy, second: Policy) -> Policy:
         return after
 
 
-@settings(max_examples=60)
 @given(policies(), policies())
 def test_merging_is_the_union_whichever_comes_first(first: Policy, second: Policy) -> None:
     forward, backward = merged(first, second), merged(second, first)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sros_tool.keystore.issuing.size import Scale, right_bytes
@@ -46,7 +46,6 @@ def use(given_policy: Policy, *rights: str, common: tuple[Group, ...] = ()) -> E
     return minimize(given_policy, seen(*rights), common).uses[0]
 
 
-@settings(max_examples=100)
 @given(
     policies(),
     st.one_of(policies(qualifier=st.just(ALLOW)), policies(exact_names, st.just(ALLOW))),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from datetime import UTC, datetime, timedelta, timezone
 
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sros_tool.dds.decision.access import Access
@@ -28,7 +28,6 @@ NOW = datetime(2026, 7, 1, tzinfo=UTC)
 DOMAINS = DomainSet.of((0, 0))
 
 
-@settings(max_examples=150)
 @given(policies(), st.sampled_from(template_names()), st.sampled_from([-12, -8, 0, 9, 14]))
 def test_vendors_agree(policy: Policy, template: str, zone: int) -> None:
     governance = render_governance(governance_for(load_template(template).protection, DOMAINS))

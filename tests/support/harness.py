@@ -7,9 +7,12 @@ import os
 import signal
 import stat
 import sys
-from collections.abc import Mapping
-from contextlib import redirect_stderr, redirect_stdout
+import threading
+import traceback
+from collections.abc import Callable, Mapping
+from contextlib import redirect_stderr, redirect_stdout, suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import NoReturn
 
@@ -72,6 +75,66 @@ def sros(
     return Ended(status, *said)
 
 
+def forked(
+    *arguments: object,
+    env: Mapping[str, str] | None = None,
+    first: Callable[[], object] | None = None,
+) -> Ended:
+    """Run the program in a process of its own, which has imported what this one has.
+
+    It calls ``first`` before the program.
+    """
+    out, err = os.pipe(), os.pipe()
+    child = os.fork()
+    if child == 0:
+        _become_program([str(argument) for argument in arguments], env, first, out[1], err[1])
+    os.close(out[1])
+    os.close(err[1])
+    said: list[str] = []
+    reader = threading.Thread(target=lambda: said.append(_read(err[0])))
+    reader.start()
+    text = _read(out[0])
+    reader.join()
+    _, status = os.waitpid(child, 0)
+    return Ended(os.waitstatus_to_exitcode(status), text, *said)
+
+
+def _become_program(
+    words: list[str],
+    env: Mapping[str, str] | None,
+    first: Callable[[], object] | None,
+    out: int,
+    err: int,
+) -> NoReturn:
+    status = 70
+    try:
+        for descriptor, source in ((0, os.open(os.devnull, os.O_RDONLY)), (1, out), (2, err)):
+            os.dup2(source, descriptor)
+        os.closerange(3, 1024)
+        sys.stdin, sys.stdout, sys.stderr = os.fdopen(0), os.fdopen(1, "w"), os.fdopen(2, "w")
+        if env is not None:
+            os.environ.clear()
+            os.environ.update(env)
+        if first:
+            first()
+        sys.argv = ["sros", *words]
+        main(words)
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else 1
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError):
+                stream.flush()
+        os._exit(status)
+
+
+def _read(descriptor: int) -> str:
+    with open(descriptor, "rb") as pipe:
+        return pipe.read().decode(errors="replace")
+
+
 def _refuse_to_execute(*_: object) -> NoReturn:
     # It would end the tests, and with the status of the command.
     raise AssertionError("a command was executed")
@@ -93,21 +156,19 @@ def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
 
 
 def remains(folder: Path) -> list[str]:
-    """Stages of transactions that were left below a folder, or beside a keystore in it."""
-    return [path for path in snapshot(folder) if ".sros-" in path]
+    """Stages of transactions that were left below a folder, or next to a keystore in it."""
+    return [
+        os.path.relpath(os.path.join(parent, name), folder)
+        for parent, folders, files in os.walk(folder)
+        for name in (*folders, *files)
+        if ".sros-" in name or ".sros-" in os.path.relpath(parent, folder)
+    ]
 
 
 def topics_of(enclave: Path) -> frozenset[str]:
     """The DDS topics of an enclave's signed permissions, as DDS would load them."""
-    signed = smime.parse((enclave / "permissions.p7s").read_bytes())
-    signed.verify(certificate(enclave / "permissions_ca.cert.pem"))
-    return frozenset(
-        topic
-        for grant in parse_permissions(signed.document).grants
-        for rule in grant.rules
-        for criteria in (*rule.publish, *rule.subscribe)
-        for topic in criteria.topics
-    )
+    signed, authority = (enclave / name for name in ("permissions.p7s", "permissions_ca.cert.pem"))
+    return _topics(_document(signed.read_bytes(), authority.read_bytes()))
 
 
 def certificate(path: Path) -> x509.Certificate:
@@ -119,33 +180,65 @@ def check_whole(keystore: Path) -> None:
     for parent, folders, files in os.walk(keystore):
         folders[:] = [name for name in folders if name != STAGES[0]]
         for name in files:
-            path = Path(parent, name)
-            assert not path.exists() or path.stat().st_size, f"{path} is empty"
-        if all(Path(parent, name).exists() for name in REQUIRED_FILES):
+            path = os.path.join(parent, name)
+            assert not os.path.exists(path) or os.stat(path).st_size, f"{path} is empty"
+        if all(os.path.exists(os.path.join(parent, name)) for name in REQUIRED_FILES):
             check_enclave_whole(Path(parent))
-    for path in keystore.glob("private/*"):
-        name = path.name.replace(".key.", ".cert.")
-        check_pair(path, keystore / "public" / name)
+    for key in keystore.glob("private/*"):
+        name = key.name.replace(".key.", ".cert.")
+        check_pair(key, keystore / "public" / name)
 
 
 def check_enclave_whole(enclave: Path) -> None:
     """Assert that every file of an enclave is there and fits the others."""
     check_pair(enclave / "key.pem", enclave / "cert.pem")
-    authority = certificate(enclave / "identity_ca.cert.pem")
-    certificate(enclave / "cert.pem").verify_directly_issued_by(authority)
+    authority = (enclave / "identity_ca.cert.pem").read_bytes()
+    _check_issued((enclave / "cert.pem").read_bytes(), authority)
+    authority = (enclave / "permissions_ca.cert.pem").read_bytes()
     for name in ("permissions", "governance"):
-        signed = smime.parse((enclave / f"{name}.p7s").read_bytes())
-        signed.verify(certificate(enclave / "permissions_ca.cert.pem"))
-        beside = enclave / f"{name}.xml"
-        if beside.exists():
-            assert beside.read_bytes() == signed.document.replace(b"\r\n", b"\n"), beside
+        document = _document((enclave / f"{name}.p7s").read_bytes(), authority)
+        clear = enclave / f"{name}.xml"
+        if clear.exists():
+            assert clear.read_bytes() == document.replace(b"\r\n", b"\n"), clear
 
 
 def check_pair(key: Path, cert: Path) -> None:
-    """Assert that a private key is its owner's alone, and that of a certificate."""
+    """Assert that a private key is its owner's alone, and the key of a certificate."""
     assert key.stat().st_mode & 0o777 == 0o600, key
-    loaded = serialization.load_pem_private_key(key.read_bytes(), None)
-    assert loaded.public_key() == certificate(cert).public_key(), key
+    assert _fit(key.read_bytes(), cert.read_bytes()), key
+
+
+# The same files are looked at after every step of a long series: what is in them is asked once.
+
+
+@cache
+def _fit(key: bytes, cert: bytes) -> bool:
+    loaded = serialization.load_pem_private_key(key, None)
+    return loaded.public_key() == x509.load_pem_x509_certificate(cert).public_key()
+
+
+@cache
+def _check_issued(cert: bytes, authority: bytes) -> None:
+    issuer = x509.load_pem_x509_certificate(authority)
+    x509.load_pem_x509_certificate(cert).verify_directly_issued_by(issuer)
+
+
+@cache
+def _document(signed: bytes, authority: bytes) -> bytes:
+    message = smime.parse(signed)
+    message.verify(x509.load_pem_x509_certificate(authority))
+    return message.document
+
+
+@cache
+def _topics(permissions: bytes) -> frozenset[str]:
+    return frozenset(
+        topic
+        for grant in parse_permissions(permissions).grants
+        for rule in grant.rules
+        for criteria in (*rule.publish, *rule.subscribe)
+        for topic in criteria.topics
+    )
 
 
 def policy_text(enclaves: Mapping[str, str]) -> str:
