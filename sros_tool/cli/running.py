@@ -80,7 +80,7 @@ class _WithCommand(click.Command):
     epilog="""\b
 Example:
   $ sros run keystore /talker_listener/talker -- \\
-        python3 -m sros_tool.demo.nodes.talker
+        python3 -m sros_tool.demo.nodes.ros talker
   [INFO] [talker]: Publishing: 'Hello World: 1'""",
 )
 @click.argument(

@@ -83,9 +83,9 @@ class Backend:
         ``names`` are the absolute ones of its ROS nodes, as `node_names` has them.
         """
         if self.library(role, secured=secured) == RCLPY:
-            program = _module(f"sros_tool.demo.nodes.{role.value}")
+            program = [sys.executable, "-m", "sros_tool.demo.nodes.ros", role.value]
             return [*program, *options, *naming_arguments(role, names)]
-        return [*_module("sros_tool.demo.nodes.cyclone"), role.value, *options]
+        return [sys.executable, "-m", "sros_tool.demo.nodes.cyclone", role.value, *options]
 
     def environment(
         self, role: Role, *, wire: bool = False, denied: bool = False, secured: bool = False
@@ -150,10 +150,6 @@ def _why_not(stacks: Sequence[Stack]) -> str:
         return "rclpy is not here"
     seen = "; ".join(f"{stack.rmw or 'its RMW'}: {stack.evidence}" for stack in stacks)
     return f"rclpy does not enforce security here ({seen})"
-
-
-def _module(name: str) -> list[str]:
-    return [sys.executable, "-m", name]
 
 
 _SIGNERS_CHECKED = ((2, 1, 4), (2, 6, 5), (2, 8, 2), (2, 9, 2))

@@ -138,8 +138,8 @@ def test_backends(
     if name == "rclpy":
         assert chosen.environment(Role.TALKER, wire=False) == {"RMW_IMPLEMENTATION": "rmw_x"}
         command = chosen.command(Role.TALKER, ["--topic", "/x"], ["/robot/mouth"])
-        module, *options = command[command.index("-m") + 1 :]
-        assert module == "sros_tool.demo.nodes.talker"
+        module, role, *options = command[command.index("-m") + 1 :]
+        assert (module, role) == ("sros_tool.demo.nodes.ros", "talker")
         remapped = ["-r", "talker:__node:=mouth", "-r", "mouth:__ns:=/robot"]
         assert options == ["--topic", "/x", "--ros-args", *remapped, "--"]
     else:

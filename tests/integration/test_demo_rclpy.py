@@ -41,11 +41,13 @@ DOMAIN = str(1 + os.getpid() % 100)
 """Of this process alone, for these nodes are in the host's network: others test there, too."""
 
 
-def node(module: str, folder: Path, *arguments: str, **more: str) -> subprocess.Popen[str]:
+def node(
+    role: str, folder: Path, *arguments: str, on: str = "ros", **more: str
+) -> subprocess.Popen[str]:
     variables = {**os.environ, "ROS_DOMAIN_ID": DOMAIN, "ROS_LOG_DIR": str(folder), **more}
-    report = ["--report", str(folder / f"{module}.jsonl")]
+    report = ["--report", str(folder / f"{role}.jsonl")]
     return subprocess.Popen(
-        [sys.executable, "-m", f"sros_tool.demo.nodes.{module}", *report, *arguments],
+        [sys.executable, "-m", f"sros_tool.demo.nodes.{on}", role, *report, *arguments],
         env=variables,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -128,7 +130,7 @@ def test_nodes_take_ros_arguments_and_end_quietly(number: signal.Signals, tmp_pa
 
 def test_a_cyclone_talker_is_heard_by_an_rclpy_listener(tmp_path: Path) -> None:
     listener = node("listener", tmp_path)
-    talker = node("cyclone_node", tmp_path, "talker", "--period", "0.1", "--text", "Cyclone")
+    talker = node("talker", tmp_path, "--period", "0.1", "--text", "Cyclone", on="cyclone")
     try:
         heard = wait_until(Kind.HEARD, tmp_path / "listener.jsonl", listener)
         assert heard[-1].text.startswith("Cyclone: ")
@@ -163,17 +165,17 @@ def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
 
 STOPPED_WHILE_IT_IS_MADE = """
 import sys
-from sros_tool.demo.nodes.options import node_options
-from sros_tool.demo.nodes.ros_node import run_ros_node
+from pathlib import Path
+from sros_tool.demo.nodes.options import NodeOptions
+from sros_tool.demo.nodes.ros import run_role
 
-def build(node, events):
+def build(node, options, events):
     import rclpy
     if "signal" in sys.argv:
         rclpy.try_shutdown()  # as the handler of a signal does
     raise RuntimeError("half made")
 
-options = node_options("x", "", ["--report", sys.argv[1]])
-sys.exit(run_ros_node("talker", options, [], build))
+sys.exit(run_role(build, NodeOptions("talker", report=Path(sys.argv[1])), []))
 """
 
 

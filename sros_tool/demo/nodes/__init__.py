@@ -1,1 +1,1 @@
-"""The nodes of the demo: rclpy and Cyclone DDS."""
+"""The programs that the demo starts: its nodes on rclpy and on Cyclone DDS."""

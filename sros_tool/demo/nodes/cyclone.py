@@ -1,11 +1,11 @@
-"""What a Cyclone DDS node does in each role; each function makes its endpoints, then runs.
+"""The nodes of the demo on Cyclone DDS: ``python -m sros_tool.demo.nodes.cyclone ROLE``.
+
+They read the environment of a ROS 2 node and speak on the same DDS topics with the same type, so
+that rclpy nodes hear them, and a launcher need not know which kind it starts.
 
 Services and actions speak on the DDS topics that rmw_cyclonedds would use (rq/...Request,
 rr/...Reply, rt/..._action/...), in strings: names and rights are those of ROS 2, the type is not.
 A request is "CLIENT NUMBER ARGUMENTS"; its reply begins with the same two words.
-
-The nodes read the same environment as a ROS 2 node and speak on the same DDS topics with the same
-type, so that rclpy nodes hear them, and a launcher need not know which kind it starts.
 """
 
 from __future__ import annotations
@@ -16,15 +16,14 @@ import signal
 import sys
 import time
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from types import FrameType
 
 from sros_tool.demo.nodes.options import (
+    FIBONACCI_ORDER,
     NodeOptions,
     fibonacci,
-    operands,
-    option_parser,
-    options_of,
+    parse_options,
     split_ros_args,
 )
 from sros_tool.errors import SrosError
@@ -32,18 +31,14 @@ from sros_tool.runtime.cyclone import Participant, Reader, SecurityRefusedError,
 from sros_tool.runtime.events import EventWriter, Kind, Stage
 from sros_tool.runtime.rcl_security import choose_loadable, domain_of
 
-_LISTEN_SECONDS = 0.02
-_ORDER = 5
-
-Ready = Callable[[], None]
-"""Called when all endpoints are there."""
+_POLL_SECONDS = 0.02
 
 
-class Talker:
+class _Talker:
     """Says its text and a number, again and again."""
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
-        self._writer = participant.writer(dds_topic(options.topic))
+        self._writer = participant.writer(_dds_topic(options.topic))
         self._options, self._events = options, events
         self._sent = 0
         self._due = time.monotonic() + options.period
@@ -59,11 +54,11 @@ class Talker:
         self._events.report(Kind.SENT, text, count=self._sent)
 
 
-class Listener:
+class _Listener:
     """Reports what it hears."""
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
-        self._reader = participant.reader(dds_topic(options.topic))
+        self._reader = participant.reader(_dds_topic(options.topic))
         self._events = events
         self._heard = 0
 
@@ -74,18 +69,12 @@ class Listener:
             self._events.report(Kind.HEARD, text, count=self._heard)
 
 
-class Observer:
+class _Observer:
     """Counts the publishers of topics."""
 
-    def __init__(
-        self,
-        participant: Participant,
-        options: NodeOptions,
-        events: EventWriter,
-        also: Sequence[str] = (),
-    ) -> None:
+    def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
         self._participant, self._options, self._events = participant, options, events
-        self._topics = [options.topic, *also]
+        self._topics = (options.topic, *options.also)
         self._due = time.monotonic()
 
     def step(self) -> None:
@@ -94,11 +83,11 @@ class Observer:
             return
         self._due += self._options.period
         found = [publication.topic for publication in self._participant.publications()]
-        counts = {topic: found.count(dds_topic(topic)) for topic in self._topics}
+        counts = {topic: found.count(_dds_topic(topic)) for topic in self._topics}
         self._events.report(Kind.SEEN, " ".join(sorted(set(found))), publishers=counts)
 
 
-class Service:
+class _Service:
     """One side of a service: what it sends on one topic, and takes from another."""
 
     def __init__(self, participant: Participant, name: str, *, server: bool) -> None:
@@ -115,11 +104,11 @@ class Service:
         self._writer.write(f"{client} {number} {text}")
 
 
-class Server:
+class _Server:
     """Adds two numbers for whoever asks."""
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
-        self._service = Service(participant, options.service, server=True)
+        self._service = _Service(participant, options.service, server=True)
         self._options, self._events = options, events
         self._answered = 0
 
@@ -133,11 +122,11 @@ class Server:
             self._events.report(Kind.SENT, answer, count=self._answered)
 
 
-class Client:
+class _Client:
     """Asks for sums, again and again, and reports the right answers."""
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
-        self._service = Service(participant, options.service, server=False)
+        self._service = _Service(participant, options.service, server=False)
         self._options, self._events = options, events
         self._name = uuid.uuid4().hex
         self._asked = self._right = 0
@@ -148,27 +137,27 @@ class Client:
         if time.monotonic() >= self._due:
             self._due += self._options.period
             self._asked += 1
-            first, second = operands(self._asked)
+            first, second = _operands(self._asked)
             self._service.send(self._name, str(self._asked), f"{first} + {second}")
             self._events.report(Kind.SENT, f"{first} + {second}", count=self._asked)
         for client, number, answer in self._service.take():
-            first, second = operands(int(number))
+            first, second = _operands(int(number))
             if client == self._name and answer.endswith(f": {first} + {second} = {first + second}"):
                 self._right += 1
                 self._events.report(Kind.HEARD, answer, count=self._right)
 
 
-class ActionServer:
-    """Counts Fibonacci's numbers, says how far it is, and tells the result to whoever fetches it.
+class _ActionServer:
+    """Computes Fibonacci numbers, reports its progress, and sends the result to whoever asks.
 
     A goal is "CLIENT NUMBER ORDER"; feedback and status are "CLIENT NUMBER WHAT".
     """
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
         action = f"{options.topic}/_action"
-        self._goals = Service(participant, f"{action}/send_goal", server=True)
-        self._cancels = Service(participant, f"{action}/cancel_goal", server=True)
-        self._results = Service(participant, f"{action}/get_result", server=True)
+        self._goals = _Service(participant, f"{action}/send_goal", server=True)
+        self._cancels = _Service(participant, f"{action}/cancel_goal", server=True)
+        self._results = _Service(participant, f"{action}/get_result", server=True)
         self._feedback = participant.writer(f"rt{action}/feedback")
         self._status = participant.writer(f"rt{action}/status")
         self._options, self._events = options, events
@@ -192,14 +181,14 @@ class ActionServer:
         self._cancels.take()
 
 
-class ActionClient:
+class _ActionClient:
     """Sends goals, again and again; reports a result that is right and whose feedback came."""
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
         action = f"{options.topic}/_action"
-        self._goals = Service(participant, f"{action}/send_goal", server=False)
-        self._cancels = Service(participant, f"{action}/cancel_goal", server=False)
-        self._results = Service(participant, f"{action}/get_result", server=False)
+        self._goals = _Service(participant, f"{action}/send_goal", server=False)
+        self._cancels = _Service(participant, f"{action}/cancel_goal", server=False)
+        self._results = _Service(participant, f"{action}/get_result", server=False)
         self._feedback = participant.reader(f"rt{action}/feedback")
         self._status = participant.reader(f"rt{action}/status")
         self._options, self._events = options, events
@@ -214,7 +203,7 @@ class ActionClient:
         if time.monotonic() >= self._due:
             self._due += self._options.period
             self._sent += 1
-            self._goals.send(self._name, str(self._sent), str(_ORDER))
+            self._goals.send(self._name, str(self._sent), str(FIBONACCI_ORDER))
             self._events.report(Kind.SENT, f"goal {self._sent}", count=self._sent)
         for text in self._feedback.take():
             client, number, _ = text.split(" ", 2)
@@ -228,18 +217,22 @@ class ActionClient:
             if client == self._name and word == "accepted":
                 self._results.send(client, number, "?")
         for client, number, answer in self._results.take():
-            complete = self._steps.get(number) == _ORDER - 1 and number in self._succeeded
-            if client == self._name and complete and answer.endswith(f": {fibonacci(_ORDER)}"):
+            complete = self._steps.get(number) == FIBONACCI_ORDER - 1 and number in self._succeeded
+            if (
+                client == self._name
+                and complete
+                and answer.endswith(f": {fibonacci(FIBONACCI_ORDER)}")
+            ):
                 self._right += 1
                 self._events.report(Kind.HEARD, answer, count=self._right)
         self._cancels.take()
 
 
-class Composed:
+class _Composed:
     """A talker, a listener and a server in one process: one participant, one enclave."""
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
-        kinds = (Talker, Listener, Server)
+        kinds = (_Talker, _Listener, _Server)
         self._nodes = [kind(participant, options, events) for kind in kinds]
 
     def step(self) -> None:
@@ -248,30 +241,30 @@ class Composed:
             node.step()
 
 
-Node = Talker | Listener | Observer | Server | Client | ActionServer | ActionClient | Composed
+_Node = (
+    _Talker | _Listener | _Observer | _Server | _Client | _ActionServer | _ActionClient | _Composed
+)
 
-ROLES: dict[str, type[Node]] = {
-    "talker": Talker,
-    "listener": Listener,
-    "observer": Observer,
-    "server": Server,
-    "client": Client,
-    "action_server": ActionServer,
-    "action_client": ActionClient,
-    "composed": Composed,
+ROLES: Mapping[str, type[_Node]] = {
+    "talker": _Talker,
+    "listener": _Listener,
+    "observer": _Observer,
+    "server": _Server,
+    "client": _Client,
+    "action_server": _ActionServer,
+    "action_client": _ActionClient,
+    "composed": _Composed,
 }
 
 
-def run(node: Node) -> None:
-    """Let a node act until it is stopped."""
-    while True:
-        node.step()
-        time.sleep(_LISTEN_SECONDS)
-
-
-def dds_topic(topic: str) -> str:
-    """The DDS topic of a ROS topic of a node in the namespace "/"."""
+def _dds_topic(topic: str) -> str:
+    """Return the DDS topic of a ROS topic of a node in the namespace /."""
     return f"rt/{topic.removeprefix('/')}"
+
+
+def _operands(number: int) -> tuple[int, int]:
+    """Return the two numbers that a request asks about; each request has its own sum."""
+    return number, 3 * number + 1
 
 
 class _Stopped(Exception):  # noqa: N818 - not an error
@@ -280,45 +273,39 @@ class _Stopped(Exception):  # noqa: N818 - not an error
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Play a role until told to stop; returns the exit status."""
-    own, ros = split_ros_args(sys.argv[1:] if arguments is None else arguments)
-    parser = option_parser("sros_tool.demo.nodes.cyclone", "Play a role over Cyclone DDS.")
-    parser.add_argument("role", choices=tuple(ROLES))
-    parser.add_argument("--also", action="append", default=[], help="one more topic to look at")
-    parsed = parser.parse_args(own)
-    options = options_of(parsed, parsed.role)
+    arguments = sys.argv[1:] if arguments is None else arguments
+    options = parse_options("sros_tool.demo.nodes.cyclone", ROLES, arguments)
     _stop_on_signals()
     events = EventWriter(options.report)
     stage = Stage.PARTICIPANT
     try:
-        choice = choose_loadable(os.environ, _enclave_in(ros))
-        _say(parsed.role, choice.note)
+        choice = choose_loadable(os.environ, _enclave_in(arguments))
+        _say(options.role, choice.note)
         with Participant(domain_of(os.environ), choice.enclave) as participant:
             stage = Stage.ENDPOINT
-            node = (
-                Observer(participant, options, events, parsed.also)
-                if parsed.role == "observer"
-                else ROLES[parsed.role](participant, options, events)
-            )
+            node = ROLES[options.role](participant, options, events)
             stage = Stage.RUNNING
             events.report(Kind.READY)
-            run(node)
+            while True:
+                node.step()
+                time.sleep(_POLL_SECONDS)
     except _Stopped:
         pass
     except SecurityRefusedError as refusal:
         events.report(Kind.REFUSED, str(refusal), stage=stage)
-        _say(parsed.role, f"refused by DDS Security: {refusal}")
+        _say(options.role, f"refused by DDS Security: {refusal}")
         return 1
     except SrosError as error:
         events.report(Kind.FAILED, str(error), stage=stage)
-        _say(parsed.role, f"failed: {error}")
+        _say(options.role, f"failed: {error}")
         return 1
     events.report(Kind.DONE)
     return 0
 
 
-def _enclave_in(ros_arguments: Sequence[str]) -> str:
+def _enclave_in(arguments: Sequence[str]) -> str:
     enclave = "/"
-    for flag, value in itertools.pairwise(ros_arguments):
+    for flag, value in itertools.pairwise(split_ros_args(arguments)[1]):
         if flag in ("-e", "--enclave"):
             enclave = value
     return enclave

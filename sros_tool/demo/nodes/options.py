@@ -1,66 +1,80 @@
-"""The options that every demo node takes, whatever DDS it runs on."""
+"""The command line of the demo's nodes, the same on rclpy and on Cyclone DDS."""
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-DEFAULT_TEXT = "Hello World"
-DEFAULT_TOPIC = "chatter"
-DEFAULT_PERIOD = 0.5
-DEFAULT_SERVICE = "/add_two_ints"
+_COMPOSED_SERVICE = "/add_two_ints"
+
+FIBONACCI_ORDER = 5
+"""The order that every goal of an action client asks for."""
 
 
 @dataclass(frozen=True)
 class NodeOptions:
-    """What a node was asked to do; ``period`` is in seconds.
+    """What a node is asked to do.
 
-    ``topic`` is also the name of an action; ``service`` that of a service.
+    ``topic`` is the ROS name of a topic, or of the service or action that the role speaks on.
+    ``period`` is in seconds.  ``server`` is the text of the only action server that there is ("":
+    not known); an observer looks at the topics ``also`` as well.
     """
 
-    topic: str
-    period: float
-    text: str
-    report: Path | None
-    service: str = DEFAULT_SERVICE
+    role: str
+    topic: str = "chatter"
+    period: float = 0.5
+    text: str = "Hello World"
+    report: Path | None = None
+    server: str = ""
+    also: tuple[str, ...] = ()
+
+    @property
+    def service(self) -> str:
+        """The ROS service of the role; a container serves one that is not its topic."""
+        return self.topic if self.role in ("server", "client") else _COMPOSED_SERVICE
 
 
-def option_parser(program: str, description: str) -> argparse.ArgumentParser:
-    """A parser of the common options; a caller may add its own."""
-    parser = argparse.ArgumentParser(prog=f"python -m {program}", description=description)
-    parser.add_argument("--topic", default=DEFAULT_TOPIC, help="ROS name (default: %(default)s)")
+def parse_options(module: str, roles: Collection[str], arguments: Sequence[str]) -> NodeOptions:
+    """Return the options on the command line of ``python -m module``, without ``--ros-args``.
+
+    Exits with status 2 on an error.
+    """
+    parser = argparse.ArgumentParser(
+        prog=f"python -m {module}", description="Play one role of the demo until stopped."
+    )
+    parser.add_argument("role", choices=tuple(roles))
+    parser.add_argument(
+        "--topic",
+        default=NodeOptions.topic,
+        help="ROS name of the topic, service or action (default: %(default)s)",
+    )
     parser.add_argument(
         "--period",
         type=_positive,
-        default=DEFAULT_PERIOD,
+        default=NodeOptions.period,
         metavar="SECONDS",
-        help="time between two messages of a talker (default: %(default)s)",
+        help="time between two messages, requests, goals or looks (default: %(default)s)",
     )
     parser.add_argument(
-        "--text", default=DEFAULT_TEXT, help="what a talker says before the number (%(default)s)"
+        "--text",
+        default=NodeOptions.text,
+        help="what a talker or server says before the number (default: %(default)s)",
     )
-    parser.add_argument("--server", default="", help="what the server of an action client says")
+    parser.add_argument(
+        "--server", default="", help="what the only server of an action client says"
+    )
+    parser.add_argument(
+        "--also", action="append", default=[], help="one more topic that an observer looks at"
+    )
     parser.add_argument(
         "--report", type=Path, metavar="FILE", help="append what happens to FILE as JSON lines"
     )
-    return parser
-
-
-def node_options(program: str, description: str, arguments: Sequence[str]) -> NodeOptions:
-    """Parse the arguments that are left without ``--ros-args``; exits with status 2 on an error."""
-    return options_of(option_parser(program, description).parse_args(arguments))
-
-
-def options_of(parsed: argparse.Namespace, role: str = "") -> NodeOptions:
-    """The common options of a command line that was parsed.
-
-    The topic of a server or client is its service; composed nodes serve the default one.
-    """
-    service = parsed.topic if role in ("server", "client") else DEFAULT_SERVICE
-    return NodeOptions(parsed.topic, parsed.period, parsed.text, parsed.report, service)
+    own, _ = split_ros_args(arguments)
+    parsed = vars(parser.parse_args(own))
+    return NodeOptions(**{**parsed, "also": tuple(parsed["also"])})
 
 
 def split_ros_args(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -85,13 +99,8 @@ def _positive(text: str) -> float:
     return value
 
 
-def operands(number: int) -> tuple[int, int]:
-    """The two numbers that the request of that number asks about; each request has its own sum."""
-    return number, 3 * number + 1
-
-
 def fibonacci(order: int) -> list[int]:
-    """The sequence of Fibonacci's numbers up to the one of that order, from 0 and 1."""
+    """Return the Fibonacci numbers up to that order, from 0 and 1."""
     sequence = [0, 1]
     while len(sequence) <= order:
         sequence.append(sequence[-1] + sequence[-2])

@@ -1,0 +1,323 @@
+"""The nodes of the demo on rclpy: ``python -m sros_tool.demo.nodes.ros ROLE [--ros-args ...]``.
+
+They are ordinary ROS 2 nodes.  rclpy and the ROS interfaces are imported when a role starts, so
+that this module can be imported without ROS.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from typing import Any
+
+from sros_tool.demo.nodes.options import FIBONACCI_ORDER, NodeOptions, fibonacci, parse_options
+from sros_tool.runtime.events import EventWriter, Kind, Stage
+
+_LOG_FLUSH_SECONDS = 0.3
+"""Fast DDS logs from a thread of its own: a process that ends at once loses the reason."""
+
+_QUEUE_DEPTH = 10
+_FIBONACCI_PACKAGES = ("example_interfaces", "test_msgs", "action_tutorials_interfaces")
+
+Build = Callable[[Any, NodeOptions, EventWriter], Sequence[Any] | None]
+"""Adds the endpoints and timers of a role to a node; returns further nodes of the process."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Play a role until told to stop; returns the exit status."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    options = parse_options("sros_tool.demo.nodes.ros", ROLES, arguments)
+    return run_role(ROLES[options.role], options, [sys.argv[0], *arguments])
+
+
+def run_role(build: Build, options: NodeOptions, arguments: Sequence[str]) -> int:
+    """Create a node, let ``build`` add its endpoints, and spin until told to stop.
+
+    ``arguments`` is the whole command line, from which rclpy takes its ``--ros-args``.  Returns
+    the exit status.
+    """
+    name = "talker" if options.role == "composed" else options.role
+    events = EventWriter(options.report)
+    try:
+        import rclpy
+    except ImportError as error:
+        return _fail(name, error, Stage.IMPORT, events)
+    stage = Stage.PARTICIPANT
+    nodes: list[Any] = []
+    joined = False
+    try:
+        rclpy.init(args=list(arguments))
+        joined = True
+        nodes.append(rclpy.create_node(name))
+        stage = Stage.ENDPOINT
+        nodes += build(nodes[0], options, events) or ()
+        stage = Stage.RUNNING
+        events.report(Kind.READY)
+        _spin(nodes)
+    except KeyboardInterrupt:
+        pass
+    except ImportError as error:
+        return _fail(name, error, Stage.IMPORT, events)
+    except Exception as error:
+        # A signal ends the context, and what is being made then fails because of that.
+        if rclpy.ok() or not joined:
+            return _fail(name, error, stage, events)
+    finally:
+        # Leaves the domain, and nothing in shared memory; what is half made may well complain.
+        with suppress(Exception):
+            for node in nodes:
+                node.destroy_node()
+            rclpy.try_shutdown()
+    events.report(Kind.DONE)
+    return 0
+
+
+def _spin(nodes: Sequence[Any]) -> None:
+    import rclpy
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
+    executor = SingleThreadedExecutor()
+    for node in nodes:
+        executor.add_node(node)
+    try:
+        executor.spin()
+    except ExternalShutdownException:
+        pass
+    except Exception:
+        # A signal may end the context in the middle of a callback; that is no failure.
+        if rclpy.ok():
+            raise
+
+
+def _fail(name: str, error: Exception, stage: Stage, events: EventWriter) -> int:
+    reason = f"{type(error).__name__}: {error}"
+    time.sleep(_LOG_FLUSH_SECONDS)
+    sys.stdout.flush()
+    events.report(Kind.FAILED, reason, stage=stage)
+    print(f"{name}: failed at stage {stage.value}: {reason}", file=sys.stderr)
+    return 1
+
+
+# ── topics ─────────────────────────────────────────────────────────────────────────────────
+
+
+def _talker(node: Any, options: NodeOptions, events: EventWriter) -> None:
+    """Publish the text and a number, again and again."""
+    from std_msgs.msg import String
+
+    publisher = node.create_publisher(String, options.topic, _QUEUE_DEPTH)
+    sent = 0
+
+    def speak() -> None:
+        nonlocal sent
+        sent += 1
+        text = f"{options.text}: {sent}"
+        node.get_logger().info(f"Publishing: '{text}'")
+        publisher.publish(String(data=text))
+        events.report(Kind.SENT, text, count=sent)
+
+    node.create_timer(options.period, speak)
+
+
+def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
+    """Log what is heard."""
+    from std_msgs.msg import String
+
+    heard = 0
+
+    def hear(message: Any) -> None:
+        nonlocal heard
+        heard += 1
+        node.get_logger().info(f"I heard: '{message.data}'")
+        events.report(Kind.HEARD, message.data, count=heard)
+
+    # rclpy keeps subscriptions alive through the node.
+    node.create_subscription(String, options.topic, hear, _QUEUE_DEPTH)
+
+
+def _observer(node: Any, options: NodeOptions, events: EventWriter) -> None:
+    """Count the publishers of topics, as any intruder could."""
+
+    def look() -> None:
+        counts = {topic: node.count_publishers(topic) for topic in (options.topic, *options.also)}
+        # The listed names are worth a line, but a node lists its own topics too: only the count
+        # of publishers says whether a talker is visible.
+        listed = " ".join(sorted(name for name, _ in node.get_topic_names_and_types()))
+        node.get_logger().info(f"Publishers: {counts}; topics: {listed}")
+        events.report(Kind.SEEN, listed, publishers=counts)
+
+    node.create_timer(options.period, look)
+
+
+# ── services ───────────────────────────────────────────────────────────────────────────────
+
+
+def _server(node: Any, options: NodeOptions, events: EventWriter) -> None:
+    """Negate the truth value of each request.
+
+    Every ROS 2 installation has the type std_srvs/SetBool, and DDS Security goes by the name of a
+    service, not by its type.
+    """
+    from std_srvs.srv import SetBool
+
+    answered = 0
+
+    def answer(request: Any, response: Any) -> Any:
+        nonlocal answered
+        answered += 1
+        response.success = not request.data
+        response.message = f"{options.text}: not {request.data} = {response.success}"
+        node.get_logger().info(f"Answering: '{response.message}'")
+        events.report(Kind.SENT, response.message, count=answered)
+        return response
+
+    node.create_service(SetBool, options.service, answer)
+
+
+def _client(node: Any, options: NodeOptions, events: EventWriter) -> None:
+    """Send requests again and again, and report the right answers."""
+    from std_srvs.srv import SetBool
+
+    client = node.create_client(SetBool, options.service)
+    asked = right = 0
+
+    def ask() -> None:
+        nonlocal asked
+        asked += 1
+        value = bool(asked % 2)
+        events.report(Kind.SENT, f"not {value}", count=asked)
+        future = client.call_async(SetBool.Request(data=value))
+        future.add_done_callback(lambda done: check(value, done.result()))
+
+    def check(value: bool, response: Any) -> None:
+        nonlocal right
+        if response.success is not value and response.message.endswith(f"= {not value}"):
+            right += 1
+            node.get_logger().info(f"Answer: '{response.message}'")
+            events.report(Kind.HEARD, response.message, count=right)
+
+    node.create_timer(options.period, ask)
+
+
+# ── actions ────────────────────────────────────────────────────────────────────────────────
+
+
+def _action_server(node: Any, options: NodeOptions, events: EventWriter) -> None:
+    """Compute the Fibonacci numbers that each goal asks for."""
+    from rclpy.action import ActionServer
+
+    action = _fibonacci_action()
+    done = 0
+
+    def execute(goal: Any) -> Any:
+        nonlocal done
+        done += 1
+        feedback = action.Feedback()
+        field = "sequence" if hasattr(feedback, "sequence") else "partial_sequence"
+        for length in range(2, goal.request.order + 1):
+            setattr(feedback, field, fibonacci(length))
+            goal.publish_feedback(feedback)
+        goal.succeed()
+        result = action.Result()
+        result.sequence = fibonacci(goal.request.order)
+        node.get_logger().info(f"Result: {list(result.sequence)}")
+        events.report(Kind.SENT, f"{options.text}: {list(result.sequence)}", count=done)
+        return result
+
+    node.action = ActionServer(node, action, options.topic, execute)
+
+
+def _action_client(node: Any, options: NodeOptions, events: EventWriter) -> None:
+    """Send goals again and again, and report the right results whose feedback was complete.
+
+    A result does not say which server it is from: ``options.server`` names the only one.
+    """
+    from rclpy.action import ActionClient
+
+    action = _fibonacci_action()
+    client = ActionClient(node, action, options.topic)
+    sent = right = 0
+    feedback: set[tuple[int, ...]] = set()
+
+    def send() -> None:
+        nonlocal sent
+        sent += 1
+        events.report(Kind.SENT, f"goal {sent}", count=sent)
+        goal = action.Goal(order=FIBONACCI_ORDER)
+        future = client.send_goal_async(goal, feedback_callback=keep)
+        future.add_done_callback(fetch)
+
+    def keep(message: Any) -> None:
+        feedback.add(tuple(_sequence_of(message.feedback)))
+
+    def fetch(future: Any) -> None:
+        goal = future.result()
+        if goal.accepted:
+            goal.get_result_async().add_done_callback(check)
+
+    def check(future: Any) -> None:
+        nonlocal right
+        sequence = _sequence_of(future.result().result)
+        lengths = range(2, FIBONACCI_ORDER + 1)
+        complete = {tuple(fibonacci(length)) for length in lengths} <= feedback
+        if sequence == fibonacci(FIBONACCI_ORDER) and complete:
+            right += 1
+            node.get_logger().info(f"Result: {sequence}")
+            events.report(Kind.HEARD, f"{options.server}: {sequence}", count=right)
+
+    node.create_timer(options.period, send)
+
+
+def _fibonacci_action() -> Any:
+    """Return the class ``Fibonacci`` of whichever ROS 2 package is installed.
+
+    Raises:
+        ImportError: no package has it.
+    """
+    reasons = []
+    for package in _FIBONACCI_PACKAGES:
+        try:
+            return importlib.import_module(f"{package}.action").Fibonacci
+        except (ImportError, AttributeError) as error:
+            reasons.append(str(error))
+    raise ImportError(f"no package has the action Fibonacci: {'; '.join(reasons)}")
+
+
+def _sequence_of(message: Any) -> list[int]:
+    """Return the numbers of a result or of feedback; packages name the field differently."""
+    return list(getattr(message, "sequence", None) or getattr(message, "partial_sequence", []))
+
+
+# ── several nodes in one process ───────────────────────────────────────────────────────────
+
+
+def _composed(node: Any, options: NodeOptions, events: EventWriter) -> list[Any]:
+    """Talk, listen and serve with three nodes in one process and one enclave."""
+    import rclpy
+
+    # Each node gets its endpoint before the next one is made: the first denial is reported.
+    _talker(node, options, events)
+    listener = rclpy.create_node("listener")
+    _listener(listener, options, events)
+    server = rclpy.create_node("server")
+    _server(server, options, events)
+    return [listener, server]
+
+
+ROLES: Mapping[str, Build] = {
+    "talker": _talker,
+    "listener": _listener,
+    "observer": _observer,
+    "server": _server,
+    "client": _client,
+    "action_server": _action_server,
+    "action_client": _action_client,
+    "composed": _composed,
+}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
