@@ -15,7 +15,7 @@ from sros_tool.cli.policy import check_output, force_option
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
-    from sros_tool.demo.model import Scenario
+    from sros_tool.demo.scenarios.model import Scenario
 
 
 def _complete_scenario(

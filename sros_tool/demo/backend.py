@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import ProtectionKind
-from sros_tool.demo.model import Condition, Role
-from sros_tool.demo.nodes.names import naming_arguments
+from sros_tool.demo.casting import naming_arguments
+from sros_tool.demo.scenarios.model import Condition, Role
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.policy.patterns import matches

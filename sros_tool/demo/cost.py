@@ -24,15 +24,15 @@ from pathlib import Path
 from typing import Any
 
 from sros_tool.demo.backend import Backend
-from sros_tool.demo.keystores import Scenery
-from sros_tool.demo.launch import base_environment
-from sros_tool.demo.model import Identity, Role
-from sros_tool.demo.network import RowNetwork, Tell
+from sros_tool.demo.keystores import KeystoreSet
+from sros_tool.demo.network import Progress, RowNetwork
+from sros_tool.demo.runner import base_environment
+from sros_tool.demo.scenarios.model import Identity, Role
 from sros_tool.errors import SrosError
 from sros_tool.runtime.netns import end_with_parent
 
 UNSECURED = "unsecured"
-PAYLOADS = (64, 1024, 16 * 1024, 256 * 1024, 1024 * 1024)
+_PAYLOADS = (64, 1024, 16 * 1024, 256 * 1024, 1024 * 1024)
 NOTE = (
     "medians; latency is half a round trip, throughput is that of bursts which are waited for;"
     " both ends are Python, whose overhead is in all numbers alike and makes the ratios smaller"
@@ -45,16 +45,16 @@ _TICK = 0.02
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured: payloads in bytes, seconds for each, and how often all of it."""
+    """How much to measure: payloads in bytes, seconds for each, and rounds of all of it."""
 
-    payloads: tuple[int, ...] = PAYLOADS
+    payloads: tuple[int, ...] = _PAYLOADS
     seconds: float = 0.2
     rounds: int = 3
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What one pair found for one payload: seconds, and messages per second."""
+    """The latency (s) and rate (messages per second) of one protection kind and payload (bytes)."""
 
     kind: str
     payload: int
@@ -64,7 +64,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class CostResult:
-    """What security costs; ``first`` has the seconds to the first message by kind."""
+    """The cost of security; ``first`` has the seconds to the first message by kind."""
 
     kinds: tuple[str, ...]
     payloads: tuple[int, ...]
@@ -72,11 +72,15 @@ class CostResult:
     measurements: tuple[Measurement, ...]
 
     def of(self, kind: str, payload: int) -> Measurement:
-        """One measurement.  Raises `KeyError`."""
+        """Return one measurement.
+
+        Raises:
+            KeyError: there is none.
+        """
         return {(each.kind, each.payload): each for each in self.measurements}[kind, payload]
 
     def as_json(self) -> dict[str, Any]:
-        """The result as the head of this module describes it."""
+        """Return the result as the head of this module describes it."""
         return {
             "kinds": list(self.kinds),
             "payloads": list(self.payloads),
@@ -104,32 +108,32 @@ class CostResult:
             "throughput_ratio": round(each.rate / base.rate, 3),
         }
 
-    def markdown(self) -> list[str]:
-        """The cost as tables of Markdown."""
-        return _markdown(self.as_json())
-
 
 def measure_cost(
     kinds: Mapping[str, tuple[Identity, Identity]],
-    scenery: Scenery,
+    keystores: KeystoreSet,
     domain: int,
     folder: Path,
     backend: Backend,
     effort: Effort,
-    tell: Tell,
+    progress: Progress,
     *,
     own_network: bool,
 ) -> CostResult:
-    """Measure each kind, by the identities of its two ends; the first one must be unsecured."""
+    """Measure each kind by the identities of its two ends; the first kind must be unsecured.
+
+    Raises:
+        SrosError: two ends did not find each other.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in kinds}
     # In turns, so that what else the machine does falls on all kinds alike.
     for turn in range(effort.rounds):
         for kind, ends in kinds.items():
             found[kind].append(
-                _run_pair(ends, scenery, domain, folder, backend, effort, own_network)
+                _run_pair(ends, keystores, domain, folder, backend, effort, own_network)
             )
-        tell(f"measured {len(kinds)} kinds of protection, round {turn + 1} of {effort.rounds}")
+        progress(f"measured {len(kinds)} kinds of protection, round {turn + 1} of {effort.rounds}")
     first = {kind: statistics.median(run["first"] for run in runs) for kind, runs in found.items()}
     measurements = [
         Measurement(
@@ -146,7 +150,7 @@ def measure_cost(
 
 def _run_pair(
     ends: tuple[Identity, Identity],
-    scenery: Scenery,
+    keystores: KeystoreSet,
     domain: int,
     folder: Path,
     backend: Backend,
@@ -155,7 +159,7 @@ def _run_pair(
 ) -> dict[str, Any]:
     answer = folder / "answer.json"
     answer.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "sros_tool.demo.cost_node", backend.name]
+    command = [sys.executable, "-m", "sros_tool.demo.nodes.ping_pong", backend.name]
     ping = ["ping", "--answer", str(answer), "--seconds", str(effort.seconds)]
     ping += ["--sizes", *map(str, effort.payloads)]
     network = RowNetwork(own=own_network)
@@ -165,7 +169,7 @@ def _run_pair(
             for identity, arguments in zip(ends, (["pong"], ping), strict=True):
                 environment = base_environment(os.environ)
                 environment |= backend.environment(Role.TALKER, wire=True)
-                environment |= scenery.environment(identity, domain)
+                environment |= keystores.environment(identity, domain)
                 processes.append(
                     subprocess.Popen(
                         [*command, *arguments],
@@ -203,55 +207,3 @@ def _with(starter: int) -> Callable[[], None]:
             os._exit(1)
 
     return before
-
-
-def payload_text(size: int) -> str:
-    """A payload for people: "64 B", "16 KiB", "1 MiB"."""
-    for unit, name in ((1024 * 1024, "MiB"), (1024, "KiB")):
-        if size >= unit:
-            return f"{size / unit:g} {name}"
-    return f"{size} B"
-
-
-def cost_table(cost: CostResult) -> list[str]:
-    """The cost for a terminal."""
-    shown = cost.as_json()
-    lines = ["what security costs: latency and throughput, and their ratio to unsecured", ""]
-    lines.append(f"{'protection':<12}{'first message':>15}{'ratio':>8}")
-    lines += [
-        f"{each['kind']:<12}{each['seconds']:>13.3f} s{each['ratio']:>8.2f}"
-        for each in shown["first_message"]
-    ]
-    lines += [
-        "",
-        f"{'payload':<10}{'protection':<12}{'latency':>13}{'ratio':>7}{'MB/s':>11}{'ratio':>7}",
-    ]
-    for payload in cost.payloads:
-        for each in shown["measurements"]:
-            if each["payload"] == payload:
-                lines.append(
-                    f"{payload_text(payload):<10}{each['kind']:<12}{each['latency_us']:>10.0f} us"
-                    f"{each['latency_ratio']:>7.2f}{each['megabytes_per_s']:>11.2f}"
-                    f"{each['throughput_ratio']:>7.2f}"
-                )
-    return [*lines, "", NOTE]
-
-
-def _markdown(shown: Mapping[str, Any]) -> list[str]:
-    lines = ["| protection | first message | ratio |", "| --- | ---: | ---: |"]
-    lines += [
-        f"| {each['kind']} | {each['seconds']:.3f} s | {each['ratio']:.2f} |"
-        for each in shown["first_message"]
-    ]
-    lines += [
-        "",
-        "| payload | protection | latency | ratio | throughput | ratio |",
-        "| ---: | --- | ---: | ---: | ---: | ---: |",
-    ]
-    lines += [
-        f"| {payload_text(each['payload'])} | {each['kind']} | {each['latency_us']:.0f} µs"
-        f" | {each['latency_ratio']:.2f} | {each['megabytes_per_s']:.2f} MB/s"
-        f" | {each['throughput_ratio']:.2f} |"
-        for each in sorted(shown["measurements"], key=lambda each: int(each["payload"]))
-    ]
-    return [*lines, "", shown["note"] + "."]

@@ -10,9 +10,9 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.demo.keystores import Setting, build_scenery
-from sros_tool.demo.policies import DEFAULT_TOPIC
+from sros_tool.demo.keystores import KeystoreSpec, create_keystores
 from sros_tool.demo.scenarios.isolation import ISOLATION
+from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.cyclone import INSTALL_ADVICE
 from sros_tool.runtime.stacks import ROS_ADVICE, Stack, survey
@@ -52,9 +52,9 @@ def examine(now: datetime) -> Diagnosis:
     with TemporaryDirectory(prefix="sros-doctor-") as folder:
         domains = DomainSet.of((_PROBE_DOMAIN, _PROBE_DOMAIN))
         template = load_template(_TEMPLATE)
-        setting = Setting(DEFAULT_TOPIC, domains, template, now)
-        scenery = build_scenery(Path(folder), ISOLATION, setting)
-        stacks = survey(scenery.probe(DEFAULT_TOPIC, _PROBE_DOMAIN))
+        spec = KeystoreSpec(DEFAULT_TOPIC, domains, template, now)
+        keystores = create_keystores(Path(folder), ISOLATION, spec)
+        stacks = survey(keystores.probe(DEFAULT_TOPIC, _PROBE_DOMAIN))
     return Diagnosis(stacks)
 
 

@@ -1,14 +1,14 @@
-"""The workbench of a forger: a copy of a keystore, and the moves that forgeries are made of.
+"""The forger: turns a keystore into what an attacker would use, or takes a defence away from it.
 
-Each works on a copy of a keystore.  Those of `FORGERIES` leave the defences of the keystore as
-they are; those of `REMOVALS` take one away, and show that the attack works then.
+Rows refer to its functions.  A function alone works on a copy of the keystore, with all its
+defences; inside of `Undefended` it works on a keystore that was made again without one of them,
+and shows that the attack works there.
 """
 
 from __future__ import annotations
 
 import os
 import re
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
@@ -33,10 +33,21 @@ from sros_tool.dds.permissions import (
     parse_permissions,
     render_permissions,
 )
-from sros_tool.errors import DocumentError, UnavailableError
+from sros_tool.errors import DocumentError, KeystoreError, UnavailableError
 from sros_tool.keystore.authorities.authority import Authorities, load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.layout import CRL, REQUIRED_FILES, enclave_path
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    CRL,
+    CRL_FILE,
+    GOVERNANCE_FILE,
+    IDENTITY_CA_FILE,
+    KEY_FILE,
+    PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
+    REQUIRED_FILES,
+    enclave_path,
+)
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.reader import load_settings
@@ -47,14 +58,16 @@ from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 from sros_tool.policy.protection import Level, TopicProtection
 from sros_tool.validity import Window
 
-PERMISSIONS, GOVERNANCE = "permissions.p7s", "governance.p7s"
-CERTIFICATE, KEY = "cert.pem", "key.pem"
-PERMISSIONS_CA, IDENTITY_CA = "permissions_ca.cert.pem", "identity_ca.cert.pem"
+_DAY, _MINUTE = timedelta(days=1), timedelta(minutes=1)
+_NOBODY = 65534
+
+STOLEN = "/stolen"
+"""The enclave that holds a copy of another one from before its revocation."""
 
 
 @dataclass(frozen=True)
-class Bench:
-    """``root`` is the copy that is worked on, ``foreign`` another keystore with the same names.
+class KeystoreCopy:
+    """A keystore that is worked on; ``foreign`` is another one with the same enclaves.
 
     ``cast`` has the enclave of each part; ``topic`` is the ROS topic that attackers are after,
     ``domain`` one of the keystore's; ``keyring`` says where the keys of the copy's CAs are.
@@ -68,14 +81,30 @@ class Bench:
     now: datetime
     keyring: Keyring = IN_KEYSTORE
 
+    @property
+    def dds_topic(self) -> str:
+        """The DDS name of the topic that attackers are after."""
+        return f"rt{self.topic}"
+
+    def enclave(self, part: str) -> str:
+        """Return the name of the enclave that plays a part.
+
+        Raises:
+            KeystoreError: no enclave does.
+        """
+        if part not in self.cast:
+            raise KeystoreError(f"the keystore has no enclave for the part of the {part}")
+        return self.cast[part]
+
     def folder(self, part: str) -> Path:
-        """The folder of the enclave that plays a part.  Raises `KeyError`."""
-        return enclave_path(self.root, self.cast[part])
+        """Return the folder of the enclave that plays a part."""
+        return enclave_path(self.root, self.enclave(part))
 
     def authorities(self, root: Path | None = None) -> Authorities:
-        """The CAs, with their keys, of the copy or of another keystore.
+        """Return the CAs, with their keys, of the copy or of another keystore.
 
-        Raises `SrosError` where the keys are not there.
+        Raises:
+            SrosError: the keys are not there.
         """
         keyring = IN_KEYSTORE if root else self.keyring
         root = root or self.root
@@ -89,30 +118,30 @@ class Bench:
         file.write_bytes(data)
 
     def read(self, part: str, name: str) -> bytes:
-        """A file of an enclave."""
+        """Return the content of a file of an enclave."""
         return (self.folder(part) / name).read_bytes()
 
     def certificate(self, part: str) -> x509.Certificate:
-        """The certificate of an enclave."""
-        return load_certificate(self.read(part, CERTIFICATE), self.cast[part])
+        """Return the certificate of an enclave."""
+        return load_certificate(self.read(part, CERTIFICATE_FILE), self.enclave(part))
 
     def key(self, part: str) -> PrivateKey:
-        """The key of an enclave."""
-        return load_key(self.read(part, KEY), self.cast[part])
+        """Return the private key of an enclave."""
+        return load_key(self.read(part, KEY_FILE), self.enclave(part))
 
     def permissions(self, part: str) -> Permissions:
-        """What the permissions of an enclave say."""
-        return parse_permissions(smime.parse(self.read(part, PERMISSIONS)).document)
+        """Return the permissions of an enclave, without checking their signature."""
+        return parse_permissions(smime.parse(self.read(part, PERMISSIONS_FILE)).document)
 
     def governance(self) -> bytes:
-        """The signed governance of the keystore, as XML."""
+        """Return the signed governance of the keystore, as XML."""
         part = next(iter(self.cast))
-        return smime.parse(self.read(part, GOVERNANCE)).document
+        return smime.parse(self.read(part, GOVERNANCE_FILE)).document
 
-    def wanted(
+    def widened(
         self, part: str, publish: Sequence[str] = (), subscribe: Sequence[str] = ()
     ) -> bytes:
-        """The permissions of an enclave with more DDS topics in its first allow rule, as XML."""
+        """Return an enclave's permissions with more DDS topics in the first allow rule, as XML."""
         permissions = self.permissions(part)
         grant = permissions.grants[0]
         place = next(place for place, rule in enumerate(grant.rules) if rule.allow)
@@ -122,7 +151,7 @@ class Bench:
         return render_permissions(Permissions(grants))
 
     def sign(self, document: bytes, root: Path | None = None) -> bytes:
-        """A document signed by the permissions CA of this keystore, or of another one."""
+        """Sign a document with the permissions CA of this keystore, or of another one."""
         authority = self.authorities(root).permissions
         return smime.sign(document, authority.certificate, authority.key)
 
@@ -136,24 +165,37 @@ class Bench:
         subject = self.certificate(subject_of or part).subject
         key = generate_key() if new_key else self.key(part)
         issuer = self.authorities().identity.issuer()
-        self.put(part, CERTIFICATE, pem(issuer.issue(subject, key.public_key(), validity)))
+        self.put(part, CERTIFICATE_FILE, pem(issuer.issue(subject, key.public_key(), validity)))
         if new_key:
-            self.put(part, KEY, key_pem(key))
-
-    @property
-    def dds_topic(self) -> str:
-        """The DDS name of the topic that attackers are after."""
-        return f"rt{self.topic}"
+            self.put(part, KEY_FILE, key_pem(key))
 
 
-Forge = Callable[[Bench], None]
-"""Turns the copy on the bench into what an attacker would use."""
+Forge = Callable[[KeystoreCopy], None]
+"""Turns a keystore into what an attacker would use."""
 
 
-def copy_keystore(source: Path, target: Path) -> None:
-    """A copy with its links as they are."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    shutil.copytree(source, target, symlinks=True)
+def unchanged(_copy: KeystoreCopy) -> None:
+    """Leave the keystore as it is."""
+
+
+def same_template(template: Template) -> Template:
+    """Return the template as it is."""
+    return template
+
+
+@dataclass(frozen=True)
+class Undefended:
+    """A keystore made again without a defence: from a changed template, then forged in."""
+
+    forge: Forge = unchanged
+    template: Callable[[Template], Template] = same_template
+
+
+def name_of(forgery: Forge | Undefended) -> str:
+    """Return a name for the folder of a forged keystore, another one for each forgery."""
+    if isinstance(forgery, Undefended):
+        return f"undefended_{forgery.template.__name__}_{forgery.forge.__name__}"
+    return forgery.__name__
 
 
 def _with(rule: Rule, publish: Sequence[str], subscribe: Sequence[str]) -> Rule:
@@ -173,9 +215,9 @@ def _more(criteria: tuple[Criteria, ...], topics: Sequence[str]) -> tuple[Criter
     return (replace(first, topics=(*first.topics, *topics)), *criteria[1:])
 
 
-def _weak(bench: Bench) -> bytes:
-    """A governance that lets everybody in and protects nothing."""
-    governance = parse_governance(bench.governance())
+def _weak(copy: KeystoreCopy) -> bytes:
+    """Return a governance that lets everybody in and protects nothing, as XML."""
+    governance = parse_governance(copy.governance())
     return render_governance(
         Governance(
             tuple(
@@ -193,138 +235,136 @@ def _weak(bench: Bench) -> bytes:
     )
 
 
-def governance_edited(bench: Bench) -> None:
-    """As `_weak`, written over the signed document."""
-    signed = bench.read("listener", GOVERNANCE)
-    kept = bench.governance().replace(b"\r\n", b"\n")
+def edited_governance(copy: KeystoreCopy) -> None:
+    """Write a weak governance over the XML inside of the listener's signed document."""
+    signed = copy.read("listener", GOVERNANCE_FILE)
+    kept = copy.governance().replace(b"\r\n", b"\n")
     # The comment changes also what is as weak already.
-    weak = _weak(bench) + b"<!-- edited -->\n"
+    weak = _weak(copy) + b"<!-- edited -->\n"
     edited = signed.replace(kept.replace(b"\n", b"\r\n"), weak.replace(b"\n", b"\r\n"))
     if edited == signed:
         raise DocumentError("the signed governance cannot be edited", "Its XML is not found in it.")
-    bench.put("listener", GOVERNANCE, edited)
+    copy.put("listener", GOVERNANCE_FILE, edited)
 
 
-def governance_of_another_ca(bench: Bench) -> None:
-    """A weak governance for the listener, signed by a stranger's CA."""
-    bench.put("listener", GOVERNANCE, bench.sign(_weak(bench), bench.foreign))
+def governance_of_another_ca(copy: KeystoreCopy) -> None:
+    """Give the listener a weak governance, signed by another CA."""
+    copy.put("listener", GOVERNANCE_FILE, copy.sign(_weak(copy), copy.foreign))
 
 
-def weaker_governance(bench: Bench) -> None:
-    """A weak governance for talker and listener, signed by the CA, as it once was."""
-    signed = bench.sign(_weak(bench))
+def weaker_governance(copy: KeystoreCopy) -> None:
+    """Give talker and listener a weak governance, signed by the CA, as it once was."""
+    signed = copy.sign(_weak(copy))
     for part in ("talker", "listener"):
-        bench.put(part, GOVERNANCE, signed)
+        copy.put(part, GOVERNANCE_FILE, signed)
 
 
-_FORGED_PERMISSIONS_DAY = timedelta(days=1)
+def _wanted(copy: KeystoreCopy) -> bytes:
+    """Return the guest's permissions with the right to publish the topic, as XML."""
+    return copy.widened("guest", publish=[copy.dds_topic])
 
 
-def _wanted(bench: Bench) -> bytes:
-    return bench.wanted("guest", publish=[bench.dds_topic])
+def permissions_of_another(copy: KeystoreCopy) -> None:
+    """Give the guest the talker's permissions."""
+    copy.put("guest", PERMISSIONS_FILE, copy.read("talker", PERMISSIONS_FILE))
 
 
-def of_another(bench: Bench) -> None:
-    """The guest's certificate with the talker's permissions."""
-    bench.put("guest", PERMISSIONS, bench.read("talker", PERMISSIONS))
-
-
-def edited(bench: Bench) -> None:
-    """The guest's permissions with one more topic, written into the signed document."""
-    signed = bench.read("guest", PERMISSIONS)
-    topic = f"<topics>\r\n            <topic>{bench.dds_topic}</topic>".encode()
+def edited_permissions(copy: KeystoreCopy) -> None:
+    """Write one more topic into the guest's signed permissions."""
+    signed = copy.read("guest", PERMISSIONS_FILE)
+    topic = f"<topics>\r\n            <topic>{copy.dds_topic}</topic>".encode()
     edited = re.sub(rb"(<publish>\s*)<topics>", lambda found: found[1] + topic, signed, count=1)
     if edited == signed:
         raise DocumentError(
             "the signed permissions cannot be edited", "They allow to publish nothing."
         )
-    bench.put("guest", PERMISSIONS, edited)
+    copy.put("guest", PERMISSIONS_FILE, edited)
 
 
-def unsigned(bench: Bench) -> None:
-    """The guest's permissions with one more topic, as plain XML."""
-    bench.put("guest", PERMISSIONS, _wanted(bench))
+def unsigned_permissions(copy: KeystoreCopy) -> None:
+    """Give the guest permissions with one more topic, as plain XML."""
+    copy.put("guest", PERMISSIONS_FILE, _wanted(copy))
 
 
-def signed_by_another_ca(bench: Bench) -> None:
-    """The guest's permissions with one more topic, signed by a stranger's CA."""
-    bench.put("guest", PERMISSIONS, bench.sign(_wanted(bench), bench.foreign))
+def permissions_of_another_ca(copy: KeystoreCopy) -> None:
+    """Give the guest permissions with one more topic, signed by another CA."""
+    copy.put("guest", PERMISSIONS_FILE, copy.sign(_wanted(copy), copy.foreign))
 
 
-def own_permissions_ca(bench: Bench, part: str = "guest") -> None:
-    """Everything that the permissions CA signs, by another one, which its own DDS trusts."""
-    certificate = bench.authorities(bench.foreign).permissions.certificate
-    document = _wanted(bench) if part == "guest" else render_permissions(bench.permissions(part))
-    bench.put(part, PERMISSIONS, bench.sign(document, bench.foreign))
-    bench.put(part, GOVERNANCE, bench.sign(bench.governance(), bench.foreign))
-    bench.put(part, PERMISSIONS_CA, pem(certificate))
+def own_permissions_ca(copy: KeystoreCopy) -> None:
+    """Sign all documents of the guest by another permissions CA, which its own DDS trusts."""
+    _trust_another_permissions_ca(copy, "guest")
 
 
-def trusted_by_the_listener_too(bench: Bench) -> None:
-    """The listener trusts the stranger's permissions CA as well."""
+def another_permissions_ca_trusted(copy: KeystoreCopy) -> None:
+    """Do the same with the listener, which then trusts that permissions CA as well."""
     for part in ("guest", "listener"):
-        own_permissions_ca(bench, part)
+        _trust_another_permissions_ca(copy, part)
 
 
-def signed_by_itself(bench: Bench) -> None:
-    """The guest's permissions with one more topic, signed with the guest's own key."""
-    signed = smime.sign(_wanted(bench), bench.certificate("guest"), bench.key("guest"))
-    bench.put("guest", PERMISSIONS, signed)
+def _trust_another_permissions_ca(copy: KeystoreCopy, part: str) -> None:
+    certificate = copy.authorities(copy.foreign).permissions.certificate
+    document = _wanted(copy) if part == "guest" else render_permissions(copy.permissions(part))
+    copy.put(part, PERMISSIONS_FILE, copy.sign(document, copy.foreign))
+    copy.put(part, GOVERNANCE_FILE, copy.sign(copy.governance(), copy.foreign))
+    copy.put(part, PERMISSIONS_CA_FILE, pem(certificate))
 
 
-def signed_by_itself_and_trusting_itself(bench: Bench) -> None:
-    """Its own DDS then has nothing against it; its peers decide.
+def permissions_signed_by_itself(copy: KeystoreCopy) -> None:
+    """Give the guest permissions with one more topic, signed with its own key."""
+    signed = smime.sign(_wanted(copy), copy.certificate("guest"), copy.key("guest"))
+    copy.put("guest", PERMISSIONS_FILE, signed)
 
-    Its certificate ends at the identity CA, for vendors that follow a chain, and is itself in the
-    file, for those that ask for the signer alone.
+
+def permissions_and_governance_signed_by_itself(copy: KeystoreCopy) -> None:
+    """Do the same with the governance, so that its own DDS has nothing against the guest.
+
+    The file of the permissions CA has the identity CA, for vendors that follow a chain, and the
+    guest's certificate, for those that ask for the signer alone.
     """
-    certificate, key = bench.certificate("guest"), bench.key("guest")
-    governance = bench.governance()
-    signed_by_itself(bench)
-    bench.put("guest", GOVERNANCE, smime.sign(governance, certificate, key))
-    bench.put("guest", PERMISSIONS_CA, bench.read("guest", IDENTITY_CA) + pem(certificate))
+    certificate, key = copy.certificate("guest"), copy.key("guest")
+    governance = copy.governance()
+    permissions_signed_by_itself(copy)
+    copy.put("guest", GOVERNANCE_FILE, smime.sign(governance, certificate, key))
+    copy.put("guest", PERMISSIONS_CA_FILE, copy.read("guest", IDENTITY_CA_FILE) + pem(certificate))
 
 
-def trusted_as_signer(bench: Bench) -> None:
-    """As `signed_by_itself`, and guest and listener have its certificate among the signers."""
-    signed_by_itself(bench)
-    trusted = bench.read("guest", PERMISSIONS_CA) + pem(bench.certificate("guest"))
+def enclave_among_the_signers(copy: KeystoreCopy) -> None:
+    """Do the same, and put its certificate among the signers of guest and listener."""
+    permissions_signed_by_itself(copy)
+    trusted = copy.read("guest", PERMISSIONS_CA_FILE) + pem(copy.certificate("guest"))
     for part in ("guest", "listener"):
-        bench.put(part, PERMISSIONS_CA, trusted)
+        copy.put(part, PERMISSIONS_CA_FILE, trusted)
 
 
-def borrowed(bench: Bench) -> None:
-    """The guest's certificate with the permissions of an enclave whose name contains its own."""
-    bench.put("guest", PERMISSIONS, bench.read("admin", PERMISSIONS))
+def borrowed_permissions(copy: KeystoreCopy) -> None:
+    """Give the guest the permissions of an enclave whose name contains its own."""
+    copy.put("guest", PERMISSIONS_FILE, copy.read("admin", PERMISSIONS_FILE))
 
 
-def borrowed_with_the_subject(bench: Bench) -> None:
-    """As `borrowed`, and the CA gave both enclaves certificates of one subject."""
-    borrowed(bench)
-    bench.reissue(
-        "guest",
-        Window(bench.now - _FORGED_PERMISSIONS_DAY, bench.now + _FORGED_PERMISSIONS_DAY),
-        subject_of="admin",
-    )
+def borrowed_permissions_and_subject(copy: KeystoreCopy) -> None:
+    """Do the same, and issue the guest a certificate with the subject of that enclave."""
+    borrowed_permissions(copy)
+    validity = Window(copy.now - _DAY, copy.now + _DAY)
+    copy.reissue("guest", validity, subject_of="admin")
 
 
-def signed_by_the_ca(bench: Bench) -> None:
-    """The guest's permissions with one more topic, signed by the CA, as they once were."""
-    bench.put("guest", PERMISSIONS, bench.sign(_wanted(bench)))
+def permissions_signed_by_the_ca(copy: KeystoreCopy) -> None:
+    """Give the guest permissions with one more topic, signed by the CA, as they once were."""
+    copy.put("guest", PERMISSIONS_FILE, copy.sign(_wanted(copy)))
 
 
-def old_permissions_after_renewal(bench: Bench) -> None:
-    """The guest was renewed, and its permissions from before are put back."""
-    old = bench.sign(_wanted(bench))
-    renew(bench.root, [bench.cast["guest"]], now=bench.now, keyring=bench.keyring)
-    bench.put("guest", PERMISSIONS, old)
+def old_permissions_after_renewal(copy: KeystoreCopy) -> None:
+    """Renew the guest, and put its permissions from before back."""
+    old = copy.sign(_wanted(copy))
+    renew(copy.root, [copy.enclave("guest")], now=copy.now, keyring=copy.keyring)
+    copy.put("guest", PERMISSIONS_FILE, old)
 
 
-def for_another_domain(bench: Bench) -> None:
-    """The guest's permissions with one more topic, signed by the CA for another domain."""
-    document = bench.wanted("guest", publish=[bench.dds_topic])
-    permissions = Permissions(_only_elsewhere(document, bench.domain))
-    bench.put("guest", PERMISSIONS, bench.sign(render_permissions(permissions)))
+def permissions_for_another_domain(copy: KeystoreCopy) -> None:
+    """Give the guest permissions with one more topic, signed by the CA for another domain."""
+    permissions = Permissions(_only_elsewhere(_wanted(copy), copy.domain))
+    copy.put("guest", PERMISSIONS_FILE, copy.sign(render_permissions(permissions)))
 
 
 def _only_elsewhere(document: bytes, domain: int) -> tuple[Grant, ...]:
@@ -335,113 +375,123 @@ def _only_elsewhere(document: bytes, domain: int) -> tuple[Grant, ...]:
     )
 
 
-def file_missing(bench: Bench) -> None:
-    """The talker without its permissions."""
-    (bench.folder("talker") / PERMISSIONS).unlink()
+def missing_permissions(copy: KeystoreCopy) -> None:
+    """Remove the talker's permissions."""
+    (copy.folder("talker") / PERMISSIONS_FILE).unlink()
 
 
-def every_topic(part: str) -> Forge:
-    """Permissions with a wildcard, as ros2/sros2 gives them to an enclave without a policy."""
-
-    def forge(bench: Bench) -> None:
-        wide = bench.wanted(part, publish=["*"], subscribe=["*"])
-        bench.put(part, PERMISSIONS, bench.sign(wide))
-
-    return forge
+def guest_may_do_everything(copy: KeystoreCopy) -> None:
+    """Give the guest permissions with a wildcard."""
+    _allow_everything(copy, "guest")
 
 
-_NOBODY = 65534
-_DAY, _MINUTE = timedelta(days=1), timedelta(minutes=1)
-STOLEN = "/stolen"
-"""Where a copy of an enclave from before its revocation is kept."""
+def talker_may_do_everything(copy: KeystoreCopy) -> None:
+    """Give the talker permissions with a wildcard."""
+    _allow_everything(copy, "talker")
 
 
-def in_date(bench: Bench) -> None:
-    """The talker's certificate issued anew, from yesterday to tomorrow."""
-    bench.reissue("talker", Window(bench.now - _DAY, bench.now + _DAY))
+def listener_may_do_everything(copy: KeystoreCopy) -> None:
+    """Give the listener permissions with a wildcard."""
+    _allow_everything(copy, "listener")
 
 
-def expired(bench: Bench) -> None:
-    """An authority issues nothing from before its own time: the first minute that it may."""
-    start = validity_of(bench.authorities().identity.certificate).not_before
-    bench.reissue("talker", Window(start, start + _MINUTE))
+def client_may_do_everything(copy: KeystoreCopy) -> None:
+    """Give the client permissions with a wildcard."""
+    _allow_everything(copy, "client")
 
 
-def not_yet_valid(bench: Bench) -> None:
-    """The talker's certificate issued anew, from tomorrow on."""
-    bench.reissue("talker", Window(bench.now + _DAY, bench.now + 2 * _DAY))
+def _allow_everything(copy: KeystoreCopy, part: str) -> None:
+    """Sign what ros2/sros2 gives to an enclave without a policy."""
+    wide = copy.widened(part, publish=["*"], subscribe=["*"])
+    copy.put(part, PERMISSIONS_FILE, copy.sign(wide))
 
 
-def key_of_another(bench: Bench) -> None:
-    """The talker's certificate with the guest's key."""
-    bench.put("talker", KEY, bench.read("guest", KEY))
+def identity_in_date(copy: KeystoreCopy) -> None:
+    """Issue the talker's certificate again, valid from yesterday to tomorrow."""
+    copy.reissue("talker", Window(copy.now - _DAY, copy.now + _DAY))
 
 
-def _revoke(bench: Bench, part: str) -> None:
-    """Revoke an enclave, and issue it anew for the same subject, as its owner would go on."""
-    folder = bench.folder(part)
-    before = {name: bench.read(part, name) for name in REQUIRED_FILES}
-    revoke(bench.root, [bench.cast[part]], now=bench.now, keyring=bench.keyring)
+def expired_identity(copy: KeystoreCopy) -> None:
+    """Issue the talker's certificate for the first minute of its CA, which issues none before."""
+    start = validity_of(copy.authorities().identity.certificate).not_before
+    copy.reissue("talker", Window(start, start + _MINUTE))
+
+
+def identity_not_yet_valid(copy: KeystoreCopy) -> None:
+    """Issue the talker's certificate again, valid from tomorrow on."""
+    copy.reissue("talker", Window(copy.now + _DAY, copy.now + 2 * _DAY))
+
+
+def key_of_another_enclave(copy: KeystoreCopy) -> None:
+    """Give the talker the guest's key."""
+    copy.put("talker", KEY_FILE, copy.read("guest", KEY_FILE))
+
+
+def _revoke(copy: KeystoreCopy, part: str) -> None:
+    """Revoke an enclave, and issue it again for the same subject, as its owner would go on."""
+    folder = copy.folder(part)
+    before = {name: copy.read(part, name) for name in REQUIRED_FILES}
+    revoke(copy.root, [copy.enclave(part)], now=copy.now, keyring=copy.keyring)
     folder.mkdir(mode=0o700, exist_ok=True)
     for name, data in before.items():
-        bench.put(part, name, data)
-    bench.reissue(part, Window(bench.now - _DAY, bench.now + _DAY), new_key=True)
-    bench.put(part, "crl.pem", (bench.root / CRL).read_bytes())
+        copy.put(part, name, data)
+    copy.reissue(part, Window(copy.now - _DAY, copy.now + _DAY), new_key=True)
+    copy.put(part, CRL_FILE, (copy.root / CRL).read_bytes())
 
 
-def talker_revoked(bench: Bench) -> None:
-    """The talker was revoked, and issued anew."""
-    _revoke(bench, "talker")
+def talker_revoked(copy: KeystoreCopy) -> None:
+    """Revoke the talker, and issue it again."""
+    _revoke(copy, "talker")
 
 
-def guest_revoked(bench: Bench) -> None:
-    """The guest was revoked, and issued anew."""
-    _revoke(bench, "guest")
+def guest_revoked(copy: KeystoreCopy) -> None:
+    """Revoke the guest, and issue it again."""
+    _revoke(copy, "guest")
 
 
-def not_delivered_of_the_talker(bench: Bench) -> None:
-    """The talker was revoked, and the listener was not told."""
-    _revocation_not_delivered(bench, "talker")
+def talker_revocation_not_delivered(copy: KeystoreCopy) -> None:
+    """Revoke the talker, keep a copy of it, and take the revocation list from the listener."""
+    _revocation_not_delivered(copy, "talker")
 
 
-def not_delivered_of_the_guest(bench: Bench) -> None:
-    """The copy has permissions from before rights were taken away."""
-    now = bench.read("guest", PERMISSIONS)
-    signed_by_the_ca(bench)
-    before = bench.read("guest", PERMISSIONS)
-    bench.put("guest", PERMISSIONS, now)
-    _revocation_not_delivered(bench, "guest")
-    (enclave_path(bench.root, STOLEN) / PERMISSIONS).write_bytes(before)
+def guest_revocation_not_delivered(copy: KeystoreCopy) -> None:
+    """Do the same with the guest; the copy has permissions from before rights were removed."""
+    now = copy.read("guest", PERMISSIONS_FILE)
+    permissions_signed_by_the_ca(copy)
+    before = copy.read("guest", PERMISSIONS_FILE)
+    copy.put("guest", PERMISSIONS_FILE, now)
+    _revocation_not_delivered(copy, "guest")
+    (enclave_path(copy.root, STOLEN) / PERMISSIONS_FILE).write_bytes(before)
 
 
-def _revocation_not_delivered(bench: Bench, part: str) -> None:
-    before = {name: bench.read(part, name) for name in REQUIRED_FILES}
-    _revoke(bench, part)
-    copy = enclave_path(bench.root, STOLEN)
-    copy.mkdir(mode=0o700)
+def _revocation_not_delivered(copy: KeystoreCopy, part: str) -> None:
+    before = {name: copy.read(part, name) for name in REQUIRED_FILES}
+    _revoke(copy, part)
+    stolen = enclave_path(copy.root, STOLEN)
+    stolen.mkdir(mode=0o700)
     for name, data in before.items():
-        (copy / name).touch(0o600)
-        (copy / name).write_bytes(data)
-    (bench.folder("listener") / "crl.pem").unlink()
+        (stolen / name).touch(0o600)
+        (stolen / name).write_bytes(data)
+    (copy.folder("listener") / CRL_FILE).unlink()
 
 
-def stolen(bench: Bench) -> None:
-    """Another user of the machine copies the files that he can read, and no others."""
+def identity_copied_by_another_user(copy: KeystoreCopy) -> None:
+    """Leave of the talker only those files that another user of the machine can read."""
     if os.geteuid() != 0:
         raise UnavailableError("only root can try it as another user of this machine")
-    folder = bench.folder("talker")
-    inside = str(folder.relative_to(bench.root))
+    folder = copy.folder("talker")
+    inside = str(folder.relative_to(copy.root))
     names = [file.name for file in folder.iterdir()]
-    copied = _read_as_nobody(bench.root, [f"{inside}/{name}" for name in names])
+    copied = _read_as_nobody(copy.root, [f"{inside}/{name}" for name in names])
     for name, data in zip(names, copied, strict=True):
         if data is None:
             (folder / name).unlink()
         else:
-            bench.put("talker", name, data)
+            copy.put("talker", name, data)
 
 
 def _read_as_nobody(root: Path, files: list[str]) -> list[bytes | None]:
-    """What a user without any rights can read below a folder, by the modes that lie below it."""
+    """Return what a user without any rights can read below a folder, by the modes below it."""
     kept: list[bytes | None] = []
     place = os.open(root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -470,110 +520,59 @@ def _read_as_nobody(root: Path, files: list[str]) -> list[bytes | None]:
     return kept
 
 
-def readable_for_all(bench: Bench) -> None:
-    """What a careless copy leaves behind, and what was standard with ros2/sros2."""
-    for path in [bench.root, *bench.root.rglob("*")]:
+def files_readable_for_all(copy: KeystoreCopy) -> None:
+    """Open the modes, as a careless copy or ros2/sros2 leaves them; then copy the talker."""
+    for path in [copy.root, *copy.root.rglob("*")]:
         if not path.is_symlink():
             path.chmod(0o755 if path.is_dir() else 0o644)
-    stolen(bench)
+    identity_copied_by_another_user(copy)
 
 
-@dataclass(frozen=True)
-class Removal:
-    """A forgery on a keystore whose template was ``weakened`` first."""
-
-    forge: Forge
-    weakened: Callable[[Template], Template] = lambda template: template
-
-
-def _as_it_is(_bench: Bench) -> None:
-    pass
-
-
-def _one_ca(template: Template) -> Template:
+def one_ca(template: Template) -> Template:
+    """Return the template with one CA for identity and permissions."""
     return replace(template, separate_authorities=False)
 
 
-def _shared_subjects(template: Template) -> Template:
+def shared_subjects(template: Template) -> Template:
+    """Return the template with subjects that have no part of their own."""
     return replace(template, unique_subject=False)
 
 
-def _open_default(template: Template) -> Template:
+def open_default(template: Template) -> Template:
+    """Return the template that lets an enclave without a policy do everything."""
     return replace(template, default_permissions=EVERYTHING)
 
 
-def protected(level: Level) -> Callable[[Template], Template]:
-    """Templates with access control, and with messages protected by that level everywhere.
+def unprotected(template: Template) -> Template:
+    """Return the template with access control, and messages that travel as they are."""
+    return _protected(template, Level.NONE)
+
+
+def signed(template: Template) -> Template:
+    """Return the template with access control, and messages that are signed and in clear."""
+    return _protected(template, Level.SIGN)
+
+
+def encrypted(template: Template) -> Template:
+    """Return the template with access control, and messages that are encrypted."""
+    return _protected(template, Level.ENCRYPT)
+
+
+def _protected(template: Template, level: Level) -> Template:
+    """Protect every topic by one level.
 
     A payload is signed with the submessage that it is in: Fast DDS loses payloads that are signed
     by themselves (`governance.signed-payload`).
     """
     discovered = level is not Level.NONE
     payload = level if level is Level.ENCRYPT else Level.NONE
-
-    def change(template: Template) -> Template:
-        topics = TopicProtection(payload, level, discovery=discovered, liveliness=discovered)
-        protection = replace(
-            template.protection,
-            rtps=level,
-            discovery=level,
-            liveliness=level,
-            default=topics,
-            named=(),
-        )
-        return replace(template, protection=protection)
-
-    return change
-
-
-in_clear = protected(Level.NONE)
-
-FORGERIES: Mapping[str, Forge] = {
-    "expired": expired,
-    "not yet valid": not_yet_valid,
-    "key of another": key_of_another,
-    "talker revoked": talker_revoked,
-    "guest revoked": guest_revoked,
-    "stolen": stolen,
-    "permissions of another": of_another,
-    "permissions edited": edited,
-    "permissions unsigned": unsigned,
-    "permissions of another CA": signed_by_another_ca,
-    "own permissions CA": own_permissions_ca,
-    "signed by itself": signed_by_itself,
-    "signed by itself, own trust": signed_by_itself_and_trusting_itself,
-    "borrowed": borrowed,
-    "old permissions": signed_by_the_ca,
-    "old permissions after renewal": old_permissions_after_renewal,
-    "permissions for another domain": for_another_domain,
-    "file missing": file_missing,
-    "governance edited": governance_edited,
-    "governance of another CA": governance_of_another_ca,
-    "old governance": weaker_governance,
-}
-
-REMOVALS: Mapping[str, Removal] = {
-    "made": Removal(_as_it_is),
-    "in date": Removal(in_date),
-    "revocation not delivered": Removal(not_delivered_of_the_talker),
-    "guest's revocation not delivered": Removal(not_delivered_of_the_guest),
-    "keys readable for all": Removal(readable_for_all),
-    "signed by the CA": Removal(signed_by_the_ca),
-    "guest may do everything": Removal(every_topic("guest")),
-    "talker may do everything": Removal(every_topic("talker")),
-    "listener may do everything": Removal(every_topic("listener")),
-    "client may do everything": Removal(every_topic("client")),
-    "another CA trusted": Removal(trusted_by_the_listener_too),
-    "one CA": Removal(signed_by_itself, _one_ca),
-    "trusted as signer": Removal(trusted_as_signer),
-    "borrowed with the subject": Removal(borrowed_with_the_subject),
-    "borrowed with shared subjects": Removal(borrowed, _shared_subjects),
-    "renewed with shared subjects": Removal(old_permissions_after_renewal, _shared_subjects),
-    "open default": Removal(_as_it_is, _open_default),
-    "in clear": Removal(_as_it_is, in_clear),
-    "strangers allowed": Removal(weaker_governance),
-    "file missing, permissive": Removal(file_missing),
-    "protection none": Removal(_as_it_is, in_clear),
-    "protection sign": Removal(_as_it_is, protected(Level.SIGN)),
-    "protection encrypt": Removal(_as_it_is, protected(Level.ENCRYPT)),
-}
+    topics = TopicProtection(payload, level, discovery=discovered, liveliness=discovered)
+    protection = replace(
+        template.protection,
+        rtps=level,
+        discovery=level,
+        liveliness=level,
+        default=topics,
+        named=(),
+    )
+    return replace(template, protection=protection)

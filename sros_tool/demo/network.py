@@ -67,14 +67,16 @@ def _enter(descriptor: int) -> None:
 
 _Value = TypeVar("_Value")
 
-Tell = Callable[[str], None]
+Progress = Callable[[str], None]
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _SECONDS_TO_END = 8.0
 
 
-def run_isolated(work: Callable[[Tell], _Value], isolation: Isolation, tell: Tell) -> _Value:
+def run_isolated(
+    work: Callable[[Progress], _Value], isolation: Isolation, tell: Progress
+) -> _Value:
     """Return what ``work`` returns; lines that it tells are passed on while it runs.
 
     The child enters a network of its own if ``isolation`` says so.  Whatever ends this process
@@ -114,7 +116,7 @@ def run_isolated(work: Callable[[Tell], _Value], isolation: Isolation, tell: Tel
 
 
 def _main(
-    work: Callable[[Tell], Any], isolation: Isolation, answers: Connection, starter: int
+    work: Callable[[Progress], Any], isolation: Isolation, answers: Connection, starter: int
 ) -> None:
     end_with_parent()
     if os.getppid() != starter:

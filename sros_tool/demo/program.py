@@ -1,4 +1,4 @@
-"""The whole demo: check what was asked, make keystores, choose a backend, run scenarios, answer."""
+"""The whole demo: check the options, make keystores, choose a backend, run scenarios."""
 
 from __future__ import annotations
 
@@ -17,30 +17,31 @@ from types import FrameType
 
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.demo.backend import AUTO, RCLPY, Backend, choose_backend, conditions
+from sros_tool.demo.casting import UserKeystore, open_user_keystore
 from sros_tool.demo.cost import UNSECURED, CostResult, Effort, measure_cost
-from sros_tool.demo.keystores import GivenKeystore, Setting, build_scenery, open_given
-from sros_tool.demo.model import Identity, Row, Scenario
-from sros_tool.demo.network import Tell, run_isolated
-from sros_tool.demo.policies import DEFAULT_TOPIC, check_topic
+from sros_tool.demo.keystores import KeystoreSpec, create_keystores
+from sros_tool.demo.network import Progress, run_isolated
 from sros_tool.demo.result import DemoResult, ScenarioResult
-from sros_tool.demo.runner import Limits, Plan, run_plan
+from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios.isolation import ISOLATION
+from sros_tool.demo.scenarios.model import Identity, Row, Scenario
+from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC, check_topic
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.runtime.netns import Isolation, try_isolation
 
-DEFAULT_DOMAIN = 80
+_DEFAULT_DOMAIN = 80
 """The rows take this domain and those after it: below 102, where Linux hands out no port."""
 
-DEFAULT_TEMPLATE = "production"
+_DEFAULT_TEMPLATE = "production"
 
-HOST = "host"
+_HOST = "host"
 """The choice to stay in the network of the machine."""
 
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """What was asked for; ``keep`` is the folder to leave everything in, if any.
+    """What to run; ``keep`` is the folder to leave everything in, if any.
 
     ``keystore`` is one of the user's, to be attacked in a copy.  Without a ``template`` it is the
     one of that keystore, or production; without a ``topic``, one that fits.  ``only`` leaves those
@@ -50,7 +51,7 @@ class DemoOptions:
     template: Template | None = None
     backend: str = AUTO
     topic: str | None = None
-    domain: int = DEFAULT_DOMAIN
+    domain: int = _DEFAULT_DOMAIN
     network: str = AUTO
     keep: Path | None = None
     scenarios: tuple[Scenario, ...] = (ISOLATION,)
@@ -60,53 +61,55 @@ class DemoOptions:
     effort: Effort = field(default_factory=Effort)
 
 
-def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
-    """Run the demo; ``tell`` gets lines about its progress.
+def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoResult:
+    """Run the demo; ``progress`` gets lines while it runs.
 
-    Raises `UsageError` before anything is made, `UnavailableError` where no DDS enforces
-    security, and what making a keystore raises.
+    Raises:
+        UsageError: before anything is made.
+        UnavailableError: no DDS enforces security here.
+        SrosError: a keystore could not be made.
     """
-    given = _given(options)
-    template = options.template or (given.template if given else load_template(DEFAULT_TEMPLATE))
+    user = _user_keystore(options)
+    template = options.template or (user.template if user else load_template(_DEFAULT_TEMPLATE))
     topic = options.topic
-    topic = check_topic((given.topic if given else DEFAULT_TOPIC) if topic is None else topic)
-    scenarios = _chosen(options)
+    topic = check_topic((user.topic if user else DEFAULT_TOPIC) if topic is None else topic)
+    scenarios = _with_chosen_rows(options)
     isolation = _isolation(options.network)
-    domains = [_domains(scenario, options, given, isolation) for scenario in scenarios]
+    domains = [_domains(scenario, options, user, isolation) for scenario in scenarios]
     results: list[ScenarioResult] = []
     with _ended_by_signals(), _folder(options.keep) as folder:
-        tell("looking for a DDS that enforces security")
+        progress("looking for a DDS that enforces security")
         backend = _find_backend(options.backend, folder, topic, now)
-        for scenario, places in zip(scenarios, domains, strict=True):
+        for scenario, of_rows in zip(scenarios, domains, strict=True):
             under = folder if len(scenarios) == 1 else folder / scenario.name
-            spanned = given.domains if given else DomainSet.of((places[0], places[-1]))
-            setting = Setting(topic, spanned, template, now)
+            spanned = user.domains if user else DomainSet.of((of_rows[0], of_rows[-1]))
+            spec = KeystoreSpec(topic, spanned, template, now)
             rows = tuple(
                 row.under(conditions(backend, template, _dds_topic(row, topic)))
                 for row in scenario.rows
             )
             scenario = replace(scenario, rows=rows)
-            scenery = build_scenery(under, scenario, setting, given)
-            tell(
+            keystores = create_keystores(under, scenario, spec, user)
+            progress(
                 f"{scenario.name}: running {len(scenario.rows)} rows on {backend.name}"
                 f" ({backend.dds}): {backend.why}"
             )
-            plan = Plan(
+            plan = RunPlan(
                 rows=scenario.rows,
-                domains=places,
+                domains=of_rows,
                 backend=backend,
-                scenery=scenery,
+                keystores=keystores,
                 topic=topic,
                 folder=under / "rows",
                 limits=options.limits,
                 own_networks=isolation.isolated,
             )
-            shown = run_isolated(partial(run_plan, plan), isolation, tell)
+            shown = run_isolated(partial(run_rows, plan), isolation, progress)
             cost = None
             if scenario.measured:
                 measuring = partial(_measure, plan, scenario, under / "cost", options.effort)
-                cost = run_isolated(measuring, isolation, tell)
-            cast = scenery.members(scenario.rows, on_ros=backend.name == RCLPY) if given else ()
+                cost = run_isolated(measuring, isolation, progress)
+            cast = keystores.members(scenario.rows, on_ros=backend.name == RCLPY) if user else ()
             results.append(ScenarioResult(scenario.name, scenario.title, tuple(shown), cost, cast))
         result = DemoResult(backend, topic, isolation, template.name, tuple(results))
         if options.keep is not None:
@@ -116,35 +119,38 @@ def run_demo(options: DemoOptions, now: datetime, tell: Tell) -> DemoResult:
 
 
 def _find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend:
-    """Try what is here in a keystore that is made for that, and removed again."""
-    with TemporaryDirectory(dir=folder, prefix="probe-") as place:
-        domains = DomainSet.of((DEFAULT_DOMAIN, DEFAULT_DOMAIN))
-        setting = Setting(topic, domains, load_template(DEFAULT_TEMPLATE), now)
-        probed = build_scenery(Path(place), replace(ISOLATION, rows=()), setting)
-        return choose_backend(wish, probed.probe(topic, DEFAULT_DOMAIN))
+    """Try what is installed, in a keystore that is made for that and removed again."""
+    with TemporaryDirectory(dir=folder, prefix="probe-") as probed:
+        domains = DomainSet.of((_DEFAULT_DOMAIN, _DEFAULT_DOMAIN))
+        spec = KeystoreSpec(topic, domains, load_template(_DEFAULT_TEMPLATE), now)
+        keystores = create_keystores(Path(probed), replace(ISOLATION, rows=()), spec)
+        return choose_backend(wish, keystores.probe(topic, _DEFAULT_DOMAIN))
 
 
 def _measure(
-    plan: Plan, scenario: Scenario, folder: Path, effort: Effort, tell: Tell
+    plan: RunPlan, scenario: Scenario, folder: Path, effort: Effort, progress: Progress
 ) -> CostResult:
     kinds = {UNSECURED: (Identity(), Identity())}
-    for kind in scenario.measured:
-        label = f"protection {kind}"
-        kinds[kind] = (Identity(label, "pong"), Identity(label, "ping"))
+    for kind, keystore in scenario.measured.items():
+        kinds[kind] = (Identity(keystore, "pong"), Identity(keystore, "ping"))
     return measure_cost(
         kinds,
-        plan.scenery,
+        plan.keystores,
         plan.domains[0],
         folder,
         plan.backend,
         effort,
-        tell,
+        progress,
         own_network=plan.own_networks,
     )
 
 
-def _given(options: DemoOptions) -> GivenKeystore | None:
-    """The keystore of the user's.  Raises `UsageError` where a scenario needs one of its own."""
+def _user_keystore(options: DemoOptions) -> UserKeystore | None:
+    """Open the user's keystore, if one is given.
+
+    Raises:
+        UsageError: a scenario needs a keystore of its own.
+    """
     if options.keystore is None:
         return None
     for scenario in options.scenarios:
@@ -155,11 +161,15 @@ def _given(options: DemoOptions) -> GivenKeystore | None:
                 "Use --keystore with --scenario attacks alone.",
             )
     topic = "" if options.topic is None else check_topic(options.topic)
-    return open_given(options.keystore, topic, options.scenarios[0])
+    return open_user_keystore(options.keystore, topic, options.scenarios[0])
 
 
-def _chosen(options: DemoOptions) -> tuple[Scenario, ...]:
-    """The scenarios with the rows that were asked for.  Raises `UsageError` where none is left."""
+def _with_chosen_rows(options: DemoOptions) -> tuple[Scenario, ...]:
+    """Return the scenarios with the rows that were asked for.
+
+    Raises:
+        UsageError: no row is left.
+    """
     if not options.only:
         return options.scenarios
     chosen = tuple(
@@ -177,8 +187,8 @@ def _chosen(options: DemoOptions) -> tuple[Scenario, ...]:
 
 
 def _dds_topic(row: Row, topic: str) -> str:
-    """The DDS topic whose protection decides a row; of a service, that of its requests."""
-    return f"rq{row.place}Request" if row.place else f"rt{topic}"
+    """Return the DDS topic whose protection decides a row; of a service, its request topic."""
+    return f"rq{row.ros_name}Request" if row.ros_name else f"rt{topic}"
 
 
 def _asked_for(row: Row, options: DemoOptions) -> bool:
@@ -186,17 +196,17 @@ def _asked_for(row: Row, options: DemoOptions) -> bool:
 
 
 def _domains(
-    scenario: Scenario, options: DemoOptions, given: GivenKeystore | None, isolation: Isolation
+    scenario: Scenario, options: DemoOptions, user: UserKeystore | None, isolation: Isolation
 ) -> tuple[int, ...]:
-    """A domain for each row; a given keystore has its own, which networks of their own part."""
-    if given is not None:
+    """Return a domain for each row; with the user's keystore, networks part the rows instead."""
+    if user is not None:
         if not isolation.isolated:
             raise UnavailableError(
                 "cannot attack a keystore here",
                 f"Its rows need network namespaces of their own, and there is {isolation.reason}.",
                 "Run it as root, or where unprivileged user namespaces are allowed.",
             )
-        return (next(iter(given.domains)),) * len(scenario.rows)
+        return (next(iter(user.domains)),) * len(scenario.rows)
     last = MAX_DOMAIN - len(scenario.rows) + 1
     if not 0 <= options.domain <= last:
         raise UsageError(
@@ -228,7 +238,7 @@ def _folder(keep: Path | None) -> Iterator[Path]:
     try:
         yield keep.absolute()
     except BaseException:
-        # What did not come to a result is not worth keeping, and it holds private keys.
+        # A demo without a result is not worth keeping, and it holds private keys.
         shutil.rmtree(keep, ignore_errors=True)
         raise
 
@@ -252,6 +262,6 @@ def _ended_by_signals() -> Iterator[None]:
 
 
 def _isolation(network: str) -> Isolation:
-    if network == HOST:
+    if network == _HOST:
         return Isolation(False, "the network of this machine was asked for")
     return try_isolation()

@@ -9,12 +9,12 @@
 - ``scenarios``: a list of ``{"name", "title", "as_expected", "cast", "rows", "cost"}``;
 - ``rows``: the rows of all scenarios, in order, each with its ``scenario``.
 
-A row has ``name``, ``expected``, ``observed`` (statuses of `sros_tool.demo.model.Status`),
-``as_expected``, ``mechanism`` (what brings the expectation about), ``detail`` (what was seen,
-counted), ``domain``, ``seconds`` (how long the window was), and for attacks ``attack`` (which
-one; "" elsewhere), ``defence_removed`` ("" for the attack itself; otherwise the row shows that
-the attack works without the defence named here), ``open_because`` ("" for a closed door;
-otherwise why it is known to be open) and ``remedy``.
+A row has ``name``, ``expected`` and ``observed`` (values of `RowStatus`), ``as_expected``,
+``mechanism`` (what brings the expected status about), ``detail`` (what was seen, counted),
+``domain``, ``seconds`` (how long the window was), and for attacks ``attack`` (which one; ""
+elsewhere), ``defence_removed`` ("" for the attack itself; otherwise the row shows that the attack
+works without the defence named here), ``open_because`` ("" for a closed door; otherwise why it is
+known to be open) and ``remedy``.
 
 ``cast`` says who plays which part in a keystore of the user's (empty without ``--keystore``): a
 list of ``{"part", "enclave", "nodes"}``; ``nodes`` are the absolute names of the ROS nodes that
@@ -29,8 +29,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from sros_tool.demo.backend import Backend
+from sros_tool.demo.casting import CastMember
 from sros_tool.demo.cost import CostResult
-from sros_tool.demo.records import CastMember, RowResult
+from sros_tool.demo.verdict import RowResult
 from sros_tool.runtime.netns import Isolation
 from sros_tool.values import as_plain
 

@@ -7,23 +7,46 @@ long for silence as for sound; only a brief row in which nobody has to be silent
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import os
+import shlex
+import signal
+import subprocess
 import time
 import uuid
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from sros_tool.demo.backend import Backend
-from sros_tool.demo.keystores import Scenery
-from sros_tool.demo.launch import PartyProcess, base_environment
-from sros_tool.demo.model import DENIALS, SPEAKING, Claim, Party, Relation, Role, Row, Wire
+from sros_tool.demo.keystores import KeystoreSet
 from sros_tool.demo.network import ENDING_SIGNALS, RowNetwork
-from sros_tool.demo.records import Replay, RowRecord, RowResult, forged_text
-from sros_tool.demo.verdict import judge_row
-from sros_tool.demo.wire import Wiretap, with_other_words
-from sros_tool.runtime.events import Kind
+from sros_tool.demo.scenarios.model import (
+    DENIALS,
+    SPEAKING,
+    Claim,
+    Party,
+    Relation,
+    Role,
+    Row,
+    Wire,
+)
+from sros_tool.demo.verdict import (
+    Injection,
+    PartyRecord,
+    RowRecord,
+    RowResult,
+    forged_text,
+    judge_row,
+)
+from sros_tool.demo.wire import Wiretap, udp_ports, with_other_words
+from sros_tool.runtime.events import Event, EventReader, Kind
+from sros_tool.runtime.netns import end_with_parent
+from sros_tool.runtime.vendor_log import plain_text
+
+_LOG = logging.getLogger(__name__)
 
 _ONLOOKER_TICK = 0.05
 _ONLOOKER_GRACE = 0.3
@@ -35,7 +58,7 @@ _FORGED = 5
 _AFTER_FORGERY = 1.0
 
 
-async def replay_packets(talker: PartyProcess, tap: Wiretap) -> Replay:
+async def replay_packets(talker: PartyProcess, tap: Wiretap) -> Injection:
     """Let a talker leave, then send again what it had sent, at the pace of the original."""
     packets = tap.packets(talker.ports())
     await end_softly([talker])
@@ -47,10 +70,10 @@ async def replay_packets(talker: PartyProcess, tap: Wiretap) -> Replay:
             await asyncio.sleep(min(each.time - before.time, _LONGEST_PAUSE))
             tap.send(each.packet)
     await asyncio.sleep(_AFTER_REPLAY)
-    return Replay(len(packets), started)
+    return Injection(len(packets), started)
 
 
-async def forge_packets(talker: PartyProcess, tap: Wiretap) -> Replay:
+async def forge_packets(talker: PartyProcess, tap: Wiretap) -> Injection:
     """Hold a talker, and go on in its name with packets that say something else."""
     talker.hold()
     await asyncio.sleep(_ONLOOKER_GRACE)
@@ -63,7 +86,7 @@ async def forge_packets(talker: PartyProcess, tap: Wiretap) -> Replay:
     for packet in sent:
         tap.send(packet)
     await asyncio.sleep(_AFTER_FORGERY)
-    return Replay(len(sent), started)
+    return Injection(len(sent), started)
 
 
 async def end_softly(processes: Collection[PartyProcess]) -> None:
@@ -98,7 +121,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Plan:
+class RunPlan:
     """All that is needed to run rows.
 
     ``domains`` has one domain per row; ``topic`` is absolute; ``period`` is in seconds.  With
@@ -108,7 +131,7 @@ class Plan:
     rows: tuple[Row, ...]
     domains: tuple[int, ...]
     backend: Backend
-    scenery: Scenery
+    keystores: KeystoreSet
     topic: str
     folder: Path
     limits: Limits = field(default_factory=Limits)
@@ -116,13 +139,13 @@ class Plan:
     own_networks: bool = False
 
 
-def run_plan(plan: Plan, progress: Callable[[str], None]) -> list[RowResult]:
+def run_rows(plan: RunPlan, progress: Callable[[str], None]) -> list[RowResult]:
     """Run all rows, and judge them; ``progress`` is told of each row that ends."""
     return asyncio.run(_Stage(plan, progress).run())
 
 
 class _Stage:
-    def __init__(self, plan: Plan, progress: Callable[[str], None]) -> None:
+    def __init__(self, plan: RunPlan, progress: Callable[[str], None]) -> None:
         self._plan = plan
         self._progress = progress
         self._mark = uuid.uuid4().hex[:8]
@@ -161,9 +184,9 @@ class _Stage:
 
     def _why_skipped(self, row: Row) -> str:
         handshake = any(claim.wire is not Wire.TEXT for claim in row.claims)
-        if (handshake or row.replay or row.forge) and not self._plan.own_networks:
+        if (handshake or row.replay or row.impersonate) and not self._plan.own_networks:
             return "it needs a network namespace of its own"
-        return self._plan.scenery.problem(row, self._plan.topic)
+        return self._plan.keystores.problem(row, self._plan.topic)
 
     async def _play(self, index: int) -> RowRecord:
         row, domain = self._plan.rows[index], self._plan.domains[index]
@@ -186,8 +209,8 @@ class _Stage:
             replay = None
             if tap and row.replay and window:
                 replay = await replay_packets(processes[row.replay], tap)
-            if tap and row.forge and window:
-                replay = await forge_packets(processes[row.forge], tap)
+            if tap and row.impersonate and window:
+                replay = await forge_packets(processes[row.impersonate], tap)
         finally:
             try:
                 await end_softly(processes.values())
@@ -204,11 +227,11 @@ class _Stage:
         row = self._plan.rows[index]
         texts = {party.name: self._text(index, party) for party in row.parties}
         topic = f"rt{self._plan.topic}"
-        return Wiretap(texts, topic, replayed=bool(row.replay or row.forge))
+        return Wiretap(texts, topic, replayed=bool(row.replay or row.impersonate))
 
     def _start(self, index: int, party: Party, domain: int, folder: Path) -> PartyProcess:
         plan, row = self._plan, self._plan.rows[index]
-        topic = plan.scenery.topic(party, plan.topic)
+        topic = plan.keystores.topic(party, plan.topic)
         options = ["--topic", topic, "--period", str(plan.period)]
         text = self._text(index, party)
         if party.role in SPEAKING:
@@ -218,10 +241,10 @@ class _Stage:
             options += ["--server", self._text(index, servers[0])] if len(servers) == 1 else []
         if party.role is Role.OBSERVER:
             for other in row.parties:
-                if other.role is Role.TALKER and other.aside:
-                    options += ["--also", plan.scenery.topic(other, plan.topic)]
+                if other.role is Role.TALKER and other.other_topic:
+                    options += ["--also", plan.keystores.topic(other, plan.topic)]
         environment = base_environment(os.environ)
-        secured = bool(party.identity.keystore)
+        secured = party.identity.keystore is not None
         denied = any(
             (claim.relation is Relation.IS_REFUSED and claim.subject == party.name)
             or (claim.denied and party.intruder)
@@ -230,12 +253,12 @@ class _Stage:
         backend = plan.backend
         environment |= backend.environment(
             party.role,
-            wire=bool(row.wire or row.replay or row.forge),
+            wire=bool(row.wire or row.replay or row.impersonate),
             denied=denied,
             secured=secured,
         )
-        environment |= plan.scenery.environment(party.identity, domain)
-        names = plan.scenery.node_names(party)
+        environment |= plan.keystores.environment(party.identity, domain)
+        names = plan.keystores.node_names(party)
         command = backend.command(party.role, options, names, secured=secured)
         return PartyProcess(
             party.name,
@@ -308,3 +331,148 @@ def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, PartyProcess
 def _is_decided_by_start(row: Row) -> bool:
     decided = (Relation.IS_REFUSED, Relation.STARTS)
     return all(claim.relation in decided for claim in (*row.claims, *row.controls))
+
+
+_LEFT_OUT_PREFIXES = ("ROS_SECURITY_",)
+
+
+_LEFT_OUT = frozenset(
+    {
+        "CYCLONEDDS_URI",
+        "FASTDDS_BUILTIN_TRANSPORTS",
+        "FASTDDS_DEFAULT_PROFILES_FILE",
+        "FASTRTPS_DEFAULT_PROFILES_FILE",
+        "RMW_FASTRTPS_USE_QOS_FROM_XML",
+        "RMW_IMPLEMENTATION",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE",
+        "ROS_DISCOVERY_SERVER",
+        "ROS_DOMAIN_ID",
+        "ROS_LOCALHOST_ONLY",
+        "ROS_STATIC_PEERS",
+    }
+)
+
+
+def base_environment(environment: Mapping[str, str]) -> dict[str, str]:
+    """``environment`` without what would change how DDS discovers or secures."""
+    return {
+        name: value
+        for name, value in environment.items()
+        if name not in _LEFT_OUT and not name.startswith(_LEFT_OUT_PREFIXES)
+    } | {"PYTHONUNBUFFERED": "1"}
+
+
+class PartyProcess:
+    """A running node; ``folder`` gets its report and its log under ``name``."""
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str],
+        folder: Path,
+        *,
+        topic: str,
+        text: str = "",
+        through: str = "",
+    ) -> None:
+        stem = name.replace(" ", "_")
+        self.name = name
+        self.topic = topic
+        self.text = text
+        self._through = through
+        self._log = folder / f"{stem}.log"
+        report = folder / f"{stem}.jsonl"
+        self._reader = EventReader(report)
+        self._events: list[Event] = []
+        self._own_status: int | None = None
+        self._asked = False
+        self._ports: frozenset[int] = frozenset()
+        starter = os.getpid()
+
+        def before() -> None:
+            end_with_parent()
+            if os.getppid() != starter:
+                os._exit(1)
+
+        with self._log.open("wb") as output:
+            self._process = subprocess.Popen(
+                [*command, "--report", str(report)],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=output,
+                env={**environment, "ROS_LOG_DIR": str(folder / "ros_log")},
+                start_new_session=True,
+                preexec_fn=before,
+            )
+        _LOG.info("started process %d, %s: %s", self._process.pid, name, shlex.join(command))
+
+    def look(self) -> list[Event]:
+        """Everything that the process has reported so far, oldest first."""
+        ended = self._process.poll()
+        self._events += self._reader.new_events()
+        if ended is not None and self._own_status is None and not self._asked:
+            self._own_status = ended
+        return self._events
+
+    @property
+    def settled(self) -> bool:
+        """Whether the process is ready, or will never be."""
+        events = self.look()
+        return self._own_status is not None or any(
+            event.kind in (Kind.READY, Kind.REFUSED, Kind.FAILED) for event in events
+        )
+
+    @property
+    def running(self) -> bool:
+        """Whether the process is ready and still there."""
+        events = self.look()
+        return self._own_status is None and any(event.kind is Kind.READY for event in events)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the process has ended by itself."""
+        self.look()
+        return self._own_status is not None
+
+    def ports(self) -> frozenset[int]:
+        """The UDP ports that the process holds, or held when it was last asked."""
+        self._ports = udp_ports(self._process.pid) or self._ports
+        return self._ports
+
+    def ask_to_end(self) -> None:
+        """Send SIGTERM; from now on an end is not the process's own."""
+        self.look()
+        self._asked = True
+        with suppress(ProcessLookupError):
+            self._process.terminate()
+            self._process.send_signal(signal.SIGCONT)
+
+    def hold(self) -> None:
+        """Stop the process where it is; `end` still ends it."""
+        with suppress(ProcessLookupError):
+            self._process.send_signal(signal.SIGSTOP)
+
+    @property
+    def gone(self) -> bool:
+        """Whether the process has ended, by itself or because it was asked to."""
+        return self._process.poll() is not None
+
+    def end(self) -> None:
+        """Force the end on the process and its children."""
+        with suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
+    def record(self) -> PartyRecord:
+        """What the process left behind; call it after `end`."""
+        # Being ended is no failure, whatever a node makes of it.
+        late = [event for event in self._reader.new_events() if event.kind is not Kind.FAILED]
+        return PartyRecord(
+            text=self.text,
+            topic=self.topic,
+            through=self._through,
+            events=(*self._events, *late),
+            output=plain_text(self._log.read_text(encoding="utf-8", errors="replace")),
+            status=self._own_status,
+        )

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
+from typing import Any
 
-from sros_tool.demo.cost import cost_table
-from sros_tool.demo.model import Status
-from sros_tool.demo.records import CastMember, RowResult
+from sros_tool.demo.casting import CastMember
+from sros_tool.demo.cost import NOTE, CostResult
 from sros_tool.demo.result import DemoResult, ScenarioResult
+from sros_tool.demo.scenarios.model import RowStatus
+from sros_tool.demo.verdict import RowResult
 from sros_tool.validity import iso
 
 _INDENT = " " * 6
@@ -72,7 +74,7 @@ def _line(mark: str, cells: Sequence[str], widths: Sequence[int]) -> str:
 
 
 def _mark(row: RowResult) -> str:
-    if row.observed is Status.SKIPPED:
+    if row.observed is RowStatus.SKIPPED:
         return "skip"
     if row.known_open:
         return "open"
@@ -81,7 +83,7 @@ def _mark(row: RowResult) -> str:
 
 def _summary(rows: Sequence[RowResult]) -> str:
     wrong = sum(1 for row in rows if not row.as_expected)
-    skipped = sum(1 for row in rows if row.observed is Status.SKIPPED)
+    skipped = sum(1 for row in rows if row.observed is RowStatus.SKIPPED)
     known = sum(1 for row in rows if row.known_open)
     good = len(rows) - wrong - skipped
     parts = [f"{good} of {len(rows)} rows as expected"]
@@ -121,7 +123,7 @@ def summary_page(result: DemoResult, now: datetime) -> str:
         lines += ["## What else was shown", "", *_table(others)]
     for scenario in result.scenarios:
         if scenario.cost is not None:
-            lines += ["## What security costs", "", *scenario.cost.markdown(), ""]
+            lines += ["## What security costs", "", *_cost_markdown(scenario.cost.as_json()), ""]
     return "\n".join(lines).rstrip() + "\n"
 
 
@@ -135,7 +137,7 @@ def _summary_cast(members: Sequence[CastMember]) -> list[str]:
 
 def _verdict(result: DemoResult, wrong: Sequence[RowResult]) -> str:
     known = sum(1 for row in result.rows if row.known_open)
-    skipped = sum(1 for row in result.rows if row.observed is Status.SKIPPED)
+    skipped = sum(1 for row in result.rows if row.observed is RowStatus.SKIPPED)
     parts = [f"{len(wrong)} of {len(result.rows)} rows not as expected" if wrong else "as expected"]
     if known:
         parts.append(f"{known} ways in that are known to be open")
@@ -184,6 +186,58 @@ def _table(rows: Sequence[RowResult]) -> list[str]:
 
 def _cells(row: RowResult) -> str:
     observed = str(row.observed) if row.as_expected else f"**{row.observed}**"
-    if row.observed is Status.SKIPPED:
+    if row.observed is RowStatus.SKIPPED:
         observed = f"skipped: {row.detail}"
     return f"{row.name} | {row.expected} | {observed}"
+
+
+def payload_text(size: int) -> str:
+    """A payload for people: "64 B", "16 KiB", "1 MiB"."""
+    for unit, name in ((1024 * 1024, "MiB"), (1024, "KiB")):
+        if size >= unit:
+            return f"{size / unit:g} {name}"
+    return f"{size} B"
+
+
+def cost_table(cost: CostResult) -> list[str]:
+    """The cost for a terminal."""
+    shown = cost.as_json()
+    lines = ["what security costs: latency and throughput, and their ratio to unsecured", ""]
+    lines.append(f"{'protection':<12}{'first message':>15}{'ratio':>8}")
+    lines += [
+        f"{each['kind']:<12}{each['seconds']:>13.3f} s{each['ratio']:>8.2f}"
+        for each in shown["first_message"]
+    ]
+    lines += [
+        "",
+        f"{'payload':<10}{'protection':<12}{'latency':>13}{'ratio':>7}{'MB/s':>11}{'ratio':>7}",
+    ]
+    for payload in cost.payloads:
+        for each in shown["measurements"]:
+            if each["payload"] == payload:
+                lines.append(
+                    f"{payload_text(payload):<10}{each['kind']:<12}{each['latency_us']:>10.0f} us"
+                    f"{each['latency_ratio']:>7.2f}{each['megabytes_per_s']:>11.2f}"
+                    f"{each['throughput_ratio']:>7.2f}"
+                )
+    return [*lines, "", NOTE]
+
+
+def _cost_markdown(shown: Mapping[str, Any]) -> list[str]:
+    lines = ["| protection | first message | ratio |", "| --- | ---: | ---: |"]
+    lines += [
+        f"| {each['kind']} | {each['seconds']:.3f} s | {each['ratio']:.2f} |"
+        for each in shown["first_message"]
+    ]
+    lines += [
+        "",
+        "| payload | protection | latency | ratio | throughput | ratio |",
+        "| ---: | --- | ---: | ---: | ---: | ---: |",
+    ]
+    lines += [
+        f"| {payload_text(each['payload'])} | {each['kind']} | {each['latency_us']:.0f} µs"
+        f" | {each['latency_ratio']:.2f} | {each['megabytes_per_s']:.2f} MB/s"
+        f" | {each['throughput_ratio']:.2f} |"
+        for each in sorted(shown["measurements"], key=lambda each: int(each["payload"]))
+    ]
+    return [*lines, "", shown["note"] + "."]

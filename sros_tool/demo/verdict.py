@@ -8,9 +8,21 @@ from __future__ import annotations
 
 import re
 import signal
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
-from sros_tool.demo.model import STATUS_OF, Claim, Party, Relation, Role, Status, Wire
-from sros_tool.demo.records import Finding, PartyRecord, RowRecord, RowResult, forged_text
+from sros_tool.demo.scenarios.model import (
+    STATUS_OF,
+    Claim,
+    Party,
+    Relation,
+    Role,
+    Row,
+    RowStatus,
+    Wire,
+)
+from sros_tool.demo.wire import WireCount
 from sros_tool.runtime.events import Event, Kind, Stage
 from sros_tool.runtime.vendor_log import (
     endpoint_refusal,
@@ -40,31 +52,31 @@ def judge_row(record: RowRecord) -> RowResult:
     )
 
 
-def _observe(record: RowRecord) -> Finding:
+def _observe(record: RowRecord) -> Observed:
     if record.skipped:
-        return Finding(Status.SKIPPED, record.skipped)
+        return Observed(RowStatus.SKIPPED, record.skipped)
     for party in record.row.parties:
         lost = _lost_import(party, record.parties[party.name])
         if lost:
-            return Finding(Status.SKIPPED, lost)
+            return Observed(RowStatus.SKIPPED, lost)
     claims = [(claim, _judge_claim(claim, record)) for claim in record.row.claims]
     controls = [(claim, _judge_claim(claim, record)) for claim in record.row.controls]
     wrong = [finding for claim, finding in claims if finding.status is not claim.expected]
     if wrong:
         definite = wrong[0].status in STATUS_OF.values()
         several = len(claims) > 1
-        status = Status.DISTURBED if several and definite else wrong[0].status
-        return Finding(status, wrong[0].detail)
+        status = RowStatus.DISTURBED if several and definite else wrong[0].status
+        return Observed(status, wrong[0].detail)
     for claim, finding in controls:
         if finding.status is not claim.expected:
             what = f"{claim.subject} {claim.relation} {claim.talker}".strip()
-            return Finding(
-                Status.UNDECIDED,
+            return Observed(
+                RowStatus.UNDECIDED,
                 f"the control failed ({what}: {finding.status}, {finding.detail})",
             )
     details = [finding.detail for _, finding in claims]
     details += [f"control: {finding.detail}" for _, finding in controls]
-    return Finding(record.row.expected, "; ".join(details))
+    return Observed(record.row.expected, "; ".join(details))
 
 
 def _lost_import(party: Party, record: PartyRecord) -> str:
@@ -76,7 +88,7 @@ def _lost_import(party: Party, record: PartyRecord) -> str:
     return next((f"{what} cannot be loaded here: {text}" for text in failed), "")
 
 
-def _judge_claim(claim: Claim, record: RowRecord) -> Finding:
+def _judge_claim(claim: Claim, record: RowRecord) -> Observed:
     subject = record.parties[claim.subject]
     if claim.relation is Relation.IS_REFUSED:
         return _judge_refusal(claim.subject, subject)
@@ -84,9 +96,9 @@ def _judge_claim(claim: Claim, record: RowRecord) -> Finding:
         if problem := _trouble(name, record.parties[name]):
             return problem
     if claim.relation is Relation.STARTS:
-        return Finding(Status.STARTED, f"{claim.subject} started")
+        return Observed(RowStatus.STARTED, f"{claim.subject} started")
     if record.window is None:
-        return Finding(Status.UNDECIDED, "not all processes were ready in time")
+        return Observed(RowStatus.UNDECIDED, "not all processes were ready in time")
     if claim.relation is Relation.READABLE:
         return _judge_wire(claim, record, subject)
     talker = record.parties[claim.talker]
@@ -98,7 +110,7 @@ def _judge_claim(claim: Claim, record: RowRecord) -> Finding:
         return _judge_answers(claim, record, subject, talker)
     sent = {e.text for e in talker.events if e.kind is Kind.SENT and _inside(e, record)}
     if not sent:
-        return Finding(Status.UNDECIDED, f"{claim.talker} sent nothing in that time")
+        return Observed(RowStatus.UNDECIDED, f"{claim.talker} sent nothing in that time")
     if claim.relation is Relation.SEES:
         return _judge_view(claim, record, subject, talker)
     mark = f"{talker.text}: "
@@ -107,32 +119,32 @@ def _judge_claim(claim: Claim, record: RowRecord) -> Finding:
     seconds = record.window[1] - record.window[0]
     arrived = len(sent & {event.text for event in heard})
     heard_of = f"{arrived} of {len(sent)} messages of the {claim.talker}"
-    return Finding(status, f"{claim.subject} heard {heard_of} in {seconds:.1f} s")
+    return Observed(status, f"{claim.subject} heard {heard_of} in {seconds:.1f} s")
 
 
 def _judge_answers(
     claim: Claim, record: RowRecord, client: PartyRecord, server: PartyRecord
-) -> Finding:
+) -> Observed:
     asked = [e for e in client.events if e.kind is Kind.SENT and _inside(e, record)]
     if not asked:
-        return Finding(Status.UNDECIDED, f"{claim.subject} asked nothing in that time")
+        return Observed(RowStatus.UNDECIDED, f"{claim.subject} asked nothing in that time")
     answers = [e for e in client.events if e.kind is Kind.HEARD and _is_of(e, server)]
     status = STATUS_OF[Relation.IS_ANSWERED, bool(answers)]
     within = sum(1 for event in answers if _inside(event, record))
     counted = f"{min(within, len(asked))} right answers of the {claim.talker}"
-    return Finding(status, f"{claim.subject} asked {len(asked)} times and got {counted}")
+    return Observed(status, f"{claim.subject} asked {len(asked)} times and got {counted}")
 
 
 def _judge_replay(
     claim: Claim, record: RowRecord, listener: PartyRecord, talker: PartyRecord
-) -> Finding:
+) -> Observed:
     replay = record.replay
     if replay is None or not replay.packets:
-        return Finding(Status.UNDECIDED, "no packets were captured that could be sent again")
+        return Observed(RowStatus.UNDECIDED, "no packets were captured that could be sent again")
     heard = [e for e in listener.events if e.kind is Kind.HEARD and _is_of(e, talker)]
     again = sum(1 for event in heard if event.time >= replay.time)
     status = STATUS_OF[Relation.HEARS_AGAIN, again > 0]
-    return Finding(
+    return Observed(
         status,
         f"{claim.subject} heard {again} messages in {replay.packets} packets of the"
         f" {claim.talker} that were sent again, twice, after it had left",
@@ -141,13 +153,13 @@ def _judge_replay(
 
 def _judge_forgery(
     claim: Claim, record: RowRecord, listener: PartyRecord, talker: PartyRecord
-) -> Finding:
+) -> Observed:
     replay = record.replay
     if replay is None or not replay.packets:
-        return Finding(Status.UNDECIDED, "no packet of the talker could be read and changed")
+        return Observed(RowStatus.UNDECIDED, "no packet of the talker could be read and changed")
     mark = forged_text(talker.text)
     believed = sum(1 for e in listener.events if e.kind is Kind.HEARD and e.text.startswith(mark))
-    return Finding(
+    return Observed(
         STATUS_OF[Relation.BELIEVES, believed > 0],
         f"{claim.subject} heard {believed} of {replay.packets} messages that the {claim.talker}"
         " never sent",
@@ -158,47 +170,49 @@ def _is_of(event: Event, speaker: PartyRecord) -> bool:
     return event.text.startswith(f"{speaker.text}: ")
 
 
-def _judge_refusal(name: str, record: PartyRecord) -> Finding:
+def _judge_refusal(name: str, record: PartyRecord) -> Observed:
     problem = _trouble(name, record)
     if problem is None:
-        return Finding(Status.STARTED, f"{name} was let in")
+        return Observed(RowStatus.STARTED, f"{name} was let in")
     return problem
 
 
 def _judge_view(
     claim: Claim, record: RowRecord, observer: PartyRecord, talker: PartyRecord
-) -> Finding:
+) -> Observed:
     looks = [e for e in observer.events if e.kind is Kind.SEEN and _inside(e, record)]
     if not looks:
-        return Finding(Status.UNDECIDED, f"{claim.subject} did not look in that time")
+        return Observed(RowStatus.UNDECIDED, f"{claim.subject} did not look in that time")
     most = max(event.publishers.get(talker.topic, 0) for event in looks)
     counted = f"{observer.through} counts {most} publishers on {talker.topic}"
-    return Finding(STATUS_OF[Relation.SEES, most > 0], f"{counted} in {len(looks)} looks")
+    return Observed(STATUS_OF[Relation.SEES, most > 0], f"{counted} in {len(looks)} looks")
 
 
-def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> Finding:
+def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> Observed:
     count = record.wire.get(claim.subject)
     if count is None:
-        return Finding(Status.UNDECIDED, "no packets were captured")
+        return Observed(RowStatus.UNDECIDED, "no packets were captured")
     if claim.wire is not Wire.TEXT:
         shown = count.topics if claim.wire is Wire.TOPIC else count.certificates
         if not shown and not count.protected:
-            return Finding(Status.UNDECIDED, "no packets of the row were captured")
+            return Observed(RowStatus.UNDECIDED, "no packets of the row were captured")
         what = f"the {claim.wire}" if claim.wire is Wire.TOPIC else f"a {claim.wire}"
-        return Finding(STATUS_OF[Relation.READABLE, shown > 0], f"{shown} packets show {what}")
+        return Observed(STATUS_OF[Relation.READABLE, shown > 0], f"{shown} packets show {what}")
     if count.plain:
-        return Finding(Status.READABLE, f"{count.plain} packets show the text")
+        return Observed(RowStatus.READABLE, f"{count.plain} packets show the text")
     sent = sum(1 for event in talker.events if event.kind is Kind.SENT and _inside(event, record))
     # Silence on the wire proves nothing unless the messages went over the captured wire.
     if count.protected * 2 < max(2, sent):
-        return Finding(
-            Status.UNDECIDED,
+        return Observed(
+            RowStatus.UNDECIDED,
             f"only {count.protected} encrypted packets were captured for {sent} messages",
         )
-    return Finding(Status.NOT_READABLE, f"0 packets show the text, {count.protected} are encrypted")
+    return Observed(
+        RowStatus.NOT_READABLE, f"0 packets show the text, {count.protected} are encrypted"
+    )
 
 
-def _trouble(name: str, record: PartyRecord) -> Finding | None:
+def _trouble(name: str, record: PartyRecord) -> Observed | None:
     """Why a party did not run through the row, or None if it did."""
     ready = any(event.kind is Kind.READY for event in record.events)
     for event in record.events:
@@ -207,17 +221,17 @@ def _trouble(name: str, record: PartyRecord) -> Finding | None:
         if event.kind is Kind.FAILED:
             return _failure(name, record, event)
     if record.status is not None:
-        return Finding(Status.CRASHED, f"{name} {_ending(record)}")
+        return Observed(RowStatus.CRASHED, f"{name} {_ending(record)}")
     if not ready:
-        return Finding(Status.NOT_STARTED, f"{name} was not ready in time")
+        return Observed(RowStatus.NOT_STARTED, f"{name} was not ready in time")
     return None
 
 
-def _failure(name: str, record: PartyRecord, event: Event) -> Finding:
+def _failure(name: str, record: PartyRecord, event: Event) -> Observed:
     told = f"{event.text}\n{record.output}"
     reason = " ".join(event.text.split())
     if lacking := missing_security(told):
-        return Finding(Status.NOT_STARTED, f"{name}: {lacking}")
+        return Observed(RowStatus.NOT_STARTED, f"{name}: {lacking}")
     if event.stage is Stage.ENDPOINT and (refusal := _own_denial(record, event.text)):
         return _refused(name, Stage.ENDPOINT, refusal)
     if event.stage in (Stage.PARTICIPANT, Stage.ENDPOINT):
@@ -225,7 +239,7 @@ def _failure(name: str, record: PartyRecord, event: Event) -> Finding:
         refusal = participant_refusal(told) or endpoint_refusal(told)
         if refusal:
             return _refused(name, Stage.PARTICIPANT, refusal)
-    return Finding(Status.CRASHED, f"{name} failed: {reason}")
+    return Observed(RowStatus.CRASHED, f"{name} failed: {reason}")
 
 
 def _own_denial(record: PartyRecord, told: str) -> str:
@@ -240,11 +254,13 @@ def _speaks_of(line: str, topic: str) -> bool:
     return bool(re.search(name, line)) or "not allowed by security" in line.lower()
 
 
-def _refused(name: str, stage: Stage | None, reason: str) -> Finding:
+def _refused(name: str, stage: Stage | None, reason: str) -> Observed:
     reason = plain_refusal(reason)
     if stage is Stage.ENDPOINT:
-        return Finding(Status.REFUSED, f"{name}: {reason}")
-    return Finding(Status.NOT_LET_IN, f"{name} was refused before it came to the topic: {reason}")
+        return Observed(RowStatus.REFUSED, f"{name}: {reason}")
+    return Observed(
+        RowStatus.NOT_LET_IN, f"{name} was refused before it came to the topic: {reason}"
+    )
 
 
 def _ending(record: PartyRecord) -> str:
@@ -263,3 +279,102 @@ def _inside(event: Event, record: RowRecord) -> bool:
         return False
     start, end = record.window
     return start <= event.time <= end
+
+
+@dataclass(frozen=True)
+class Injection:
+    """How many captured packets were sent again or changed, and when (CLOCK_MONOTONIC)."""
+
+    packets: int
+    time: float
+
+
+def forged_text(text: str) -> str:
+    """What is said in the name of a talker that says ``text``; of the same length."""
+    return text.swapcase()
+
+
+@dataclass(frozen=True)
+class PartyRecord:
+    """What one process left behind.
+
+    ``text`` marks the messages of a talker; ``topic`` is its ROS topic; ``through`` names the
+    library it used; ``output`` is what it printed; ``status`` its exit status
+    (negative for a signal) if it ended before it was stopped.
+    """
+
+    text: str = ""
+    topic: str = ""
+    through: str = ""
+    events: tuple[Event, ...] = ()
+    output: str = ""
+    status: int | None = None
+
+
+@dataclass(frozen=True)
+class RowRecord:
+    """What a row left behind.
+
+    ``window`` is the time (CLOCK_MONOTONIC) that counts; None where not all parties became ready.
+    ``skipped`` is the reason for which the row was not run, or "".
+    """
+
+    row: Row
+    domain: int
+    parties: Mapping[str, PartyRecord] = field(default_factory=dict)
+    window: tuple[float, float] | None = None
+    wire: Mapping[str, WireCount] = field(default_factory=dict)
+    replay: Injection | None = None
+    skipped: str = ""
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What was observed about one claim, and in a clause why one may believe it."""
+
+    status: RowStatus
+    detail: str
+
+
+@dataclass(frozen=True)
+class RowResult:
+    """A line of the table: ``as_expected`` is also true of a row skipped with its reason."""
+
+    name: str
+    expected: RowStatus
+    observed: RowStatus
+    mechanism: str
+    detail: str
+    domain: int
+    seconds: float = 0.0
+    attack: str = ""
+    removed: str = ""
+    open_because: str = ""
+    remedy: str = ""
+
+    @property
+    def as_expected(self) -> bool:
+        """Whether this row lets the demo succeed."""
+        return self.observed in (self.expected, RowStatus.SKIPPED)
+
+    @property
+    def known_open(self) -> bool:
+        """Whether it shows a way in that is known to be open, and why."""
+        return bool(self.open_because) and self.observed is self.expected
+
+    def as_json(self) -> dict[str, Any]:
+        """The row as `sros demo --json` shows it."""
+        return {
+            "name": self.name,
+            "expected": self.expected.value,
+            "observed": self.observed.value,
+            "as_expected": self.as_expected,
+            "mechanism": self.mechanism,
+            "detail": self.detail,
+            "domain": self.domain,
+            "seconds": round(self.seconds, 1),
+            "attack": self.attack,
+            "defence_removed": self.removed,
+            "open_because": self.open_because,
+            "remedy": self.remedy,
+        }

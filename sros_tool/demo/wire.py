@@ -11,10 +11,9 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, NamedTuple
-
-from sros_tool.demo.records import WireCount
 
 _ETH_P_IP = 0x0800
 _PACKET_OUTGOING = 4
@@ -255,3 +254,17 @@ class Wiretap:
         if self._injector is not None:
             self._injector.close()
         self._capture = self._injector = None
+
+
+@dataclass(frozen=True)
+class WireCount:
+    """How many packets held a talker's text in the open, and how many of its row were protected.
+
+    ``topics`` and ``certificates`` count the packets of the row that show the name of its topic,
+    and a certificate.
+    """
+
+    plain: int
+    protected: int
+    topics: int = 0
+    certificates: int = 0

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+import inspect
+from datetime import UTC, datetime
 from itertools import chain, combinations
+from pathlib import Path
 
 import pytest
 
-from sros_tool.demo.forger import FORGERIES, REMOVALS
-from sros_tool.demo.keystores import Scenery
-from sros_tool.demo.model import DENIALS, FOREIGN, OWN, Condition, Row, Status
+from sros_tool.demo import forger
+from sros_tool.demo.forger import KeystoreCopy, Undefended, name_of
+from sros_tool.demo.keystores import KeystoreSet
 from sros_tool.demo.scenarios import SCENARIOS
 from sros_tool.demo.scenarios.attacks import ATTACKS
+from sros_tool.demo.scenarios.model import DENIALS, FOREIGN, OWN, Condition, Row, RowStatus
+from sros_tool.errors import KeystoreError
 
 ROWS = (
     *ATTACKS.rows,
-    *(case.instead for row in ATTACKS.rows for case in row.cases if case.instead),
+    *(variant.instead for row in ATTACKS.rows for variant in row.variants if variant.instead),
 )
 CLOSED = {
     *DENIALS,
-    Status.NOT_HEARD,
-    Status.NOT_HEARD_AGAIN,
-    Status.NOT_ANSWERED,
-    Status.NOT_VISIBLE,
-    Status.NOT_READABLE,
+    RowStatus.NOT_HEARD,
+    RowStatus.NOT_HEARD_AGAIN,
+    RowStatus.NOT_ANSWERED,
+    RowStatus.NOT_VISIBLE,
+    RowStatus.NOT_READABLE,
 }
 BY_NAME = pytest.mark.parametrize("row", ROWS, ids=lambda row: row.name)
 
@@ -50,30 +55,50 @@ def test_what_is_open_says_why_and_what_to_do(row: Row) -> None:
     if row.expected not in CLOSED and not row.removed:
         assert row.open_because
         assert row.remedy
-    for case in row.cases:
-        if case.expected not in CLOSED and not case.instead:
-            assert case.open_because
-            assert case.remedy
+    for variant in row.variants:
+        if variant.expected not in CLOSED and not variant.instead:
+            assert variant.open_because
+            assert variant.remedy
 
 
 @BY_NAME
 def test_its_identities_can_be_made(row: Row) -> None:
-    scenery = Scenery({}, ATTACKS.cast)
+    keystores = KeystoreSet({}, ATTACKS.cast)
     for party in row.parties:
-        assert party.identity.keystore in {"", OWN, FOREIGN, *FORGERIES, *REMOVALS}
-        if party.identity.keystore:
-            assert scenery.enclave(party.identity).startswith("/")
+        chosen = party.identity.keystore
+        assert chosen in (None, OWN, FOREIGN) or isinstance(chosen, Undefended) or callable(chosen)
+        if chosen is not None:
+            assert keystores.enclave(party.identity).startswith("/")
 
 
-def test_every_forgery_is_used() -> None:
+def public_functions(argument: str) -> set[str]:
+    """The public functions of the forger that take one argument of that name."""
+    found = inspect.getmembers(forger, inspect.isfunction)
+    return {
+        name
+        for name, function in found
+        if not name.startswith("_") and [*inspect.signature(function).parameters] == [argument]
+    }
+
+
+def test_every_forgery_is_used_and_has_a_folder_of_its_own() -> None:
     rows = [*ROWS, *(row for scenario in SCENARIOS for row in scenario.rows)]
     used = {party.identity.keystore for row in rows for party in row.parties}
-    assert set(FORGERIES) | set(REMOVALS) <= used
+    forged = {each for each in used if each not in (None, OWN, FOREIGN)}
+    undefended = {each for each in forged if isinstance(each, Undefended)}
+    forges = {each.forge for each in undefended} | (forged - undefended)
+    names = {each.__name__ for each in forges if callable(each)}
+    assert len(public_functions("copy")) > 25
+    assert names - {"unchanged"} == public_functions("copy")
+    templates = {each.template.__name__ for each in undefended}
+    assert templates == public_functions("template")
+    folders = [name_of(each) for each in forged]  # type: ignore[arg-type]
+    assert len(folders) == len(set(folders)) == len(forged) > 40
 
 
 @BY_NAME
 def test_every_template_and_vendor_has_an_expectation(row: Row) -> None:
-    """A case must fit the claim that it changes; `Row.under` raises where it does not."""
+    """A variant must fit the claim that it changes; `Row.under` raises where it does not."""
     subsets = chain.from_iterable(combinations(Condition, size) for size in range(4))
     for conditions in subsets:
         chosen = row.under(frozenset(conditions))
@@ -83,3 +108,9 @@ def test_every_template_and_vendor_has_an_expectation(row: Row) -> None:
 def test_names_are_distinct() -> None:
     names = [row.name for row in ROWS]
     assert len(names) == len(set(names)) > 55
+
+
+def test_a_part_that_nobody_plays_is_named() -> None:
+    copy = KeystoreCopy(Path("ks"), Path("other"), {}, "/t", 0, datetime(2026, 1, 1, tzinfo=UTC))
+    with pytest.raises(KeystoreError, match="no enclave for the part of the admin"):
+        forger.borrowed_permissions(copy)

@@ -7,11 +7,18 @@ from dataclasses import replace
 import pytest
 
 from sros_tool.demo.backend import Backend, conditions
-from sros_tool.demo.model import Condition, Status
 from sros_tool.demo.scenarios.attacks import ATTACKS
+from sros_tool.demo.scenarios.model import Condition, RowStatus
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.policy.protection import Level, NamedProtection, TopicProtection
 
+OPEN = {
+    RowStatus.HEARD,
+    RowStatus.ANSWERED,
+    RowStatus.VISIBLE,
+    RowStatus.HEARD_AGAIN,
+    RowStatus.READABLE,
+}
 CYCLONE = Backend("cyclone", "Cyclone DDS 0.10.2", "a test")
 FAST = Backend("rclpy", "Fast DDS 2.14.5", "a test")
 C = Condition
@@ -59,7 +66,7 @@ def test_which_fast_dds_knows_its_signers(version: str, exact: bool) -> None:
     assert (C.EXACT_SIGNER in conditions(fast, load_template("sros2"), "rt/a")) is exact
 
 
-def outcomes(backend: Backend, template: str) -> dict[str, Status]:
+def outcomes(backend: Backend, template: str) -> dict[str, RowStatus]:
     holding = conditions(backend, load_template(template), "rt/chatter")
     return {row.name: row.under(holding).expected for row in ATTACKS.rows}
 
@@ -67,32 +74,34 @@ def outcomes(backend: Backend, template: str) -> dict[str, Status]:
 def test_what_differs_between_templates_and_vendors() -> None:
     production = outcomes(CYCLONE, "production")
 
-    def differing(backend: Backend, template: str) -> dict[str, Status]:
+    def differing(backend: Backend, template: str) -> dict[str, RowStatus]:
         found = outcomes(backend, template)
         return {name: found[name] for name in found if found[name] is not production[name]}
 
     assert not differing(CYCLONE, "production")
     shared = {
-        "an enclave without a policy publishes": Status.HEARD,
-        "permissions borrowed from a longer name": Status.HEARD,
-        "old permissions put back after renewal": Status.HEARD,
+        "an enclave without a policy publishes": RowStatus.HEARD,
+        "permissions borrowed from a longer name": RowStatus.HEARD,
+        "old permissions put back after renewal": RowStatus.HEARD,
     }
     assert differing(CYCLONE, "development") == shared
     assert differing(CYCLONE, "sros2") == shared | {
-        "permissions signed by the enclave itself": Status.HEARD,
-        "permissions and governance signed by itself": Status.HEARD,
+        "permissions signed by the enclave itself": RowStatus.HEARD,
+        "permissions and governance signed by itself": RowStatus.HEARD,
     }
     vendors = {
-        "certificate with the key of another enclave": Status.NOT_LET_IN,
-        "permissions for another domain": Status.NOT_HEARD,
+        "certificate with the key of another enclave": RowStatus.NOT_LET_IN,
+        "permissions for another domain": RowStatus.NOT_HEARD,
     }
     assert differing(FAST, "production") == vendors
     assert differing(FAST, "sros2") == vendors | {
-        "an enclave without a policy publishes": Status.HEARD,
-        "old permissions put back after renewal": Status.HEARD,
+        "an enclave without a policy publishes": RowStatus.HEARD,
+        "old permissions put back after renewal": RowStatus.HEARD,
     }
     of_2_9_1 = replace(FAST, dds="Fast DDS 2.9.1")
-    assert {name for name, end in differing(of_2_9_1, "sros2").items() if end is Status.HEARD} == {
+    assert {
+        name for name, end in differing(of_2_9_1, "sros2").items() if end is RowStatus.HEARD
+    } == {
         "an enclave without a policy publishes",
         "old permissions put back after renewal",
         "permissions signed by the enclave itself",
@@ -105,5 +114,4 @@ def test_a_defence_that_a_vendor_has_in_another_form_is_removed_in_that_form() -
     twins = {row.name: row.under(holding) for row in ATTACKS.rows if row.removed}
     assert twins["permissions borrowed, subjects not unique"].removed == "a subject of its own"
     for name, row in twins.items():
-        assert row.expected in (Status.HEARD, Status.ANSWERED, Status.VISIBLE, Status.HEARD_AGAIN,
-                                Status.READABLE), name  # fmt: skip
+        assert row.expected in OPEN, name

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.demo.model import OWN, UNSECURED, Identity, Relation, Role, Status
 from sros_tool.demo.scenarios.custom import read_scenario
+from sros_tool.demo.scenarios.model import OWN, UNSECURED, Identity, Relation, Role, RowStatus
 from sros_tool.errors import DocumentError
 from tests.support.harness import policy_text, publish, sros
 
@@ -33,13 +33,27 @@ topic = "/image"
 
 [[row]]
 name = "the viewer sees"
-claims = ["viewer hears camera"]
+claim = { listener = "viewer", talker = "camera", expected = "heard" }
 
 [[row]]
 name = "a spy does not"
-claims = ["spy does not hear camera"]
-controls = ["viewer hears camera"]
 because = "it has no keys"
+
+[[row.claim]]
+listener = "spy"
+talker = "camera"
+expected = "not heard"
+
+[[row.control]]
+listener = "viewer"
+talker = "camera"
+expected = "heard"
+"""
+CLAIM = 'claim = { listener = "viewer", talker = "camera", expected = "heard" }'
+CONTROL = """[[row.control]]
+listener = "viewer"
+talker = "camera"
+expected = "heard"
 """
 HEARS = '<topics subscribe="ALLOW"><topic>/image</topic></topics>'
 
@@ -61,9 +75,9 @@ def test_a_good_file(folder: Path) -> None:
     scenario = read_scenario(write(folder, GOOD))
     assert (scenario.name, scenario.title) == ("mine", "who sees the camera")
     first, second = scenario.rows
-    assert first.expected is Status.HEARD
+    assert first.expected is RowStatus.HEARD
     assert [party.name for party in first.parties] == ["camera", "viewer"]
-    assert second.expected is Status.NOT_HEARD
+    assert second.expected is RowStatus.NOT_HEARD
     assert second.mechanism == "it has no keys"
     camera, _, spy = second.parties
     assert camera.identity == Identity(OWN, "/arm/camera")
@@ -79,18 +93,31 @@ def test_a_good_file(folder: Path) -> None:
         ('"/arm/viewer"', '"/arm/vewer"', 13, "did you mean /arm/viewer?"),
         ('topic = "/image"', 'topic = "a b"', 8, "not a topic name"),
         ('name = "viewer"', 'name = "camera"', 11, "two parties"),
-        ("viewer hears camera", "viewer hears camra", 23, "no party 'camra'"),
-        ("viewer hears camera", "viewer likes camera", 23, "is not a claim"),
-        ("viewer hears camera", "camera hears viewer", 23, "a talker cannot do that"),
-        ('controls = ["viewer hears camera"]\n', "", 27, "a crash would look the same"),
-        ("because", "becuase", 29, "'becuase' is not a key"),
+        (CLAIM, CLAIM.replace("camera", "camra"), 23, "no party 'camra'"),
+        (CLAIM, CLAIM.replace("heard", "liked"), 23, "'liked' is not a status"),
+        (CLAIM, CLAIM.replace('"heard"', '["heard"]'), 23, "is not a status"),
+        (CLAIM, CLAIM.replace('"camera"', '["camera"]'), 23, "no party ['camera']"),
+        (CLAIM, CLAIM.replace('expected = "heard"', "x = 1"), 23, "has no expected status; there"),
+        (CLAIM, CLAIM.replace("viewer", "camera"), 23, "cannot be the listener of a claim"),
+        (CLAIM, CLAIM.replace("listener", "client"), 23, "needs listener and talker, and no other"),
+        (CLAIM, CLAIM.replace('"heard"', '"started"'), 23, "needs party, and no other keys"),
+        (CLAIM, "claim = 3", 23, "claim is not a table"),
+        (CLAIM, 'claim = ["viewer hears camera"]', 23, '\'viewer hears camera\' is not a table'),
+        (CLAIM, 'claims = ["viewer hears camera"]', 23, "there are tables [[row.claim]]"),
+        (CLAIM, 'claims = ["viewer hears camera"]', 23, 'listener = "spy", talker = "camera"'),
+        (CONTROL, "", 29, "a crash would look the same"),
+        ("because", "becuase", 27, "'becuase' is not a key"),
+        ('role = "listener"\ntopic = "/image"\n\n[[row]]',
+         'role = "listener"\nkeystore = "foreign"\n\n[[row]]', 19, "this one is unsecured"),
+        ('enclave = "/arm/viewer"', 'enclave = "/arm/viewer"\nkeystore = "theirs"', 14,
+         "'theirs' is not a keystore; there are own, foreign"),
         ('policy = "robot.xml"', 'policy = "other.xml"', 2, "other.xml"),
         ('policy = "robot.xml"\n', "", 1, "no policy"),
-        ('claims = ["viewer hears camera"]\n', "", 22, "has no claims"),
+        (CLAIM, "", 22, "has no claim"),
         ('name = "the viewer sees"', "name = 3", 22, "3, not a text"),
     ],
-)
-def test_what_is_wrong_is_told_with_its_line(
+)  # fmt: skip
+def test_what_is_wrong_is_reported_with_its_line(
     folder: Path, old: str, new: str, line: int, told: str
 ) -> None:
     assert old in GOOD

@@ -9,14 +9,14 @@ import pytest
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
-from sros_tool.demo.model import Role
-from sros_tool.demo.nodes.names import (
+from sros_tool.demo.casting import (
     is_node_allowed,
     may,
     naming_arguments,
     node_names,
     nodes_named,
 )
+from sros_tool.demo.scenarios.model import Role
 from sros_tool.names import NODE_SERVICES
 from sros_tool.policy import read_policy
 from sros_tool.resources import policies_dir

@@ -11,13 +11,13 @@ import pytest
 
 from sros_tool.demo import backend as backends
 from sros_tool.demo.backend import Backend, choose_backend
-from sros_tool.demo.model import Role, Status
 from sros_tool.demo.nodes.options import split_ros_args
-from sros_tool.demo.policies import check_topic, talking_policy
 from sros_tool.demo.program import DemoOptions, run_demo
-from sros_tool.demo.records import RowResult
 from sros_tool.demo.result import DemoResult, ScenarioResult
+from sros_tool.demo.scenarios.model import Role, RowStatus
+from sros_tool.demo.scenarios.policies import check_topic, talking_policy
 from sros_tool.demo.show import demo_table
+from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.netns import Isolation
@@ -162,9 +162,9 @@ def test_ros_arguments(given: list[str], own: list[str], ros: list[str]) -> None
 
 def test_the_table_shows_reasons_and_a_summary() -> None:
     rows = (
-        RowResult("a", Status.HEARD, Status.HEARD, "m", "49 of 50", 1),
-        RowResult("b", Status.REFUSED, Status.CRASHED, "m", "SIGSEGV", 2),
-        RowResult("c", Status.READABLE, Status.SKIPPED, "m", "not permitted", 3),
+        RowResult("a", RowStatus.HEARD, RowStatus.HEARD, "m", "49 of 50", 1),
+        RowResult("b", RowStatus.REFUSED, RowStatus.CRASHED, "m", "SIGSEGV", 2),
+        RowResult("c", RowStatus.READABLE, RowStatus.SKIPPED, "m", "not permitted", 3),
     )
     result = DemoResult(
         Backend("cyclone", "C 1", "w"),

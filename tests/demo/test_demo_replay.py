@@ -6,7 +6,7 @@ import struct
 
 import pytest
 
-from sros_tool.demo.records import forged_text
+from sros_tool.demo.verdict import forged_text
 from sros_tool.demo.wire import PacketCounter, packets_of, with_other_words, without_checksum
 from tests.demo.test_demo_capture import packet
 

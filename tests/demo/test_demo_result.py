@@ -7,11 +7,11 @@ from datetime import UTC, datetime
 from xml.etree import ElementTree
 
 from sros_tool.demo.backend import Backend
-from sros_tool.demo.cost import CostResult, Measurement, cost_table, payload_text
-from sros_tool.demo.model import Status
-from sros_tool.demo.records import RowResult
+from sros_tool.demo.cost import CostResult, Measurement
 from sros_tool.demo.result import DemoResult, ScenarioResult
-from sros_tool.demo.show import demo_table, summary_page
+from sros_tool.demo.scenarios.model import RowStatus
+from sros_tool.demo.show import cost_table, demo_table, payload_text, summary_page
+from sros_tool.demo.verdict import RowResult
 from sros_tool.report import cost_plot
 from sros_tool.runtime.netns import Isolation
 
@@ -28,15 +28,22 @@ COST = CostResult(
     ),
 )
 CLOSED = RowResult(
-    "edited", Status.NOT_LET_IN, Status.NOT_LET_IN, "a signature", "seen", 1, attack="forged"
+    "edited", RowStatus.NOT_LET_IN, RowStatus.NOT_LET_IN, "a signature", "seen", 1, attack="forged"
 )
 TWIN = RowResult(
-    "signed", Status.HEARD, Status.HEARD, "m", "seen", 1, attack="forged", removed="the signature"
+    "signed",
+    RowStatus.HEARD,
+    RowStatus.HEARD,
+    "m",
+    "seen",
+    1,
+    attack="forged",
+    removed="the signature",
 )
 OPEN = RowResult(
     "put back",
-    Status.HEARD,
-    Status.HEARD,
+    RowStatus.HEARD,
+    RowStatus.HEARD,
     "m",
     "seen",
     1,
@@ -83,7 +90,9 @@ def test_a_known_open_door_is_named_and_no_failure() -> None:
 
 
 def test_a_door_that_is_open_and_should_not_be_is_a_failure() -> None:
-    bad = RowResult("edited", Status.NOT_LET_IN, Status.HEARD, "m", "was heard", 1, attack="x")
+    bad = RowResult(
+        "edited", RowStatus.NOT_LET_IN, RowStatus.HEARD, "m", "was heard", 1, attack="x"
+    )
     shown = result(bad, OPEN)
     assert not shown.as_expected
     assert "FAIL  edited" in demo_table(shown)
@@ -95,7 +104,7 @@ def test_a_door_that_is_open_and_should_not_be_is_a_failure() -> None:
 def test_a_door_that_was_known_to_be_open_and_is_closed_is_told() -> None:
     """Perhaps the vendor has closed it: then the expectation is to be changed."""
     closed = RowResult(
-        "put back", Status.HEARD, Status.NOT_HEARD, "m", "d", 1, attack="a", open_because="o"
+        "put back", RowStatus.HEARD, RowStatus.NOT_HEARD, "m", "d", 1, attack="a", open_because="o"
     )
     assert not result(closed).as_expected
     assert "FAIL  put back" in demo_table(result(closed))

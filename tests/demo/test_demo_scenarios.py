@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.demo.model import SPEAKING, STATUS_OF, Relation, Row, Scenario
 from sros_tool.demo.scenarios import SCENARIOS, choose_scenarios
 from sros_tool.demo.scenarios.isolation import ROWS
+from sros_tool.demo.scenarios.model import SPEAKING, STATUS_OF, Relation, Row, Scenario
 from sros_tool.errors import UsageError
 
 EVERY_ROW = pytest.mark.parametrize(

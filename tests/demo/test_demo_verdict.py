@@ -6,10 +6,10 @@ from collections.abc import Iterable
 
 import pytest
 
-from sros_tool.demo.model import Row, Status
-from sros_tool.demo.records import PartyRecord, RowRecord, RowResult, WireCount
 from sros_tool.demo.scenarios.isolation import ROWS
-from sros_tool.demo.verdict import judge_row
+from sros_tool.demo.scenarios.model import Row, RowStatus
+from sros_tool.demo.verdict import PartyRecord, RowRecord, RowResult, judge_row
+from sros_tool.demo.wire import WireCount
 from sros_tool.runtime.events import Event, Kind, Stage
 
 WINDOW = (100.0, 105.0)
@@ -46,26 +46,26 @@ DENIED = "secured listener without permission"
 
 def test_heard() -> None:
     result = judge(POSITIVE, secured_talker=talker("T"), secured_listener=listener("T"))
-    assert (result.observed, result.as_expected) == (Status.HEARD, True)
+    assert (result.observed, result.as_expected) == (RowStatus.HEARD, True)
     assert "1 of 2 messages" in result.detail
 
 
 def test_silence_is_a_failure_where_sound_is_expected() -> None:
     result = judge(POSITIVE, secured_talker=talker("T"), secured_listener=listener())
-    assert (result.observed, result.as_expected) == (Status.NOT_HEARD, False)
+    assert (result.observed, result.as_expected) == (RowStatus.NOT_HEARD, False)
 
 
 def test_words_of_another_talker_do_not_count() -> None:
     result = judge(POSITIVE, secured_talker=talker("T-1"), secured_listener=listener("T-11"))
-    assert result.observed is Status.NOT_HEARD
+    assert result.observed is RowStatus.NOT_HEARD
 
 
 def test_silence_counts_beside_a_control_that_heard() -> None:
     parties = {"secured_talker": talker("T"), "unsecured_listener": listener()}
     good = judge(NEGATIVE, **parties, secured_listener=listener("T"))
-    assert (good.observed, good.as_expected) == (Status.NOT_HEARD, True)
+    assert (good.observed, good.as_expected) == (RowStatus.NOT_HEARD, True)
     deaf_control = judge(NEGATIVE, **parties, secured_listener=listener())
-    assert (deaf_control.observed, deaf_control.as_expected) == (Status.UNDECIDED, False)
+    assert (deaf_control.observed, deaf_control.as_expected) == (RowStatus.UNDECIDED, False)
 
 
 def test_one_leaked_message_is_a_failure_even_before_the_window() -> None:
@@ -76,7 +76,7 @@ def test_one_leaked_message_is_a_failure_even_before_the_window() -> None:
         unsecured_listener=leak,
         secured_listener=listener("T"),
     )
-    assert (result.observed, result.as_expected) == (Status.HEARD, False)
+    assert (result.observed, result.as_expected) == (RowStatus.HEARD, False)
 
 
 def test_silence_of_a_talker_that_sent_nothing_is_undecided() -> None:
@@ -86,23 +86,23 @@ def test_silence_of_a_talker_that_sent_nothing_is_undecided() -> None:
         unsecured_listener=listener(),
         secured_listener=listener("T"),
     )
-    assert (result.observed, result.as_expected) == (Status.UNDECIDED, False)
+    assert (result.observed, result.as_expected) == (RowStatus.UNDECIDED, False)
 
 
 CRASHES = {
-    "killed": (PartyRecord(events=(READY,), status=-11), Status.CRASHED, "SIGSEGV"),
-    "ended by itself": (PartyRecord(events=(READY,), status=0), Status.CRASHED, "status 0"),
+    "killed": (PartyRecord(events=(READY,), status=-11), RowStatus.CRASHED, "SIGSEGV"),
+    "ended by itself": (PartyRecord(events=(READY,), status=0), RowStatus.CRASHED, "status 0"),
     "died before it was ready": (
         PartyRecord(output="Traceback\nImportError: no std_msgs", status=1),
-        Status.CRASHED,
+        RowStatus.CRASHED,
         "ImportError",
     ),
     "an exception": (
         PartyRecord(events=(Event(Kind.FAILED, 99, "ValueError: x", stage=Stage.ENDPOINT),)),
-        Status.CRASHED,
+        RowStatus.CRASHED,
         "ValueError: x",
     ),
-    "never ready": (PartyRecord(), Status.NOT_STARTED, "not ready"),
+    "never ready": (PartyRecord(), RowStatus.NOT_STARTED, "not ready"),
     "no security built in": (
         PartyRecord(
             events=(
@@ -114,12 +114,12 @@ CRASHES = {
                 ),
             )
         ),
-        Status.NOT_STARTED,
+        RowStatus.NOT_STARTED,
         "security libraries",
     ),
     "refused already as a participant": (
         PartyRecord(events=(Event(Kind.REFUSED, 99, "bad file", stage=Stage.PARTICIPANT),)),
-        Status.NOT_LET_IN,
+        RowStatus.NOT_LET_IN,
         "before it came to the topic",
     ),
     "denied a topic that every node has": (
@@ -128,12 +128,12 @@ CRASHES = {
             output="[SECURITY Error] rt/rosout topic not found in allow rule.\n",
             events=(Event(Kind.FAILED, 99, "RCLError: x", stage=Stage.ENDPOINT),),
         ),
-        Status.NOT_LET_IN,
+        RowStatus.NOT_LET_IN,
         "before it came to the topic",
     ),
     "a denial in the log, then a crash": (
         PartyRecord(topic="/chatter", output=FAST_DDS_DENIAL, status=-6),
-        Status.CRASHED,
+        RowStatus.CRASHED,
         "SIGABRT",
     ),
 }
@@ -177,14 +177,14 @@ REFUSALS = {
 def test_a_refusal_by_security(case: str) -> None:
     parties = {"listener_without_permission": REFUSALS[case]}
     result = judge(DENIED, **parties, secured_listener=listener())
-    assert (result.observed, result.as_expected) == (Status.REFUSED, True)
+    assert (result.observed, result.as_expected) == (RowStatus.REFUSED, True)
     without_twin = judge(DENIED, **parties, secured_listener=PartyRecord())
-    assert (without_twin.observed, without_twin.as_expected) == (Status.UNDECIDED, False)
+    assert (without_twin.observed, without_twin.as_expected) == (RowStatus.UNDECIDED, False)
 
 
 def test_a_listener_that_is_let_in_is_a_failure() -> None:
     result = judge(DENIED, listener_without_permission=listener(), secured_listener=listener())
-    assert (result.observed, result.as_expected) == (Status.STARTED, False)
+    assert (result.observed, result.as_expected) == (RowStatus.STARTED, False)
 
 
 def test_a_refused_listener_is_not_silence() -> None:
@@ -194,19 +194,19 @@ def test_a_refused_listener_is_not_silence() -> None:
         unsecured_listener=REFUSALS["Cyclone says so"],
         secured_listener=listener("T"),
     )
-    assert (result.observed, result.as_expected) == (Status.REFUSED, False)
+    assert (result.observed, result.as_expected) == (RowStatus.REFUSED, False)
 
 
 @pytest.mark.parametrize(
     ("secured", "unsecured", "observed"),
     [
-        (["S"], ["U"], Status.UNDISTURBED),
-        (["S", "U"], ["U"], Status.DISTURBED),
-        (["S"], ["U", "S"], Status.DISTURBED),
-        ([], ["U"], Status.DISTURBED),
+        (["S"], ["U"], RowStatus.UNDISTURBED),
+        (["S", "U"], ["U"], RowStatus.DISTURBED),
+        (["S"], ["U", "S"], RowStatus.DISTURBED),
+        ([], ["U"], RowStatus.DISTURBED),
     ],
 )
-def test_side_by_side(secured: list[str], unsecured: list[str], observed: Status) -> None:
+def test_side_by_side(secured: list[str], unsecured: list[str], observed: RowStatus) -> None:
     result = judge(
         "both pairs side by side on one topic",
         secured_talker=talker("S"),
@@ -219,9 +219,9 @@ def test_side_by_side(secured: list[str], unsecured: list[str], observed: Status
 
 @pytest.mark.parametrize(
     ("of_secured", "of_open", "observed"),
-    [(0, 1, Status.NOT_VISIBLE), (1, 1, Status.VISIBLE), (0, 0, Status.UNDECIDED)],
+    [(0, 1, RowStatus.NOT_VISIBLE), (1, 1, RowStatus.VISIBLE), (0, 0, RowStatus.UNDECIDED)],
 )
-def test_view(of_secured: int, of_open: int, observed: Status) -> None:
+def test_view(of_secured: int, of_open: int, observed: RowStatus) -> None:
     looks = {"/c": of_secured, "/c_open": of_open}
     result = judge(
         "secured talker in an unsecured node's view",
@@ -240,19 +240,19 @@ def test_an_observer_without_rclpy_is_skipped_with_the_reason() -> None:
         unsecured_talker_aside=talker("U"),
         observer=PartyRecord(events=(failed,), status=1),
     )
-    assert (result.observed, result.as_expected) == (Status.SKIPPED, True)
+    assert (result.observed, result.as_expected) == (RowStatus.SKIPPED, True)
     assert "ModuleNotFoundError" in result.detail
 
 
 @pytest.mark.parametrize(
     ("plain", "protected", "observed"),
     [
-        (0, 100, Status.NOT_READABLE),
-        (1, 100, Status.READABLE),
-        (0, 0, Status.UNDECIDED),
+        (0, 100, RowStatus.NOT_READABLE),
+        (1, 100, RowStatus.READABLE),
+        (0, 0, RowStatus.UNDECIDED),
     ],
 )
-def test_wire(plain: int, protected: int, observed: Status) -> None:
+def test_wire(plain: int, protected: int, observed: RowStatus) -> None:
     parties = {"secured talker": talker("T"), "secured listener": listener("T")}
     wire = {"secured talker": WireCount(plain, protected)}
     record = RowRecord(row("secured payload on the wire"), 100, parties, WINDOW, wire)
@@ -261,5 +261,5 @@ def test_wire(plain: int, protected: int, observed: Status) -> None:
 
 def test_a_skipped_row_is_shown_with_its_reason() -> None:
     result = judge_row(RowRecord(row(POSITIVE), 100, skipped="not permitted"))
-    assert (result.observed, result.detail) == (Status.SKIPPED, "not permitted")
+    assert (result.observed, result.detail) == (RowStatus.SKIPPED, "not permitted")
     assert set(result.as_json()) >= {"name", "expected", "observed", "as_expected", "mechanism"}

@@ -11,9 +11,9 @@ import pytest
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import CYCLONE, RCLPY, Backend, choose_backend
-from sros_tool.demo.keystores import Setting, build_scenery
-from sros_tool.demo.policies import DEFAULT_TOPIC
+from sros_tool.demo.keystores import KeystoreSpec, create_keystores
 from sros_tool.demo.scenarios.isolation import ISOLATION
+from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
 
@@ -25,10 +25,10 @@ DOMAIN = 189
 def _found(name: str) -> Backend | str:
     with TemporaryDirectory() as folder:
         domains, template = DomainSet.of((DOMAIN, DOMAIN)), load_template("production")
-        setting = Setting(DEFAULT_TOPIC, domains, template, datetime.now(UTC))
-        scenery = build_scenery(Path(folder), ISOLATION, setting)
+        spec = KeystoreSpec(DEFAULT_TOPIC, domains, template, datetime.now(UTC))
+        keystores = create_keystores(Path(folder), ISOLATION, spec)
         try:
-            return choose_backend(name, scenery.probe(DEFAULT_TOPIC, DOMAIN))
+            return choose_backend(name, keystores.probe(DEFAULT_TOPIC, DOMAIN))
         except UnavailableError as error:
             return str(error)
 

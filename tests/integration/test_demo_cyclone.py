@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.demo.keystores import Scenery, Setting, build_scenery
-from sros_tool.demo.model import UNSECURED, Identity
+from sros_tool.demo.keystores import KeystoreSet, KeystoreSpec, create_keystores
 from sros_tool.demo.scenarios.isolation import ISOLATION, LISTENER, TALKER, TALKER_DENIED
+from sros_tool.demo.scenarios.model import OWN, UNSECURED, Identity
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.cyclone import load_cyclone
@@ -57,15 +57,15 @@ def _needs_cyclone() -> None:
 
 
 @pytest.fixture(scope="module")
-def keystores(tmp_path_factory: pytest.TempPathFactory) -> Scenery:
+def keystores(tmp_path_factory: pytest.TempPathFactory) -> KeystoreSet:
     folder = tmp_path_factory.mktemp("keystores")
     domains, template = DomainSet.of((DOMAIN, DOMAIN)), load_template("production")
-    setting = Setting("/chatter", domains, template, datetime.now(UTC))
-    return build_scenery(folder, ISOLATION, setting)
+    spec = KeystoreSpec("/chatter", domains, template, datetime.now(UTC))
+    return create_keystores(folder, ISOLATION, spec)
 
 
 @pytest.fixture
-def child(keystores: Scenery) -> Callable[[Identity, str], list[str]]:
+def child(keystores: KeystoreSet) -> Callable[[Identity, str], list[str]]:
     """Runs code in a process of its own with an identity; returns the lines that it prints."""
 
     def run(identity: Identity, code: str, domain: int = DOMAIN) -> list[str]:
@@ -145,11 +145,11 @@ def test_what_is_written_is_read_and_seen(child: Callable[[Identity, str], list[
 @pytest.mark.parametrize("broken", ["permissions.p7s", "governance.p7s", "cert.pem", "key.pem"])
 def test_a_broken_enclave_is_refused(
     child: Callable[[Identity, str], list[str]],
-    keystores: Scenery,
+    keystores: KeystoreSet,
     tmp_path: Path,
     broken: str,
 ) -> None:
-    enclave = keystores.keystores["own"] / "enclaves/talker_listener/talker"
+    enclave = keystores.keystores[OWN] / "enclaves/talker_listener/talker"
     code = "print(attempt(lambda _: Participant(110, Path({!r})), ''))"
     copy = tmp_path / "enclave"
     copy.mkdir()

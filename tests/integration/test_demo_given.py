@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.demo.backend import RCLPY
-from sros_tool.demo.keystores import open_given
+from sros_tool.demo.casting import open_user_keystore
 from sros_tool.demo.scenarios.attacks import ATTACKS
 from sros_tool.errors import SrosError
 from sros_tool.resources import policies_dir
@@ -31,23 +31,23 @@ def robot(tmp_path: Path) -> Path:
 
 
 def test_who_plays_which_part_in_a_robot(robot: Path, tmp_path: Path) -> None:
-    given = open_given(robot, "/cmd_vel", ATTACKS)
-    assert given.topic == "/cmd_vel"
-    assert given.cast["talker"] == "/mobile_robot/velocity_mux"
-    assert given.cast["listener"] == "/mobile_robot/base"
-    assert given.cast["guest"] not in (given.cast["talker"], given.cast["listener"])
-    assert {"server", "client"} <= set(given.cast)
-    assert given.template.unique_subject
-    given.copy(tmp_path / "copy")
+    user = open_user_keystore(robot, "/cmd_vel", ATTACKS)
+    assert user.topic == "/cmd_vel"
+    assert user.cast["talker"] == "/mobile_robot/velocity_mux"
+    assert user.cast["listener"] == "/mobile_robot/base"
+    assert user.cast["guest"] not in (user.cast["talker"], user.cast["listener"])
+    assert {"server", "client"} <= set(user.cast)
+    assert user.template.unique_subject
+    user.copy(tmp_path / "copy")
     copied = set(snapshot(tmp_path / "copy"))
     assert not [path for path in copied if "ca.key" in path]
     talker = "enclaves/mobile_robot/velocity_mux/key.pem"
     assert copied >= {talker, "public/identity_ca.cert.pem", "enclaves/governance.p7s"}
     assert "enclaves/mobile_robot/teleop/key.pem" not in copied or "/mobile_robot/teleop" in (
-        given.cast.values()
+        user.cast.values()
     )
     with pytest.raises(SrosError, match="no two enclaves"):
-        open_given(robot, "/no_such_topic", ATTACKS)
+        open_user_keystore(robot, "/no_such_topic", ATTACKS)
 
 
 @needs_isolation
@@ -79,10 +79,10 @@ def test_a_part_is_given_to_whom_it_fits_best(tmp_path: Path) -> None:
     both = f"{publish('/image')}{HEARS}"
     policies = {"/a": both, "/b": publish("/image"), "/c": both, "/d": HEARS, "/e": publish("/x")}
     root = make_keystore(tmp_path, policies)
-    given = open_given(root, "/image", ATTACKS)
-    assert given.guessed
+    user = open_user_keystore(root, "/image", ATTACKS)
+    assert user.guessed
     parts = ("talker", "listener", "guest")
-    assert [given.cast[part] for part in parts] == ["/b", "/d", "/e"]
+    assert [user.cast[part] for part in parts] == ["/b", "/d", "/e"]
 
 
 @needs_isolation
@@ -142,17 +142,17 @@ party = [
 
 [[row]]
 name = "a spy does not see the camera"
-claims = ["spy does not hear camera"]
-controls = ["viewer hears camera"]
+claim = { listener = "spy", talker = "camera", expected = "not heard" }
+control = { listener = "viewer", talker = "camera", expected = "heard" }
 
 [[row]]
 name = "a viewer does not send images"
-claims = ["stranger is refused"]
-controls = ["viewer starts"]
+claim = { party = "stranger", expected = "refused" }
+control = { party = "viewer", expected = "started" }
 
 [[row]]
 name = "what is wrong is told"
-claims = ["stranger starts"]
+claim = { party = "stranger", expected = "started" }
 """
 
 

@@ -15,12 +15,13 @@ import pytest
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY, Backend, choose_backend
-from sros_tool.demo.keystores import Scenery, Setting, build_scenery
-from sros_tool.demo.model import UNSECURED, Status
+from sros_tool.demo.keystores import KeystoreSet, KeystoreSpec, create_keystores
 from sros_tool.demo.network import run_isolated
-from sros_tool.demo.runner import Limits, Plan, run_plan
+from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios import SCENARIOS
-from sros_tool.demo.scenarios.isolation import COMPOSITION, ISOLATION, TALKER
+from sros_tool.demo.scenarios.composition import COMPOSITION
+from sros_tool.demo.scenarios.isolation import ISOLATION, TALKER
+from sros_tool.demo.scenarios.model import UNSECURED, RowStatus
 from sros_tool.demo.scenarios.services import ACTIONS, SERVICES
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
@@ -73,21 +74,21 @@ def test_the_runner_drives_rclpy_nodes(tmp_path: Path) -> None:
         for row in scenario.rows
         if all(p.identity == UNSECURED for p in row.parties)
     ) + tuple(without_security(row) for row in COMPOSITION.rows if row.brief and not row.attack)
-    plan = Plan(
+    plan = RunPlan(
         rows=rows,
         domains=tuple(range(191, 191 + len(rows))),
         backend=Backend(RCLPY, "Fast DDS", "a test"),
-        scenery=Scenery({}),
+        keystores=KeystoreSet({}),
         topic="/chatter",
         folder=tmp_path / "rows",
         limits=Limits(window=2.0, longest_window=10.0),
     )
-    results = run_isolated(lambda tell: run_plan(plan, tell), try_isolation(), print)
+    results = run_isolated(lambda tell: run_rows(plan, tell), try_isolation(), print)
     wired = {row.name for row in rows if row.wire}
     assert len(results) == 8
     for result in results:
         unpermitted = result.name in wired or "cannot be loaded" in result.detail
-        skipped = result.observed is Status.SKIPPED and unpermitted
+        skipped = result.observed is RowStatus.SKIPPED and unpermitted
         assert result.observed is result.expected or skipped, result
 
 
@@ -143,8 +144,8 @@ def test_a_cyclone_talker_is_heard_by_an_rclpy_listener(tmp_path: Path) -> None:
 def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
     """Over an RMW without security, the node must fail at the participant and say why."""
     domains, template = DomainSet.of((190, 190)), load_template("production")
-    setting = Setting("/chatter", domains, template, datetime.now(UTC))
-    keystores = build_scenery(tmp_path, ISOLATION, setting)
+    spec = KeystoreSpec("/chatter", domains, template, datetime.now(UTC))
+    keystores = create_keystores(tmp_path, ISOLATION, spec)
     stack = next(rclpy_stacks(keystores.probe("/chatter", 190)))
     assert stack.enforces is not None, stack.evidence
     variables = keystores.environment(TALKER, 190)

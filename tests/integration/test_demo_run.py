@@ -15,12 +15,12 @@ from typing import Any
 import pytest
 
 from sros_tool.demo.backend import Backend
-from sros_tool.demo.keystores import Scenery
-from sros_tool.demo.model import UNSECURED, Row, Status
+from sros_tool.demo.keystores import KeystoreSet
 from sros_tool.demo.network import run_isolated
-from sros_tool.demo.records import RowResult
-from sros_tool.demo.runner import Limits, Plan, run_plan
+from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios.isolation import ROWS
+from sros_tool.demo.scenarios.model import UNSECURED, Row, RowStatus
+from sros_tool.demo.verdict import RowResult
 from sros_tool.errors import SrosError, UnavailableError
 from sros_tool.runtime.cyclone import load_cyclone
 from sros_tool.runtime.netns import try_isolation
@@ -137,17 +137,17 @@ def processes_with(text: str) -> list[str]:
 
 def play(rows: tuple[Row, ...], backend: Backend, folder: Path) -> dict[str, RowResult]:
     """Run rows without any keystore: only unsecured parties can take part."""
-    plan = Plan(
+    plan = RunPlan(
         rows=rows,
         domains=tuple(range(180, 180 + len(rows))),
         backend=backend,
-        scenery=Scenery({}),
+        keystores=KeystoreSet({}),
         topic="/chatter",
         folder=folder / "rows",
         limits=SHORT,
         own_networks=try_isolation().isolated,
     )
-    results = run_isolated(lambda tell: run_plan(plan, tell), try_isolation(), lambda _line: None)
+    results = run_isolated(lambda tell: run_rows(plan, tell), try_isolation(), lambda _line: None)
     return {result.name: result for result in results}
 
 
@@ -161,12 +161,12 @@ CYCLONE = Backend("cyclone", "Cyclone DDS", "a test")
 def test_without_security_the_demo_fails(tmp_path: Path) -> None:
     """Its rows can fail: where everybody is unsecured, everybody is heard and let in."""
     found = play(tuple(map(without_security, ROWS)), CYCLONE, tmp_path)
-    assert found["secured talker to secured listener"].observed is Status.HEARD
-    closed = [result for result in found.values() if result.expected is not Status.HEARD]
-    skipped = {result.name for result in closed if result.observed is Status.SKIPPED}
+    assert found["secured talker to secured listener"].observed is RowStatus.HEARD
+    closed = [result for result in found.values() if result.expected is not RowStatus.HEARD]
+    skipped = {result.name for result in closed if result.observed is RowStatus.SKIPPED}
     wrong = {result.name for result in closed if not result.as_expected}
     assert wrong | skipped >= {
-        result.name for result in closed if result.expected is not Status.READABLE
+        result.name for result in closed if result.expected is not RowStatus.READABLE
     }
     assert skipped <= {row.name for row in ROWS if row.wire}
 
@@ -195,7 +195,7 @@ def test_a_node_that_dies_makes_its_row_fail(victim: str, tmp_path: Path) -> Non
             return [sys.executable, "-c", code, *options]
 
     (result,) = play((row,), Dying("cyclone", "x", "y"), tmp_path).values()
-    assert result.observed is Status.CRASHED
+    assert result.observed is RowStatus.CRASHED
     assert "SIGSEGV" in result.detail
     assert not result.as_expected
 
@@ -253,9 +253,9 @@ def test_a_denial_as_rclpy_over_fast_dds_shows_it(tmp_path: Path) -> None:
         ) -> list[str]:
             return [sys.executable, "-c", FAST_DDS_NODE, *options]
 
-    rows = tuple(without_security(row) for row in ROWS if row.expected is Status.REFUSED)
+    rows = tuple(without_security(row) for row in ROWS if row.expected is RowStatus.REFUSED)
     results = play(rows, FastDds("rclpy", "Fast DDS", "a test"), tmp_path)
     assert len(results) == 2
     for result in results.values():
-        assert (result.observed, result.as_expected) == (Status.REFUSED, True)
+        assert (result.observed, result.as_expected) == (RowStatus.REFUSED, True)
         assert "topic not found in allow rule" in result.detail

@@ -24,10 +24,10 @@ from sros_tool.dds.decision.answers import Outcome, Verb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY, Backend, conditions
-from sros_tool.demo.keystores import Scenery, Setting, build_scenery
-from sros_tool.demo.model import DENIALS, Party, Relation, Role, Row, Scenario, Status
-from sros_tool.demo.nodes.names import OWN_NAMES
+from sros_tool.demo.casting import OWN_NAMES
+from sros_tool.demo.keystores import KeystoreSet, KeystoreSpec, create_keystores
 from sros_tool.demo.scenarios import SCENARIOS
+from sros_tool.demo.scenarios.model import DENIALS, Party, Relation, Role, Row, RowStatus, Scenario
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
@@ -116,22 +116,22 @@ class Casting:
 
     row: Row
     party: Party
-    scenery: Scenery
+    keystores: KeystoreSet
 
     @property
     def key(self) -> Key:
         return (
             self.party.role,
-            self.scenery.node_names(self.party),
-            self.scenery.topic(self.party, TOPIC),
+            self.keystores.node_names(self.party),
+            self.keystores.topic(self.party, TOPIC),
         )
 
     @property
-    def refused(self) -> Status | None:
+    def refused(self) -> RowStatus | None:
         """The denial that the row expects of this party."""
         for claim in self.row.claims:
             if claim.relation is Relation.IS_REFUSED and claim.subject == self.party.name:
-                return Status.REFUSED
+                return RowStatus.REFUSED
             if claim.denied in DENIALS and self.party.intruder:
                 return claim.denied
         return None
@@ -140,12 +140,14 @@ class Casting:
 def castings(scenario: Scenario, folder: Path) -> Iterator[Casting]:
     template = load_template("production")
     rows = tuple(row.under(conditions(BACKEND, template, "rt/chatter")) for row in scenario.rows)
-    setting = Setting(TOPIC, DomainSet.of((DOMAIN, DOMAIN)), template, datetime.now(UTC))
-    scenery = build_scenery(folder, replace(scenario, rows=rows), setting)
-    assert not scenery.missing
+    spec = KeystoreSpec(TOPIC, DomainSet.of((DOMAIN, DOMAIN)), template, datetime.now(UTC))
+    keystores = create_keystores(folder, replace(scenario, rows=rows), spec)
+    assert not keystores.missing
     for row in rows:
         yield from (
-            Casting(row, party, scenery) for party in row.parties if party.identity.keystore
+            Casting(row, party, keystores)
+            for party in row.parties
+            if party.identity.keystore is not None
         )
 
 
@@ -217,10 +219,12 @@ def test_demo_nodes_do_what_their_enclave_allows_and_are_denied_what_the_row_wan
     wrong = []
     asked = 0
     for each in cast:
-        if each.refused is Status.NOT_LET_IN or each.row.attack == "world-readable keys":
+        if each.refused is RowStatus.NOT_LET_IN or each.row.attack == "world-readable keys":
             continue  # the documents or the files do not get as far as a right
         identity = each.party.identity
-        root, enclave = each.scenery.keystores[identity.keystore], each.scenery.enclave(identity)
+        assert identity.keystore is not None
+        root = each.keystores.keystores[identity.keystore]
+        enclave = each.keystores.enclave(identity)
         if not (enclave_path(root, enclave) / "permissions.p7s").exists():
             continue  # the row takes them away
         access = access_of(root, enclave)
@@ -236,7 +240,7 @@ def test_demo_nodes_do_what_their_enclave_allows_and_are_denied_what_the_row_wan
         )
         if each.refused is None and refused:
             wrong.append(f"{each.row.name}: {each.party.name} is denied {sorted(refused)}")
-        if each.refused is Status.REFUSED and not refused:
+        if each.refused is RowStatus.REFUSED and not refused:
             wrong.append(f"{each.row.name}: {each.party.name} is denied nothing")
         if refused - of_the_row:
             others = sorted(refused - of_the_row)
@@ -251,7 +255,8 @@ def test_it_would_see_a_node_under_another_name(cast: list[Casting]) -> None:
     (own,), (name,) = OWN_NAMES[Role.CLIENT], client.key[1]
     assert name == "/add_two_ints_client" != f"/{own}"
     identity = client.party.identity
-    access = access_of(client.scenery.keystores[identity.keystore], "/add_two_ints/client")
+    assert identity.keystore is not None
+    access = access_of(client.keystores.keystores[identity.keystore], "/add_two_ints/client")
     services = {pair for each in NODE_SERVICES for pair in named("reply", f"{name}/{each}")}
     assert not denied(access, services)
     elsewhere = {pair for each in NODE_SERVICES for pair in named("reply", f"/{own}/{each}")}

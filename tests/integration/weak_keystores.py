@@ -8,11 +8,12 @@ from datetime import datetime
 from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
+from sros_tool.demo import forger
 from sros_tool.demo.backend import Backend
-from sros_tool.demo.forger import REMOVALS, Bench, Forge, in_clear
-from sros_tool.demo.keystores import Setting, make_keystore
-from sros_tool.demo.model import Condition
+from sros_tool.demo.forger import Forge, KeystoreCopy
+from sros_tool.demo.keystores import KeystoreSpec, create_scenario_keystore
 from sros_tool.demo.scenarios.attacks import ATTACKS
+from sros_tool.demo.scenarios.model import Condition
 from sros_tool.keystore.template import Template, load_template
 
 DOMAIN = 7
@@ -37,7 +38,7 @@ class Weakness:
         return self.broken
 
 
-def _open_modes(bench: Bench) -> None:
+def _open_modes(bench: KeystoreCopy) -> None:
     for path in [bench.root, *bench.root.rglob("*")]:
         if not path.is_symlink():
             path.chmod(0o755 if path.is_dir() else 0o644)
@@ -72,9 +73,9 @@ WEAKNESSES: Mapping[str, Weakness] = {
                 "an enclave calls a service that it was not given",
             }
         ),
-        forge=REMOVALS["guest may do everything"].forge,
+        forge=forger.guest_may_do_everything,
     ),
-    "nothing encrypted": Weakness(frozenset({"payload read on the wire"}), in_clear),
+    "nothing encrypted": Weakness(frozenset({"payload read on the wire"}), forger.unprotected),
     "files open to all users": Weakness(
         frozenset({"identity copied by another user of the robot"}), forge=_open_modes
     ),
@@ -85,8 +86,8 @@ def make_weak(folder: Path, weakness: Weakness, now: datetime) -> Path:
     """A keystore for the attacks with one weakness."""
     root = folder / "keystore"
     template = weakness.template(load_template("production"))
-    setting = Setting("/chatter", DomainSet.of((DOMAIN, DOMAIN)), template, now)
-    make_keystore(root, ATTACKS, setting)
+    spec = KeystoreSpec("/chatter", DomainSet.of((DOMAIN, DOMAIN)), template, now)
+    create_scenario_keystore(root, ATTACKS, spec)
     if weakness.forge is not None:
-        weakness.forge(Bench(root, root, ATTACKS.cast, "/chatter", DOMAIN, now))
+        weakness.forge(KeystoreCopy(root, root, ATTACKS.cast, "/chatter", DOMAIN, now))
     return root

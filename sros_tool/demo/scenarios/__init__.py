@@ -1,15 +1,16 @@
-"""The scenarios that ship with sros."""
+"""The scenarios that ship with sros, as data; `custom` reads those of users."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from sros_tool.demo.model import Scenario
 from sros_tool.demo.scenarios.attacks import ATTACKS
+from sros_tool.demo.scenarios.composition import COMPOSITION
 from sros_tool.demo.scenarios.custom import read_scenario
 from sros_tool.demo.scenarios.governance import GOVERNANCE
-from sros_tool.demo.scenarios.isolation import COMPOSITION, ISOLATION
+from sros_tool.demo.scenarios.isolation import ISOLATION
+from sros_tool.demo.scenarios.model import Scenario
 from sros_tool.demo.scenarios.services import ACTIONS, SERVICES
 from sros_tool.errors import UsageError
 
@@ -21,20 +22,22 @@ SCENARIOS: tuple[Scenario, ...] = (
     ATTACKS,
     GOVERNANCE,
 )
-DEFAULT_SCENARIO = ISOLATION.name
+_DEFAULT_SCENARIO = ISOLATION.name
 ALL = "all"
 
 
 def choose_scenarios(names: Sequence[str]) -> tuple[Scenario, ...]:
-    """The scenarios of those names or files, in order; none is the default.
+    """Return the scenarios of those names or TOML files, in order; without any, the default.
 
-    Raises `UsageError` and, for a file, `DocumentError`.
+    Raises:
+        UsageError: there is none of that name.
+        DocumentError: a file is not understood.
     """
     if ALL in names:
         return SCENARIOS
     known = {scenario.name: scenario for scenario in SCENARIOS}
     chosen = []
-    for name in dict.fromkeys(names or (DEFAULT_SCENARIO,)):
+    for name in dict.fromkeys(names or (_DEFAULT_SCENARIO,)):
         if name.endswith(".toml"):
             chosen.append(read_scenario(Path(name)))
             continue

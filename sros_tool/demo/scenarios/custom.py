@@ -7,7 +7,7 @@
 
     [[party]]
     name = "camera"
-    role = "talker"                       # a role of `sros_tool.demo.model.Role`
+    role = "talker"                       # a value of `sros_tool.demo.scenarios.model.Role`
     enclave = "/arm/camera"               # left out: unsecured
     topic = "/image"                      # or the name of a service or action
 
@@ -18,13 +18,22 @@
 
     [[row]]
     name = "a spy does not see the camera"
-    claims = ["spy does not hear camera"]
-    controls = ["viewer hears camera"]    # what makes the silence believable
     because = "..."                       # what brings it about, for the table
 
+    [[row.claim]]
+    listener = "spy"
+    talker = "camera"
+    expected = "not heard"
+
+    [[row.control]]                       # what makes the silence believable
+    listener = "viewer"
+    talker = "camera"
+    expected = "heard"
+
+``expected`` is a status as the table shows it, and says which parties a claim names: `_PARTIES`.
 ``keystore = "foreign"`` gives a party the identity of another CA; ``variables`` is a table of
-environment variables.  Whatever is expected not to happen needs a claim or control beside it that
-does happen.
+environment variables.  A claim that something does not happen needs another claim or a control
+that something does happen.
 """
 
 from __future__ import annotations
@@ -36,8 +45,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from sros_tool.demo.model import (
-    FOREIGN,
+from sros_tool.demo.scenarios.model import (
     OWN,
     SPEAKING,
     UNSECURED,
@@ -47,41 +55,66 @@ from sros_tool.demo.model import (
     Relation,
     Role,
     Row,
+    RowStatus,
     Scenario,
-    Status,
+    SoundKeystore,
 )
-from sros_tool.demo.policies import check_topic
+from sros_tool.demo.scenarios.policies import check_topic
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.files import parse_toml
 from sros_tool.policy import Policy, read_policy
 from sros_tool.xml import read_bytes
 
-_PHRASES: tuple[tuple[str, Relation, bool], ...] = (
-    ("is not readable on the wire", Relation.READABLE, False),
-    ("is readable on the wire", Relation.READABLE, True),
-    ("is not answered by", Relation.IS_ANSWERED, False),
-    ("is answered by", Relation.IS_ANSWERED, True),
-    ("does not hear", Relation.HEARS, False),
-    ("does not see", Relation.SEES, False),
-    ("is refused", Relation.IS_REFUSED, True),
-    ("hears", Relation.HEARS, True),
-    ("sees", Relation.SEES, True),
-    ("starts", Relation.STARTS, True),
-)
-_ALONE = (Relation.READABLE, Relation.IS_REFUSED, Relation.STARTS)
-_ASKING = (Role.CLIENT, Role.ACTION_CLIENT)
-_SERVING = (Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED)
-_HEARING = (Role.LISTENER, Role.COMPOSED)
+_PARTIES: Mapping[Relation, tuple[str, ...]] = {
+    Relation.HEARS: ("listener", "talker"),
+    Relation.IS_ANSWERED: ("client", "server"),
+    Relation.SEES: ("observer", "talker"),
+    Relation.READABLE: ("talker",),
+    Relation.IS_REFUSED: ("party",),
+    Relation.STARTS: ("party",),
+}
+"""The keys that name the parties of a claim: whom it is about, and the other one."""
+
+_CLAIMS: Mapping[str, tuple[Relation, bool]] = {
+    "heard": (Relation.HEARS, True),
+    "not heard": (Relation.HEARS, False),
+    "answered": (Relation.IS_ANSWERED, True),
+    "not answered": (Relation.IS_ANSWERED, False),
+    "visible": (Relation.SEES, True),
+    "not visible": (Relation.SEES, False),
+    "readable": (Relation.READABLE, True),
+    "not readable": (Relation.READABLE, False),
+    "refused": (Relation.IS_REFUSED, True),
+    "started": (Relation.STARTS, True),
+}
+_EXAMPLE = 'Write a table: listener = "spy", talker = "camera", expected = "not heard".'
+
+_FITTING: Mapping[str, tuple[Role, ...]] = {
+    "talker": (Role.TALKER, Role.COMPOSED),
+    "listener": (Role.LISTENER, Role.COMPOSED),
+    "observer": (Role.OBSERVER,),
+    "client": (Role.CLIENT, Role.ACTION_CLIENT),
+    "server": (Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED),
+    "party": tuple(Role),
+}
+"""The roles of a party that a key of a claim can name."""
+
 _NAMED = (Role.SERVER, Role.CLIENT, Role.ACTION_SERVER, Role.ACTION_CLIENT)
+"""The roles that need the name of their service or action."""
+
 _KEYS = {
     "": {"title", "policy", "party", "row"},
     "party": {"name", "role", "enclave", "keystore", "topic", "variables"},
-    "row": {"name", "claims", "controls", "because"},
+    "row": {"name", "claim", "control", "because"},
 }
 
 
 def read_scenario(path: Path) -> Scenario:
-    """Read a scenario file; raises `DocumentError` with the line of what is not understood."""
+    """Read a scenario file.
+
+    Raises:
+        DocumentError: with the line of what is not understood.
+    """
     try:
         text = read_bytes(path, "scenario").decode()
         data = parse_toml(text)
@@ -139,11 +172,16 @@ class _Reader:
 
     def _identity(self, table: Mapping[str, Any], place: int, policy: Policy) -> Identity:
         enclave = self._text(table, "enclave", "party", place, "")
-        keystore = self._text(table, "keystore", "party", place, OWN)
-        if keystore not in (OWN, FOREIGN):
-            problem = f"{keystore!r} is not a keystore; there are {OWN} and {FOREIGN}"
+        word = self._text(table, "keystore", "party", place, OWN)
+        keystores = {each.value: each for each in SoundKeystore}
+        if word not in keystores:
+            problem = f"{word!r} is not a keystore; there are {', '.join(keystores)}"
             raise self._error("party", place, "keystore", problem)
         if not enclave:
+            for key in ("keystore", "variables"):
+                if key in table:
+                    problem = f"{key} is for a party with an enclave, and this one is unsecured"
+                    raise self._error("party", place, key, problem, "Name its enclave.")
             return UNSECURED
         if policy.enclave(enclave) is None:
             paths = [each.path for each in policy.enclaves]
@@ -157,18 +195,18 @@ class _Reader:
             isinstance(value, str) for value in variables.values()
         ):
             raise self._error("party", place, "variables", "variables is not a table of texts")
-        return Identity(keystore, enclave, tuple(variables.items()))
+        return Identity(keystores[word], enclave, tuple(variables.items()))
 
     def _row(self, table: Mapping[str, Any], place: int, parties: Mapping[str, Party]) -> Row:
         self._known(table, "row", place)
         name = self._text(table, "name", "row", place)
-        claims = self._claims(table, "claims", place, parties)
-        controls = self._claims(table, "controls", place, parties)
+        claims = self._claims(table, "claim", place, parties)
+        controls = self._claims(table, "control", place, parties)
         if not claims:
-            raise self._error("row", place, "name", f"the row {name!r} has no claims")
+            raise self._error("row", place, "name", f"the row {name!r} has no claim", _EXAMPLE)
         self._check_controls(claims, controls, place)
         used = {word for claim in (*claims, *controls) for word in (claim.subject, claim.talker)}
-        expected = claims[0].expected if len(claims) == 1 else Status.UNDISTURBED
+        expected = claims[0].expected if len(claims) == 1 else RowStatus.UNDISTURBED
         wire = any(claim.relation is Relation.READABLE for claim in (*claims, *controls))
         return Row(
             name,
@@ -183,27 +221,39 @@ class _Reader:
     def _claims(
         self, table: Mapping[str, Any], key: str, place: int, parties: Mapping[str, Party]
     ) -> tuple[Claim, ...]:
-        texts = table.get(key, [])
-        if not isinstance(texts, list) or not all(isinstance(text, str) for text in texts):
-            raise self._error("row", place, key, f"{key} is not a list of texts")
-        return tuple(self._claim(text, key, place, parties) for text in texts)
+        tables = table.get(key, [])
+        tables = [tables] if isinstance(tables, dict) else tables
+        if not isinstance(tables, list):
+            raise self._error("row", place, key, f"{key} is not a table", _EXAMPLE)
+        return tuple(self._claim(each, key, place, parties) for each in tables)
 
-    def _claim(self, text: str, key: str, place: int, parties: Mapping[str, Party]) -> Claim:
-        for phrase, relation, holds in _PHRASES:
-            found = re.fullmatch(rf"(.+?) {phrase}(?: (.+))?", text.strip())
-            if not found or bool(found[2]) is (relation in _ALONE):
-                continue
-            subject, other = found[1], found[2] or ""
-            for name in filter(None, (subject, other)):
-                if name not in parties:
-                    problem = f"{text!r}: there is no party {name!r}; there are"
-                    raise self._error("row", place, key, f"{problem} {', '.join(parties)}")
-            claim = Claim(relation, subject, other, holds)
-            if problem := _misfit(claim, parties):
-                raise self._error("row", place, key, f"{text!r}: {problem}")
-            return claim
-        phrases = ", ".join(f"'X {p}{'' if r in _ALONE else ' Y'}'" for p, r, _ in _PHRASES)
-        raise self._error("row", place, key, f"{text!r} is not a claim; claims are {phrases}")
+    def _claim(self, table: Any, key: str, place: int, parties: Mapping[str, Party]) -> Claim:
+        if not isinstance(table, dict):
+            raise self._error("row", place, key, f"{table!r} is not a table", _EXAMPLE)
+        expected = table.get("expected")
+        if not isinstance(expected, str) or expected not in _CLAIMS:
+            problem = (
+                f"a {key} has no expected status"
+                if expected is None
+                else f"{expected!r} is not a status that can be expected"
+            )
+            raise self._error("row", place, key, f"{problem}; there are {', '.join(_CLAIMS)}")
+        relation, holds = _CLAIMS[expected]
+        keys = _PARTIES[relation]
+        if set(table) != {*keys, "expected"}:
+            problem = f"a {key} that is {expected!r} needs {' and '.join(keys)}, and no other keys"
+            raise self._error("row", place, key, f"{problem}; it has {', '.join(table)}")
+        names = [table[each] for each in keys]
+        for each, name in zip(keys, names, strict=True):
+            if not isinstance(name, str) or name not in parties:
+                problem = f"there is no party {name!r}; there are {', '.join(parties)}"
+                raise self._error("row", place, key, problem)
+            role = parties[name].role
+            server_on_the_wire = relation is Relation.READABLE and role in SPEAKING
+            if role not in _FITTING[each] and not server_on_the_wire:
+                problem = f"{name} is a {role}, and cannot be the {each} of a claim"
+                raise self._error("row", place, key, problem)
+        return Claim(relation, names[0], names[1] if len(names) > 1 else "", holds)
 
     def _check_controls(
         self, claims: Sequence[Claim], controls: Sequence[Claim], place: int
@@ -222,7 +272,7 @@ class _Reader:
                 raise self._error(
                     "row",
                     place,
-                    "claims",
+                    "claim",
                     f"nothing shows that{who} at the same time: a crash would look the same",
                     "Add a control, such as the rightful listener that hears the same talker.",
                 )
@@ -237,6 +287,9 @@ class _Reader:
 
     def _known(self, table: Mapping[str, Any], kind: str, place: int) -> None:
         for key in table:
+            if key in ("claims", "controls"):
+                problem = f"{key!r} is not a key here; there are tables [[row.{key[:-1]}]]"
+                raise self._error(kind, place, key, problem, _EXAMPLE)
             if key not in _KEYS[kind]:
                 known = ", ".join(sorted(_KEYS[kind]))
                 problem = f"{key!r} is not a key here; there are {known}"
@@ -263,38 +316,23 @@ class _Reader:
         return DocumentError(f"the scenario '{self._path}', line {line}: {problem}", "", remedy)
 
     def _line(self, kind: str, place: int, key: str) -> int:
-        """The line of a key in the table of that kind and place, or that of the table."""
+        """Return the line of a key in the table of that kind and number, or that of the table."""
         heads = [n for n, text in enumerate(self._lines) if re.match(rf"\s*\[\[{kind}\]\]", text)]
         start = heads[place] if kind and place < len(heads) else 0
-        end = next(
-            (n for n in range(start + 1, len(self._lines)) if self._lines[n].lstrip()[:1] == "["),
-            len(self._lines),
+        ends = (
+            n
+            for n in range(start + 1, len(self._lines))
+            if re.match(r"\s*\[\[\s*\w+\s*\]\]", self._lines[n])
         )
-        for number in range(start, end):
-            if re.match(rf"\s*[\"']?{re.escape(key)}[\"']?\s*[=.]", self._lines[number]):
+        for number in range(start, next(ends, len(self._lines))):
+            if re.match(
+                rf"\s*([\"']?{re.escape(key)}[\"']?\s*[=.]|\[\[row\.{re.escape(key)}\]\])",
+                self._lines[number],
+            ):
                 return number + 1
         return start + 1
 
 
 def _happens(claim: Claim) -> bool:
-    """Whether a claim is of something that works, not of a silence or a refusal."""
+    """Return whether a claim is of something that works, not of a silence or a refusal."""
     return claim.holds and claim.relation is not Relation.IS_REFUSED
-
-
-def _misfit(claim: Claim, parties: Mapping[str, Party]) -> str:
-    """Why the roles of its parties do not fit a claim, or ""."""
-    subject = parties[claim.subject].role
-    needed: dict[Relation, tuple[Role, ...]] = {
-        Relation.HEARS: _HEARING,
-        Relation.IS_ANSWERED: _ASKING,
-        Relation.SEES: (Role.OBSERVER,),
-        Relation.READABLE: tuple(SPEAKING),
-    }
-    if subject not in needed.get(claim.relation, tuple(Role)):
-        return f"a {subject} cannot do that"
-    if not claim.talker:
-        return ""
-    other = parties[claim.talker].role
-    answering = claim.relation is Relation.IS_ANSWERED
-    fitting = _SERVING if answering else (Role.TALKER, Role.COMPOSED)
-    return "" if other in fitting else f"{claim.talker} is a {other}"

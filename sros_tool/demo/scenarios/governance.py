@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from sros_tool.demo.model import (
+from sros_tool.demo import forger
+from sros_tool.demo.forger import Undefended
+from sros_tool.demo.scenarios.model import (
     Claim,
     Identity,
     Party,
     Relation,
     Role,
     Row,
+    RowStatus,
     Scenario,
-    Status,
 )
-from sros_tool.demo.policies import measured_policy
+from sros_tool.demo.scenarios.policies import measured_policy
 
-KINDS = ("none", "sign", "encrypt")
+KINDS = {
+    "none": Undefended(template=forger.unprotected),
+    "sign": Undefended(template=forger.signed),
+    "encrypt": Undefended(template=forger.encrypted),
+}
+"""The keystore of each protection kind."""
 
 _MECHANISMS = {
     "none": "access is controlled, and messages travel as they are",
@@ -24,15 +31,14 @@ _MECHANISMS = {
 
 
 def _row(kind: str) -> Row:
-    expected = Status.NOT_READABLE if kind == "encrypt" else Status.READABLE
-    label = f"protection {kind}"
+    expected = RowStatus.NOT_READABLE if kind == "encrypt" else RowStatus.READABLE
     return Row(
         f"payload on the wire under {kind}",
         expected,
         _MECHANISMS[kind],
         (
-            Party("talker", Role.TALKER, Identity(label, "talker")),
-            Party("listener", Role.LISTENER, Identity(label, "listener")),
+            Party("talker", Role.TALKER, Identity(KINDS[kind], "talker")),
+            Party("listener", Role.LISTENER, Identity(KINDS[kind], "listener")),
         ),
         (Claim(Relation.READABLE, "talker").expecting(expected),),
         (Claim(Relation.HEARS, "listener", "talker"),),
@@ -41,26 +47,25 @@ def _row(kind: str) -> Row:
     )
 
 
-def _changed(kind: str, expected: Status, mechanism: str) -> Row:
-    label = f"protection {kind}"
+def _changed(kind: str, expected: RowStatus, mechanism: str) -> Row:
     return Row(
         f"changed packets under {kind}",
         expected,
         mechanism,
         (
-            Party("talker", Role.TALKER, Identity(label, "talker")),
-            Party("listener", Role.LISTENER, Identity(label, "listener")),
+            Party("talker", Role.TALKER, Identity(KINDS[kind], "talker")),
+            Party("listener", Role.LISTENER, Identity(KINDS[kind], "listener")),
         ),
         (Claim(Relation.BELIEVES, "listener", "talker").expecting(expected),),
         (Claim(Relation.HEARS, "listener", "talker"),),
-        forge="talker",
+        impersonate="talker",
         brief=True,
     )
 
 
 _CHANGES = (
-    _changed("none", Status.DECEIVED, "nothing proves that the packet is the talker's"),
-    _changed("sign", Status.NOT_DECEIVED, "its code does not fit a changed packet"),
+    _changed("none", RowStatus.DECEIVED, "nothing proves that the packet is the talker's"),
+    _changed("sign", RowStatus.NOT_DECEIVED, "its code does not fit a changed packet"),
 )
 
 GOVERNANCE = Scenario(

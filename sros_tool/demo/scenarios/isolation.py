@@ -6,7 +6,7 @@ messages, or the same program in an enclave that is permitted.
 
 from __future__ import annotations
 
-from sros_tool.demo.model import (
+from sros_tool.demo.scenarios.model import (
     FOREIGN,
     OWN,
     UNSECURED,
@@ -16,10 +16,10 @@ from sros_tool.demo.model import (
     Relation,
     Role,
     Row,
+    RowStatus,
     Scenario,
-    Status,
 )
-from sros_tool.demo.policies import SERVICE, composed_policy, talking_policy
+from sros_tool.demo.scenarios.policies import talking_policy
 
 TALKER = Identity(OWN, "talker")
 LISTENER = Identity(OWN, "listener")
@@ -45,27 +45,27 @@ _DENIED_TALKER = Party("talker without permission", Role.TALKER, TALKER_DENIED)
 _DENIED_LISTENER = Party("listener without permission", Role.LISTENER, LISTENER_DENIED)
 _FOREIGN_TALKER = Party("foreign talker", Role.TALKER, FOREIGN_TALKER)
 _FOREIGN_LISTENER = Party("foreign listener", Role.LISTENER, FOREIGN_LISTENER)
-_OPEN_TALKER_ASIDE = Party("unsecured talker aside", Role.TALKER, UNSECURED, aside=True)
+_OPEN_TALKER_ASIDE = Party("unsecured talker aside", Role.TALKER, UNSECURED, other_topic=True)
 _OBSERVER = Party("observer", Role.OBSERVER, UNSECURED)
 
 ROWS: tuple[Row, ...] = (
     Row(
         "secured talker to secured listener",
-        Status.HEARD,
+        RowStatus.HEARD,
         "each proves its identity by a certificate of the same CA, and has the permission",
         (_SECURED_TALKER, _SECURED_LISTENER),
         (_hears("secured listener", "secured talker"),),
     ),
     Row(
         "unsecured talker to unsecured listener",
-        Status.HEARD,
+        RowStatus.HEARD,
         "no security on either side: the control of all rows below",
         (_OPEN_TALKER, _OPEN_LISTENER),
         (_hears("unsecured listener", "unsecured talker"),),
     ),
     Row(
         "secured talker to unsecured listener",
-        Status.NOT_HEARD,
+        RowStatus.NOT_HEARD,
         "a listener that cannot authenticate gets no keys, and is sent nothing",
         (_SECURED_TALKER, _OPEN_LISTENER, _SECURED_LISTENER),
         (_hears_not("unsecured listener", "secured talker"),),
@@ -73,7 +73,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(
         "unsecured talker to secured listener",
-        Status.NOT_HEARD,
+        RowStatus.NOT_HEARD,
         "a listener in a closed domain ignores a talker that cannot authenticate",
         (_OPEN_TALKER, _SECURED_LISTENER, _OPEN_LISTENER),
         (_hears_not("secured listener", "unsecured talker"),),
@@ -81,7 +81,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(
         "secured listener without permission",
-        Status.REFUSED,
+        RowStatus.REFUSED,
         "its own DDS refuses the reader: the signed permissions do not allow the topic",
         (_DENIED_LISTENER, _SECURED_LISTENER),
         (Claim(Relation.IS_REFUSED, "listener without permission"),),
@@ -89,7 +89,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(
         "secured talker without permission",
-        Status.REFUSED,
+        RowStatus.REFUSED,
         "its own DDS refuses the writer: the signed permissions do not allow the topic",
         (_DENIED_TALKER, _SECURED_TALKER),
         (Claim(Relation.IS_REFUSED, "talker without permission"),),
@@ -97,7 +97,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(
         "talker of another keystore to secured listener",
-        Status.NOT_HEARD,
+        RowStatus.NOT_HEARD,
         "a certificate of another CA proves nothing here: no handshake, no keys",
         (_FOREIGN_TALKER, _SECURED_LISTENER, _FOREIGN_LISTENER),
         (_hears_not("secured listener", "foreign talker"),),
@@ -105,7 +105,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(
         "both pairs side by side on one topic",
-        Status.UNDISTURBED,
+        RowStatus.UNDISTURBED,
         "each pair hears its own talker, and nothing of the other one",
         (_SECURED_TALKER, _SECURED_LISTENER, _OPEN_TALKER, _OPEN_LISTENER),
         (
@@ -117,7 +117,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(
         "secured talker in an unsecured node's view",
-        Status.NOT_VISIBLE,
+        RowStatus.NOT_VISIBLE,
         "discovery of endpoints is encrypted: it counts no publisher of the secured topic",
         (_SECURED_TALKER, _OPEN_TALKER_ASIDE, _OBSERVER),
         (Claim(Relation.SEES, "observer", "secured talker", holds=False),),
@@ -125,7 +125,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(
         "unsecured payload on the wire",
-        Status.READABLE,
+        RowStatus.READABLE,
         "the text lies open in the packets",
         (_OPEN_TALKER, _OPEN_LISTENER),
         (Claim(Relation.READABLE, "unsecured talker"),),
@@ -134,7 +134,7 @@ ROWS: tuple[Row, ...] = (
     ),
     Row(
         "secured payload on the wire",
-        Status.NOT_READABLE,
+        RowStatus.NOT_READABLE,
         "every packet with data is encrypted",
         (_SECURED_TALKER, _SECURED_LISTENER),
         (Claim(Relation.READABLE, "secured talker", holds=False),),
@@ -154,93 +154,4 @@ ISOLATION = Scenario(
         "listener without permission": "/talker_listener/listener_without_permission",
     },
     talking_policy,
-)
-
-
-_CONTAINER = Party("container", Role.COMPOSED, Identity(OWN, "container"))
-_TALKER = Party("talker", Role.TALKER, Identity(OWN, "talker"))
-_LISTENER = Party("listener", Role.LISTENER, Identity(OWN, "listener"))
-_CLIENT = Party("client", Role.CLIENT, Identity(OWN, "client"), SERVICE)
-_COMPOSITION_OPEN_LISTENER = Party("unsecured listener", Role.LISTENER, UNSECURED)
-
-COMPOSITION_ROWS: tuple[Row, ...] = (
-    Row(
-        "listener of a container hears a talker",
-        Status.HEARD,
-        "the enclave of the container may subscribe the topic",
-        (_CONTAINER, _TALKER),
-        (Claim(Relation.HEARS, "container", "talker"),),
-        brief=True,
-    ),
-    Row(
-        "talker of a container is heard by a listener",
-        Status.HEARD,
-        "the enclave of the container may publish the topic",
-        (_CONTAINER, _LISTENER),
-        (Claim(Relation.HEARS, "listener", "container"),),
-        brief=True,
-    ),
-    Row(
-        "server of a container answers a client",
-        Status.ANSWERED,
-        "the enclave of the container may reply",
-        (_CONTAINER, _CLIENT),
-        (Claim(Relation.IS_ANSWERED, "client", "container"),),
-        brief=True,
-    ),
-    Row(
-        "unsecured listener hears a container",
-        Status.NOT_HEARD,
-        "one participant, one identity: what protects one node protects all of them",
-        (_CONTAINER, _COMPOSITION_OPEN_LISTENER, _LISTENER),
-        (Claim(Relation.HEARS, "unsecured listener", "container", holds=False),),
-        (Claim(Relation.HEARS, "listener", "container"),),
-    ),
-    Row(
-        "container in the enclave of one of its nodes",
-        Status.REFUSED,
-        "the process needs the rights of all of its nodes: one of them is denied",
-        (Party("container as a listener", Role.COMPOSED, Identity(OWN, "listener")), _LISTENER),
-        (Claim(Relation.IS_REFUSED, "container as a listener"),),
-        (Claim(Relation.STARTS, "listener"),),
-    ),
-    Row(
-        "listener node with the rights of its container publishes",
-        Status.HEARD,
-        "DDS cannot tell the nodes of a process apart: they share the sum of their rights",
-        (
-            Party("listener node gone astray", Role.TALKER, Identity(OWN, "container")),
-            _LISTENER,
-        ),
-        (Claim(Relation.HEARS, "listener", "listener node gone astray"),),
-        brief=True,
-        attack="a node uses the rights of its neighbour",
-        open_because="one process is one participant with one enclave",
-        remedy="run nodes that must not be trusted with each other's rights in processes of their"
-        " own",
-    ),
-    Row(
-        "listener node in an enclave of its own publishes",
-        Status.REFUSED,
-        "its own enclave has its own rights only",
-        (
-            Party("listener that talks", Role.TALKER, Identity(OWN, "listener")),
-            _TALKER,
-        ),
-        (Claim(Relation.IS_REFUSED, "listener that talks"),),
-        (Claim(Relation.STARTS, "talker"),),
-    ),
-)
-
-COMPOSITION = Scenario(
-    "composition",
-    "several nodes in one process share one enclave",
-    COMPOSITION_ROWS,
-    {
-        "container": "/composition",
-        "talker": "/talker_listener/talker",
-        "listener": "/talker_listener/listener",
-        "client": f"{SERVICE}/client",
-    },
-    composed_policy,
 )

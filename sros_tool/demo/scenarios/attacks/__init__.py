@@ -7,8 +7,6 @@ same attack succeed where the defence is gone: an attack that never works would 
 
 from __future__ import annotations
 
-from sros_tool.demo.model import Row, Scenario
-from sros_tool.demo.policies import GUEST, SERVICE, attacked_policy
 from sros_tool.demo.scenarios.attacks import (
     documents,
     identities,
@@ -16,17 +14,14 @@ from sros_tool.demo.scenarios.attacks import (
     strangers,
     variables,
 )
-from sros_tool.demo.scenarios.attacks import (
-    strangers as wire,
-)
+from sros_tool.demo.scenarios.model import Row, Scenario
+from sros_tool.demo.scenarios.policies import GUEST, SERVICE, attacked_policy
 
 ROWS: tuple[Row, ...] = (
-    *wire.WIRE_ROWS,
     *strangers.ROWS,
     *rights.ROWS,
     *identities.ROWS,
     *documents.ROWS,
-    *documents.GOVERNANCE_ROWS,
     *variables.ROWS,
 )
 

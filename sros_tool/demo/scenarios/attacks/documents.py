@@ -1,117 +1,118 @@
-"""Attacks with permissions: copied, edited, signed by the wrong one, borrowed, outdated."""
+"""Attacks with permissions and governance: edited, signed by the wrong CA, borrowed, outdated."""
 
 from __future__ import annotations
 
-from sros_tool.demo.forger import STOLEN
-from sros_tool.demo.model import UNSECURED, Case, Condition, Identity, Row, Status
+from sros_tool.demo import forger
+from sros_tool.demo.forger import Undefended
 from sros_tool.demo.scenarios.attacks.kinds import injection, succeeds
+from sros_tool.demo.scenarios.model import UNSECURED, Condition, Identity, Row, RowStatus, Variant
 
 _ITSELF = "permissions signed by the enclave itself"
 _BORROWED = "permissions borrowed from a longer name"
 
 _TRUSTED_AS_SIGNER = injection(
     "permissions signed by the enclave itself, a trusted signer",
-    Identity("trusted as signer", "guest"),
-    Status.HEARD,
+    Identity(Undefended(forger.enclave_among_the_signers), "guest"),
+    RowStatus.HEARD,
     "who stands in the file of the permissions CA may sign",
     attack=_ITSELF,
     removed="a file of the permissions CA that holds the CA alone",
-    victims="trusted as signer",
+    victims=Undefended(forger.enclave_among_the_signers),
 )
 _SAME_SUBJECT = injection(
     "permissions borrowed, the same subject",
-    Identity("borrowed with the subject", "guest"),
-    Status.HEARD,
+    Identity(Undefended(forger.borrowed_permissions_and_subject), "guest"),
+    RowStatus.HEARD,
     "two certificates of one subject fit the same permissions",
     attack=_BORROWED,
     removed="a subject of its own",
-    victims="borrowed with the subject",
+    victims=Undefended(forger.borrowed_permissions_and_subject),
 )
 _SIGNED_WRONG = "its own DDS verifies the signature of the permissions CA"
 
 ROWS: tuple[Row, ...] = (
     injection(
         "permissions copied from another enclave",
-        Identity("permissions of another", "guest"),
-        Status.NOT_LET_IN,
+        Identity(forger.permissions_of_another, "guest"),
+        RowStatus.NOT_LET_IN,
         "the subject of the permissions is not that of the certificate",
         attack="forged permissions",
     ),
     injection(
         "permissions edited",
-        Identity("permissions edited", "guest"),
-        Status.NOT_LET_IN,
+        Identity(forger.edited_permissions, "guest"),
+        RowStatus.NOT_LET_IN,
         _SIGNED_WRONG,
         attack="forged permissions",
     ),
     injection(
         "permissions unsigned",
-        Identity("permissions unsigned", "guest"),
-        Status.NOT_LET_IN,
+        Identity(forger.unsigned_permissions, "guest"),
+        RowStatus.NOT_LET_IN,
         _SIGNED_WRONG,
         attack="forged permissions",
     ),
     injection(
         "permissions signed by another CA",
-        Identity("permissions of another CA", "guest"),
-        Status.NOT_LET_IN,
+        Identity(forger.permissions_of_another_ca, "guest"),
+        RowStatus.NOT_LET_IN,
         _SIGNED_WRONG,
         attack="forged permissions",
     ),
     succeeds(
         "the same permissions, signed by the permissions CA",
-        Identity("signed by the CA", "guest"),
+        Identity(Undefended(forger.permissions_signed_by_the_ca), "guest"),
         attack="forged permissions",
         removed="the wrong signature",
-        victims="signed by the CA",
+        victims=Undefended(forger.permissions_signed_by_the_ca),
     ),
     injection(
         "a permissions CA of its own",
-        Identity("own permissions CA", "guest"),
-        Status.NOT_HEARD,
+        Identity(forger.own_permissions_ca, "guest"),
+        RowStatus.NOT_HEARD,
         "its own DDS is satisfied; its peers verify its permissions with the CA that they trust",
         attack="a permissions CA of its own",
     ),
     injection(
         "a permissions CA of its own, trusted by the listener",
-        Identity("another CA trusted", "guest"),
-        Status.HEARD,
+        Identity(Undefended(forger.another_permissions_ca_trusted), "guest"),
+        RowStatus.HEARD,
         "whom the permissions CA trusts is let in",
         attack="a permissions CA of its own",
         removed="the listener's permissions CA",
-        victims="another CA trusted",
+        victims=Undefended(forger.another_permissions_ca_trusted),
         crowd=False,
     ),
     *(
         injection(
             name,
-            Identity(label, "guest"),
+            Identity(forge, "guest"),
             closed,
             mechanism,
             attack=_ITSELF,
-            cases=(
-                Case((Condition.EXACT_SIGNER,), closed, mechanism=exact),
-                Case(
+            variants=(
+                Variant((Condition.EXACT_SIGNER,), closed, mechanism=exact),
+                Variant(
                     (Condition.ONE_CA,),
-                    Status.HEARD,
+                    RowStatus.HEARD,
                     "with one CA for both jobs, this DDS takes any enclave's certificate for a"
                     " signer of permissions (the class of CVE-2023-24011)",
                     "use a keystore with separate CAs (template development or production)",
                 ),
             ),
         )
-        for name, label, closed, mechanism, exact in (
+        for name, forge, closed, mechanism, exact in (
             (
                 _ITSELF,
-                "signed by itself",
-                Status.NOT_LET_IN,
+                forger.permissions_signed_by_itself,
+                RowStatus.NOT_LET_IN,
                 "the permissions CA is on nobody's certificate path: it signs documents only",
                 "Fast DDS takes no signer but the permissions CA itself",
             ),
             (
                 "permissions and governance signed by itself",
-                "signed by itself, own trust",
-                Status.NOT_HEARD,
+                forger.permissions_and_governance_signed_by_itself,
+                RowStatus.NOT_HEARD,
                 "its own DDS is made to agree; its peers verify with the permissions CA",
                 "its own DDS is made to agree; its peers take no signer but the permissions CA",
             ),
@@ -119,29 +120,29 @@ ROWS: tuple[Row, ...] = (
     ),
     injection(
         "permissions signed by the enclave itself, one CA",
-        Identity("one CA", "guest"),
-        Status.HEARD,
+        Identity(Undefended(forger.permissions_signed_by_itself, forger.one_ca), "guest"),
+        RowStatus.HEARD,
         "Cyclone DDS 0.10 accepts every signer whose certificate comes from the CA",
         attack=_ITSELF,
         removed="a permissions CA of its own",
-        victims="one CA",
-        cases=(Case((Condition.EXACT_SIGNER,), Status.HEARD, instead=_TRUSTED_AS_SIGNER),),
+        victims=Undefended(forger.permissions_signed_by_itself, forger.one_ca),
+        variants=(Variant((Condition.EXACT_SIGNER,), RowStatus.HEARD, instead=_TRUSTED_AS_SIGNER),),
     ),
     injection(
         _BORROWED,
-        Identity("borrowed", "guest"),
-        Status.NOT_LET_IN,
+        Identity(forger.borrowed_permissions, "guest"),
+        RowStatus.NOT_LET_IN,
         "each subject has a part that no other has",
         attack=_BORROWED,
-        cases=(
-            Case(
+        variants=(
+            Variant(
                 (Condition.FAST,),
-                Status.NOT_LET_IN,
+                RowStatus.NOT_LET_IN,
                 mechanism="Fast DDS compares whole subjects, and no two of them are the same",
             ),
-            Case(
+            Variant(
                 (Condition.SHARED_SUBJECTS, Condition.CYCLONE),
-                Status.HEARD,
+                RowStatus.HEARD,
                 "Cyclone DDS 0.10 takes a subject for its own that contains its parts",
                 "use the template production (unique_subject), or names that do not contain others",
             ),
@@ -149,18 +150,18 @@ ROWS: tuple[Row, ...] = (
     ),
     injection(
         "permissions borrowed, subjects not unique",
-        Identity("borrowed with shared subjects", "guest"),
-        Status.HEARD,
+        Identity(Undefended(forger.borrowed_permissions, forger.shared_subjects), "guest"),
+        RowStatus.HEARD,
         "Cyclone DDS compares parts of names, so those of /guest/admin fit /guest",
         attack=_BORROWED,
         removed="unique subjects",
-        victims="borrowed with shared subjects",
-        cases=(Case((Condition.FAST,), Status.HEARD, instead=_SAME_SUBJECT),),
+        victims=Undefended(forger.borrowed_permissions, forger.shared_subjects),
+        variants=(Variant((Condition.FAST,), RowStatus.HEARD, instead=_SAME_SUBJECT),),
     ),
     injection(
         "old permissions put back",
-        Identity("old permissions", "guest"),
-        Status.HEARD,
+        Identity(forger.permissions_signed_by_the_ca, "guest"),
+        RowStatus.HEARD,
         "what the CA has signed holds until it expires",
         attack="old permissions put back",
         open_because="DDS Security 1.1 cannot revoke permissions (sros2#275)",
@@ -169,14 +170,14 @@ ROWS: tuple[Row, ...] = (
     ),
     injection(
         "old permissions put back after renewal",
-        Identity("old permissions after renewal", "guest"),
-        Status.NOT_LET_IN,
+        Identity(forger.old_permissions_after_renewal, "guest"),
+        RowStatus.NOT_LET_IN,
         "the renewed certificate has another subject, which the old permissions do not fit",
         attack="old permissions put back after renewal",
-        cases=(
-            Case(
+        variants=(
+            Variant(
                 (Condition.SHARED_SUBJECTS,),
-                Status.HEARD,
+                RowStatus.HEARD,
                 "the renewed certificate has the same subject as the old one",
                 "use the template production (unique_subject), or `sros revoke` and a new enclave",
             ),
@@ -184,81 +185,80 @@ ROWS: tuple[Row, ...] = (
     ),
     injection(
         "old permissions put back after renewal, subjects not unique",
-        Identity("renewed with shared subjects", "guest"),
-        Status.HEARD,
+        Identity(Undefended(forger.old_permissions_after_renewal, forger.shared_subjects), "guest"),
+        RowStatus.HEARD,
         "the same subject fits old and new permissions",
         attack="old permissions put back after renewal",
         removed="unique subjects",
-        victims="renewed with shared subjects",
+        victims=Undefended(forger.old_permissions_after_renewal, forger.shared_subjects),
     ),
     injection(
         "old permissions put back after revocation",
-        Identity("old permissions", "guest"),
-        Status.NOT_HEARD,
+        Identity(forger.permissions_signed_by_the_ca, "guest"),
+        RowStatus.NOT_HEARD,
         "the listener's crl.pem names the certificate that they were signed for",
         attack="old permissions put back after revocation",
-        victims="guest revoked",
+        victims=forger.guest_revoked,
     ),
     injection(
         "old permissions put back after revocation, list not delivered",
-        Identity("guest's revocation not delivered", STOLEN),
-        Status.HEARD,
+        Identity(Undefended(forger.guest_revocation_not_delivered), forger.STOLEN),
+        RowStatus.HEARD,
         "who has no crl.pem knows of no revocation",
         attack="old permissions put back after revocation",
         removed="the listener's crl.pem",
-        victims="guest's revocation not delivered",
+        victims=Undefended(forger.guest_revocation_not_delivered),
     ),
     injection(
         "permissions for another domain",
-        Identity("permissions for another domain", "guest"),
-        Status.NOT_LET_IN,
+        Identity(forger.permissions_for_another_domain, "guest"),
+        RowStatus.NOT_LET_IN,
         "no rule of the permissions is for this domain",
         attack="permissions for another domain",
-        cases=(
-            Case(
+        variants=(
+            Variant(
                 (Condition.OPEN_JOIN, Condition.UNCONTROLLED),
-                Status.HEARD,
+                RowStatus.HEARD,
                 "the template controls neither who joins nor who uses the topic",
                 "leave join_access_control and the access control of topics on",
             ),
-            Case((Condition.OPEN_JOIN,), Status.REFUSED),
-            Case(
+            Variant((Condition.OPEN_JOIN,), RowStatus.REFUSED),
+            Variant(
                 (Condition.FAST,),
-                Status.NOT_HEARD,
+                RowStatus.NOT_HEARD,
                 mechanism="Fast DDS lets it start; its peers find no rule for the domain",
             ),
         ),
     ),
     succeeds(
         "the same permissions for this domain",
-        Identity("signed by the CA", "guest"),
+        Identity(Undefended(forger.permissions_signed_by_the_ca), "guest"),
         attack="permissions for another domain",
         removed="the wrong domain",
-        victims="signed by the CA",
+        victims=Undefended(forger.permissions_signed_by_the_ca),
     ),
-)
-
-
-GOVERNANCE_ROWS: tuple[Row, ...] = (
     *(
         injection(
-            label,
+            name,
             UNSECURED,
-            Status.NOT_LET_IN,
+            RowStatus.NOT_LET_IN,
             "the listener's DDS verifies the signature of the permissions CA",
             attack="weaker governance",
-            victims=label,
+            victims=forge,
             tampered=True,
         )
-        for label in ("governance edited", "governance of another CA")
+        for name, forge in (
+            ("governance edited", forger.edited_governance),
+            ("governance of another CA", forger.governance_of_another_ca),
+        )
     ),
     injection(
         "an older, weaker governance put back",
         UNSECURED,
-        Status.HEARD,
+        RowStatus.HEARD,
         "what the CA has signed holds for ever: governance has no dates",
         attack="weaker governance",
-        victims="old governance",
+        victims=forger.weaker_governance,
         tampered=True,
         open_because="DDS Security 1.1 cannot revoke a governance document",
         remedy="after strengthening the governance: `sros rotate_ca`, so that nobody trusts the CA"
@@ -267,11 +267,11 @@ GOVERNANCE_ROWS: tuple[Row, ...] = (
     injection(
         "weaker governance, signed by the permissions CA",
         UNSECURED,
-        Status.HEARD,
+        RowStatus.HEARD,
         "the listener lets everybody in",
         attack="weaker governance",
         removed="the wrong signature",
-        victims="strangers allowed",
+        victims=Undefended(forger.weaker_governance),
         crowd=False,
     ),
 )

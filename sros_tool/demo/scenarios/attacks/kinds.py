@@ -1,27 +1,27 @@
 """Rows of the same kind: somebody injects, listens, looks around, asks, or poses as a server.
 
-In each, the attacker is the party "attacker".  Its victims and the control are those of the
-keystore with the label ``victims``; where no keystore stands in its way (``removed``), there is
-nothing but the victim.
+In each, the attacker is the party "attacker".  Its victims and the control have identities of the
+keystore ``victims``; where the defence is gone (``removed``), there is nothing but the victim.
 """
 
 from __future__ import annotations
 
-from sros_tool.demo.model import (
+from sros_tool.demo.scenarios.model import (
     OWN,
-    Case,
     Claim,
     Condition,
     Identity,
+    KeystoreChoice,
     Party,
     Relation,
     Role,
     Row,
-    Status,
+    RowStatus,
+    Variant,
 )
-from sros_tool.demo.policies import SERVICE
+from sros_tool.demo.scenarios.policies import SERVICE
 
-ATTACKER = "attacker"
+_ATTACKER = "attacker"
 
 _LET_IN = (
     "the template lets unauthenticated participants in, and protects nothing",
@@ -33,25 +33,25 @@ _UNCONTROLLED = (
 )
 
 
-def open_to(success: Status, expected: Status) -> tuple[Case, ...]:
+def open_to(success: RowStatus, expected: RowStatus) -> tuple[Variant, ...]:
     """The cases in which a template leaves open what is expected to be closed."""
-    if expected is Status.REFUSED:
-        return (Case((Condition.UNCONTROLLED,), success, *_UNCONTROLLED),)
-    if expected is success or expected is Status.NOT_LET_IN:
+    if expected is RowStatus.REFUSED:
+        return (Variant((Condition.UNCONTROLLED,), success, *_UNCONTROLLED),)
+    if expected is success or expected is RowStatus.NOT_LET_IN:
         return ()
-    return (Case((Condition.STRANGERS,), success, *_LET_IN),)
+    return (Variant((Condition.STRANGERS,), success, *_LET_IN),)
 
 
 def injection(
     name: str,
     attacker: Identity,
-    expected: Status,
+    expected: RowStatus,
     mechanism: str,
     *,
     attack: str,
     removed: str = "",
-    victims: str = OWN,
-    cases: tuple[Case, ...] = (),
+    victims: KeystoreChoice = OWN,
+    variants: tuple[Variant, ...] = (),
     open_because: str = "",
     remedy: str = "",
     tampered: bool = False,
@@ -63,7 +63,7 @@ def injection(
     and the control is a listener beside it with its files as they should be.
     """
     listener = Party("listener", Role.LISTENER, Identity(victims, "listener"), intruder=tampered)
-    parties = [Party(ATTACKER, Role.TALKER, attacker, intruder=True), listener]
+    parties = [Party(_ATTACKER, Role.TALKER, attacker, intruder=True), listener]
     controls: list[Claim] = []
     if tampered:
         parties += [
@@ -79,10 +79,10 @@ def injection(
         expected,
         mechanism,
         tuple(parties),
-        (Claim(Relation.HEARS, "listener", ATTACKER).expecting(expected),),
+        (Claim(Relation.HEARS, "listener", _ATTACKER).expecting(expected),),
         tuple(controls),
         brief=True,
-        cases=(*cases, *open_to(Status.HEARD, expected)),
+        variants=(*variants, *open_to(RowStatus.HEARD, expected)),
         attack=attack,
         removed=removed,
         open_because=open_because,
@@ -90,24 +90,26 @@ def injection(
     )
 
 
-def succeeds(name: str, attacker: Identity, *, attack: str, removed: str, victims: str) -> Row:
+def succeeds(
+    name: str, attacker: Identity, *, attack: str, removed: str, victims: KeystoreChoice
+) -> Row:
     """The same attacker with nothing wrong about him is heard."""
     mechanism = "with nothing wrong about it, it is heard"
     return injection(
-        name, attacker, Status.HEARD, mechanism, attack=attack, removed=removed, victims=victims
+        name, attacker, RowStatus.HEARD, mechanism, attack=attack, removed=removed, victims=victims
     )
 
 
 def listening(
     name: str,
     attacker: Identity,
-    expected: Status,
+    expected: RowStatus,
     mechanism: str,
     *,
     attack: str,
     removed: str = "",
-    victims: str = OWN,
-    cases: tuple[Case, ...] = (),
+    victims: KeystoreChoice = OWN,
+    variants: tuple[Variant, ...] = (),
 ) -> Row:
     """Whether the attacker hears the topic."""
     return Row(
@@ -115,14 +117,14 @@ def listening(
         expected,
         mechanism,
         (
-            Party(ATTACKER, Role.LISTENER, attacker, intruder=True),
+            Party(_ATTACKER, Role.LISTENER, attacker, intruder=True),
             Party("talker", Role.TALKER, Identity(victims, "talker")),
             Party("listener", Role.LISTENER, Identity(victims, "listener")),
         ),
-        (Claim(Relation.HEARS, ATTACKER, "talker").expecting(expected),),
+        (Claim(Relation.HEARS, _ATTACKER, "talker").expecting(expected),),
         (Claim(Relation.HEARS, "listener", "talker"),),
         brief=True,
-        cases=(*cases, *open_to(Status.HEARD, expected)),
+        variants=(*variants, *open_to(RowStatus.HEARD, expected)),
         attack=attack,
         removed=removed,
     )
@@ -131,32 +133,32 @@ def listening(
 def looking(
     name: str,
     attacker: Identity,
-    expected: Status,
+    expected: RowStatus,
     mechanism: str,
     *,
     attack: str,
     removed: str = "",
-    victims: str = OWN,
-    cases: tuple[Case, ...] = (),
+    victims: KeystoreChoice = OWN,
+    variants: tuple[Variant, ...] = (),
     open_because: str = "",
     remedy: str = "",
 ) -> Row:
     """Whether the attacker counts a publisher of the topic."""
-    in_the_open = Party("unsecured talker", Role.TALKER, aside=True)
-    unsecured = not attacker.keystore
+    in_the_open = Party("unsecured talker", Role.TALKER, other_topic=True)
+    unsecured = attacker.keystore is None
     return Row(
         name,
         expected,
         mechanism,
         (
-            Party(ATTACKER, Role.OBSERVER, attacker, intruder=True),
+            Party(_ATTACKER, Role.OBSERVER, attacker, intruder=True),
             Party("talker", Role.TALKER, Identity(victims, "talker")),
             *((in_the_open,) if unsecured else ()),
         ),
-        (Claim(Relation.SEES, ATTACKER, "talker").expecting(expected),),
-        (Claim(Relation.SEES, ATTACKER, "unsecured talker"),) if unsecured else (),
+        (Claim(Relation.SEES, _ATTACKER, "talker").expecting(expected),),
+        (Claim(Relation.SEES, _ATTACKER, "unsecured talker"),) if unsecured else (),
         brief=True,
-        cases=cases,
+        variants=variants,
         attack=attack,
         removed=removed,
         open_because=open_because,
@@ -167,12 +169,12 @@ def looking(
 def with_service(
     name: str,
     attacker: Identity,
-    expected: Status,
+    expected: RowStatus,
     mechanism: str,
     *,
     attack: str,
     removed: str = "",
-    victims: str = OWN,
+    victims: KeystoreChoice = OWN,
 ) -> Row:
     """Whether the attacker gets answers of a service."""
     return Row(
@@ -180,14 +182,14 @@ def with_service(
         expected,
         mechanism,
         (
-            Party(ATTACKER, Role.CLIENT, attacker, SERVICE, intruder=True),
+            Party(_ATTACKER, Role.CLIENT, attacker, SERVICE, intruder=True),
             Party("server", Role.SERVER, Identity(victims, "server"), SERVICE),
             Party("client", Role.CLIENT, Identity(victims, "client"), SERVICE),
         ),
-        (Claim(Relation.IS_ANSWERED, ATTACKER, "server").expecting(expected),),
+        (Claim(Relation.IS_ANSWERED, _ATTACKER, "server").expecting(expected),),
         (Claim(Relation.IS_ANSWERED, "client", "server"),),
         brief=True,
-        cases=() if removed else open_to(Status.ANSWERED, expected),
+        variants=() if removed else open_to(RowStatus.ANSWERED, expected),
         attack=attack,
         removed=removed,
     )
@@ -196,12 +198,12 @@ def with_service(
 def served(
     name: str,
     attacker: Identity,
-    expected: Status,
+    expected: RowStatus,
     mechanism: str,
     *,
     attack: str,
     removed: str = "",
-    victims: str = OWN,
+    victims: KeystoreChoice = OWN,
 ) -> Row:
     """Whether a client takes answers of the attacker, who poses as the server."""
     rightful = Party("server", Role.SERVER, Identity(victims, "server"), SERVICE)
@@ -210,14 +212,14 @@ def served(
         expected,
         mechanism,
         (
-            Party(ATTACKER, Role.SERVER, attacker, SERVICE, intruder=True),
+            Party(_ATTACKER, Role.SERVER, attacker, SERVICE, intruder=True),
             Party("client", Role.CLIENT, Identity(victims, "client"), SERVICE),
             *(() if removed else (rightful,)),
         ),
-        (Claim(Relation.IS_ANSWERED, "client", ATTACKER).expecting(expected),),
+        (Claim(Relation.IS_ANSWERED, "client", _ATTACKER).expecting(expected),),
         () if removed else (Claim(Relation.IS_ANSWERED, "client", "server"),),
         brief=True,
-        cases=() if removed else open_to(Status.ANSWERED, expected),
+        variants=() if removed else open_to(RowStatus.ANSWERED, expected),
         attack=attack,
         removed=removed,
     )

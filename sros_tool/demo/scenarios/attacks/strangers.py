@@ -1,11 +1,13 @@
-"""Attacks by nodes without an identity, and what every node with one can see."""
+"""Attacks by strangers: on the wire, by nodes without an identity; and what enclaves can see."""
 
 from __future__ import annotations
 
-from sros_tool.demo.model import (
+from sros_tool.demo import forger
+from sros_tool.demo.forger import Undefended
+from sros_tool.demo.scenarios.attacks.kinds import injection, listening, looking, open_to
+from sros_tool.demo.scenarios.model import (
     OWN,
     UNSECURED,
-    Case,
     Claim,
     Condition,
     Identity,
@@ -13,84 +15,18 @@ from sros_tool.demo.model import (
     Relation,
     Role,
     Row,
-    Status,
+    RowStatus,
+    Variant,
     Wire,
 )
-from sros_tool.demo.scenarios.attacks.kinds import injection, listening, looking, open_to
+
+_IN_CLEAR = Undefended(template=forger.unprotected)
+_STRANGERS_ALLOWED = Undefended(forger.weaker_governance)
 
 ROWS: tuple[Row, ...] = (
-    listening(
-        "an unsecured node listens",
-        UNSECURED,
-        Status.NOT_HEARD,
-        "who cannot authenticate gets no keys, and is sent nothing",
-        attack="an unsecured node listens",
-    ),
-    listening(
-        "an unsecured node listens, strangers allowed",
-        UNSECURED,
-        Status.HEARD,
-        "the governance lets everybody in and protects nothing",
-        attack="an unsecured node listens",
-        removed="the governance's refusal of strangers",
-        victims="strangers allowed",
-    ),
-    looking(
-        "an unsecured node lists topics",
-        UNSECURED,
-        Status.NOT_VISIBLE,
-        "discovery of endpoints is encrypted: it counts no publisher of the topic",
-        attack="an unsecured node lists topics",
-        cases=(
-            Case(
-                (Condition.STRANGERS_SEE,),
-                Status.VISIBLE,
-                "the template lets unauthenticated participants in",
-                "leave out allow_unauthenticated_participants",
-            ),
-        ),
-    ),
-    looking(
-        "an unsecured node lists topics, strangers allowed",
-        UNSECURED,
-        Status.VISIBLE,
-        "discovery is not protected, and open to everybody",
-        attack="an unsecured node lists topics",
-        removed="the governance's refusal of strangers",
-        victims="strangers allowed",
-    ),
-    injection(
-        "an unsecured node injects",
-        UNSECURED,
-        Status.NOT_HEARD,
-        "a listener in a closed domain ignores a talker that cannot authenticate",
-        attack="an unsecured node injects",
-    ),
-    injection(
-        "an unsecured node injects, strangers allowed",
-        UNSECURED,
-        Status.HEARD,
-        "the governance lets everybody in and protects nothing",
-        attack="an unsecured node injects",
-        removed="the governance's refusal of strangers",
-        victims="strangers allowed",
-    ),
-    looking(
-        "an enclave without rights lists topics",
-        Identity(OWN, "guest"),
-        Status.VISIBLE,
-        "endpoints are announced to every authenticated participant",
-        attack="an authenticated node looks around",
-        open_because="DDS Security 1.1 does not hide endpoints from authenticated participants",
-        remedy="give an identity to nobody who must not know what there is",
-    ),
-)
-
-
-WIRE_ROWS: tuple[Row, ...] = (
     Row(
         "payload read on the wire",
-        Status.NOT_READABLE,
+        RowStatus.NOT_READABLE,
         "every packet with data is encrypted, with keys that only authenticated peers get",
         (
             Party("talker", Role.TALKER, Identity(OWN, "talker")),
@@ -99,10 +35,10 @@ WIRE_ROWS: tuple[Row, ...] = (
         (Claim(Relation.READABLE, "talker", holds=False),),
         (Claim(Relation.HEARS, "listener", "talker"),),
         wire=True,
-        cases=(
-            Case(
+        variants=(
+            Variant(
                 (Condition.IN_CLEAR,),
-                Status.READABLE,
+                RowStatus.READABLE,
                 "the template does not encrypt the payload of this topic",
                 'set data = "ENCRYPT" for it',
             ),
@@ -111,11 +47,15 @@ WIRE_ROWS: tuple[Row, ...] = (
     ),
     Row(
         "payload read on the wire, not encrypted",
-        Status.READABLE,
+        RowStatus.READABLE,
         "with the protection kinds NONE, access is controlled but nothing is hidden",
         (
-            Party("talker", Role.TALKER, Identity("in clear", "talker")),
-            Party("listener", Role.LISTENER, Identity("in clear", "listener")),
+            Party("talker", Role.TALKER, Identity(_IN_CLEAR, "talker")),
+            Party(
+                "listener",
+                Role.LISTENER,
+                Identity(_IN_CLEAR, "listener"),
+            ),
         ),
         (Claim(Relation.READABLE, "talker"),),
         (Claim(Relation.HEARS, "listener", "talker"),),
@@ -126,7 +66,7 @@ WIRE_ROWS: tuple[Row, ...] = (
     ),
     Row(
         "packets of a secured talker sent again",
-        Status.NOT_HEARD_AGAIN,
+        RowStatus.NOT_HEARD_AGAIN,
         "keys are agreed on anew with each peer, so that old packets fit nobody's",
         (
             Party("talker", Role.TALKER, Identity(OWN, "talker")),
@@ -136,12 +76,12 @@ WIRE_ROWS: tuple[Row, ...] = (
         (Claim(Relation.HEARS, "listener", "talker"),),
         replay="talker",
         brief=True,
-        cases=open_to(Status.HEARD_AGAIN, Status.NOT_HEARD_AGAIN),
+        variants=open_to(RowStatus.HEARD_AGAIN, RowStatus.NOT_HEARD_AGAIN),
         attack="replay of captured packets",
     ),
     Row(
         "packets of an unsecured talker sent again",
-        Status.HEARD_AGAIN,
+        RowStatus.HEARD_AGAIN,
         "nothing in a packet proves when it was sent, nor by whom",
         (Party("talker", Role.TALKER), Party("listener", Role.LISTENER)),
         (Claim(Relation.HEARS_AGAIN, "listener", "talker"),),
@@ -154,7 +94,7 @@ WIRE_ROWS: tuple[Row, ...] = (
     *(
         Row(
             f"{what} read in the handshake",
-            Status.READABLE,
+            RowStatus.READABLE,
             "identity and permissions travel in clear before there are keys",
             (
                 Party("talker", Role.TALKER, Identity(OWN, "talker")),
@@ -169,5 +109,70 @@ WIRE_ROWS: tuple[Row, ...] = (
             remedy="put no secrets into names, and keep strangers off the network",
         )
         for what, wire in (("topic names", Wire.TOPIC), ("certificates", Wire.CERTIFICATE))
+    ),
+    listening(
+        "an unsecured node listens",
+        UNSECURED,
+        RowStatus.NOT_HEARD,
+        "who cannot authenticate gets no keys, and is sent nothing",
+        attack="an unsecured node listens",
+    ),
+    listening(
+        "an unsecured node listens, strangers allowed",
+        UNSECURED,
+        RowStatus.HEARD,
+        "the governance lets everybody in and protects nothing",
+        attack="an unsecured node listens",
+        removed="the governance's refusal of strangers",
+        victims=_STRANGERS_ALLOWED,
+    ),
+    looking(
+        "an unsecured node lists topics",
+        UNSECURED,
+        RowStatus.NOT_VISIBLE,
+        "discovery of endpoints is encrypted: it counts no publisher of the topic",
+        attack="an unsecured node lists topics",
+        variants=(
+            Variant(
+                (Condition.STRANGERS_SEE,),
+                RowStatus.VISIBLE,
+                "the template lets unauthenticated participants in",
+                "leave out allow_unauthenticated_participants",
+            ),
+        ),
+    ),
+    looking(
+        "an unsecured node lists topics, strangers allowed",
+        UNSECURED,
+        RowStatus.VISIBLE,
+        "discovery is not protected, and open to everybody",
+        attack="an unsecured node lists topics",
+        removed="the governance's refusal of strangers",
+        victims=_STRANGERS_ALLOWED,
+    ),
+    injection(
+        "an unsecured node injects",
+        UNSECURED,
+        RowStatus.NOT_HEARD,
+        "a listener in a closed domain ignores a talker that cannot authenticate",
+        attack="an unsecured node injects",
+    ),
+    injection(
+        "an unsecured node injects, strangers allowed",
+        UNSECURED,
+        RowStatus.HEARD,
+        "the governance lets everybody in and protects nothing",
+        attack="an unsecured node injects",
+        removed="the governance's refusal of strangers",
+        victims=_STRANGERS_ALLOWED,
+    ),
+    looking(
+        "an enclave without rights lists topics",
+        Identity(OWN, "guest"),
+        RowStatus.VISIBLE,
+        "endpoints are announced to every authenticated participant",
+        attack="an authenticated node looks around",
+        open_because="DDS Security 1.1 does not hide endpoints from authenticated participants",
+        remedy="give an identity to nobody who must not know what there is",
     ),
 )

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from sros_tool.demo.model import (
+from sros_tool.demo import forger
+from sros_tool.demo.forger import Undefended
+from sros_tool.demo.scenarios.attacks.kinds import open_to
+from sros_tool.demo.scenarios.model import (
     OWN,
     Claim,
     Identity,
@@ -10,9 +13,8 @@ from sros_tool.demo.model import (
     Relation,
     Role,
     Row,
-    Status,
+    RowStatus,
 )
-from sros_tool.demo.scenarios.attacks.kinds import open_to
 
 _ENABLE, _STRATEGY = "ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY"
 _PERMISSIVE = (_STRATEGY, "Permissive")
@@ -21,7 +23,7 @@ _PERMISSIVE = (_STRATEGY, "Permissive")
 def _in_the_open(
     name: str,
     identity: Identity,
-    expected: Status,
+    expected: RowStatus,
     mechanism: str,
     *,
     attack: str,
@@ -44,7 +46,7 @@ def _in_the_open(
         (claim,),
         (Claim(Relation.HEARS, "unsecured listener", "unsecured talker"),),
         brief=True,
-        cases=open_to(Status.HEARD, expected),
+        variants=open_to(RowStatus.HEARD, expected),
         attack=attack,
         removed=removed,
         open_because=open_because,
@@ -55,15 +57,15 @@ def _in_the_open(
 ROWS: tuple[Row, ...] = (
     _in_the_open(
         "a file of the enclave missing, Enforce",
-        Identity("file missing", "talker"),
-        Status.NOT_LET_IN,
+        Identity(forger.missing_permissions, "talker"),
+        RowStatus.NOT_LET_IN,
         "with Enforce, a node without all of its files does not start",
         attack="a file of the enclave missing",
     ),
     _in_the_open(
         "a file of the enclave missing, Permissive",
-        Identity("file missing, permissive", "talker", (_PERMISSIVE,)),
-        Status.HEARD,
+        Identity(Undefended(forger.missing_permissions), "talker", (_PERMISSIVE,)),
+        RowStatus.HEARD,
         "with Permissive, it runs unsecured, and everybody hears it",
         attack="a file of the enclave missing",
         removed="ROS_SECURITY_STRATEGY=Enforce",
@@ -71,7 +73,7 @@ ROWS: tuple[Row, ...] = (
     _in_the_open(
         "variables spelt right",
         Identity(OWN, "talker"),
-        Status.NOT_HEARD,
+        RowStatus.NOT_HEARD,
         "the talker runs secured, and sends strangers nothing",
         attack="misspelt security variables",
     ),
@@ -79,9 +81,11 @@ ROWS: tuple[Row, ...] = (
         _in_the_open(
             f"{variable}={value}{' and a file missing' if variable == _STRATEGY else ''}",
             Identity(
-                "file missing" if variable == _STRATEGY else OWN, "talker", ((variable, value),)
+                forger.missing_permissions if variable == _STRATEGY else OWN,
+                "talker",
+                ((variable, value),),
             ),
-            Status.HEARD,
+            RowStatus.HEARD,
             mechanism,
             attack="misspelt security variables",
             open_because="rcl takes every other spelling for no, and a node says nothing about it",

@@ -1,4 +1,4 @@
-"""One end of a measurement: ``python -m sros_tool.demo.cost_node cyclone|rclpy ping|pong``.
+"""One end of a measurement: ``python -m sros_tool.demo.nodes.ping_pong cyclone|rclpy ping|pong``.
 
 ``pong`` sends back what it gets: whole messages that begin with "e", and a short receipt for the
 last one of each burst, "b".  ``ping`` measures, and writes what it found as JSON.  Both read the
@@ -89,7 +89,7 @@ _LINKS = {"cyclone": _cyclone_link, "rclpy": _rclpy_link}
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure, or answer until there is no parent any more; returns the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m sros_tool.demo.cost_node")
+    parser = argparse.ArgumentParser(prog="python -m sros_tool.demo.nodes.ping_pong")
     parser.add_argument("library", choices=_LINKS)
     parser.add_argument("role", choices=("ping", "pong"))
     parser.add_argument("--sizes", type=int, nargs="*", default=[], help="payloads in bytes")

@@ -1,4 +1,4 @@
-"""What a demo is made of, as plain data: parties, claims about them, rows, scenarios.
+"""The data model of scenarios: parties, claims about them, rows.
 
 A row is one line of the table: processes that start together, what is claimed of them, and the
 controls that make a silence believable.
@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
+from sros_tool.demo.forger import Forge, Undefended
 from sros_tool.policy import Policy
 
 
@@ -28,11 +29,11 @@ class Role(StrEnum):
 
 
 SPEAKING = frozenset({Role.TALKER, Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED})
-"""The roles that send something by which they are recognised."""
+"""The roles that send a text by which they are recognised."""
 
 
-class Status(StrEnum):
-    """What was expected or observed of a row."""
+class RowStatus(StrEnum):
+    """The expected or observed outcome of a row."""
 
     HEARD = "heard"
     NOT_HEARD = "not heard"
@@ -57,12 +58,12 @@ class Status(StrEnum):
     SKIPPED = "skipped"
 
 
-DENIALS = (Status.REFUSED, Status.NOT_LET_IN)
+DENIALS = (RowStatus.REFUSED, RowStatus.NOT_LET_IN)
 """Security says no to a topic, or already to the whole process."""
 
 
 class Relation(StrEnum):
-    """What can be claimed of a party, or of a party and another one."""
+    """A statement about one party, or about two."""
 
     HEARS = "hears"
     HEARS_AGAIN = "hears replayed packets of"
@@ -74,66 +75,81 @@ class Relation(StrEnum):
     READABLE = "is readable on the wire"
 
 
-STATUS_OF: dict[tuple[Relation, bool], Status] = {
-    (Relation.HEARS, True): Status.HEARD,
-    (Relation.HEARS, False): Status.NOT_HEARD,
-    (Relation.HEARS_AGAIN, True): Status.HEARD_AGAIN,
-    (Relation.HEARS_AGAIN, False): Status.NOT_HEARD_AGAIN,
-    (Relation.BELIEVES, True): Status.DECEIVED,
-    (Relation.BELIEVES, False): Status.NOT_DECEIVED,
-    (Relation.IS_ANSWERED, True): Status.ANSWERED,
-    (Relation.IS_ANSWERED, False): Status.NOT_ANSWERED,
-    (Relation.IS_REFUSED, True): Status.REFUSED,
-    (Relation.IS_REFUSED, False): Status.STARTED,
-    (Relation.STARTS, True): Status.STARTED,
-    (Relation.STARTS, False): Status.REFUSED,
-    (Relation.SEES, True): Status.VISIBLE,
-    (Relation.SEES, False): Status.NOT_VISIBLE,
-    (Relation.READABLE, True): Status.READABLE,
-    (Relation.READABLE, False): Status.NOT_READABLE,
+STATUS_OF: dict[tuple[Relation, bool], RowStatus] = {
+    (Relation.HEARS, True): RowStatus.HEARD,
+    (Relation.HEARS, False): RowStatus.NOT_HEARD,
+    (Relation.HEARS_AGAIN, True): RowStatus.HEARD_AGAIN,
+    (Relation.HEARS_AGAIN, False): RowStatus.NOT_HEARD_AGAIN,
+    (Relation.BELIEVES, True): RowStatus.DECEIVED,
+    (Relation.BELIEVES, False): RowStatus.NOT_DECEIVED,
+    (Relation.IS_ANSWERED, True): RowStatus.ANSWERED,
+    (Relation.IS_ANSWERED, False): RowStatus.NOT_ANSWERED,
+    (Relation.IS_REFUSED, True): RowStatus.REFUSED,
+    (Relation.IS_REFUSED, False): RowStatus.STARTED,
+    (Relation.STARTS, True): RowStatus.STARTED,
+    (Relation.STARTS, False): RowStatus.REFUSED,
+    (Relation.SEES, True): RowStatus.VISIBLE,
+    (Relation.SEES, False): RowStatus.NOT_VISIBLE,
+    (Relation.READABLE, True): RowStatus.READABLE,
+    (Relation.READABLE, False): RowStatus.NOT_READABLE,
 }
 
 
 class Wire(StrEnum):
-    """What is looked for in the packets of a party."""
+    """A text to look for in the packets of a party."""
 
     TEXT = "text"
     TOPIC = "topic name"
     CERTIFICATE = "certificate"
 
 
+class SoundKeystore(StrEnum):
+    """The keystores of a scenario that nobody has forged."""
+
+    OWN = "own"
+    FOREIGN = "foreign"
+    """One of another CA, with the same enclaves."""
+
+
+OWN, FOREIGN = SoundKeystore.OWN, SoundKeystore.FOREIGN
+
+KeystoreChoice = SoundKeystore | Forge | Undefended
+"""One of the sound keystores, or the function of the forger that makes the keystore.
+
+A function works on a copy of the scenario's own keystore, `Undefended` on one made again.
+"""
+
+
 @dataclass(frozen=True)
 class Identity:
-    """With which security a process runs.
+    """The keystore and enclave a process runs with (without a keystore: unsecured).
 
-    ``keystore`` is the label of a keystore of the scenery ("" for none), ``enclave`` a part of its
-    cast ("talker") or the name of an enclave ("/arm/camera").  ``variables`` replace those of a
-    secured process.
+    ``enclave`` is a part of the scenario's cast ("talker") or the name of an enclave
+    ("/arm/camera").  ``variables`` replace environment variables of a secured process.
     """
 
-    keystore: str = ""
+    keystore: KeystoreChoice | None = None
     enclave: str = ""
     variables: tuple[tuple[str, str], ...] = ()
 
 
 UNSECURED = Identity()
-OWN, FOREIGN = "own", "foreign"
 
 
 @dataclass(frozen=True)
 class Party:
     """One process of a row.
 
-    ``topic`` is what it speaks on: "" is the topic of the demo, another name a topic, service or
-    action of its own.  ``aside`` puts a talker on a topic that nobody else uses.  An ``intruder``
-    may be kept out without ending the row.
+    ``topic`` is the ROS name of its topic, service or action ("": the topic of the demo).
+    ``other_topic`` puts a talker on a topic that nobody else uses.  An ``intruder`` may be kept
+    out, and the row goes on.
     """
 
     name: str
     role: Role
     identity: Identity = UNSECURED
     topic: str = ""
-    aside: bool = False
+    other_topic: bool = False
     intruder: bool = False
 
 
@@ -141,23 +157,27 @@ class Party:
 class Claim:
     """``subject`` hears, sees ... ``talker``, or, where not ``holds``, does not.
 
-    ``denied`` is the denial by which it must already end, if any: a status of `DENIALS`.
+    ``denied`` is the status of `DENIALS` by which that must be prevented, if any.
     """
 
     relation: Relation
     subject: str
     talker: str = ""
     holds: bool = True
-    denied: Status | None = None
+    denied: RowStatus | None = None
     wire: Wire = Wire.TEXT
 
     @property
-    def expected(self) -> Status:
+    def expected(self) -> RowStatus:
         """The status that this claim expects."""
         return self.denied or STATUS_OF[self.relation, self.holds]
 
-    def expecting(self, status: Status) -> Claim:
-        """The same claim, with another outcome.  Raises `ValueError` if it cannot have that."""
+    def expecting(self, status: RowStatus) -> Claim:
+        """Return the same claim with another expected status.
+
+        Raises:
+            ValueError: the relation cannot have that status.
+        """
         if status in DENIALS:
             return replace(self, holds=False, denied=status)
         for holds in (True, False):
@@ -167,7 +187,7 @@ class Claim:
 
 
 class Condition(StrEnum):
-    """What of a keystore's template or of a vendor decides how a row ends."""
+    """A property of a keystore's template or of a vendor on which an expected status depends."""
 
     ONE_CA = "one CA for identity and permissions"
     SHARED_SUBJECTS = "subjects without a part of their own"
@@ -183,8 +203,8 @@ class Condition(StrEnum):
 
 
 @dataclass(frozen=True)
-class Case:
-    """Where all ``conditions`` hold, a row ends as ``expected``.
+class Variant:
+    """The expected status of a row where all ``conditions`` hold.
 
     ``open_because`` says why that lets an attack through ("": it does not), ``remedy`` what a user
     can do then.  ``instead`` is another row that is played in place of it, for defences that a
@@ -192,7 +212,7 @@ class Case:
     """
 
     conditions: tuple[Condition, ...]
-    expected: Status
+    expected: RowStatus
     open_because: str = ""
     remedy: str = ""
     mechanism: str = ""
@@ -203,25 +223,26 @@ class Case:
 class Row:
     """One line of the demo's table.
 
-    ``mechanism`` says in a clause what brings the expected outcome about; ``wire`` asks for a
+    ``mechanism`` says in a clause what brings the expected status about; ``wire`` asks for a
     capture of the packets; ``replay`` names the party whose packets are sent again after it has
-    left, ``forge`` the one in whose name changed packets are sent.  A ``brief`` row ends as soon
-    as it is decided.  The first of ``cases`` that fits replaces the outcome.  ``attack`` names the
-    attack to which the row belongs; with ``removed`` it shows that attack without the defence that
-    ``removed`` names.  ``open_because`` and ``remedy`` are as in `Case`.
+    left, ``impersonate`` the one in whose name changed packets are sent.  A ``brief`` row ends as
+    soon as it is decided.  The first of ``variants`` whose conditions hold replaces the expected
+    status.  ``attack`` names the attack to which the row belongs; with ``removed`` it shows that
+    attack without the defence that ``removed`` names.  ``open_because`` and ``remedy`` are as in
+    `Variant`.
     """
 
     name: str
-    expected: Status
+    expected: RowStatus
     mechanism: str
     parties: tuple[Party, ...]
     claims: tuple[Claim, ...]
     controls: tuple[Claim, ...] = ()
     wire: bool = False
     replay: str = ""
-    forge: str = ""
+    impersonate: str = ""
     brief: bool = False
-    cases: tuple[Case, ...] = ()
+    variants: tuple[Variant, ...] = ()
     attack: str = ""
     removed: str = ""
     open_because: str = ""
@@ -229,47 +250,52 @@ class Row:
 
     @property
     def tapped(self) -> bool:
-        """Whether its packets are looked at."""
-        return bool(self.wire or self.replay or self.forge)
+        """Whether its packets are captured."""
+        return bool(self.wire or self.replay or self.impersonate)
 
     def party(self, name: str) -> Party:
-        """The party of that name.  Raises `KeyError`."""
+        """Return the party of that name.
+
+        Raises:
+            KeyError: there is none.
+        """
         return {party.name: party for party in self.parties}[name]
 
     @property
-    def place(self) -> str:
-        """The ROS name that its claim is about: "" is the topic of the demo."""
+    def ros_name(self) -> str:
+        """The ROS name that its first claim is about ("": the topic of the demo)."""
         return self.party(self.claims[0].subject).topic
 
     def under(self, conditions: frozenset[Condition]) -> Row:
-        """The row as it must end where those conditions hold."""
-        for case in self.cases:
-            if conditions.issuperset(case.conditions):
-                if case.instead is not None:
-                    return case.instead.under(conditions)
+        """Return the row with the status that is expected where those conditions hold."""
+        for variant in self.variants:
+            if conditions.issuperset(variant.conditions):
+                if variant.instead is not None:
+                    return variant.instead.under(conditions)
                 claims = tuple(
-                    claim.expecting(case.expected) if place == 0 else claim
+                    claim.expecting(variant.expected) if place == 0 else claim
                     for place, claim in enumerate(self.claims)
                 )
                 return replace(
                     self,
-                    expected=case.expected,
+                    expected=variant.expected,
                     claims=claims,
-                    open_because=case.open_because,
-                    remedy=case.remedy or self.remedy,
-                    mechanism=case.mechanism or self.mechanism,
-                    cases=(),
+                    open_because=variant.open_because,
+                    remedy=variant.remedy or self.remedy,
+                    mechanism=variant.mechanism or self.mechanism,
+                    variants=(),
                 )
         return self
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Rows that belong together, and the policy that their enclaves live by.
+    """Rows that belong together, and the policy of their enclaves.
 
     ``cast`` gives the enclave of each part.  ``policy`` makes the policy for the topic of the
-    demo.  ``measured`` names the protection kinds whose cost is measured; one with
-    ``any_keystore`` can be played in a keystore of the user's.
+    demo; the enclaves ``unpermitted`` have none.  ``measured`` gives the keystore of each
+    protection kind whose cost is measured; one with ``any_keystore`` can be played in a keystore
+    of the user's.
     """
 
     name: str
@@ -278,5 +304,5 @@ class Scenario:
     cast: Mapping[str, str] = field(default_factory=dict)
     policy: Callable[[str], Policy] | None = None
     unpermitted: tuple[str, ...] = ()
-    measured: tuple[str, ...] = ()
+    measured: Mapping[str, Undefended] = field(default_factory=dict)
     any_keystore: bool = False

@@ -1,0 +1,329 @@
+"""Casting: which enclave of a keystore plays which part, and under which node names.
+
+Both go by the signed permissions.  A ROS node offers services under its own name (its parameters,
+its types), and an enclave that was made from a policy allows them to the nodes of that policy
+alone: a node of another name fails at start.  So a node that plays a part in an enclave takes one
+of the names that the enclave allows.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+from pathlib import Path
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.permissions import Grant, Rule, parse_permissions
+from sros_tool.demo.scenarios.model import Role, Scenario
+from sros_tool.demo.scenarios.policies import SERVICE
+from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.keystore.authorities.keyring import Keyring
+from sros_tool.keystore.layout import (
+    ENCLAVES,
+    PERMISSIONS,
+    PRIVATE,
+    ROLES,
+    ca_key,
+    enclave_path,
+    list_enclaves,
+)
+from sros_tool.keystore.reader import load_ca_certificate, load_governance, load_settings
+from sros_tool.keystore.template import Template
+from sros_tool.names import NODE_SERVICES, dds_names
+from sros_tool.pki import smime
+from sros_tool.policy.patterns import matches
+
+_TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events", "rt/clock", "ros_discovery_info")
+_NODE_MARK = ("rr", f"/{NODE_SERVICES[0]}Reply")
+_WILD = set("*?[")
+
+
+@dataclass(frozen=True)
+class CastMember:
+    """An enclave that plays a part in a keystore of the user's, and its ROS nodes on rclpy."""
+
+    part: str
+    enclave: str
+    nodes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class UserKeystore:
+    """A keystore of the user's that is to be attacked: its template, its domains, and its cast.
+
+    ``topic`` is the ROS topic that is attacked, ``service`` the ROS service, "" without one.
+    ``guessed`` says that the cast was chosen by the rights of its enclaves, not by their names.
+    """
+
+    root: Path
+    template: Template
+    domains: DomainSet
+    cast: Mapping[str, str]
+    topic: str
+    service: str
+    guessed: bool
+
+    def copy(self, target: Path) -> None:
+        """Copy the enclaves of the cast, with their modes and links, but no key of a CA."""
+        folders = {f"{ENCLAVES}{name}" for name in self.cast.values()}
+        shutil.copytree(self.root, target, symlinks=True, ignore=_all_but(self.root, folders))
+
+    def keyring(self) -> Keyring:
+        """Return where the CA keys are: in the keystore, or where its settings say."""
+        inside = {role: self.root.absolute() / ca_key(role) for role in ROLES}
+        places = {role: f"file:{path}" for role, path in inside.items() if path.exists()}
+        return Keyring(places=places)
+
+
+def open_user_keystore(root: Path, topic: str, scenario: Scenario) -> UserKeystore:
+    """Read a keystore and cast its enclaves for the ROS topic ``topic`` ("": one that fits).
+
+    Raises:
+        KeystoreError: it is no keystore, or no two enclaves may talk to each other.
+    """
+    names = list_enclaves(root)
+    domains = load_governance(root, load_ca_certificate(root, PERMISSIONS)).domains()
+    rights = {name: grants for name in names if (grants := enclave_grant(root, name))}
+    template = load_settings(root)
+    # Whatever is made next to it has keys of its own.
+    template = replace(template, identity_key="", permissions_key="")
+    wanted = f"rt{topic}" if topic else ""
+    guessed = not set(scenario.cast.values()) <= set(names)
+    if not guessed:
+        cast = dict(scenario.cast)
+        chosen = wanted or _first_topic(rights, cast)
+    else:
+        cast, chosen = _best_cast(rights, wanted)
+    if not chosen:
+        raise KeystoreError(
+            f"no two enclaves of keystore '{root}' talk on {topic or 'a topic'}",
+            "An attack on it needs one enclave that may publish a topic and another one that may"
+            " subscribe it, by a name without wildcards.",
+            "Name the topic with --topic, or attack a keystore made by the demo.",
+        )
+    service = _service(rights, cast) if "server" in cast else ""
+    topic = chosen.removeprefix("rt")
+    return UserKeystore(root, template, domains, cast, topic, service, guessed)
+
+
+def _best_cast(rights: Mapping[str, Grant], wanted: str) -> tuple[dict[str, str], str]:
+    """Return a talker, a listener and a guest, and the DDS topic they can show most on.
+
+    An enclave that may only publish, or only subscribe, shows more than one that may do both.
+    """
+    best: tuple[int, dict[str, str], str] = (-1, {}, "")
+    for topic in [wanted] if wanted else sorted(each for each in _topics(rights) if "rt/" in each):
+        talkers = {name for name in rights if may(rights[name], "publish", topic)}
+        listeners = {name for name in rights if may(rights[name], "subscribe", topic)}
+        pair = next(
+            (
+                (talker, listener)
+                for talker in _single_purpose_first(rights, talkers, listeners)
+                for listener in _single_purpose_first(rights, listeners, talkers)
+                if talker != listener
+            ),
+            None,
+        )
+        if pair is None:
+            continue
+        cast = dict(zip(("talker", "listener"), pair, strict=True))
+        guests = [name for name in rights if name not in pair]
+        guests.sort(key=lambda name: (name in talkers) + (name in listeners))
+        if guests:
+            cast["guest"] = guests[0]
+        nested = [(g, a) for g, a in permutations(rights, 2) if _within(g, a)]
+        lent = next(((g, a) for g, a in nested if a in talkers and g not in talkers), None)
+        if lent and not set(lent) & set(pair):
+            cast["guest"], cast["admin"] = lent
+        both = talkers & listeners
+        score = len(cast) + (cast.get("guest") not in talkers) - len(both & set(pair))
+        if score > best[0]:
+            best = (score, cast, topic)
+    _, cast, topic = best
+    if cast:
+        cast |= _serving(rights)
+    return cast, topic
+
+
+def _single_purpose_first(
+    rights: Mapping[str, Grant], chosen: set[str], others: set[str]
+) -> list[str]:
+    """Return ``chosen`` in the order of ``rights``, but enclaves that are in ``others`` last."""
+    return sorted((name for name in rights if name in chosen), key=lambda name: name in others)
+
+
+def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
+    """Return a server and a client of one service, if any; best a client that may not serve."""
+    found: dict[str, str] = {}
+    for server, client in permutations(rights, 2):
+        for topic in topics_of_its_own(rights[server], "publish"):
+            if topic.startswith("rr/") and topic.endswith("Reply") and "/_action/" not in topic:
+                request = f"rq{topic[2:].removesuffix('Reply')}Request"
+                if "parameter" not in topic and may(rights[client], "publish", request):
+                    found = {"server": server, "client": client}
+                    if not may(rights[client], "publish", topic):
+                        return found
+    return found
+
+
+def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
+    """Return the service that the server of a cast offers and its client calls."""
+    for topic in topics_of_its_own(rights[cast["server"]], "publish"):
+        name = topic[2:].removesuffix("Reply")
+        if topic == f"rr{name}Reply" and may(rights[cast["client"]], "publish", f"rq{name}Request"):
+            return name
+    return SERVICE
+
+
+def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
+    own = [
+        topic
+        for topic in topics_of_its_own(rights[cast["talker"]], "publish")
+        if topic[:3] == "rt/"
+    ]
+    return next((t for t in own if may(rights[cast["listener"]], "subscribe", t)), "")
+
+
+def _within(short: str, long: str) -> bool:
+    """Return whether the parts of an enclave's name are a part of those of another's."""
+    return set(short.strip("/").split("/")) < set(long.strip("/").split("/"))
+
+
+def _topics(rights: Mapping[str, Grant]) -> set[str]:
+    return {topic for grant in rights.values() for topic in topics_of_its_own(grant, "publish")}
+
+
+def _all_but(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[str]]:
+    """Return what `shutil.copytree` leaves out: keys of CAs, and enclaves that play no part."""
+    wanted = {root / folder for folder in folders}
+    kept = {parent for folder in wanted for parent in folder.parents} | wanted
+
+    def left_out(parent: str, names: list[str]) -> set[str]:
+        if Path(parent) == root:
+            return {name for name in names if name == PRIVATE or name.startswith(".")}
+        inside = Path(parent).relative_to(root).parts[0] == ENCLAVES
+        paths = {name: Path(parent, name) for name in names}
+        return {
+            name for name, path in paths.items() if inside and path.is_dir() and path not in kept
+        }
+
+    return left_out
+
+
+def enclave_grant(root: Path, enclave: str) -> Grant | None:
+    """Return the first grant of an enclave, or None where its permissions cannot be read."""
+    try:
+        signed = (enclave_path(root, enclave) / "permissions.p7s").read_bytes()
+        grants = parse_permissions(smime.parse(signed).document).grants
+    except (SrosError, OSError):
+        return None
+    return grants[0] if grants else None
+
+
+def may(grant: Grant, verb: str, topic: str) -> bool:
+    """Return whether the first rule that names a DDS topic allows it, as the vendors decide.
+
+    ``verb`` is publish or subscribe.
+    """
+    for rule in grant.rules:
+        if any(matches(expression, topic) for expression in _expressions(rule, verb)):
+            return rule.allow
+    return False
+
+
+def topics_of_its_own(grant: Grant, verb: str) -> Iterator[str]:
+    """Yield the DDS topics without wildcards that a grant allows, but for those of every node."""
+    for topic in _allowed(grant, verb):
+        private = topic.startswith("rt/_") or "/_action/" in topic
+        if topic not in _TOPICS_OF_EVERY_NODE and not private:
+            yield topic
+
+
+def is_node_allowed(grant: Grant, node: str) -> bool:
+    """Return whether a grant allows every service that the node of that absolute name offers."""
+    names = (dds_names("reply", f"{node}/{service}") for service in NODE_SERVICES)
+    return all(
+        all(may(grant, "publish", topic) for topic in each.publish)
+        and all(may(grant, "subscribe", topic) for topic in each.subscribe)
+        for each in names
+    )
+
+
+def nodes_named(grant: Grant) -> Iterator[str]:
+    """Yield the absolute names of the nodes that a grant names and allows."""
+    kind, service = _NODE_MARK
+    for topic in _allowed(grant, "publish"):
+        if topic.startswith(kind) and topic.endswith(service):
+            node = topic.removeprefix(kind).removesuffix(service)
+            if is_node_allowed(grant, node):
+                yield node
+
+
+def _allowed(grant: Grant, verb: str) -> Iterator[str]:
+    for rule in grant.rules:
+        for topic in _expressions(rule, verb) if rule.allow else ():
+            if not set(topic) & _WILD:
+                yield topic
+
+
+def _expressions(rule: Rule, verb: str) -> Iterator[str]:
+    for criteria in rule.publish if verb == "publish" else rule.subscribe:
+        yield from criteria.topics
+
+
+OWN_NAMES: Mapping[Role, tuple[str, ...]] = {
+    Role.TALKER: ("talker",),
+    Role.LISTENER: ("listener",),
+    Role.OBSERVER: ("observer",),
+    Role.SERVER: ("server",),
+    Role.CLIENT: ("client",),
+    Role.ACTION_SERVER: ("action_server",),
+    Role.ACTION_CLIENT: ("action_client",),
+    Role.COMPOSED: ("talker", "listener", "server"),
+}
+"""The names that the nodes of a process have by default, in the namespace /."""
+
+
+def node_names(role: Role, grant: Grant | None) -> tuple[str, ...]:
+    """Return the absolute names of a role's nodes under a grant (None: without security).
+
+    A node keeps its own name where the grant allows it.  Otherwise it gets that of a node which
+    the grant names, the most similar one first, and its own one where there is none.
+    """
+    wanted = [f"/{name}" for name in OWN_NAMES[role]]
+    if grant is None:
+        return tuple(wanted)
+    kept = {name for name in wanted if is_node_allowed(grant, name)}
+    named = [*dict.fromkeys(nodes_named(grant))]
+    free = [name for name in named if name not in kept]
+    return tuple(_names(wanted, kept, free, named))
+
+
+def _names(
+    wanted: Sequence[str], kept: set[str], free: list[str], named: Sequence[str]
+) -> Iterator[str]:
+    for name in wanted:
+        if name in kept or not named:
+            yield name
+            continue
+        # More nodes than names: DDS does not mind two nodes of one name in a process.
+        alike = [each for each in free if name[1:] in each.lower()]
+        chosen = (alike or free or named)[0]
+        if chosen in free:
+            free.remove(chosen)
+        yield chosen
+
+
+def naming_arguments(role: Role, names: Sequence[str]) -> list[str]:
+    """Return the ``--ros-args`` by which the nodes of a role take these absolute names."""
+    rules: list[str] = []
+    for own, name in zip(OWN_NAMES[role], names, strict=True):
+        namespace, _, node = name.rpartition("/")
+        if node != own:
+            rules += ["-r", f"{own}:__node:={node}"]
+        if namespace:
+            # rcl looks for the namespace of a node under the name that the node has by then.
+            rules += ["-r", f"{node}:__ns:={namespace}"]
+    return ["--ros-args", *rules, "--"] if rules else []
