@@ -19,7 +19,7 @@ from sros_tool.errors import Note, UsageError
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
     from sros_tool.keystore.authorities.keyring import Keyring
-    from sros_tool.keystore.lifecycle.create import Result
+    from sros_tool.keystore.lifecycle.create import Creation
     from sros_tool.keystore.template import Template
     from sros_tool.policy.model import Policy
 
@@ -174,7 +174,7 @@ def generate(
     secrets: Secrets | None = None,
     now: datetime | None = None,
     dry_run: bool = False,
-) -> Result:
+) -> Creation:
     """Create the enclaves of policies, and sign the permissions that the policies state for them.
 
     All or nothing: after an error the keystore is as it was.  An enclave that exists keeps its key,

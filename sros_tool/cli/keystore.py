@@ -27,7 +27,7 @@ from sros_tool.cli.common import (
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
-    from sros_tool.keystore.lifecycle.create import Result
+    from sros_tool.keystore.lifecycle.create import Creation
 
 
 @click.command(
@@ -181,7 +181,7 @@ def generate_artifacts(
     _show(result, dry_run)
 
 
-def _show(result: Result, dry_run: bool) -> None:
+def _show(result: Creation, dry_run: bool) -> None:
     if dry_run:
         print_plan(result.root, result.changes)
     else:

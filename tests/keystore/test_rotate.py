@@ -591,7 +591,7 @@ def test_a_ca_never_ends_before_the_old_one_unasked(tmp_path: Path) -> None:
     settings = (root / "sros.toml").read_text()
     assert settings.count('"3650d"') == 2
     (root / "sros.toml").write_text(settings.replace('"3650d"', '"90d"', 1))
-    refused(lambda: rotate_ca(root, now=NOW), root, "end before the old")
+    refused(lambda: rotate_ca(root, now=NOW), root, "expire before the old")
     rotate_ca(root, now=NOW, validity=timedelta(days=90))
 
 

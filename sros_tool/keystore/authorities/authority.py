@@ -7,11 +7,10 @@ It holds the issuing CA first, for Cyclone DDS 0.10.2 reads nothing else of it (
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
-from typing import TypeVar
 
 from cryptography import x509
 
@@ -44,8 +43,6 @@ from sros_tool.pki.certificates import (
 from sros_tool.pki.keys import PrivateKey
 from sros_tool.validity import iso, window
 
-Document = TypeVar("Document")
-
 
 @dataclass(frozen=True, slots=True)
 class Authority:
@@ -58,23 +55,35 @@ class Authority:
         """What issues the certificates of enclaves in this authority's name."""
         return Issuer(self.certificate, self.key)
 
-    def sign(
-        self, document: bytes, meant: Document, read: Callable[[bytes], Document], what: str
-    ) -> bytes:
-        """Sign a document and check the result before anybody relies on it.
+    def sign(self, document: bytes, what: str) -> bytes:
+        """Return the S/MIME message of a document, checked before anybody relies on it.
 
-        The signed message is taken apart again, its digest checked, and what it says (by
-        ``read``) compared with what was ``meant``.  ``what`` names it in errors.
+        The message is taken apart again: its digest has to fit, and it has to carry ``document``.
+        ``what`` names the document in the error.
+
+        Raises:
+            PkiError: the message does not carry the document.
         """
         message = smime.sign(document, self.certificate, self.key)
         signed = smime.parse(message)
-        if not signed.carries_digest() or read(signed.document) != meant:
-            raise PkiError(
-                f"{what} as signed does not say what was meant",
-                "Nothing was written.",
-                "This is a defect of sros: please report it with the policy.",
-            )
+        check_meaning(
+            (signed.carries_digest(), _lines(signed.document)), (True, _lines(document)), what
+        )
         return message
+
+
+def check_meaning(read: object, meant: object, what: str) -> None:
+    """Raise `PkiError` unless what was read back from a document is what was meant."""
+    if read != meant:
+        raise PkiError(
+            f"{what} as signed does not say what was meant",
+            "Nothing was written.",
+            "This is a defect of sros: please report it with the policy.",
+        )
+
+
+def _lines(document: bytes) -> bytes:
+    return document.replace(b"\r\n", b"\n")
 
 
 @dataclass(frozen=True, slots=True)

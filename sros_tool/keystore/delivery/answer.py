@@ -76,9 +76,8 @@ class Imported:
 
 
 def seal(files: dict[str, bytes], authority: Authority) -> bytes:
-    """The signed list of the files of an answer."""
-    listed = _listed(files)
-    return authority.sign(listed, listed, _lines, "the list of the files of the answer")
+    """Return the signed list of the files of an answer."""
+    return authority.sign(_listed(files), "the list of the files of the answer")
 
 
 def _listed(files: dict[str, bytes]) -> bytes:

@@ -1,4 +1,4 @@
-"""Answers the signing request of a robot: all that its enclave needs but the key it has."""
+"""Answering the signing request of a robot: everything its enclave needs except its key."""
 
 from __future__ import annotations
 
@@ -9,30 +9,40 @@ from pathlib import Path
 
 from cryptography import x509
 
-from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.portable import document_notes, name_notes
-from sros_tool.errors import KeystoreError, Note, PkiError, PolicyError, SrosError
-from sros_tool.keystore.authorities.authority import Authorities, load_authorities
+from sros_tool.dds.portable import name_notes
+from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
+from sros_tool.keystore.authorities.authority import load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.delivery.answer import SEAL, Answer, check_answer, seal
 from sros_tool.keystore.delivery.archive import pack, staged_file
-from sros_tool.keystore.issuing.enclave import default_enclave
-from sros_tool.keystore.issuing.issuance import Issuance, Make, policies_of, renewed
-from sros_tool.keystore.issuing.proof import proven
+from sros_tool.keystore.issuing.enclave import (
+    EarlierRights,
+    EnclaveWriter,
+    Issuance,
+    Issued,
+    NewIdentity,
+    StatedRights,
+    default_rights,
+    link_shared_files,
+    policies_of,
+    present_files,
+    shared_files,
+    stated_enclave,
+)
 from sros_tool.keystore.layout import (
-    CRL,
-    ENCLAVES,
+    CERTIFICATE_FILE,
+    GOVERNANCE_FILE,
     GOVERNANCE_P7S,
+    KEY_FILE,
+    PERMISSIONS_FILE,
     REQUEST,
     REVOKED,
-    ROLES,
-    ca_certificate,
     enclave_folder,
+    enclave_path,
     list_enclaves,
 )
-from sros_tool.keystore.ledger import Entry, append, document_entry
+from sros_tool.keystore.ledger import append, document_entry
 from sros_tool.keystore.reader import check_domain, load_governance, load_settings, read_granted
-from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
@@ -41,16 +51,17 @@ from sros_tool.pki.certificates import enclave_subject, load_certificate, pem, v
 from sros_tool.pki.certificates import subject_text as text_of
 from sros_tool.pki.keys import load_key
 from sros_tool.pki.requests import SigningRequest, key_digest, load_request
-from sros_tool.policy.model import Enclave, Policy
+from sros_tool.policy.model import Policy
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
 
 @dataclass(frozen=True, slots=True)
 class Signed:
-    """A request that was answered; ``archive`` is the answer for the robot, as `.tar.gz`.
+    """A request that was answered.
 
-    ``identity_ca`` is the certificate of the CA that the robot is going to trust.
+    ``key`` is the SHA-256 of its public key, ``identity_ca`` the certificate of the CA that the
+    robot is going to trust, ``archive`` the answer for the robot, as ``.tar.gz``.
     """
 
     name: str
@@ -77,18 +88,15 @@ def sign_request(
 ) -> Signed:
     """Certify the key of a request, sign the permissions, and make the answer for the robot.
 
+    ``data`` is the request as PEM.
+
     The keystore gets everything but the key.  The rights are those that ``policy`` states; else,
     with ``renew``, those that are signed already; else the default of the keystore's template.
     ``answer`` is the file that the answer goes to, which appears after the keystore has changed.
     """
     request = load_request(data, "that was given")
     name = check_enclave_name(request.name)
-    enclave = policy.enclave(name) if policy else None
-    if policy and enclave is None:
-        there = ", ".join(each.path for each in policy.enclaves)
-        raise PolicyError(
-            f"unable to find enclave {name} in the policy '{policy.file}'", f"It has {there}."
-        )
+    stated = stated_enclave(policy, name) if policy else None
     if answer is not None:
         _check_free(answer, force)
     if not dry_run:
@@ -102,13 +110,31 @@ def sign_request(
         authorities = load_authorities(root, template, keyring, now)
         domains = load_governance(root, authorities.permissions.certificate).domains().closed()
         check_domain(domains, domain, root)
-        work = _Signer(transaction, authorities, template, domains, now)
-        prepared = work.sign(request, enclave, renew=renew)
-        notes, sealed = prepared.notes, seal(prepared.files, authorities.permissions)
-        _check_result(Answer(name, prepared.files, sealed), request, now)
-        archive = pack({SEAL: sealed, **prepared.files})
+        notes = _new_key_note(root, request) if renew else []
+        rights: EarlierRights | StatedRights
+        if renew and stated is None:
+            rights = _earlier_rights(root, name, authorities.permissions.certificate)
+        else:
+            rights = StatedRights(stated or default_rights(template, name), domains)
+        writer = EnclaveWriter(
+            transaction,
+            template,
+            now,
+            identity=authorities.identity,
+            permissions=authorities.permissions,
+        )
+        subject = enclave_subject(name, unique=template.unique_subject)
+        identity = NewIdentity(subject, request.public_key)
+        issued = writer.write(Issuance(name, identity, rights))
+        transaction.write(f"{enclave_folder(name)}/{REQUEST}", request.pem)
+        link_shared_files(transaction, name, present_files(root, name))
+        notes += [*issued.notes(), *writer.notes]
+        files = _answer_files(root, issued)
+        sealed = seal(files, authorities.permissions)
+        _check_result(Answer(name, files, sealed), request, now)
+        archive = pack({SEAL: sealed, **files})
         sent = document_entry(now, "answer", sealed, enclave=name)
-        append(transaction, [*prepared.entries, sent])
+        append(transaction, [*writer.entries, sent])
         staged = staged_file(answer, archive) if answer and not dry_run else nullcontext()
         with staged as put_in_place:
             transaction.commit()
@@ -154,8 +180,8 @@ def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
 
 
 def _check_key(root: Path, request: SigningRequest) -> None:
-    """Refuse a key that was revoked, and one beside which the keystore has another."""
-    for path in sorted((root / REVOKED).glob("*/cert.pem")):
+    """Refuse a key that was revoked, and one where the keystore has another key."""
+    for path in sorted((root / REVOKED).glob(f"*/{CERTIFICATE_FILE}")):
         certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
         if certificate.public_key() == request.public_key:
             raise KeystoreError(
@@ -164,7 +190,7 @@ def _check_key(root: Path, request: SigningRequest) -> None:
                 f"{text_of(certificate.subject)}.",
                 "Have a new key made on the robot, in another folder.",
             )
-    path = root / enclave_folder(request.name) / "key.pem"
+    path = enclave_path(root, request.name) / KEY_FILE
     if path.exists():
         key = load_key(read_bytes(path, "private key"), f"'{path}'")
         if key.public_key() != request.public_key:
@@ -176,113 +202,60 @@ def _check_key(root: Path, request: SigningRequest) -> None:
 
 
 def _check_result(answer: Answer, request: SigningRequest, now: datetime) -> None:
-    """See that the robot will accept the answer, before anybody relies on it."""
+    """Check that the robot will accept the answer, before anybody relies on it."""
     try:
         check_answer(answer, request.public_key, now=now)
     except SrosError as error:
         raise KeystoreError(
             f"the answer for {answer.name} would be of no use on the robot: {error.what}",
             error.why,
-            "Nothing was changed; `sros inspect` tells more of the keystore.",
+            "Nothing was changed; `sros inspect` says more about the keystore.",
         ) from error
 
 
-@dataclass(frozen=True, slots=True)
-class _Prepared:
-    """The files of the answer by their paths, what the ledger is told, and remarks."""
-
-    files: dict[str, bytes]
-    entries: list[Entry]
-    notes: list[Note]
-
-
-class _Signer:
-    """Puts what a request asks for into a transaction."""
-
-    def __init__(
-        self,
-        transaction: Transaction,
-        authorities: Authorities,
-        template: Template,
-        domains: DomainSet,
-        now: datetime,
-    ) -> None:
-        self._transaction = transaction
-        self._root = transaction.root
-        self._authorities = authorities
-        self._issuance = Issuance(
-            transaction,
-            template,
-            now,
-            identity=authorities.identity,
-            permissions=authorities.permissions,
+def _new_key_note(root: Path, request: SigningRequest) -> list[Note]:
+    """Note when an enclave that is renewed has a new key."""
+    old = _present_certificate(root, request.name)
+    if old.public_key() == request.public_key:
+        return []
+    until = iso(validity_of(old).not_after)
+    return [
+        Note(
+            "request.new-key",
+            f"{request.name}: the request has a new key. The certificate of the earlier one "
+            f"stays valid until {until}, for whoever has that key.",
         )
-        self._template = template
-        self._domains = domains
+    ]
 
-    def sign(self, request: SigningRequest, enclave: Enclave | None, *, renew: bool) -> _Prepared:
-        """Stage the enclave."""
-        name, folder = request.name, enclave_folder(request.name)
-        notes = self._new_key(request) if renew else []
-        made, policy = self._rights(name, enclave, renew)
-        certificate = self._issuance.certificate(
-            name, enclave_subject(name, unique=self._template.unique_subject), request.public_key
+
+def _earlier_rights(root: Path, name: str, authority: x509.Certificate) -> EarlierRights:
+    """Return the rights that are signed for an enclave by the permissions CA."""
+    subject = text_of(_present_certificate(root, name).subject)
+    old = read_granted(enclave_path(root, name) / PERMISSIONS_FILE, subject)
+    old.signed.verify(authority)
+    if old.grant is None:
+        raise PkiError(
+            f"the permissions of enclave {name} have no grant for {subject}",
+            "They belong to another certificate.",
+            "State the rights with -p POLICY_FILE.",
         )
-        permissions, message = self._issuance.permissions(name, certificate, made, policy)
-        self._transaction.write(f"{folder}/{REQUEST}", request.pem)
-        files = {f"{folder}/cert.pem": pem(certificate), f"{folder}/permissions.p7s": message}
-        files |= self._shared(folder)
-        notes += document_notes(name, permissions, len(message))
-        notes += self._issuance.notes
-        return _Prepared(dict(sorted(files.items())), self._issuance.entries, notes)
+    return EarlierRights(old.grant, policies_of(root).get(old.digest, ""))
 
-    def _new_key(self, request: SigningRequest) -> list[Note]:
-        old = self._certificate(request.name)
-        if old.public_key() == request.public_key:
-            return []
-        until = iso(validity_of(old).not_after)
-        return [
-            Note(
-                "request.new-key",
-                f"{request.name}: the request has a new key. The certificate of the earlier one "
-                f"stays valid until {until}, for whoever has that key.",
-            )
-        ]
 
-    def _rights(self, name: str, enclave: Enclave | None, renew: bool) -> tuple[Make, str]:
-        """What makes the permissions, and the digest of the policy that it comes from."""
-        if enclave is None and renew:
-            subject = text_of(self._certificate(name).subject)
-            old = read_granted(self._root / enclave_folder(name) / "permissions.p7s", subject)
-            old.signed.verify(self._authorities.permissions.certificate)
-            if old.grant is None:
-                raise PkiError(
-                    f"the permissions of enclave {name} have no grant for {subject}",
-                    "They belong to another certificate.",
-                    "State the rights with -p POLICY_FILE.",
-                )
-            return renewed(old.grant), policies_of(self._root).get(old.digest, "")
-        meant = enclave or default_enclave(self._template.default_permissions, name)
-        return proven(meant, self._domains, ask=True), meant.digest
+def _present_certificate(root: Path, name: str) -> x509.Certificate:
+    path = enclave_path(root, name) / CERTIFICATE_FILE
+    return load_certificate(read_bytes(path, "certificate"), f"'{path}'")
 
-    def _certificate(self, name: str) -> x509.Certificate:
-        path = self._root / enclave_folder(name) / "cert.pem"
-        return load_certificate(read_bytes(path, "certificate"), f"'{path}'")
 
-    def _shared(self, folder: str) -> dict[str, bytes]:
-        """Link what all enclaves share, where that is missing, and return it for the answer."""
-        up = "../" * folder.count("/")
-        sources = {f"{role}_ca.cert.pem": (ca_certificate(role), "../") for role in ROLES}
-        if (self._root / CRL).exists():
-            sources["crl.pem"] = (CRL, "../")
-        found = {}
-        for file, (source, above) in sources.items():
-            path = f"{folder}/{file}"
-            if not (self._root / path).exists():
-                self._transaction.link(path, f"{up}{above}{source}")
-            found[path] = read_bytes(self._root / source, "file")
-        path = f"{folder}/governance.p7s"
-        if folder != ENCLAVES and not (self._root / path).exists():
-            self._transaction.link(path, f"{up}governance.p7s")
-        found[path] = read_bytes(self._root / GOVERNANCE_P7S, "governance document")
-        return found
+def _answer_files(root: Path, issued: Issued) -> dict[str, bytes]:
+    """Return the files of the answer by their paths in a keystore, sorted."""
+    name = issued.issuance.name
+    folder = enclave_folder(name)
+    files = {
+        f"{folder}/{CERTIFICATE_FILE}": pem(issued.certificate),
+        f"{folder}/{PERMISSIONS_FILE}": issued.document,
+        f"{folder}/{GOVERNANCE_FILE}": read_bytes(root / GOVERNANCE_P7S, "governance document"),
+    }
+    for file, source in shared_files(root, name).items():
+        files[f"{folder}/{file}"] = read_bytes(root / source, "file")
+    return dict(sorted(files.items()))

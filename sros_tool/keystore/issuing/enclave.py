@@ -1,52 +1,309 @@
-"""What an enclave without a policy may do: the default of the keystore's template."""
+"""The one writer of an enclave: its certificate and permissions are issued, proven and staged here.
+
+Every verb that issues says what is issued as an `Issuance`, and `EnclaveWriter.write` does it: the
+rights become permissions, these are proven, both documents are signed, staged in a transaction, and
+recorded for the ledger.  For many enclaves, several processes do it.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from dataclasses import replace
-from datetime import datetime
-from enum import Enum
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timedelta
 from functools import cache
 from pathlib import Path
+from typing import TypeVar
 
 from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.permissions import parse_permissions
+from sros_tool.dds.permissions import Grant, Permissions, parse_permissions, render_permissions
 from sros_tool.dds.portable import document_notes
-from sros_tool.errors import KeystoreError, Note, SrosError
-from sros_tool.keystore.authorities.authority import Authorities
-from sros_tool.keystore.issuing.issuance import Issuance
-from sros_tool.keystore.issuing.proof import FEW, proven
+from sros_tool.errors import KeystoreError, Note, PolicyError
+from sros_tool.keystore.authorities.authority import Authority, check_meaning
+from sros_tool.keystore.issuing.proof import prove
 from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
     CRL,
+    CRL_FILE,
     ENCLAVES,
-    IDENTITY,
-    PERMISSIONS,
-    PUBLIC,
-    REQUEST,
+    GOVERNANCE_FILE,
+    GOVERNANCE_P7S,
+    KEY_FILE,
+    PERMISSIONS_FILE,
+    ROLES,
+    ca_certificate,
     enclave_folder,
+    enclave_path,
 )
+from sros_tool.keystore.ledger import Entry, certificate_entry, document_entry, read_ledger
 from sros_tool.keystore.template import Template
+from sros_tool.keystore.transaction.stage import Staged
 from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.parallel import Progress
-from sros_tool.pki import smime
-from sros_tool.pki.certificates import (
-    common_name_of,
-    enclave_subject,
-    issued_by,
-    load_certificate,
-    subject_of,
-    subject_text,
-    validity_of,
-)
-from sros_tool.pki.keys import generate_key, key_pem, load_key
+from sros_tool.parallel import Progress, map_slices
+from sros_tool.pki.certificates import pem, subject_text, validity_of
+from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem
+from sros_tool.pki.token import TokenKey
 from sros_tool.policy import read_policy
-from sros_tool.policy.model import Enclave
+from sros_tool.policy.model import Enclave, Policy
 from sros_tool.resources import policies_dir
-from sros_tool.validity import iso
-from sros_tool.xml import read_bytes
+from sros_tool.translate import permissions_for
+from sros_tool.validity import Window, iso, window
+
+Result = TypeVar("Result")
+
+_NOTED_LOSS = 0.01
+
+
+# ── what is issued ─────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class NewIdentity:
+    """The subject and the key that a certificate is issued for.
+
+    ``new_key`` is the private key where it was just generated: it is staged with the certificate.
+    """
+
+    subject: x509.Name
+    public_key: PublicKey
+    new_key: PrivateKey | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StatedRights:
+    """The rights that a policy states for an enclave, on the domains of the keystore."""
+
+    enclave: Enclave
+    domains: DomainSet
+
+
+@dataclass(frozen=True, slots=True)
+class EarlierRights:
+    """Rights that were signed before.
+
+    ``policy`` is the SHA-256 of the policy that they were made from, "" where the ledger does not
+    know it.
+    """
+
+    grant: Grant
+    policy: str
+
+
+@dataclass(frozen=True, slots=True)
+class Issuance:
+    """What is issued for one enclave.
+
+    ``identity`` is a certificate that the enclave keeps, or what a new one is issued for.  Without
+    ``rights`` the permissions stay as they are.
+    """
+
+    name: str
+    identity: NewIdentity | x509.Certificate
+    rights: StatedRights | EarlierRights | None
+
+
+@dataclass(frozen=True, slots=True)
+class Issued:
+    """The certificate and the permissions that an enclave has now.
+
+    ``document`` is the signed ``permissions.p7s``; it is empty, and so are the permissions, where
+    none were issued.
+    """
+
+    issuance: Issuance
+    certificate: x509.Certificate
+    permissions: Permissions = Permissions(())  # noqa: RUF009 - frozen
+    document: bytes = b""
+
+    def notes(self) -> Iterator[Note]:
+        """Yield notes on the permissions: where they are not portable, or not as in ros2/sros2."""
+        name, rights = self.issuance.name, self.issuance.rights
+        if isinstance(rights, StatedRights) and len(rights.enclave.profiles) > 1:
+            yield Note(
+                "policy.several-profiles",
+                f"{name}: the rights of its {len(rights.enclave.profiles)} <profiles> are joined. "
+                "ros2/sros2 makes a grant of each, of which DDS reads only the first.",
+            )
+        if self.document:
+            yield from document_notes(name, self.permissions, len(self.document))
+
+
+# ── issuing it ─────────────────────────────────────────────────────────────────────────────
+
+
+class EnclaveWriter:
+    """Issues for enclaves in the name of the authorities that are given, in one transaction.
+
+    ``entries`` are for the ledger; ``notes`` say where the authorities expire too early for the
+    validity that the template chooses.
+    """
+
+    def __init__(
+        self,
+        transaction: Transaction,
+        template: Template,
+        now: datetime,
+        *,
+        identity: Authority | None,
+        permissions: Authority | None,
+    ) -> None:
+        self.entries: list[Entry] = []
+        self._transaction = transaction
+        self._now = now
+        self._issuer = identity.issuer() if identity else None
+        self._signer = permissions
+        self._certificate_validity = window(now, template.certificate_validity)
+        self._permissions_validity = window(now, template.permissions_validity)
+        self.notes = tuple(
+            note
+            for what, validity, authority in (
+                ("certificates", self._certificate_validity, identity),
+                ("permissions", self._permissions_validity, permissions),
+            )
+            if authority
+            and (note := _early_expiry(what, validity, authority.certificate, transaction.root))
+        )
+        if permissions:
+            self._permissions_validity = self._permissions_validity.within(
+                validity_of(permissions.certificate)
+            )
+        keys = (authority.key for authority in (identity, permissions) if authority)
+        self._key_on_token = any(isinstance(key, TokenKey) for key in keys)
+
+    def write(self, issuance: Issuance) -> Issued:
+        """Issue, prove, sign and stage what ``issuance`` says, and record it for the ledger.
+
+        A certificate expires with the identity CA at the latest; permissions expire with their
+        certificate and with the permissions CA at the latest.
+
+        Raises:
+            KeystoreError: the permissions would not say what the policy says.
+        """
+        name, identity, rights = issuance.name, issuance.identity, issuance.rights
+        certificate = self._issue(name, identity) if isinstance(identity, NewIdentity) else identity
+        if rights is None:
+            return Issued(issuance, certificate)
+        subject = subject_text(certificate.subject)
+        validity = self._permissions_validity.within(validity_of(certificate))
+        permissions = _permissions(rights, subject, validity)
+        message = self._sign(name, permissions)
+        policy = rights.policy if isinstance(rights, EarlierRights) else rights.enclave.digest
+        self.entries.append(
+            document_entry(
+                self._now,
+                "permissions",
+                message,
+                enclave=name,
+                subject=subject,
+                validity=validity,
+                policy=policy,
+            )
+        )
+        return Issued(issuance, certificate, permissions, message)
+
+    def _issue(self, name: str, identity: NewIdentity) -> x509.Certificate:
+        if self._issuer is None:
+            raise KeystoreError("there is no identity CA to issue by")
+        folder = enclave_folder(name)
+        if identity.new_key:
+            pem_of_key = key_pem(identity.new_key)
+            self._transaction.write(f"{folder}/{KEY_FILE}", pem_of_key, private=True)
+        certificate = self._issuer.issue(
+            identity.subject, identity.public_key, self._certificate_validity
+        )
+        self._transaction.write(f"{folder}/{CERTIFICATE_FILE}", pem(certificate))
+        self.entries.append(certificate_entry(self._now, "certificate", certificate, name))
+        return certificate
+
+    def _sign(self, name: str, permissions: Permissions) -> bytes:
+        if self._signer is None:
+            raise KeystoreError("there is no permissions CA to sign by")
+        folder, what = enclave_folder(name), f"the permissions of {name}"
+        document = render_permissions(permissions)
+        check_meaning(parse_permissions(document), permissions, what)
+        message = self._signer.sign(document, what)
+        self._transaction.write(f"{folder}/permissions.xml", document)
+        self._transaction.write(f"{folder}/{PERMISSIONS_FILE}", message)
+        return message
+
+    def for_each(
+        self,
+        names: Sequence[str],
+        work: Callable[[str], Result],
+        progress: Progress | None = None,
+    ) -> dict[str, Result]:
+        """Return the result of ``work`` for each enclave, done on all cores.
+
+        What forked workers issue and stage counts as if it had been done here.  The session of a
+        token does not survive a fork, so with a key on a token there is no worker.
+        """
+        own_process = os.getpid()
+
+        def work_on(part: Sequence[str]) -> tuple[list[Result], list[Entry], Staged]:
+            mark, first, results = self._transaction.mark(), len(self.entries), []
+            for name in part:
+                results.append(work(name))
+                if progress and os.getpid() == own_process:
+                    progress(name)
+            return results, self.entries[first:], self._transaction.since(mark)
+
+        slices = [(names, work_on(names))] if self._key_on_token else map_slices(names, work_on)
+        found: dict[str, Result] = {}
+        for index, (part, (results, entries, staged)) in enumerate(slices):
+            if index:  # this process did the first slice, forked workers did the others
+                self._transaction.absorb(staged)
+                self.entries += entries
+                for name in part if progress else ():
+                    progress(name)  # type: ignore[misc]
+            found |= zip(part, results, strict=True)
+        return found
+
+
+def _permissions(
+    rights: StatedRights | EarlierRights, subject: str, validity: Window
+) -> Permissions:
+    """Return the permissions that give ``rights`` to a subject (RFC 4514 text) for a time."""
+    if isinstance(rights, EarlierRights):
+        begin, end = iso(validity.not_before), iso(validity.not_after)
+        grant = replace(rights.grant, subject=subject, not_before=begin, not_after=end)
+        return Permissions((grant,))
+    permissions = permissions_for(
+        rights.enclave, subject=subject, validity=validity, domains=rights.domains
+    )
+    prove(rights.enclave, permissions, rights.domains)
+    return permissions
+
+
+def _early_expiry(
+    what: str, wanted: Window, authority: x509.Certificate, root: Path
+) -> Note | None:
+    """Note when the CA's expiry shortens the chosen validity by more than 1 %."""
+    end = validity_of(authority).not_after
+    lost = wanted.not_after - end
+    if lost <= max((wanted.not_after - wanted.not_before) * _NOTED_LOSS, timedelta(0)):
+        return None
+    return Note(
+        "keystore.ends-with-ca",
+        f"What is issued now expires with its CA at {iso(end)}, {lost.days} days before the "
+        f"validity that is chosen for {what} is over: rotate the CA with "
+        f"`sros rotate_ca {root} --next`.",
+    )
+
+
+# ── what goes with it ──────────────────────────────────────────────────────────────────────
+
+
+def stated_enclave(policy: Policy, name: str) -> Enclave:
+    """Return what a policy states for an enclave; raise `PolicyError` if it states nothing."""
+    enclave = policy.enclave(name)
+    if enclave is None:
+        present = ", ".join(each.path for each in policy.enclaves)
+        raise PolicyError(
+            f"unable to find enclave {name} in the policy '{policy.file}'", f"It has {present}."
+        )
+    return enclave
 
 
 @cache
@@ -54,172 +311,41 @@ def _default_policy(choice: str) -> Enclave:
     return read_policy(policies_dir() / "defaults" / f"{choice}.xml").enclaves[0]
 
 
-def default_enclave(choice: str, name: str) -> Enclave:
-    """The policy ``defaults/<choice>.xml`` for the enclave ``name``."""
-    return replace(_default_policy(choice), path=name)
+def default_rights(template: Template, name: str) -> Enclave:
+    """Return what an enclave without a policy may do, by the choice of the keystore's template."""
+    return replace(_default_policy(template.default_permissions), path=name)
 
 
-class Fate(Enum):
-    """What became of an enclave."""
-
-    CREATED = "created"
-    CHANGED = "changed"
-    COMPLETED = "completed"
-    KEPT = "kept"
+def policies_of(root: Path) -> dict[str, str]:
+    """Map the SHA-256 of each signed document in the ledger to that of the policy it is from."""
+    return {each.sha256: each.policy for each in read_ledger(root)}
 
 
-class Registrar:
-    """Adds enclaves to one transaction; ``entries`` are for the ledger, ``notes`` are remarks."""
+def present_files(root: Path, name: str) -> set[str]:
+    """Return the files of an enclave; a link that leads nowhere is a file that is missing."""
+    folder = enclave_path(root, name)
+    try:
+        return {file for file in os.listdir(folder) if (folder / file).exists()}
+    except FileNotFoundError:
+        return set()
 
-    def __init__(
-        self,
-        transaction: Transaction,
-        authorities: Authorities,
-        template: Template,
-        domains: DomainSet,
-        now: datetime,
-    ) -> None:
-        self._transaction = transaction
-        self._authorities = authorities
-        self._issuance = Issuance(
-            transaction,
-            template,
-            now,
-            identity=authorities.identity,
-            permissions=authorities.permissions,
-        )
-        self._template = template
-        self._domains = domains
-        self._now = now
-        self._has_crl = (transaction.root / CRL).exists()
-        self._few = False
-        self.notes: list[Note] = []
-        self.entries = self._issuance.entries
 
-    def register_all(
-        self, wanted: Sequence[tuple[str, Enclave | None]], progress: Progress | None
-    ) -> dict[str, Fate]:
-        """Make or complete each enclave; with a policy, give it those permissions."""
-        self._few = len(wanted) <= FEW
+def shared_files(root: Path, name: str) -> dict[str, str]:
+    """Map the files of an enclave that it shares with all others to their paths in the keystore."""
+    shared = {f"{role}_ca.cert.pem": ca_certificate(role) for role in ROLES}
+    if enclave_folder(name) != ENCLAVES:  # in the folder of the enclave / it lies itself
+        shared[GOVERNANCE_FILE] = GOVERNANCE_P7S
+    if (root / CRL).exists():
+        shared[CRL_FILE] = CRL
+    return shared
 
-        def work(item: tuple[str, Enclave | None]) -> tuple[Fate, list[Note]]:
-            notes: list[Note] = []
-            return self._register(*item, notes), notes
 
-        def told(item: tuple[str, Enclave | None], _: object) -> None:
-            if progress:
-                progress(item[0])
-
-        done = self._issuance.spread(wanted, work, told)
-        self.notes += [note for _, notes in done for note in notes]
-        if self.entries:
-            self.notes += self._issuance.notes
-        return {name: fate for (name, _), (fate, _) in zip(wanted, done, strict=True)}
-
-    def _register(self, name: str, policy: Enclave | None, notes: list[Note]) -> Fate:
-        folder = enclave_folder(name)
-        present = self._present(folder)
-        before = len(self._transaction.changes)
-        certificate = self._identity(name, folder, present)
-        self._links(folder, present)
-        if policy is not None or "permissions.p7s" not in present:
-            self._permissions(name, policy, certificate, notes)
-        if not present & {"key.pem", REQUEST}:
-            return Fate.CREATED
-        if "permissions.p7s" in present and policy is not None:
-            return Fate.CHANGED
-        return Fate.COMPLETED if len(self._transaction.changes) > before else Fate.KEPT
-
-    def _present(self, folder: str) -> set[str]:
-        path = os.path.join(self._transaction.root, folder)
-        try:
-            names = os.listdir(path)
-        except FileNotFoundError:
-            return set()
-        # A link that leads nowhere is a file that is missing.
-        return {name for name in names if Path(path, name).exists()}
-
-    def _identity(self, name: str, folder: str, present: set[str]) -> x509.Certificate:
-        if "cert.pem" in present and present & {"key.pem", REQUEST}:
-            return self._existing(name, folder)
-        if "cert.pem" in present:
-            raise KeystoreError(
-                f"enclave {name} has a certificate but no key",
-                "Its key.pem is missing, and a new key would make the certificate useless.",
-                f"Restore the key, or remove '{self._transaction.root / folder}/cert.pem' to have "
-                "both made anew.",
-            )
-        if "key.pem" in present:
-            path = self._transaction.root / folder / "key.pem"
-            key = load_key(read_bytes(path, "private key"), f"'{path}'")
-            public = key.public_key()
-        else:
-            new = generate_key()
-            public = new.public_key()
-            self._transaction.write(f"{folder}/key.pem", key_pem(new), private=True)
-        subject = enclave_subject(name, unique=self._template.unique_subject)
-        if "permissions.p7s" in present:
-            subject = self._subject_of_permissions(folder, subject)
-        return self._issuance.certificate(name, subject, public)
-
-    def _subject_of_permissions(self, folder: str, otherwise: x509.Name) -> x509.Name:
-        """The subject of this name that the permissions of an enclave are signed for."""
-        path = self._transaction.root / folder / "permissions.p7s"
-        try:
-            signed = smime.parse(read_bytes(path, "permissions document"))
-            signed.verify(self._authorities.permissions.certificate)
-            subjects = [
-                subject_of(grant.subject)
-                for grant in parse_permissions(signed.document, f"'{path}'").grants
-            ]
-        except (SrosError, ValueError):
-            return otherwise  # they cannot be used with any certificate
-        own = common_name_of(otherwise)
-        return next((each for each in subjects if common_name_of(each) == own), otherwise)
-
-    def _existing(self, name: str, folder: str) -> x509.Certificate:
-        path = self._transaction.root / folder / "cert.pem"
-        certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
-        if not issued_by(certificate, self._authorities.identity.certificate):
-            raise KeystoreError(
-                f"the certificate of enclave {name} was not issued by the identity CA of this "
-                "keystore",
-                f"'{path}' names {subject_text(certificate.issuer)} as its issuer, so no node of "
-                "this keystore would talk to it.",
-                "Restore the right certificate, or remove the enclave's folder and make it anew.",
-            )
-        validity = validity_of(certificate)
-        if not validity.contains(self._now):
-            raise KeystoreError(
-                f"the certificate of enclave {name} is not valid now",
-                f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}.",
-                f"Renew it with `sros renew {self._transaction.root} {name}`.",
-            )
-        return certificate
-
-    def _links(self, folder: str, present: set[str]) -> None:
-        up = "../" * folder.count("/")
-        for role in (IDENTITY, PERMISSIONS):
-            name = f"{role}_ca.cert.pem"
-            if name not in present:
-                self._transaction.link(f"{folder}/{name}", f"{up}../{PUBLIC}/{name}")
-        if "governance.p7s" not in present and folder != ENCLAVES:
-            self._transaction.link(f"{folder}/governance.p7s", f"{up}governance.p7s")
-        if self._has_crl and "crl.pem" not in present:
-            self._transaction.link(f"{folder}/crl.pem", f"{up}../{CRL}")
-
-    def _permissions(
-        self, name: str, policy: Enclave | None, certificate: x509.Certificate, notes: list[Note]
-    ) -> None:
-        enclave = policy or default_enclave(self._template.default_permissions, name)
-        if len(enclave.profiles) > 1:
-            notes.append(
-                Note(
-                    "policy.several-profiles",
-                    f"{name}: the rights of its {len(enclave.profiles)} <profiles> are joined. "
-                    "ros2/sros2 makes a grant of each, of which DDS reads only the first.",
-                )
-            )
-        make = proven(enclave, self._domains, ask=self._few)
-        permissions, message = self._issuance.permissions(name, certificate, make, enclave.digest)
-        notes += document_notes(name, permissions, len(message))
+def link_shared_files(transaction: Transaction, name: str, present: Collection[str]) -> None:
+    """Stage links to the files that all enclaves share, but for those that are ``present``."""
+    folder = enclave_folder(name)
+    up = "../" * folder.count("/")
+    for file, source in shared_files(transaction.root, name).items():
+        if file not in present:
+            inside = source.removeprefix(f"{ENCLAVES}/")
+            target = f"{up}{inside}" if inside != source else f"{up}../{source}"
+            transaction.link(f"{folder}/{file}", target)

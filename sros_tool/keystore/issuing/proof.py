@@ -1,11 +1,17 @@
-"""Proves that permissions say what the policy says that they were made from, before they are used.
+"""The proof that permissions say what the policy says that they are made from.
 
 A policy allows what something allows and nothing denies; DDS takes the first rule that matches.
-Both mean the same if the document has one grant, its denials stand first, every rule is for all of
-its domains and without partitions, nothing else is allowed, and the expressions are those of the
-policy: for every name then, mentioned or not.  That is a comparison of sets, cheap enough to make
-of every document.  Where it does not hold, and wherever there is little to sign, the decision
-engine is asked for every name that either of them mentions, and for names that none mentions.
+Both mean the same, for every name, mentioned or not, if
+
+- the document has one grant, its denials come first, every rule is for all of its domains and
+  without partitions, nothing else is allowed, and its expressions are those of the policy: a
+  comparison of sets;
+- the vendors match each expression with wildcards as a policy means it (one without wildcards
+  matches itself for all of them): a comparison of matchers, for names that tell them apart.
+
+Both are made of every document, whatever its size and however many are signed at once.  For a
+document of another form, the decision engine is asked for every name that either of them mentions,
+and for names that none mentions.
 
 The DDS names are written down here a second time, from the ROS 2 design "Topic and Service name
 mapping to DDS", so that an error of `sros_tool.translate` does not prove itself.
@@ -17,32 +23,27 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
+from functools import lru_cache
 
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import Outcome, Verb
+from sros_tool.dds.decision.matching import matches as dds_matches
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule, settings
 from sros_tool.dds.permissions import Permissions
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.issuing.issuance import Make
 from sros_tool.names import ROS_DISCOVERY_TOPIC, expand, is_expression
 from sros_tool.policy.model import ALLOW, Enclave
 from sros_tool.policy.patterns import common_name, matches, overlap
-from sros_tool.translate import permissions_for
-from sros_tool.validity import Window
 
 ASKED = (Vendor.STANDARD, Vendor.FAST)
-"""Whose decisions have to be those of the policy; Fast DDS 2.9 reads such documents as 2.14.
+"""The vendors that have to decide as the policy does; Fast DDS 2.9 reads such documents as 2.14.
 
-Not Cyclone DDS 0.10: it denies a topic in both directions if one is denied, which is remarked on
-(``portable.deny-blocks-topic``) and cannot be said otherwise.
+Not Cyclone DDS 0.10: it denies a topic in both directions if one is denied, which is noted
+(``portable.deny-blocks-topic``) and cannot be expressed otherwise.
 """
 
-FEW = 4
-"""Up to so many enclaves are signed at once, asking the engine for each takes no time to notice."""
-
-_MOST_ASKED = 200
 _SET = re.compile(r"\[!?[^\]]+\]")
 _CHARACTERS = "nabcdefghijklmopqrstuvwxyz_/0123456789" + "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 _OUT, _IN = "publish", "subscribe"
@@ -51,15 +52,15 @@ _ACTION_TOPICS = ("feedback", "status")
 
 
 def _service(client: bool, part: str = "") -> tuple[tuple[str, str, str], ...]:
-    """Both topics of a service: the direction, what stands before the name, and what behind it."""
+    """Return both topics of a service: direction, and what precedes and follows the name."""
     ask, answer = (_OUT, _IN) if client else (_IN, _OUT)
     return (ask, "rq", f"{part}Request"), (answer, "rr", f"{part}Reply")
 
 
 def _action(client: bool) -> tuple[tuple[str, str, str], ...]:
-    told = _IN if client else _OUT
+    direction = _IN if client else _OUT
     services = (end for p in _ACTION_SERVICES for end in _service(client, f"/_action/{p}"))
-    return (*services, *((told, "rt", f"/_action/{topic}") for topic in _ACTION_TOPICS))
+    return (*services, *((direction, "rt", f"/_action/{topic}") for topic in _ACTION_TOPICS))
 
 
 _ENDPOINTS = {
@@ -73,37 +74,33 @@ _ENDPOINTS = {
 
 
 @dataclass(slots=True)
-class Expressions:
+class ExpressionSets:
     """The DDS expressions that are allowed and denied, for writing and for reading."""
 
     allowed: dict[str, set[str]]
     denied: dict[str, set[str]]
 
     @classmethod
-    def none(cls) -> Expressions:
+    def none(cls) -> ExpressionSets:
         """Nothing allowed, nothing denied."""
         return cls({_OUT: set(), _IN: set()}, {_OUT: set(), _IN: set()})
 
     def allow(self, verb: str, topic: str) -> bool:
-        """What a policy means: something allows it, and nothing denies it."""
+        """Whether a policy allows it: something allows it, and nothing denies it."""
         return _meant(self.allowed[verb], topic) and not _meant(self.denied[verb], topic)
 
-    def count(self) -> int:
-        """How many expressions there are."""
-        return sum(1 for _ in self.all())
-
     def all(self) -> Iterator[str]:
-        """Every expression, perhaps more than once."""
+        """Yield every expression, perhaps more than once."""
         for side in (self.allowed, self.denied):
             for expressions in side.values():
                 yield from expressions
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
-    """A DDS topic on which policy and permissions do not agree; ``meant`` is what the policy says.
+class Disagreement:
+    """A DDS topic on which policy and permissions differ.
 
-    ``outcome`` is what the vendor decides.
+    ``meant`` is whether the policy allows it, ``outcome`` is what the vendor decides.
     """
 
     verb: str
@@ -118,32 +115,11 @@ class Difference:
         return f"{self.verb} {self.topic} is {meant}, and {self.vendor.title} says {self.outcome}"
 
 
-def proven(policy: Enclave, domains: DomainSet, *, ask: bool) -> Make:
-    """Makes the permissions that a policy states, each proven to say what the policy says.
-
-    With ``ask`` the decision engine is asked, too; see `prove`.
-    """
-
-    def make(subject: str, validity: Window) -> Permissions:
-        permissions = permissions_for(policy, subject=subject, validity=validity, domains=domains)
-        prove(policy, permissions, domains, ask=ask)
-        return permissions
-
-    return make
-
-
-def prove(
-    policy: Enclave, permissions: Permissions, domains: DomainSet, *, ask: bool = False
-) -> None:
-    """Raise `KeystoreError` unless ``permissions`` decide as ``policy`` does on all ``domains``.
-
-    With ``ask`` the engine is asked even where the comparison says enough, unless the document
-    has more names than are asked for in a moment.
-    """
+def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None:
+    """Raise `KeystoreError` unless ``permissions`` decide as ``policy`` does on all ``domains``."""
     stated = stated_expressions(policy)
-    if signed_expressions(permissions, domains) == stated and not (
-        ask and stated.count() <= _MOST_ASKED
-    ):
+    wildcards = {each for each in stated.all() if is_expression(each)}
+    if signed_expressions(permissions, domains) == stated and all(map(matched_as_meant, wildcards)):
         return
     found = differences(policy, permissions, domains)
     if found:
@@ -155,9 +131,19 @@ def prove(
         )
 
 
-def stated_expressions(policy: Enclave) -> Expressions:
-    """What a policy states of an enclave, in the names of DDS, with what every participant has."""
-    found = Expressions.none()
+@lru_cache(maxsize=4096)
+def matched_as_meant(expression: str) -> bool:
+    """Whether the vendors match the names that an expression tells apart as a policy means it."""
+    return all(
+        dds_matches(vendor.traits.style, expression, name) == matches(expression, name)
+        for name in telling_topics([expression])
+        for vendor in ASKED
+    )
+
+
+def stated_expressions(policy: Enclave) -> ExpressionSets:
+    """Return what a policy states for an enclave, in DDS names, with what every participant has."""
+    found = ExpressionSets.none()
     for verb in (_OUT, _IN):
         found.allowed[verb].add(ROS_DISCOVERY_TOPIC)
     for profile in policy.all_profiles():
@@ -171,11 +157,11 @@ def stated_expressions(policy: Enclave) -> Expressions:
     return found
 
 
-def signed_expressions(permissions: Permissions, domains: DomainSet) -> Expressions | None:
-    """What permissions say, if they have the form in which the order of rules does not matter."""
+def signed_expressions(permissions: Permissions, domains: DomainSet) -> ExpressionSets | None:
+    """Return what permissions say, or None where the order of their rules could matter."""
     if len(permissions.grants) != 1 or permissions.grants[0].default_allow:
         return None
-    found = Expressions.none()
+    found = ExpressionSets.none()
     allowing = False
     for rule in permissions.grants[0].rules:
         if (allowing and not rule.allow) or rule.domains != domains or rule.relay:
@@ -198,29 +184,35 @@ def differences(
     permissions: Permissions,
     domains: DomainSet,
     vendors: Iterable[Vendor] = ASKED,
-) -> list[Difference]:
-    """Where the vendors' decisions are not what the policy says, over all `telling_topics`."""
+) -> list[Disagreement]:
+    """Return where the vendors' decisions are not what the policy says.
+
+    They are asked for the `telling_topics` of all expressions, and of each one alone.
+    """
     stated = stated_expressions(policy)
-    topics = telling_topics([*stated.all(), *_topics(permissions)])
+    expressions = {*stated.all(), *_topics(permissions)}
+    topics = set(telling_topics(expressions))
+    for each in filter(is_expression, expressions):
+        topics.update(telling_topics([each]))
     found = []
     for vendor in vendors:
         for domain in _ends(domains):
             access = _access(vendor, permissions, domain)
-            for topic in topics:
+            for topic in sorted(topics):
                 for verb in (_OUT, _IN):
                     meant = stated.allow(verb, topic)
                     outcome = access.decide(Verb(verb), topic).outcome
                     if outcome.ok != meant:
-                        found.append(Difference(verb, topic, meant, vendor, outcome))
+                        found.append(Disagreement(verb, topic, meant, vendor, outcome))
     return found
 
 
 def telling_topics(expressions: Iterable[str]) -> tuple[str, ...]:
-    """Topics that tell apart what the expressions mean, sorted.
+    """Return topics that tell the expressions apart, sorted.
 
-    Every one that is mentioned; for each wildcard one that it means, one that only it means, and
-    one for each other wildcard that it overlaps; and one that nothing means, in each of ROS'
-    prefixes.
+    Each topic that is mentioned; for each wildcard one that it matches, one that only it matches,
+    and one for each other wildcard that it overlaps; and one that nothing matches, for each prefix
+    of ROS.
     """
     known = sorted(set(expressions))
     wild = [each for each in known if is_expression(each)]
@@ -237,7 +229,7 @@ def telling_topics(expressions: Iterable[str]) -> tuple[str, ...]:
 
 
 def _only(one: str, known: list[str]) -> str | None:
-    """A name that only ``one`` means, if there is a simple one."""
+    """Return a name that only ``one`` matches, if there is a simple one."""
     for letter in ("never_mentioned", "n", "0", ""):
         name = _SET.sub(_member, one).replace("*", letter).replace("?", "n")
         if matches(one, name) and not any(matches(each, name) for each in known if each != one):
@@ -246,18 +238,18 @@ def _only(one: str, known: list[str]) -> str | None:
 
 
 def _member(found: re.Match[str]) -> str:
-    """A character that a set stands for."""
+    """Return a character that a set stands for."""
     return next((c for c in _CHARACTERS if matches(found[0], c)), "")
 
 
 def _ends(domains: DomainSet) -> tuple[int, ...]:
-    """The first and the last domain of each range."""
+    """Return the first and the last domain of each range."""
     ends = ((part.first, part.last) for part in domains.closed().ranges)
     return tuple(sorted({end for pair in ends for end in pair if end is not None}))
 
 
 def _access(vendor: Vendor, permissions: Permissions, domain: int) -> Access:
-    """The decisions for the document's own subject, in the middle of its validity."""
+    """Return the decisions for the document's own subject, in the middle of its validity."""
     grant = permissions.grants[0]
     window = grant.validity
     middle = window.not_before + (window.not_after - window.not_before) / 2

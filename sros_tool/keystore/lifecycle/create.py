@@ -1,36 +1,54 @@
-"""Founds a keystore: authorities, governance, settings, at a place where nothing is in the way."""
+"""Creating keystores and enclaves: authorities, governance, settings, keys and permissions."""
 
 from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from enum import Enum
 from pathlib import Path
 from types import MappingProxyType
 
+from cryptography import x509
+
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import parse_governance, render_governance
+from sros_tool.dds.permissions import parse_permissions
 from sros_tool.dds.portable import name_notes
-from sros_tool.errors import KeystoreError, Note, PolicyError, UsageError
+from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, UsageError
 from sros_tool.keystore.authorities.authority import (
     Authorities,
-    Authority,
+    check_meaning,
     create_authorities,
     load_authorities,
 )
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.issuing.enclave import Fate, Registrar
+from sros_tool.keystore.issuing.enclave import (
+    EnclaveWriter,
+    Issuance,
+    NewIdentity,
+    StatedRights,
+    default_rights,
+    link_shared_files,
+    present_files,
+    stated_enclave,
+)
 from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
     ENCLAVES,
     GOVERNANCE_P7S,
     GOVERNANCE_XML,
+    KEY_FILE,
+    PERMISSIONS_FILE,
     PRIVATE,
     PUBLIC,
+    REQUEST,
     SETTINGS,
     check_keystore,
     enclave_names,
+    enclave_path,
     is_keystore,
 )
 from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
@@ -42,99 +60,31 @@ from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
 from sros_tool.parallel import Progress
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import (
+    common_name_of,
+    enclave_subject,
+    issued_by,
+    load_certificate,
+    subject_of,
+    subject_text,
+    validity_of,
+)
+from sros_tool.pki.keys import generate_key, load_key
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.translate import governance_for
-from sros_tool.validity import window
+from sros_tool.validity import iso, window
+from sros_tool.xml import read_bytes
 
-NOTHING: Mapping[str, bytes] = MappingProxyType({})
-
-
-def write_keystore(
-    transaction: Transaction,
-    template: Template,
-    domains: DomainSet,
-    keyring: Keyring,
-    now: datetime,
-    imported: Mapping[str, bytes] = NOTHING,
-) -> tuple[Authorities, list[Entry]]:
-    """Stage a new keystore: its authorities, its governance and its settings."""
-    for span in (template.certificate_validity, template.permissions_validity):
-        window(now, span)  # what could not issue anything is no keystore
-    authorities = create_authorities(transaction, template, keyring, now, imported)
-    distinct = dict.fromkeys((authorities.identity, authorities.permissions))
-    entries = [certificate_entry(now, "ca", each.certificate) for each in distinct]
-    message = _write_governance(transaction, authorities.permissions, template, domains)
-    entries.append(document_entry(now, "governance", message))
-    transaction.write(
-        SETTINGS,
-        b"# The choices by which sros made this keystore; what is added later follows them.\n"
-        + render_template(keyring.remembered(template)).encode(),
-    )
-    return authorities, entries
-
-
-def _write_governance(
-    transaction: Transaction, authority: Authority, template: Template, domains: DomainSet
-) -> bytes:
-    """Stage the governance document of a keystore, with its readable form; the signed one."""
-    governance = governance_for(template.protection, domains)
-    document = render_governance(governance)
-    message = authority.sign(document, governance, parse_governance, "the governance document")
-    transaction.write(GOVERNANCE_XML, document)
-    transaction.write(GOVERNANCE_P7S, message)
-    return message
-
-
-def check_free(root: Path) -> None:
-    """Raise `KeystoreError` where something is in the way of a new keystore."""
-    if is_keystore(root):
-        raise _exists(root)
-    if root.resolve() == Path("/"):
-        raise KeystoreError("the root of the file system is no place for a keystore")
-    if os.path.lexists(root) and not root.is_dir():
-        raise KeystoreError(f"'{root}' is in the way", "It is not a folder.")
-    remains = [part for part in (PUBLIC, PRIVATE, ENCLAVES) if (root / part).exists()]
-    if remains:
-        if is_keystore(root):  # another process has completed it between the two looks
-            raise _exists(root)
-        raise KeystoreError(
-            f"'{root}' holds parts of a keystore already",
-            f"There are {', '.join(remains)}; a new CA beside them would lock out every enclave "
-            "that trusts the old one.",
-            "Restore what is missing, or choose another path.",
-        )
-
-
-def _exists(root: Path) -> KeystoreError:
-    return KeystoreError(
-        f"keystore '{root}' already exists",
-        "",
-        "Nothing was changed. Add to it with `sros create_enclave`, or choose another path.",
-    )
-
-
-def check_typo(root: Path) -> None:
-    """Refuse to make a keystore whose name is all but that of one beside it."""
-    try:
-        beside = [p.name for p in root.absolute().parent.iterdir() if p.is_dir()]
-    except OSError:
-        return
-    close = difflib.get_close_matches(root.name, beside, n=3, cutoff=0.5)
-    for name in close:
-        if is_keystore(root.absolute().parent / name):
-            raise UsageError(
-                f"'{root}' does not exist, and '{name}' beside it is a keystore",
-                "This may be a typing error, so no second keystore is made.",
-                f"Name '{root.with_name(name)}', or run `sros create_keystore {root}` first.",
-            )
+_NONE_IMPORTED: Mapping[str, bytes] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
-    """What a verb did, or with ``dry_run`` would do.
+class Creation:
+    """What was created, or with ``dry_run`` would be.
 
     ``created`` are new enclaves, ``changed`` those whose permissions were replaced, ``completed``
-    those of which a missing file was added, ``kept`` those that were left as they are.
+    those that got a file that was missing, ``kept`` those that were left as they are.
     """
 
     root: Path
@@ -156,33 +106,33 @@ def create_keystore(
     domains: DomainSet | None = None,
     now: datetime,
     keyring: Keyring = IN_KEYSTORE,
-    imported: Mapping[str, bytes] = NOTHING,
+    imported: Mapping[str, bytes] = _NONE_IMPORTED,
     dry_run: bool = False,
-) -> Result:
-    """Make a new keystore for ``domains`` (default: 0) by the choices of ``template``.
+) -> Creation:
+    """Create a keystore for ``domains`` (default: 0) by the choices of ``template``.
 
-    Raises `KeystoreError` if ``root`` is a keystore, or holds any part of one: a CA is never made
-    anew beside the remains of an older one.  ``imported`` are PEM certificates of existing CAs by
-    role ("identity", "permissions"), whose keys the ``keyring`` has.
+    ``imported`` are PEM certificates of existing CAs by role ("identity", "permissions"), whose
+    keys the ``keyring`` has.
+
+    Raises:
+        KeystoreError: ``root`` is a keystore, or holds any part of one: a CA is never made next to
+            the remains of an older one.
     """
     if not dry_run:
         tidy(root)
-    check_free(root)
+    _check_free(root)
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
-        check_free(root)  # another process may have been faster
         domains = domains or DomainSet.of((0, 0))
-        authorities, entries = write_keystore(
-            transaction, template, domains, keyring, now, imported
-        )
-        append(transaction, entries)
+        keystore = _write_keystore(transaction, template, domains, keyring, now, imported)
+        append(transaction, keystore.entries)
         transaction.commit()
-    return Result(
+    return Creation(
         root,
         template,
         domains,
         True,
         changes=tuple(transaction.changes),
-        notes=authorities.notes,
+        notes=keystore.authorities.notes,
     )
 
 
@@ -195,8 +145,8 @@ def create_enclaves(
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
     progress: Progress | None = None,
-) -> Result:
-    """Make enclaves; what they may do is the default of the keystore's template.
+) -> Creation:
+    """Create enclaves; what they may do is the default of the keystore's template.
 
     An enclave that exists is left as it is, and completed where a file is missing: neither its
     key nor its permissions are ever replaced.  ``domain`` is the one that the caller will use
@@ -222,7 +172,7 @@ def create_permission(
     domain: int | None = None,
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
-) -> Result:
+) -> Creation:
     """Give an existing enclave the permissions that ``policy`` states for it."""
     check_enclave_name(name)
     if not dry_run:
@@ -231,13 +181,10 @@ def create_permission(
     existing = set(enclave_names(root))
     if name not in existing:
         raise no_such_enclave(root, name, existing)
-    enclave = policy.enclave(name)
-    if enclave is None:
-        there = ", ".join(each.path for each in policy.enclaves)
-        raise PolicyError(
-            f"unable to find enclave {name} in the policy '{policy.file}'", f"It has {there}."
-        )
-    return _produce(root, {name: enclave}, now, domain, keyring, dry_run)
+    enclave = stated_enclave(policy, name)
+    with Transaction(root, dry_run=dry_run) as transaction:
+        keystore = _open_keystore(transaction, domain, keyring, now)
+        return _write_enclaves(transaction, keystore, {name: enclave}, now)
 
 
 def generate_artifacts(
@@ -252,13 +199,32 @@ def generate_artifacts(
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
     progress: Progress | None = None,
-) -> Result:
-    """Make the named enclaves and those of the policies, with their permissions, all or nothing.
+) -> Creation:
+    """Create the named enclaves and those of the policies, with their permissions, all or nothing.
 
     Permissions that a policy states replace those that an enclave had.  Where there is no
-    keystore, one is made by the template ``create``, if that is given.
+    keystore, one is created by the template ``create``, if that is given.
     """
-    wanted: dict[str, Enclave | None] = {check_enclave_name(name): None for name in enclaves}
+    wanted = _wanted(enclaves, policies)
+    if not dry_run:
+        tidy(root)
+    if create is None or is_keystore(root):
+        check_keystore(root)
+        with Transaction(root, dry_run=dry_run) as transaction:
+            keystore = _open_keystore(transaction, domain, keyring, now)
+            return _write_enclaves(transaction, keystore, wanted, now, progress)
+    _check_typo(root)
+    _check_free(root)
+    domains = domains or DomainSet.of((0 if domain is None else domain,) * 2)
+    check_domain(domains, domain, root)
+    with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
+        keystore = _write_keystore(transaction, create, domains, keyring, now, _NONE_IMPORTED)
+        return _write_enclaves(transaction, keystore, wanted, now, progress)
+
+
+def _wanted(names: Sequence[str], policies: Sequence[Policy]) -> dict[str, Enclave | None]:
+    """Return each enclave with what a policy states for it; raise where two policies differ."""
+    wanted: dict[str, Enclave | None] = {check_enclave_name(name): None for name in names}
     for policy in policies:
         for enclave in policy.enclaves:
             other = wanted.get(enclave.path)
@@ -269,61 +235,251 @@ def generate_artifacts(
                     "Join the two.",
                 )
             wanted[enclave.path] = enclave
-    if not dry_run:
-        tidy(root)
-    if not is_keystore(root) and create is not None:
-        check_typo(root)
-        check_free(root)
-    else:
-        check_keystore(root)
-        create = None
-    return _produce(root, wanted, now, domain, keyring, dry_run, progress, create, domains)
+    return wanted
 
 
-# ── the work ───────────────────────────────────────────────────────────────────────────────
+# ── the keystore ───────────────────────────────────────────────────────────────────────────
 
 
-def _produce(
-    root: Path,
-    wanted: dict[str, Enclave | None],
-    now: datetime,
-    domain: int | None,
+@dataclass(frozen=True, slots=True)
+class _Keystore:
+    """A keystore that enclaves are added to, its enclaves, and ledger entries where it is new."""
+
+    authorities: Authorities
+    template: Template
+    domains: DomainSet
+    names: tuple[str, ...] = ()
+    entries: tuple[Entry, ...] = ()
+
+
+def _open_keystore(
+    transaction: Transaction, domain: int | None, keyring: Keyring, now: datetime
+) -> _Keystore:
+    root = transaction.root
+    template = load_settings(root)
+    authorities = load_authorities(root, template, keyring, now)
+    domains = load_governance(root, authorities.permissions.certificate).domains().closed()
+    check_domain(domains, domain, root)
+    return _Keystore(authorities, template, domains, tuple(enclave_names(root)))
+
+
+def _write_keystore(
+    transaction: Transaction,
+    template: Template,
+    domains: DomainSet,
     keyring: Keyring,
-    dry_run: bool,
-    progress: Progress | None = None,
-    create: Template | None = None,
-    domains: DomainSet | None = None,
-) -> Result:
-    fresh = create is not None
-    with Transaction(root, fresh=fresh, dry_run=dry_run) as transaction:
-        if create is not None:
-            check_free(root)  # another process may have been faster
-            template = create
-            domains = domains or DomainSet.of((0 if domain is None else domain,) * 2)
-            check_domain(domains, domain, root)
-            authorities, entries = write_keystore(transaction, template, domains, keyring, now)
-            existing: tuple[str, ...] = ()
-        else:
-            template = load_settings(root)
-            authorities = load_authorities(root, template, keyring, now)
-            domains = load_governance(root, authorities.permissions.certificate).domains().closed()
-            check_domain(domains, domain, root)
-            existing = tuple(enclave_names(root))
-            entries = []
-        registrar = Registrar(transaction, authorities, template, domains, now)
-        fates = registrar.register_all(list(wanted.items()), progress)
-        append(transaction, [*entries, *registrar.entries])
-        transaction.commit()
-    of = {fate: tuple(name for name in fates if fates[name] is fate) for fate in Fate}
-    return Result(
-        root,
-        template,
-        domains,
-        fresh,
-        of[Fate.CREATED],
-        of[Fate.CHANGED],
-        of[Fate.COMPLETED],
-        of[Fate.KEPT],
-        tuple(transaction.changes),
-        (*registrar.notes, *name_notes({*existing, *of[Fate.CREATED]}, of[Fate.CREATED])),
+    now: datetime,
+    imported: Mapping[str, bytes],
+) -> _Keystore:
+    """Stage a new keystore: its authorities, its governance and its settings."""
+    _check_free(transaction.root)  # another process may have been faster
+    for span in (template.certificate_validity, template.permissions_validity):
+        window(now, span)  # raises where nothing could be issued
+    authorities = create_authorities(transaction, template, keyring, now, imported)
+    distinct = dict.fromkeys((authorities.identity, authorities.permissions))
+    entries = [certificate_entry(now, "ca", each.certificate) for each in distinct]
+    governance = governance_for(template.protection, domains)
+    document = render_governance(governance)
+    what = "the governance document"
+    check_meaning(parse_governance(document), governance, what)
+    message = authorities.permissions.sign(document, what)
+    transaction.write(GOVERNANCE_XML, document)
+    transaction.write(GOVERNANCE_P7S, message)
+    entries.append(document_entry(now, "governance", message))
+    transaction.write(
+        SETTINGS,
+        b"# The choices by which sros made this keystore; what is added later follows them.\n"
+        + render_template(keyring.remembered(template)).encode(),
     )
+    return _Keystore(authorities, template, domains, entries=tuple(entries))
+
+
+def _check_free(root: Path) -> None:
+    """Raise `KeystoreError` where something is in the way of a new keystore."""
+    if is_keystore(root):
+        raise _already_exists(root)
+    if root.resolve() == Path("/"):
+        raise KeystoreError("the root of the file system is no place for a keystore")
+    if os.path.lexists(root) and not root.is_dir():
+        raise KeystoreError(f"'{root}' is in the way", "It is not a folder.")
+    remains = [part for part in (PUBLIC, PRIVATE, ENCLAVES) if (root / part).exists()]
+    if remains:
+        if is_keystore(root):  # another process has just completed it
+            raise _already_exists(root)
+        raise KeystoreError(
+            f"'{root}' holds parts of a keystore already",
+            f"There are {', '.join(remains)}; a new CA next to them would lock out every enclave "
+            "that trusts the old one.",
+            "Restore what is missing, or choose another path.",
+        )
+
+
+def _already_exists(root: Path) -> KeystoreError:
+    return KeystoreError(
+        f"keystore '{root}' already exists",
+        "",
+        "Nothing was changed. Add to it with `sros create_enclave`, or choose another path.",
+    )
+
+
+def _check_typo(root: Path) -> None:
+    """Refuse a name that looks like a typo of a sibling keystore."""
+    try:
+        siblings = [p.name for p in root.absolute().parent.iterdir() if p.is_dir()]
+    except OSError:
+        return
+    close = difflib.get_close_matches(root.name, siblings, n=3, cutoff=0.5)
+    for name in close:
+        if is_keystore(root.absolute().parent / name):
+            raise UsageError(
+                f"'{root}' does not exist, and '{name}' beside it is a keystore",
+                "This may be a typing error, so no second keystore is made.",
+                f"Name '{root.with_name(name)}', or run `sros create_keystore {root}` first.",
+            )
+
+
+# ── its enclaves ───────────────────────────────────────────────────────────────────────────
+
+
+class _Outcome(Enum):
+    """What was done to an enclave."""
+
+    CREATED = "created"
+    CHANGED = "changed"
+    COMPLETED = "completed"
+    KEPT = "kept"
+
+
+def _write_enclaves(
+    transaction: Transaction,
+    keystore: _Keystore,
+    wanted: Mapping[str, Enclave | None],
+    now: datetime,
+    progress: Progress | None = None,
+) -> Creation:
+    """Create or complete each enclave; with a policy, give it those permissions.  Commit."""
+    writer = EnclaveWriter(
+        transaction,
+        keystore.template,
+        now,
+        identity=keystore.authorities.identity,
+        permissions=keystore.authorities.permissions,
+    )
+
+    def write(name: str) -> tuple[_Outcome, tuple[Note, ...]]:
+        return _write_enclave(writer, transaction, keystore, name, wanted[name], now)
+
+    done = writer.for_each(list(wanted), write, progress)
+    append(transaction, [*keystore.entries, *writer.entries])
+    transaction.commit()
+    outcomes = {name: outcome for name, (outcome, _) in done.items()}
+    created = _with(outcomes, _Outcome.CREATED)
+    return Creation(
+        transaction.root,
+        keystore.template,
+        keystore.domains,
+        bool(keystore.entries),
+        created,
+        _with(outcomes, _Outcome.CHANGED),
+        _with(outcomes, _Outcome.COMPLETED),
+        _with(outcomes, _Outcome.KEPT),
+        tuple(transaction.changes),
+        (
+            *(note for _, notes in done.values() for note in notes),
+            *(writer.notes if writer.entries else ()),
+            *name_notes({*keystore.names, *created}, created),
+        ),
+    )
+
+
+def _with(outcomes: Mapping[str, _Outcome], outcome: _Outcome) -> tuple[str, ...]:
+    return tuple(name for name, each in outcomes.items() if each is outcome)
+
+
+def _write_enclave(
+    writer: EnclaveWriter,
+    transaction: Transaction,
+    keystore: _Keystore,
+    name: str,
+    policy: Enclave | None,
+    now: datetime,
+) -> tuple[_Outcome, tuple[Note, ...]]:
+    """Stage what an enclave lacks, and the permissions of its policy if there is one."""
+    present = present_files(transaction.root, name)
+    before = len(transaction.changes)
+    identity = _identity(transaction.root, keystore, name, present, now)
+    rights = None
+    if policy or PERMISSIONS_FILE not in present:
+        enclave = policy or default_rights(keystore.template, name)
+        rights = StatedRights(enclave, keystore.domains)
+    issued = writer.write(Issuance(name, identity, rights))
+    link_shared_files(transaction, name, present)
+    notes = tuple(issued.notes())
+    if not present & {KEY_FILE, REQUEST}:
+        return _Outcome.CREATED, notes
+    if PERMISSIONS_FILE in present and policy:
+        return _Outcome.CHANGED, notes
+    completed = len(transaction.changes) > before
+    return _Outcome.COMPLETED if completed else _Outcome.KEPT, notes
+
+
+def _identity(
+    root: Path, keystore: _Keystore, name: str, present: set[str], now: datetime
+) -> NewIdentity | x509.Certificate:
+    """Return the certificate of an enclave, or what to issue one for; a key is never replaced."""
+    folder = enclave_path(root, name)
+    if CERTIFICATE_FILE in present:
+        if not present & {KEY_FILE, REQUEST}:
+            raise KeystoreError(
+                f"enclave {name} has a certificate but no key",
+                f"Its {KEY_FILE} is missing, and a new key would make the certificate useless.",
+                f"Restore the key, or remove '{folder / CERTIFICATE_FILE}' to have both made "
+                "again.",
+            )
+        return _usable_certificate(root, keystore, name, now)
+    subject = enclave_subject(name, unique=keystore.template.unique_subject)
+    if PERMISSIONS_FILE in present:
+        authority = keystore.authorities.permissions.certificate
+        own = common_name_of(subject)
+        signed_for = _permissions_subjects(folder / PERMISSIONS_FILE, authority)
+        subject = next((each for each in signed_for if common_name_of(each) == own), subject)
+    if KEY_FILE in present:
+        path = folder / KEY_FILE
+        key = load_key(read_bytes(path, "private key"), f"'{path}'")
+        return NewIdentity(subject, key.public_key())
+    new_key = generate_key()
+    return NewIdentity(subject, new_key.public_key(), new_key)
+
+
+def _usable_certificate(
+    root: Path, keystore: _Keystore, name: str, now: datetime
+) -> x509.Certificate:
+    """Return the certificate of an enclave; raise `KeystoreError` where DDS would refuse it."""
+    path = enclave_path(root, name) / CERTIFICATE_FILE
+    certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+    if not issued_by(certificate, keystore.authorities.identity.certificate):
+        raise KeystoreError(
+            f"the certificate of enclave {name} was not issued by the identity CA of this keystore",
+            f"'{path}' names {subject_text(certificate.issuer)} as its issuer, so no node of "
+            "this keystore would talk to it.",
+            "Restore the right certificate, or remove the enclave's folder and create it again.",
+        )
+    validity = validity_of(certificate)
+    if not validity.contains(now):
+        raise KeystoreError(
+            f"the certificate of enclave {name} is not valid now",
+            f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}.",
+            f"Renew it with `sros renew {root} {name}`.",
+        )
+    return certificate
+
+
+def _permissions_subjects(path: Path, authority: x509.Certificate) -> Iterator[x509.Name]:
+    """Yield the subjects that permissions are signed for; none where they cannot be used."""
+    try:
+        signed = smime.parse(read_bytes(path, "permissions document"))
+        signed.verify(authority)
+        grants = parse_permissions(signed.document, f"'{path}'").grants
+        yield from [subject_of(grant.subject) for grant in grants]
+    except (SrosError, ValueError):
+        return

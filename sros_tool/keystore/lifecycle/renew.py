@@ -1,4 +1,4 @@
-"""Renews enclaves: new certificates, and the permissions that they have signed anew."""
+"""Renewing enclaves: a new certificate each, and the same permissions signed again."""
 
 from __future__ import annotations
 
@@ -14,14 +14,23 @@ from sros_tool.keystore.expiry import (
     Credentials,
     Threshold,
     UnreadableEnclave,
-    describe_lifetime,
-    lifetimes,
-    parse_threshold,
     read_credentials,
     refuse_unreadable,
 )
-from sros_tool.keystore.issuing.issuance import Issuance, policies_of, renewed
-from sros_tool.keystore.layout import check_keystore, enclave_folder, has_enclave, list_enclaves
+from sros_tool.keystore.issuing.enclave import (
+    EarlierRights,
+    EnclaveWriter,
+    Issuance,
+    NewIdentity,
+    policies_of,
+)
+from sros_tool.keystore.layout import (
+    KEY_FILE,
+    check_keystore,
+    enclave_path,
+    has_enclave,
+    list_enclaves,
+)
 from sros_tool.keystore.ledger import Entry, append, read_ledger
 from sros_tool.keystore.lifecycle.revocation_list import Lists
 from sros_tool.keystore.lifecycle.revoke import link_everywhere, still_valid
@@ -35,20 +44,19 @@ from sros_tool.names import check_enclave_name
 from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import enclave_subject, issued_by, validity_of
 from sros_tool.pki.crl import Revoked
-from sros_tool.pki.keys import PublicKey, generate_key, key_pem
+from sros_tool.pki.keys import PrivateKey, PublicKey, generate_key
 from sros_tool.validity import iso
 
-__all__ = ["Renewal", "Threshold", "describe_lifetime", "lifetimes", "parse_threshold", "renew"]
+_REASON = "superseded"
 
 
 @dataclass(frozen=True, slots=True)
 class Renewal:
     """What was renewed, or with ``dry_run`` would be.
 
-    ``works_until`` is the last end of a certificate that was replaced and not revoked, if there is
-    one that has not ended.  ``restart`` are the enclaves whose processes go on trusting the
-    revoked ones until they are started again.  ``remarks`` are sentences on what is still to be
-    done.
+    ``works_until`` is the latest expiry of a certificate that was replaced and not revoked, if one
+    has not expired yet.  ``restart`` are the enclaves whose processes go on trusting the revoked
+    ones until they are restarted.  ``remarks`` are sentences on what is still to be done.
     """
 
     root: Path
@@ -63,7 +71,7 @@ class Renewal:
 
 @dataclass(frozen=True, slots=True)
 class _Replaced:
-    """A certificate that another took the place of."""
+    """A certificate that was replaced."""
 
     name: str
     serial: int
@@ -85,11 +93,13 @@ def renew(
 ) -> Renewal:
     """Renew the named enclaves, or all that are due by ``expiring``; all or nothing.
 
-    The certificate is issued anew for the same key, or with ``new_key`` for a new one; the rights
-    stay as they are signed.  Certificate, key and permissions of an enclave change at one moment.
-    A certificate that is replaced works until it ends, for whoever has its files, unless it is
+    The new certificate is for the same key, or with ``new_key`` for a new one; the rights stay as
+    they are signed.  Certificate, key and permissions of an enclave change at one moment.  A
+    certificate that is replaced works until it expires, for whoever has its files, unless it is
     revoked; with ``revoke_old`` all earlier ones of the renewed enclaves are, at the same moment.
-    Raises one error that names every enclave that cannot be renewed.
+
+    Raises:
+        KeystoreError: an enclave cannot be renewed; one error names every such enclave.
     """
     if not dry_run:
         tidy(root)
@@ -100,20 +110,36 @@ def renew(
     with Transaction(root, dry_run=dry_run) as transaction:
         template = load_settings(root)
         authorities = load_authorities(root, template, keyring, now)
-        work = _Renewer(transaction, authorities, template, now, new_key)
-        chosen = dict.fromkeys(names, None)
+        writer = EnclaveWriter(
+            transaction,
+            template,
+            now,
+            identity=authorities.identity,
+            permissions=authorities.permissions,
+        )
+        renewer = _Renewer(transaction, writer, authorities, template, now, new_key=new_key)
         existing = list_enclaves(root) if expiring or revoke_old else ()
+        thresholds: dict[str, Threshold | None] = dict.fromkeys(names)
         if expiring is not None:
-            chosen |= {name: expiring for name in existing if name not in chosen}
-        replaced = work.renew_all(list(chosen.items()), progress)
+            thresholds |= {name: expiring for name in existing if name not in thresholds}
+
+        def renew_one(name: str) -> _Replaced | UnreadableEnclave | None:
+            return renewer.renew_if_due(name, thresholds[name])
+
+        done = writer.for_each(list(thresholds), renew_one, progress)
+        refuse_unreadable(
+            tuple(each for each in done.values() if isinstance(each, UnreadableEnclave)), "renewed"
+        )
+        replaced = [each for each in done.values() if isinstance(each, _Replaced)]
         valid = [each for each in replaced if each.not_after >= now]
-        entries, lists, count = work.issuance.entries, None, 0
+        entries, lists, count = writer.entries, None, 0
         if revoke_old and replaced:
             ledger = read_ledger(root)
             lists = Lists(transaction, authorities.identity, template, keyring, ledger, now)
             revocations = _superseded(replaced, ledger, lists, now)
             count = len(revocations)
-            newly = [Revoked(int(each.serial, 16), _moment(now), _REASON) for each in revocations]
+            date = now.replace(microsecond=0)
+            newly = [Revoked(int(each.serial, 16), date, _REASON) for each in revocations]
             _, signed = lists.sign(newly, existing, incomplete=False)
             entries += [*revocations, *signed]
             link_everywhere(transaction, existing)
@@ -123,7 +149,7 @@ def renew(
         root,
         tuple(each.name for each in replaced),
         tuple(transaction.changes),
-        work.issuance.notes if replaced else (),
+        writer.notes if replaced else (),
         max((each.not_after for each in valid), default=None) if lists is None else None,
         count,
         existing if lists else (),
@@ -131,17 +157,10 @@ def renew(
     )
 
 
-_REASON = "superseded"
-
-
-def _moment(now: datetime) -> datetime:
-    return now.replace(microsecond=0)
-
-
 def _superseded(
     replaced: Sequence[_Replaced], ledger: Sequence[Entry], lists: Lists, now: datetime
 ) -> list[Entry]:
-    """Ledger entries for all earlier certificates that have not ended and are not revoked yet."""
+    """Return ledger entries that revoke all earlier certificates that have not expired yet."""
     listed = {each.serial for each in lists.present.revoked} if lists.present else set()
     issued: dict[str, list[Entry]] = {each.name: [] for each in replaced}
     for entry in ledger:
@@ -162,50 +181,35 @@ def _superseded(
 
 
 class _Renewer:
+    """Renews enclaves one by one, for `EnclaveWriter.for_each`."""
+
     def __init__(
         self,
         transaction: Transaction,
+        writer: EnclaveWriter,
         authorities: Authorities,
         template: Template,
         now: datetime,
+        *,
         new_key: bool,
     ) -> None:
-        self.issuance = Issuance(
-            transaction,
-            template,
-            now,
-            identity=authorities.identity,
-            permissions=authorities.permissions,
-        )
-        self._transaction = transaction
+        self._root = transaction.root
+        self._writer = writer
         self._authorities = authorities
         self._template = template
         self._now = now
         self._new_key = new_key
         self._policies = policies_of(transaction.root)
 
-    def renew_all(
-        self, items: Sequence[tuple[str, Threshold | None]], progress: Progress | None
-    ) -> list[_Replaced]:
-        """Renew each enclave, or that with a threshold if it is due; all, or none."""
-
-        def told(item: tuple[str, Threshold | None], result: object) -> None:
-            if progress and isinstance(result, _Replaced):
-                progress(item[0])
-
-        done = self.issuance.spread(items, self._attempt, told)
-        refuse_unreadable(
-            tuple(each for each in done if isinstance(each, UnreadableEnclave)), "renewed"
-        )
-        return [each for each in done if isinstance(each, _Replaced)]
-
-    def _attempt(self, item: tuple[str, Threshold | None]) -> _Replaced | UnreadableEnclave | None:
-        name, threshold = item
+    def renew_if_due(
+        self, name: str, threshold: Threshold | None
+    ) -> _Replaced | UnreadableEnclave | None:
+        """Renew an enclave; with a ``threshold`` only if it is due, else return None."""
         try:
-            state = read_credentials(self._transaction.root, name)
+            state = read_credentials(self._root, name)
             if threshold and not state.lifetime().due(threshold, self._now):
                 return None
-            self._renew(state)
+            self._writer.write(self._issuance(state))
         except SrosError as error:
             return UnreadableEnclave(name, error)
         old = state.certificate
@@ -213,7 +217,8 @@ class _Renewer:
         until = validity_of(old).not_after
         return _Replaced(name, old.serial_number, state.grant.subject, until)
 
-    def _renew(self, state: Credentials) -> None:
+    def _issuance(self, state: Credentials) -> Issuance:
+        """Return what is issued in place of what an enclave has, after that was verified."""
         name = state.name
         if not issued_by(state.certificate, self._authorities.identity.certificate):
             raise KeystoreError(
@@ -221,22 +226,21 @@ class _Renewer:
                 "keystore"
             )
         state.signed.verify(self._authorities.permissions.certificate)
-        public: PublicKey = state.certificate.public_key()  # type: ignore[assignment]
-        if self._new_key:
-            public = self._make_key(name)
         subject = enclave_subject(name, unique=self._template.unique_subject)
-        certificate = self.issuance.certificate(name, subject, public)
+        if self._new_key:
+            key = self._generate_key(name)
+            identity = NewIdentity(subject, key.public_key(), key)
+        else:
+            public: PublicKey = state.certificate.public_key()  # type: ignore[assignment]
+            identity = NewIdentity(subject, public)
         policy = self._policies.get(state.digest, "")
-        self.issuance.permissions(name, certificate, renewed(state.grant), policy)
+        return Issuance(name, identity, EarlierRights(state.grant, policy))
 
-    def _make_key(self, name: str) -> PublicKey:
-        folder = enclave_folder(name)
-        if not (self._transaction.root / folder / "key.pem").exists():
+    def _generate_key(self, name: str) -> PrivateKey:
+        if not (enclave_path(self._root, name) / KEY_FILE).exists():
             raise KeystoreError(
                 f"the key of enclave {name} is not in this keystore",
                 "It was made on its robot and stays there, so no new one is made here.",
                 "Have a new request made there, and sign it with --renew.",
             )
-        key = generate_key()
-        self._transaction.write(f"{folder}/key.pem", key_pem(key), private=True)
-        return key.public_key()
+        return generate_key()

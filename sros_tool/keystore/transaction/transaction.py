@@ -274,8 +274,8 @@ class Transaction:
         filesystem.flush_file_system(self._stage)
         _bridge(self.root, self._stage, self._moves)
         point_live(self._stage, AFTER)
-        self._report_commit()
         self._undo.clear()
+        self._report_commit()
         with contextlib.suppress(OSError, SrosError):  # it is committed; `_end` tries once more
             recover(self.root)
 
