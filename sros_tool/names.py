@@ -1,15 +1,12 @@
-"""ROS names: their grammar, how a policy's names expand, and what they are called in DDS.
+"""ROS names: their grammar, how a policy's names expand, and the names that ROS itself gives.
 
-Sources: ROS 2 design "Topic and Service Names" and "Topic and Service name mapping to DDS";
-rcl's ``validate_topic_name`` and ``rmw_validate_namespace``; the table of ros2/sros2's
-permission translation.
+Sources: ROS 2 design "Topic and Service Names" and "Actions"; rcl's ``validate_topic_name`` and
+``rmw_validate_namespace``.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
-from typing import NamedTuple
 
 from sros_tool.errors import InvalidNameError
 
@@ -31,6 +28,15 @@ PARAMETER_SERVICES = (
 
 NODE_SERVICES = (*PARAMETER_SERVICES, "get_type_description")
 """All services that a node of ROS 2 Jazzy offers under its own name, as ``~/NAME``."""
+
+ACTION_INSIDE = "/_action/"
+"""Stands between the name of an action and those of its services and topics."""
+
+ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")
+"""The services that an action consists of (ROS 2 design "Actions")."""
+
+ACTION_TOPICS = ("feedback", "status")
+"""The topics that an action consists of; the server publishes them."""
 
 # By far the most names need no closer look: relative, private or absolute, without wildcards.
 _PLAIN = re.compile(r"(?:~?/)?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
@@ -147,69 +153,7 @@ def expand(name: str, ns: str, node: str) -> str:
     return prefix + name
 
 
-class DdsNames(NamedTuple):
-    """The DDS topics behind one right: what its holder writes and what it reads."""
-
-    publish: tuple[str, ...]
-    subscribe: tuple[str, ...]
-
-
-def dds_names(right: str, fqn: str) -> DdsNames:
-    """The DDS topics that ``right`` on the absolute ROS name ``fqn`` stands for.
-
-    ``right`` is publish or subscribe (topics), request or reply (services), call or execute
-    (actions).
-    """
-    return _DDS_NAMES[right](fqn)
-
-
-def _publisher(fqn: str) -> DdsNames:
-    return DdsNames((f"rt{fqn}",), ())
-
-
-def _subscriber(fqn: str) -> DdsNames:
-    return DdsNames((), (f"rt{fqn}",))
-
-
-def _client(fqn: str) -> DdsNames:
-    return DdsNames((f"rq{fqn}Request",), (f"rr{fqn}Reply",))
-
-
-def _server(fqn: str) -> DdsNames:
-    return DdsNames((f"rr{fqn}Reply",), (f"rq{fqn}Request",))
-
-
-def _action_client(fqn: str) -> DdsNames:
-    return DdsNames(_action_requests(fqn), _action_answers(fqn))
-
-
-def _action_server(fqn: str) -> DdsNames:
-    return DdsNames(_action_answers(fqn), _action_requests(fqn))
-
-
-def _action_requests(fqn: str) -> tuple[str, ...]:
-    return (
-        f"rq{fqn}/_action/cancel_goalRequest",
-        f"rq{fqn}/_action/get_resultRequest",
-        f"rq{fqn}/_action/send_goalRequest",
-    )
-
-
-def _action_answers(fqn: str) -> tuple[str, ...]:
-    return (
-        f"rr{fqn}/_action/cancel_goalReply",
-        f"rr{fqn}/_action/get_resultReply",
-        f"rr{fqn}/_action/send_goalReply",
-        f"rt{fqn}/_action/feedback",
-        f"rt{fqn}/_action/status",
-    )
-
-
-_DDS_NAMES: dict[str, Callable[[str], DdsNames]] = {
-    "publish": _publisher,
-    "subscribe": _subscriber,
-    "request": _client,
-    "reply": _server,
-    "call": _action_client,
-    "execute": _action_server,
-}
+def action_part(name: str) -> tuple[str, str]:
+    """Return the action that a service or topic is part of, and which part; "" for any other."""
+    action, _, part = name.rpartition(ACTION_INSIDE)
+    return (action, part) if part in (*ACTION_SERVICES, *ACTION_TOPICS) else ("", "")

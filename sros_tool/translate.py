@@ -7,17 +7,77 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, grant
-from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expand
+from sros_tool.names import ROS_DISCOVERY_TOPIC, expand
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Qualifier
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.protection import DomainProtection, NamedProtection, TopicProtection
-from sros_tool.policy.rights import Right
+from sros_tool.policy.rights import ACTION_PARTS, GOAL, Right
 from sros_tool.validity import Window
+
+SERVICE_ENDS = {"rq": "Request", "rr": "Reply"}
+"""What the topics of a service begin and end with: its requests, and its replies."""
+
+_TOPIC = ("rt", "")
+_REQUESTS, _REPLIES = SERVICE_ENDS.items()
+_Ends = tuple[tuple[str, str], ...]
+_DDS_NAMES: dict[str, tuple[_Ends, _Ends]] = {
+    "publish": ((_TOPIC,), ()),
+    "subscribe": ((), (_TOPIC,)),
+    "request": ((_REQUESTS,), (_REPLIES,)),
+    "reply": ((_REPLIES,), (_REQUESTS,)),
+}
+"""What stands before and behind a ROS name in the topics that a right writes, and reads."""
+
+_DDS_NAMES |= {
+    action: (
+        tuple((begin, inside + end) for part, inside in of for begin, end in _DDS_NAMES[part][0]),
+        tuple((begin, inside + end) for part, inside in of for begin, end in _DDS_NAMES[part][1]),
+    )
+    for action, of in ACTION_PARTS.items()
+}
+
+
+class DdsNames(NamedTuple):
+    """The DDS topics behind one right: what its holder writes and what it reads."""
+
+    publish: tuple[str, ...]
+    subscribe: tuple[str, ...]
+
+
+def dds_names(right: str, fqn: str) -> DdsNames:
+    """Return the DDS topics that ``right`` on the absolute ROS name ``fqn`` stands for.
+
+    ``right`` is publish or subscribe (topics), request or reply (services), call or execute
+    (actions).  Source: ROS 2 design "Topic and Service name mapping to DDS".
+    """
+    written, read = _DDS_NAMES[right]
+    return DdsNames(
+        tuple([begin + fqn + end for begin, end in written]),
+        tuple([begin + fqn + end for begin, end in read]),
+    )
+
+
+def service_of(topic: str) -> tuple[str, str]:
+    """Return the service of a DDS topic, and ``rq`` for its requests or ``rr`` for its replies.
+
+    Both are "" where the topic is not that of a service.
+    """
+    begin, name = topic[:2], topic[2:]
+    end = SERVICE_ENDS.get(begin)
+    if (
+        end is None
+        or not name.startswith("/")
+        or not name.endswith(end)
+        or len(name) < len(end) + 2
+    ):
+        return "", ""
+    return name.removesuffix(end), begin
+
 
 # ── ROS → DDS ──────────────────────────────────────────────────────────────────────────────
 
@@ -53,14 +113,9 @@ class _Topics:
         self.subscribe: set[str] = set()
 
     def add(self, right: str, fqn: str) -> None:
-        if right == "publish":
-            self.publish.add("rt" + fqn)
-        elif right == "subscribe":
-            self.subscribe.add("rt" + fqn)
-        else:
-            names = dds_names(right, fqn)
-            self.publish.update(names.publish)
-            self.subscribe.update(names.subscribe)
+        names = dds_names(right, fqn)
+        self.publish.update(names.publish)
+        self.subscribe.update(names.subscribe)
 
     def is_empty(self) -> bool:
         return not (self.publish or self.subscribe)
@@ -212,11 +267,10 @@ def _candidates(publish: Iterable[str], subscribe: Iterable[str]) -> Iterable[tu
 
     Services of an action are not told apart from it unless some of its topics are missing.
     """
-    goal = "/_action/send_goalRequest"
-    requests_out = [t for t in publish if t.startswith("rq/") and t.endswith("Request")]
-    requests_in = [t for t in subscribe if t.startswith("rq/") and t.endswith("Request")]
-    for kind, cut in (("actions", goal), ("services", "Request")):
-        for right, requests in zip(RIGHTS[kind], (requests_out, requests_in), strict=True):
-            for topic in requests:
-                if topic.endswith(cut):
-                    yield kind, right, topic[2 : -len(cut)]
+    requests_out = [name for name, begin in map(service_of, publish) if begin == "rq"]
+    requests_in = [name for name, begin in map(service_of, subscribe) if begin == "rq"]
+    for kind, end in (("actions", GOAL), ("services", "")):
+        for right, services in zip(RIGHTS[kind], (requests_out, requests_in), strict=True):
+            for service in services:
+                if service.endswith(end):
+                    yield kind, right, service.removesuffix(end)

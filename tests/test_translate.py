@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Permissions, Rule
-from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expand
+from sros_tool.names import ROS_DISCOVERY_TOPIC, expand
 from sros_tool.policy import ALLOW, DENY, RIGHTS, Enclave, Group, Profile, Profiles, Qualifier
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.protection import (
@@ -22,7 +22,7 @@ from sros_tool.policy.protection import (
     NamedProtection,
     TopicProtection,
 )
-from sros_tool.translate import governance_for, permissions_for, ros_rights
+from sros_tool.translate import dds_names, governance_for, permissions_for, ros_rights
 from sros_tool.validity import window
 
 DOMAINS = DomainSet.parse("0,7")

@@ -21,12 +21,20 @@ from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
 from sros_tool.dds.portable import mistaken_names, outside, some_pairs
 from sros_tool.errors import SrosError
 from sros_tool.keystore.issuing.size import Scale, right_bytes
-from sros_tool.names import NODE_SERVICES, PARAMETER_SERVICES, expand, is_expression
+from sros_tool.names import (
+    ACTION_SERVICES,
+    ACTION_TOPICS,
+    NODE_SERVICES,
+    PARAMETER_SERVICES,
+    action_part,
+    expand,
+    is_expression,
+)
 from sros_tool.pki.certificates import common_name, subject_text
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Policy, Profile, Source
 from sros_tool.policy.patterns import covers, literal_prefix, matches, overlap
-from sros_tool.policy.rights import Right, Rules, parts, policy_rights
+from sros_tool.policy.rights import GOAL, WHOLE, Right, Rules, parts, policy_rights
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
 from sros_tool.xml import parse, read_bytes
@@ -169,8 +177,6 @@ NAMING_KINDS = by_id(
 _LONGEST = 247
 _DIGIT_FIRST = re.compile(r"/(?:[0-9]|\[[0-9-]+\])")
 _DDS_PREFIX = re.compile(r"/?(?:rt|rq|rr|rs)/")
-_ACTION_SERVICE = re.compile(r"/_action/(?:send_goal|cancel_goal|get_result)\Z")
-_ACTION_TOPIC = re.compile(r"/_action/(?:feedback|status)\Z")
 _GLOBAL_TOPICS = ("/rosout", "/parameter_events", "/clock", "/tf", "/tf_static", "/diagnostics")
 _ALL = re.compile(r"/?[*?]*\*[*?]*\Z")
 _OTHER_SIDE = {"subscribe": "publish", "request": "reply", "call": "execute"}
@@ -202,7 +208,7 @@ def check_counterparts(checked: CheckedPolicy) -> Iterator[Finding]:
         if not other or not each.allows or is_expression(name) or name in _GLOBAL_TOPICS:
             continue
         if name not in names[other] and not any(matches(wide, name) for wide in wild[other]):
-            if _ACTION_TOPIC.search(name) or _ACTION_SERVICE.search(name):
+            if action_part(name)[1]:
                 continue  # it stands as an action there
             yield each.found(NO_COUNTERPART, f"no enclave may {other} {name}")
 
@@ -217,9 +223,11 @@ def _belongs(each: Stated) -> str:
     """The kind that the name has everywhere, where it is another than here."""
     kind, name = each.right.kind, each.name
     if kind != "services":
-        is_service = name.rpartition("/")[2] in NODE_SERVICES or _ACTION_SERVICE.search(name)
+        is_service = (
+            name.rpartition("/")[2] in NODE_SERVICES or action_part(name)[1] in ACTION_SERVICES
+        )
         return "services" if is_service else ""
-    return "topics" if name in _GLOBAL_TOPICS or _ACTION_TOPIC.search(name) else ""
+    return "topics" if name in _GLOBAL_TOPICS or action_part(name)[1] in ACTION_TOPICS else ""
 
 
 def _breadth(each: Stated) -> Iterator[Finding]:
@@ -515,9 +523,6 @@ HALF_ACTION = Kind(
 
 RULES_KINDS = by_id(CONTRADICTION, UNREACHABLE, NO_EFFECT, RULES_REDUNDANT, HALF_ACTION)
 
-_GOAL = "/_action/send_goal"
-_WHOLE = {"request": "call", "reply": "execute"}
-
 
 def check_rules(checked: CheckedPolicy) -> Iterator[Finding]:
     """Every statement against the others of its enclave."""
@@ -540,9 +545,9 @@ def _permission(each: Stated, rules: Rules) -> Iterator[Finding]:
         else:
             yield each.found(UNREACHABLE, f"{each.right.told()} is denied by {shown}")
         return
-    if each.name.endswith(_GOAL) and each.right.right in _WHOLE:
-        action = each.name.removesuffix(_GOAL)
-        whole = _WHOLE[each.right.right]
+    if each.name.endswith(GOAL) and each.right.right in WHOLE:
+        action = each.name.removesuffix(GOAL)
+        whole = WHOLE[each.right.right]
         if not rules.allow(each.right.enclave, whole, action):
             text = f"{each.name} is allowed, but not all that it takes to {whole} {action}"
             yield each.found(HALF_ACTION, text)

@@ -31,7 +31,8 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.reader import load_ca_certificate, load_governance, load_settings
 from sros_tool.keystore.template import Template
-from sros_tool.names import NODE_SERVICES, dds_names
+from sros_tool.names import NODE_SERVICES
+from sros_tool.translate import dds_names
 from sros_tool.pki import smime
 from sros_tool.policy.patterns import matches
 

@@ -16,7 +16,16 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, UsageError
 from sros_tool.graph.learn import CommonParts, Learned, LearnedProfile, Right, groups_of
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
-from sros_tool.names import NODE_SERVICES, check_enclave_name, expression_problem, is_expression
+from sros_tool.names import (
+    ACTION_INSIDE,
+    ACTION_SERVICES,
+    ACTION_TOPICS,
+    NODE_SERVICES,
+    action_part,
+    check_enclave_name,
+    expression_problem,
+    is_expression,
+)
 from sros_tool.policy.model import Policy
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.rights import profile_rights
@@ -27,6 +36,7 @@ from sros_tool.runtime.vendor_log import (
     SECURITY_DIRECTORY,
     denied_topic,
 )
+from sros_tool.translate import service_of
 
 _NEAR_LINES = 3
 """How many lines after a denial are still about it."""
@@ -137,19 +147,16 @@ def propose(denials: Iterable[Denial]) -> MissingRights:
     )
 
 
-_SERVICE = re.compile(r"r(?P<side>[qr])(?P<name>/.+?)(?P<end>Request|Reply)\Z")
-_ACTION = re.compile(r"(?P<name>/.+)/_action/(?:send_goal|cancel_goal|get_result)\Z")
-
-
 _OWN_SERVICE = re.compile(rf"(?P<node>/.+)/(?:{'|'.join(NODE_SERVICES)})\Z")
 
 
 def serving_node(denial: Denial) -> str:
     """The full name of the node, where a service that every node offers is what it is denied."""
-    if denial.remote or not (service := _SERVICE.match(denial.topic)):
+    service, begin = service_of(denial.topic)
+    if denial.remote or not service:
         return ""
-    offered = (service["side"] == "q") == (denial.direction == SUBSCRIBE)
-    own = _OWN_SERVICE.match(service["name"])
+    offered = (begin == "rq") == (denial.direction == SUBSCRIBE)
+    own = _OWN_SERVICE.match(service)
     return own["node"] if own and denial.direction and offered else ""
 
 
@@ -162,27 +169,28 @@ def nodes_served(rights: Iterable[tuple[str, str]]) -> tuple[str, ...]:
 def _is_ros(topic: str) -> bool:
     if is_expression(topic) or expression_problem(topic[2:]):
         return False  # a topic that is named like a wildcard must not become one
-    return topic.startswith("rt/") or _SERVICE.match(topic) is not None
+    return topic.startswith("rt/") or bool(service_of(topic)[0])
 
 
 def _right(denial: Denial) -> Right:
-    service = _SERVICE.match(denial.topic)
-    if service is None:
+    service, begin = service_of(denial.topic)
+    if not service:
         return Right(denial.direction, denial.topic[2:])
-    client = (service["side"] == "q") == (denial.direction == PUBLISH)
-    if action := _ACTION.match(service["name"]):
-        return Right("call" if client else "execute", action["name"])
-    return Right("request" if client else "reply", service["name"])
+    client = (begin == "rq") == (denial.direction == PUBLISH)
+    action, part = action_part(service)
+    if action and part in ACTION_SERVICES:
+        return Right("call" if client else "execute", action)
+    return Right("request" if client else "reply", service)
 
 
 def _without_parts(rights: set[Right]) -> frozenset[Right]:
     """The rights without the topics that an action among them stands for."""
     parts = {
-        Right(way, f"{each.name}/_action/{topic}")
+        Right(way, f"{each.name}{ACTION_INSIDE}{topic}")
         for each in rights
         for way in ({"call": SUBSCRIBE, "execute": PUBLISH}.get(each.right),)
         if way
-        for topic in ("feedback", "status")
+        for topic in ACTION_TOPICS
     }
     return frozenset(rights - parts)
 

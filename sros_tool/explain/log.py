@@ -20,6 +20,7 @@ from sros_tool.explain.question import Part, Question, ask
 from sros_tool.explain.remedy import remedy
 from sros_tool.faults import Fault
 from sros_tool.graph.observation import PUBLISH
+from sros_tool.names import ACTION_INSIDE
 from sros_tool.policy.patterns import covers
 from sros_tool.runtime.vendor_log import (
     CONTINUED,
@@ -33,7 +34,7 @@ from sros_tool.runtime.vendor_log import (
     plain_refusal,
     plain_text,
 )
-from sros_tool.translate import grant_rights
+from sros_tool.translate import SERVICE_ENDS, grant_rights
 
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
 """The forms of a topic in a line: between punctuation, or with it where it has some itself."""
@@ -367,10 +368,10 @@ def _nothing_found(enclave: LoadedEnclave) -> str:
 
 
 _HALVES = {
-    ("rq", "publish"): ("call", "Request"),
-    ("rq", "subscribe"): ("serve", "Request"),
-    ("rr", "publish"): ("serve", "Reply"),
-    ("rr", "subscribe"): ("call", "Reply"),
+    ("rq", "publish"): ("call", SERVICE_ENDS["rq"]),
+    ("rq", "subscribe"): ("serve", SERVICE_ENDS["rq"]),
+    ("rr", "publish"): ("serve", SERVICE_ENDS["rr"]),
+    ("rr", "subscribe"): ("call", SERVICE_ENDS["rr"]),
 }
 
 
@@ -379,7 +380,7 @@ def _in_ros_terms(denial: Denial) -> tuple[str, str]:
     prefix, topic = denial.topic[:2], denial.topic[2:]
     if (prefix, denial.direction) in _HALVES:
         word, end = _HALVES[prefix, denial.direction]
-        name, part, _ = topic.removesuffix(end).partition("/_action/")
+        name, part, _ = topic.removesuffix(end).partition(ACTION_INSIDE)
         return ("execute" if part and word == "serve" else word), name
     if prefix == "rt" and topic.startswith("/"):
         return denial.direction or "use", topic

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 from sros_tool.dds.decision.answers import Verb
 from sros_tool.errors import UsageError
-from sros_tool.names import ROS_DISCOVERY_TOPIC, dds_names, expression_problem, is_expression
+from sros_tool.names import ROS_DISCOVERY_TOPIC, expression_problem, is_expression
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right
+from sros_tool.translate import dds_names, service_of
 
 JOIN = "join"
 TYPES = ("topic", "service", "action")
@@ -29,7 +30,7 @@ _RIGHTS = {
 WORDS = (*dict.fromkeys(word for word, _ in _RIGHTS), JOIN)
 """What can be asked for; request and reply are the policy's words for call and serve."""
 
-_ENDS = {"rq": ("Request", "requests"), "rr": ("Reply", "replies")}
+_ROLES = {"rq": "requests", "rr": "replies"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,6 +139,7 @@ def _a(kind: str) -> str:
 def _role(topic: str, kind: str) -> str:
     if kind == "topic":
         return ""
-    end, word = _ENDS.get(topic[:2], ("", ""))
-    last = topic.removesuffix(end).rpartition("/")[2]
+    service, begin = service_of(topic)
+    word = _ROLES.get(begin, "")
+    last = (service or topic).rpartition("/")[2]
     return f"{last} {word}".rstrip() if kind == "action" else word

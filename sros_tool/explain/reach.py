@@ -17,10 +17,11 @@ from functools import lru_cache
 from itertools import product
 
 from sros_tool.dds.governance import Governance
-from sros_tool.names import dds_names, is_expression
+from sros_tool.names import ACTION_INSIDE, is_expression
 from sros_tool.policy.model import DENY
 from sros_tool.policy.patterns import common_name, literal_prefix, matches, overlap
 from sros_tool.policy.rights import Right
+from sros_tool.translate import SERVICE_ENDS, dds_names
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +57,10 @@ def unguarded(governance: Governance) -> Iterator[Unguarded]:
 OF_EVERY_NODE = ("/parameter_events",)
 """Topics that every node publishes and reads: with them, everybody influences everybody."""
 
-_ACTION = "/_action/"
 _SAID_AS = {
     "rt": ("topics", "publish", ""),
-    "rq": ("services", "request", "Request"),
-    "rr": ("services", "reply", "Reply"),
+    "rq": ("services", "request", SERVICE_ENDS["rq"]),
+    "rr": ("services", "reply", SERVICE_ENDS["rr"]),
 }
 """What a ROS node does that writes a DDS topic of this prefix, and how such a topic ends."""
 
@@ -263,7 +263,7 @@ def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
     return (
         topic == "rt/rosout",
         kind == "rr/",
-        kind != "rt/" or _ACTION in topic,
+        kind != "rt/" or ACTION_INSIDE in topic,
         is_expression(topic),
         topic,
     )
@@ -308,7 +308,7 @@ def _in_ros_terms(topic: str) -> tuple[str, str, str]:
     name = _ros_part(topic, topic[:2], end) if kind else ""
     if not name.startswith("/"):
         return "dds", "publish", topic
-    action, part, _ = name.partition(_ACTION)
+    action, part, _ = name.partition(ACTION_INSIDE)
     if part and action:
         return "actions", "call" if right == "request" else "execute", action
     return kind, right, name

@@ -19,6 +19,7 @@ from sros_tool.dds.permissions import Criteria, Rule
 from sros_tool.errors import DocumentError, InvalidNameError, Note
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE, Endpoint, Observation, ObservedNode
 from sros_tool.names import (
+    ACTION_INSIDE,
     check_enclave_name,
     check_namespace,
     expand,
@@ -407,7 +408,7 @@ def _rights_of(node: ObservedNode, remarks: Remarks) -> list[tuple[_Place, froze
 
 
 def _remark_on(right: Right, node: ObservedNode, remarks: Remarks) -> None:
-    if "/_action/" in right.name:
+    if ACTION_INSIDE in right.name:
         remarks.add("partial-action", f"{node.fqn} {right.right} {right.name}")
     elif right.name.endswith("/_service_event"):
         remarks.add("service-event", f"{node.fqn} {right.right} {right.name}")

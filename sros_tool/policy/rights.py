@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from sros_tool.names import expand, is_expression
+from sros_tool.names import ACTION_INSIDE, ACTION_SERVICES, ACTION_TOPICS, expand, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Profile, Qualifier
 from sros_tool.policy.patterns import covers, overlap
 from sros_tool.values import shows
@@ -23,14 +23,23 @@ KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
 RIGHT_ORDER = {right: number for number, right in enumerate(KIND_OF)}
 """The order in which rights are told: publish, subscribe, request, reply, call, execute."""
 
-_GOAL = "/_action/send_goal"
-_SERVICES = ("/_action/cancel_goal", "/_action/get_result", _GOAL)
-_TOPICS = ("/_action/feedback", "/_action/status")
-_PARTS = {
-    "call": tuple([("request", s) for s in _SERVICES] + [("subscribe", t) for t in _TOPICS]),
-    "execute": tuple([("reply", s) for s in _SERVICES] + [("publish", t) for t in _TOPICS]),
+WHOLE = {"request": "call", "reply": "execute"}
+"""The right to an action that consists of that right to its services."""
+
+ACTION_PARTS: dict[str, tuple[tuple[str, str], ...]] = {
+    action: tuple(
+        [(of_services, f"{ACTION_INSIDE}{each}") for each in ACTION_SERVICES]
+        + [(of_topics, f"{ACTION_INSIDE}{each}") for each in ACTION_TOPICS]
+    )
+    for action, of_services, of_topics in (
+        ("call", "request", "subscribe"),
+        ("execute", "reply", "publish"),
+    )
 }
-_WHOLE = {"request": "call", "reply": "execute"}
+"""What a right to an action consists of: rights, and what follows the name of the action."""
+
+GOAL = f"{ACTION_INSIDE}send_goal"
+"""Follows the name of an action in the service by which it is recognised."""
 
 
 @shows("enclave", "qualifier", "kind", "right", "name")
@@ -105,7 +114,7 @@ def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
 
 def parts(right: Right) -> tuple[Right, ...]:
     """The topics and services that a right stands for: itself, or the five parts of an action."""
-    found = _PARTS.get(right.right)
+    found = ACTION_PARTS.get(right.right)
     if found is None:
         return (right,)
     return tuple(
@@ -122,9 +131,9 @@ def folded(rights: Iterable[Right]) -> frozenset[Right]:
     """The normal form: all parts of an action are told as the action, and not a second time."""
     remaining = set(unfolded(rights))
     actions = [
-        Right(each.enclave, each.qualifier, _WHOLE[each.right], each.name.removesuffix(_GOAL))
+        Right(each.enclave, each.qualifier, WHOLE[each.right], each.name.removesuffix(GOAL))
         for each in remaining
-        if each.right in _WHOLE and each.name.endswith(_GOAL) and each.name.startswith("/")
+        if each.right in WHOLE and each.name.endswith(GOAL) and each.name.startswith("/")
     ]
     whole = [each for each in actions if each.name and remaining.issuperset(parts(each))]
     for each in whole:

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
-from sros_tool.names import dds_names, is_expression
+from sros_tool.names import ACTION_INSIDE, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Qualifier
 from sros_tool.policy.patterns import covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import (
@@ -42,6 +42,7 @@ from sros_tool.report.picture import (
     Validity,
     WireLevel,
 )
+from sros_tool.translate import dds_names
 
 _OVERLAYS = {
     "use": Overlay("use", "allowed, never observed", "observed, not allowed"),
@@ -373,7 +374,7 @@ def edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = ()
     edges = []
     for (enclave, kind, right, name), found in topics.items():
         qualifier = DENY if DENY in found else ALLOW
-        action, inside, part = name.rpartition(_INSIDE)
+        action, inside, part = name.rpartition(ACTION_INSIDE)
         if inside and (action in known.actions or is_expression(action)):
             whole[enclave, action, qualifier][right, part] = found[qualifier]
             continue
@@ -420,7 +421,7 @@ def _by(names: set[str], *, action: bool = False) -> tuple[str, ...]:
     if "" in names:
         return ()
     return tuple(
-        sorted({each.rpartition(_INSIDE)[0] or each if action else each for each in names})
+        sorted({each.rpartition(ACTION_INSIDE)[0] or each if action else each for each in names})
     )
 
 

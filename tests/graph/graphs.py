@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, make_observation
-from sros_tool.names import dds_names, expand
+from sros_tool.names import expand
+from sros_tool.translate import dds_names
 
 SERVICES = (
     "describe_parameters",

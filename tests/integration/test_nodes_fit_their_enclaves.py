@@ -31,11 +31,12 @@ from sros_tool.demo.scenarios.model import DENIALS, Party, Relation, Role, Row, 
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
-from sros_tool.names import NODE_SERVICES, ROS_DISCOVERY_TOPIC, dds_names, expand
+from sros_tool.names import NODE_SERVICES, ROS_DISCOVERY_TOPIC, expand
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, subject_text
 from sros_tool.policy import Enclave, read_policy
 from sros_tool.resources import policies_dir
+from sros_tool.translate import dds_names
 from tests.integration.test_policies_live import all_dds_endpoints, observed_in, run_script, without
 
 pytestmark = [

@@ -30,6 +30,7 @@ from sros_tool.errors import SrosError
 from sros_tool.runtime.cyclone import Participant, Reader, SecurityRefusedError, Writer
 from sros_tool.runtime.events import EventWriter, Kind, Stage
 from sros_tool.runtime.rcl_security import choose_loadable, domain_of
+from sros_tool.translate import dds_names
 
 _POLL_SECONDS = 0.02
 
@@ -91,7 +92,7 @@ class _Service:
     """One side of a service: what it sends on one topic, and takes from another."""
 
     def __init__(self, participant: Participant, name: str, *, server: bool) -> None:
-        request, reply = f"rq{name}Request", f"rr{name}Reply"
+        (request,), (reply,) = dds_names("request", name)
         self._reader: Reader = participant.reader(request if server else reply)
         self._writer: Writer = participant.writer(reply if server else request)
 

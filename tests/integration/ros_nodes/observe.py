@@ -18,8 +18,9 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-from sros_tool.names import NODE_SERVICES, dds_names, expand
+from sros_tool.names import NODE_SERVICES, expand
 from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
+from sros_tool.translate import dds_names
 
 Process = list[dict[str, Any]] | dict[str, Any]
 RUN_NODES = Path(__file__).with_name("run_nodes.py")
