@@ -16,11 +16,10 @@ from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
 from sros_tool.explain.answer import Answer, lines_of_right
 from sros_tool.explain.evaluator import Evaluator, plan_enclave
-from sros_tool.translate import dds_names
 from sros_tool.policy.document import write_policy
 from sros_tool.policy.model import DENY, Enclave, Group, Policy, Profile, Profiles, Source
 from sros_tool.policy.rights import Right, profile_rights
-from sros_tool.translate import grant_rights
+from sros_tool.translate import dds_names, grant_rights
 
 _NO_RULE = frozenset({"no-rule", "default"})
 
