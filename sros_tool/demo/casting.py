@@ -32,9 +32,9 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import load_ca_certificate, load_governance, load_settings
 from sros_tool.keystore.template import Template
 from sros_tool.names import NODE_SERVICES
-from sros_tool.translate import dds_names
 from sros_tool.pki import smime
 from sros_tool.policy.patterns import matches
+from sros_tool.translate import dds_names
 
 _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events", "rt/clock", "ros_discovery_info")
 _NODE_MARK = ("rr", f"/{NODE_SERVICES[0]}Reply")

@@ -33,10 +33,9 @@ from sros_tool.errors import SrosError
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.template import Template
-from sros_tool.names import ACTION_INSIDE
 from sros_tool.runtime.environment import DOMAIN, secured_environment
 from sros_tool.runtime.stacks import ProbeEnclave
-from sros_tool.translate import dds_names, service_of
+from sros_tool.translate import dds_names
 
 _RIGHTS = {
     Role.TALKER: "publish",
