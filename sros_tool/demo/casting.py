@@ -31,10 +31,10 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.reader import load_ca_certificate, load_governance, load_settings
 from sros_tool.keystore.template import Template
-from sros_tool.names import NODE_SERVICES
+from sros_tool.names import ACTION_INSIDE, NODE_SERVICES
 from sros_tool.pki import smime
 from sros_tool.policy.patterns import matches
-from sros_tool.translate import dds_names
+from sros_tool.translate import dds_names, service_of
 
 _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events", "rt/clock", "ros_discovery_info")
 _NODE_MARK = ("rr", f"/{NODE_SERVICES[0]}Reply")
@@ -160,8 +160,9 @@ def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
     found: dict[str, str] = {}
     for server, client in permutations(rights, 2):
         for topic in topics_of_its_own(rights[server], "publish"):
-            if topic.startswith("rr/") and topic.endswith("Reply") and "/_action/" not in topic:
-                request = f"rq{topic[2:].removesuffix('Reply')}Request"
+            service, begin = service_of(topic)
+            if begin == "rr" and ACTION_INSIDE not in service:
+                request = dds_names("request", service).publish[0]
                 if "parameter" not in topic and may(rights[client], "publish", request):
                     found = {"server": server, "client": client}
                     if not may(rights[client], "publish", topic):
@@ -172,8 +173,9 @@ def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
 def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     """Return the service that the server of a cast offers and its client calls."""
     for topic in topics_of_its_own(rights[cast["server"]], "publish"):
-        name = topic[2:].removesuffix("Reply")
-        if topic == f"rr{name}Reply" and may(rights[cast["client"]], "publish", f"rq{name}Request"):
+        name, begin = service_of(topic)
+        requests = dds_names("request", name).publish[0]
+        if begin == "rr" and may(rights[cast["client"]], "publish", requests):
             return name
     return SERVICE
 
@@ -237,7 +239,7 @@ def may(grant: Grant, verb: str, topic: str) -> bool:
 def topics_of_its_own(grant: Grant, verb: str) -> Iterator[str]:
     """Yield the DDS topics without wildcards that a grant allows, but for those of every node."""
     for topic in _allowed(grant, verb):
-        private = topic.startswith("rt/_") or "/_action/" in topic
+        private = topic.startswith("rt/_") or ACTION_INSIDE in topic
         if topic not in _TOPICS_OF_EVERY_NODE and not private:
             yield topic
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
 
+from sros_tool.translate import dds_names
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.demo.backend import AUTO, RCLPY, Backend, choose_backend, conditions
 from sros_tool.demo.casting import UserKeystore, open_user_keystore
@@ -188,7 +189,7 @@ def _with_chosen_rows(options: DemoOptions) -> tuple[Scenario, ...]:
 
 def _dds_topic(row: Row, topic: str) -> str:
     """Return the DDS topic whose protection decides a row; of a service, its request topic."""
-    return f"rq{row.ros_name}Request" if row.ros_name else f"rt{topic}"
+    return dds_names("request", row.ros_name).publish[0] if row.ros_name else f"rt{topic}"
 
 
 def _asked_for(row: Row, options: DemoOptions) -> bool:

@@ -345,11 +345,10 @@ class Known:
         return found
 
 
-_INSIDE = "/_action/"
 _NO_ACTION = Right("", ALLOW, "call", "")
 _WHOLE: dict[str, frozenset[tuple[str, str]]] = {
     right: frozenset(
-        (part.right, part.name.removeprefix(_INSIDE))
+        (part.right, part.name.removeprefix(ACTION_INSIDE))
         for part in parts(_NO_ACTION._replace(right=right))
     )
     for right in ("call", "execute")
