@@ -15,7 +15,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
 
-from sros_tool.translate import dds_names
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.demo.backend import AUTO, RCLPY, Backend, choose_backend, conditions
 from sros_tool.demo.casting import UserKeystore, open_user_keystore
@@ -30,6 +29,7 @@ from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC, check_topic
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.runtime.netns import Isolation, try_isolation
+from sros_tool.translate import dds_names
 
 _DEFAULT_DOMAIN = 80
 """The rows take this domain and those after it: below 102, where Linux hands out no port."""
