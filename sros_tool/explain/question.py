@@ -69,7 +69,7 @@ class Question:
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """The endpoints that are needed; none for joining."""
+        """The endpoints that it needs; none for joining."""
         if self.only or not self.right:
             return self.only
         names = dds_names(self.right, self.name)
@@ -78,7 +78,7 @@ class Question:
         return (*published, *read)
 
     def allowed(self, enclave: str) -> Right:
-        """The right that a policy would have to state."""
+        """Return the right that a policy would have to state."""
         return Right(enclave, ALLOW, self.right, self.name)
 
     def __str__(self) -> str:
@@ -87,13 +87,19 @@ class Question:
 
 
 def ask(word: str, name: str = "", kind: str | None = None) -> Question:
-    """The question of the command line: ``call /add``, with ``kind`` topic, service or action.
+    """Return the question of the command line, as of ``call /add``.
 
-    Without ``kind``, call means a service.  Raises `UsageError` for what no node can do.
+    Args:
+        word: One of `WORDS`.
+        name: An absolute ROS name; "" for joining.
+        kind: What the name is: topic, service or action. Without it, call means a service.
+
+    Raises:
+        UsageError: No node can do that, or the name is none that a node could use.
     """
     if word not in WORDS:
         raise UsageError(
-            f"{word!r} is nothing that an enclave could do",
+            f"unknown action {word!r}",
             "",
             f"Ask for {', '.join(WORDS[:-1])} or {WORDS[-1]}.",
         )
@@ -114,6 +120,7 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
 
 
 def _checked(name: str, word: str, kind: str) -> str:
+    """Return the name, if a node can use it."""
     if not name:
         raise UsageError(f"{word} needs the name of {_a(kind)}", "", f"Write `{word} /NAME`.")
     problem = expression_problem(name)
@@ -137,6 +144,7 @@ def _a(kind: str) -> str:
 
 
 def _role(topic: str, kind: str) -> str:
+    """Return what a DDS topic is for in a service or action, as ``send_goal requests``."""
     if kind == "topic":
         return ""
     service, begin = service_of(topic)

@@ -1,9 +1,9 @@
-"""The environment in which a process runs secured: what rcl and the RMWs read.
+"""The environment and the arguments with which a process runs secured: what rcl and the RMWs read.
 
-Source: rcl 9.x ``security.c``, ``rcl/src/rcl/domain_id.c``.
+ROS_SECURITY_ENCLAVE_OVERRIDE secures a process, and the ROS graph does not show it; the graph shows
+the enclave of ``--ros-args --enclave``.
 
-ROS_SECURITY_ENCLAVE_OVERRIDE secures a process, and the ROS graph does not show it; what it shows
-is the enclave of ``--ros-args --enclave`` (rcl, security.c and context.c).
+Source: rcl 9.x ``security.c``, ``context.c`` and ``domain_id.c``.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ STRATEGY = "ROS_SECURITY_STRATEGY"
 ENCLAVE = "ROS_SECURITY_ENCLAVE_OVERRIDE"
 DOMAIN = "ROS_DOMAIN_ID"
 
-_DOMAIN = re.compile(r"(?:0|[1-9]\d*)\Z", re.ASCII)
+_DOMAIN_ID = re.compile(r"(?:0|[1-9]\d*)\Z", re.ASCII)
 
 
 def domain_from(environment: Mapping[str, str]) -> int | None:
-    """ROS_DOMAIN_ID as a number, or None where it is unset or empty.
+    """Return ROS_DOMAIN_ID as a number, or None where it is unset or empty.
 
-    Raises `UsageError` where it is no domain id (rcl then refuses to start, too).
+    Raises:
+        UsageError: It is not a domain id; rcl then refuses to start, too.
     """
     text = environment.get(DOMAIN, "")
     if not text:
         return None
     # rcl reads a leading zero as octal (strtoul with base 0): 010 would be domain 8 to a node.
-    domain = DomainSet.parse(text, DOMAIN).only() if _DOMAIN.match(text) else None
+    domain = DomainSet.parse(text, DOMAIN).only() if _DOMAIN_ID.match(text) else None
     if domain is None:
         raise UsageError(
             f"{DOMAIN} is {text!r}, which is not a domain id",
@@ -47,10 +48,13 @@ def domain_from(environment: Mapping[str, str]) -> int | None:
 
 
 def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
-    """The domain for a process of a keystore that is made for ``domains``.
+    """Return the domain for a process of the keystore at ``root``, which is made for ``domains``.
 
     It is the one that is ``wanted`` (by an option or ROS_DOMAIN_ID); else 0, as ROS does, where
-    the keystore has it; else the keystore's only domain, or its first one.
+    the keystore has it; else the keystore's first one.
+
+    Raises:
+        KeystoreError: The keystore is not for the domain that is wanted.
     """
     if wanted is not None:
         if wanted not in domains:
@@ -65,7 +69,7 @@ def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
 
 
 def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
-    """The variables with which a process runs in enclave ``name``, and not at all otherwise."""
+    """Return the variables with which a process runs in enclave ``name``, or does not start."""
     return {
         KEYSTORE: str(root.absolute()),
         ENABLE: "true",
@@ -76,9 +80,12 @@ def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
 
 
 def render_environment(variables: Mapping[str, str], form: str) -> str:
-    """The variables as text for ``sh``, ``fish``, ``json``, ``systemd`` or ``docker``.
+    """Return the variables as text in one of `FORMS`.
 
     ``docker`` is an env-file, ``systemd`` the lines of a unit; neither can hold a line break.
+
+    Raises:
+        UsageError: A value has a line break that the form cannot hold.
     """
     if form == "json":
         return json.dumps(dict(variables), indent=2) + "\n"
@@ -109,14 +116,15 @@ def _docker(name: str, value: str) -> str:
 _LINES = {"sh": _sh, "fish": _fish, "systemd": _systemd, "docker": _docker}
 FORMS = ("sh", "fish", "json", "systemd", "docker")
 
+# ── the command line of a node ─────────────────────────────────────────────────────────────
 
 _ROS_ARGS = "--ros-args"
-_ENCLAVE = re.compile(r"(?:-e|--enclave)\Z")
+_ENCLAVE_OPTION = re.compile(r"(?:-e|--enclave)\Z")
 _PYTHON = re.compile(r"python[\d.]*\Z")
 
 
 def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
-    """The command with ``--ros-args --enclave``, if it is known to start a ROS node.
+    """Return the command with ``--ros-args --enclave``, if it is known to start a ROS node.
 
     Known are ``ros2 run``, an executable of a ROS package (``lib/PACKAGE/NAME``), also of Python,
     and whatever has ``--ros-args`` already.  A command that names an enclave keeps it.
@@ -125,7 +133,7 @@ def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
     if Path(command[0]).name == "ros2" and not _is_ros2_run(command):
         return command
     ros_args = command[command.index(_ROS_ARGS) :] if _ROS_ARGS in command else ()
-    if any(_ENCLAVE.match(word) for word in ros_args):
+    if any(_ENCLAVE_OPTION.match(word) for word in ros_args):
         return command
     if ros_args or _is_ros2_run(command) or _is_of_package(command):
         return (*command, _ROS_ARGS, "--enclave", enclave)

@@ -1,8 +1,8 @@
 """What a watched process reports while it runs: one JSON object per line, appended to a file.
 
 Times are seconds of CLOCK_MONOTONIC, which all processes of a machine share.  A line is written
-with one system call, so that a reader never mixes two; a last line without its end is left for
-the next look.
+with one system call, so that a reader never mixes two; an unfinished last line is left for the
+next read.
 """
 
 from __future__ import annotations
@@ -96,14 +96,18 @@ class EventWriter:
 
 
 class EventReader:
-    """Reads what has been appended since the last look; a file not there yet is empty."""
+    """Reads what has been appended since the last read; a file not there yet is empty."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._position = 0
 
     def new_events(self) -> list[Event]:
-        """The whole lines that have come since the last call.  Raises `DocumentError`."""
+        """Return the events of the whole lines that have come since the last call.
+
+        Raises:
+            DocumentError: A line is not an event.
+        """
         try:
             with self._path.open("rb") as file:
                 file.seek(self._position)
@@ -116,7 +120,11 @@ class EventReader:
 
 
 def read_events(path: Path) -> list[Event]:
-    """All events in a file, oldest first.  Raises `DocumentError`."""
+    """Return all events in a file, oldest first.
+
+    Raises:
+        DocumentError: A line is not an event.
+    """
     return EventReader(path).new_events()
 
 
@@ -133,5 +141,5 @@ def _parse(line: bytes, path: Path) -> Event:
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DocumentError(
-            f"cannot read the report {path}", f"A line is not ours: {error}."
+            f"cannot read the report {path}", f"A line is not an event: {error}."
         ) from error

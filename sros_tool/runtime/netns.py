@@ -1,4 +1,4 @@
-"""Give the calling process a network of its own, so that a demo neither disturbs nor is disturbed.
+"""Give the calling process a network of its own, so that a demo and the host do not interfere.
 
 The network namespace holds nothing but a loopback interface, and vanishes with the last process
 in it.  Root needs CAP_SYS_ADMIN; everybody else a user namespace, which also grants the right to
@@ -58,7 +58,7 @@ class _RouteEntry(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Isolation:
-    """Whether a network of its own is to be had, and the reason where it is not."""
+    """Whether a process can get a network of its own, and the reason where it cannot."""
 
     isolated: bool
     reason: str = ""
@@ -93,8 +93,9 @@ def try_isolation() -> Isolation:
 def enter_isolation() -> None:
     """Move this process, with one thread only, into a network namespace of its own.
 
-    Raises `OSError` where the kernel does not let it; the process may then be half way (in a user
-    namespace without rights), so ask `try_isolation` first.
+    Raises:
+        OSError: The kernel does not allow it. The process may then be half way (in a user namespace
+            without rights), so call `try_isolation` first.
     """
     user, group = os.getuid(), os.getgid()
     try:

@@ -1,4 +1,4 @@
-"""The process in which one DDS is asked whether it enforces security; started by `stacks` only.
+"""The process in which one DDS is tried; started by `sros_tool.runtime.stacks` only.
 
 It joins in the enclave that the environment names, then asks for endpoints that the enclave's
 permissions allow and for some that they do not, and reports each answer.  Nothing is judged here:
@@ -38,7 +38,7 @@ Close = Callable[[], None]
 
 
 def join_rclpy() -> tuple[Ask, Close]:
-    """A node of rclpy with the RMW that ``RMW_IMPLEMENTATION`` names, or rclpy's default."""
+    """Join as a node of rclpy with the RMW of ``RMW_IMPLEMENTATION``, or rclpy's default."""
     import rclpy
     from std_msgs.msg import String
 
@@ -59,7 +59,7 @@ def join_rclpy() -> tuple[Ask, Close]:
 
 
 def join_cyclone() -> tuple[Ask, Close]:
-    """A participant of the Cyclone DDS that sros itself speaks with."""
+    """Join as a participant of the Cyclone DDS that sros itself uses."""
     participant = Participant(domain_of(os.environ), choose_enclave(os.environ).enclave)
 
     def ask(kind: str, topic: str) -> None:
@@ -72,7 +72,7 @@ def join_cyclone() -> tuple[Ask, Close]:
 
 
 def join_cyclonedds_package() -> tuple[Ask, Close]:
-    """A participant of the Python package ``cyclonedds``, with the libddsc that it brings."""
+    """Join as a participant of the Python package ``cyclonedds``, with the libddsc it brings."""
     core, domain, idl, pub, sub, topics = (
         importlib.import_module(f"cyclonedds.{name}")
         for name in ("core", "domain", "idl", "pub", "sub", "topic")
@@ -98,7 +98,7 @@ JOINS: dict[str, Callable[[], tuple[Ask, Close]]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """``KIND REPORT ALLOWED DENIED``: join, then ask for endpoints on the two topics."""
+    """Join, then ask for endpoints on two topics; arguments are ``KIND REPORT ALLOWED DENIED``."""
     kind, report, allowed, denied = sys.argv[1:] if arguments is None else arguments
     if try_isolation().isolated:
         enter_isolation()
@@ -138,7 +138,7 @@ def _report_failure(events: EventWriter, error: Exception, stage: Stage, asked: 
 
 
 def _dds_in_memory() -> str:
-    """Name, version and file of the DDS that is loaded into this process, one per line; or ""."""
+    """Return name, version and file of the DDS that is loaded here, one per line; or ""."""
     for each in MIDDLEWARE:
         for prefix in each.libraries:
             for file in loaded_libraries(prefix):

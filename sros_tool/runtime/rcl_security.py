@@ -1,7 +1,7 @@
 """Which enclave a process would load, by exactly the rules of ROS 2's rcl (rcl/src/rcl/security.c).
 
-The rules are unforgiving: anything but ``true`` switches security off, anything but ``Enforce``
-lets a process go on unsecured.
+Anything but ``true`` switches security off, and with anything but ``Enforce`` a process without an
+enclave runs unsecured.
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from sros_tool.runtime.environment import ENABLE, ENCLAVE, KEYSTORE, STRATEGY, d
 
 @dataclass(frozen=True)
 class SecurityChoice:
-    """What rcl makes of an environment: the enclave's directory, or None for no security."""
+    """The enclave's directory that rcl chooses, or None for no security, and why."""
 
     enclave: Path | None
     note: str
 
 
 def choose_enclave(environment: Mapping[str, str], enclave: str = "/") -> SecurityChoice:
-    """The choice for a process started with ``--ros-args --enclave`` ENCLAVE.
+    """Return rcl's choice for a process started with ``--ros-args --enclave`` ENCLAVE.
 
-    Raises `SrosError` where rcl would not start the process: Enforce, and no such enclave.
+    Raises:
+        SrosError: rcl would not start the process: Enforce, and no such enclave.
     """
     if environment.get(ENABLE) != "true":
         return SecurityChoice(None, f"security is off: {ENABLE} is not exactly 'true'")
@@ -46,10 +47,12 @@ def choose_enclave(environment: Mapping[str, str], enclave: str = "/") -> Securi
 
 
 def choose_loadable(environment: Mapping[str, str], enclave: str = "/") -> SecurityChoice:
-    """As `choose_enclave`, and then as the RMWs go on: an enclave that lacks a file is none.
+    """Return the choice of `choose_enclave`, or none where the enclave lacks a file.
 
-    Raises `SrosError` where that ends the process (Enforce), with the words of the RMWs, which do
-    not say which file it is (rmw_dds_common ``security.cpp``).
+    Source: rmw_dds_common ``security.cpp``, which does not say which file it is.
+
+    Raises:
+        SrosError: The process would not start (Enforce); with the words of the RMWs.
     """
     choice = choose_enclave(environment, enclave)
     folder = choice.enclave
@@ -63,5 +66,9 @@ def choose_loadable(environment: Mapping[str, str], enclave: str = "/") -> Secur
 
 
 def domain_of(environment: Mapping[str, str]) -> int:
-    """The domain that ROS_DOMAIN_ID names, 0 where it is not set.  Raises `SrosError`."""
+    """Return the domain that ROS_DOMAIN_ID names, 0 where it is not set.
+
+    Raises:
+        UsageError: It is not a domain id.
+    """
     return domain_from(environment) or 0

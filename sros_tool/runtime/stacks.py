@@ -1,10 +1,9 @@
-"""Judge what a DDS answered to a probe: does it enforce security, and on what evidence.
+"""Which of the DDS stacks here enforce security: each is tried in an enclave made by sros.
 
-Only two answers are a no: it says that security is not built in, or it lets an endpoint pass that
-the permissions do not allow.  Whatever else goes wrong is "could not be tried", never a no.
-
-Each is tried in a process of its own, in an enclave made by sros: a name or a version says
-nothing about how a library was built.
+A name or a version says nothing about how a library was built, so each stack is tried in a process
+of its own.  Only two answers are a no: it says that security is not built in, or it lets an
+endpoint pass that the permissions do not allow.  Whatever else goes wrong is "could not be tried",
+never a no.
 """
 
 from __future__ import annotations
@@ -36,116 +35,13 @@ from sros_tool.runtime.vendor_log import (
 
 _LOG = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True)
-class ProbeRun:
-    """What one probe process left: its reports, its output, and how it ended.
-
-    ``status`` is its exit status, negative for a signal, None where it had to be stopped.
-    """
-
-    events: tuple[Event, ...]
-    output: str
-    status: int | None
-
-
-@dataclass(frozen=True)
-class Verdict:
-    """Whether a DDS enforces security (None: could not be tried), and what was seen."""
-
-    enforces: bool | None
-    evidence: str
-
-
-def judge(run: ProbeRun, allowed: str, denied: str) -> Verdict:
-    """Decide from a run that asked for a writer on ``allowed`` and endpoints on ``denied``."""
-    told = "\n".join([run.output, *(event.text for event in run.events)])
-    if lacking := missing_security(told):
-        return Verdict(False, f"a secured participant fails: {lacking}")
-    if not _happened(run.events, Kind.READY, Stage.PARTICIPANT):
-        return _untried(_why_not_joined(run, told))
-    answers = {
-        event.text.partition("\n")[0]: event
-        for event in run.events
-        if event.stage is Stage.ENDPOINT
-    }
-    wanted = answers.get(f"writer {allowed}")
-    if wanted is None or wanted.kind is not Kind.READY:
-        return _untried(f"even the allowed writer on {allowed} failed. {_reason(wanted, run)}")
-    asked = [f"writer {denied}", f"reader {denied}"]
-    for question in asked:
-        answer = answers.get(question)
-        if answer is None:
-            return _untried(f"no answer about the {question}. {_ending(run)}")
-        if answer.kind is Kind.READY:
-            return Verdict(False, f"it created a {question}, which its permissions do not allow")
-    refusals = [_refusal(answers[question], run, denied) for question in asked]
-    if not all(refusals):
-        reason = _reason(answers[asked[0]], run)
-        return _untried(f"endpoints on {denied} failed, but not by a security refusal. {reason}")
-    return Verdict(
-        True,
-        f"in an enclave made by sros it created the allowed writer on {allowed}, and refused"
-        f" writer and reader on {denied}: {refusals[0]}",
-    )
-
-
-def _refusal(answer: Event, run: ProbeRun, topic: str) -> str:
-    if answer.kind is Kind.REFUSED:
-        return answer.text.partition("\n")[2]
-    lines = [line for line in run.output.splitlines() if topic in line or "SECURITY" in line]
-    return endpoint_refusal("\n".join([answer.text, *lines]))
-
-
-def _why_not_joined(run: ProbeRun, told: str) -> str:
-    failed = _first(run.events, Kind.FAILED) or _first(run.events, Kind.REFUSED)
-    refusal = participant_refusal(told) or endpoint_refusal(told)
-    if refusal:
-        return f"the participant itself was refused: {refusal}"
-    return _reason(failed, run)
-
-
-def _reason(event: Event | None, run: ProbeRun) -> str:
-    if event is None:
-        return _ending(run)
-    return " ".join(event.text.split())
-
-
-def _ending(run: ProbeRun) -> str:
-    if run.status is None:
-        return "The probe process gave no answer in time."
-    if run.status < 0:
-        return f"The probe process was ended by {_signal_name(-run.status)}."
-    last = run.output.strip().splitlines()[-1:]
-    return f"The probe process ended with status {run.status}. {' '.join(last)}".strip()
-
-
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:
-        return f"signal {number}"
-
-
-def _happened(events: Sequence[Event], kind: Kind, stage: Stage) -> bool:
-    return any(event.kind is kind and event.stage is stage for event in events)
-
-
-def _first(events: Sequence[Event], kind: Kind) -> Event | None:
-    return next((event for event in events if event.kind is kind), None)
-
-
-def _untried(why: str) -> Verdict:
-    return Verdict(None, f"could not be tried: {why}")
-
-
-PROBE_SECONDS = 60.0
+_PROBE_SECONDS = 60.0
 
 ROS_ADVICE = (
     "The ROS 2 packages of Ubuntu (ros-jazzy-ros-base) have DDS Security built in; the wheels on"
     " PyPI do not."
 )
-_STATUS_TIMEOUT = 5.0
+_EXIT_SECONDS = 5.0
 
 
 @dataclass(frozen=True)
@@ -165,7 +61,7 @@ class ProbeEnclave:
 class Stack:
     """One DDS or RMW, and whether it enforces security (None: it could not be tried).
 
-    ``kind`` is "cyclone" (the libddsc that sros speaks with), "rmw" (under rclpy) or "cyclonedds"
+    ``kind`` is "cyclone" (the libddsc that sros uses), "rmw" (under rclpy) or "cyclonedds"
     (the Python package).  ``evidence`` says what was tried and seen.
     """
 
@@ -181,13 +77,16 @@ class Stack:
     rmw: str = ""
 
 
+# ── the stacks ──────────────────────────────────────────────────────────────────────────
+
+
 def survey(probe: ProbeEnclave) -> tuple[Stack, ...]:
-    """Every stack that sros knows how to look for, also those that are not here."""
+    """Return every stack that sros can look for, also those that are not here."""
     return (*rclpy_stacks(probe), cyclone_stack(probe), cyclonedds_package_stack(probe))
 
 
 def rclpy_stacks(probe: ProbeEnclave) -> Iterator[Stack]:
-    """One stack per RMW that is installed, rclpy's choice first; each is tried when asked for."""
+    """Yield one stack per installed RMW, rclpy's choice first; each is tried when asked for."""
     if importlib.util.find_spec("rclpy") is None:
         yield _without_rclpy()
         return
@@ -196,13 +95,13 @@ def rclpy_stacks(probe: ProbeEnclave) -> Iterator[Stack]:
 
 
 def cyclone_stack(probe: ProbeEnclave) -> Stack:
-    """The Cyclone DDS that sros itself speaks with."""
+    """Return the Cyclone DDS that sros itself uses (`sros_tool.runtime.cyclone`)."""
     run = _run_probe("cyclone", probe, {})
     verdict = judge(run, probe.allowed, probe.denied)
     dds, version, where = _identity(run)
     absent = not version and any("cannot find Cyclone DDS" in event.text for event in run.events)
     if absent:
-        verdict = Verdict(None, verdict.evidence.removeprefix("could not be tried: "))
+        verdict = ProbeVerdict(None, verdict.evidence.removeprefix("could not be tried: "))
     return Stack(
         "Cyclone DDS (libddsc)",
         "cyclone",
@@ -217,7 +116,7 @@ def cyclone_stack(probe: ProbeEnclave) -> Stack:
 
 
 def cyclonedds_package_stack(probe: ProbeEnclave) -> Stack:
-    """The Python package ``cyclonedds``, which brings a libddsc of its own."""
+    """Return the Python package ``cyclonedds``, which brings a libddsc of its own."""
     spec = importlib.util.find_spec("cyclonedds")
     if spec is None:
         return _absent("cyclonedds (Python package)", "cyclonedds", "Cyclone DDS")
@@ -225,7 +124,7 @@ def cyclonedds_package_stack(probe: ProbeEnclave) -> Stack:
     verdict = judge(run, probe.allowed, probe.denied)
     dds, version, where = _identity(run)
     if verdict.enforces is None and where and not _has_plugins(Path(where)):
-        verdict = Verdict(
+        verdict = ProbeVerdict(
             False,
             "a secured participant fails, and no libdds_security_*.so comes with it."
             f" {verdict.evidence.partition(': ')[2]}",
@@ -279,6 +178,39 @@ def _absent(name: str, kind: str, dds: str) -> Stack:
     return Stack(name, kind, dds, "", "", False, None, "")
 
 
+def _identity(run: ProbeRun) -> tuple[str, str, str]:
+    for event in run.events:
+        if event.kind is Kind.SEEN and event.text.count("\n") == 2:
+            name, version, where = event.text.split("\n")
+            return name, version, where
+    return "", "", ""
+
+
+def _has_plugins(library: Path) -> bool:
+    return any(library.parent.glob("**/libdds_security_auth*.so*"))
+
+
+def _package_version(name: str) -> str:
+    with suppress(importlib.metadata.PackageNotFoundError):
+        return importlib.metadata.version(name)
+    return ""
+
+
+# ── trying one ──────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True)
+class ProbeRun:
+    """What one probe process left: its reports, its output, and how it ended.
+
+    ``status`` is its exit status, negative for a signal, None where it had to be stopped.
+    """
+
+    events: tuple[Event, ...]
+    output: str
+    status: int | None
+
+
 def _run_probe(kind: str, probe: ProbeEnclave, extra: Mapping[str, str]) -> ProbeRun:
     with TemporaryDirectory(prefix="sros-probe-") as folder:
         report, log = Path(folder, "report.jsonl"), Path(folder, "log.txt")
@@ -308,28 +240,106 @@ def _run_probe(kind: str, probe: ProbeEnclave, extra: Mapping[str, str]) -> Prob
 
 def _wait(process: subprocess.Popen[bytes]) -> int | None:
     try:
-        return process.wait(PROBE_SECONDS)
+        return process.wait(_PROBE_SECONDS)
     except subprocess.TimeoutExpired:
         return None
     finally:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, signal.SIGKILL)
-        process.wait(_STATUS_TIMEOUT)
+        process.wait(_EXIT_SECONDS)
 
 
-def _identity(run: ProbeRun) -> tuple[str, str, str]:
-    for event in run.events:
-        if event.kind is Kind.SEEN and event.text.count("\n") == 2:
-            name, version, where = event.text.split("\n")
-            return name, version, where
-    return "", "", ""
+# ── judging what was seen ───────────────────────────────────────────────────────────────
 
 
-def _has_plugins(library: Path) -> bool:
-    return any(library.parent.glob("**/libdds_security_auth*.so*"))
+@dataclass(frozen=True)
+class ProbeVerdict:
+    """Whether a DDS enforces security, None where it could not be tried, and what was seen."""
+
+    enforces: bool | None
+    evidence: str
 
 
-def _package_version(name: str) -> str:
-    with suppress(importlib.metadata.PackageNotFoundError):
-        return importlib.metadata.version(name)
-    return ""
+def judge(run: ProbeRun, allowed: str, denied: str) -> ProbeVerdict:
+    """Return the verdict on a run that asked for a writer on ``allowed`` and for endpoints on
+    ``denied``."""
+    text = "\n".join([run.output, *(event.text for event in run.events)])
+    if lacking := missing_security(text):
+        return ProbeVerdict(False, f"a secured participant fails: {lacking}")
+    if not _happened(run.events, Kind.READY, Stage.PARTICIPANT):
+        return _untried(_why_not_joined(run, text))
+    answers = {
+        event.text.partition("\n")[0]: event
+        for event in run.events
+        if event.stage is Stage.ENDPOINT
+    }
+    wanted = answers.get(f"writer {allowed}")
+    if wanted is None or wanted.kind is not Kind.READY:
+        return _untried(f"even the allowed writer on {allowed} failed. {_reason(wanted, run)}")
+    asked = [f"writer {denied}", f"reader {denied}"]
+    for question in asked:
+        answer = answers.get(question)
+        if answer is None:
+            return _untried(f"no answer about the {question}. {_ending(run)}")
+        if answer.kind is Kind.READY:
+            return ProbeVerdict(
+                False, f"it created a {question}, which its permissions do not allow"
+            )
+    refusals = [_refusal(answers[question], run, denied) for question in asked]
+    if not all(refusals):
+        reason = _reason(answers[asked[0]], run)
+        return _untried(f"endpoints on {denied} failed, but not by a security refusal. {reason}")
+    return ProbeVerdict(
+        True,
+        f"in an enclave made by sros it created the allowed writer on {allowed}, and refused"
+        f" writer and reader on {denied}: {refusals[0]}",
+    )
+
+
+def _refusal(answer: Event, run: ProbeRun, topic: str) -> str:
+    if answer.kind is Kind.REFUSED:
+        return answer.text.partition("\n")[2]
+    lines = [line for line in run.output.splitlines() if topic in line or "SECURITY" in line]
+    return endpoint_refusal("\n".join([answer.text, *lines]))
+
+
+def _why_not_joined(run: ProbeRun, text: str) -> str:
+    failed = _first(run.events, Kind.FAILED) or _first(run.events, Kind.REFUSED)
+    refusal = participant_refusal(text) or endpoint_refusal(text)
+    if refusal:
+        return f"the participant itself was refused: {refusal}"
+    return _reason(failed, run)
+
+
+def _reason(event: Event | None, run: ProbeRun) -> str:
+    if event is None:
+        return _ending(run)
+    return " ".join(event.text.split())
+
+
+def _ending(run: ProbeRun) -> str:
+    if run.status is None:
+        return "The probe process gave no answer in time."
+    if run.status < 0:
+        return f"The probe process was ended by {_signal_name(-run.status)}."
+    last = run.output.strip().splitlines()[-1:]
+    return f"The probe process ended with status {run.status}. {' '.join(last)}".strip()
+
+
+def _signal_name(number: int) -> str:
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
+
+
+def _happened(events: Sequence[Event], kind: Kind, stage: Stage) -> bool:
+    return any(event.kind is kind and event.stage is stage for event in events)
+
+
+def _first(events: Sequence[Event], kind: Kind) -> Event | None:
+    return next((event for event in events if event.kind is kind), None)
+
+
+def _untried(why: str) -> ProbeVerdict:
+    return ProbeVerdict(None, f"could not be tried: {why}")
