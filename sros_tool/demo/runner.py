@@ -1,7 +1,8 @@
-"""What an onlooker on the network does with packets that he has seen: replay them, change them.
+"""The runner: starts the processes of each row, watches them, and ends them.
 
 A row's window starts when all its processes are ready, so a busy machine is waited for.  It is as
-long for silence as for sound; only a brief row in which nobody has to be silent ends early.
+long for silence as for sound; only a brief row in which nobody has to be silent ends early.  None
+of the processes outlives its starter.
 """
 
 from __future__ import annotations
@@ -33,84 +34,32 @@ from sros_tool.demo.scenarios.model import (
     Row,
     Wire,
 )
-from sros_tool.demo.verdict import (
-    Injection,
-    PartyRecord,
-    RowRecord,
-    RowResult,
-    forged_text,
-    judge_row,
-)
-from sros_tool.demo.wire import Wiretap, udp_ports, with_other_words
+from sros_tool.demo.verdict import PartyRecord, RowRecord, RowResult, judge_row
+from sros_tool.demo.wire import Injection, Wiretap, forged_text, udp_ports, with_other_words
 from sros_tool.runtime.events import Event, EventReader, Kind
 from sros_tool.runtime.netns import end_with_parent
 from sros_tool.runtime.vendor_log import plain_text
 
 _LOG = logging.getLogger(__name__)
 
-_ONLOOKER_TICK = 0.05
-_ONLOOKER_GRACE = 0.3
-_SECONDS_TO_END = 2.0
-_AFTER_REPLAY = 2.0
-_LONGEST_PAUSE = 0.5
-_ROUNDS = 2
-_FORGED = 5
-_AFTER_FORGERY = 1.0
-
-
-async def replay_packets(talker: PartyProcess, tap: Wiretap) -> Injection:
-    """Let a talker leave, then send again what it had sent, at the pace of the original."""
-    packets = tap.packets(talker.ports())
-    await end_softly([talker])
-    await asyncio.sleep(_ONLOOKER_GRACE)
-    started = time.monotonic()
-    # Twice, since the listener may take from the first round only who there is to hear.
-    for _ in range(_ROUNDS):
-        for before, each in zip([*packets[:1], *packets], packets, strict=False):
-            await asyncio.sleep(min(each.time - before.time, _LONGEST_PAUSE))
-            tap.send(each.packet)
-    await asyncio.sleep(_AFTER_REPLAY)
-    return Injection(len(packets), started)
-
-
-async def forge_packets(talker: PartyProcess, tap: Wiretap) -> Injection:
-    """Hold a talker, and go on in its name with packets that say something else."""
-    talker.hold()
-    await asyncio.sleep(_ONLOOKER_GRACE)
-    words, others = talker.text, forged_text(talker.text)
-    packets = [each.packet for each in reversed(tap.packets(talker.ports()))]
-    last = next((each for each in packets if with_other_words(each, words, others, 1)), b"")
-    started = time.monotonic()
-    steps = range(1, _FORGED + 1) if last else ()
-    sent = [each for step in steps if (each := with_other_words(last, words, others, step))]
-    for packet in sent:
-        tap.send(packet)
-    await asyncio.sleep(_AFTER_FORGERY)
-    return Injection(len(sent), started)
-
-
-async def end_softly(processes: Collection[PartyProcess]) -> None:
-    """Let processes end by themselves, for a while; they log and report until then."""
-    for process in processes:
-        process.ask_to_end()
-    latest = time.monotonic() + _SECONDS_TO_END
-    while time.monotonic() < latest and not all(process.gone for process in processes):
-        await asyncio.sleep(_ONLOOKER_TICK)
-
-
 _TICK = 0.05
+"""Seconds between two looks at what the processes reported."""
+
 _GRACE = 0.3
+"""Seconds for messages that are on their way when a window closes."""
+
 _ENOUGH_MESSAGES = 3
 _AFTER_ENOUGH = 2.0
-_BRIEFEST = 1.0
+_SHORTEST_BRIEF = 1.0
+_SECONDS_TO_END = 2.0
 
 
 @dataclass(frozen=True)
 class Limits:
     """Seconds: to start in, the shortest and longest window, and for all rows together.
 
-    ``wave`` is for as many rows as run at once; many rows have more than ``total``.  All but the
-    shortest window only tell a machine that is slow from a process that hangs.
+    ``wave`` is for as many rows as run at once: many rows get more than ``total``.  All but the
+    shortest window only tell a slow machine from a process that hangs.
     """
 
     start: float = 60.0
@@ -122,7 +71,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """All that is needed to run rows.
+    """The rows to run, and everything that this needs.
 
     ``domains`` has one domain per row; ``topic`` is absolute; ``period`` is in seconds.  With
     ``own_networks``, each row gets a network namespace of its own.
@@ -140,16 +89,18 @@ class RunPlan:
 
 
 def run_rows(plan: RunPlan, progress: Callable[[str], None]) -> list[RowResult]:
-    """Run all rows, and judge them; ``progress`` is told of each row that ends."""
-    return asyncio.run(_Stage(plan, progress).run())
+    """Run all rows and judge them; ``progress`` gets a line for each row that ends."""
+    return asyncio.run(_Runner(plan, progress).run())
 
 
-class _Stage:
+class _Runner:
+    """Runs the rows of a plan, as many at once as the backend bears."""
+
     def __init__(self, plan: RunPlan, progress: Callable[[str], None]) -> None:
         self._plan = plan
         self._progress = progress
         self._mark = uuid.uuid4().hex[:8]
-        self._places = asyncio.Semaphore(plan.backend.rows_at_once)
+        self._slots = asyncio.Semaphore(plan.backend.rows_at_once)
         self._end = 0.0
         self._finished = 0
 
@@ -164,7 +115,7 @@ class _Stage:
         return await asyncio.gather(*map(self._run_row, range(len(self._plan.rows))))
 
     def _text(self, index: int, party: Party) -> str:
-        """What a talker says; it occurs nowhere else, not in another row either."""
+        """Return what a talker says; it occurs nowhere else, not in another row either."""
         return f"Hello World from the {party.name} {self._mark}-{index}"
 
     async def _run_row(self, index: int) -> RowResult:
@@ -173,7 +124,7 @@ class _Stage:
         if skipped:
             record = RowRecord(row, domain, skipped=skipped)
         else:
-            async with self._places:
+            async with self._slots:
                 record = await self._play(index)
         result = judge_row(record)
         self._finished += 1
@@ -206,14 +157,14 @@ class _Stage:
             window = await self._watch(row, processes)
             ports = frozenset[int]().union(*(each.ports() for each in processes.values()))
             wire = tap.count(ports) if tap and row.wire else {}
-            replay = None
+            injected = None
             if tap and row.replay and window:
-                replay = await replay_packets(processes[row.replay], tap)
+                injected = await _replay_packets(processes[row.replay], tap)
             if tap and row.impersonate and window:
-                replay = await forge_packets(processes[row.impersonate], tap)
+                injected = await _forge_packets(processes[row.impersonate], tap)
         finally:
             try:
-                await end_softly(processes.values())
+                await _end_softly(processes.values())
             finally:
                 for process in processes.values():
                     process.end()
@@ -221,7 +172,7 @@ class _Stage:
                     tap.close()
                 network.close()
         records = {name: process.record() for name, process in processes.items()}
-        return RowRecord(row, domain, records, window, wire, replay)
+        return RowRecord(row, domain, records, window, wire, injected)
 
     def _listen_in(self, index: int) -> Wiretap:
         row = self._plan.rows[index]
@@ -253,7 +204,7 @@ class _Stage:
         backend = plan.backend
         environment |= backend.environment(
             party.role,
-            wire=bool(row.wire or row.replay or row.impersonate),
+            wire=row.tapped,
             denied=denied,
             secured=secured,
         )
@@ -297,7 +248,7 @@ class _Stage:
             if enough_at is None and all(self._is_met(claim, processes) for claim in positive):
                 enough_at = now
             if enough_at is not None:
-                if not silence and now >= start + _BRIEFEST:
+                if not silence and now >= start + _SHORTEST_BRIEF:
                     break
                 if silence and now >= max(shortest, enough_at + _AFTER_ENOUGH):
                     break
@@ -308,7 +259,7 @@ class _Stage:
         return start, now
 
     def _is_met(self, claim: Claim, processes: Mapping[str, PartyProcess]) -> bool:
-        """Whether a claim that something happens has been seen to hold, several times."""
+        """Return whether a claim that something happens has been seen to hold, several times."""
         events = processes[claim.subject].look()
         if claim.relation in (Relation.HEARS, Relation.IS_ANSWERED):
             mark = f"{processes[claim.talker].text}: "
@@ -321,7 +272,7 @@ class _Stage:
 
 
 def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, PartyProcess]) -> bool:
-    """Whether a claim needs time to pass: nothing must happen, and something still could."""
+    """Return whether a claim needs time: nothing must happen, and something still could."""
     if claim.holds or claim.relation in (Relation.HEARS_AGAIN, Relation.BELIEVES):
         return False
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
@@ -333,10 +284,57 @@ def _is_decided_by_start(row: Row) -> bool:
     return all(claim.relation in decided for claim in (*row.claims, *row.controls))
 
 
-_LEFT_OUT_PREFIXES = ("ROS_SECURITY_",)
+async def _end_softly(processes: Collection[PartyProcess]) -> None:
+    """Ask processes to end, and wait a while; they log and report until then."""
+    for process in processes:
+        process.ask_to_end()
+    latest = time.monotonic() + _SECONDS_TO_END
+    while time.monotonic() < latest and not all(process.gone for process in processes):
+        await asyncio.sleep(_TICK)
 
 
-_LEFT_OUT = frozenset(
+_AFTER_REPLAY = 2.0
+_LONGEST_PAUSE = 0.5
+_REPLAY_ROUNDS = 2
+_FORGED_PACKETS = 5
+_AFTER_FORGERY = 1.0
+
+
+async def _replay_packets(talker: PartyProcess, tap: Wiretap) -> Injection:
+    """End a talker, then send its packets again at the pace of the original."""
+    packets = tap.packets(talker.ports())
+    await _end_softly([talker])
+    await asyncio.sleep(_GRACE)
+    started = time.monotonic()
+    # Twice, since the listener may take from the first round only who there is to hear.
+    for _ in range(_REPLAY_ROUNDS):
+        for before, each in zip([*packets[:1], *packets], packets, strict=False):
+            await asyncio.sleep(min(each.time - before.time, _LONGEST_PAUSE))
+            tap.send(each.packet)
+    await asyncio.sleep(_AFTER_REPLAY)
+    return Injection(len(packets), started)
+
+
+async def _forge_packets(talker: PartyProcess, tap: Wiretap) -> Injection:
+    """Suspend a talker, and go on in its name with packets that say something else."""
+    talker.hold()
+    await asyncio.sleep(_GRACE)
+    words, others = talker.text, forged_text(talker.text)
+    packets = [each.packet for each in reversed(tap.packets(talker.ports()))]
+    last = next((each for each in packets if with_other_words(each, words, others, 1)), b"")
+    started = time.monotonic()
+    steps = range(1, _FORGED_PACKETS + 1) if last else ()
+    sent = [each for step in steps if (each := with_other_words(last, words, others, step))]
+    for packet in sent:
+        tap.send(packet)
+    await asyncio.sleep(_AFTER_FORGERY)
+    return Injection(len(sent), started)
+
+
+_PREFIXES_LEFT_OUT = ("ROS_SECURITY_",)
+
+
+_VARIABLES_LEFT_OUT = frozenset(
     {
         "CYCLONEDDS_URI",
         "FASTDDS_BUILTIN_TRANSPORTS",
@@ -354,16 +352,16 @@ _LEFT_OUT = frozenset(
 
 
 def base_environment(environment: Mapping[str, str]) -> dict[str, str]:
-    """``environment`` without what would change how DDS discovers or secures."""
+    """Return ``environment`` without the variables that change DDS discovery or security."""
     return {
         name: value
         for name, value in environment.items()
-        if name not in _LEFT_OUT and not name.startswith(_LEFT_OUT_PREFIXES)
+        if name not in _VARIABLES_LEFT_OUT and not name.startswith(_PREFIXES_LEFT_OUT)
     } | {"PYTHONUNBUFFERED": "1"}
 
 
 class PartyProcess:
-    """A running node; ``folder`` gets its report and its log under ``name``."""
+    """A running process of a row; ``folder`` gets its report and its log under ``name``."""
 
     def __init__(
         self,
@@ -390,7 +388,7 @@ class PartyProcess:
         self._ports: frozenset[int] = frozenset()
         starter = os.getpid()
 
-        def before() -> None:
+        def end_with_starter() -> None:
             end_with_parent()
             if os.getppid() != starter:
                 os._exit(1)
@@ -403,12 +401,12 @@ class PartyProcess:
                 stderr=output,
                 env={**environment, "ROS_LOG_DIR": str(folder / "ros_log")},
                 start_new_session=True,
-                preexec_fn=before,
+                preexec_fn=end_with_starter,
             )
         _LOG.info("started process %d, %s: %s", self._process.pid, name, shlex.join(command))
 
     def look(self) -> list[Event]:
-        """Everything that the process has reported so far, oldest first."""
+        """Return everything that the process has reported so far, oldest first."""
         ended = self._process.poll()
         self._events += self._reader.new_events()
         if ended is not None and self._own_status is None and not self._asked:
@@ -436,7 +434,7 @@ class PartyProcess:
         return self._own_status is not None
 
     def ports(self) -> frozenset[int]:
-        """The UDP ports that the process holds, or held when it was last asked."""
+        """Return the UDP ports that the process holds, or held when it was last asked."""
         self._ports = udp_ports(self._process.pid) or self._ports
         return self._ports
 
@@ -449,7 +447,7 @@ class PartyProcess:
             self._process.send_signal(signal.SIGCONT)
 
     def hold(self) -> None:
-        """Stop the process where it is; `end` still ends it."""
+        """Suspend the process; `end` still ends it."""
         with suppress(ProcessLookupError):
             self._process.send_signal(signal.SIGSTOP)
 
@@ -459,14 +457,14 @@ class PartyProcess:
         return self._process.poll() is not None
 
     def end(self) -> None:
-        """Force the end on the process and its children."""
+        """Kill the process and its children."""
         with suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
     def record(self) -> PartyRecord:
-        """What the process left behind; call it after `end`."""
-        # Being ended is no failure, whatever a node makes of it.
+        """Return what the process left behind; to be called after `end`."""
+        # A node that is asked to end may report a failure; that is none.
         late = [event for event in self._reader.new_events() if event.kind is not Kind.FAILED]
         return PartyRecord(
             text=self.text,

@@ -1,7 +1,7 @@
-"""From what the processes of a row reported to what was observed: a crash is not a refusal.
+"""The verdict: what was observed in a row, by the reports of its processes.
 
-Silence counts only where both sides were ready, the talker really sent, and the controls held;
-a refusal only where DDS Security said so itself, about this topic.
+A crash is not a refusal.  Silence counts only where both sides were ready, the talker really sent,
+and the controls held; a refusal only where DDS Security said so itself, about this topic.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from sros_tool.demo.scenarios.model import (
     RowStatus,
     Wire,
 )
-from sros_tool.demo.wire import WireCount
+from sros_tool.demo.wire import Injection, WireCount, forged_text
 from sros_tool.runtime.events import Event, Kind, Stage
 from sros_tool.runtime.vendor_log import (
     endpoint_refusal,
@@ -32,275 +32,13 @@ from sros_tool.runtime.vendor_log import (
 )
 
 
-def judge_row(record: RowRecord) -> RowResult:
-    """What was observed in a row."""
-    finding = _observe(record)
-    row = record.row
-    seconds = record.window[1] - record.window[0] if record.window else 0.0
-    return RowResult(
-        row.name,
-        row.expected,
-        finding.status,
-        row.mechanism,
-        finding.detail,
-        record.domain,
-        seconds,
-        row.attack,
-        row.removed,
-        row.open_because,
-        row.remedy,
-    )
-
-
-def _observe(record: RowRecord) -> Observed:
-    if record.skipped:
-        return Observed(RowStatus.SKIPPED, record.skipped)
-    for party in record.row.parties:
-        lost = _lost_import(party, record.parties[party.name])
-        if lost:
-            return Observed(RowStatus.SKIPPED, lost)
-    claims = [(claim, _judge_claim(claim, record)) for claim in record.row.claims]
-    controls = [(claim, _judge_claim(claim, record)) for claim in record.row.controls]
-    wrong = [finding for claim, finding in claims if finding.status is not claim.expected]
-    if wrong:
-        definite = wrong[0].status in STATUS_OF.values()
-        several = len(claims) > 1
-        status = RowStatus.DISTURBED if several and definite else wrong[0].status
-        return Observed(status, wrong[0].detail)
-    for claim, finding in controls:
-        if finding.status is not claim.expected:
-            what = f"{claim.subject} {claim.relation} {claim.talker}".strip()
-            return Observed(
-                RowStatus.UNDECIDED,
-                f"the control failed ({what}: {finding.status}, {finding.detail})",
-            )
-    details = [finding.detail for _, finding in claims]
-    details += [f"control: {finding.detail}" for _, finding in controls]
-    return Observed(record.row.expected, "; ".join(details))
-
-
-def _lost_import(party: Party, record: PartyRecord) -> str:
-    """Why a node could not be loaded that needs what is not everywhere: rclpy, or an interface."""
-    if party.role in (Role.TALKER, Role.LISTENER):
-        return ""
-    failed = (e.text for e in record.events if e.kind is Kind.FAILED and e.stage is Stage.IMPORT)
-    what = "rclpy" if party.role is Role.OBSERVER else f"the {party.role}"
-    return next((f"{what} cannot be loaded here: {text}" for text in failed), "")
-
-
-def _judge_claim(claim: Claim, record: RowRecord) -> Observed:
-    subject = record.parties[claim.subject]
-    if claim.relation is Relation.IS_REFUSED:
-        return _judge_refusal(claim.subject, subject)
-    for name in filter(None, (claim.subject, claim.talker)):
-        if problem := _trouble(name, record.parties[name]):
-            return problem
-    if claim.relation is Relation.STARTS:
-        return Observed(RowStatus.STARTED, f"{claim.subject} started")
-    if record.window is None:
-        return Observed(RowStatus.UNDECIDED, "not all processes were ready in time")
-    if claim.relation is Relation.READABLE:
-        return _judge_wire(claim, record, subject)
-    talker = record.parties[claim.talker]
-    if claim.relation is Relation.HEARS_AGAIN:
-        return _judge_replay(claim, record, subject, talker)
-    if claim.relation is Relation.BELIEVES:
-        return _judge_forgery(claim, record, subject, talker)
-    if claim.relation is Relation.IS_ANSWERED:
-        return _judge_answers(claim, record, subject, talker)
-    sent = {e.text for e in talker.events if e.kind is Kind.SENT and _inside(e, record)}
-    if not sent:
-        return Observed(RowStatus.UNDECIDED, f"{claim.talker} sent nothing in that time")
-    if claim.relation is Relation.SEES:
-        return _judge_view(claim, record, subject, talker)
-    mark = f"{talker.text}: "
-    heard = [e for e in subject.events if e.kind is Kind.HEARD and e.text.startswith(mark)]
-    status = STATUS_OF[Relation.HEARS, bool(heard)]
-    seconds = record.window[1] - record.window[0]
-    arrived = len(sent & {event.text for event in heard})
-    heard_of = f"{arrived} of {len(sent)} messages of the {claim.talker}"
-    return Observed(status, f"{claim.subject} heard {heard_of} in {seconds:.1f} s")
-
-
-def _judge_answers(
-    claim: Claim, record: RowRecord, client: PartyRecord, server: PartyRecord
-) -> Observed:
-    asked = [e for e in client.events if e.kind is Kind.SENT and _inside(e, record)]
-    if not asked:
-        return Observed(RowStatus.UNDECIDED, f"{claim.subject} asked nothing in that time")
-    answers = [e for e in client.events if e.kind is Kind.HEARD and _is_of(e, server)]
-    status = STATUS_OF[Relation.IS_ANSWERED, bool(answers)]
-    within = sum(1 for event in answers if _inside(event, record))
-    counted = f"{min(within, len(asked))} right answers of the {claim.talker}"
-    return Observed(status, f"{claim.subject} asked {len(asked)} times and got {counted}")
-
-
-def _judge_replay(
-    claim: Claim, record: RowRecord, listener: PartyRecord, talker: PartyRecord
-) -> Observed:
-    replay = record.replay
-    if replay is None or not replay.packets:
-        return Observed(RowStatus.UNDECIDED, "no packets were captured that could be sent again")
-    heard = [e for e in listener.events if e.kind is Kind.HEARD and _is_of(e, talker)]
-    again = sum(1 for event in heard if event.time >= replay.time)
-    status = STATUS_OF[Relation.HEARS_AGAIN, again > 0]
-    return Observed(
-        status,
-        f"{claim.subject} heard {again} messages in {replay.packets} packets of the"
-        f" {claim.talker} that were sent again, twice, after it had left",
-    )
-
-
-def _judge_forgery(
-    claim: Claim, record: RowRecord, listener: PartyRecord, talker: PartyRecord
-) -> Observed:
-    replay = record.replay
-    if replay is None or not replay.packets:
-        return Observed(RowStatus.UNDECIDED, "no packet of the talker could be read and changed")
-    mark = forged_text(talker.text)
-    believed = sum(1 for e in listener.events if e.kind is Kind.HEARD and e.text.startswith(mark))
-    return Observed(
-        STATUS_OF[Relation.BELIEVES, believed > 0],
-        f"{claim.subject} heard {believed} of {replay.packets} messages that the {claim.talker}"
-        " never sent",
-    )
-
-
-def _is_of(event: Event, speaker: PartyRecord) -> bool:
-    return event.text.startswith(f"{speaker.text}: ")
-
-
-def _judge_refusal(name: str, record: PartyRecord) -> Observed:
-    problem = _trouble(name, record)
-    if problem is None:
-        return Observed(RowStatus.STARTED, f"{name} was let in")
-    return problem
-
-
-def _judge_view(
-    claim: Claim, record: RowRecord, observer: PartyRecord, talker: PartyRecord
-) -> Observed:
-    looks = [e for e in observer.events if e.kind is Kind.SEEN and _inside(e, record)]
-    if not looks:
-        return Observed(RowStatus.UNDECIDED, f"{claim.subject} did not look in that time")
-    most = max(event.publishers.get(talker.topic, 0) for event in looks)
-    counted = f"{observer.through} counts {most} publishers on {talker.topic}"
-    return Observed(STATUS_OF[Relation.SEES, most > 0], f"{counted} in {len(looks)} looks")
-
-
-def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> Observed:
-    count = record.wire.get(claim.subject)
-    if count is None:
-        return Observed(RowStatus.UNDECIDED, "no packets were captured")
-    if claim.wire is not Wire.TEXT:
-        shown = count.topics if claim.wire is Wire.TOPIC else count.certificates
-        if not shown and not count.protected:
-            return Observed(RowStatus.UNDECIDED, "no packets of the row were captured")
-        what = f"the {claim.wire}" if claim.wire is Wire.TOPIC else f"a {claim.wire}"
-        return Observed(STATUS_OF[Relation.READABLE, shown > 0], f"{shown} packets show {what}")
-    if count.plain:
-        return Observed(RowStatus.READABLE, f"{count.plain} packets show the text")
-    sent = sum(1 for event in talker.events if event.kind is Kind.SENT and _inside(event, record))
-    # Silence on the wire proves nothing unless the messages went over the captured wire.
-    if count.protected * 2 < max(2, sent):
-        return Observed(
-            RowStatus.UNDECIDED,
-            f"only {count.protected} encrypted packets were captured for {sent} messages",
-        )
-    return Observed(
-        RowStatus.NOT_READABLE, f"0 packets show the text, {count.protected} are encrypted"
-    )
-
-
-def _trouble(name: str, record: PartyRecord) -> Observed | None:
-    """Why a party did not run through the row, or None if it did."""
-    ready = any(event.kind is Kind.READY for event in record.events)
-    for event in record.events:
-        if event.kind is Kind.REFUSED:
-            return _refused(name, event.stage, _own_denial(record, "") or event.text)
-        if event.kind is Kind.FAILED:
-            return _failure(name, record, event)
-    if record.status is not None:
-        return Observed(RowStatus.CRASHED, f"{name} {_ending(record)}")
-    if not ready:
-        return Observed(RowStatus.NOT_STARTED, f"{name} was not ready in time")
-    return None
-
-
-def _failure(name: str, record: PartyRecord, event: Event) -> Observed:
-    told = f"{event.text}\n{record.output}"
-    reason = " ".join(event.text.split())
-    if lacking := missing_security(told):
-        return Observed(RowStatus.NOT_STARTED, f"{name}: {lacking}")
-    if event.stage is Stage.ENDPOINT and (refusal := _own_denial(record, event.text)):
-        return _refused(name, Stage.ENDPOINT, refusal)
-    if event.stage in (Stage.PARTICIPANT, Stage.ENDPOINT):
-        # A ROS node has topics and services of its own: denied one of them, it does not start.
-        refusal = participant_refusal(told) or endpoint_refusal(told)
-        if refusal:
-            return _refused(name, Stage.PARTICIPANT, refusal)
-    return Observed(RowStatus.CRASHED, f"{name} failed: {reason}")
-
-
-def _own_denial(record: PartyRecord, told: str) -> str:
-    """The line in which DDS Security denies this very topic, or ""."""
-    lines = f"{record.output}\n{told}".splitlines()
-    return endpoint_refusal("\n".join(line for line in lines if _speaks_of(line, record.topic)))
-
-
-def _speaks_of(line: str, topic: str) -> bool:
-    """Whether a line is about that topic, or a service or action of that name."""
-    name = rf"r[tqr]{re.escape(topic)}(?:/_action/\w+)?(?:Request|Reply)?(?!\w|/)"
-    return bool(re.search(name, line)) or "not allowed by security" in line.lower()
-
-
-def _refused(name: str, stage: Stage | None, reason: str) -> Observed:
-    reason = plain_refusal(reason)
-    if stage is Stage.ENDPOINT:
-        return Observed(RowStatus.REFUSED, f"{name}: {reason}")
-    return Observed(
-        RowStatus.NOT_LET_IN, f"{name} was refused before it came to the topic: {reason}"
-    )
-
-
-def _ending(record: PartyRecord) -> str:
-    status = record.status or 0
-    if status < 0:
-        try:
-            return f"was ended by {signal.Signals(-status).name}"
-        except ValueError:
-            return f"was ended by signal {-status}"
-    last = " ".join(record.output.strip().splitlines()[-1:])
-    return f"ended by itself with status {status}. {last}".strip()
-
-
-def _inside(event: Event, record: RowRecord) -> bool:
-    if record.window is None:
-        return False
-    start, end = record.window
-    return start <= event.time <= end
-
-
-@dataclass(frozen=True)
-class Injection:
-    """How many captured packets were sent again or changed, and when (CLOCK_MONOTONIC)."""
-
-    packets: int
-    time: float
-
-
-def forged_text(text: str) -> str:
-    """What is said in the name of a talker that says ``text``; of the same length."""
-    return text.swapcase()
-
-
 @dataclass(frozen=True)
 class PartyRecord:
     """What one process left behind.
 
     ``text`` marks the messages of a talker; ``topic`` is its ROS topic; ``through`` names the
-    library it used; ``output`` is what it printed; ``status`` its exit status
-    (negative for a signal) if it ended before it was stopped.
+    library it used; ``output`` is what it printed; ``status`` is its exit status (negative for a
+    signal) if it ended before it was stopped.
     """
 
     text: str = ""
@@ -316,7 +54,7 @@ class RowRecord:
     """What a row left behind.
 
     ``window`` is the time (CLOCK_MONOTONIC) that counts; None where not all parties became ready.
-    ``skipped`` is the reason for which the row was not run, or "".
+    ``injected`` is what an onlooker sent; ``skipped`` is why the row was not run, or "".
     """
 
     row: Row
@@ -324,16 +62,8 @@ class RowRecord:
     parties: Mapping[str, PartyRecord] = field(default_factory=dict)
     window: tuple[float, float] | None = None
     wire: Mapping[str, WireCount] = field(default_factory=dict)
-    replay: Injection | None = None
+    injected: Injection | None = None
     skipped: str = ""
-
-
-@dataclass(frozen=True)
-class Observed:
-    """What was observed about one claim, and in a clause why one may believe it."""
-
-    status: RowStatus
-    detail: str
 
 
 @dataclass(frozen=True)
@@ -363,7 +93,7 @@ class RowResult:
         return bool(self.open_because) and self.observed is self.expected
 
     def as_json(self) -> dict[str, Any]:
-        """The row as `sros demo --json` shows it."""
+        """Return the row as `sros demo --json` shows it."""
         return {
             "name": self.name,
             "expected": self.expected.value,
@@ -378,3 +108,262 @@ class RowResult:
             "open_because": self.open_because,
             "remedy": self.remedy,
         }
+
+
+@dataclass(frozen=True)
+class _Finding:
+    """What was observed about one claim, with the evidence in a clause."""
+
+    status: RowStatus
+    detail: str
+
+
+def judge_row(record: RowRecord) -> RowResult:
+    """Return what was observed in a row."""
+    finding = _observe(record)
+    row = record.row
+    seconds = record.window[1] - record.window[0] if record.window else 0.0
+    return RowResult(
+        row.name,
+        row.expected,
+        finding.status,
+        row.mechanism,
+        finding.detail,
+        record.domain,
+        seconds,
+        row.attack,
+        row.removed,
+        row.open_because,
+        row.remedy,
+    )
+
+
+def _observe(record: RowRecord) -> _Finding:
+    if record.skipped:
+        return _Finding(RowStatus.SKIPPED, record.skipped)
+    for party in record.row.parties:
+        lost = _lost_import(party, record.parties[party.name])
+        if lost:
+            return _Finding(RowStatus.SKIPPED, lost)
+    claims = [(claim, _judge_claim(claim, record)) for claim in record.row.claims]
+    controls = [(claim, _judge_claim(claim, record)) for claim in record.row.controls]
+    wrong = [finding for claim, finding in claims if finding.status is not claim.expected]
+    if wrong:
+        definite = wrong[0].status in STATUS_OF.values()
+        several = len(claims) > 1
+        status = RowStatus.DISTURBED if several and definite else wrong[0].status
+        return _Finding(status, wrong[0].detail)
+    for claim, finding in controls:
+        if finding.status is not claim.expected:
+            what = f"{claim.subject} {claim.relation} {claim.talker}".strip()
+            return _Finding(
+                RowStatus.UNDECIDED,
+                f"the control failed ({what}: {finding.status}, {finding.detail})",
+            )
+    details = [finding.detail for _, finding in claims]
+    details += [f"control: {finding.detail}" for _, finding in controls]
+    return _Finding(record.row.expected, "; ".join(details))
+
+
+def _lost_import(party: Party, record: PartyRecord) -> str:
+    """Return why a node lacks what not every machine has (rclpy, an interface), or ""."""
+    if party.role in (Role.TALKER, Role.LISTENER):
+        return ""
+    failed = (e.text for e in record.events if e.kind is Kind.FAILED and e.stage is Stage.IMPORT)
+    what = "rclpy" if party.role is Role.OBSERVER else f"the {party.role}"
+    return next((f"{what} cannot be loaded here: {text}" for text in failed), "")
+
+
+def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
+    subject = record.parties[claim.subject]
+    if claim.relation is Relation.IS_REFUSED:
+        return _judge_refusal(claim.subject, subject)
+    for name in filter(None, (claim.subject, claim.talker)):
+        if problem := _why_not_running(name, record.parties[name]):
+            return problem
+    if claim.relation is Relation.STARTS:
+        return _Finding(RowStatus.STARTED, f"{claim.subject} started")
+    if record.window is None:
+        return _Finding(RowStatus.UNDECIDED, "not all processes were ready in time")
+    if claim.relation is Relation.READABLE:
+        return _judge_wire(claim, record, subject)
+    talker = record.parties[claim.talker]
+    if claim.relation is Relation.HEARS_AGAIN:
+        return _judge_replay(claim, record, subject, talker)
+    if claim.relation is Relation.BELIEVES:
+        return _judge_forgery(claim, record, subject, talker)
+    if claim.relation is Relation.IS_ANSWERED:
+        return _judge_answers(claim, record, subject, talker)
+    sent = {e.text for e in talker.events if e.kind is Kind.SENT and _in_window(e, record)}
+    if not sent:
+        return _Finding(RowStatus.UNDECIDED, f"{claim.talker} sent nothing in that time")
+    if claim.relation is Relation.SEES:
+        return _judge_view(claim, record, subject, talker)
+    mark = f"{talker.text}: "
+    heard = [e for e in subject.events if e.kind is Kind.HEARD and e.text.startswith(mark)]
+    status = STATUS_OF[Relation.HEARS, bool(heard)]
+    seconds = record.window[1] - record.window[0]
+    arrived = len(sent & {event.text for event in heard})
+    heard_of = f"{arrived} of {len(sent)} messages of the {claim.talker}"
+    return _Finding(status, f"{claim.subject} heard {heard_of} in {seconds:.1f} s")
+
+
+def _judge_answers(
+    claim: Claim, record: RowRecord, client: PartyRecord, server: PartyRecord
+) -> _Finding:
+    asked = [e for e in client.events if e.kind is Kind.SENT and _in_window(e, record)]
+    if not asked:
+        return _Finding(RowStatus.UNDECIDED, f"{claim.subject} asked nothing in that time")
+    answers = [e for e in client.events if e.kind is Kind.HEARD and _is_of(e, server)]
+    status = STATUS_OF[Relation.IS_ANSWERED, bool(answers)]
+    within = sum(1 for event in answers if _in_window(event, record))
+    counted = f"{min(within, len(asked))} right answers of the {claim.talker}"
+    return _Finding(status, f"{claim.subject} asked {len(asked)} times and got {counted}")
+
+
+def _judge_replay(
+    claim: Claim, record: RowRecord, listener: PartyRecord, talker: PartyRecord
+) -> _Finding:
+    injected = record.injected
+    if injected is None or not injected.packets:
+        return _Finding(RowStatus.UNDECIDED, "no packets were captured that could be sent again")
+    heard = [e for e in listener.events if e.kind is Kind.HEARD and _is_of(e, talker)]
+    again = sum(1 for event in heard if event.time >= injected.time)
+    status = STATUS_OF[Relation.HEARS_AGAIN, again > 0]
+    return _Finding(
+        status,
+        f"{claim.subject} heard {again} messages in {injected.packets} packets of the"
+        f" {claim.talker} that were sent again, twice, after it had left",
+    )
+
+
+def _judge_forgery(
+    claim: Claim, record: RowRecord, listener: PartyRecord, talker: PartyRecord
+) -> _Finding:
+    injected = record.injected
+    if injected is None or not injected.packets:
+        return _Finding(RowStatus.UNDECIDED, "no packet of the talker could be read and changed")
+    mark = forged_text(talker.text)
+    believed = sum(1 for e in listener.events if e.kind is Kind.HEARD and e.text.startswith(mark))
+    return _Finding(
+        STATUS_OF[Relation.BELIEVES, believed > 0],
+        f"{claim.subject} heard {believed} of {injected.packets} messages that the {claim.talker}"
+        " never sent",
+    )
+
+
+def _is_of(event: Event, speaker: PartyRecord) -> bool:
+    return event.text.startswith(f"{speaker.text}: ")
+
+
+def _judge_refusal(name: str, record: PartyRecord) -> _Finding:
+    problem = _why_not_running(name, record)
+    if problem is None:
+        return _Finding(RowStatus.STARTED, f"{name} was let in")
+    return problem
+
+
+def _judge_view(
+    claim: Claim, record: RowRecord, observer: PartyRecord, talker: PartyRecord
+) -> _Finding:
+    looks = [e for e in observer.events if e.kind is Kind.SEEN and _in_window(e, record)]
+    if not looks:
+        return _Finding(RowStatus.UNDECIDED, f"{claim.subject} did not look in that time")
+    most = max(event.publishers.get(talker.topic, 0) for event in looks)
+    counted = f"{observer.through} counts {most} publishers on {talker.topic}"
+    return _Finding(STATUS_OF[Relation.SEES, most > 0], f"{counted} in {len(looks)} looks")
+
+
+def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> _Finding:
+    count = record.wire.get(claim.subject)
+    if count is None:
+        return _Finding(RowStatus.UNDECIDED, "no packets were captured")
+    if claim.wire is not Wire.TEXT:
+        shown = count.topics if claim.wire is Wire.TOPIC else count.certificates
+        if not shown and not count.protected:
+            return _Finding(RowStatus.UNDECIDED, "no packets of the row were captured")
+        what = f"the {claim.wire}" if claim.wire is Wire.TOPIC else f"a {claim.wire}"
+        return _Finding(STATUS_OF[Relation.READABLE, shown > 0], f"{shown} packets show {what}")
+    if count.plain:
+        return _Finding(RowStatus.READABLE, f"{count.plain} packets show the text")
+    sent = sum(
+        1 for event in talker.events if event.kind is Kind.SENT and _in_window(event, record)
+    )
+    # Silence on the wire proves nothing unless the messages went over the captured wire.
+    if count.protected * 2 < max(2, sent):
+        return _Finding(
+            RowStatus.UNDECIDED,
+            f"only {count.protected} encrypted packets were captured for {sent} messages",
+        )
+    return _Finding(
+        RowStatus.NOT_READABLE, f"0 packets show the text, {count.protected} are encrypted"
+    )
+
+
+def _why_not_running(name: str, record: PartyRecord) -> _Finding | None:
+    """Return why a party did not run through the row, or None if it did."""
+    ready = any(event.kind is Kind.READY for event in record.events)
+    for event in record.events:
+        if event.kind is Kind.REFUSED:
+            return _refused(name, event.stage, _own_denial(record, "") or event.text)
+        if event.kind is Kind.FAILED:
+            return _failure(name, record, event)
+    if record.status is not None:
+        return _Finding(RowStatus.CRASHED, f"{name} {_end_of(record)}")
+    if not ready:
+        return _Finding(RowStatus.NOT_STARTED, f"{name} was not ready in time")
+    return None
+
+
+def _failure(name: str, record: PartyRecord, event: Event) -> _Finding:
+    reported = f"{event.text}\n{record.output}"
+    reason = " ".join(event.text.split())
+    if lacking := missing_security(reported):
+        return _Finding(RowStatus.NOT_STARTED, f"{name}: {lacking}")
+    if event.stage is Stage.ENDPOINT and (refusal := _own_denial(record, event.text)):
+        return _refused(name, Stage.ENDPOINT, refusal)
+    if event.stage in (Stage.PARTICIPANT, Stage.ENDPOINT):
+        # A ROS node has topics and services of its own: denied one of them, it does not start.
+        refusal = participant_refusal(reported) or endpoint_refusal(reported)
+        if refusal:
+            return _refused(name, Stage.PARTICIPANT, refusal)
+    return _Finding(RowStatus.CRASHED, f"{name} failed: {reason}")
+
+
+def _own_denial(record: PartyRecord, reported: str) -> str:
+    """Return the line in which DDS Security denies this very topic, or ""."""
+    lines = f"{record.output}\n{reported}".splitlines()
+    return endpoint_refusal("\n".join(line for line in lines if _is_about(line, record.topic)))
+
+
+def _is_about(line: str, topic: str) -> bool:
+    """Return whether a line is about that topic, or a service or action of that name."""
+    name = rf"r[tqr]{re.escape(topic)}(?:/_action/\w+)?(?:Request|Reply)?(?!\w|/)"
+    return bool(re.search(name, line)) or "not allowed by security" in line.lower()
+
+
+def _refused(name: str, stage: Stage | None, reason: str) -> _Finding:
+    reason = plain_refusal(reason)
+    if stage is Stage.ENDPOINT:
+        return _Finding(RowStatus.REFUSED, f"{name}: {reason}")
+    return _Finding(
+        RowStatus.NOT_LET_IN, f"{name} was refused before it came to the topic: {reason}"
+    )
+
+
+def _end_of(record: PartyRecord) -> str:
+    status = record.status or 0
+    if status < 0:
+        try:
+            return f"was ended by {signal.Signals(-status).name}"
+        except ValueError:
+            return f"was ended by signal {-status}"
+    last = " ".join(record.output.strip().splitlines()[-1:])
+    return f"ended by itself with status {status}. {last}".strip()
+
+
+def _in_window(event: Event, record: RowRecord) -> bool:
+    if record.window is None:
+        return False
+    start, end = record.window
+    return start <= event.time <= end

@@ -268,3 +268,16 @@ class WireCount:
     protected: int
     topics: int = 0
     certificates: int = 0
+
+
+@dataclass(frozen=True)
+class Injection:
+    """How many captured packets were sent again or changed, and when (CLOCK_MONOTONIC)."""
+
+    packets: int
+    time: float
+
+
+def forged_text(text: str) -> str:
+    """What is said in the name of a talker that says ``text``; of the same length."""
+    return text.swapcase()

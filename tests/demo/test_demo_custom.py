@@ -98,7 +98,8 @@ def test_a_good_file(folder: Path) -> None:
         (CLAIM, CLAIM.replace('"heard"', '["heard"]'), 23, "is not a status"),
         (CLAIM, CLAIM.replace('"camera"', '["camera"]'), 23, "no party ['camera']"),
         (CLAIM, CLAIM.replace('expected = "heard"', "x = 1"), 23, "has no expected status; there"),
-        (CLAIM, CLAIM.replace("viewer", "camera"), 23, "cannot be the listener of a claim"),
+        (CLAIM, CLAIM.replace("viewer", "camera"), 23, "camera is a talker, and cannot be the lis"),
+        (CLAIM, 'claim = { party = "spy", expected = "readable" }', 23, "spy is a listener, and"),
         (CLAIM, CLAIM.replace("listener", "client"), 23, "needs listener and talker, and no other"),
         (CLAIM, CLAIM.replace('"heard"', '"started"'), 23, "needs party, and no other keys"),
         (CLAIM, "claim = 3", 23, "claim is not a table"),
@@ -125,6 +126,31 @@ def test_what_is_wrong_is_reported_with_its_line(
         read_scenario(write(folder, GOOD.replace(old, new)))
     assert f"line {line}: " in str(caught.value)
     assert told in str(caught.value)
+
+
+SERVICES = """policy = "robot.xml"
+party = [
+    { name = "adder", role = "server", topic = "/add" },
+    { name = "asker", role = "client", topic = "/add" },
+]
+
+[[row]]
+name = "answers in the open"
+claim = [
+    { party = "adder", expected = "readable" },
+    { client = "asker", server = "adder", expected = "answered" },
+]
+"""
+
+
+def test_claims_in_a_list(folder: Path) -> None:
+    (row,) = read_scenario(write(folder, SERVICES)).rows
+    assert [(claim.relation, claim.subject, claim.talker) for claim in row.claims] == [
+        (Relation.READABLE, "adder", ""),
+        (Relation.IS_ANSWERED, "asker", "adder"),
+    ]
+    assert row.wire
+    assert row.expected is RowStatus.UNDISTURBED
 
 
 def test_broken_toml_and_missing_files(folder: Path) -> None:

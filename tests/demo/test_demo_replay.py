@@ -6,8 +6,13 @@ import struct
 
 import pytest
 
-from sros_tool.demo.verdict import forged_text
-from sros_tool.demo.wire import PacketCounter, packets_of, with_other_words, without_checksum
+from sros_tool.demo.wire import (
+    PacketCounter,
+    forged_text,
+    packets_of,
+    with_other_words,
+    without_checksum,
+)
 from tests.demo.test_demo_capture import packet
 
 WORDS = "Hello World from the talker"

@@ -69,7 +69,7 @@ _PARTIES: Mapping[Relation, tuple[str, ...]] = {
     Relation.HEARS: ("listener", "talker"),
     Relation.IS_ANSWERED: ("client", "server"),
     Relation.SEES: ("observer", "talker"),
-    Relation.READABLE: ("talker",),
+    Relation.READABLE: ("party",),
     Relation.IS_REFUSED: ("party",),
     Relation.STARTS: ("party",),
 }
@@ -249,9 +249,8 @@ class _Reader:
                 problem = f"there is no party {name!r}; there are {', '.join(parties)}"
                 raise self._error("row", place, key, problem)
             role = parties[name].role
-            server_on_the_wire = relation is Relation.READABLE and role in SPEAKING
-            if role not in _FITTING[each] and not server_on_the_wire:
-                problem = f"{name} is a {role}, and cannot be the {each} of a claim"
+            if role not in (SPEAKING if relation is Relation.READABLE else _FITTING[each]):
+                problem = f"{name} is a {role}, and cannot be the {each} that is {expected!r}"
                 raise self._error("row", place, key, problem)
         return Claim(relation, names[0], names[1] if len(names) > 1 else "", holds)
 

@@ -1,4 +1,4 @@
-"""The policies that the demo's enclaves live by: those that ship with sros, on the demo's topic."""
+"""The policies of the demo's enclaves: those that ship with sros, on the demo's topic."""
 
 from __future__ import annotations
 
@@ -20,27 +20,31 @@ _POLICY_TOPIC = "chatter"
 _TALKER, _LISTENER = "/talker_listener/talker", "/talker_listener/listener"
 _WITHOUT = "_without_permission"
 GUEST: Final = "/talker_listener/guest"
-GUEST_TOPIC: Final = "/guest_book"
+_GUEST_TOPIC: Final = "/guest_book"
 SERVICE: Final = "/add_two_ints"
 ACTION: Final = "/fibonacci"
-COST_TOPICS: Final = ("/cost_ping", "/cost_pong")
+_COST_TOPICS: Final = ("/cost_ping", "/cost_pong")
 
 _ROS_TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
-_LONGEST_TOPIC = 200
-_EVERY_NODE_MAY = ("/rosout", "/parameter_events", "/clock", DENIED_TOPIC)
+_MAX_TOPIC_LENGTH = 200
+_TOPICS_OF_EVERY_NODE = ("/rosout", "/parameter_events", "/clock", DENIED_TOPIC)
 
 
 def check_topic(topic: str) -> str:
-    """The absolute form of a topic name for the demo.  Raises `UsageError`."""
-    if len(topic) > _LONGEST_TOPIC or not _ROS_TOPIC.match(topic):
+    """Return the absolute form of a topic name for the demo.
+
+    Raises:
+        UsageError: the demo cannot use it.
+    """
+    if len(topic) > _MAX_TOPIC_LENGTH or not _ROS_TOPIC.match(topic):
         raise UsageError(
             f"{topic!r} is not a topic name that the demo can use",
             "It must be made of letters, digits and underscores, in parts joined by '/', none of"
-            f" which starts with a digit, and have at most {_LONGEST_TOPIC} characters.",
+            f" which starts with a digit, and have at most {_MAX_TOPIC_LENGTH} characters.",
             "Use a name such as /chatter or /robot/camera.",
         )
     absolute = topic if topic.startswith("/") else f"/{topic}"
-    if absolute in _EVERY_NODE_MAY:
+    if absolute in _TOPICS_OF_EVERY_NODE:
         raise UsageError(
             f"the demo cannot use {absolute}",
             "It is one of the topics that a ROS 2 node uses by itself.",
@@ -49,65 +53,65 @@ def check_topic(topic: str) -> str:
     return absolute
 
 
-def shipped_policy(file: str) -> Policy:
-    """A policy that ships with sros."""
+def _shipped_policy(file: str) -> Policy:
+    """Return a policy that ships with sros."""
     return read_policy(policies_dir() / file)
 
 
 def talking_policy(topic: str) -> Policy:
-    """The shipped policy, for ``topic``, and the two enclaves that are not allowed it."""
-    shipped = shipped_policy(_POLICY_FILE)
+    """Return the shipped policy for ``topic``, with two more enclaves that may not use it."""
+    shipped = _shipped_policy(_POLICY_FILE)
     by_path = {enclave.path: enclave for enclave in shipped.enclaves}
     talker, listener = by_path[_TALKER], by_path[_LISTENER]
     return replace(
         shipped,
         enclaves=(
-            with_topic(talker, topic),
-            with_topic(listener, topic),
-            replace(with_topic(talker, None), path=f"{_TALKER}{_WITHOUT}"),
-            replace(with_topic(listener, None), path=f"{_LISTENER}{_WITHOUT}"),
+            _with_topic(talker, topic),
+            _with_topic(listener, topic),
+            replace(_with_topic(talker, None), path=f"{_TALKER}{_WITHOUT}"),
+            replace(_with_topic(listener, None), path=f"{_LISTENER}{_WITHOUT}"),
         ),
     )
 
 
 def attacked_policy(topic: str) -> Policy:
-    """A talker and a listener on ``topic``, a service, and a guest who may use neither.
+    """Return a talker and a listener on ``topic``, a service, and a guest who may use neither.
 
     The name of the guest's enclave is contained in that of an enclave which may publish ``topic``.
     """
     talking = talking_policy(topic)
-    talker = next(each for each in shipped_policy(_POLICY_FILE).enclaves if each.path == _TALKER)
-    guest = replace(with_topic(talker, GUEST_TOPIC), path=GUEST)
-    guests = (guest, replace(with_topic(talker, topic), path=f"{GUEST}/admin"))
-    service = shipped_policy("add_two_ints.xml").enclaves
+    talker = next(each for each in _shipped_policy(_POLICY_FILE).enclaves if each.path == _TALKER)
+    guest = replace(_with_topic(talker, _GUEST_TOPIC), path=GUEST)
+    guests = (guest, replace(_with_topic(talker, topic), path=f"{GUEST}/admin"))
+    service = _shipped_policy("add_two_ints.xml").enclaves
     allowed = tuple(each for each in talking.enclaves if not each.path.endswith(_WITHOUT))
     return replace(talking, enclaves=(*allowed, *guests, *service))
 
 
 def shipped_service_policy(_topic: str) -> Policy:
-    """The shipped policy of a service; it has no use for the topic."""
-    return shipped_policy("add_two_ints.xml")
+    """Return the shipped policy of a service; the topic does not matter."""
+    return _shipped_policy("add_two_ints.xml")
 
 
 def shipped_action_policy(_topic: str) -> Policy:
-    """The shipped policy of an action; it has no use for the topic."""
-    return shipped_policy("fibonacci.xml")
+    """Return the shipped policy of an action; the topic does not matter."""
+    return _shipped_policy("fibonacci.xml")
 
 
 def composed_policy(topic: str) -> Policy:
-    """The shipped policy of a container, and of nodes outside that it speaks with."""
+    """Return the shipped policy of a container, and of nodes outside that it talks to."""
     talking = talking_policy(topic)
-    container = (with_topic(each, topic) for each in shipped_policy("composition.xml").enclaves)
+    container = (_with_topic(each, topic) for each in _shipped_policy("composition.xml").enclaves)
     service = shipped_service_policy(topic).enclaves
     return replace(talking, enclaves=(*talking.enclaves, *container, *service))
 
 
 def measured_policy(topic: str) -> Policy:
-    """The talker and listener, and two enclaves whose nodes send messages to and fro."""
+    """Return a talker, a listener, and the two enclaves between which the cost is measured."""
     talking = talking_policy(topic)
     basics = read_policy(policies_dir() / "defaults/node_basics.xml").enclaves[0].all_profiles()
     rights = (("publish", ALLOW), ("subscribe", ALLOW))
-    groups = (*basics[0].groups, Group("topics", rights, COST_TOPICS))
+    groups = (*basics[0].groups, Group("topics", rights, _COST_TOPICS))
     ends = tuple(
         Enclave(path, (Profiles((Profile("/", "cost", groups),)),))
         for path in ("/cost/ping", "/cost/pong")
@@ -115,8 +119,8 @@ def measured_policy(topic: str) -> Policy:
     return replace(talking, enclaves=(*talking.enclaves, *ends))
 
 
-def with_topic(enclave: Enclave, topic: str | None) -> Enclave:
-    """The enclave with ``topic`` in place of the shipped policy's, or without either."""
+def _with_topic(enclave: Enclave, topic: str | None) -> Enclave:
+    """Return the enclave with ``topic`` instead of the shipped policy's, or with neither."""
 
     def of_group(group: Group) -> Group | None:
         if group.kind != "topics" or _POLICY_TOPIC not in group.names:
