@@ -15,20 +15,15 @@ from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
-    PERMISSIONS,
-    REQUEST,
     ROLES,
-    SETTINGS,
     ca_certificate,
     ca_key,
-    enclave_names,
-    enclave_path,
     is_keystore,
+    permissions_ca_for,
 )
-from sros_tool.keystore.reader import OpenedEnclave, load_settings, open_enclave
+from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_enclave, read_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
-    load_certificate,
     load_certificates,
     subject_text,
     validity_of,
@@ -43,12 +38,18 @@ Description = dict[str, Any]
 
 
 def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Description:
-    """What ``path`` is and says; ``kind`` tells which description follows.
+    """Return what ``path`` is and says; its ``kind`` says which description follows.
 
     Kinds: keystore, enclave, certificate, revocation list, private key, permissions, governance.
-    ``authority`` is
-    the permissions CA certificate against which a signed document is verified; by default the one
-    that lies with it.  Raises `DocumentError` for what is none of these.
+
+    Args:
+        path: a keystore, the folder of an enclave, or a file of one.
+        now: the moment for which validity is reported.
+        authority: the permissions CA certificate to verify a signed document against; by default
+            the one that lies with it.
+
+    Raises:
+        DocumentError: ``path`` is none of these.
     """
     if path.is_dir():
         if is_keystore(path):
@@ -89,7 +90,8 @@ def _file(path: Path, data: bytes, now: datetime, authority: Path | None) -> Des
 
 
 def _keystore(root: Path, now: datetime) -> Description:
-    template = load_settings(root)
+    keystore = OpenedKeystore(root)
+    settings = keystore.settings
     authorities: Description = {}
     for role in ROLES:
         path = root / ca_certificate(role)
@@ -102,7 +104,7 @@ def _keystore(root: Path, now: datetime) -> Description:
             }
         except SrosError as error:
             authorities[role] = {"error": str(error)}
-    enclaves = [_enclave_of(root, name, now) for name in enclave_names(root)]
+    enclaves = [_enclave(name, keystore.enclave(name, now=now)) for name in keystore.names]
     governance = None
     if (root / GOVERNANCE_P7S).exists():
         try:
@@ -116,7 +118,7 @@ def _keystore(root: Path, now: datetime) -> Description:
     return {
         "kind": "keystore",
         "path": str(root),
-        "template": template.name if (root / SETTINGS).exists() else None,
+        "template": settings.name if settings else None,
         "authorities": authorities,
         "governance": governance,
         "enclaves": enclaves,
@@ -124,23 +126,20 @@ def _keystore(root: Path, now: datetime) -> Description:
     }
 
 
-def _enclave_of(root: Path, name: str, now: datetime) -> Description:
-    """An enclave of a keystore; that its key was made on its robot, where it stays, is no fault."""
-    folder = enclave_path(root, name)
-    described = describe_enclave(open_enclave(folder, now=now))
-    elsewhere = (folder / REQUEST).exists() and not (folder / "key.pem").exists()
-    if elsewhere and (folder / "cert.pem").exists():
-        described["problems"] = [p for p in described["problems"] if p != "key.pem: missing"]
-    return {"name": name, "key_on_robot": elsewhere, **described}
+def _enclave(name: str, state: OpenedEnclave) -> Description:
+    """Return an enclave of a keystore; that its key stays on its robot is no problem there."""
+    described = describe_enclave(state)
+    described["problems"] = [str(problem) for problem in state.problems_at_home]
+    return {"name": name, "key_on_robot": state.key_on_robot, **described}
 
 
 def describe_enclave(state: OpenedEnclave) -> Description:
-    """The state of an enclave: ``loadable`` says whether a process can run in it now."""
+    """Return the state of an enclave: ``loadable`` says whether a process can run in it now."""
     domains = state.domains()
     return {
         "loadable": not state.problems,
         "problems": [str(problem) for problem in state.problems],
-        "subject": subject_text(state.certificate.subject) if state.certificate else None,
+        "subject": state.subject or None,
         "valid_until": iso(validity_of(state.certificate).not_after) if state.certificate else None,
         "identity_ca": subject_text(state.identity_ca.subject) if state.identity_ca else None,
         "permissions_ca": (
@@ -153,7 +152,7 @@ def describe_enclave(state: OpenedEnclave) -> Description:
 
 
 def describe_certificate(certificate: x509.Certificate, now: datetime) -> Description:
-    """The parts of a certificate that matter to DDS Security."""
+    """Return the parts of a certificate that matter to DDS Security."""
     validity = validity_of(certificate)
     try:
         is_ca = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
@@ -175,7 +174,7 @@ def describe_certificate(certificate: x509.Certificate, now: datetime) -> Descri
 
 
 def _certificates(data: bytes, name: str, now: datetime) -> Description:
-    """The first certificate of a file, and what else is in it under "further" and "crl"."""
+    """Return the first certificate of a file, with what else it holds as "further" and "crl"."""
     certificate, *further = load_certificates(data, name)
     described = describe_certificate(certificate, now)
     if further:  # the chain of a CA, or the other one while a CA is being replaced
@@ -186,7 +185,7 @@ def _certificates(data: bytes, name: str, now: datetime) -> Description:
 
 
 def _list(crl: RevocationList, now: datetime) -> Description:
-    """A revocation list; an expired one makes DDS refuse whom its CA has certified."""
+    """Return a revocation list; an expired one makes DDS refuse all that its CA certified."""
     return {
         "issuer": subject_text(crl.list.issuer),
         "number": crl.number,
@@ -200,11 +199,11 @@ def _list(crl: RevocationList, now: datetime) -> Description:
 def _signed(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
     signed = smime.parse(data)
     signer = signed.signer()
-    found = authority or _authority_beside(path)
+    found = authority or permissions_ca_for(path)
     reason = "no permissions CA certificate lies with it; name one with --ca"
     verified: bool | None = None
     if found:
-        certificate = load_certificate(read_bytes(found, "certificate"), f"'{found}'")
+        certificate = read_certificate(found)
         try:
             signed.verify(certificate)
             verified, reason = True, ""
@@ -219,12 +218,6 @@ def _signed(path: Path, data: bytes, now: datetime, authority: Path | None) -> D
         "signature_verified": verified,
         "signature_problem": reason,
     }
-
-
-def _authority_beside(path: Path) -> Path | None:
-    name = f"{PERMISSIONS}_ca.cert.pem"
-    folder = path.absolute().parent
-    return next((p for p in (folder / name, folder.parent / "public" / name) if p.exists()), None)
 
 
 def _document(document: bytes, now: datetime) -> Description:
@@ -264,7 +257,7 @@ def _grant(grant: Grant, now: datetime | None) -> Description:
 
 
 def _rights(rights: Iterable[RosRight]) -> Description:
-    """ROS names by kind and right, such as ``{"topics": {"publish": ["/chatter"]}}``."""
+    """Return ROS names by kind and right, such as ``{"topics": {"publish": ["/chatter"]}}``."""
     table: Description = {}
     for right in rights:
         table.setdefault(right.kind, {}).setdefault(right.right, []).append(right.name)

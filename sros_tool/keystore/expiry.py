@@ -11,28 +11,40 @@ from cryptography import x509
 
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore.layout import enclave_folder, list_enclaves
-from sros_tool.keystore.reader import read_granted
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    PERMISSIONS_FILE,
+    enclave_path,
+    list_enclaves,
+)
+from sros_tool.keystore.reader import read_certificate, read_granted
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import load_certificate, subject_text, validity_of
+from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.validity import BACKDATE, Window, iso, parse_duration
-from sros_tool.xml import read_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Threshold:
+    """When an enclave is due: with so much ``remaining``, or ``elapsed`` (0 to 1) of its life."""
+
+    remaining: timedelta | None = None
+    elapsed: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Lifetime:
-    """When what an enclave consists of ends, and how much of its life is over."""
+    """The validity of an enclave's certificate and of its permissions."""
 
     name: str
     certificate: Window
     permissions: Window
 
     def ends(self) -> datetime:
-        """The earlier of both ends."""
+        """Return the expiry of whichever expires first."""
         return min(self.certificate.not_after, self.permissions.not_after)
 
     def due(self, threshold: Threshold, now: datetime) -> bool:
-        """Whether it is to be renewed by ``threshold``."""
+        """Whether the enclave is to be renewed by ``threshold``."""
         if threshold.remaining is not None:
             return self.ends() - now <= threshold.remaining
         assert threshold.elapsed is not None
@@ -43,18 +55,10 @@ class Lifetime:
 
 
 @dataclass(frozen=True, slots=True)
-class Threshold:
-    """When a thing is to be renewed: at so much ``remaining``, or ``elapsed`` (0 to 1) of it."""
-
-    remaining: timedelta | None = None
-    elapsed: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Credentials:
-    """What an enclave has: a certificate, and the grant that DDS reads, neither verified yet.
+    """The certificate of an enclave and the grant that DDS reads, neither verified yet.
 
-    ``digest`` is the SHA-256 of the signed permissions.
+    ``digest`` is the SHA-256 of the signed permissions, in hexadecimal.
     """
 
     name: str
@@ -64,28 +68,20 @@ class Credentials:
     grant: Grant
 
     def lifetime(self) -> Lifetime:
-        """When both end."""
+        """Return the validity of both."""
         return Lifetime(self.name, validity_of(self.certificate), self.grant.validity)
 
 
 @dataclass(frozen=True, slots=True)
 class UnreadableEnclave:
-    """An enclave of which nobody can tell when it ends, and why."""
+    """An enclave whose certificate or permissions cannot be read, and why."""
 
     name: str
     error: SrosError
 
 
-def _elapsed(validity: Window, now: datetime) -> float:
-    """How much of a life is over, from 0 to 1; the time by which it was back-dated is no life."""
-    begin = validity.not_before
-    if validity.not_after - begin > BACKDATE:
-        begin += BACKDATE
-    return (now - begin) / (validity.not_after - begin)
-
-
 def parse_threshold(text: str) -> Threshold:
-    """Read ``30d`` (that much is left) or ``66%`` (that much is over)."""
+    """Return the threshold that ``30d`` (so much is left) or ``66%`` (so much is over) means."""
     match = re.fullmatch(r"(\d{1,3})%", text.strip(), re.ASCII)
     if not match:
         return Threshold(remaining=parse_duration(text))
@@ -95,9 +91,10 @@ def parse_threshold(text: str) -> Threshold:
 
 
 def lifetimes(root: Path) -> tuple[Lifetime, ...]:
-    """When each enclave of a keystore ends, in the order of names.
+    """Return the lifetime of each enclave of a keystore, in the order of names.
 
-    Raises one `KeystoreError` that names every enclave that cannot be read.
+    Raises:
+        KeystoreError: some enclaves cannot be read; it names all of them.
     """
     found, unreadable = survey(root)
     refuse_unreadable(unreadable, "read")
@@ -105,7 +102,7 @@ def lifetimes(root: Path) -> tuple[Lifetime, ...]:
 
 
 def survey(root: Path) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...]]:
-    """As `lifetimes`, with those that cannot be read beside those that can."""
+    """Return the lifetimes of the enclaves that can be read, and the others."""
     found, unreadable = [], []
     for name in list_enclaves(root):
         try:
@@ -116,27 +113,30 @@ def survey(root: Path) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, .
 
 
 def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> None:
-    """Raise one error that names every one of the enclaves, if there are any."""
+    """Raise one `KeystoreError` that names all these enclaves, if there are any."""
     if len(unreadable) == 1:
         raise unreadable[0].error
     if unreadable:
         names = ", ".join(each.name for each in unreadable)
-        told = " ".join(f"{each.error.what}." for each in unreadable)
+        reasons = " ".join(f"{each.error.what}." for each in unreadable)
         raise KeystoreError(
             f"{len(unreadable)} enclaves cannot be {verb}: {names}",
-            f"{told} Nothing was changed.",
+            f"{reasons} Nothing was changed.",
             "Mend or revoke them, or name those that are meant.",
         )
 
 
 def read_credentials(root: Path, name: str) -> Credentials:
-    """What an enclave has; raises `KeystoreError` where that is not to be read."""
-    folder = root / enclave_folder(name)
+    """Return the certificate and the grant of an enclave, without verifying them.
+
+    Raises:
+        KeystoreError: one of them cannot be read, or they do not belong together.
+    """
+    folder = enclave_path(root, name)
     try:
-        path = folder / "cert.pem"
-        certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+        certificate = read_certificate(folder / CERTIFICATE_FILE)
         subject = subject_text(certificate.subject)
-        granted = read_granted(folder / "permissions.p7s", subject)
+        granted = read_granted(folder / PERMISSIONS_FILE, subject)
     except SrosError as error:
         raise KeystoreError(
             f"enclave {name} cannot be read: {error.what}",
@@ -147,17 +147,25 @@ def read_credentials(root: Path, name: str) -> Credentials:
         raise KeystoreError(
             f"the permissions of enclave {name} have no grant for {subject}",
             "They belong to another certificate.",
-            f"Sign them anew with `sros create_permission {root} {name} POLICY_FILE`.",
+            f"Sign them again with `sros create_permission {root} {name} POLICY_FILE`.",
         )
     return Credentials(name, certificate, granted.signed, granted.digest, granted.grant)
 
 
 def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
-    """In words: which part ends first, and when."""
+    """Return a line that says which part expires first, and when."""
     first = (
         "certificate"
         if lifetime.certificate.not_after <= lifetime.permissions.not_after
         else "permissions"
     )
-    word = "ended" if lifetime.ends() < now else "until"
+    word = "expired" if lifetime.ends() < now else "until"
     return f"{lifetime.name}  {first} {word} {iso(lifetime.ends())}"
+
+
+def _elapsed(validity: Window, now: datetime) -> float:
+    """Return how much of a life is over, from 0 to 1, without the time it was back-dated by."""
+    begin = validity.not_before
+    if validity.not_after - begin > BACKDATE:
+        begin += BACKDATE
+    return (now - begin) / (validity.not_after - begin)

@@ -1,4 +1,4 @@
-"""Tells what became of everything that a keystore ever issued, by its ledger and its files."""
+"""What became of everything that a keystore ever issued, by its ledger and its files."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from enum import StrEnum
 from pathlib import Path
 
 from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
     CRL,
     GOVERNANCE_P7S,
+    PERMISSIONS_FILE,
     PUBLIC,
     RETIRED,
     REVOKED,
@@ -25,11 +27,11 @@ from sros_tool.keystore.reader import read_lists
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
-_ISSUED = ("cert.pem", "permissions.p7s")
+_ISSUED = (CERTIFICATE_FILE, PERMISSIONS_FILE)
 _PEM = re.compile(rb"-----BEGIN ([A-Z0-9 ]+)-----(.*?)-----END \1-----\n?", re.DOTALL)
 
 
-class Status(StrEnum):
+class HistoryStatus(StrEnum):
     """What became of something that was issued."""
 
     CURRENT = "current"
@@ -45,48 +47,49 @@ class Status(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
-    """An entry of the ledger, what became of it, and where it lies (or "")."""
+class HistoryItem:
+    """An entry of the ledger, what became of it, and the path where it lies (or "")."""
 
     entry: Entry
-    status: Status
+    status: HistoryStatus
     path: str
 
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """All entries, oldest first, and the files that none of them explains."""
+    """All entries, oldest first, and the paths of files that none of them explains."""
 
-    items: tuple[Item, ...]
+    items: tuple[HistoryItem, ...]
     unexplained: tuple[str, ...]
 
 
 def history(root: Path, *, now: datetime) -> History:
-    """Compare the ledger of a keystore with its certificates and signed documents."""
+    """Return the ledger of a keystore, compared with its certificates and signed documents."""
     issued, put_away = _files(root, _served(root)), _files(root, _put_away(root))
     retired = _files(root, _retired(root))
     entries = read_ledger(root)
-    # A list of a new CA begins empty, and what has ended is on none: the ledger knows it still.
+    # The list of a new CA begins empty, and what expired is on none: the ledger still knows it.
     revoked = {each.serial for each in entries if each.what == "revocation"}
     revoked |= {f"{each.serial:x}" for crl in read_lists(root) for each in crl.revoked}
     moment = iso(now)
 
-    def status(entry: Entry) -> Status:
+    def status(entry: Entry) -> HistoryStatus:
         if entry.what == "answer":
-            return Status.SENT
+            return HistoryStatus.SENT
         if entry.what == "revocation" or entry.serial in revoked or entry.sha256 in put_away:
-            return Status.REVOKED
+            return HistoryStatus.REVOKED
         if entry.sha256 in retired and entry.sha256 not in issued:
-            return Status.RETIRED
+            return HistoryStatus.RETIRED
         if entry.not_after and entry.not_after < moment:
-            return Status.EXPIRED
-        return Status.CURRENT if entry.sha256 in issued else Status.SUPERSEDED
+            return HistoryStatus.EXPIRED
+        return HistoryStatus.CURRENT if entry.sha256 in issued else HistoryStatus.SUPERSEDED
 
     known = {entry.sha256 for entry in entries}
     found = {**retired, **put_away, **issued}
     return History(
         tuple(
-            Item(entry, status(entry), (found.get(entry.sha256) or [""])[0]) for entry in entries
+            HistoryItem(entry, status(entry), (found.get(entry.sha256) or [""])[0])
+            for entry in entries
         ),
         tuple(
             sorted(path for digest, paths in found.items() if digest not in known for path in paths)
@@ -95,7 +98,7 @@ def history(root: Path, *, now: datetime) -> History:
 
 
 def _served(root: Path) -> Iterator[str]:
-    """Every certificate and signed document that DDS may load."""
+    """Yield the path of every certificate and signed document that DDS may load."""
     yield from (f"{PUBLIC}/{path.name}" for path in sorted((root / PUBLIC).glob("*.cert.pem")))
     yield from (GOVERNANCE_P7S, CRL)
     for name in list_enclaves(root):
@@ -112,7 +115,7 @@ def _retired(root: Path) -> Iterator[str]:
 
 
 def _files(root: Path, paths: Iterator[str]) -> dict[str, list[str]]:
-    """Those of the files that are there, by the digests of what they hold as the ledger has it."""
+    """Map the digests of the ledger to the files that have them."""
     found: dict[str, list[str]] = {}
     for path in paths:
         if (root / path).is_file() and not (root / path).is_symlink():
@@ -122,7 +125,7 @@ def _files(root: Path, paths: Iterator[str]) -> dict[str, list[str]]:
 
 
 def _digests(path: Path) -> list[str]:
-    """Of everything in a file: that of a CA holds more while it is being replaced."""
+    """Return the digest of everything in a file: a CA's holds more while it is being replaced."""
     data = read_bytes(path, "file")
     if not path.name.endswith("cert.pem"):
         return [hashlib.sha256(data).hexdigest()]

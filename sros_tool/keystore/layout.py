@@ -65,6 +65,13 @@ def ca_key(role: str) -> str:
     return f"{PRIVATE}/{role}_ca.key.pem"
 
 
+def permissions_ca_for(document: Path) -> Path | None:
+    """Return the certificate of the permissions CA that lies with a signed document, or None."""
+    folder = document.absolute().parent
+    places = (folder / PERMISSIONS_CA_FILE, folder.parent / PUBLIC / PERMISSIONS_CA_FILE)
+    return next((path for path in places if path.exists()), None)
+
+
 def enclave_folder(name: str) -> str:
     """Return the folder of an enclave, relative to the keystore; for ``/`` it is ``enclaves``."""
     return ENCLAVES + name.rstrip("/")

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line: what was issued (or revoked), when, for whom, and how long it is valid.
+    """A line of the ledger: what was issued (or revoked), when, for whom, and how long it is valid.
 
     ``what`` is ca, certificate, permissions, governance, crl, revocation, or answer (the signed
     list of what was sent to a robot).  ``sha256`` is that of the DER of a certificate or of the
@@ -54,7 +54,7 @@ _FIELDS = tuple(each.name for each in fields(Entry))
 def certificate_entry(
     now: datetime, what: str, certificate: x509.Certificate, enclave: str = ""
 ) -> Entry:
-    """The entry of an issued certificate."""
+    """Return the entry of an issued certificate."""
     validity = validity_of(certificate)
     return Entry(
         time=iso(now),
@@ -78,7 +78,7 @@ def document_entry(
     validity: Window | None = None,
     policy: str = "",
 ) -> Entry:
-    """The entry of a signed document."""
+    """Return the entry of a signed document."""
     return Entry(
         time=iso(now),
         what=what,
@@ -92,7 +92,11 @@ def document_entry(
 
 
 def read_ledger(root: Path) -> tuple[Entry, ...]:
-    """All entries, oldest first; none for a keystore without a ledger (of ros2/sros2)."""
+    """Return all entries, oldest first; none for a keystore without a ledger (of ros2/sros2).
+
+    Raises:
+        KeystoreError: a line is no entry.
+    """
     path = root / LEDGER
     if not path.exists():
         return ()
@@ -110,7 +114,7 @@ def read_ledger(root: Path) -> tuple[Entry, ...]:
 
 
 def append(transaction: Transaction, entries: Iterable[Entry]) -> None:
-    """Stage the ledger with further entries."""
+    """Stage the ledger with further entries in a transaction."""
     new = b"".join(_line(entry) for entry in entries)
     if not new:
         return

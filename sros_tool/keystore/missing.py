@@ -11,16 +11,14 @@ from sros_tool.keystore.layout import REVOKED
 from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.names import check_enclave_name
 
-_FEW = 5
-"""So many enclaves are told before the rest is counted."""
-
-
+_SHOWN = 5
+"""How many enclaves are named before the rest is counted."""
 _ALIKE = 0.75
-"""The least likeness (`difflib`) of a slip of the keyboard: one letter of four, or two of eight."""
+"""The least similarity (`difflib`) of a typo: one letter of four, or two of eight."""
 
 
 def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
-    """The error for ``name``, which is none of the enclaves that are ``there``."""
+    """Return the error for ``name``, which is none of the enclaves that are ``there``."""
     if revocation := _revocation(root, name):
         return _was_revoked(root, revocation)
     what = f"enclave {name} does not exist in keystore '{root}'"
@@ -32,23 +30,25 @@ def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
     except InvalidNameError as error:
         return error
     names = sorted(there)
-    more = f" and {len(names) - _FEW} more" if len(names) > _FEW else ""
-    why = f"It has {', '.join(names[:_FEW]) or 'none'}{more}."
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    why = f"It has {', '.join(names[:_SHOWN]) or 'none'}{more}."
     return KeystoreError(what, why, f"Make it with `sros create_enclave {root} {name}`.")
 
 
 def _revocation(root: Path, name: str) -> Entry | None:
-    """How the ledger says that an enclave was revoked, if nothing was issued for it since."""
+    """Return the ledger's entry of an enclave's revocation, if nothing was issued for it since."""
     try:
         entries = read_ledger(root)
     except SrosError:
         return None  # that the enclave is missing is what counts here
-    of_it = [e for e in entries if e.enclave == name and e.what in ("certificate", "revocation")]
-    if not of_it or of_it[-1].what != "revocation":
+    of_enclave = [
+        e for e in entries if e.enclave == name and e.what in ("certificate", "revocation")
+    ]
+    if not of_enclave or of_enclave[-1].what != "revocation":
         return None
     # Earlier certificates of it were revoked with it; the files are those of one.
-    kept = (e for e in reversed(of_it) if e.serial and (root / REVOKED / e.serial).is_dir())
-    return next(kept, of_it[-1])
+    kept = (e for e in reversed(of_enclave) if e.serial and (root / REVOKED / e.serial).is_dir())
+    return next(kept, of_enclave[-1])
 
 
 def _was_revoked(root: Path, entry: Entry) -> SrosError:
@@ -57,15 +57,15 @@ def _was_revoked(root: Path, entry: Entry) -> SrosError:
     return KeystoreError(
         f"enclave {entry.enclave} of keystore '{root}' was revoked at {entry.time}{reason}",
         f"Its files lie in '{folder}'." if folder.is_dir() else "",
-        f"If it is needed again, make it anew with `sros create_enclave {root} {entry.enclave}`.",
+        f"If it is needed again, make it again with `sros create_enclave {root} {entry.enclave}`.",
     )
 
 
 def likely_names(name: str, there: Collection[str]) -> tuple[str, ...]:
-    """The enclaves that someone who wrote ``name`` may have meant, at most three.
+    """Return the enclaves that someone who wrote ``name`` may have meant, at most three.
 
-    Those that end in it, for its beginning is what one leaves out; otherwise those whose last part
-    is spelt alike.
+    Those that end in it, for its beginning is what people leave out; otherwise those whose last
+    part has a similar spelling.
     """
     end = "/" + name.strip("/")
     if end == "/":

@@ -1,4 +1,4 @@
-"""Reads the rights that a policy, a permissions document, an enclave or a keystore gives.
+"""The rights that a policy, a permissions document, an enclave or a keystore gives.
 
 What DDS loads is ``permissions.p7s``, so that counts in enclaves and keystores.  Its signature is
 verified against the permissions CA that lies with it.
@@ -16,11 +16,12 @@ from cryptography import x509
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
 from sros_tool.errors import DocumentError, Note, SrosError
 from sros_tool.keystore.layout import (
-    PERMISSIONS,
-    PUBLIC,
+    PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
     enclave_names,
     enclave_path,
     is_keystore,
+    permissions_ca_for,
 )
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
@@ -29,17 +30,15 @@ from sros_tool.policy.rights import Right, policy_rights
 from sros_tool.translate import grant_rights
 from sros_tool.xml import parse, read_bytes
 
-_SIGNED = "permissions.p7s"
-_AUTHORITY = f"{PERMISSIONS}_ca.cert.pem"
 _COMMON_NAME = re.compile(r"(?:^|[,/])\s*CN\s*=\s*(/[^,]*?)\s*(?:,|$)")
 
 
 @dataclass(frozen=True, slots=True)
 class RightsSource:
-    """What a file or folder says of rights.
+    """The rights that a file or folder gives.
 
-    ``kind`` is policy, permissions, enclave or keystore.  ``scope`` are the enclaves of which it
-    can speak; None where it speaks of all.  ``sound`` is False where DDS would refuse some of it:
+    ``kind`` is policy, permissions, enclave or keystore.  ``scope`` are the enclaves that it
+    can give rights to; None for all.  ``sound`` is False where DDS would refuse some of it:
     a signature that does not verify, permissions that are missing or cannot be read.
     """
 
@@ -52,19 +51,22 @@ class RightsSource:
 
 
 def load_rights(path: Path) -> RightsSource:
-    """The rights that lie at ``path``.
+    """Return the rights that ``path`` gives.
 
-    A policy file, ``permissions.p7s`` or ``permissions.xml``, the folder of an enclave, or a
-    keystore.  Raises `DocumentError` for anything else.
+    It is a policy file, ``permissions.p7s`` or ``permissions.xml``, the folder of an enclave, or a
+    keystore.
+
+    Raises:
+        DocumentError: it is anything else.
     """
     if path.is_dir():
         if is_keystore(path):
             return _keystore(path)
-        if (path / _SIGNED).exists():
-            return _one(path, "enclave", path / _SIGNED)
+        if (path / PERMISSIONS_FILE).exists():
+            return _one(path, "enclave", path / PERMISSIONS_FILE)
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
-            f"It has no enclaves folder, and no {_SIGNED}.",
+            f"It has no enclaves folder, and no {PERMISSIONS_FILE}.",
         )
     data = read_bytes(path, "file")
     signed = b"multipart/signed" in data[:1000].lower()
@@ -86,7 +88,7 @@ def _keystore(root: Path) -> RightsSource:
     reader = _Reader()
     rights: set[Right] = set()
     for name in enclave_names(root):
-        file = enclave_path(root, name) / _SIGNED
+        file = enclave_path(root, name) / PERMISSIONS_FILE
         try:
             found, scope = reader.permissions(file, name)
         except SrosError as error:
@@ -110,7 +112,7 @@ def _keystore(root: Path) -> RightsSource:
 
 @dataclass(slots=True)
 class _Reader:
-    """Reads permissions, and remembers what is to be said about them."""
+    """Reads permissions, and collects notes about them."""
 
     sound: bool = True
     unsure: list[Note] = field(default_factory=list)
@@ -118,7 +120,7 @@ class _Reader:
     _authorities: dict[bytes, x509.Certificate] = field(default_factory=dict)
 
     def permissions(self, file: Path, what: str) -> tuple[frozenset[Right], tuple[str, ...]]:
-        """The rights in a permissions document, signed or not, and the enclaves it is for."""
+        """Return the rights in a permissions document and the enclaves that it is for."""
         data = read_bytes(file, "permissions document")
         if b"multipart/signed" in data[:1000].lower():
             try:
@@ -128,9 +130,8 @@ class _Reader:
             self._verify(signed, file, what)
             data = signed.document
         else:
-            self.unsure.append(
-                Note("rights.unsigned", f"{what}: not signed. DDS loads {_SIGNED} instead.")
-            )
+            text = f"{what}: not signed. DDS loads {PERMISSIONS_FILE} instead."
+            self.unsure.append(Note("rights.unsigned", text))
         permissions = parse_permissions(data, f"'{file}'")
         self.notes += [
             Note(note.id, f"{what}: {note.text}") for note in _left_out(permissions.grants)
@@ -141,9 +142,10 @@ class _Reader:
 
     def _verify(self, signed: smime.SignedDocument, file: Path, what: str) -> None:
         try:
-            authority = self._authority_beside(file)
+            authority = self._authority_for(file)
             if authority is None:
-                text = f"{what}: the signature was not verified, for no {_AUTHORITY} lies with it."
+                text = f"{what}: the signature was not verified, for no {PERMISSIONS_CA_FILE} "
+                text += "lies with it."
                 self.unsure.append(Note("rights.not-verified", text))
                 return
             signed.verify(authority)
@@ -152,19 +154,18 @@ class _Reader:
             text = f"{what}: THE SIGNATURE DOES NOT VERIFY, and DDS refuses it: {error}"
             self.notes.append(Note("rights.bad-signature", text.rstrip(".") + "."))
 
-    def _authority_beside(self, file: Path) -> x509.Certificate | None:
-        folder = file.absolute().parent
-        for path in (folder / _AUTHORITY, folder.parent / PUBLIC / _AUTHORITY):
-            if path.exists():
-                data = read_bytes(path, "certificate")
-                if data not in self._authorities:
-                    self._authorities[data] = load_certificate(data, f"'{path}'")
-                return self._authorities[data]
-        return None
+    def _authority_for(self, file: Path) -> x509.Certificate | None:
+        path = permissions_ca_for(file)
+        if path is None:
+            return None
+        data = read_bytes(path, "certificate")
+        if data not in self._authorities:
+            self._authorities[data] = load_certificate(data, f"'{path}'")
+        return self._authorities[data]
 
 
 def _first_of_each(permissions: Permissions) -> dict[str, Grant]:
-    """The grant of each enclave: DDS reads the first one of a subject only."""
+    """Return the grant of each enclave: DDS reads the first one of a subject only."""
     grants: dict[str, Grant] = {}
     for grant in permissions.grants:
         grants.setdefault(_enclave_of(grant), grant)
@@ -172,13 +173,13 @@ def _first_of_each(permissions: Permissions) -> dict[str, Grant]:
 
 
 def _enclave_of(grant: Grant) -> str:
-    """An enclave's name is the common name of its certificate; else the grant's own name."""
+    """Return the enclave of a grant: the common name of its subject, or the grant's name."""
     match = _COMMON_NAME.search(grant.subject)
     return match[1] if match else grant.name or grant.subject
 
 
 def _left_out(grants: Iterable[Grant]) -> Iterator[Note]:
-    """Remarks on what a grant says and rights in ROS terms do not."""
+    """Yield notes on what a grant says and rights in ROS terms do not."""
     seen: set[str] = set()
     for grant in grants:
         name = _enclave_of(grant)

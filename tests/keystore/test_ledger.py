@@ -11,7 +11,7 @@ import pytest
 from cryptography.hazmat.primitives import hashes
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.history import Status, history
+from sros_tool.keystore.history import HistoryStatus, history
 from sros_tool.keystore.layout import LEDGER
 from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
@@ -207,7 +207,7 @@ def test_history_as_text_and_json(tmp_path: Path) -> None:
     assert set(document) == {"kind", "path", "entries", "unexplained"}
     assert len(document["entries"]) == 9
     assert {*document["entries"][3]} == {*Entry.__slots__, "status", "path"}
-    assert {entry["status"] for entry in document["entries"]} <= set(Status)
+    assert {entry["status"] for entry in document["entries"]} <= set(HistoryStatus)
     assert document["unexplained"] == []
 
 

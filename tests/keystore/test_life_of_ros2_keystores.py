@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore.history import Status, history
+from sros_tool.keystore.history import HistoryStatus, history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.rotation.state import rotation_status
 from sros_tool.keystore.reader import open_enclave, read_lists
@@ -109,7 +109,9 @@ def test_rotating_with_a_revocation_in_every_stage(root: Path) -> None:
     assert (root / "private/ca.key.pem").stat().st_mode & 0o777 == 0o600
     found = history(root, now=NOW)
     assert found.unexplained == (f"retired/{old.serial_number:x}.cert.pem",)
-    assert {each.status for each in found.items if each.entry.what == "ca"} == {Status.CURRENT}
+    assert {each.status for each in found.items if each.entry.what == "ca"} == {
+        HistoryStatus.CURRENT
+    }
     sros("revoke", root, "/d").ok()
     check(root, "/a", "/b/c")
 

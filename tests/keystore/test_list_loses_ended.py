@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore.history import Status, history
+from sros_tool.keystore.history import HistoryStatus, history
 from sros_tool.keystore.layout import LEDGER, enclave_path
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
@@ -62,7 +62,7 @@ def test_revoking_another_drops_it_too_and_the_ledger_keeps_it(tmp_path: Path) -
         for item in history(root, now=late).items
         if item.entry.serial == f"{serial:x}" and item.entry.what == "certificate"
     ]
-    assert found.status is Status.REVOKED
+    assert found.status is HistoryStatus.REVOKED
 
 
 def test_of_what_nobody_knows_the_end_stays(tmp_path: Path) -> None:

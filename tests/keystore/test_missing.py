@@ -64,7 +64,7 @@ def test_of_a_revoked_enclave_it_says_since_when(tmp_path: Path) -> None:
     (entry, *_) = (e for e in read_ledger(root) if e.what == "revocation" and e.serial == serial)
     said = (
         f"enclave /camera of keystore '{root}' was revoked at {entry.time} (keyCompromise). Its "
-        f"files lie in '{root}/revoked/{serial}'. If it is needed again, make it anew with "
+        f"files lie in '{root}/revoked/{serial}'. If it is needed again, make it again with "
         f"`sros create_enclave {root} /camera`."
     )
     assert str(no_such_enclave(root, "/camera", list_enclaves(root))) == said

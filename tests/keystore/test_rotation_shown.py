@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.keystore.history import Status, history
+from sros_tool.keystore.history import HistoryStatus, history
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
@@ -30,7 +30,7 @@ def root(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return tmp_path / "ks"
 
 
-def standing(root: Path) -> dict[str, tuple[Status, str]]:
+def standing(root: Path) -> dict[str, tuple[HistoryStatus, str]]:
     """By the digests of CAs and lists, what the history says of each, and where it lies."""
     found = history(root, now=NOW)
     assert not found.unexplained
@@ -49,17 +49,17 @@ def test_the_history_knows_both_cas_and_their_lists(root: Path) -> None:
         for file, first in old.items():
             path = f"public/{file}.cert.pem"
             new = next(each for each in certificates_of(root, file) if each != first)
-            assert standing(root)[digest(new)] == (Status.CURRENT, path)
-            expected = (Status.CURRENT, path)
+            assert standing(root)[digest(new)] == (HistoryStatus.CURRENT, path)
+            expected = (HistoryStatus.CURRENT, path)
             if stage is Stage.RETIRE:
-                expected = (Status.RETIRED, f"retired/{first.serial_number:x}.cert.pem")
+                expected = (HistoryStatus.RETIRED, f"retired/{first.serial_number:x}.cert.pem")
             assert standing(root)[digest(first)] == expected
         lists = [each for each in history(root, now=NOW).items if each.entry.what == "crl"]
-        current = [each for each in lists if each.status is Status.CURRENT]
+        current = [each for each in lists if each.status is HistoryStatus.CURRENT]
         assert len(current) == (1 if stage is Stage.RETIRE else 2)
     gone = [each for each in history(root, now=NOW).items if each.entry.enclave == "/c"]
     # Its permissions were put away with its certificate; the new CA's list names neither.
-    assert Counter(each.status for each in gone) == {Status.REVOKED: 3}
+    assert Counter(each.status for each in gone) == {HistoryStatus.REVOKED: 3}
 
 
 def test_a_stranger_in_the_file_of_a_ca_is_named(root: Path, tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_a_ca_of_the_same_key_is_followed(tmp_path: Path) -> None:
     create_enclaves(root, ["/a"], now=NOW)
     old = certificates_of(root, "identity_ca")[0]
     renew_identity_ca(root, now=NOW)
-    assert standing(root)[digest(old)][0] is Status.RETIRED
+    assert standing(root)[digest(old)][0] is HistoryStatus.RETIRED
 
 
 def test_inspect_shows_all_that_a_ca_file_holds(root: Path) -> None:

@@ -18,7 +18,7 @@ from cryptography import x509
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore import history as history_of_keystores
 from sros_tool.keystore.expiry import Threshold, lifetimes
-from sros_tool.keystore.history import Status, history
+from sros_tool.keystore.history import HistoryStatus, history
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
@@ -170,14 +170,14 @@ def check_history(root: Path, now: datetime) -> dict[str, int]:
     """The ledger explains every file, and nothing that is served has ended or is revoked."""
     found = history(root, now=now)
     assert not found.unexplained
-    counts = dict.fromkeys(Status, 0)
+    counts = dict.fromkeys(HistoryStatus, 0)
     for item in found.items:
         counts[item.status] += 1
         if item.path.startswith("retired/"):
-            assert item.status is Status.RETIRED
+            assert item.status is HistoryStatus.RETIRED
         elif item.path and not item.path.startswith("revoked/"):
-            assert item.status is Status.CURRENT, (item, now)
-        assert item.status is not Status.CURRENT or item.path, item
+            assert item.status is HistoryStatus.CURRENT, (item, now)
+        assert item.status is not HistoryStatus.CURRENT or item.path, item
     return {str(status): count for status, count in counts.items()}
 
 
