@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, UsageError
-from sros_tool.graph.learn import CommonParts, Learned, LearnedProfile, Right, groups_of
+from sros_tool.graph.learn import CommonParts, Learned, LearnedProfile, NodeRight, groups_of
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.names import (
     ACTION_INSIDE,
@@ -66,7 +66,7 @@ class MissingRights:
     of peers, ``foreign`` those of topics without a ROS name: all of them are left to a person.
     """
 
-    rights: dict[str, frozenset[Right]]
+    rights: dict[str, frozenset[NodeRight]]
     unclear: tuple[Denial, ...] = ()
     by_rule: tuple[Denial, ...] = ()
     remote: tuple[Denial, ...] = ()
@@ -127,7 +127,7 @@ def propose(denials: Iterable[Denial]) -> MissingRights:
     A node stops at its first refusal, so one denied half of a service asks for the service, and
     one denied service of an action for the action.
     """
-    rights: dict[str, set[Right]] = {}
+    rights: dict[str, set[NodeRight]] = {}
     rest: dict[str, list[Denial]] = {"unclear": [], "by_rule": [], "remote": [], "foreign": []}
     for each in denials:
         kind = (
@@ -172,21 +172,21 @@ def _is_ros(topic: str) -> bool:
     return topic.startswith("rt/") or bool(service_of(topic)[0])
 
 
-def _right(denial: Denial) -> Right:
+def _right(denial: Denial) -> NodeRight:
     service, begin = service_of(denial.topic)
     if not service:
-        return Right(denial.direction, denial.topic[2:])
+        return NodeRight(denial.direction, denial.topic[2:])
     client = (begin == "rq") == (denial.direction == PUBLISH)
     action, part = action_part(service)
     if action and part in ACTION_SERVICES:
-        return Right("call" if client else "execute", action)
-    return Right("request" if client else "reply", service)
+        return NodeRight("call" if client else "execute", action)
+    return NodeRight("request" if client else "reply", service)
 
 
-def _without_parts(rights: set[Right]) -> frozenset[Right]:
+def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:
     """The rights without the topics that an action among them stands for."""
     parts = {
-        Right(way, f"{each.name}{ACTION_INSIDE}{topic}")
+        NodeRight(way, f"{each.name}{ACTION_INSIDE}{topic}")
         for each in rights
         for way in ({"call": SUBSCRIBE, "execute": PUBLISH}.get(each.right),)
         if way
@@ -245,7 +245,7 @@ def as_learned(
                 continue
             has = present.get(place, frozenset())
             parts = _whole_parts(denied, place, has, common) if common else ()
-            given = common.given(parts, *place) if common else frozenset[Right]()
+            given = common.given(parts, *place) if common else frozenset[NodeRight]()
             if parts:
                 wholes[_fqn(place)] = ", ".join(parts)
             groups = groups_of(denied - given, *place)
@@ -261,9 +261,9 @@ def as_learned(
     return Learned(tuple(profiles), (*_notes(proposal), *notes))
 
 
-def _by_enclave(proposal: MissingRights, enclave: str) -> dict[str, frozenset[Right]]:
+def _by_enclave(proposal: MissingRights, enclave: str) -> dict[str, frozenset[NodeRight]]:
     """The rights by enclave: the log may name an enclave that is also given."""
-    found: dict[str, frozenset[Right]] = {}
+    found: dict[str, frozenset[NodeRight]] = {}
     for named, rights in proposal.rights.items():
         if not (named or enclave):
             raise UsageError(
@@ -277,15 +277,15 @@ def _by_enclave(proposal: MissingRights, enclave: str) -> dict[str, frozenset[Ri
 
 
 def _by_place(
-    rights: frozenset[Right],
+    rights: frozenset[NodeRight],
     node: tuple[str, str] | None,
-    present: Mapping[tuple[str, str], frozenset[Right]],
-) -> dict[tuple[str, str], frozenset[Right]]:
+    present: Mapping[tuple[str, str], frozenset[NodeRight]],
+) -> dict[tuple[str, str], frozenset[NodeRight]]:
     """The rights by the namespace and name of the profile that they belong to."""
     if node is not None:
         return {node: rights}
     own = nodes_served((each.right, each.name) for each in rights)
-    found: dict[tuple[str, str], set[Right]] = {}
+    found: dict[tuple[str, str], set[NodeRight]] = {}
     (only,) = present if len(present) == 1 else (None,)
     (one,) = own if len(own) == 1 else (None,)
     rest = only or (_place(one, present) if one and not present else ANY_NODE)
@@ -306,9 +306,9 @@ def _fqn(place: tuple[str, str]) -> str:
 
 
 def _whole_parts(
-    denied: frozenset[Right],
+    denied: frozenset[NodeRight],
     place: tuple[str, str],
-    has: frozenset[Right],
+    has: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
     """The part of which something was denied to a node that has nothing of it."""
@@ -322,12 +322,12 @@ def _whole_parts(
     return ()
 
 
-def _profiles(policy: Policy | None, path: str) -> dict[tuple[str, str], frozenset[Right]]:
+def _profiles(policy: Policy | None, path: str) -> dict[tuple[str, str], frozenset[NodeRight]]:
     """What each profile of an enclave says, by its namespace and node."""
     enclave = policy.enclave(path) if policy else None
-    found: dict[tuple[str, str], frozenset[Right]] = {}
+    found: dict[tuple[str, str], frozenset[NodeRight]] = {}
     for each in enclave.all_profiles() if enclave else ():
-        rights = frozenset(Right(r.right, r.name) for r in profile_rights(path, each))
+        rights = frozenset(NodeRight(r.right, r.name) for r in profile_rights(path, each))
         found[each.ns, each.node] = found.get((each.ns, each.node), frozenset()) | rights
     return found
 

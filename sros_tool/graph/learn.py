@@ -1,10 +1,10 @@
-"""How a learned policy writes names: relative where that serves, and not those of one run.
-
-A part is chosen only where the node has everything in it, so that an include grants nothing that
-was not seen.
+"""Learn a policy from an observation of the ROS graph.
 
 Names come over the network, and on an unsecured robot from anybody: whatever is no plain ROS name
-is left out, above all a topic that is *named* like a wildcard.
+is left out, above all a topic that is *named* like a wildcard.  The policy writes names relative
+where that is shorter, with ``*`` for the part of a node's name that changes with every start.  A
+common part is included only where the node has every right in it, so that an include grants
+nothing that was not seen.
 """
 
 from __future__ import annotations
@@ -31,6 +31,206 @@ from sros_tool.policy.model import ALLOW, RIGHTS, Enclave, Group, Policy, Profil
 from sros_tool.translate import ros_rights
 from sros_tool.xml import read_bytes, tag_of
 
+
+@dataclass(frozen=True, slots=True, order=True)
+class NodeRight:
+    """A right (publish, subscribe, request, reply, call, execute) on an absolute ROS name."""
+
+    right: str
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class LearnedProfile:
+    """A node's rights: by includes, and the rest in groups; ``rights`` are all, absolute."""
+
+    enclave: str
+    ns: str
+    node: str
+    rights: frozenset[NodeRight]
+    includes: tuple[str, ...]
+    groups: tuple[Group, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """The result of learning: profiles sorted by enclave and node, and notes."""
+
+    profiles: tuple[LearnedProfile, ...]
+    notes: tuple[Note, ...] = ()
+
+    @property
+    def includes(self) -> tuple[str, ...]:
+        """Return every part that is included, sorted."""
+        return tuple(sorted({each for profile in self.profiles for each in profile.includes}))
+
+    def flat(self) -> Learned:
+        """Return the same without includes."""
+        profiles = (
+            replace(each, includes=(), groups=groups_of(each.rights, each.ns, each.node))
+            for each in self.profiles
+        )
+        return replace(self, profiles=tuple(profiles))
+
+    def policy(self) -> Policy:
+        """Return everything as a policy without includes."""
+        enclaves: dict[str, list[Profile]] = {}
+        for each in self.profiles:
+            groups = groups_of(each.rights, each.ns, each.node)
+            enclaves.setdefault(each.enclave, []).append(Profile(each.ns, each.node, groups))
+        return Policy(
+            tuple(Enclave(path, (Profiles(tuple(found)),)) for path, found in enclaves.items())
+        )
+
+
+_Place = tuple[str, str, str]
+
+
+def learn(observation: Observation, common: CommonParts | None = None) -> Learned:
+    """Return the least policy for an observation; ``common`` are the parts that it may include.
+
+    A node that can be in one of several enclaves gets its rights in each of them, and a note.
+    """
+    notes = _Notes()
+    seen: dict[_Place, set[NodeRight]] = {}
+    for node in observation.nodes:
+        if is_tool(node.name):
+            notes.add("tool", node.fqn)
+            continue
+        for place, rights in _rights_of(node, notes):
+            seen.setdefault(place, set()).update(rights)
+    for enclave, ns, name in observation.silent:
+        if is_tool(name):
+            notes.add("tool", f"{ns.rstrip('/')}/{name}")
+        elif (enclave, ns, stable_name(name)) not in seen:
+            notes.add("silent", f"{ns.rstrip('/')}/{name}")
+    for _, endpoint in observation.strays:
+        notes.add("stray", endpoint.topic)
+    if len(seen) > 1 and {enclave for enclave, _, _ in seen} == {"/"}:
+        notes.add("root-enclave", str(len(seen)))
+    profiles = []
+    for place, found in sorted(seen.items()):
+        if not found:
+            continue
+        _, ns, name = place
+        rights = frozenset(found)
+        includes, rest = common.choose(rights, ns, name) if common else ((), rights)
+        profiles.append(LearnedProfile(*place, rights, includes, groups_of(rest, ns, name)))
+    return Learned(tuple(profiles), notes.notes())
+
+
+def _rights_of(node: ObservedNode, notes: _Notes) -> list[tuple[_Place, frozenset[NodeRight]]]:
+    """Return the rights of a node, for each enclave that it can be in."""
+    if not node.enclaves:
+        notes.add("unknown-enclave", node.fqn)
+        return []
+    name = stable_name(node.name)
+    enclaves = [each for each in node.enclaves if _is_enclave(each)]
+    if not _is_place(node.ns, node.name) or not enclaves:
+        notes.add("odd-node", f"{node.fqn!r} in {' or '.join(map(repr, node.enclaves))}")
+        return []
+    if name != node.name:
+        notes.add("changing-name", f"{node.fqn} as {name}")
+    if len(enclaves) > 1:
+        notes.add("ambiguous", f"{node.fqn} in {' or '.join(enclaves)}")
+    folded = fold(each for each in node.endpoints if _is_plain(each, node, notes))
+    for half in folded.halves:
+        notes.add("half-service", f"{node.fqn} {half.topic}")
+    for foreign in folded.foreign:
+        notes.add("no-ros-name", f"{node.fqn} {foreign.topic}")
+    own, stable = expand("~/", node.ns, node.name), expand("~/", node.ns, name)
+    rights = set()
+    for each in folded.rights:
+        _note_about(each, node, notes)
+        renamed = stable + each.name[len(own) :] if each.name.startswith(own) else each.name
+        rights.add(NodeRight(each.right, renamed))
+    return [((enclave, node.ns, name), frozenset(rights)) for enclave in enclaves]
+
+
+def _note_about(right: NodeRight, node: ObservedNode, notes: _Notes) -> None:
+    if ACTION_INSIDE in right.name:
+        notes.add("partial-action", f"{node.fqn} {right.right} {right.name}")
+    elif right.name.endswith("/_service_event"):
+        notes.add("service-event", f"{node.fqn} {right.right} {right.name}")
+    elif right == NodeRight("publish", "/clock"):
+        notes.add("sets-clock", node.fqn)
+
+
+def _is_plain(endpoint: Endpoint, node: ObservedNode, notes: _Notes) -> bool:
+    _, slash, name = endpoint.topic.partition("/")
+    if slash and (expression_problem("/" + name) or is_expression(name)):
+        notes.add("odd-name", f"{node.fqn} {endpoint.topic!r}")
+        return False
+    return True
+
+
+def _is_enclave(name: str) -> bool:
+    try:
+        check_enclave_name(name)
+    except InvalidNameError:
+        return False
+    return True
+
+
+def _is_place(ns: str, name: str) -> bool:
+    try:
+        plain = check_namespace(ns) == ns and not is_expression(ns)
+    except InvalidNameError:
+        return False
+    return plain and name.replace("_", "a").isalnum() and name.isascii() and not name[0].isdigit()
+
+
+@dataclass(frozen=True, slots=True)
+class Folded:
+    """The rights behind a set of endpoints.
+
+    ``halves`` are endpoints of services whose other half is missing; ``foreign`` are topics that
+    have no ROS name.  A policy can express neither.
+    """
+
+    rights: frozenset[NodeRight]
+    halves: frozenset[Endpoint]
+    foreign: frozenset[Endpoint]
+
+
+_ANY_DOMAIN = DomainSet.of((0, 0))
+
+
+def fold(endpoints: Iterable[Endpoint]) -> Folded:
+    """Return the rights behind endpoints: actions and services where all their topics are there."""
+    endpoints = tuple(endpoints)
+    rule = Rule(True, _ANY_DOMAIN, _criteria(endpoints, PUBLISH), _criteria(endpoints, SUBSCRIBE))
+    rights, halves, foreign = set(), set(), set()
+    for each in ros_rights(rule):
+        if each.kind != "dds":
+            rights.add(NodeRight(each.right, each.name))
+        elif each.name.startswith(("rq/", "rr/")):
+            halves.add(Endpoint(each.name, each.right))
+        else:
+            foreign.add(Endpoint(each.name, each.right))
+    return Folded(frozenset(rights), frozenset(halves), frozenset(foreign))
+
+
+def _criteria(endpoints: Iterable[Endpoint], direction: str) -> tuple[Criteria, ...]:
+    topics = tuple(sorted(each.topic for each in endpoints if each.direction == direction))
+    return (Criteria(topics),) if topics else ()
+
+
+def groups_of(rights: Iterable[NodeRight], ns: str, node: str) -> tuple[Group, ...]:
+    """Return groups of one right each, in the order of the policy language, with sorted names."""
+    rights = tuple(rights)
+    groups = []
+    for kind, both in RIGHTS.items():
+        for right in both:
+            names = sorted(written(each.name, ns, node) for each in rights if each.right == right)
+            if names:
+                groups.append(Group(kind, ((right, ALLOW),), tuple(names)))
+    return tuple(groups)
+
+
+# ── names ───────────────────────────────────────────────────────────────────────────────
+
+
 _CHANGING = (
     # tf2_ros names the node of a listener by its address; the others by their process.
     (re.compile(r"(transform_listener_impl_)[0-9a-f]+\Z"), r"\1*"),
@@ -38,7 +238,6 @@ _CHANGING = (
     (re.compile(r"(rqt_gui_(?:py|cpp)_node_)[0-9]+\Z"), r"\1*"),
 )
 _TOOLS = re.compile(r"_ros2cli(_.*)?\Z|_sros_observer\Z")
-
 _ABSOLUTE = frozenset(
     ("/bond", "/clock", "/diagnostics", "/parameter_events", "/rosout", "/tf", "/tf_static")
 )
@@ -46,12 +245,12 @@ _ABSOLUTE = frozenset(
 
 
 def is_tool(name: str) -> bool:
-    """Whether a node is that of a tool that looks at the robot, and no part of it."""
+    """Return whether a node belongs to a tool that looks at the robot, and is no part of it."""
     return _TOOLS.match(name) is not None
 
 
 def stable_name(name: str) -> str:
-    """The node's name, with ``*`` for a part that is another one each time that it starts."""
+    """Return the name of a node, with ``*`` for the part that changes each time it starts."""
     for pattern, stable in _CHANGING:
         if pattern.match(name):
             return pattern.sub(stable, name)
@@ -59,10 +258,10 @@ def stable_name(name: str) -> str:
 
 
 def written(fqn: str, ns: str, node: str) -> str:
-    """How the profile of ``node`` in ``ns`` writes an absolute name; `expand` gives it back.
+    """Return an absolute name as the profile of ``node`` in ``ns`` writes it; undone by `expand`.
 
-    ``~/x`` for what is the node's own, ``x`` for what is in its namespace, ``/x`` for the rest.
-    In the root namespace only what lies directly in it is relative, as the rest is of others.
+    ``~/x`` for the node's own names, ``x`` for names in its namespace, ``/x`` for the rest.  In
+    the root namespace only names directly in it are relative, as deeper ones belong to others.
     """
     own = expand("~/", ns, node)
     if fqn.startswith(own):
@@ -76,8 +275,127 @@ def written(fqn: str, ns: str, node: str) -> str:
     return rest
 
 
-_SHOWN = 5
+# ── common parts ────────────────────────────────────────────────────────────────────────
 
+
+PARTS = (
+    "common/lifecycle_node.xml",
+    "common/component_container.xml",
+    "common/node.xml",
+    "common/rclcpp_node.xml",
+    "common/rclpy_node.xml",
+    "common/transform_listener.xml",
+    "common/node/logging.xml",
+    "common/node/parameters.xml",
+    "common/node/time.xml",
+    "common/node/types.xml",
+)
+"""The parts that a learned policy includes, relative to its folder; the widest first."""
+
+
+@dataclass(frozen=True, slots=True)
+class CommonParts:
+    """The parts that a policy can include.
+
+    ``rights`` are the rights of each part, with names as it writes them; ``missing`` are the files
+    to copy for a part: their paths relative to the folder of the policy, and their content.
+    """
+
+    rights: Mapping[str, frozenset[NodeRight]] = field(default_factory=dict)
+    missing: Mapping[str, Mapping[str, bytes]] = field(default_factory=dict)
+
+    def choose(
+        self, rights: frozenset[NodeRight], ns: str, node: str
+    ) -> tuple[tuple[str, ...], frozenset[NodeRight]]:
+        """Return the parts for a node with these absolute rights, and the remaining rights."""
+        chosen, rest = [], rights
+        for part, names in self.rights.items():
+            given = _expanded(names, ns, node)
+            if given <= rights and given & rest:
+                chosen.append(part)
+                rest -= given
+        return tuple(chosen), rest
+
+    def given(self, parts: Iterable[str], ns: str, node: str) -> frozenset[NodeRight]:
+        """Return the rights that these parts give to a node, by absolute names."""
+        return frozenset().union(*(_expanded(self.rights[part], ns, node) for part in parts))
+
+    def to_copy(self, parts: Iterable[str]) -> dict[str, bytes]:
+        """Return the files that these parts need and that the folder of the policy lacks."""
+        return {path: data for part in parts for path, data in self.missing[part].items()}
+
+
+def common_parts(folder: Path, shipped: Path) -> CommonParts:
+    """Return the parts that a policy in ``folder`` can include, from there or from ``shipped``.
+
+    A file of the user is used as it is; a shipped part that would silently mix with it is left out.
+    """
+    rights, missing = {}, {}
+    for part in PARTS:
+        needed = _needed_files(shipped, part)
+        if (folder / part).exists():
+            found, copies = _part_rights(folder, part), dict[str, bytes]()
+        else:
+            copies = {path: data for path, data in needed.items() if not (folder / path).exists()}
+            other = [
+                path for path in needed if path not in copies and _differs(folder, path, needed)
+            ]
+            found = None if other else _part_rights(shipped, part)
+        if found:
+            rights[part], missing[part] = found, copies
+    return CommonParts(rights, missing)
+
+
+def _expanded(rights: Iterable[NodeRight], ns: str, node: str) -> frozenset[NodeRight]:
+    return frozenset(NodeRight(each.right, expand(each.name, ns, node)) for each in rights)
+
+
+def _differs(folder: Path, path: str, needed: Mapping[str, bytes]) -> bool:
+    try:
+        return read_bytes(folder / path, "policy file") != needed[path]
+    except DocumentError:
+        return True
+
+
+def _part_rights(root: Path, part: str) -> frozenset[NodeRight] | None:
+    """Return the rights in a part; None if it cannot be read, or denies something."""
+    includer = Includer(root.resolve())
+    file = (root / part).resolve()
+    rights = set()
+    try:
+        for group, _ in includer.children(includer.load(file), Place(file)):
+            for right, qualifier in group.attrib.items():
+                if qualifier != ALLOW:
+                    return None
+                rights |= {NodeRight(str(right), (name.text or "").strip()) for name in group}
+    except DocumentError:
+        return None
+    return frozenset(rights)
+
+
+def _needed_files(root: Path, part: str) -> dict[str, bytes]:
+    """Return a shipped part and everything that it includes: path below ``root``, content."""
+    found: dict[str, bytes] = {}
+    waiting = [(root / part).resolve()]
+    includer = Includer(root.resolve())
+    while waiting:
+        file = waiting.pop()
+        path = file.relative_to(root.resolve()).as_posix()
+        if path in found:
+            continue
+        found[path] = read_bytes(file, "policy file")
+        waiting += [
+            (file.parent / each.get("href", "")).resolve()
+            for each in includer.load(file)
+            if tag_of(each).endswith("}include")
+        ]
+    return found
+
+
+# ── notes and news ──────────────────────────────────────────────────────────────────────
+
+
+_SHOWN = 5
 _TEXTS = {
     "ambiguous": "the graph does not tell in which enclave each of these nodes of the same name "
     "runs, so their rights stand in all of them; start them one at a time under --watch to tell "
@@ -107,18 +425,18 @@ _TEXTS = {
 }
 
 
-class Remarks:
-    """Collects remarks of a kind, and says each kind once."""
+class _Notes:
+    """The subjects of each kind of note, for one note of each kind."""
 
     def __init__(self) -> None:
         self._found: dict[str, set[str]] = {}
 
     def add(self, kind: str, subject: str) -> None:
-        """Remark on a node, a topic, or a number."""
+        """Add a subject: a node, a topic, or a number."""
         self._found.setdefault(kind, set()).add(subject)
 
     def notes(self) -> tuple[Note, ...]:
-        """One note for each kind, in the order of their ids."""
+        """Return one note for each kind, in the order of their ids."""
         return tuple(
             Note(f"graph.{kind}", _TEXTS[kind].format(_listed(sorted(subjects))))
             for kind, subjects in sorted(self._found.items())
@@ -130,338 +448,28 @@ def _listed(subjects: list[str]) -> str:
     return ", ".join(subjects[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
-_ANY_DOMAIN = DomainSet.of((0, 0))
-
-
-@dataclass(frozen=True, slots=True, order=True)
-class Right:
-    """A right (publish, subscribe, request, reply, call, execute) on an absolute ROS name."""
-
-    right: str
-    name: str
-
-
-@dataclass(frozen=True, slots=True)
-class Folded:
-    """The rights behind a set of endpoints.
-
-    ``halves`` are endpoints of services whose other half is missing; ``foreign`` are topics that
-    have no ROS name.  Neither can be said in a policy.
-    """
-
-    rights: frozenset[Right]
-    halves: frozenset[Endpoint]
-    foreign: frozenset[Endpoint]
-
-
-def fold(endpoints: Iterable[Endpoint]) -> Folded:
-    """Actions and services are folded back from their topics where all of these are there."""
-    endpoints = tuple(endpoints)
-    rule = Rule(True, _ANY_DOMAIN, _criteria(endpoints, PUBLISH), _criteria(endpoints, SUBSCRIBE))
-    rights, halves, foreign = set(), set(), set()
-    for each in ros_rights(rule):
-        if each.kind != "dds":
-            rights.add(Right(each.right, each.name))
-        elif each.name.startswith(("rq/", "rr/")):
-            halves.add(Endpoint(each.name, each.right))
-        else:
-            foreign.add(Endpoint(each.name, each.right))
-    return Folded(frozenset(rights), frozenset(halves), frozenset(foreign))
-
-
-def _criteria(endpoints: Iterable[Endpoint], direction: str) -> tuple[Criteria, ...]:
-    topics = tuple(sorted(each.topic for each in endpoints if each.direction == direction))
-    return (Criteria(topics),) if topics else ()
-
-
-PARTS = (
-    "common/lifecycle_node.xml",
-    "common/component_container.xml",
-    "common/node.xml",
-    "common/rclcpp_node.xml",
-    "common/rclpy_node.xml",
-    "common/transform_listener.xml",
-    "common/node/logging.xml",
-    "common/node/parameters.xml",
-    "common/node/time.xml",
-    "common/node/types.xml",
-)
-"""The parts that a learned policy includes, relative to its folder; the widest first."""
-
-
-@dataclass(frozen=True, slots=True)
-class CommonParts:
-    """The parts that can be included beside a policy.
-
-    ``rights`` are those of each part, with names as it writes them; ``missing`` are the files
-    that have to be copied for a part: their paths beside the policy, and their content.
-    """
-
-    rights: Mapping[str, frozenset[Right]] = field(default_factory=dict)
-    missing: Mapping[str, Mapping[str, bytes]] = field(default_factory=dict)
-
-    def choose(
-        self, rights: frozenset[Right], ns: str, node: str
-    ) -> tuple[tuple[str, ...], frozenset[Right]]:
-        """The parts for a node with these rights (absolute names), and the rights that remain."""
-        chosen, rest = [], rights
-        for part, names in self.rights.items():
-            given = _expanded(names, ns, node)
-            if given <= rights and given & rest:
-                chosen.append(part)
-                rest -= given
-        return tuple(chosen), rest
-
-    def given(self, parts: Iterable[str], ns: str, node: str) -> frozenset[Right]:
-        """What these parts give to a node, by absolute names."""
-        return frozenset().union(*(_expanded(self.rights[part], ns, node) for part in parts))
-
-    def to_copy(self, parts: Iterable[str]) -> dict[str, bytes]:
-        """The files that these parts need and that are not beside the policy yet."""
-        return {path: data for part in parts for path, data in self.missing[part].items()}
-
-
-def common_parts(folder: Path, shipped: Path) -> CommonParts:
-    """What a policy in ``folder`` can include, from there or copied from ``shipped``.
-
-    A file of the user is taken as it is; what it would silently mix with ours is left out.
-    """
-    rights, missing = {}, {}
-    for part in PARTS:
-        needed = _closure(shipped, part)
-        if (folder / part).exists():
-            found, copies = _rights(folder, part), dict[str, bytes]()
-        else:
-            copies = {path: data for path, data in needed.items() if not (folder / path).exists()}
-            other = [
-                path for path in needed if path not in copies and _differs(folder, path, needed)
-            ]
-            found = None if other else _rights(shipped, part)
-        if found:
-            rights[part], missing[part] = found, copies
-    return CommonParts(rights, missing)
-
-
-def _expanded(rights: Iterable[Right], ns: str, node: str) -> frozenset[Right]:
-    return frozenset(Right(each.right, expand(each.name, ns, node)) for each in rights)
-
-
-def _differs(folder: Path, path: str, needed: Mapping[str, bytes]) -> bool:
-    try:
-        return read_bytes(folder / path, "policy file") != needed[path]
-    except DocumentError:
-        return True
-
-
-def _rights(root: Path, part: str) -> frozenset[Right] | None:
-    """What a part grants; None if it cannot be read, or denies something."""
-    includer = Includer(root.resolve())
-    file = (root / part).resolve()
-    rights = set()
-    try:
-        for group, _ in includer.children(includer.load(file), Place(file)):
-            for right, qualifier in group.attrib.items():
-                if qualifier != ALLOW:
-                    return None
-                rights |= {Right(str(right), (name.text or "").strip()) for name in group}
-    except DocumentError:
-        return None
-    return frozenset(rights)
-
-
-def _closure(root: Path, part: str) -> dict[str, bytes]:
-    """A shipped part and everything that it includes: path below ``root``, content."""
-    found: dict[str, bytes] = {}
-    waiting = [(root / part).resolve()]
-    includer = Includer(root.resolve())
-    while waiting:
-        file = waiting.pop()
-        path = file.relative_to(root.resolve()).as_posix()
-        if path in found:
-            continue
-        found[path] = read_bytes(file, "policy file")
-        waiting += [
-            (file.parent / each.get("href", "")).resolve()
-            for each in includer.load(file)
-            if tag_of(each).endswith("}include")
-        ]
-    return found
-
-
-_Place = tuple[str, str, str]
-
-
-@dataclass(frozen=True, slots=True)
-class LearnedProfile:
-    """A node's rights: by includes, and the rest in groups; ``rights`` are all, absolute."""
-
-    enclave: str
-    ns: str
-    node: str
-    rights: frozenset[Right]
-    includes: tuple[str, ...]
-    groups: tuple[Group, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class Learned:
-    """What an observation comes down to: profiles sorted by enclave and node, and remarks."""
-
-    profiles: tuple[LearnedProfile, ...]
-    notes: tuple[Note, ...] = ()
-
-    @property
-    def includes(self) -> tuple[str, ...]:
-        """Every part that is included, sorted."""
-        return tuple(sorted({each for profile in self.profiles for each in profile.includes}))
-
-    def flat(self) -> Learned:
-        """The same without includes."""
-        profiles = (
-            replace(each, includes=(), groups=groups_of(each.rights, each.ns, each.node))
-            for each in self.profiles
-        )
-        return replace(self, profiles=tuple(profiles))
-
-    def policy(self) -> Policy:
-        """Everything as a policy without includes."""
-        enclaves: dict[str, list[Profile]] = {}
-        for each in self.profiles:
-            groups = groups_of(each.rights, each.ns, each.node)
-            enclaves.setdefault(each.enclave, []).append(Profile(each.ns, each.node, groups))
-        return Policy(
-            tuple(Enclave(path, (Profiles(tuple(found)),)) for path, found in enclaves.items())
-        )
-
-
-def learn(observation: Observation, common: CommonParts | None = None) -> Learned:
-    """The policy of an observation; with ``common``, its parts stand for what every node has.
-
-    A node that can be in one of several enclaves gets its rights in each of them, and a note.
-    """
-    remarks = Remarks()
-    seen: dict[_Place, set[Right]] = {}
-    for node in observation.nodes:
-        if is_tool(node.name):
-            remarks.add("tool", node.fqn)
-            continue
-        for place, rights in _rights_of(node, remarks):
-            seen.setdefault(place, set()).update(rights)
-    for enclave, ns, name in observation.silent:
-        if is_tool(name):
-            remarks.add("tool", f"{ns.rstrip('/')}/{name}")
-        elif (enclave, ns, stable_name(name)) not in seen:
-            remarks.add("silent", f"{ns.rstrip('/')}/{name}")
-    for _, endpoint in observation.strays:
-        remarks.add("stray", endpoint.topic)
-    if len(seen) > 1 and {enclave for enclave, _, _ in seen} == {"/"}:
-        remarks.add("root-enclave", str(len(seen)))
-    profiles = []
-    for place, found in sorted(seen.items()):
-        if not found:
-            continue
-        _, ns, name = place
-        rights = frozenset(found)
-        includes, rest = common.choose(rights, ns, name) if common else ((), rights)
-        profiles.append(LearnedProfile(*place, rights, includes, groups_of(rest, ns, name)))
-    return Learned(tuple(profiles), remarks.notes())
-
-
-def groups_of(rights: Iterable[Right], ns: str, node: str) -> tuple[Group, ...]:
-    """Groups of one right each, in the order of the policy language, with sorted names."""
-    rights = tuple(rights)
-    groups = []
-    for kind, both in RIGHTS.items():
-        for right in both:
-            names = sorted(written(each.name, ns, node) for each in rights if each.right == right)
-            if names:
-                groups.append(Group(kind, ((right, ALLOW),), tuple(names)))
-    return tuple(groups)
-
-
-def _rights_of(node: ObservedNode, remarks: Remarks) -> list[tuple[_Place, frozenset[Right]]]:
-    """The profiles of a node, one for each enclave that it can be in."""
-    if not node.enclaves:
-        remarks.add("unknown-enclave", node.fqn)
-        return []
-    name = stable_name(node.name)
-    enclaves = [each for each in node.enclaves if _is_enclave(each)]
-    if not _is_place(node.ns, node.name) or not enclaves:
-        remarks.add("odd-node", f"{node.fqn!r} in {' or '.join(map(repr, node.enclaves))}")
-        return []
-    if name != node.name:
-        remarks.add("changing-name", f"{node.fqn} as {name}")
-    if len(enclaves) > 1:
-        remarks.add("ambiguous", f"{node.fqn} in {' or '.join(enclaves)}")
-    folded = fold(each for each in node.endpoints if _is_plain(each, node, remarks))
-    for half in folded.halves:
-        remarks.add("half-service", f"{node.fqn} {half.topic}")
-    for foreign in folded.foreign:
-        remarks.add("no-ros-name", f"{node.fqn} {foreign.topic}")
-    own, stable = expand("~/", node.ns, node.name), expand("~/", node.ns, name)
-    rights = set()
-    for each in folded.rights:
-        _remark_on(each, node, remarks)
-        renamed = stable + each.name[len(own) :] if each.name.startswith(own) else each.name
-        rights.add(Right(each.right, renamed))
-    return [((enclave, node.ns, name), frozenset(rights)) for enclave in enclaves]
-
-
-def _remark_on(right: Right, node: ObservedNode, remarks: Remarks) -> None:
-    if ACTION_INSIDE in right.name:
-        remarks.add("partial-action", f"{node.fqn} {right.right} {right.name}")
-    elif right.name.endswith("/_service_event"):
-        remarks.add("service-event", f"{node.fqn} {right.right} {right.name}")
-    elif right == Right("publish", "/clock"):
-        remarks.add("sets-clock", node.fqn)
-
-
-def _is_plain(endpoint: Endpoint, node: ObservedNode, remarks: Remarks) -> bool:
-    _, slash, name = endpoint.topic.partition("/")
-    if slash and (expression_problem("/" + name) or is_expression(name)):
-        remarks.add("odd-name", f"{node.fqn} {endpoint.topic!r}")
-        return False
-    return True
-
-
-def _is_enclave(name: str) -> bool:
-    try:
-        check_enclave_name(name)
-    except InvalidNameError:
-        return False
-    return True
-
-
-def _is_place(ns: str, name: str) -> bool:
-    try:
-        plain = check_namespace(ns) == ns and not is_expression(ns)
-    except InvalidNameError:
-        return False
-    return plain and name.replace("_", "a").isalnum() and name.isascii() and not name[0].isdigit()
-
-
 _EVERY_NODE = "common/node.xml"
 
 
 class News:
-    """Remembers what was told.  What every node has is not worth a line."""
+    """The nodes and rights reported so far; rights that every node needs are not reported."""
 
     def __init__(self, common: CommonParts) -> None:
-        self._ordinary = common.rights.get(_EVERY_NODE, frozenset[Right]())
-        self._told: set[tuple[str, str, str]] = set()
-        self._rights: set[tuple[str, str, str, Right]] = set()
+        self._ordinary = common.rights.get(_EVERY_NODE, frozenset[NodeRight]())
+        self._nodes: set[tuple[str, str, str]] = set()
+        self._rights: set[tuple[str, str, str, NodeRight]] = set()
 
     def lines(self, observation: Observation) -> list[str]:
-        """A line for each node and each right in ``observation`` that was not told before."""
+        """Return a line for each node and each right that was not reported before."""
         lines = []
         for each in learn(observation).profiles:
             place = each.enclave, each.ns, each.node
             name = f"{each.ns.rstrip('/')}/{each.node}"
-            if place not in self._told:
-                self._told.add(place)
+            if place not in self._nodes:
+                self._nodes.add(place)
                 lines.append(f"new: {name} ({each.enclave})")
             for right in sorted(each.rights):
-                plain = Right(right.right, written(right.name, each.ns, each.node))
+                plain = NodeRight(right.right, written(right.name, each.ns, each.node))
                 if plain not in self._ordinary and (*place, right) not in self._rights:
                     self._rights.add((*place, right))
                     lines.append(f"new: {name} ({each.enclave}) {right.right} {right.name}")

@@ -1,14 +1,15 @@
-"""Finds the process and the enclave of every node in what rclpy tells of a graph.
+"""Observe the live ROS graph: through rclpy, for how long, and in which enclave each node runs.
+
+`RosGraph` looks by rclpy in a process of its own (`sros_tool.graph.observer`); `settle`, `look_for`
+and `watch` decide for how long.  Times are in seconds; clock and source are passed in.
 
 rclpy lists nodes with their enclaves, but without their processes; and endpoints with the names
 of their nodes and with their participants (processes), but without enclaves.  Where nodes of the
-same name run in several enclaves, the two lists have to be brought together.
+same name run in several enclaves, `resolve` brings the two lists together.
 
-Times are in seconds.  The clock is passed in, as is the source: a test needs neither.
-
-The graph shows the enclave of ``--ros-args --enclave``, and "/" of a process that has it from
+The graph shows the enclave of ``--ros-args --enclave``, and "/" for a process that has it from
 ROS_SECURITY_ENCLAVE_OVERRIDE.  But a secured participant's identifier begins with a digest of the
-subject of its certificate (DDS-Security 1.1, 9.3.3), which its peers check when it comes.
+subject of its certificate (DDS-Security 1.1, 9.3.3), which its peers check; `identified` uses it.
 """
 
 from __future__ import annotations
@@ -34,124 +35,17 @@ from sros_tool.errors import UnavailableError
 from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, make_observation
 
 _LOG = logging.getLogger(__name__)
-
-Listed = tuple[str, str, str]
-"""A node as it is announced: enclave, namespace, name."""
-_Name = tuple[str, str]
-
-# What rmw reports for an endpoint that no announced node claims (rmw_dds_common, graph_cache).
-NOBODY = "_NODE_NAME_UNKNOWN_"
-
-
-@dataclass(frozen=True, slots=True)
-class Sighting:
-    """One look at the graph: the announced nodes, in their order, and all endpoints.
-
-    Each endpoint comes with its participant, and the namespace and name of its node.  ``ordered``
-    says that the nodes are listed by ascending participant, as rmw_dds_common does (graph_cache
-    keeps its participants in a map by identifier).
-    """
-
-    listed: tuple[Listed, ...]
-    endpoints: tuple[tuple[str, str, str, Endpoint], ...]
-    ordered: bool = False
-
-
-def resolve(sighting: Sighting) -> Observation:
-    """The nodes of a sighting, each with its process and the enclaves that it can have."""
-    found: dict[str, dict[_Name, set[Endpoint]]] = {}
-    strays = set()
-    for participant, ns, name, endpoint in sighting.endpoints:
-        if name in ("", NOBODY):
-            strays.add((participant, endpoint))
-        else:
-            nodes = found.setdefault(participant, {})
-            nodes.setdefault((ns, name), set()).add(endpoint)
-    candidates = _enclaves(sighting, {each: frozenset(nodes) for each, nodes in found.items()})
-    nodes_seen = []
-    heard = set()
-    for participant, nodes in found.items():
-        enclaves = tuple(sorted(candidates[participant]))
-        if not enclaves:  # its announcement is still to come, or was just withdrawn
-            strays |= {(participant, each) for every in nodes.values() for each in every}
-            continue
-        for (ns, name), endpoints in nodes.items():
-            heard |= {(enclave, ns, name) for enclave in enclaves}
-            nodes_seen.append(ObservedNode(enclaves, ns, name, participant, frozenset(endpoints)))
-    return make_observation(nodes_seen, set(sighting.listed) - heard, strays)
-
-
-def _enclaves(
-    sighting: Sighting, processes: dict[str, frozenset[_Name]]
-) -> dict[str, frozenset[str]]:
-    """The enclaves in which each process can be, narrowed as far as the sighting allows."""
-    free: dict[str, Counter[_Name]] = {}
-    for enclave, ns, name in sighting.listed:
-        free.setdefault(enclave, Counter())[(ns, name)] += 1
-    candidates = {
-        each: frozenset(e for e, names in free.items() if all(names[n] for n in nodes))
-        for each, nodes in processes.items()
-    }
-    if sighting.ordered:
-        candidates = _by_order(sighting.listed, processes, candidates)
-    settled: set[str] = set()
-    while True:
-        news = [each for each, left in candidates.items() if len(left) == 1 and each not in settled]
-        if not news:
-            return candidates
-        # A node that is taken is not there for another process; that may settle further ones.
-        for each in news:
-            settled.add(each)
-            (enclave,) = candidates[each]
-            free[enclave].subtract(processes[each])
-        for each, left in candidates.items():
-            if each not in settled:
-                possible = frozenset(
-                    e for e in left if all(free[e][name] > 0 for name in processes[each])
-                )
-                candidates[each] = possible or left
-
-
-def _by_order(
-    listed: Sequence[Listed],
-    processes: dict[str, frozenset[_Name]],
-    candidates: dict[str, frozenset[str]],
-) -> dict[str, frozenset[str]]:
-    """The candidates, where the order of the list tells them; as they were, where it is in doubt.
-
-    The nth node of a name belongs to the nth participant that has this name, if there are as
-    many nodes as participants of it.
-    """
-    enclaves: dict[_Name, list[str]] = {}
-    for enclave, ns, name in listed:
-        enclaves.setdefault((ns, name), []).append(enclave)
-    told: dict[str, set[str]] = {}
-    for node, places in enclaves.items():
-        owners = sorted(each for each, names in processes.items() if node in names)
-        if len(owners) == len(places):
-            for owner, enclave in zip(owners, places, strict=True):
-                told.setdefault(owner, set()).add(enclave)
-    if any(len(each) > 1 or not each <= candidates[owner] for owner, each in told.items()):
-        return candidates  # not the order that was promised
-    return {each: frozenset(told.get(each, left)) for each, left in candidates.items()}
-
-
-def nodes_of(listed: Sequence[Sequence[str]]) -> tuple[Listed, ...]:
-    """The announced nodes from JSON."""
-    return tuple((enclave, ns, name) for enclave, ns, name in listed)
-
-
-PERIOD_SECONDS = 0.1
+_PERIOD_SECONDS = 0.1
 """How often the graph is looked at; a node that lives for a second is seen several times."""
 _START_SECONDS = 30.0
 _END_SECONDS = 3.0
 
 
 class GraphSource(Protocol):
-    """Where observations come from; tests put a script in its place."""
+    """A source of observations: `RosGraph`, or a script in a test."""
 
     def next(self, seconds: float) -> Observation | None:
-        """The graph after its next change, or None if it has not changed for ``seconds``."""
+        """Return the graph after its next change, or None if it has not changed for ``seconds``."""
 
 
 class ObserverError(UnavailableError):
@@ -161,18 +55,6 @@ class ObserverError(UnavailableError):
         super().__init__(what, reason)
         self.reason = reason
         self.output = output
-
-
-def require_rclpy() -> None:
-    """Raise `UnavailableError` if this Python has no rclpy."""
-    if importlib.util.find_spec("rclpy") is None:
-        raise UnavailableError(
-            "rclpy is not installed for this Python, and without it sros cannot see the ROS graph",
-            f"Python is {sys.executable}.",
-            "On a machine with ROS 2, source its setup file first (. /opt/ros/jazzy/setup.bash); "
-            "elsewhere install sros with it: pip install 'sros_tool[ros]'. "
-            "A policy can still be learned from logs with --from-log.",
-        )
 
 
 class RosGraph:
@@ -196,7 +78,7 @@ class RosGraph:
                 # -P: what lies in the present folder is not what shall be imported.
                 [
                     *(sys.executable, "-P", "-m", "sros_tool.graph.observer"),
-                    *(str(write_end), str(PERIOD_SECONDS)),
+                    *(str(write_end), str(_PERIOD_SECONDS)),
                 ],
                 stdin=subprocess.PIPE,
                 stdout=self._output,
@@ -233,7 +115,7 @@ class RosGraph:
         self.close()
 
     def next(self, seconds: float) -> Observation | None:
-        """The graph after its next change, or None if it has not changed for ``seconds``."""
+        """Return the graph after its next change, or None if it has not changed for ``seconds``."""
         line = self._line(seconds)
         if line is None:
             return None
@@ -241,7 +123,7 @@ class RosGraph:
             (participant, ns, name, Endpoint(topic, direction))
             for participant, ns, name, topic, direction in line["endpoints"]
         )
-        return resolve(Sighting(nodes_of(line["listed"]), endpoints, line["ordered"]))
+        return resolve(Sighting(parse_listed(line["listed"]), endpoints, line["ordered"]))
 
     def close(self) -> None:
         """End the observer, politely first, so that the graph forgets it at once."""
@@ -256,7 +138,7 @@ class RosGraph:
         self._output.close()
 
     def _line(self, seconds: float) -> dict[str, Any] | None:
-        """The next line of the observer, or None after ``seconds``."""
+        """Return the next line of the observer, or None after ``seconds``."""
         deadline = time.monotonic() + seconds
         with selectors.DefaultSelector() as selector:
             selector.register(self._report, selectors.EVENT_READ)
@@ -291,13 +173,33 @@ class RosGraph:
         return ObserverError(what, f"{answer['reason']}".rstrip(".") + ".", output)
 
 
+def require_rclpy() -> None:
+    """Raise `UnavailableError` if this Python has no rclpy."""
+    if importlib.util.find_spec("rclpy") is None:
+        raise UnavailableError(
+            "rclpy is not installed for this Python, and without it sros cannot see the ROS graph",
+            f"Python is {sys.executable}.",
+            "On a machine with ROS 2, source its setup file first (. /opt/ros/jazzy/setup.bash); "
+            "elsewhere install sros with it: pip install 'sros_tool[ros]'. "
+            "A policy can still be learned from logs with --from-log.",
+        )
+
+
+def parse_listed(listed: Sequence[Sequence[str]]) -> tuple[Listed, ...]:
+    """Return the announced nodes from the JSON of the observer."""
+    return tuple((enclave, ns, name) for enclave, ns, name in listed)
+
+
+# ── for how long ────────────────────────────────────────────────────────────────────────
+
+
 Clock = Callable[[], float]
 _TICK = 0.2
 
 
 @dataclass(frozen=True, slots=True)
 class Settling:
-    """When a graph counts as complete: after ``least``, unchanged for ``still``; at ``most``.
+    """When a graph counts as complete: after ``least``, unchanged for ``still``, or after ``most``.
 
     Fast DDS announces its participants every 3 s after a first burst, some of which gets lost when
     there are many: half a robot was seen to stand still from 0.4 to 3.4 s.
@@ -314,7 +216,7 @@ SECURED = Settling(least=6.0, still=5.0, most=45.0)
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """The graph at the end of a look, how long the look took, and whether it had come to rest."""
+    """The graph at the end of a look, the seconds it took, and whether it had stopped changing."""
 
     observation: Observation
     seconds: float
@@ -322,7 +224,7 @@ class Snapshot:
 
 
 def settle(source: GraphSource, settling: Settling, clock: Clock) -> Snapshot:
-    """The graph once it has come to rest, or as it is at the latest moment."""
+    """Return the graph once it stops changing, or as it is after ``settling.most``."""
     begin = changed = clock()
     seen = Observation()
     while True:
@@ -337,7 +239,7 @@ def settle(source: GraphSource, settling: Settling, clock: Clock) -> Snapshot:
 
 
 def look_for(source: GraphSource, seconds: float, clock: Clock) -> Snapshot:
-    """The graph as it is after exactly so many seconds."""
+    """Return the graph as it is after exactly so many seconds."""
     begin = clock()
     seen = Observation()
     while (left := begin + seconds - clock()) > 0:
@@ -355,13 +257,13 @@ def watch(
     still: float = 0.5,
     patience: float = 2.0,
 ) -> Snapshot:
-    """The union of everything seen in so many seconds (None: without end), or until ``stop()``.
+    """Return the union of everything seen in so many seconds (None: forever), or until ``stop()``.
 
-    ``tell`` gets the union whenever it has grown and then held still for a moment, so that what
-    is only half discovered is not told; it waits no longer than ``patience``.
+    ``tell`` gets the union whenever it has grown and then not changed for ``still`` seconds, so
+    that a half discovered node is not reported; it waits no longer than ``patience``.
     """
     begin = clock()
-    union = told = Observation()
+    union = reported = Observation()
     grown = changed = begin
     while not stop() and (seconds is None or clock() - begin < seconds):
         news = source.next(_TICK)
@@ -369,42 +271,148 @@ def watch(
         if news is not None:
             both = union.union(news)
             if both != union:
-                if told is union:
+                if reported is union:
                     grown = now
                 union, changed = both, now
-        if union is not told and (now - changed >= still or now - grown >= patience):
+        if union is not reported and (now - changed >= still or now - grown >= patience):
             tell(union)
-            told = union
-    if union is not told:
+            reported = union
+    if union is not reported:
         tell(union)
     return Snapshot(union, clock() - begin, True)
+
+
+# ── the process and the enclave of each node ────────────────────────────────────────────
+
+
+Listed = tuple[str, str, str]
+"""A node as it is announced: enclave, namespace, name."""
+_Name = tuple[str, str]
+# What rmw reports for an endpoint that no announced node claims (rmw_dds_common, graph_cache).
+NOBODY = "_NODE_NAME_UNKNOWN_"
+
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """One look at the graph: the announced nodes, in their order, and all endpoints.
+
+    Each endpoint comes with its participant, and the namespace and name of its node.  ``ordered``
+    says that the nodes are listed by ascending participant, as rmw_dds_common does (graph_cache
+    keeps its participants in a map by identifier).
+    """
+
+    listed: tuple[Listed, ...]
+    endpoints: tuple[tuple[str, str, str, Endpoint], ...]
+    ordered: bool = False
+
+
+def resolve(sighting: Sighting) -> Observation:
+    """Return the nodes of a sighting, each with its process and the enclaves that it can be in."""
+    found: dict[str, dict[_Name, set[Endpoint]]] = {}
+    strays = set()
+    for participant, ns, name, endpoint in sighting.endpoints:
+        if name in ("", NOBODY):
+            strays.add((participant, endpoint))
+        else:
+            nodes = found.setdefault(participant, {})
+            nodes.setdefault((ns, name), set()).add(endpoint)
+    candidates = _enclaves(sighting, {each: frozenset(nodes) for each, nodes in found.items()})
+    nodes_seen = []
+    heard = set()
+    for participant, nodes in found.items():
+        enclaves = tuple(sorted(candidates[participant]))
+        if not enclaves:  # its announcement is still to come, or was just withdrawn
+            strays |= {(participant, each) for every in nodes.values() for each in every}
+            continue
+        for (ns, name), endpoints in nodes.items():
+            heard |= {(enclave, ns, name) for enclave in enclaves}
+            nodes_seen.append(ObservedNode(enclaves, ns, name, participant, frozenset(endpoints)))
+    return make_observation(nodes_seen, set(sighting.listed) - heard, strays)
+
+
+def _enclaves(
+    sighting: Sighting, processes: dict[str, frozenset[_Name]]
+) -> dict[str, frozenset[str]]:
+    """Return the enclaves that each process can be in, as few as the sighting allows."""
+    free: dict[str, Counter[_Name]] = {}
+    for enclave, ns, name in sighting.listed:
+        free.setdefault(enclave, Counter())[(ns, name)] += 1
+    candidates = {
+        each: frozenset(e for e, names in free.items() if all(names[n] for n in nodes))
+        for each, nodes in processes.items()
+    }
+    if sighting.ordered:
+        candidates = _by_order(sighting.listed, processes, candidates)
+    settled: set[str] = set()
+    while True:
+        news = [each for each, left in candidates.items() if len(left) == 1 and each not in settled]
+        if not news:
+            return candidates
+        # A node that is taken is not there for another process; that may settle further ones.
+        for each in news:
+            settled.add(each)
+            (enclave,) = candidates[each]
+            free[enclave].subtract(processes[each])
+        for each, left in candidates.items():
+            if each not in settled:
+                possible = frozenset(
+                    e for e in left if all(free[e][name] > 0 for name in processes[each])
+                )
+                candidates[each] = possible or left
+
+
+def _by_order(
+    listed: Sequence[Listed],
+    processes: dict[str, frozenset[_Name]],
+    candidates: dict[str, frozenset[str]],
+) -> dict[str, frozenset[str]]:
+    """Return the candidates narrowed by the order of the list; unchanged if that is in doubt.
+
+    The nth node of a name belongs to the nth participant that has this name, if there are as
+    many nodes as participants of it.
+    """
+    enclaves: dict[_Name, list[str]] = {}
+    for enclave, ns, name in listed:
+        enclaves.setdefault((ns, name), []).append(enclave)
+    by_owner: dict[str, set[str]] = {}
+    for node, places in enclaves.items():
+        owners = sorted(each for each, names in processes.items() if node in names)
+        if len(owners) == len(places):
+            for owner, enclave in zip(owners, places, strict=True):
+                by_owner.setdefault(owner, set()).add(enclave)
+    if any(len(each) > 1 or not each <= candidates[owner] for owner, each in by_owner.items()):
+        return candidates  # not the order that was promised
+    return {each: frozenset(by_owner.get(each, left)) for each, left in candidates.items()}
+
+
+# ── enclaves by certificates ────────────────────────────────────────────────────────────
 
 
 _DIGITS = 12
 _FIRST_BIT = 1 << (4 * _DIGITS - 1)
 _SECURED = tuple("89abcdef")
 """How identifiers of secured participants begin, in hex: with the first bit set."""
-_NOT_SAID = ("/",)
+_DEFAULT_ENCLAVE = ("/",)
 
 
 def identity_of(subject: bytes) -> str:
-    """The first 6 bytes, in hex, of the participants whose certificate has this subject (DER)."""
+    """Return how participants with this certificate subject (DER) begin: 6 bytes, in hex."""
     digest = int(sha256(subject).hexdigest()[:_DIGITS], 16)
     return f"{_FIRST_BIT | digest >> 1:x}"
 
 
 def identified(observation: Observation, enclaves: Mapping[str, str]) -> Observation:
-    """The observation with the enclaves that the certificates of its participants tell.
+    """Return the observation with the enclaves by the certificates of its participants.
 
-    ``enclaves`` are by `identity_of`.  A secured node of which neither they nor the graph tell the
-    enclave has none.
+    ``enclaves`` are by `identity_of`.  A secured node has none where neither they nor the graph
+    say its enclave.
     """
     nodes = []
     for node in observation.nodes:
-        told = enclaves.get(node.participant[:_DIGITS])
-        if told is not None:
-            node = replace(node, enclaves=(told,))
-        elif node.participant.startswith(_SECURED) and node.enclaves == _NOT_SAID:
+        enclave = enclaves.get(node.participant[:_DIGITS])
+        if enclave is not None:
+            node = replace(node, enclaves=(enclave,))
+        elif node.participant.startswith(_SECURED) and node.enclaves == _DEFAULT_ENCLAVE:
             node = replace(node, enclaves=())
         nodes.append(node)
     return make_observation(nodes, observation.silent, observation.strays)

@@ -9,7 +9,7 @@ import pytest
 
 from sros_tool.errors import UsageError
 from sros_tool.explain.denials import Denial, MissingRights, as_learned, propose, read_denials
-from sros_tool.graph.learn import Right, common_parts
+from sros_tool.graph.learn import NodeRight, common_parts
 from sros_tool.policy import ALLOW, Enclave, Group, Policy, Profile, Profiles
 from sros_tool.resources import policies_dir
 from sros_tool.runtime.vendor_log import plain_text
@@ -93,8 +93,8 @@ def test_the_enclave_that_rcl_names() -> None:
         "rt/y topic not found in allow rule. -> Function check_create_datawriter\n"
     )
     assert propose(read_denials(text)).rights == {
-        "/robot/arm": {Right("publish", "/x")},
-        "/": {Right("publish", "/y")},
+        "/robot/arm": {NodeRight("publish", "/x")},
+        "/": {NodeRight("publish", "/y")},
     }
 
 
@@ -121,8 +121,8 @@ def test_processes_that_write_at_the_same_time(one: str, other: str) -> None:
     )
     proposal = propose(read_denials(text))
     assert proposal.rights == {
-        "/talker": {Right("publish", "/x")},
-        "/listener": {Right("subscribe", "/x")},
+        "/talker": {NodeRight("publish", "/x")},
+        "/listener": {NodeRight("subscribe", "/x")},
     }
     assert [note.id for note in as_learned(proposal, "", None, None).notes] == [
         "log.several-enclaves"
@@ -132,18 +132,18 @@ def test_processes_that_write_at_the_same_time(one: str, other: str) -> None:
 @pytest.mark.parametrize(
     ("topic", "direction", "right"),
     [
-        ("rt/x", "publish", Right("publish", "/x")),
-        ("rt/x", "subscribe", Right("subscribe", "/x")),
-        ("rq/addRequest", "publish", Right("request", "/add")),
-        ("rr/addReply", "subscribe", Right("request", "/add")),
-        ("rq/addRequest", "subscribe", Right("reply", "/add")),
-        ("rr/addReply", "publish", Right("reply", "/add")),
-        ("rq/f/_action/send_goalRequest", "publish", Right("call", "/f")),
-        ("rr/f/_action/get_resultReply", "publish", Right("execute", "/f")),
-        ("rt/f/_action/status", "subscribe", Right("subscribe", "/f/_action/status")),
+        ("rt/x", "publish", NodeRight("publish", "/x")),
+        ("rt/x", "subscribe", NodeRight("subscribe", "/x")),
+        ("rq/addRequest", "publish", NodeRight("request", "/add")),
+        ("rr/addReply", "subscribe", NodeRight("request", "/add")),
+        ("rq/addRequest", "subscribe", NodeRight("reply", "/add")),
+        ("rr/addReply", "publish", NodeRight("reply", "/add")),
+        ("rq/f/_action/send_goalRequest", "publish", NodeRight("call", "/f")),
+        ("rr/f/_action/get_resultReply", "publish", NodeRight("execute", "/f")),
+        ("rt/f/_action/status", "subscribe", NodeRight("subscribe", "/f/_action/status")),
     ],
 )
-def test_one_half_asks_for_the_whole(topic: str, direction: str, right: Right) -> None:
+def test_one_half_asks_for_the_whole(topic: str, direction: str, right: NodeRight) -> None:
     assert propose([Denial(topic, direction)]).rights == {"": {right}}
 
 
@@ -154,7 +154,7 @@ def test_an_action_brings_its_topics_along() -> None:
         Denial("rt/f/_action/status", "publish"),
     ]
     assert propose(denials).rights == {
-        "": {Right("call", "/f"), Right("publish", "/f/_action/status")}
+        "": {NodeRight("call", "/f"), NodeRight("publish", "/f/_action/status")}
     }
 
 
@@ -230,7 +230,7 @@ def test_topics_of_a_node_of_another_name_are_proposed() -> None:
     proposal = propose([Denial("rq/foo/get_parametersRequest", "subscribe"),
                         Denial("rt/x", "publish")])  # fmt: skip
     (profile,) = as_learned(proposal, "/robot", None, robot(WHOLE), COMMON).profiles
-    assert (profile.node, profile.rights) == ("talker", frozenset([Right("publish", "/x")]))
+    assert (profile.node, profile.rights) == ("talker", frozenset([NodeRight("publish", "/x")]))
 
 
 @pytest.mark.parametrize(

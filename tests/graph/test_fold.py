@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.graph.learn import Right, fold
+from sros_tool.graph.learn import NodeRight, fold
 from sros_tool.graph.observation import Endpoint
 from tests.graph.graphs import endpoints
 
@@ -39,10 +39,10 @@ def test_a_partial_action_stays_its_parts() -> None:
     whole = endpoints("/", "n", ["execute /fib"])
     folded = fold(whole - {Endpoint("rt/fib/_action/status", "publish")})
     assert folded.rights == {
-        Right("publish", "/fib/_action/feedback"),
-        Right("reply", "/fib/_action/cancel_goal"),
-        Right("reply", "/fib/_action/get_result"),
-        Right("reply", "/fib/_action/send_goal"),
+        NodeRight("publish", "/fib/_action/feedback"),
+        NodeRight("reply", "/fib/_action/cancel_goal"),
+        NodeRight("reply", "/fib/_action/get_result"),
+        NodeRight("reply", "/fib/_action/send_goal"),
     }
 
 

@@ -13,7 +13,7 @@ from sros_tool.policy.rights import policy_rights
 from tests.support.children import python
 from tests.support.harness import sros
 
-LOG = Path(__file__).with_name("logs") / "fastdds_2.9.1.log"
+LOG = Path(__file__).parents[1] / "explain" / "denial_logs" / "fastdds_2.9.1.log"
 CYCLONE = LOG.with_name("cyclone_0.10.2.log")
 
 
