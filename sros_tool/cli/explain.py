@@ -40,8 +40,7 @@ if TYPE_CHECKING:
     from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave
     from sros_tool.explain.log import LogFinding
     from sros_tool.explain.question import Part, Question
-    from sros_tool.explain.reach import Path as FlowPath
-    from sros_tool.explain.reach import Reach
+    from sros_tool.explain.reach import HopPath, Reach
     from sros_tool.explain.who import EnclaveOutcome
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.model import Enclave, Source
@@ -861,7 +860,7 @@ def _reach_json(reach: Reach) -> dict[str, Any]:
     }
 
 
-def _paths_json(paths: dict[str, FlowPath]) -> list[dict[str, Any]]:
+def _paths_json(paths: dict[str, HopPath]) -> list[dict[str, Any]]:
     return [
         {
             "enclave": enclave,

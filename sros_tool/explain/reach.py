@@ -1,10 +1,12 @@
-"""Topics that the governance leaves open: everybody in the domain may write or read them.
+"""The reach of an enclave: whom it can influence and learn from, over any number of hops.
 
-Whoever publishes a topic influences all who may subscribe to it.  A service carries both ways: the
-request to the server, the reply to the client; an action is its services and topics.  All of them
-are DDS topics, and are followed as such.  Where both sides are wildcards, there is a way if they
-have a name in common that neither side is denied.
-Nothing here reads files: rights go in, ways come out.
+Whoever publishes a topic influences all who may subscribe to it.  A service carries information in
+both directions: the request to the server, the reply to the client; an action is its services and
+topics.  All of them are DDS topics, and are followed as such.  Where both sides are wildcards,
+there is a hop if they have a name in common that neither side is denied.  Topics that the
+governance leaves open can be written or read by every enclave, whatever its rights.
+
+Nothing here reads files.
 """
 
 from __future__ import annotations
@@ -28,7 +30,8 @@ from sros_tool.translate import SERVICE_ENDS, dds_names
 class Unguarded:
     """DDS topics without access control in one direction (publish or subscribe).
 
-    ``topic`` is an expression; ``without`` are those of earlier rules that guard a part of it.
+    ``topic`` is an expression; ``without`` are the expressions of earlier rules that guard a part
+    of it.
     """
 
     direction: str
@@ -37,7 +40,7 @@ class Unguarded:
 
 
 def unguarded(governance: Governance) -> Iterator[Unguarded]:
-    """What anybody may do in any of the domains; the first topic rule that matches holds.
+    """Yield what anybody may do in any of the domains; the first topic rule that matches holds.
 
     DDS-Security 1.1, 9.4.1.2.6 (topic rules, and enable_read/write_access_control).
     """
@@ -57,12 +60,12 @@ def unguarded(governance: Governance) -> Iterator[Unguarded]:
 OF_EVERY_NODE = ("/parameter_events",)
 """Topics that every node publishes and reads: with them, everybody influences everybody."""
 
-_SAID_AS = {
+_WRITER_RIGHTS = {
     "rt": ("topics", "publish", ""),
     "rq": ("services", "request", SERVICE_ENDS["rq"]),
     "rr": ("services", "reply", SERVICE_ENDS["rr"]),
 }
-"""What a ROS node does that writes a DDS topic of this prefix, and how such a topic ends."""
+"""By the prefix of a DDS topic: the kind of ROS name, the right to write it, and its suffix."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +74,7 @@ class Hop:
 
     ``right`` is what the source does (publish, request, reply; call or execute where the name is
     of an action), ``kind`` topics, services, actions or dds.  ``name`` is a name that both may use;
-    ``said`` and ``heard`` are the names or wildcards of their rights by which they may.
+    ``said`` and ``heard`` are the names or wildcards in the rights of source and target.
     """
 
     source: str
@@ -83,54 +86,54 @@ class Hop:
     heard: str
 
     def __str__(self) -> str:
-        """As ``/a -publish /x-> /b``."""
+        """Return text as ``/a -publish /x-> /b``."""
         return f"{self.source} {self.arrow()}"
 
     def arrow(self) -> str:
-        """As ``-publish /x-> /b``."""
+        """Return text as ``-publish /x-> /b``."""
         return f"-{self.right} {self.name}-> {self.target}"
 
 
-Path = tuple[Hop, ...]
-"""Hops, each of which starts where the one before it ends."""
+HopPath = tuple[Hop, ...]
+"""Hops, each of which starts at the target of the one before it."""
 
 
-def path_text(path: Path) -> str:
-    """As ``/a -publish /x-> /b -publish /y-> /c``."""
+def path_text(path: HopPath) -> str:
+    """Return text as ``/a -publish /x-> /b -publish /y-> /c``."""
     return " ".join((path[0].source, *(hop.arrow() for hop in path)))
 
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """What an enclave can influence and what it can learn from, each with a shortest path.
+    """The enclaves that an enclave can influence and learn from, each with a shortest path.
 
-    Paths of ``influences`` start at the enclave, those of ``learns_from`` end there.
+    Paths of ``influences`` start at the enclave, paths of ``learns_from`` lead to it.
     """
 
     enclave: str
-    influences: dict[str, Path]
-    learns_from: dict[str, Path]
+    influences: dict[str, HopPath]
+    learns_from: dict[str, HopPath]
 
 
 @dataclass(frozen=True, slots=True)
-class _End:
-    """One side's right to DDS topics, and the denials and exceptions that take from it."""
+class _Access:
+    """The right of an enclave to DDS topics, without what denials and exceptions take from it."""
 
     enclave: str
     topic: str
     without: tuple[str, ...]
 
 
-class _Side:
-    """The ends of all enclaves in one direction: all that write, or all that read.
+class _Direction:
+    """The accesses of all enclaves in one direction: all that write, or all that read.
 
-    They are found by their exact topics, and by what stands before their first wildcard.
+    They are found by their exact topics, and by the text before their first wildcard.
     """
 
-    def __init__(self, ends: Iterable[_End]) -> None:
-        self.of: dict[str, list[_End]] = defaultdict(list)
-        self._exact: dict[str, list[_End]] = defaultdict(list)
-        self._wild: dict[str, list[_End]] = defaultdict(list)
+    def __init__(self, ends: Iterable[_Access]) -> None:
+        self.of: dict[str, list[_Access]] = defaultdict(list)
+        self._exact: dict[str, list[_Access]] = defaultdict(list)
+        self._wild: dict[str, list[_Access]] = defaultdict(list)
         for end in ends:
             self.of[end.enclave].append(end)
             if is_expression(end.topic):
@@ -140,8 +143,8 @@ class _Side:
         self._topics = sorted(self._exact)
         self._prefixes = sorted(self._wild)
 
-    def meeting(self, topic: str) -> Iterator[_End]:
-        """The ends that might share a name with a topic or wildcard."""
+    def meeting(self, topic: str) -> Iterator[_Access]:
+        """Yield the accesses that might have a name in common with a topic or wildcard."""
         prefix = literal_prefix(topic)
         if prefix == topic:
             yield from self._exact.get(topic, ())
@@ -155,7 +158,7 @@ class _Side:
 
 
 def _starting(ordered: list[str], prefix: str) -> Iterator[str]:
-    """The texts of a sorted list that start with ``prefix``."""
+    """Yield the texts of a sorted list that start with ``prefix``."""
     for index in range(bisect_left(ordered, prefix), len(ordered)):
         if not ordered[index].startswith(prefix):
             return
@@ -166,10 +169,10 @@ _Used = set[tuple[str, tuple[str, ...]]]
 
 
 class Network:
-    """All enclaves of a system, connected by what they may say and hear.
+    """All enclaves of a system, connected by what they may write and read.
 
-    ``without`` are topics (ROS names) that do not count.  What is ``unguarded`` all of
-    ``everybody`` may do, whatever the rights say.
+    ``without`` are topics (ROS names) that do not count.  All enclaves in ``everybody`` may do
+    what is ``unguarded``, whatever the rights say.
     """
 
     def __init__(
@@ -180,7 +183,7 @@ class Network:
         unguarded: Iterable[Unguarded] = (),
         everybody: Iterable[str] = (),
     ) -> None:
-        ends: dict[str, list[_End]] = {"publish": [], "subscribe": []}
+        ends: dict[str, list[_Access]] = {"publish": [], "subscribe": []}
         denied: dict[tuple[str, str], set[str]] = defaultdict(set)
         allowed: dict[tuple[str, str], set[str]] = defaultdict(set)
         for right in rights:
@@ -193,29 +196,29 @@ class Network:
             for topic in sorted(topics, key=_plain_first):
                 met = tuple(each for each in outside if overlap(each, topic))
                 if topic not in met:
-                    ends[direction].append(_End(enclave, topic, met))
+                    ends[direction].append(_Access(enclave, topic, met))
         for each, enclave in product(dict.fromkeys(unguarded), everybody):
             outside = sorted({*each.without, *ignored})
             met = tuple(other for other in outside if overlap(other, each.topic))
             if each.topic not in met:
-                ends[each.direction].append(_End(enclave, each.topic, met))
-        self._sides = {direction: _Side(found) for direction, found in ends.items()}
+                ends[each.direction].append(_Access(enclave, each.topic, met))
+        self._sides = {direction: _Direction(found) for direction, found in ends.items()}
 
     @property
     def enclaves(self) -> tuple[str, ...]:
-        """The enclaves that may say or hear anything, sorted."""
+        """The enclaves that may write or read anything, sorted."""
         return tuple(sorted({name for side in self._sides.values() for name in side.of}))
 
     def hops(self, enclave: str) -> Iterator[Hop]:
-        """Every way by which information leaves an enclave, one hop far, itself left out."""
+        """Yield every hop by which information leaves an enclave for another one."""
         return self._steps(enclave, True, set(), {enclave})
 
     def reach(self, enclave: str) -> Reach:
-        """What an enclave can influence and learn from over any number of hops."""
+        """Return whom an enclave can influence and learn from over any number of hops."""
         return Reach(enclave, self._search(enclave, True), self._search(enclave, False))
 
-    def _search(self, start: str, forward: bool) -> dict[str, Path]:
-        paths: dict[str, Path] = {start: ()}
+    def _search(self, start: str, forward: bool) -> dict[str, HopPath]:
+        paths: dict[str, HopPath] = {start: ()}
         used: _Used = set()
         queue = deque([start])
         while queue:
@@ -231,9 +234,9 @@ class Network:
     def _steps(
         self, enclave: str, forward: bool, used: _Used, known: Container[str]
     ) -> Iterator[Hop]:
-        """The hops out of an enclave, or into it, from or to others than the ``known``.
+        """Yield the hops out of an enclave, or into it, from or to others than the ``known``.
 
-        Ends whose like was ``used`` already lead nowhere new, and are left out.
+        Accesses to topics that were ``used`` already lead nowhere new, and are left out.
         """
         directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
         own, others = (self._sides[direction] for direction in directions)
@@ -248,7 +251,7 @@ class Network:
 
 
 def _topics(right: Right) -> Iterator[tuple[str, str]]:
-    """The DDS topics behind a right, each with its direction."""
+    """Yield the DDS topics behind a right, each with its direction."""
     if right.kind == "dds":
         yield right.right, right.name
         return
@@ -258,7 +261,7 @@ def _topics(right: Right) -> Iterator[tuple[str, str]]:
 
 
 def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
-    """Tells ways by topics of the robot before those by services, and every node's log last."""
+    """Sort topics of the robot before services, and every node's log last."""
     kind = topic[:3]
     return (
         topic == "rt/rosout",
@@ -269,8 +272,8 @@ def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
     )
 
 
-def _shared(one: _End, other: _End) -> str:
-    """A DDS topic that both ends may use, or ""."""
+def _shared(one: _Access, other: _Access) -> str:
+    """Return a DDS topic that both may use, or ""."""
     if not overlap(one.topic, other.topic):
         return ""
     exact = next((end.topic for end in (one, other) if not is_expression(end.topic)), "")
@@ -282,7 +285,7 @@ def _shared(one: _End, other: _End) -> str:
 
 @lru_cache(maxsize=4096)
 def _shared_by_wildcards(one: str, other: str, outside: tuple[str, ...]) -> str:
-    for prefix, (_, _, end) in _SAID_AS.items():
+    for prefix, (_, _, end) in _WRITER_RIGHTS.items():
         # In ROS terms first, so that the name is one that a node could have.
         inner = [_ros_part(each, prefix, end) for each in (one, other)]
         outer = [_ros_part(each, prefix, end) for each in outside]
@@ -294,7 +297,7 @@ def _shared_by_wildcards(one: str, other: str, outside: tuple[str, ...]) -> str:
 
 
 def _ros_part(topic: str, prefix: str, end: str) -> str:
-    """What a DDS expression says of ROS names of one kind, or "" where it says nothing simple."""
+    """Return the ROS name or wildcard within a DDS expression of one kind, or "" without one."""
     if topic == "*":
         return "*"
     if topic.startswith(prefix + "/") and topic.endswith(end):
@@ -303,8 +306,8 @@ def _ros_part(topic: str, prefix: str, end: str) -> str:
 
 
 def _in_ros_terms(topic: str) -> tuple[str, str, str]:
-    """The kind, the right of the writer and the ROS name of a DDS topic or expression."""
-    kind, right, end = _SAID_AS.get(topic[:2], ("", "", ""))
+    """Return the kind, the right of the writer and the ROS name of a DDS topic or expression."""
+    kind, right, end = _WRITER_RIGHTS.get(topic[:2], ("", "", ""))
     name = _ros_part(topic, topic[:2], end) if kind else ""
     if not name.startswith("/"):
         return "dds", "publish", topic
@@ -314,7 +317,7 @@ def _in_ros_terms(topic: str) -> tuple[str, str, str]:
     return kind, right, name
 
 
-def _hop(said: _End, heard: _End, topic: str) -> Hop:
+def _hop(said: _Access, heard: _Access, topic: str) -> Hop:
     kind, right, name = _in_ros_terms(topic)
     ends = (_in_ros_terms(end.topic)[2] for end in (said, heard))
     return Hop(said.enclave, heard.enclave, kind, right, name, *ends)
