@@ -22,14 +22,13 @@ from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.layout import (
     ENCLAVES,
-    PERMISSIONS,
     PRIVATE,
     ROLES,
     ca_key,
     enclave_path,
     list_enclaves,
 )
-from sros_tool.keystore.reader import load_ca_certificate, load_governance, load_settings
+from sros_tool.keystore.reader import governance_of, load_settings
 from sros_tool.keystore.template import Template
 from sros_tool.names import ACTION_INSIDE, NODE_SERVICES
 from sros_tool.pki import smime
@@ -85,7 +84,7 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario) -> UserKeysto
         KeystoreError: it is no keystore, or no two enclaves may talk to each other.
     """
     names = list_enclaves(root)
-    domains = load_governance(root, load_ca_certificate(root, PERMISSIONS)).domains()
+    domains = governance_of(root).domains()
     rights = {name: grants for name in names if (grants := enclave_grant(root, name))}
     template = load_settings(root)
     # Whatever is made next to it has keys of its own.

@@ -33,7 +33,7 @@ from sros_tool.explain.answer import (
 )
 from sros_tool.explain.question import OWN_PARTS, Part, Question
 from sros_tool.faults import Fault
-from sros_tool.keystore.layout import KEY_FILE, LEDGER, REQUEST
+from sros_tool.keystore.layout import KEY_FILE, LEDGER
 from sros_tool.keystore.loading import vendor_problems
 from sros_tool.keystore.reader import OpenedEnclave, Problem, open_enclave
 from sros_tool.pki import smime
@@ -116,7 +116,7 @@ def load_enclave(name: str, folder: Path, *, at: datetime) -> LoadedEnclave:
         tuple(_expiries(state, folder)),
         state,
         at,
-        key_elsewhere=(folder / REQUEST).exists() and not (folder / KEY_FILE).exists(),
+        key_elsewhere=state.key_on_robot,
     )
 
 

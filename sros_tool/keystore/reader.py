@@ -101,7 +101,7 @@ class OpenedKeystore:
     @cached_property
     def governance(self) -> Governance:
         """The governance that DDS loads, its signature verified."""
-        return load_governance(self.root, load_ca_certificate(self.root, PERMISSIONS))
+        return governance_of(self.root)
 
     @cached_property
     def domains(self) -> DomainSet:

@@ -21,11 +21,11 @@ from sros_tool.dds.permissions import Grant
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.graph.learn import learn
 from sros_tool.graph.observation import from_json
-from sros_tool.keystore.layout import PERMISSIONS, PUBLIC, REQUEST, enclave_names, enclave_path
+from sros_tool.keystore.layout import PUBLIC
 from sros_tool.keystore.reader import (
     OpenedEnclave,
-    load_ca_certificate,
-    load_governance,
+    OpenedKeystore,
+    Problem,
     open_enclave,
     read_lists,
 )
@@ -142,16 +142,15 @@ def _observation(path: Path) -> PictureSource:
 def _with_keystore(source: PictureSource, root: Path, now: datetime) -> PictureSource:
     findings = list(source.findings)
     governance = None
+    keystore = OpenedKeystore(root)
     try:
-        governance = load_governance(root, load_ca_certificate(root, PERMISSIONS))
+        governance = keystore.governance
     except SrosError as error:
         findings.append(PicturedFinding("view.no-governance", "error", str(error)))
     enclaves, validities = [], set()
-    for name in enclave_names(root):
-        folder = enclave_path(root, name)
-        state = open_enclave(folder, now=now)
-        away = (folder / REQUEST).exists() and not (folder / "key.pem").exists()
-        enclaves.append(_described(name, state, key_elsewhere=away))
+    for name in keystore.names:
+        state = keystore.enclave(name, now=now)
+        enclaves.append(_described(name, state, state.problems_at_home))
         validities |= set(_validities_of(name, state))
     try:
         validities |= set(_authorities(root))
@@ -171,18 +170,14 @@ def _with_enclave(source: PictureSource, folder: Path, now: datetime) -> Picture
     name = next(iter(sorted(source.scope or ())), base_name(folder))
     return replace(
         source,
-        enclaves=(_described(name, state, key_elsewhere=False),),
+        enclaves=(_described(name, state, state.problems),),
         governance=state.governance,
         validities=tuple(sorted(_validities_of(name, state))),
     )
 
 
-def _described(name: str, state: OpenedEnclave, *, key_elsewhere: bool) -> PicturedEnclave:
-    problems = tuple(
-        str(each)
-        for each in state.problems
-        if not (key_elsewhere and (each.file, each.text) == ("key.pem", "missing"))
-    )
+def _described(name: str, state: OpenedEnclave, found: tuple[Problem, ...]) -> PicturedEnclave:
+    problems = tuple(map(str, found))
     certificate = state.certificate
     if certificate is None:
         return PicturedEnclave(name, "", problems=problems)

@@ -16,7 +16,7 @@ from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.trust import check_same_authority, refuse_home, trusted_in
 from sros_tool.keystore.layout import ENCLAVES, OPTIONAL_FILES, REQUIRED_FILES, enclave_folder
-from sros_tool.keystore.reader import OpenedEnclave, open_enclave
+from sros_tool.keystore.reader import OpenedEnclave, open_enclave, read_certificate
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
@@ -25,7 +25,6 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     common_name_of,
     digest,
-    load_certificate,
     subject_text,
     validity_of,
 )
@@ -258,7 +257,7 @@ def _check_newer(place: Path, answer: Answer, certificate: x509.Certificate) -> 
     remedy = "Have a new answer made, or add --force if going back is meant."
     path = place / "cert.pem"
     if path.exists():
-        old = validity_of(load_certificate(read_bytes(path, "certificate"), f"'{path}'"))
+        old = validity_of(read_certificate(path))
         new = validity_of(certificate)
         if new.not_before < old.not_before:
             raise KeystoreError(

@@ -15,10 +15,10 @@ from sros_tool.keystore.delivery.trust import check_same_authority
 from sros_tool.keystore.layout import (
     OPTIONAL_FILES,
     PRIVATE,
-    REQUEST,
     REQUIRED_FILES,
     enclave_folder,
     enclave_path,
+    key_on_robot,
     list_enclaves,
 )
 from sros_tool.keystore.missing import no_such_enclave
@@ -74,7 +74,7 @@ def select(
         for name in fitting:
             if name in chosen or name in left_out:
                 continue
-            (left_out if _born_elsewhere(root, name) else chosen).append(name)
+            (left_out if key_on_robot(enclave_path(root, name)) else chosen).append(name)
     if not chosen:
         raise KeystoreError(
             f"the keys of {', '.join(left_out)} are not in keystore '{root}'",
@@ -128,7 +128,7 @@ def collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]
         check_enclave_name(name)
         if name not in existing:
             raise no_such_enclave(root, name, existing)
-        if _born_elsewhere(root, name):
+        if key_on_robot(enclave_path(root, name)):
             raise KeystoreError(
                 f"the key of enclave {name} is not in keystore '{root}'",
                 "It was made on its robot and stays there, so there is nothing that could run.",
@@ -146,11 +146,6 @@ def collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]
             if (folder / file).exists():
                 files[f"{enclave_folder(name)}/{file}"] = read_bytes(folder / file, "file")
     return dict(sorted(files.items()))
-
-
-def _born_elsewhere(root: Path, name: str) -> bool:
-    folder = enclave_path(root, name)
-    return (folder / REQUEST).exists() and not (folder / "key.pem").exists()
 
 
 def _real(path: Path) -> Path:

@@ -42,12 +42,18 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.ledger import append, document_entry
-from sros_tool.keystore.reader import check_domain, load_governance, load_settings, read_granted
+from sros_tool.keystore.reader import (
+    check_domain,
+    load_governance,
+    load_settings,
+    read_certificate,
+    read_granted,
+)
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
-from sros_tool.pki.certificates import enclave_subject, load_certificate, pem, validity_of
+from sros_tool.pki.certificates import enclave_subject, pem, validity_of
 from sros_tool.pki.certificates import subject_text as text_of
 from sros_tool.pki.keys import load_key
 from sros_tool.pki.requests import SigningRequest, key_digest, load_request
@@ -182,7 +188,7 @@ def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
 def _check_key(root: Path, request: SigningRequest) -> None:
     """Refuse a key that was revoked, and one where the keystore has another key."""
     for path in sorted((root / REVOKED).glob(f"*/{CERTIFICATE_FILE}")):
-        certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+        certificate = read_certificate(path)
         if certificate.public_key() == request.public_key:
             raise KeystoreError(
                 f"the key of the request for {request.name} was revoked",
@@ -244,7 +250,7 @@ def _earlier_rights(root: Path, name: str, authority: x509.Certificate) -> Earli
 
 def _present_certificate(root: Path, name: str) -> x509.Certificate:
     path = enclave_path(root, name) / CERTIFICATE_FILE
-    return load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+    return read_certificate(path)
 
 
 def _answer_files(root: Path, issued: Issued) -> dict[str, bytes]:

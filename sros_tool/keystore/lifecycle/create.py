@@ -53,7 +53,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
 from sros_tool.keystore.missing import no_such_enclave
-from sros_tool.keystore.reader import check_domain, load_governance, load_settings
+from sros_tool.keystore.reader import check_domain, load_governance, load_settings, read_certificate
 from sros_tool.keystore.template import Template, render_template
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
@@ -65,7 +65,6 @@ from sros_tool.pki.certificates import (
     common_name_of,
     enclave_subject,
     issued_by,
-    load_certificate,
     subject_of,
     subject_text,
     validity_of,
@@ -456,7 +455,7 @@ def _usable_certificate(
 ) -> x509.Certificate:
     """Return the certificate of an enclave; raise `KeystoreError` where DDS would refuse it."""
     path = enclave_path(root, name) / CERTIFICATE_FILE
-    certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+    certificate = read_certificate(path)
     if not issued_by(certificate, keystore.authorities.identity.certificate):
         raise KeystoreError(
             f"the certificate of enclave {name} was not issued by the identity CA of this keystore",

@@ -30,13 +30,13 @@ from sros_tool.keystore.reader import (
     carried_crl,
     certificates_of,
     identity_file,
+    read_certificate,
     read_crl,
 )
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.certificates import (
     digest,
-    load_certificate,
     pem,
     same_key,
     subject_text,
@@ -44,7 +44,6 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.crl import RevocationList, Revoked, sign_crl
 from sros_tool.validity import BACKDATE, Window, iso
-from sros_tool.xml import read_bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +159,7 @@ class Lists:
         }
         for path in (self._root / REVOKED).glob("*/cert.pem"):
             if int(path.parent.name, 16) not in ends:
-                found = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+                found = read_certificate(path)
                 ends.setdefault(found.serial_number, iso(validity_of(found).not_after))
         return ends
 

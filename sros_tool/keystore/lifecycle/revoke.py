@@ -23,12 +23,12 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Entry, append, read_ledger
 from sros_tool.keystore.lifecycle.revocation_list import Lists
 from sros_tool.keystore.missing import no_such_enclave
-from sros_tool.keystore.reader import load_settings, read_crl
+from sros_tool.keystore.reader import load_settings, read_certificate, read_crl
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
-from sros_tool.pki.certificates import issued_by, load_certificate, subject_text
+from sros_tool.pki.certificates import issued_by, subject_text
 from sros_tool.pki.crl import REASONS, Revoked
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
@@ -159,7 +159,7 @@ def _move_away(transaction: Transaction, authority: Authority, name: str) -> tup
     """Have the files of an enclave moved; the serial number and subject of its certificate."""
     folder = enclave_folder(name)
     path = transaction.root / folder / "cert.pem"
-    certificate = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+    certificate = read_certificate(path)
     if not issued_by(certificate, authority.certificate):
         raise KeystoreError(
             f"the certificate of enclave {name} was not issued by the identity CA of this keystore",

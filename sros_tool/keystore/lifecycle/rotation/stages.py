@@ -61,6 +61,7 @@ from sros_tool.keystore.reader import (
     carried_crl,
     certificates_of,
     load_settings,
+    read_certificate,
     read_crl,
     read_granted,
 )
@@ -75,7 +76,6 @@ from sros_tool.pki.certificates import (
     digest,
     issue_ca,
     issued_by,
-    load_certificate,
     pem,
     same_key,
     subject_text,
@@ -485,7 +485,7 @@ def _issuance(
     path = folder / CERTIFICATE_FILE
     if not path.exists():
         return None  # it will be of the new CA
-    kept = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+    kept = read_certificate(path)
     certificate: NewIdentity | x509.Certificate = kept
     if identity:
         if not issued_by(kept, identity.old[0]):

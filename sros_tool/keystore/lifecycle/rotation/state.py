@@ -22,12 +22,11 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     list_enclaves,
 )
-from sros_tool.keystore.reader import authority_files, certificates_of
+from sros_tool.keystore.reader import authority_files, certificates_of, read_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     digest,
     issued_by,
-    load_certificate,
     subject_text,
     validity_of,
 )
@@ -184,7 +183,7 @@ def _count(
         try:
             if role == IDENTITY:
                 path = folder / "cert.pem"
-                own = load_certificate(read_bytes(path, "certificate"), f"'{path}'")
+                own = read_certificate(path)
                 fits = [issued_by(own, each) for each in authorities]
             else:
                 signed = smime.parse(read_bytes(folder / "permissions.p7s", "permissions"))
