@@ -138,7 +138,7 @@ Example:
 @click.option(
     "--vendor",
     type=click.Choice([each.value for each in Vendor]),
-    help="Whose decision counts. [default: that of this machine's RMW]",
+    help="Whose decision counts. [default: the vendor of this machine's RMW]",
 )
 @click.option("--all-vendors", is_flag=True, help="Compare what the vendors decide.")
 @click.option(
@@ -150,7 +150,8 @@ Example:
 @click.option(
     "--time-zone",
     metavar="ZONE",
-    help="That of the robot, which Fast DDS goes by: Asia/Tokyo. [default: this machine's]",
+    help="Time zone of the robot, in which Fast DDS reads dates: Asia/Tokyo. "
+    "[default: this machine's]",
 )
 @click.option("--who", is_flag=True, help="Say which enclaves of the keystore may.")
 @click.option(
@@ -191,7 +192,7 @@ def explain(
     With --policy and no keystore, the policy itself is asked, before anything is signed.
 
     The exit status is 0 if it is allowed (with --who: to anybody), and 1 if it is denied; with
-    --log, 1 if the log tells of a fault.
+    --log, 1 if the log reports a fault.
     """
     if sum((who, bool(reach), log is not None)) > 1:
         raise UsageError("--who, --reach and --log exclude each other")
@@ -921,7 +922,7 @@ def _show_log(
         for finding in findings:
             _echo(_finding_lines(finding))
         if not findings:
-            click.echo("nothing in it tells of DDS Security refusing anything", err=True)
+            click.echo("nothing in it says that DDS Security refused anything", err=True)
     return 1 if findings else 0
 
 

@@ -63,7 +63,7 @@ class MissingRights:
     """The rights that denials ask for, by enclave ("" where the log does not name it).
 
     ``unclear`` are denials without a direction, ``by_rule`` those by a deny rule, ``remote`` those
-    of peers, ``foreign`` those of topics without a ROS name: all of them are left to a person.
+    of peers, ``foreign`` those of topics without a ROS name: all of them are left to the user.
     """
 
     rights: dict[str, frozenset[NodeRight]]
@@ -122,7 +122,7 @@ def _direction(lines: list[str], topic: str) -> tuple[bool, str]:
 
 
 def propose(denials: Iterable[Denial]) -> MissingRights:
-    """The rights that would have let pass what was denied, as far as the log tells.
+    """The rights that would have let pass what was denied, as far as the log says.
 
     A node stops at its first refusal, so one denied half of a service asks for the service, and
     one denied service of an action for the action.
@@ -336,7 +336,7 @@ def _notes(proposal: MissingRights) -> tuple[Note, ...]:
     texts = {
         "log.unclear": (
             proposal.unclear,
-            "not proposed, as the log does not tell whether these were to be published or "
+            "not proposed, as the log does not say whether these were to be published or "
             "subscribed: {}",
         ),
         "log.denied-by-rule": (

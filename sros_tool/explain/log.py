@@ -270,7 +270,7 @@ class _Examiner:
             return finding
         answer = self._answer(enclave, denial.vendor, _question(denial))
         if answer.allowed:
-            found = ["the permissions that lie there now allow it"]
+            found = ["the permissions that are there now allow it"]
             remedy = "Restart the process: it loaded the permissions that were there before."
         else:
             other, better = _other_node(denial, answer)
@@ -362,7 +362,7 @@ def _listed(nodes: Sequence[str]) -> str:
 
 def _nothing_found(enclave: LoadedEnclave) -> str:
     return (
-        f"Enclave {enclave.name}, as it lies there now, has no fault that would explain it: "
+        f"Enclave {enclave.name}, as it is there now, has no fault that would explain it: "
         "look at the files on the robot itself, its clock and its time zone."
     )
 

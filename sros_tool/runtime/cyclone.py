@@ -369,7 +369,7 @@ def load_cyclone() -> CycloneLibrary:
 
     sink = _LOG_SINK(keep)
     api.dds_set_log_sink(sink, None)
-    return CycloneLibrary(api, path, version, plugins_beside(path), log, sink)
+    return CycloneLibrary(api, path, version, plugins_next_to(path), log, sink)
 
 
 def _load_first() -> tuple[Any, Path]:
@@ -427,7 +427,7 @@ def _load_all(files: Iterable[Path]) -> None:
     """Load libraries that need each other, in whatever order works; ignore what never loads.
 
     With them in memory under their own names, libddsc finds them without LD_LIBRARY_PATH.  Those
-    that others need come first, or the loader might take the system's copy beside ours.
+    that others need come first, or the loader might take the system's copy as well as ours.
     """
     waiting = sorted(files, key=_load_order)
     while waiting:
@@ -469,7 +469,7 @@ def _same_size(one: Path, other: Path) -> bool:
     return one.stat().st_size == other.stat().st_size
 
 
-def plugins_beside(path: Path) -> Path | None:
+def plugins_next_to(path: Path) -> Path | None:
     """Return the folder of the security plugins that belong to the libddsc at ``path``, or None."""
     folders = [*sorted(path.parent.glob("libddsc0*/")), path.parent]
     for folder in folders:

@@ -19,7 +19,7 @@ from sros_tool.runtime.cyclone import (
     Participant,
     SecurityRefusedError,
     loaded_libraries,
-    plugins_beside,
+    plugins_next_to,
     security_properties,
     version_of,
 )
@@ -147,7 +147,7 @@ def _dds_in_memory() -> str:
 
 
 def _package_plugins() -> Path | None:
-    folders = (plugins_beside(file) for file in loaded_libraries("libddsc"))
+    folders = (plugins_next_to(file) for file in loaded_libraries("libddsc"))
     return next((folder for folder in folders if folder is not None), None)
 
 

@@ -94,4 +94,4 @@ def vendor_here(environment: Mapping[str, str]) -> tuple[Vendor, str]:
     for rmw in rmw_implementations(environment):
         if vendor := vendor_of(rmw):
             return vendor, f"{rmw} is installed here"
-    return Vendor.FAST, "what ROS 2 Jazzy uses unless told otherwise"
+    return Vendor.FAST, "the default of ROS 2 Jazzy"

@@ -139,7 +139,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "not-built-in", ROS, r"doesn't have the security libraries|compile Fast DDS using the"
         r"|-DSECURITY=ON|security (?:is )?not supported|compiled without security",
         "this DDS was built without DDS Security, so no secured node can start with it",
-        "Use the ROS 2 packages of the distribution; `sros doctor` tells which DDS enforces.",
+        "Use the ROS 2 packages of the distribution; `sros doctor` shows which DDS enforces.",
         refuses=Refused.ALL_SECURITY,
     ),
     _text(
@@ -193,7 +193,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "certificate-issuer", _CYCLONE, r"Certificate not valid: error: unable to get "
         r"(?:local )?issuer certificate|Certificate not valid: error: self.signed",
-        "the certificate was not issued by the identity CA that lies with it",
+        "the certificate was not issued by the identity CA next to it",
         "Use the files of one keystore together.", (Fault.CERTIFICATE_ISSUER,),
     ),
     _text(
@@ -231,8 +231,8 @@ LOG_TEXTS: tuple[LogText, ...] = (
     ),
     _text(
         "signer", _CYCLONE, r"PKCS7_verify:certificate verify error",
-        "governance.p7s or permissions.p7s was signed by another CA than the permissions CA that "
-        "lies with it", f"Use the files of one keystore together. {_SIGN_ONE}", _SIGNATURE,
+        "governance.p7s or permissions.p7s was signed by another CA than the permissions CA "
+        "next to it", f"Use the files of one keystore together. {_SIGN_ONE}", _SIGNATURE,
     ),
     _text(
         "not-signed", _CYCLONE, r"SMIME_read_ASN1_ex:no content type|SMIME_read_ASN1",
@@ -273,8 +273,9 @@ LOG_TEXTS: tuple[LogText, ...] = (
     # ── Fast DDS, meeting peers ────────────────────────────────────────────────────────────
     _text(
         "peer-permissions-ca", _FAST, r"Remote participant PermissionsCA differs from local",
-        "a PEER was refused: its permissions CA is not that of this process. The two have enclaves "
-        "of different keystores, or one was started before the CA was replaced and one after",
+        "a PEER was refused: its permissions CA is not the one of this process. The two have "
+        "enclaves of different keystores, or one was started before the CA was replaced and one "
+        "after",
         _PEERS + " Restart both after each stage of `sros rotate_ca KEYSTORE`.",
     ),
     _text(
@@ -299,15 +300,15 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "peer-malformed", _FAST,
         r"Error validating remote permissions for \S+ \(Malformed permissions file",
         "a PEER was refused: its permissions, although signed, are not such as Fast DDS accepts",
-        "Have sros write those of the peer: `sros create_permission KEYSTORE ENCLAVE POLICY`.",
+        "Have sros write the peer's permissions: `sros create_permission KEYSTORE ENCLAVE POLICY`.",
     ),
     _text(
         "peer-domain", _FAST, r"Error checking remote participant"
         r"|Not found a rule allowing to use the domain_id.*check_remote_participant"
         r"|check_remote_participant.*Not found a rule allowing to use the domain_id",
         "a PEER was refused: its permissions are not for this domain",
-        "Sign those of the peer again, with this domain: `sros create_permission KEYSTORE ENCLAVE "
-        "POLICY` takes the domains of the keystore.",
+        "Sign the peer's permissions again, with this domain: `sros create_permission KEYSTORE "
+        "ENCLAVE POLICY` takes the domains of the keystore.",
     ),
     _text(
         "peer-refused", _FAST, r"Error validating remote permissions for"
@@ -354,7 +355,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "signature", _FAST, r"PKCS7 data verification failed",
         "governance.p7s or permissions.p7s was changed, or signed by another CA than the "
-        "permissions CA that lies with it; which of the two, it does not say",
+        "permissions CA next to it; which of the two, it does not say",
         _SIGN_ONE, _SIGNATURE,
         refuses=Refused.PARTICIPANT,
     ),
@@ -411,8 +412,8 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "participant", _FAST, r"Cannot create participant due to initialization error"
         r"|Problem creating RTPSParticipant|failed to create participant",
         "the process may not join, and this log does not say why: Fast DDS 2.9 is silent about "
-        "signatures, expired permissions and subjects, 2.14 tells its standard output or the file "
-        "of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL, unseen=_FILE, weak=2,
+        "signatures, expired permissions and subjects, 2.14 reports them on standard output or in "
+        "the file of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL, unseen=_FILE, weak=2,
     ),
     _text(
         "service", ROS, r"(?:could not|failed to) create (?:service|client)"
@@ -448,7 +449,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
         r"(?P<topic>\S+) (?P<how>denied by default rule|found in deny_rule)",
         refuses=Refused.TOPIC,
     ),
-    # ── what says that it is a refusal, and nothing of its cause ───────────────────────────
+    # ── refusals without a cause ───────────────────────────────────────────────────────────
     _text("refusal", _FAST, r"validate_local_identity|verifying CA certificate",
           refuses=Refused.PARTICIPANT),
     _text("refusal", _CYCLONE, r"Error occurred while validating local (?:permission|identity)"

@@ -404,7 +404,7 @@ def test_a_denied_topic_is_compared_with_what_is_signed(keystore: Path, tmp_path
     )
     found = sros("explain", keystore, ENCLAVE, "--log", log)
     assert found.status == 1
-    assert "the permissions that lie there now allow it" in found.out
+    assert "the permissions that are there now allow it" in found.out
     assert "Restart the process" in found.out
     assert "no rule allows publish rt/other" in found.out
     assert f"sros explain {keystore} {ENCLAVE} publish /other" in found.out
