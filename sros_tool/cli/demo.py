@@ -139,7 +139,7 @@ def demo(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Show on a real DDS that nobody hears secured nodes, or gets in, without permission.
+    """Show on a real DDS that nobody hears secured nodes or gets in without permission.
 
     Makes keystores, starts nodes with and without them, and compares what was expected with what
     happened. The scenario isolation takes some ten seconds on Cyclone DDS and some twenty on rclpy,
@@ -207,13 +207,13 @@ def _list(scenarios: Sequence[Scenario], as_json: bool) -> None:
 
 
 def _write_report(report: Path, result: dict[str, Any], keep: Path | None) -> None:
-    """The page, which says nothing of where on this machine things were."""
+    """Write the page, without the folders of this machine."""
     from sros_tool.files import replace_file
-    from sros_tool.report.demo_page import render_demo_page, without_places
+    from sros_tool.report.demo_page import render_demo_page, without_folders
 
     places = [Path.home(), Path.cwd(), Path(tempfile.gettempdir()), *([keep] if keep else [])]
-    told = without_places(result, [str(place.absolute()) for place in places])
-    replace_file(report, render_demo_page(told).encode())
+    folders = [str(place.absolute()) for place in places]
+    replace_file(report, render_demo_page(without_folders(result, folders)).encode())
 
 
 def _progress(line: str) -> None:

@@ -1,4 +1,4 @@
-"""Choose what the demo's nodes run on: rclpy where its RMW enforces security, else Cyclone DDS."""
+"""The backend: rclpy nodes where its RMW enforces security, else nodes on Cyclone DDS."""
 
 from __future__ import annotations
 
@@ -32,7 +32,6 @@ from sros_tool.runtime.stacks import (
 from sros_tool.translate import governance_for
 
 AUTO, RCLPY, CYCLONE = "auto", "rclpy", "cyclone"
-CHOICES = (AUTO, RCLPY, CYCLONE)
 
 _ASKED = "as asked for"
 _NO_RCLPY = (
@@ -47,8 +46,8 @@ _ON_THE_WIRE = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 class Backend:
     """What the nodes run on; ``why`` says in one line how it was chosen.
 
-    Beside Cyclone nodes, the one that looks around is a node of rclpy where ``ros_observer``
-    says so; ``rmw`` is what rclpy runs on.
+    With ``ros_observer``, an unsecured observer of Cyclone nodes is a node of rclpy; ``rmw`` is
+    what rclpy runs on.
     """
 
     name: str
@@ -64,13 +63,13 @@ class Backend:
 
     @property
     def vendor(self) -> Condition | None:
-        """The vendor, as far as the outcome of a row depends on it."""
+        """The vendor, as far as the expected status of a row depends on it."""
         if self.dds.startswith("Cyclone DDS"):
             return Condition.CYCLONE
         return Condition.FAST if self.dds.startswith("Fast DDS") else None
 
     def library(self, role: Role, *, secured: bool = False) -> str:
-        """The library that a node of that role uses; unsecured observers can be of rclpy."""
+        """Return the library that a node of that role uses."""
         if self.name == RCLPY or (role is Role.OBSERVER and self.ros_observer and not secured):
             return RCLPY
         return self.dds
@@ -90,7 +89,7 @@ class Backend:
     def environment(
         self, role: Role, *, wire: bool = False, denied: bool = False, secured: bool = False
     ) -> Mapping[str, str]:
-        """The variables that a node needs beside those of its security.
+        """Return the variables that a node needs in addition to those of its security.
 
         ``wire`` keeps its messages off shared memory; ``denied`` makes it say why.
         """
@@ -106,9 +105,12 @@ class Backend:
 
 
 def choose_backend(wish: str, probe: ProbeEnclave) -> Backend:
-    """Find, by trying, a backend that enforces security.
+    """Find a backend that enforces security, by trying.
 
-    ``wish`` is one of `CHOICES`.  Raises `UnavailableError` where there is none.
+    ``wish`` is `AUTO`, `RCLPY` or `CYCLONE`.
+
+    Raises:
+        UnavailableError: there is none.
     """
     if wish == CYCLONE:
         return _cyclone(cyclone_stack(probe), _ASKED)
@@ -137,7 +139,7 @@ def _cyclone(stack: Stack, why: str) -> Backend:
 
 
 def _observing_rmw() -> str | None:
-    """An RMW whose nodes discover unsecured Cyclone nodes ("": rclpy's own), None without one."""
+    """Return an RMW that discovers unsecured Cyclone nodes ("": rclpy's default), or None."""
     if importlib.util.find_spec("rclpy") is None:
         return None
     names = rmw_implementations(os.environ)
@@ -160,7 +162,7 @@ _ENCRYPTING = (ProtectionKind.ENCRYPT, ProtectionKind.ENCRYPT_WITH_ORIGIN_AUTHEN
 
 
 def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Condition]:
-    """What holds on ``backend`` in a keystore made by ``template``, for a DDS topic."""
+    """Return what holds on ``backend`` in a keystore made by ``template``, for a DDS topic."""
     (domain,) = governance_for(template.protection, DomainSet.of((0, 0))).domain_access_rules
     rule = next(each for each in domain.topic_access_rules if matches(each.topic_expression, topic))
     kinds = (

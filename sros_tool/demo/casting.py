@@ -158,7 +158,7 @@ def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
     """Return a server and a client of one service, if any; best a client that may not serve."""
     found: dict[str, str] = {}
     for server, client in permutations(rights, 2):
-        for topic in topics_of_its_own(rights[server], "publish"):
+        for topic in _topics_of_its_own(rights[server], "publish"):
             service, begin = service_of(topic)
             if begin == "rr" and ACTION_INSIDE not in service:
                 request = dds_names("request", service).publish[0]
@@ -171,7 +171,7 @@ def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
 
 def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     """Return the service that the server of a cast offers and its client calls."""
-    for topic in topics_of_its_own(rights[cast["server"]], "publish"):
+    for topic in _topics_of_its_own(rights[cast["server"]], "publish"):
         name, begin = service_of(topic)
         requests = dds_names("request", name).publish[0]
         if begin == "rr" and may(rights[cast["client"]], "publish", requests):
@@ -182,7 +182,7 @@ def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
 def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     own = [
         topic
-        for topic in topics_of_its_own(rights[cast["talker"]], "publish")
+        for topic in _topics_of_its_own(rights[cast["talker"]], "publish")
         if topic[:3] == "rt/"
     ]
     return next((t for t in own if may(rights[cast["listener"]], "subscribe", t)), "")
@@ -194,7 +194,7 @@ def _within(short: str, long: str) -> bool:
 
 
 def _topics(rights: Mapping[str, Grant]) -> set[str]:
-    return {topic for grant in rights.values() for topic in topics_of_its_own(grant, "publish")}
+    return {topic for grant in rights.values() for topic in _topics_of_its_own(grant, "publish")}
 
 
 def _all_but(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[str]]:
@@ -235,7 +235,7 @@ def may(grant: Grant, verb: str, topic: str) -> bool:
     return False
 
 
-def topics_of_its_own(grant: Grant, verb: str) -> Iterator[str]:
+def _topics_of_its_own(grant: Grant, verb: str) -> Iterator[str]:
     """Yield the DDS topics without wildcards that a grant allows, but for those of every node."""
     for topic in _allowed(grant, verb):
         private = topic.startswith("rt/_") or ACTION_INSIDE in topic

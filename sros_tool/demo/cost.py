@@ -18,20 +18,18 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sros_tool.demo.backend import Backend
-from sros_tool.demo.keystores import KeystoreSet
-from sros_tool.demo.network import Progress, RowNetwork
-from sros_tool.demo.runner import base_environment
+from sros_tool.demo.forger import Undefended
+from sros_tool.demo.network import Progress, RowNetwork, end_with_starter
+from sros_tool.demo.runner import RunPlan, base_environment
 from sros_tool.demo.scenarios.model import Identity, Role
 from sros_tool.errors import SrosError
-from sros_tool.runtime.netns import end_with_parent
 
-UNSECURED = "unsecured"
+_UNSECURED = "unsecured"
 _PAYLOADS = (64, 1024, 16 * 1024, 256 * 1024, 1024 * 1024)
 NOTE = (
     "medians; latency is half a round trip, throughput is that of bursts which are waited for;"
@@ -39,7 +37,7 @@ NOTE = (
     " than those of nodes in C++; messages go over UDP, not through shared memory; the numbers of"
     " payloads that do not fit into the buffer of a socket scatter"
 )
-_LONGEST = 60.0
+_LONGEST_START = 60.0
 _TICK = 0.02
 
 
@@ -89,7 +87,7 @@ class CostResult:
                 {
                     "kind": kind,
                     "seconds": round(self.first[kind], 4),
-                    "ratio": round(self.first[kind] / self.first[UNSECURED], 2),
+                    "ratio": round(self.first[kind] / self.first[_UNSECURED], 2),
                 }
                 for kind in self.kinds
             ],
@@ -97,7 +95,7 @@ class CostResult:
         }
 
     def _measured(self, each: Measurement) -> dict[str, Any]:
-        base = self.of(UNSECURED, each.payload)
+        base = self.of(_UNSECURED, each.payload)
         return {
             "kind": each.kind,
             "payload": each.payload,
@@ -110,29 +108,26 @@ class CostResult:
 
 
 def measure_cost(
-    kinds: Mapping[str, tuple[Identity, Identity]],
-    keystores: KeystoreSet,
-    domain: int,
+    plan: RunPlan,
+    measured: Mapping[str, Undefended],
     folder: Path,
-    backend: Backend,
     effort: Effort,
     progress: Progress,
-    *,
-    own_network: bool,
 ) -> CostResult:
-    """Measure each kind by the identities of its two ends; the first kind must be unsecured.
+    """Measure two unsecured ends, and then two ends in each of the keystores ``measured``.
 
     Raises:
         SrosError: two ends did not find each other.
     """
+    kinds = {_UNSECURED: (Identity(), Identity())}
+    for kind, keystore in measured.items():
+        kinds[kind] = (Identity(keystore, "pong"), Identity(keystore, "ping"))
     folder.mkdir(parents=True, exist_ok=True)
     found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in kinds}
     # In turns, so that what else the machine does falls on all kinds alike.
     for turn in range(effort.rounds):
         for kind, ends in kinds.items():
-            found[kind].append(
-                _run_pair(ends, keystores, domain, folder, backend, effort, own_network)
-            )
+            found[kind].append(_run_pair(ends, plan, folder, effort))
         progress(f"measured {len(kinds)} kinds of protection, round {turn + 1} of {effort.rounds}")
     first = {kind: statistics.median(run["first"] for run in runs) for kind, runs in found.items()}
     measurements = [
@@ -149,27 +144,22 @@ def measure_cost(
 
 
 def _run_pair(
-    ends: tuple[Identity, Identity],
-    keystores: KeystoreSet,
-    domain: int,
-    folder: Path,
-    backend: Backend,
-    effort: Effort,
-    own_network: bool,
+    ends: tuple[Identity, Identity], plan: RunPlan, folder: Path, effort: Effort
 ) -> dict[str, Any]:
+    """Let one pair measure, and return what its ping reported."""
     answer = folder / "answer.json"
     answer.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "sros_tool.demo.nodes.ping_pong", backend.name]
+    command = [sys.executable, "-m", "sros_tool.demo.nodes.ping_pong", plan.backend.name]
     ping = ["ping", "--answer", str(answer), "--seconds", str(effort.seconds)]
     ping += ["--sizes", *map(str, effort.payloads)]
-    network = RowNetwork(own=own_network)
+    network = RowNetwork(own=plan.own_networks)
     processes: list[subprocess.Popen[bytes]] = []
     try:
         with network.entered(), (folder / "cost.log").open("ab") as log:
             for identity, arguments in zip(ends, (["pong"], ping), strict=True):
                 environment = base_environment(os.environ)
-                environment |= backend.environment(Role.TALKER, wire=True)
-                environment |= keystores.environment(identity, domain)
+                environment |= plan.backend.environment(Role.TALKER, wire=True)
+                environment |= plan.keystores.environment(identity, plan.domains[0])
                 processes.append(
                     subprocess.Popen(
                         [*command, *arguments],
@@ -177,10 +167,10 @@ def _run_pair(
                         stdout=log,
                         stderr=log,
                         env=environment,
-                        preexec_fn=_with(os.getpid()),
+                        preexec_fn=end_with_starter(),
                     )
                 )
-        deadline = time.monotonic() + _LONGEST + len(effort.payloads) * 4 * effort.seconds
+        deadline = time.monotonic() + _LONGEST_START + len(effort.payloads) * 4 * effort.seconds
         while processes[1].poll() is None and processes[0].poll() is None:
             if time.monotonic() > deadline:
                 break
@@ -198,12 +188,3 @@ def _run_pair(
         )
     found: dict[str, Any] = json.loads(answer.read_text(encoding="utf-8"))
     return found
-
-
-def _with(starter: int) -> Callable[[], None]:
-    def before() -> None:
-        end_with_parent()
-        if os.getppid() != starter:
-            os._exit(1)
-
-    return before

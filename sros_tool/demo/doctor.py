@@ -24,7 +24,7 @@ _TEMPLATE = "production"
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found."""
+    """The stacks of this machine, and what to do where none enforces security."""
 
     stacks: tuple[Stack, ...]
 
@@ -39,7 +39,7 @@ class Diagnosis:
         return "" if self.enforces else f"{INSTALL_ADVICE} {ROS_ADVICE}"
 
     def as_json(self) -> dict[str, Any]:
-        """The diagnosis as `sros doctor --json` shows it."""
+        """Return the diagnosis as `sros doctor --json` shows it."""
         return {
             "enforces": self.enforces,
             "stacks": as_plain(self.stacks),
@@ -48,7 +48,7 @@ class Diagnosis:
 
 
 def examine(now: datetime) -> Diagnosis:
-    """Try every stack in an enclave made for the purpose, and leave nothing behind."""
+    """Try every stack in an enclave of a temporary keystore."""
     with TemporaryDirectory(prefix="sros-doctor-") as folder:
         domains = DomainSet.of((_PROBE_DOMAIN, _PROBE_DOMAIN))
         template = load_template(_TEMPLATE)
@@ -59,7 +59,7 @@ def examine(now: datetime) -> Diagnosis:
 
 
 def diagnosis_text(diagnosis: Diagnosis) -> str:
-    """The diagnosis for people: one line per stack, under it what was seen and what to do."""
+    """Return the diagnosis as text: a line per stack, then the evidence and what to do."""
     width = max(len(stack.name) for stack in diagnosis.stacks)
     lines: list[str] = []
     for stack in diagnosis.stacks:

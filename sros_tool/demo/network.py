@@ -1,7 +1,8 @@
-"""A network for each row: a namespace that lives as long as what was started in it.
+"""Networks of their own: for the demo in a child process, and in it for each row.
 
-Only for a process that is already in a network of its own and has one thread (`isolated`): to
-enter a namespace and to come back changes the calling thread alone (setns(2)).
+A row's network is a namespace that lives as long as what was started in it.  It needs a process
+that is already in a network of its own and has one thread (`run_isolated`): to enter a namespace
+and to come back changes the calling thread alone (setns(2)).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _HERE = "/proc/thread-self/ns/net"
 
 
 class RowNetwork:
-    """Where the processes and the capture of a row live; the host's network where not ``own``."""
+    """The network of a row's processes and capture; the machine's own where not ``own``."""
 
     def __init__(self, *, own: bool) -> None:
         self.own = own
@@ -40,7 +41,7 @@ class RowNetwork:
 
     @contextmanager
     def entered(self) -> Iterator[None]:
-        """What is started or opened in this context belongs to the network of the row."""
+        """Start and open things in the network of the row while in this context."""
         if not self.own:
             yield
             return
@@ -51,7 +52,7 @@ class RowNetwork:
             _enter(self._back)
 
     def close(self) -> None:
-        """Let go of it; the kernel removes it with the last process and socket in it."""
+        """Release the network; the kernel removes it with the last process and socket in it."""
         for descriptor in (self._there, self._back):
             if descriptor >= 0:
                 os.close(descriptor)
@@ -68,23 +69,39 @@ def _enter(descriptor: int) -> None:
 _Value = TypeVar("_Value")
 
 Progress = Callable[[str], None]
+"""Takes a line about what has been done."""
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 _SECONDS_TO_END = 8.0
 
 
-def run_isolated(
-    work: Callable[[Progress], _Value], isolation: Isolation, tell: Progress
-) -> _Value:
-    """Return what ``work`` returns; lines that it tells are passed on while it runs.
+def end_with_starter() -> Callable[[], None]:
+    """Return what a child of this process has to call first so that it does not outlive it."""
+    starter = os.getpid()
 
-    The child enters a network of its own if ``isolation`` says so.  Whatever ends this process
-    ends the child.  An `SrosError` of ``work`` is raised here again.
+    def follow() -> None:
+        end_with_parent()
+        if os.getppid() != starter:
+            os._exit(1)
+
+    return follow
+
+
+def run_isolated(
+    work: Callable[[Progress], _Value], isolation: Isolation, progress: Progress
+) -> _Value:
+    """Run ``work`` in a child process and return its result.
+
+    ``progress`` gets the lines that ``work`` passes to its own while it runs.  The child enters a
+    network of its own if ``isolation`` says so, and does not outlive this process.
+
+    Raises:
+        SrosError: the one that ``work`` raised, or one that says how it ended.
     """
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe(duplex=False)
-    child = context.Process(target=_main, args=(work, isolation, theirs, os.getpid()))
+    child = context.Process(target=_main, args=(work, isolation, theirs, end_with_starter()))
     child.start()
     theirs.close()
     try:
@@ -97,8 +114,8 @@ def run_isolated(
                     "the demo ended without a result",
                     f"Its process ended with status {child.exitcode}.",
                 ) from None
-            if kind == "told":
-                tell(value)
+            if kind == "progress":
+                progress(value)
             elif kind == "failed":
                 raise value
             else:
@@ -116,11 +133,12 @@ def run_isolated(
 
 
 def _main(
-    work: Callable[[Progress], Any], isolation: Isolation, answers: Connection, starter: int
+    work: Callable[[Progress], Any],
+    isolation: Isolation,
+    answers: Connection,
+    follow_starter: Callable[[], None],
 ) -> None:
-    end_with_parent()
-    if os.getppid() != starter:
-        os._exit(1)
+    follow_starter()
     # Not the handlers of the parent: one that raises can do so in the middle of a fork, where
     # Python drops the exception.  Work that has something to clean up sets its own.
     for number in ENDING_SIGNALS:
@@ -128,7 +146,7 @@ def _main(
     try:
         if isolation.isolated:
             enter_isolation()
-        answers.send(("result", work(lambda line: answers.send(("told", line)))))
+        answers.send(("result", work(lambda line: answers.send(("progress", line)))))
     except asyncio.CancelledError:
         os._exit(1)
     except SrosError as error:

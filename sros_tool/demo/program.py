@@ -18,13 +18,13 @@ from types import FrameType
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.demo.backend import AUTO, RCLPY, Backend, choose_backend, conditions
 from sros_tool.demo.casting import UserKeystore, open_user_keystore
-from sros_tool.demo.cost import UNSECURED, CostResult, Effort, measure_cost
+from sros_tool.demo.cost import Effort, measure_cost
 from sros_tool.demo.keystores import KeystoreSpec, create_keystores
 from sros_tool.demo.network import Progress, run_isolated
 from sros_tool.demo.result import DemoResult, ScenarioResult
 from sros_tool.demo.runner import Limits, RunPlan, run_rows
 from sros_tool.demo.scenarios.isolation import ISOLATION
-from sros_tool.demo.scenarios.model import Identity, Row, Scenario
+from sros_tool.demo.scenarios.model import Row, Scenario
 from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC, check_topic
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import Template, load_template
@@ -108,7 +108,9 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             shown = run_isolated(partial(run_rows, plan), isolation, progress)
             cost = None
             if scenario.measured:
-                measuring = partial(_measure, plan, scenario, under / "cost", options.effort)
+                measuring = partial(
+                    measure_cost, plan, scenario.measured, under / "cost", options.effort
+                )
                 cost = run_isolated(measuring, isolation, progress)
             cast = keystores.members(scenario.rows, on_ros=backend.name == RCLPY) if user else ()
             results.append(ScenarioResult(scenario.name, scenario.title, tuple(shown), cost, cast))
@@ -126,24 +128,6 @@ def _find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend
         spec = KeystoreSpec(topic, domains, load_template(_DEFAULT_TEMPLATE), now)
         keystores = create_keystores(Path(probed), replace(ISOLATION, rows=()), spec)
         return choose_backend(wish, keystores.probe(topic, _DEFAULT_DOMAIN))
-
-
-def _measure(
-    plan: RunPlan, scenario: Scenario, folder: Path, effort: Effort, progress: Progress
-) -> CostResult:
-    kinds = {UNSECURED: (Identity(), Identity())}
-    for kind, keystore in scenario.measured.items():
-        kinds[kind] = (Identity(keystore, "pong"), Identity(keystore, "ping"))
-    return measure_cost(
-        kinds,
-        plan.keystores,
-        plan.domains[0],
-        folder,
-        plan.backend,
-        effort,
-        progress,
-        own_network=plan.own_networks,
-    )
 
 
 def _user_keystore(options: DemoOptions) -> UserKeystore | None:

@@ -1,4 +1,4 @@
-"""What a demo showed, and its JSON.
+"""The result of a demo, and its JSON.
 
 `DemoResult.as_json` is what ``sros demo --json`` prints and ``--keep`` leaves as ``result.json``:
 
@@ -38,7 +38,7 @@ from sros_tool.values import as_plain
 
 @dataclass(frozen=True)
 class ScenarioResult:
-    """What one scenario showed."""
+    """The result of one scenario."""
 
     name: str
     title: str
@@ -52,7 +52,7 @@ class ScenarioResult:
         return all(row.as_expected for row in self.rows)
 
     def as_json(self) -> dict[str, Any]:
-        """The scenario as `sros demo --json` shows it."""
+        """Return the scenario as `sros demo --json` shows it."""
         return {
             "name": self.name,
             "title": self.title,
@@ -65,7 +65,7 @@ class ScenarioResult:
 
 @dataclass(frozen=True)
 class DemoResult:
-    """What the demo showed."""
+    """The result of the demo."""
 
     backend: Backend
     topic: str
@@ -80,7 +80,7 @@ class DemoResult:
 
     @property
     def cost(self) -> CostResult | None:
-        """What security costs, where that was measured."""
+        """The cost of security, where it was measured."""
         return next((each.cost for each in self.scenarios if each.cost is not None), None)
 
     @property
@@ -89,7 +89,7 @@ class DemoResult:
         return all(scenario.as_expected for scenario in self.scenarios)
 
     def as_json(self) -> dict[str, Any]:
-        """The result as the head of this module describes it."""
+        """Return the result as the head of this module describes it."""
         scenarios = [scenario.as_json() for scenario in self.scenarios]
         return {
             "backend": self.backend.name,

@@ -16,14 +16,14 @@ import signal
 import subprocess
 import time
 import uuid
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.keystores import KeystoreSet
-from sros_tool.demo.network import ENDING_SIGNALS, RowNetwork
+from sros_tool.demo.network import ENDING_SIGNALS, Progress, RowNetwork, end_with_starter
 from sros_tool.demo.scenarios.model import (
     DENIALS,
     SPEAKING,
@@ -37,7 +37,6 @@ from sros_tool.demo.scenarios.model import (
 from sros_tool.demo.verdict import PartyRecord, RowRecord, RowResult, judge_row
 from sros_tool.demo.wire import Injection, Wiretap, forged_text, udp_ports, with_other_words
 from sros_tool.runtime.events import Event, EventReader, Kind
-from sros_tool.runtime.netns import end_with_parent
 from sros_tool.runtime.vendor_log import plain_text
 
 _LOG = logging.getLogger(__name__)
@@ -88,7 +87,7 @@ class RunPlan:
     own_networks: bool = False
 
 
-def run_rows(plan: RunPlan, progress: Callable[[str], None]) -> list[RowResult]:
+def run_rows(plan: RunPlan, progress: Progress) -> list[RowResult]:
     """Run all rows and judge them; ``progress`` gets a line for each row that ends."""
     return asyncio.run(_Runner(plan, progress).run())
 
@@ -96,7 +95,7 @@ def run_rows(plan: RunPlan, progress: Callable[[str], None]) -> list[RowResult]:
 class _Runner:
     """Runs the rows of a plan, as many at once as the backend bears."""
 
-    def __init__(self, plan: RunPlan, progress: Callable[[str], None]) -> None:
+    def __init__(self, plan: RunPlan, progress: Progress) -> None:
         self._plan = plan
         self._progress = progress
         self._mark = uuid.uuid4().hex[:8]
@@ -143,7 +142,7 @@ class _Runner:
         row, domain = self._plan.rows[index], self._plan.domains[index]
         folder = self._plan.folder / f"row_{index + 1:02}"
         folder.mkdir(parents=True)
-        processes: dict[str, PartyProcess] = {}
+        processes: dict[str, _PartyProcess] = {}
         tap: Wiretap | None = None
         network = RowNetwork(own=self._plan.own_networks)
         try:
@@ -180,7 +179,7 @@ class _Runner:
         topic = f"rt{self._plan.topic}"
         return Wiretap(texts, topic, replayed=bool(row.replay or row.impersonate))
 
-    def _start(self, index: int, party: Party, domain: int, folder: Path) -> PartyProcess:
+    def _start(self, index: int, party: Party, domain: int, folder: Path) -> _PartyProcess:
         plan, row = self._plan, self._plan.rows[index]
         topic = plan.keystores.topic(party, plan.topic)
         options = ["--topic", topic, "--period", str(plan.period)]
@@ -211,7 +210,7 @@ class _Runner:
         environment |= plan.keystores.environment(party.identity, domain)
         names = plan.keystores.node_names(party)
         command = backend.command(party.role, options, names, secured=secured)
-        return PartyProcess(
+        return _PartyProcess(
             party.name,
             command,
             environment,
@@ -222,7 +221,7 @@ class _Runner:
         )
 
     async def _watch(
-        self, row: Row, processes: Mapping[str, PartyProcess]
+        self, row: Row, processes: Mapping[str, _PartyProcess]
     ) -> tuple[float, float] | None:
         limits = self._plan.limits
         deadline = min(time.monotonic() + limits.start, self._end)
@@ -258,7 +257,7 @@ class _Runner:
         await asyncio.sleep(_GRACE)
         return start, now
 
-    def _is_met(self, claim: Claim, processes: Mapping[str, PartyProcess]) -> bool:
+    def _is_met(self, claim: Claim, processes: Mapping[str, _PartyProcess]) -> bool:
         """Return whether a claim that something happens has been seen to hold, several times."""
         events = processes[claim.subject].look()
         if claim.relation in (Relation.HEARS, Relation.IS_ANSWERED):
@@ -271,7 +270,7 @@ class _Runner:
         return True
 
 
-def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, PartyProcess]) -> bool:
+def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
     """Return whether a claim needs time: nothing must happen, and something still could."""
     if claim.holds or claim.relation in (Relation.HEARS_AGAIN, Relation.BELIEVES):
         return False
@@ -284,7 +283,7 @@ def _is_decided_by_start(row: Row) -> bool:
     return all(claim.relation in decided for claim in (*row.claims, *row.controls))
 
 
-async def _end_softly(processes: Collection[PartyProcess]) -> None:
+async def _end_softly(processes: Collection[_PartyProcess]) -> None:
     """Ask processes to end, and wait a while; they log and report until then."""
     for process in processes:
         process.ask_to_end()
@@ -300,7 +299,7 @@ _FORGED_PACKETS = 5
 _AFTER_FORGERY = 1.0
 
 
-async def _replay_packets(talker: PartyProcess, tap: Wiretap) -> Injection:
+async def _replay_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
     """End a talker, then send its packets again at the pace of the original."""
     packets = tap.packets(talker.ports())
     await _end_softly([talker])
@@ -315,7 +314,7 @@ async def _replay_packets(talker: PartyProcess, tap: Wiretap) -> Injection:
     return Injection(len(packets), started)
 
 
-async def _forge_packets(talker: PartyProcess, tap: Wiretap) -> Injection:
+async def _forge_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
     """Suspend a talker, and go on in its name with packets that say something else."""
     talker.hold()
     await asyncio.sleep(_GRACE)
@@ -360,7 +359,7 @@ def base_environment(environment: Mapping[str, str]) -> dict[str, str]:
     } | {"PYTHONUNBUFFERED": "1"}
 
 
-class PartyProcess:
+class _PartyProcess:
     """A running process of a row; ``folder`` gets its report and its log under ``name``."""
 
     def __init__(
@@ -386,13 +385,6 @@ class PartyProcess:
         self._own_status: int | None = None
         self._asked = False
         self._ports: frozenset[int] = frozenset()
-        starter = os.getpid()
-
-        def end_with_starter() -> None:
-            end_with_parent()
-            if os.getppid() != starter:
-                os._exit(1)
-
         with self._log.open("wb") as output:
             self._process = subprocess.Popen(
                 [*command, "--report", str(report)],
@@ -401,7 +393,7 @@ class PartyProcess:
                 stderr=output,
                 env={**environment, "ROS_LOG_DIR": str(folder / "ros_log")},
                 start_new_session=True,
-                preexec_fn=end_with_starter,
+                preexec_fn=end_with_starter(),
             )
         _LOG.info("started process %d, %s: %s", self._process.pid, name, shlex.join(command))
 

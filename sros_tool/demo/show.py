@@ -1,4 +1,4 @@
-"""Show the result of the demo as text: one line per row, and under it what was seen."""
+"""Show the result of the demo as text: a table for a terminal, a page in Markdown."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _INDENT = " " * 6
 
 
 def demo_table(result: DemoResult) -> str:
-    """The table, with the backend above it and the verdict below."""
+    """Return the table, with the backend above it and the verdict below."""
     network = (
         "a network namespace of its own"
         if result.isolation.isolated
@@ -31,13 +31,13 @@ def demo_table(result: DemoResult) -> str:
         lines.append("")
         if len(result.scenarios) > 1:
             lines += [f"{scenario.name}: {scenario.title}", ""]
-        lines += _cast(scenario.cast)
+        lines += _cast_lines(scenario.cast)
         lines += _scenario(scenario)
     return "\n".join([*lines, "", _summary(result.rows)])
 
 
-def _cast(members: Sequence[CastMember]) -> list[str]:
-    """Who plays which part, in a keystore that was not made for it."""
+def _cast_lines(members: Sequence[CastMember]) -> list[str]:
+    """Say which enclave plays which part, in a keystore that was not made for the demo."""
     width = max((len(member.part) for member in members), default=0)
     lines = [
         f"{_INDENT}{member.part:<{width}}  {member.enclave}"
@@ -97,7 +97,7 @@ def _summary(rows: Sequence[RowResult]) -> str:
 
 
 def summary_page(result: DemoResult, now: datetime) -> str:
-    """The page; ``now`` is when it was seen."""
+    """Return the page for a reviewer, in Markdown; ``now`` is the time of the demo."""
     attacks = [row for row in result.rows if row.attack and not row.removed]
     others = [row for row in result.rows if not row.attack]
     wrong = [row for row in result.rows if not row.as_expected]
@@ -192,7 +192,7 @@ def _cells(row: RowResult) -> str:
 
 
 def payload_text(size: int) -> str:
-    """A payload for people: "64 B", "16 KiB", "1 MiB"."""
+    """Return a payload in bytes for people: "64 B", "16 KiB", "1 MiB"."""
     for unit, name in ((1024 * 1024, "MiB"), (1024, "KiB")):
         if size >= unit:
             return f"{size / unit:g} {name}"
@@ -200,7 +200,7 @@ def payload_text(size: int) -> str:
 
 
 def cost_table(cost: CostResult) -> list[str]:
-    """The cost for a terminal."""
+    """Return the cost of security as lines for a terminal."""
     shown = cost.as_json()
     lines = ["what security costs: latency and throughput, and their ratio to unsecured", ""]
     lines.append(f"{'protection':<12}{'first message':>15}{'ratio':>8}")

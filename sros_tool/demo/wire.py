@@ -1,7 +1,7 @@
-"""Count what is readable on the wire, with a packet socket in plain Python.
+"""The wire: count what packets show, and send captured or changed packets again.
 
-Needs CAP_NET_RAW in the network that is looked at: root has it, and so has whoever made a network
-namespace of his own (`sros_tool.runtime.netns`).
+It uses packet sockets in plain Python, which need CAP_NET_RAW in their network: root has it, and so
+has a process in a network namespace that it made itself (`sros_tool.runtime.netns`).
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ _PROTECTED_SUBMESSAGES = range(0x30, 0x35)
 """SEC_BODY, SEC_PREFIX, SEC_POSTFIX, SRTPS_PREFIX, SRTPS_POSTFIX (DDS-Security 1.1 §7.3.6)."""
 
 
-class Kept(NamedTuple):
-    """A captured packet: when it was read (CLOCK_MONOTONIC), its UDP source port, all of it."""
+class _CapturedPacket(NamedTuple):
+    """A captured IPv4 packet, the time (CLOCK_MONOTONIC) it was read, and its UDP source port."""
 
     time: float
     source: int
@@ -46,10 +46,10 @@ class PacketCounter:
         self._keep = keep
         self.plain: Counter[str] = Counter()
         self.protected: Counter[int] = Counter()
-        self.kept: list[Kept] = []
+        self.kept: list[_CapturedPacket] = []
 
     def count(self, packet: bytes) -> None:
-        """Count one packet; whatever is not UDP is passed over."""
+        """Count one packet; what is not UDP is left out."""
         start = (packet[0] & 0x0F) * 4 if packet else 0
         if len(packet) < max(20, start) + 8 or packet[9] != _UDP:
             return
@@ -57,7 +57,7 @@ class PacketCounter:
         target = int.from_bytes(packet[start + 2 : start + 4], "big")
         payload = packet[start + 8 :]
         if self._keep and payload[:4] == b"RTPS":
-            self.kept.append(Kept(time.monotonic(), source, packet))
+            self.kept.append(_CapturedPacket(time.monotonic(), source, packet))
         for mark, raw in self._marks.items():
             if raw in payload:
                 self.plain[mark] += 1
@@ -66,9 +66,10 @@ class PacketCounter:
 
 
 class Capture(PacketCounter):
-    """Listens on every interface and counts; only what is to be kept is stored, in memory.
+    """Captures on every interface and counts; only with ``keep``, packets are stored (in memory).
 
-    Raises `PermissionError` where it is not permitted.
+    Raises:
+        PermissionError: capturing is not permitted.
     """
 
     def __init__(self, marks: Sequence[str], *, keep: bool = False) -> None:
@@ -81,11 +82,11 @@ class Capture(PacketCounter):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
 
     def fileno(self) -> int:
-        """The descriptor to wait on."""
+        """Return the descriptor to wait on."""
         return self._socket.fileno()
 
     def drain(self) -> None:
-        """Count all packets that have come."""
+        """Count all packets that have arrived."""
         while True:
             try:
                 packet, address = self._socket.recvfrom(65535)
@@ -95,12 +96,12 @@ class Capture(PacketCounter):
                 self.count(packet)
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stop capturing."""
         self._socket.close()
 
 
 def _is_protected(payload: bytes) -> bool:
-    """Whether a UDP payload is RTPS with a protected submessage (RTPS 2.3 §9.4)."""
+    """Return whether a UDP payload is RTPS with a protected submessage (RTPS 2.3 §9.4)."""
     if payload[:4] != b"RTPS":
         return False
     position = _RTPS_HEADER
@@ -117,7 +118,7 @@ def _is_protected(payload: bytes) -> bool:
 
 
 def udp_ports(process: int) -> frozenset[int]:
-    """The UDP ports that a process has bound, by its open descriptors; empty if it has ended."""
+    """Return the UDP ports that a process has bound, by its open files; none if it has ended."""
     folder = Path(f"/proc/{process}")
     try:
         links = list((folder / "fd").iterdir())
@@ -137,23 +138,25 @@ def _socket_inode(link: Path) -> str:
     return target.removeprefix("socket:[").removesuffix("]") if target[:8] == "socket:[" else ""
 
 
-_REPLAY_RTPS_HEADER, _DATA = 20, 0x15
-_NUMBER = 20
-"""From the head of a DATA submessage to the low half of its sequence number."""
+_DATA = 0x15
+_SEQUENCE_NUMBER = 20
+"""Bytes from the head of a DATA submessage to the low half of its sequence number."""
 
 
-class Injector:
-    """Sends whole IPv4 packets under the address they came from; needs CAP_NET_RAW.
+class _Injector:
+    """Sends whole IPv4 packets with their original source address.
 
     A packet socket would not do: the kernel drops loopback addresses that come in by one.
-    Raises `PermissionError` where it is not permitted.
+
+    Raises:
+        PermissionError: it needs CAP_NET_RAW.
     """
 
     def __init__(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
 
     def send(self, packet: bytes) -> None:
-        """Send one packet as it is, but for the checksum, which the loopback never filled in."""
+        """Send one packet as it is, except for the checksum, which the loopback never filled in."""
         self._socket.sendto(without_checksum(packet), (socket.inet_ntoa(packet[16:20]), 0))
 
     def close(self) -> None:
@@ -161,19 +164,20 @@ class Injector:
         self._socket.close()
 
 
-def packets_of(kept: Sequence[Kept], ports: Collection[int]) -> list[Kept]:
-    """The captured packets that were sent from one of the ports, in order."""
+def packets_of(kept: Sequence[_CapturedPacket], ports: Collection[int]) -> list[_CapturedPacket]:
+    """Return the captured packets that were sent from one of the ports, in order."""
     return [each for each in kept if each.source in ports]
 
 
 def with_other_words(packet: bytes, words: str, others: str, step: int) -> bytes | None:
-    """An RTPS packet that says something else of the same length, ``step`` messages later.
+    """Return an RTPS packet with ``others`` for ``words`` (of the same length), a later message.
 
-    The sequence number of the DATA submessage that holds ``words`` is raised, so that a reader
-    takes it for the writer's next one (RTPS 2.3 §9.4.5.3).  None where no words are readable.
+    The sequence number of the DATA submessage that holds ``words`` is raised by ``step``, so that
+    a reader takes it for the writer's next one (RTPS 2.3 §9.4.5.3).  None where the words are not
+    readable.
     """
     start = (packet[0] & 0x0F) * 4 + 8
-    position = start + _REPLAY_RTPS_HEADER
+    position = start + _RTPS_HEADER
     changed = bytearray(packet)
     while position + 4 <= len(packet):
         kind, flags = packet[position], packet[position + 1]
@@ -182,7 +186,7 @@ def with_other_words(packet: bytes, words: str, others: str, step: int) -> bytes
         end = position + 4 + length if length else len(packet)
         place = packet.find(words.encode(), position, end)
         if kind == _DATA and place >= 0:
-            number = slice(position + _NUMBER, position + _NUMBER + 4)
+            number = slice(position + _SEQUENCE_NUMBER, position + _SEQUENCE_NUMBER + 4)
             raised = int.from_bytes(packet[number], order) + step
             changed[number] = raised.to_bytes(4, order)
             changed[place : place + len(others.encode())] = others.encode()
@@ -192,7 +196,7 @@ def with_other_words(packet: bytes, words: str, others: str, step: int) -> bytes
 
 
 def without_checksum(packet: bytes) -> bytes:
-    """A UDP packet whose checksum says that there is none (RFC 768: zero)."""
+    """Return a UDP packet with the checksum that means none (RFC 768: zero)."""
     start = (packet[0] & 0x0F) * 4 + 6
     return packet[:start] + b"\0\0" + packet[start + 2 :]
 
@@ -201,10 +205,10 @@ _CERTIFICATE = "-----BEGIN CERTIFICATE-----"
 
 
 class Wiretap:
-    """Captures from the moment it is made; ``problem`` says why that is not permitted, or "".
+    """Captures as soon as it is created; ``problem`` says why that is not permitted, or "".
 
-    ``texts`` marks what each party says, by its name; ``topic`` is a DDS topic name.  Make it in
-    the network that it listens in on, and in the loop of asyncio.
+    ``texts`` has the text of each party, by its name; ``topic`` is a DDS topic name.  Create it in
+    the network of the row, and in the loop of asyncio.
     """
 
     def __init__(self, texts: Mapping[str, str], topic: str, *, replayed: bool) -> None:
@@ -212,10 +216,10 @@ class Wiretap:
         self._topic = topic
         self.problem = ""
         self._capture: Capture | None = None
-        self._injector: Injector | None = None
+        self._injector: _Injector | None = None
         try:
             self._capture = Capture([*texts.values(), topic, _CERTIFICATE], keep=replayed)
-            self._injector = Injector() if replayed else None
+            self._injector = _Injector() if replayed else None
         except OSError as error:
             self.problem = f"capturing packets is not permitted: {error.strerror}"
             self.close()
@@ -223,7 +227,7 @@ class Wiretap:
         asyncio.get_running_loop().add_reader(self._capture.fileno(), self._capture.drain)
 
     def count(self, ports: Collection[int]) -> dict[str, WireCount]:
-        """What was readable so far, by party; packets of ``ports`` count as protected."""
+        """Return what was readable so far, by party; protected packets are those of ``ports``."""
         if self._capture is None:
             return {}
         self._capture.drain()
@@ -234,20 +238,20 @@ class Wiretap:
             for name, text in self._texts.items()
         }
 
-    def packets(self, ports: Collection[int]) -> list[Kept]:
-        """The packets that were sent from one of the ports so far, in order."""
+    def packets(self, ports: Collection[int]) -> list[_CapturedPacket]:
+        """Return the packets that were sent from one of the ports so far, in order."""
         if self._capture is None:
             return []
         self._capture.drain()
         return packets_of(self._capture.kept, ports)
 
     def send(self, packet: bytes) -> None:
-        """Send a packet again."""
+        """Send a captured or changed packet."""
         if self._injector is not None:
             self._injector.send(packet)
 
     def close(self) -> None:
-        """Stop listening."""
+        """Stop capturing."""
         if self._capture is not None:
             asyncio.get_running_loop().remove_reader(self._capture.fileno())
             self._capture.close()
@@ -258,7 +262,7 @@ class Wiretap:
 
 @dataclass(frozen=True)
 class WireCount:
-    """How many packets held a talker's text in the open, and how many of its row were protected.
+    """How many packets showed a talker's text, and how many of its row were protected.
 
     ``topics`` and ``certificates`` count the packets of the row that show the name of its topic,
     and a certificate.
@@ -279,5 +283,5 @@ class Injection:
 
 
 def forged_text(text: str) -> str:
-    """What is said in the name of a talker that says ``text``; of the same length."""
+    """Return what is said in the name of a talker that says ``text``; of the same length."""
     return text.swapcase()

@@ -1,7 +1,7 @@
-"""Draws what security costs: latency and throughput over the payload, as a plot or on a page.
+"""The plots of what security costs: latency and throughput over the payload, for file and page.
 
-Both axes are logarithmic.  Kinds of protection are told apart by the shape of their points and by
-colour.  It takes the JSON that `sros_tool.demo.cost` describes.
+Both axes are logarithmic.  Kinds of protection differ in the shape and the colour of their points.
+It takes the JSON that `sros_tool.demo.cost` describes.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ _SHAPES = (
     "M0 -5L4.6 3.8H-4.6z",
     "M0 5L4.6 -3.8H-4.6z",
 )
-"""What stands for the kinds in turn: a circle, a square, a rhombus, two triangles."""
+"""The points of the kinds in turn: a circle, a square, a rhombus, two triangles."""
 
 _PLOTS = (
     ("Latency in µs, over the payload", "latency_us"),
     ("Throughput in MB/s, over the payload", "megabytes_per_s"),
 )
 _COLOURS = ("#1b1b1b", "#0072b2", "#b8860b", "#00795a", "#a3497e")
-"""After Okabe and Ito: told apart by those who do not see all colours."""
+"""After Okabe and Ito: distinct for people who do not see all colours."""
 
 _STYLE = (
     ".grid{stroke:#ddd;fill:none}"
@@ -40,7 +40,7 @@ _STYLE = (
 
 
 def cost_section(cost: Json) -> str:
-    """The plots and the table, as markup."""
+    """Return the plots and the table, as markup for a page."""
     kinds = cost["kinds"]
     legend = "".join(
         f'<li><svg class="icon" width="14" height="14" aria-hidden="true"><path class="k{n}" '
@@ -58,7 +58,7 @@ def cost_section(cost: Json) -> str:
 
 
 def cost_picture(cost: Json) -> str:
-    """The plots as an SVG document of its own."""
+    """Return the plots as an SVG document."""
     kinds, note = cost["kinds"], wrap(cost["note"], 120)
     across, below = _LEFT + _WIDTH + 48, _TOP + _HEIGHT + 84
     width, height = 2 * across, below + 30 + 24 * len(kinds) + 16 * len(note)
@@ -75,9 +75,9 @@ def cost_picture(cost: Json) -> str:
     for number, kind in enumerate(kinds):
         y = below + 24 * number
         first = next((e["seconds"] for e in cost["first_message"] if e["kind"] == kind), None)
-        told = f"{kind}: first message after {first:.2f} s" if first is not None else kind
+        label = f"{kind}: first message after {first:.2f} s" if first is not None else kind
         parts.append(f'<path class="k{number}" transform="translate({_LEFT} {y - 4})"')
-        parts.append(f'd="{_shape(number)}"/><text x="{_LEFT + 14}" y="{y}">{escape(told)}</text>')
+        parts.append(f'd="{_shape(number)}"/><text x="{_LEFT + 14}" y="{y}">{escape(label)}</text>')
     for number, line in enumerate(note):
         y = below + 24 * len(kinds) + 16 * number
         parts.append(f'<text x="{_LEFT}" y="{y}" fill="#555">{escape(line)}</text>')
@@ -93,7 +93,7 @@ def _shape(number: int) -> str:
 
 
 def payload_text(size: int) -> str:
-    """As ``64 B``, ``16 KiB``, ``1 MiB``."""
+    """Return a payload in bytes as ``64 B``, ``16 KiB``, ``1 MiB``."""
     for unit, step in (("MiB", 1 << 20), ("KiB", 1 << 10)):
         if size >= step:
             return f"{size / step:g} {unit}"

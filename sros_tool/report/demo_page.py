@@ -1,4 +1,4 @@
-"""Writes the demo and the attack demo as a page: what was tried, expected and seen, and by what.
+"""The page of a demo: what was tried, expected and seen, what decides it, and what it costs.
 
 It takes the JSON of ``sros demo --json`` (`sros_tool.demo.result`) as a value.  The page has no
 script; it opens from disk, and can be printed.
@@ -19,22 +19,22 @@ SKIPPED = "skipped"
 
 
 def render_demo_page(result: Json) -> str:
-    """The result of a demo as an HTML document."""
+    """Return the result of a demo as an HTML document."""
     body = "\n".join((_head(result), *map(_scenario, result["scenarios"])))
     title = f"sros demo on {result['dds']}"
     return document(title, f"<main>{body}</main>", asset("demo.css"))
 
 
-def without_places(value: Any, places: Sequence[str]) -> Any:
-    """``value`` with every text in it told without these folders of the machine."""
+def without_folders(value: Any, folders: Sequence[str]) -> Any:
+    """Return a JSON value in whose texts "…" stands for these folders of the machine."""
     if isinstance(value, str):
-        for place in sorted(places, key=len, reverse=True):
-            value = value.replace(place, "…") if len(place) > 1 else value
+        for folder in sorted(folders, key=len, reverse=True):
+            value = value.replace(folder, "…") if len(folder) > 1 else value
         return value
     if isinstance(value, Mapping):
-        return {key: without_places(each, places) for key, each in value.items()}
+        return {key: without_folders(each, folders) for key, each in value.items()}
     if isinstance(value, Sequence):
-        return [without_places(each, places) for each in value]
+        return [without_folders(each, folders) for each in value]
     return value
 
 
@@ -84,8 +84,8 @@ def _scenario(scenario: Json) -> str:
         )
         parts.append(f'<p class="soft">Cast: {"; ".join(members)}.</p>')
     if rows:
-        told = f"{escape(scenario['name'])}: {good} of {len(rows)} rows as expected"
-        parts += [f'<p class="soft">{told}</p>', _table(rows)]
+        count = f"{escape(scenario['name'])}: {good} of {len(rows)} rows as expected"
+        parts += [f'<p class="soft">{count}</p>', _table(rows)]
     if scenario.get("cost"):
         parts.append(cost_section(scenario["cost"]))
     return "\n".join((*parts, "</section>"))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 from lxml import html
 
-from sros_tool.report.demo_page import render_demo_page, without_places
+from sros_tool.report.demo_page import render_demo_page, without_folders
 from tests.report.pictures import HOSTILE, new_page
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def test_costs_are_drawn_and_told() -> None:
 
 def test_no_place_of_the_machine_is_told() -> None:
     value = {"a": ["in /home/me/ks/log", 3], "b": {"c": "/home/me"}, "d": None}
-    assert without_places(value, ["/home/me", "/"]) == {
+    assert without_folders(value, ["/home/me", "/"]) == {
         "a": ["in …/ks/log", 3],
         "b": {"c": "…"},
         "d": None,

@@ -1,8 +1,9 @@
 """One end of a measurement: ``python -m sros_tool.demo.nodes.ping_pong cyclone|rclpy ping|pong``.
 
-``pong`` sends back what it gets: whole messages that begin with "e", and a short receipt for the
-last one of each burst, "b".  ``ping`` measures, and writes what it found as JSON.  Both read the
-environment of a ROS 2 node; what they cost in Python is the same with and without security, and is
+``ping`` measures, and writes the numbers as JSON; ``pong`` answers.  The first letter of a message
+says what it is: "h" (hello) asks when the other end began to join, "e" (echo) is sent back whole,
+"b" belongs to a burst, and "l" (last) ends one and is answered by a short receipt.  Both read the
+environment of a ROS 2 node; their overhead in Python is the same with and without security, and is
 in all numbers.
 """
 
@@ -32,7 +33,7 @@ _LOST = 2.0
 
 @dataclass(frozen=True)
 class _Channel:
-    """What one end writes to and reads from the other one.
+    """The connection of one end to the other one.
 
     ``wait`` sleeps until there is something to take, but no longer than so many seconds; ``take``
     returns the messages that have come since its last call, oldest first.
@@ -44,7 +45,7 @@ class _Channel:
 
 
 @contextmanager
-def _cyclone_link(sends: str, hears: str) -> Iterator[_Channel]:
+def _cyclone_channel(sends: str, hears: str) -> Iterator[_Channel]:
     from sros_tool.runtime.cyclone import Participant
     from sros_tool.runtime.rcl_security import choose_loadable, domain_of
 
@@ -55,7 +56,7 @@ def _cyclone_link(sends: str, hears: str) -> Iterator[_Channel]:
 
 
 @contextmanager
-def _rclpy_link(sends: str, hears: str) -> Iterator[_Channel]:
+def _rclpy_channel(sends: str, hears: str) -> Iterator[_Channel]:
     try:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
@@ -84,13 +85,13 @@ def _rclpy_link(sends: str, hears: str) -> Iterator[_Channel]:
     yield _Channel(lambda text: publisher.publish(String(data=text)), wait, take)
 
 
-_LINKS = {"cyclone": _cyclone_link, "rclpy": _rclpy_link}
+_CHANNELS = {"cyclone": _cyclone_channel, "rclpy": _rclpy_channel}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Measure, or answer until there is no parent any more; returns the exit status."""
+    """Measure, or answer until the parent ends; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m sros_tool.demo.nodes.ping_pong")
-    parser.add_argument("library", choices=_LINKS)
+    parser.add_argument("library", choices=_CHANNELS)
     parser.add_argument("role", choices=("ping", "pong"))
     parser.add_argument("--sizes", type=int, nargs="*", default=[], help="payloads in bytes")
     parser.add_argument("--seconds", type=float, default=0.5, help="for each measurement")
@@ -99,10 +100,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     begin = time.monotonic()
     try:
         sends, hears = (_PONG, _PING) if options.role == "pong" else (_PING, _PONG)
-        with _LINKS[options.library](sends, hears) as link:
+        with _CHANNELS[options.library](sends, hears) as channel:
             if options.role == "pong":
-                _answer(link, begin)
-            measured = _measure(link, begin, options.sizes, options.seconds)
+                _answer(channel, begin)
+            measured = _measure(channel, begin, options.sizes, options.seconds)
     except SrosError as error:
         print(error, file=sys.stderr)
         return 1
@@ -110,66 +111,72 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _answer(link: _Channel, begin: float) -> None:
+def _answer(channel: _Channel, begin: float) -> None:
     while True:
-        link.wait(1.0)
-        for text in link.take():
+        channel.wait(1.0)
+        for text in channel.take():
             if text[0] == "h":
-                link.write(f"h{begin:.6f}")
+                channel.write(f"h{begin:.6f}")
             elif text[0] == "e":
-                link.write(text)
+                channel.write(text)
             elif text[0] == "l":
-                link.write("l")
+                channel.write("l")
 
 
-def _measure(link: _Channel, begin: float, sizes: Sequence[int], seconds: float) -> dict[str, Any]:
+def _measure(
+    channel: _Channel, begin: float, sizes: Sequence[int], seconds: float
+) -> dict[str, Any]:
     other = ""
     while not other:
-        link.write("h")
-        link.wait(_ASK_AGAIN)
-        other = next(iter(link.take()), "")
+        channel.write("h")
+        channel.wait(_ASK_AGAIN)
+        other = next(iter(channel.take()), "")
     first = time.monotonic() - max(begin, float(other[1:]))
-    while link.wait(0.3):
-        link.take()  # further answers to "h"
+    while channel.wait(0.3):
+        channel.take()  # further answers to "h"
     found = []
     for size in sizes:
-        latency = _latency(link, size, seconds)
-        rate = _throughput(link, size, seconds)
+        latency = _latency(channel, size, seconds)
+        rate = _throughput(channel, size, seconds)
         found.append({"size": size, "latency": latency, "rate": rate})
     return {"first": first, "sizes": found}
 
 
-def _latency(link: _Channel, size: int, seconds: float) -> float:
-    """Half of the median round trip of a message of ``size`` bytes, in seconds."""
+def _latency(channel: _Channel, size: int, seconds: float) -> float:
+    """Return half of the median round trip of a message of ``size`` bytes, in seconds."""
     text = "e".ljust(size, "x")
     times: list[float] = []
     end = time.monotonic() + seconds
     while (start := time.monotonic()) < end or not times:
-        link.write(text)
-        _await(link)
+        channel.write(text)
+        _await(channel)
         times.append(time.monotonic() - start)
     return statistics.median(times) / 2
 
 
-def _throughput(link: _Channel, size: int, seconds: float) -> float:
-    """Messages per second in the median burst; each burst is waited for."""
+def _throughput(channel: _Channel, size: int, seconds: float) -> float:
+    """Return the messages per second in the median burst; each burst is waited for."""
     burst = max(1, min(_BURST, _BURST_BYTES // size))
     texts = [*["b".ljust(size, "x")] * (burst - 1), "l".ljust(size, "x")]
     times: list[float] = []
     end = time.monotonic() + seconds
     while (start := time.monotonic()) < end or not times:
         for text in texts:
-            link.write(text)
-        _await(link)
+            channel.write(text)
+        _await(channel)
         times.append(time.monotonic() - start)
     return burst / statistics.median(times)
 
 
-def _await(link: _Channel) -> None:
-    """Wait for an answer; raises `SrosError` where a reliable one does not come."""
-    if not link.wait(_LOST):
+def _await(channel: _Channel) -> None:
+    """Wait for an answer.
+
+    Raises:
+        SrosError: it did not come, although messages are reliable.
+    """
+    if not channel.wait(_LOST):
         raise SrosError("an answer was lost", f"It did not come within {_LOST} s.")
-    link.take()
+    channel.take()
 
 
 if __name__ == "__main__":

@@ -24,9 +24,6 @@ from sros_tool.demo.scenarios.policies import talking_policy
 TALKER = Identity(OWN, "talker")
 LISTENER = Identity(OWN, "listener")
 TALKER_DENIED = Identity(OWN, "talker without permission")
-LISTENER_DENIED = Identity(OWN, "listener without permission")
-FOREIGN_TALKER = Identity(FOREIGN, "talker")
-FOREIGN_LISTENER = Identity(FOREIGN, "listener")
 
 
 def _hears(listener: str, talker: str) -> Claim:
@@ -42,9 +39,11 @@ _SECURED_LISTENER = Party("secured listener", Role.LISTENER, LISTENER)
 _OPEN_TALKER = Party("unsecured talker", Role.TALKER, UNSECURED)
 _OPEN_LISTENER = Party("unsecured listener", Role.LISTENER, UNSECURED)
 _DENIED_TALKER = Party("talker without permission", Role.TALKER, TALKER_DENIED)
-_DENIED_LISTENER = Party("listener without permission", Role.LISTENER, LISTENER_DENIED)
-_FOREIGN_TALKER = Party("foreign talker", Role.TALKER, FOREIGN_TALKER)
-_FOREIGN_LISTENER = Party("foreign listener", Role.LISTENER, FOREIGN_LISTENER)
+_DENIED_LISTENER = Party(
+    "listener without permission", Role.LISTENER, Identity(OWN, "listener without permission")
+)
+_FOREIGN_TALKER = Party("foreign talker", Role.TALKER, Identity(FOREIGN, "talker"))
+_FOREIGN_LISTENER = Party("foreign listener", Role.LISTENER, Identity(FOREIGN, "listener"))
 _OPEN_TALKER_ASIDE = Party("unsecured talker aside", Role.TALKER, UNSECURED, other_topic=True)
 _OBSERVER = Party("observer", Role.OBSERVER, UNSECURED)
 

@@ -1,4 +1,4 @@
-"""The attacks: every way in that is known, each with a control, and once without its defence.
+"""The attacks: every known way in, each with a control, and once without its defence.
 
 An attacker is an intruder in the row.  The control of a row that expects a closed door is the
 rightful talker, whom the same listener hears at the same time.  A row with ``removed`` shows the

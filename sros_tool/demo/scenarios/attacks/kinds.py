@@ -1,4 +1,4 @@
-"""Rows of the same kind: somebody injects, listens, looks around, asks, or poses as a server.
+"""The kinds of attacks: somebody injects, listens, looks around, asks, or poses as a server.
 
 In each, the attacker is the party "attacker".  Its victims and the control have identities of the
 keystore ``victims``; where the defence is gone (``removed``), there is nothing but the victim.
@@ -34,7 +34,7 @@ _UNCONTROLLED = (
 
 
 def open_to(success: RowStatus, expected: RowStatus) -> tuple[Variant, ...]:
-    """The cases in which a template leaves open what is expected to be closed."""
+    """Return the variants in which a template leaves open what is expected to be closed."""
     if expected is RowStatus.REFUSED:
         return (Variant((Condition.UNCONTROLLED,), success, *_UNCONTROLLED),)
     if expected is success or expected is RowStatus.NOT_LET_IN:
@@ -57,10 +57,10 @@ def injection(
     tampered: bool = False,
     crowd: bool = True,
 ) -> Row:
-    """Whether the attacker is heard on the topic.
+    """Return a row that shows whether the attacker is heard on the topic.
 
     With ``tampered``, it is the listener whose files were changed: it may be kept from starting,
-    and the control is a listener beside it with its files as they should be.
+    and the control is another listener with its files as they should be.
     """
     listener = Party("listener", Role.LISTENER, Identity(victims, "listener"), intruder=tampered)
     parties = [Party(_ATTACKER, Role.TALKER, attacker, intruder=True), listener]
@@ -93,7 +93,7 @@ def injection(
 def succeeds(
     name: str, attacker: Identity, *, attack: str, removed: str, victims: KeystoreChoice
 ) -> Row:
-    """The same attacker with nothing wrong about him is heard."""
+    """Return a row in which the same attacker, with nothing wrong about it, is heard."""
     mechanism = "with nothing wrong about it, it is heard"
     return injection(
         name, attacker, RowStatus.HEARD, mechanism, attack=attack, removed=removed, victims=victims
@@ -111,7 +111,7 @@ def listening(
     victims: KeystoreChoice = OWN,
     variants: tuple[Variant, ...] = (),
 ) -> Row:
-    """Whether the attacker hears the topic."""
+    """Return a row that shows whether the attacker hears the topic."""
     return Row(
         name,
         expected,
@@ -143,8 +143,8 @@ def looking(
     open_because: str = "",
     remedy: str = "",
 ) -> Row:
-    """Whether the attacker counts a publisher of the topic."""
-    in_the_open = Party("unsecured talker", Role.TALKER, other_topic=True)
+    """Return a row that shows whether the attacker counts a publisher of the topic."""
+    open_talker = Party("unsecured talker", Role.TALKER, other_topic=True)
     unsecured = attacker.keystore is None
     return Row(
         name,
@@ -153,7 +153,7 @@ def looking(
         (
             Party(_ATTACKER, Role.OBSERVER, attacker, intruder=True),
             Party("talker", Role.TALKER, Identity(victims, "talker")),
-            *((in_the_open,) if unsecured else ()),
+            *((open_talker,) if unsecured else ()),
         ),
         (Claim(Relation.SEES, _ATTACKER, "talker").expecting(expected),),
         (Claim(Relation.SEES, _ATTACKER, "unsecured talker"),) if unsecured else (),
@@ -166,7 +166,7 @@ def looking(
     )
 
 
-def with_service(
+def asking(
     name: str,
     attacker: Identity,
     expected: RowStatus,
@@ -176,7 +176,7 @@ def with_service(
     removed: str = "",
     victims: KeystoreChoice = OWN,
 ) -> Row:
-    """Whether the attacker gets answers of a service."""
+    """Return a row that shows whether the attacker gets answers of a service."""
     return Row(
         name,
         expected,
@@ -195,7 +195,7 @@ def with_service(
     )
 
 
-def served(
+def posing_as_server(
     name: str,
     attacker: Identity,
     expected: RowStatus,
@@ -205,7 +205,7 @@ def served(
     removed: str = "",
     victims: KeystoreChoice = OWN,
 ) -> Row:
-    """Whether a client takes answers of the attacker, who poses as the server."""
+    """Return a row that shows whether a client takes answers of an attacker posing as server."""
     rightful = Party("server", Role.SERVER, Identity(victims, "server"), SERVICE)
     return Row(
         name,

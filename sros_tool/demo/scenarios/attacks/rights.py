@@ -1,10 +1,10 @@
-"""Attacks by an enclave that does more than it was given."""
+"""Attacks by an enclave that tries more than its permissions allow."""
 
 from __future__ import annotations
 
 from sros_tool.demo import forger
 from sros_tool.demo.forger import Undefended
-from sros_tool.demo.scenarios.attacks.kinds import injection, listening, served, with_service
+from sros_tool.demo.scenarios.attacks.kinds import asking, injection, listening, posing_as_server
 from sros_tool.demo.scenarios.model import OWN, Condition, Identity, Row, RowStatus, Variant
 
 ROWS: tuple[Row, ...] = (
@@ -72,14 +72,14 @@ ROWS: tuple[Row, ...] = (
         removed="least privilege",
         victims=Undefended(forger.talker_may_do_everything),
     ),
-    with_service(
+    asking(
         "an enclave calls a service that it was not given",
         Identity(OWN, "guest"),
         RowStatus.REFUSED,
         "its signed permissions allow neither the request nor the reply",
         attack="an enclave calls a service",
     ),
-    with_service(
+    asking(
         "an enclave calls a service, wildcard permissions",
         Identity(Undefended(forger.guest_may_do_everything), "guest"),
         RowStatus.ANSWERED,
@@ -88,14 +88,14 @@ ROWS: tuple[Row, ...] = (
         removed="least privilege",
         victims=Undefended(forger.guest_may_do_everything),
     ),
-    served(
+    posing_as_server(
         "a client poses as the server",
         Identity(OWN, "client"),
         RowStatus.REFUSED,
         "its signed permissions allow to ask, not to reply",
         attack="a client poses as the server",
     ),
-    served(
+    posing_as_server(
         "a client poses as the server, wildcard permissions",
         Identity(Undefended(forger.client_may_do_everything), "client"),
         RowStatus.ANSWERED,

@@ -20,7 +20,7 @@ _ENABLE, _STRATEGY = "ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY"
 _PERMISSIVE = (_STRATEGY, "Permissive")
 
 
-def _in_the_open(
+def _misled(
     name: str,
     identity: Identity,
     expected: RowStatus,
@@ -31,7 +31,7 @@ def _in_the_open(
     open_because: str = "",
     remedy: str = "",
 ) -> Row:
-    """Whether a talker that should be secured is heard by an unsecured listener."""
+    """Return a row that shows whether a misled talker is heard by an unsecured listener."""
     parties = (
         Party("misled talker", Role.TALKER, identity, intruder=True),
         Party("unsecured listener", Role.LISTENER),
@@ -55,14 +55,14 @@ def _in_the_open(
 
 
 ROWS: tuple[Row, ...] = (
-    _in_the_open(
+    _misled(
         "a file of the enclave missing, Enforce",
         Identity(forger.missing_permissions, "talker"),
         RowStatus.NOT_LET_IN,
         "with Enforce, a node without all of its files does not start",
         attack="a file of the enclave missing",
     ),
-    _in_the_open(
+    _misled(
         "a file of the enclave missing, Permissive",
         Identity(Undefended(forger.missing_permissions), "talker", (_PERMISSIVE,)),
         RowStatus.HEARD,
@@ -70,7 +70,7 @@ ROWS: tuple[Row, ...] = (
         attack="a file of the enclave missing",
         removed="ROS_SECURITY_STRATEGY=Enforce",
     ),
-    _in_the_open(
+    _misled(
         "variables spelt right",
         Identity(OWN, "talker"),
         RowStatus.NOT_HEARD,
@@ -78,7 +78,7 @@ ROWS: tuple[Row, ...] = (
         attack="misspelt security variables",
     ),
     *(
-        _in_the_open(
+        _misled(
             f"{variable}={value}{' and a file missing' if variable == _STRATEGY else ''}",
             Identity(
                 forger.missing_permissions if variable == _STRATEGY else OWN,
