@@ -205,6 +205,9 @@ _PHRASES = {
     "env": "print the environment",
     "run": "run the command",
     "demo": "run the demo",
+    "policies": "show the policies",
+    "crl": "show or sign the revocation list",
+    "completion": "print the completion script",
     "doctor": "examine this machine",
 }
 
