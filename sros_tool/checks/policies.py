@@ -14,7 +14,7 @@ from urllib.parse import unquote
 
 from lxml import etree
 
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
@@ -169,11 +169,6 @@ NO_COUNTERPART = Kind(
     "Compare the names on both sides, after remapping.",
 )
 
-NAMING_KINDS = by_id(
-    NEVER_MATCHES, DDS_NAME, WRONG_KIND, EVERYTHING, WIDE, READS_EVERYTHING, SETS_PARAMETERS,
-    SETS_CLOCK, NO_COUNTERPART,
-)  # fmt: skip
-
 _LONGEST = 247
 _DIGIT_FIRST = re.compile(r"/(?:[0-9]|\[[0-9-]+\])")
 _DDS_PREFIX = re.compile(r"/?(?:rt|rq|rr|rs)/")
@@ -307,11 +302,6 @@ RELATIVE_GLOBAL = Kind(
     "Put a / before the name.",
 )
 
-NODES_KINDS = by_id(
-    NO_TYPE_DESCRIPTION, NO_ROSOUT, NO_PARAMETER_EVENTS, NO_PARAMETER_SERVICES, NO_PARAMETERS,
-    RELATIVE_GLOBAL,
-)  # fmt: skip
-
 _GLOBAL = ("rosout", "parameter_events", "clock")
 _BASICS = (
     (NO_TYPE_DESCRIPTION, "reply", ("~/get_type_description",)),
@@ -417,10 +407,7 @@ SEVERAL_PROFILES = Kind(
     "Put all <profile> of an enclave into one <profiles>.",
 )
 
-PORTABILITY_KINDS = by_id(
-    DOCUMENT_SIZE, LONG_NAME, DENY_BLOCKS, CHARACTER_SET, ENCLAVE_NAMES, SEVERAL_PROFILES
-)
-
+_OUTSIDE = {each.id: each for each in (DOCUMENT_SIZE, LONG_NAME, DENY_BLOCKS, CHARACTER_SET)}
 _FROM_ALL_SIZES_ON = MAX_SIGNED_BYTES // 2
 _ANY_TIME = Window(datetime(2026, 1, 1, tzinfo=UTC), datetime(2027, 1, 1, tzinfo=UTC))
 _DOMAINS = DomainSet.of((0, 0))
@@ -461,7 +448,7 @@ def outside_findings(
 ) -> Iterator[Finding]:
     """What of a permissions document lies outside of the portable profile."""
     for identity, fact in outside(permissions, signed_bytes, overlap):
-        yield PORTABILITY_KINDS[identity].found(subject, fact, file, line)
+        yield _OUTSIDE[identity].found(subject, fact, file, line)
 
 
 def _signed_bytes(enclave: Enclave) -> int:
@@ -520,8 +507,6 @@ HALF_ACTION = Kind(
     "ROS 2 design, Actions; rcl_action 9 (rcl_action_client_init, rcl_action_server_init).",
     'Write <actions call="ALLOW"> or <actions execute="ALLOW"> with the name of the action.',
 )
-
-RULES_KINDS = by_id(CONTRADICTION, UNREACHABLE, NO_EFFECT, RULES_REDUNDANT, HALF_ACTION)
 
 
 def check_rules(checked: CheckedPolicy) -> Iterator[Finding]:
@@ -601,8 +586,6 @@ REDUNDANT = Kind(
     "XInclude 1.0.",
     "Remove it.",
 )
-
-FILES_KINDS = by_id(MALFORMED, DUPLICATE, FALLBACK, REDUNDANT)
 
 _CHECKS = (check_rules, check_nodes, check_names, check_counterparts, check_portability)
 _PLACE = re.compile(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
@@ -697,6 +680,3 @@ def _reached(file: Path, known: dict[Path, frozenset[Path]]) -> frozenset[Path]:
                 reached |= {target, *_reached(target, known)}
     known[file] = frozenset(reached)
     return known[file]
-
-
-KINDS = {**NAMING_KINDS, **NODES_KINDS, **PORTABILITY_KINDS, **RULES_KINDS, **FILES_KINDS}

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from types import ModuleType
 
 from sros_tool.checks import policies, runtime
 from sros_tool.checks.keystores import authorities, documents, enclaves, files, issued
@@ -13,8 +14,19 @@ from sros_tool.errors import UsageError
 
 _MODULES = (policies, files, authorities, enclaves, documents, issued, runtime)
 
+
+def _declared(module: ModuleType) -> Iterator[Kind]:
+    """Yield the kinds that are constants of a module, or values of its tables."""
+    for value in vars(module).values():
+        for each in value.values() if isinstance(value, dict) else (value,):
+            if isinstance(each, Kind):
+                yield each
+
+
 KINDS: Mapping[str, Kind] = by_id(
-    *(kind for module in _MODULES for _, kind in sorted(module.KINDS.items()))
+    *dict.fromkeys(
+        kind for module in _MODULES for kind in sorted(_declared(module), key=lambda kind: kind.id)
+    )
 )
 """Every kind by its id."""
 

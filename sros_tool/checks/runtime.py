@@ -11,7 +11,7 @@ from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 
 from sros_tool.checks.keystores.keystore import joined, keystore_findings
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
@@ -162,11 +162,6 @@ MIXED_VENDORS = Kind(
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Use one RMW per robot.",
 )
-
-HOST_KINDS = by_id(
-    RMW_NOT_INSTALLED, RMW_INSECURE, CLOCK_BEHIND, DAEMON_UNSECURED, DAEMON_OTHER,
-    PROCESS_UNSECURED, PROCESS_OUTDATED, MIXED_VENDORS,
-)  # fmt: skip
 
 _NOT_DDS = ("rmw_zenoh", "rmw_email", "rmw_iceoryx")
 _DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
@@ -410,12 +405,6 @@ CA_KEY_HERE = Kind(
     "Run them with an export (`sros distribute_key`), and keep the keystore elsewhere.",
 )
 
-VARIABLES_KINDS = by_id(
-    ENABLE_MISSPELT, NOT_ENABLED, MISSPELT, STRATEGY_MISSPELT, NOT_ENFORCED, KEYSTORE_UNSET,
-    KEYSTORE_NOT_FOUND, KEYSTORE_RELATIVE, ENCLAVE_NOT_FOUND, NO_ENCLAVE,
-    UNSECURED_WITHOUT_ENCLAVE, DOMAIN_MALFORMED, DOMAIN_NOT_GOVERNED, CA_KEY_HERE,
-)  # fmt: skip
-
 _READ = (
     ENABLE, STRATEGY, KEYSTORE, ENCLAVE, DOMAIN, "RMW_IMPLEMENTATION", "ROS_SECURITY_LOG_FILE",
     "ROS_SECURITY_LOG_VERBOSITY", "ROS_SECURITY_LOG_PUBLISH",
@@ -522,6 +511,3 @@ def _value(environment: Mapping[str, str], name: str) -> str:
 def runtime_findings(setting: Setting) -> list[Finding]:
     """Everything that is found in an environment and on its host."""
     return joined([*check_variables(setting), *check_host(setting)])
-
-
-KINDS = {**HOST_KINDS, **VARIABLES_KINDS}

@@ -10,7 +10,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
@@ -86,10 +86,6 @@ SIGNATURE_HASH = Kind(
     "Issue it with SHA-256, as sros does.",
     vendors=FAST_DDS,
 )
-
-CERTIFICATES_KINDS = by_id(
-    NOT_A_CA, CA_EXTENSIONS, INTERMEDIATE, CA_PURPOSE, KEY_ALGORITHM, SIGNATURE_HASH
-)  # fmt: skip
 
 
 def authority_findings(
@@ -233,11 +229,6 @@ CRL_ISSUER = Kind(
     "Run `sros crl ROOT --refresh`.",
 )
 
-CA_KINDS = by_id(
-    UNREADABLE, ONE_AUTHORITY, CA_ENDS, CA_EXPIRED, CA_MISSING, CA_MISMATCH, CA_KEY_PLAIN,
-    SETTINGS_MISSING, LEDGER_MISSING, CRL_ENDS, CRL_ISSUER,
-)  # fmt: skip
-
 _SOON = timedelta(days=90)
 _LIST_SOON = timedelta(days=30)
 
@@ -343,6 +334,3 @@ def _revocation_list(keystore: CheckedKeystore) -> Iterator[Finding]:
     identity = keystore.authorities.get(IDENTITY, ())
     if identity and not any(signed_by(crl.list, each) for each in identity):
         yield CRL_ISSUER.found("revocation list", "no identity CA of the keystore signed it", file)
-
-
-KINDS = {**CERTIFICATES_KINDS, **CA_KINDS}

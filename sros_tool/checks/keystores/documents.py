@@ -9,7 +9,7 @@ from math import isfinite
 
 from sros_tool.checks.keystores.enclaves import grant_of, plain, plain_file
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind
 from sros_tool.checks.policies import outside_findings
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import Refusal, Verb
@@ -160,12 +160,6 @@ DOMAINS = Kind(
     "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; measured.",
     "Sign both for the same domains: `sros create_permission` takes those of the governance.",
 )
-
-PERMISSIONS_KINDS = by_id(
-    SEVERAL_GRANTS, DEFAULT_ALLOW, ALLOW_RULES, PARTITIONS, DOMAIN_RANGE, GRANT_NAME, SUBJECT,
-    TIME_FORMAT, TIME_WINDOW, LOCAL_TIME, CHARACTER_CLASS, EMPTY_TOPIC, NO_EFFECT, UNREACHABLE,
-    DOMAINS,
-)  # fmt: skip
 
 _MOMENT = re.compile(r"(\d{4})-\d\d-\d\dT\d\d:\d\d:\d\dZ\Z")
 _SUBJECT = re.compile(
@@ -415,12 +409,6 @@ XML_DIFFERS = Kind(
     "Restore it from governance.p7s (`sros inspect` shows it).",
 )
 
-GOVERNANCE_KINDS = by_id(
-    UNAUTHENTICATED, NO_JOIN_CONTROL, NO_ACCESS_CONTROL, NO_ENCRYPTION, SIGNED_PAYLOAD,
-    NOT_AUTHENTIC, DISCOVERY_OPEN, LIVELINESS_OPEN, NO_TOPIC_RULE, GOVERNANCE_UNREACHABLE,
-    GOVERNANCE_DOMAIN_RANGE, DIFFERS, XML_DIFFERS,
-)  # fmt: skip
-
 _SIGNING = (ProtectionKind.SIGN, ProtectionKind.SIGN_WITH_ORIGIN_AUTHENTICATION)
 _NONE = (ProtectionKind.NONE,)
 
@@ -559,8 +547,6 @@ DIFFER = Kind(
     "Stay inside the portable profile; `sros explain --all-vendors` tells each decision.",
 )
 
-VENDORS_KINDS = by_id(DIFFER)
-
 _UNHEARD_OF = "rt/sros_nobody_has_this"
 _MANY = 3
 
@@ -648,6 +634,3 @@ def _example(expression: str) -> str:
             name += "x" if letter in "*?" else letter
         index += 1
     return name
-
-
-KINDS = {**PERMISSIONS_KINDS, **GOVERNANCE_KINDS, **VENDORS_KINDS}

@@ -143,11 +143,6 @@ WAITS = Kind(
     "Answer it with `sros sign_request`, and put the answer in place with `sros import`.",
 )
 
-STATE_KINDS = by_id(
-    ENDS_SOON, OUTLIVES_CA, PERMISSIONS_OUTLIVE, NAME_MISMATCH, IS_A_CA, NOT_UNIQUE,
-    LONG_PERMISSIONS, EVERYTHING, XML_DIFFERS, CRL_MISSING, WAITS,
-)  # fmt: skip
-
 _SOON = timedelta(days=30)
 _LONG = timedelta(days=2 * 366)
 _EVERY_TOPIC = frozenset({"*", "rt/*"})
@@ -275,6 +270,3 @@ def plain_file(path: Path) -> bytes:
         return plain(read_bytes(path, "file"))
     except SrosError:
         return b""
-
-
-KINDS = {**LOADING_KINDS, **STATE_KINDS}

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind
 from sros_tool.keystore.layout import (
     ENCLAVES,
     LEDGER,
@@ -108,11 +108,6 @@ UNKNOWN_FILE = Kind(
     "ROS 2 keystore layout.",
     "Delete it, or keep it elsewhere.",
 )
-
-KINDS = by_id(
-    KEY_READABLE, WORLD_WRITABLE, FOLDER_OPEN, LINK_DANGLING, LINK_ABSOLUTE, LINK_OUTSIDE,
-    INTERRUPTED, STRAY_KEY, CA_KEY_ON_ROBOT, UNKNOWN_FILE,
-)  # fmt: skip
 
 _OF_KEYS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
 _KEY_MARK = b"PRIVATE KEY-----"

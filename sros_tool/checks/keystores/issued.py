@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from sros_tool.checks.keystores.documents import DIFFERS as GOVERNANCE_DIFFERS
 from sros_tool.checks.keystores.enclaves import grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind
 from sros_tool.checks.policies import ENCLAVE_NAMES
 from sros_tool.dds.portable import mistaken_names, some_pairs
 from sros_tool.errors import SrosError
@@ -88,17 +88,6 @@ AUTHORITIES_DIFFER = Kind(
     "Their nodes never talk to each other, and neither Fast DDS nor Cyclone DDS says why.",
     "DDS-Security 1.1, 9.3; Fast DDS 2.9.1, Cyclone DDS 0.10.2; measured.",
     "Export the enclave again from the keystore of the others, or make it anew there.",
-)
-
-KINDS = by_id(
-    AUTHORITIES_DIFFER,
-    SERIAL_TWICE,
-    KEY_TWICE,
-    UNEXPLAINED,
-    OLD_PERMISSIONS,
-    STALE,
-    NOT_IN_POLICY,
-    NOT_IN_KEYSTORE,
 )
 
 _Key = TypeVar("_Key")
