@@ -357,7 +357,7 @@ def check(
         ...     print(finding.place, finding.id, finding.text, finding.remedy)
     """
     from sros_tool.checks.kind import Severity
-    from sros_tool.checks.registry import Selection
+    from sros_tool.checks.registry import FindingFilter
     from sros_tool.checks.targets import Circumstances, path_findings
 
     levels = {each.word: each for each in Severity}
@@ -368,7 +368,7 @@ def check(
     read = tuple(_policy(each) for each in _several("policies", policies))
     at = Circumstances(_moment(now), zone, domain, read)
     found = dict.fromkeys(each for path in paths for each in path_findings(Path(path), at))
-    return Selection(severity=levels[severity], strict=strict).choose(found).shown
+    return FindingFilter(severity=levels[severity], strict=strict).choose(found).shown
 
 
 def _moment(now: datetime | None) -> datetime:

@@ -30,7 +30,7 @@ NOTE, WARNING, ERROR = Severity.NOTE, Severity.WARNING, Severity.ERROR
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class FindingKind:
     """A kind of finding.
 
     ``id`` is stable, a family and a name with a dot between them; ``title`` a clause; ``why``,
@@ -88,7 +88,7 @@ class Finding:
     account: such a finding counts as a note.
     """
 
-    kind: Kind
+    kind: FindingKind
     subject: str
     text: str
     file: str = ""
@@ -133,7 +133,7 @@ class Finding:
         }
 
 
-def by_id(*kinds: Kind) -> Mapping[str, Kind]:
+def by_id(*kinds: FindingKind) -> Mapping[str, FindingKind]:
     """A table of kinds by their ids, each of which is given once."""
     table = {kind.id: kind for kind in kinds}
     assert len(table) == len(kinds), "an id is given twice"

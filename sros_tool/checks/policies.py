@@ -1,4 +1,4 @@
-"""Findings in policies."""
+"""Findings in policies: names, nodes, rules, portability, and the files themselves."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from urllib.parse import unquote
 
 from lxml import etree
 
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
@@ -41,7 +41,7 @@ from sros_tool.xml import parse, read_bytes
 
 
 @dataclass(frozen=True, slots=True)
-class Stated:
+class _Statement:
     """One right as one line of a policy states it; ``written`` is the name as it stands there."""
 
     right: Right
@@ -59,13 +59,13 @@ class Stated:
         """The absolute name."""
         return self.right.name
 
-    def found(self, kind: Kind, text: str, remedy: str = "") -> Finding:
+    def found(self, kind: FindingKind, text: str, remedy: str = "") -> Finding:
         """A finding of that kind about this line."""
         file, line = self.source.file, self.source.line
         return kind.found(self.right.enclave, text, file, line, remedy)
 
 
-class CheckedPolicy:
+class _CheckedPolicy:
     """A policy, its statements, and its rights in a form that can be asked."""
 
     def __init__(self, policy: Policy) -> None:
@@ -77,12 +77,12 @@ class CheckedPolicy:
         return Rules(policy_rights(self.policy))
 
     @cached_property
-    def statements(self) -> tuple[Stated, ...]:
+    def statements(self) -> tuple[_Statement, ...]:
         """Every right and denial, in the order of the document."""
         return tuple(each for enclave in self.policy.enclaves for each in _statements(enclave))
 
 
-def _statements(enclave: Enclave) -> Iterator[Stated]:
+def _statements(enclave: Enclave) -> Iterator[_Statement]:
     for profile in enclave.all_profiles():
         for group in profile.groups:
             for index, written in enumerate(group.names):
@@ -90,10 +90,10 @@ def _statements(enclave: Enclave) -> Iterator[Stated]:
                 source = group.source_of(index)
                 for right, qualifier in group.rights:
                     stated = Right(enclave.path, qualifier, right, name)
-                    yield Stated(stated, written, source, profile)
+                    yield _Statement(stated, written, source, profile)
 
 
-NEVER_MATCHES = Kind(
+NEVER_MATCHES = FindingKind(
     "policy.name-never-matches",
     WARNING,
     "a name that no topic, service or action can have",
@@ -101,7 +101,7 @@ NEVER_MATCHES = Kind(
     "rmw (validate_full_topic_name.h: at most 247 characters, no part begins with a digit).",
     "Correct the name.",
 )
-DDS_NAME = Kind(
+DDS_NAME = FindingKind(
     "policy.dds-name",
     WARNING,
     "a DDS name where a ROS name is meant",
@@ -110,7 +110,7 @@ DDS_NAME = Kind(
     "ROS 2 design, Topic and Service name mapping to DDS.",
     "Write the ROS name, without its prefix.",
 )
-WRONG_KIND = Kind(
+WRONG_KIND = FindingKind(
     "policy.wrong-kind",
     WARNING,
     "a topic said to be a service, or a service said to be a topic",
@@ -119,7 +119,7 @@ WRONG_KIND = Kind(
     "ROS 2 Jazzy (rclcpp 28, rclpy 7); ROS 2 design, Actions.",
     "Move the name to the group of its kind.",
 )
-EVERYTHING = Kind(
+EVERYTHING = FindingKind(
     "policy.everything",
     WARNING,
     "a wildcard that allows to act on everything",
@@ -127,7 +127,7 @@ EVERYTHING = Kind(
     "ROS 2 design, ROS 2 Security Enclaves: the least that is needed.",
     "Name what the node uses; `sros minimize_policy` narrows it to what was observed.",
 )
-WIDE = Kind(
+WIDE = FindingKind(
     "policy.wide-wildcard",
     WARNING,
     "a wildcard wider than a namespace",
@@ -135,7 +135,7 @@ WIDE = Kind(
     "DDS-Security 1.1, 9.4.1.3 (POSIX fnmatch, in which * also matches a slash).",
     "Begin it with a whole namespace, as in /arm/*, or end it with a whole name.",
 )
-READS_EVERYTHING = Kind(
+READS_EVERYTHING = FindingKind(
     "policy.reads-everything",
     NOTE,
     "a wildcard by which an enclave reads across namespaces",
@@ -143,7 +143,7 @@ READS_EVERYTHING = Kind(
     "ROS 2 design, ROS 2 Security Enclaves: the least that is needed.",
     "Name the topics, or deny those that are nobody's business.",
 )
-SETS_PARAMETERS = Kind(
+SETS_PARAMETERS = FindingKind(
     "policy.sets-all-parameters",
     WARNING,
     "a wildcard by which an enclave sets the parameters of every node",
@@ -151,7 +151,7 @@ SETS_PARAMETERS = Kind(
     "ROS 2 Jazzy: set_parameters of every node.",
     "Name the nodes whose parameters it has to set.",
 )
-SETS_CLOCK = Kind(
+SETS_CLOCK = FindingKind(
     "policy.sets-clock",
     NOTE,
     "an enclave that may publish /clock",
@@ -159,7 +159,7 @@ SETS_CLOCK = Kind(
     "ROS 2 design, Clock and Time.",
     "Give it to a simulator alone.",
 )
-NO_COUNTERPART = Kind(
+NO_COUNTERPART = FindingKind(
     "policy.no-counterpart",
     NOTE,
     "nobody in the policy is allowed the other side",
@@ -177,7 +177,7 @@ _ALL = re.compile(r"/?[*?]*\*[*?]*\Z")
 _OTHER_SIDE = {"subscribe": "publish", "request": "reply", "call": "execute"}
 
 
-def check_names(checked: CheckedPolicy) -> Iterator[Finding]:
+def _check_names(checked: _CheckedPolicy) -> Iterator[Finding]:
     """Every name by itself."""
     for each in checked.statements:
         if reason := _never(each.name):
@@ -190,7 +190,7 @@ def check_names(checked: CheckedPolicy) -> Iterator[Finding]:
             yield from _breadth(each)
 
 
-def check_counterparts(checked: CheckedPolicy) -> Iterator[Finding]:
+def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
     """Names that one side is allowed and the other side nobody."""
     names: dict[str, set[str]] = {right: set() for pair in RIGHTS.values() for right in pair}
     for each in checked.statements:
@@ -214,7 +214,7 @@ def _never(name: str) -> str:
     return "a part of it begins with a digit" if _DIGIT_FIRST.search(name) else ""
 
 
-def _belongs(each: Stated) -> str:
+def _belongs(each: _Statement) -> str:
     """The kind that the name has everywhere, where it is another than here."""
     kind, name = each.right.kind, each.name
     if kind != "services":
@@ -225,7 +225,7 @@ def _belongs(each: Stated) -> str:
     return "topics" if name in _GLOBAL_TOPICS or action_part(name)[1] in ACTION_TOPICS else ""
 
 
-def _breadth(each: Stated) -> Iterator[Finding]:
+def _breadth(each: _Statement) -> Iterator[Finding]:
     name, right = each.name, each.right.right
     if right == "publish" and name == "/clock":
         yield each.found(SETS_CLOCK, f"{each.right.enclave} may publish /clock")
@@ -244,55 +244,55 @@ def _breadth(each: Stated) -> Iterator[Finding]:
         yield each.found(SETS_PARAMETERS, f"{told} reaches every node")
 
 
-_NODES_INCLUDE = (
+_INCLUDE_HINT = (
     '<xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> gives all of that; '
     "`sros policies --copy` has the file."
 )
 
-NO_TYPE_DESCRIPTION = Kind(
+NO_TYPE_DESCRIPTION = FindingKind(
     "policy.no-type-description",
     ERROR,
     "a node that may not offer ~/get_type_description",
     "Nodes of Jazzy offer this service, and one that is denied it ends as soon as it starts.",
     "ROS 2 Jazzy, rclcpp 28 and rclpy 7 (node type descriptions interface); REP-2016.",
     f'Allow <services reply="ALLOW"><service>~/get_type_description</service></services>. '
-    f"{_NODES_INCLUDE}",
+    f"{_INCLUDE_HINT}",
 )
-NO_ROSOUT = Kind(
+NO_ROSOUT = FindingKind(
     "policy.no-rosout",
     ERROR,
     "a node that may not publish /rosout",
     "Every node makes a publisher for its log when it starts, and fails where it may not.",
     "ROS 2 Jazzy, rcl 9 (rcl_logging_rosout_init_publisher_for_node).",
-    f'Allow <topics publish="ALLOW"><topic>/rosout</topic></topics>. {_NODES_INCLUDE}',
+    f'Allow <topics publish="ALLOW"><topic>/rosout</topic></topics>. {_INCLUDE_HINT}',
 )
-NO_PARAMETER_EVENTS = Kind(
+NO_PARAMETER_EVENTS = FindingKind(
     "policy.no-parameter-events",
     ERROR,
     "a node that may not publish /parameter_events",
     "Every node announces its parameters there, and fails at its start where it may not.",
     "ROS 2 Jazzy, rclcpp 28 (NodeParameters) and rclpy 7 (Node).",
-    f'Allow <topics publish="ALLOW"><topic>/parameter_events</topic></topics>. {_NODES_INCLUDE}',
+    f'Allow <topics publish="ALLOW"><topic>/parameter_events</topic></topics>. {_INCLUDE_HINT}',
 )
-NO_PARAMETER_SERVICES = Kind(
+NO_PARAMETER_SERVICES = FindingKind(
     "policy.no-parameter-services",
     ERROR,
     "a node that may not offer all of its parameter services",
     "Every node offers all six unless it was made without, and fails at its start where it may "
     "not.",
     "ROS 2 Jazzy, rclcpp 28 (ParameterService) and rclpy 7 (start_parameter_services).",
-    f'Allow <services reply="ALLOW"> with ~/get_parameters and the others. {_NODES_INCLUDE}',
+    f'Allow <services reply="ALLOW"> with ~/get_parameters and the others. {_INCLUDE_HINT}',
 )
-NO_PARAMETERS = Kind(
+NO_PARAMETERS = FindingKind(
     "policy.without-parameters",
     NOTE,
     "a node that may offer no parameter service at all",
     "It has everything else that it needs, so it may well have been made without parameters; "
     "otherwise it fails at its start.",
     "ROS 2 Jazzy, rclcpp 28 (NodeOptions) and rclpy 7 (start_parameter_services).",
-    f"If it has parameters, let it offer them. {_NODES_INCLUDE}",
+    f"If it has parameters, let it offer them. {_INCLUDE_HINT}",
 )
-RELATIVE_GLOBAL = Kind(
+RELATIVE_GLOBAL = FindingKind(
     "policy.relative-global-name",
     ERROR,
     "a name that ROS has at the root, said relative to a namespace",
@@ -314,7 +314,7 @@ _LISTENER = "transform_listener_impl_"
 _OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
 
 
-def check_nodes(checked: CheckedPolicy) -> Iterator[Finding]:
+def _check_nodes(checked: _CheckedPolicy) -> Iterator[Finding]:
     """Every node of a policy, by what its enclave allows as a whole.
 
     Nodes whose names begin with an underscore are hidden ones, tools that are started without
@@ -330,7 +330,7 @@ def check_nodes(checked: CheckedPolicy) -> Iterator[Finding]:
             yield each.found(RELATIVE_GLOBAL, text, f"Write /{each.written}.")
 
 
-def _basics(checked: CheckedPolicy, enclave: Enclave, profile: Profile) -> Iterator[Finding]:
+def _basics(checked: _CheckedPolicy, enclave: Enclave, profile: Profile) -> Iterator[Finding]:
     node = expand("~", profile.ns, profile.node)
     listener = profile.node.startswith(_LISTENER)
     lacks_others = False
@@ -348,7 +348,7 @@ def _basics(checked: CheckedPolicy, enclave: Enclave, profile: Profile) -> Itera
         yield kind.found(enclave.path, text, profile.source.file, profile.source.line)
 
 
-DOCUMENT_SIZE = Kind(
+DOCUMENT_SIZE = FindingKind(
     "portable.document-size",
     WARNING,
     "signed permissions of 64 KB or more",
@@ -359,7 +359,7 @@ DOCUMENT_SIZE = Kind(
     "Use wildcards (`sros minimize_policy` proposes them), or split the enclave.",
     vendors=(Vendor.FAST_2_9,),
 )
-LONG_NAME = Kind(
+LONG_NAME = FindingKind(
     "portable.long-name",
     WARNING,
     "a topic whose name is too long for Fast DDS",
@@ -369,7 +369,7 @@ LONG_NAME = Kind(
     "Use shorter namespaces and names.",
     vendors=FAST_DDS,
 )
-DENY_BLOCKS = Kind(
+DENY_BLOCKS = FindingKind(
     "portable.deny-blocks-topic",
     WARNING,
     "a denial of one direction of a topic that is allowed in the other",
@@ -379,7 +379,7 @@ DENY_BLOCKS = Kind(
     "Remove the denial: what no rule allows is denied anyway.",
     vendors=(Vendor.CYCLONE,),
 )
-CHARACTER_SET = Kind(
+CHARACTER_SET = FindingKind(
     "portable.character-set",
     NOTE,
     "a [set] of characters in a name",
@@ -387,7 +387,7 @@ CHARACTER_SET = Kind(
     "Fast DDS 2.14.5 (fnmatch), Cyclone DDS 0.10.2 (its own matching); measured.",
     "Use * or ?, or write the names out.",
 )
-ENCLAVE_NAMES = Kind(
+ENCLAVE_NAMES = FindingKind(
     "portable.enclave-names",
     WARNING,
     "an enclave whose name consists of parts of another's",
@@ -398,7 +398,7 @@ ENCLAVE_NAMES = Kind(
     "with a part of their own (template production).",
     vendors=(Vendor.CYCLONE,),
 )
-SEVERAL_PROFILES = Kind(
+SEVERAL_PROFILES = FindingKind(
     "policy.several-profiles",
     NOTE,
     "an enclave with several <profiles>",
@@ -413,7 +413,7 @@ _ANY_TIME = Window(datetime(2026, 1, 1, tzinfo=UTC), datetime(2027, 1, 1, tzinfo
 _DOMAINS = DomainSet.of((0, 0))
 
 
-def check_portability(checked: CheckedPolicy) -> Iterator[Finding]:
+def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
     """Every enclave as its permissions would be signed."""
     for enclave in checked.policy.enclaves:
         source = enclave.source
@@ -436,7 +436,7 @@ def check_portability(checked: CheckedPolicy) -> Iterator[Finding]:
         yield ENCLAVE_NAMES.found(pairs[0][0], text, checked.policy.file, line)
 
 
-def _at_denial(found: Finding, checked: CheckedPolicy) -> Finding:
+def _at_denial(found: Finding, checked: _CheckedPolicy) -> Finding:
     """``found``, at the first denial of its enclave."""
     denials = (s for s in checked.statements if s.right.enclave == found.subject and not s.allows)
     source = next(denials).source
@@ -463,7 +463,7 @@ _ORDER = (
     "first rule that matches decides (DDS-Security 1.1, 9.4.1.3)."
 )
 
-CONTRADICTION = Kind(
+CONTRADICTION = FindingKind(
     "policy.contradiction",
     WARNING,
     "the same name is allowed and denied",
@@ -471,7 +471,7 @@ CONTRADICTION = Kind(
     _ORDER,
     "Remove the one that is not meant.",
 )
-UNREACHABLE = Kind(
+UNREACHABLE = FindingKind(
     "policy.unreachable-rule",
     WARNING,
     "a permission that a denial takes away as a whole",
@@ -480,7 +480,7 @@ UNREACHABLE = Kind(
     _ORDER,
     "Remove the permission, or narrow the denial.",
 )
-NO_EFFECT = Kind(
+NO_EFFECT = FindingKind(
     "policy.deny-without-effect",
     WARNING,
     "a denial of what nothing allows",
@@ -490,7 +490,7 @@ NO_EFFECT = Kind(
     "which one direction is denied.",
     "Remove the denial.",
 )
-RULES_REDUNDANT = Kind(
+REDUNDANT_RULE = FindingKind(
     "policy.redundant-rule",
     NOTE,
     "a permission that a wildcard beside it gives already",
@@ -498,7 +498,7 @@ RULES_REDUNDANT = Kind(
     "sros: rights of a profile are joined.",
     "Remove the name, or better the wildcard.",
 )
-HALF_ACTION = Kind(
+HALF_ACTION = FindingKind(
     "policy.action-in-part",
     ERROR,
     "a part of an action without the others",
@@ -509,7 +509,7 @@ HALF_ACTION = Kind(
 )
 
 
-def check_rules(checked: CheckedPolicy) -> Iterator[Finding]:
+def _check_rules(checked: _CheckedPolicy) -> Iterator[Finding]:
     """Every statement against the others of its enclave."""
     for each in checked.statements:
         if each.allows:
@@ -519,7 +519,7 @@ def check_rules(checked: CheckedPolicy) -> Iterator[Finding]:
     yield from _redundant(checked)
 
 
-def _permission(each: Stated, rules: Rules) -> Iterator[Finding]:
+def _permission(each: _Statement, rules: Rules) -> Iterator[Finding]:
     denial = each.right._replace(qualifier=DENY)
     if denials := rules.covering(denial):
         same = set(parts(denial)) == set(denials)
@@ -538,7 +538,7 @@ def _permission(each: Stated, rules: Rules) -> Iterator[Finding]:
             yield each.found(HALF_ACTION, text)
 
 
-def _redundant(checked: CheckedPolicy) -> Iterator[Finding]:
+def _redundant(checked: _CheckedPolicy) -> Iterator[Finding]:
     wild: dict[tuple[int, str], list[str]] = defaultdict(list)
     for each in checked.statements:
         if each.allows and is_expression(each.name):
@@ -549,11 +549,11 @@ def _redundant(checked: CheckedPolicy) -> Iterator[Finding]:
             continue
         for wide in wild.get((id(each.profile), each.right.right), ()):
             if wide != each.name and covers(wide, each.name):
-                yield each.found(RULES_REDUNDANT, f"{each.right.told()} is part of {wide}")
+                yield each.found(REDUNDANT_RULE, f"{each.right.told()} is part of {wide}")
                 break
 
 
-MALFORMED = Kind(
+MALFORMED = FindingKind(
     "policy.malformed",
     ERROR,
     "a policy that cannot be read",
@@ -561,7 +561,7 @@ MALFORMED = Kind(
     "SROS2 policy XML 0.2.0 (policy.xsd of ros2/sros2) and the names of ROS 2.",
     "Correct it where the text says.",
 )
-DUPLICATE = Kind(
+DUPLICATE = FindingKind(
     "policy.duplicate-enclave",
     ERROR,
     "an enclave that is given twice",
@@ -570,7 +570,7 @@ DUPLICATE = Kind(
     "ros2/sros2 0.13 (create_permission, generate_artifacts).",
     "Join the two into one <enclave>.",
 )
-FALLBACK = Kind(
+FALLBACK = FindingKind(
     "policy.include-fallback",
     WARNING,
     "an include whose file does not exist",
@@ -578,7 +578,7 @@ FALLBACK = Kind(
     "XInclude 1.0, 4.4.",
     "Put the file there, or remove the include.",
 )
-REDUNDANT = Kind(
+REDUNDANT_INCLUDE = FindingKind(
     "policy.redundant-include",
     NOTE,
     "an include that brings nothing new",
@@ -587,7 +587,7 @@ REDUNDANT = Kind(
     "Remove it.",
 )
 
-_CHECKS = (check_rules, check_nodes, check_names, check_counterparts, check_portability)
+_CHECKS = (_check_rules, _check_nodes, _check_names, _check_counterparts, _check_portability)
 _PLACE = re.compile(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
 _INCLUDE = re.compile(r"\{http://www\.w3\.org/200[13]/XInclude\}include\Z")
 _MANY = 1000
@@ -595,7 +595,7 @@ _MANY = 1000
 
 def policy_findings(policy: Policy) -> Iterator[Finding]:
     """Everything that is found in a policy that could be read."""
-    checked = CheckedPolicy(policy)
+    checked = _CheckedPolicy(policy)
     for check in _CHECKS:
         yield from check(checked)
 
@@ -659,7 +659,7 @@ def _includes(path: Path) -> Iterator[Finding]:
             )
             if twice or any(file != o and file in _reached(o, below) for o in others):
                 text = f"'{href}' comes with another include of the same profile"
-                yield REDUNDANT.found(str(path), text, str(path), line)
+                yield REDUNDANT_INCLUDE.found(str(path), text, str(path), line)
 
 
 def _target(path: Path, element: etree._Element) -> Path:

@@ -9,21 +9,21 @@ from types import ModuleType
 
 from sros_tool.checks import policies, runtime
 from sros_tool.checks.keystores import authorities, documents, enclaves, files, issued
-from sros_tool.checks.kind import NOTE, WARNING, Finding, Kind, Severity, by_id
+from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, Severity, by_id
 from sros_tool.errors import UsageError
 
 _MODULES = (policies, files, authorities, enclaves, documents, issued, runtime)
 
 
-def _declared(module: ModuleType) -> Iterator[Kind]:
+def _declared(module: ModuleType) -> Iterator[FindingKind]:
     """Yield the kinds that are constants of a module, or values of its tables."""
     for value in vars(module).values():
         for each in value.values() if isinstance(value, dict) else (value,):
-            if isinstance(each, Kind):
+            if isinstance(each, FindingKind):
                 yield each
 
 
-KINDS: Mapping[str, Kind] = by_id(
+KINDS: Mapping[str, FindingKind] = by_id(
     *dict.fromkeys(
         kind for module in _MODULES for kind in sorted(_declared(module), key=lambda kind: kind.id)
     )
@@ -32,7 +32,7 @@ KINDS: Mapping[str, Kind] = by_id(
 
 
 @dataclass(frozen=True, slots=True)
-class Selection:
+class FindingFilter:
     """Which findings are wanted.
 
     With ``vendor``, what concerns others only is left out, and so is that vendors differ.
@@ -60,7 +60,7 @@ class Selection:
                     "See `sros check --list`; patterns are written as 'policy.*'.",
                 )
 
-    def wants(self, kind: Kind) -> bool:
+    def wants(self, kind: FindingKind) -> bool:
         """Whether findings of that kind are wanted, if they are severe enough."""
         included = not self.include or any(_matches(kind, each) for each in self.include)
         if self.vendor and kind.vendors and self.vendor not in kind.vendors:
@@ -69,7 +69,7 @@ class Selection:
             return False
         return included and not any(_matches(kind, each) for each in self.exclude)
 
-    def choose(self, findings: Iterable[Finding]) -> Chosen:
+    def choose(self, findings: Iterable[Finding]) -> ChosenFindings:
         """Those that are shown, the worst first, and those that were accepted and are not."""
         wanted = [each for each in findings if self.wants(each.kind)]
         if self.strict:
@@ -78,11 +78,11 @@ class Selection:
         shown.sort(key=lambda each: (-each.severity, each.file, each.line or 0))
         hidden = [each for each in wanted if each.severity < self.severity]
         accepted = [each for each in hidden if each.accepted and each.kind.severity > NOTE]
-        return Chosen(tuple(shown), tuple(accepted), len(hidden) - len(accepted))
+        return ChosenFindings(tuple(shown), tuple(accepted), len(hidden) - len(accepted))
 
 
 @dataclass(frozen=True, slots=True)
-class Chosen:
+class ChosenFindings:
     """The findings that are shown, those that were accepted, and the number of hidden ones."""
 
     shown: tuple[Finding, ...]
@@ -94,11 +94,11 @@ class Chosen:
         return any(each.severity >= level for each in self.shown)
 
 
-def select_kinds(selection: Selection) -> Sequence[Kind]:
+def select_kinds(selection: FindingFilter) -> Sequence[FindingKind]:
     """The kinds that are wanted, in the order in which they are listed."""
     return [kind for kind in KINDS.values() if selection.wants(kind)]
 
 
-def _matches(kind: Kind, pattern: str) -> bool:
+def _matches(kind: FindingKind, pattern: str) -> bool:
     names = (kind.id, kind.group)
     return any(name and fnmatchcase(name, pattern) for name in names)

@@ -11,7 +11,7 @@ from datetime import UTC, datetime, timedelta, tzinfo
 from pathlib import Path
 
 from sros_tool.checks.keystores.keystore import joined, keystore_findings
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
@@ -96,7 +96,7 @@ def _boot_time(proc: Path) -> datetime:
     return datetime.fromtimestamp(0, UTC)
 
 
-RMW_NOT_INSTALLED = Kind(
+RMW_NOT_INSTALLED = FindingKind(
     "runtime.rmw-not-installed",
     ERROR,
     "RMW_IMPLEMENTATION names an RMW that is not installed",
@@ -104,7 +104,7 @@ RMW_NOT_INSTALLED = Kind(
     "rmw_implementation 2.15 (functions.cpp).",
     "Install it, or choose one that is there.",
 )
-RMW_INSECURE = Kind(
+RMW_INSECURE = FindingKind(
     "runtime.rmw-without-security",
     ERROR,
     "an RMW that does not enforce DDS Security",
@@ -112,7 +112,7 @@ RMW_INSECURE = Kind(
     "Found by trying (`sros doctor`); rmw_zenoh reads none of the files of an enclave.",
     "Use an RMW of which `sros doctor` says that it enforces security.",
 )
-CLOCK_BEHIND = Kind(
+CLOCK_BEHIND = FindingKind(
     "runtime.clock-behind",
     ERROR,
     "the clock of this host is behind",
@@ -121,7 +121,7 @@ CLOCK_BEHIND = Kind(
     "RFC 5280, 6.1.3 (the current time); robots without a battery for their clock.",
     "Set the clock before nodes start, for instance by chrony with makestep.",
 )
-DAEMON_UNSECURED = Kind(
+DAEMON_UNSECURED = FindingKind(
     "runtime.daemon-unsecured",
     WARNING,
     "the daemon of ros2 runs without security",
@@ -130,7 +130,7 @@ DAEMON_UNSECURED = Kind(
     "ros2cli 0.32 (daemon); it keeps the environment in which it was started.",
     "Run `ros2 daemon stop`; it is started anew by the next command, with this environment.",
 )
-DAEMON_OTHER = Kind(
+DAEMON_OTHER = FindingKind(
     "runtime.daemon-differs",
     WARNING,
     "the daemon of ros2 runs with another keystore or enclave",
@@ -138,7 +138,7 @@ DAEMON_OTHER = Kind(
     "ros2cli 0.32 (daemon); it keeps the environment in which it was started.",
     "Run `ros2 daemon stop`.",
 )
-PROCESS_UNSECURED = Kind(
+PROCESS_UNSECURED = FindingKind(
     "runtime.process-unsecured",
     WARNING,
     "a node that runs without security beside secured ones",
@@ -146,7 +146,7 @@ PROCESS_UNSECURED = Kind(
     "DDS-Security 1.1, 9.4.1.2 (allow_unauthenticated_participants is false).",
     "Start it with `sros run ROOT NAME -- COMMAND...`.",
 )
-PROCESS_OUTDATED = Kind(
+PROCESS_OUTDATED = FindingKind(
     "runtime.process-outdated",
     WARNING,
     "a process that runs with older files of its enclave",
@@ -154,7 +154,7 @@ PROCESS_OUTDATED = Kind(
     "Fast DDS 2.14.5, Cyclone DDS 0.10.2 (read at the start).",
     "Restart it.",
 )
-MIXED_VENDORS = Kind(
+MIXED_VENDORS = FindingKind(
     "runtime.mixed-vendors",
     WARNING,
     "secured processes on different RMWs",
@@ -169,7 +169,7 @@ _TOLERANCE = timedelta(minutes=2)
 _LOADED = ("cert.pem", "permissions.p7s", "governance.p7s", "crl.pem", "identity_ca.cert.pem")
 
 
-def check_host(setting: Setting) -> Iterator[Finding]:
+def _check_host(setting: Setting) -> Iterator[Finding]:
     """The RMW that nodes would use, the clock, and what runs."""
     yield from _rmw(setting)
     yield from _clock(setting)
@@ -181,7 +181,7 @@ def _rmw(setting: Setting) -> Iterator[Finding]:
     if chosen and setting.rmws and chosen not in setting.rmws:
         text = f"{RMW} is {chosen}; there are {', '.join(setting.rmws)}"
         yield RMW_NOT_INSTALLED.found(RMW, text)
-    if not is_secured(setting.environment):
+    if not _is_secured(setting.environment):
         return
     used = chosen or DEFAULT_RMW
     if used.startswith(_NOT_DDS):
@@ -205,7 +205,7 @@ def _clock(setting: Setting) -> Iterator[Finding]:
 
 
 def _processes(setting: Setting) -> Iterator[Finding]:
-    secured_here = is_secured(setting.environment)
+    secured_here = _is_secured(setting.environment)
     rmws: dict[str, list[str]] = {}
     for process in setting.processes:
         environment = process.environment
@@ -213,7 +213,7 @@ def _processes(setting: Setting) -> Iterator[Finding]:
             # Each domain has a daemon of its own; commands ask that of theirs.
             if secured_here and _domain(environment) == _domain(setting.environment):
                 yield from _daemon(process, setting.environment)
-        elif is_secured(environment):
+        elif _is_secured(environment):
             rmws.setdefault(environment.get(RMW) or DEFAULT_RMW, []).append(process.told)
             yield from _outdated(process)
         elif secured_here and _is_node_beside(process, setting.environment):
@@ -227,7 +227,7 @@ def _processes(setting: Setting) -> Iterator[Finding]:
 
 
 def _daemon(process: Process, wanted: Mapping[str, str]) -> Iterator[Finding]:
-    if not is_secured(process.environment):
+    if not _is_secured(process.environment):
         text = f"{ENABLE} is not 'true' for {process.told}"
         yield DAEMON_UNSECURED.found(process.told, text)
         return
@@ -257,7 +257,7 @@ def _outdated(process: Process) -> Iterator[Finding]:
         yield PROCESS_OUTDATED.found(process.told, text)
 
 
-def is_secured(environment: Mapping[str, str]) -> bool:
+def _is_secured(environment: Mapping[str, str]) -> bool:
     """Whether security is on."""
     return environment.get(ENABLE) == "true"
 
@@ -286,7 +286,7 @@ _NAME_IT = (
 )
 _ENV = '`eval "$(sros env ROOT NAME)"` sets all of them.'
 
-ENABLE_MISSPELT = Kind(
+ENABLE_MISSPELT = FindingKind(
     "runtime.enable-misspelt",
     ERROR,
     "ROS_SECURITY_ENABLE is neither true nor false",
@@ -295,7 +295,7 @@ ENABLE_MISSPELT = Kind(
     _RCL,
     f"Write ROS_SECURITY_ENABLE=true. {_ENV}",
 )
-NOT_ENABLED = Kind(
+NOT_ENABLED = FindingKind(
     "runtime.not-enabled",
     WARNING,
     "security is prepared and not switched on",
@@ -303,7 +303,7 @@ NOT_ENABLED = Kind(
     _RCL,
     f"Write ROS_SECURITY_ENABLE=true, or unset the others. {_ENV}",
 )
-MISSPELT = Kind(
+MISSPELT = FindingKind(
     "runtime.variable-misspelt",
     ERROR,
     "a variable that nobody reads",
@@ -311,7 +311,7 @@ MISSPELT = Kind(
     _RCL,
     "Correct the name.",
 )
-STRATEGY_MISSPELT = Kind(
+STRATEGY_MISSPELT = FindingKind(
     "runtime.strategy-misspelt",
     ERROR,
     "ROS_SECURITY_STRATEGY is neither Enforce nor Permissive",
@@ -320,7 +320,7 @@ STRATEGY_MISSPELT = Kind(
     _RCL,
     f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV}",
 )
-NOT_ENFORCED = Kind(
+NOT_ENFORCED = FindingKind(
     "runtime.not-enforced",
     WARNING,
     "security is on and not enforced",
@@ -329,7 +329,7 @@ NOT_ENFORCED = Kind(
     _RCL,
     f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV}",
 )
-KEYSTORE_UNSET = Kind(
+KEYSTORE_UNSET = FindingKind(
     "runtime.keystore-unset",
     ERROR,
     "security is on and no keystore is named",
@@ -337,7 +337,7 @@ KEYSTORE_UNSET = Kind(
     _RCL,
     f"Set ROS_SECURITY_KEYSTORE. {_ENV}",
 )
-KEYSTORE_NOT_FOUND = Kind(
+KEYSTORE_NOT_FOUND = FindingKind(
     "runtime.keystore-not-found",
     ERROR,
     "ROS_SECURITY_KEYSTORE names no keystore",
@@ -345,7 +345,7 @@ KEYSTORE_NOT_FOUND = Kind(
     _RCL,
     f"Correct the path. {_ENV}",
 )
-KEYSTORE_RELATIVE = Kind(
+KEYSTORE_RELATIVE = FindingKind(
     "runtime.keystore-relative",
     WARNING,
     "ROS_SECURITY_KEYSTORE is a relative path",
@@ -353,7 +353,7 @@ KEYSTORE_RELATIVE = Kind(
     _RCL,
     f"Write the whole path. {_ENV}",
 )
-ENCLAVE_NOT_FOUND = Kind(
+ENCLAVE_NOT_FOUND = FindingKind(
     "runtime.enclave-not-found",
     ERROR,
     "the enclave is not in the keystore",
@@ -361,7 +361,7 @@ ENCLAVE_NOT_FOUND = Kind(
     _RCL,
     "Correct the name, or make it with `sros create_enclave`.",
 )
-NO_ENCLAVE = Kind(
+NO_ENCLAVE = FindingKind(
     "runtime.enclave-unset",
     WARNING,
     "no enclave is named",
@@ -370,7 +370,7 @@ NO_ENCLAVE = Kind(
     _RCL,
     _NAME_IT,
 )
-UNSECURED_WITHOUT_ENCLAVE = Kind(
+UNSECURED_WITHOUT_ENCLAVE = FindingKind(
     "runtime.unsecured-without-enclave",
     ERROR,
     "no enclave is named, and nodes run unsecured",
@@ -379,7 +379,7 @@ UNSECURED_WITHOUT_ENCLAVE = Kind(
     _RCL,
     f"Write ROS_SECURITY_STRATEGY=Enforce. {_NAME_IT}",
 )
-DOMAIN_MALFORMED = Kind(
+DOMAIN_MALFORMED = FindingKind(
     "runtime.domain-malformed",
     ERROR,
     "ROS_DOMAIN_ID is no domain id",
@@ -387,7 +387,7 @@ DOMAIN_MALFORMED = Kind(
     "rcl 9 (rcl/src/rcl/domain_id.c: strtoul with base 0); domains above 230 Cyclone DDS refuses.",
     "Write one whole number from 0 to 230, without leading zeros.",
 )
-DOMAIN_NOT_GOVERNED = Kind(
+DOMAIN_NOT_GOVERNED = FindingKind(
     "runtime.domain-not-governed",
     ERROR,
     "the keystore is not made for this domain",
@@ -396,7 +396,7 @@ DOMAIN_NOT_GOVERNED = Kind(
     "DDS-Security 1.1, 9.4.1.2; measured.",
     "Set ROS_DOMAIN_ID to a domain of the keystore, or make one with --domain.",
 )
-CA_KEY_HERE = Kind(
+CA_KEY_HERE = FindingKind(
     "runtime.ca-key-present",
     NOTE,
     "nodes run with the keystore that has the keys of the CAs",
@@ -417,7 +417,7 @@ _OLD = {
 _CLOSE = 0.88
 
 
-def check_variables(setting: Setting) -> Iterator[Finding]:
+def _check_variables(setting: Setting) -> Iterator[Finding]:
     """The variables, and the enclave that they name, as a node would load it."""
     environment = setting.environment
     yield from _spelling(environment)
@@ -510,4 +510,4 @@ def _value(environment: Mapping[str, str], name: str) -> str:
 
 def runtime_findings(setting: Setting) -> list[Finding]:
     """Everything that is found in an environment and on its host."""
-    return joined([*check_variables(setting), *check_host(setting)])
+    return joined([*_check_variables(setting), *_check_host(setting)])

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from sros_tool.checks.kind import Finding, Kind
+from sros_tool.checks.kind import Finding, FindingKind
 
 VERSION = "2.1.0"
 SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
@@ -15,7 +15,7 @@ _BASE = "SRCROOT"
 
 
 def sarif(
-    findings: Sequence[Finding], kinds: Sequence[Kind], *, version: str, base: Path
+    findings: Sequence[Finding], kinds: Sequence[FindingKind], *, version: str, base: Path
 ) -> dict[str, Any]:
     """A SARIF log of one run, in which ``kinds`` are the rules.
 
@@ -38,7 +38,7 @@ def sarif(
     return {"$schema": SCHEMA, "version": VERSION, "runs": [run]}
 
 
-def _rule(kind: Kind) -> dict[str, Any]:
+def _rule(kind: FindingKind) -> dict[str, Any]:
     return {
         "id": kind.id,
         "name": "".join(part.capitalize() for part in kind.id.replace(".", "-").split("-")),

@@ -14,7 +14,7 @@ import click
 
 from sros_tool import __version__
 from sros_tool.checks.kind import Finding
-from sros_tool.checks.registry import Chosen, Selection, select_kinds
+from sros_tool.checks.registry import ChosenFindings, FindingFilter, select_kinds
 from sros_tool.checks.sarif import sarif
 from sros_tool.cli.common import (
     PATH,
@@ -152,7 +152,7 @@ def check(
     the environment and the processes of this machine.
     """
     from sros_tool.checks.kind import Severity
-    from sros_tool.checks.registry import Selection
+    from sros_tool.checks.registry import FindingFilter
 
     family, paths = _family(targets)
     form = "json" if as_json else "sarif" if as_sarif else form
@@ -164,7 +164,7 @@ def check(
         if form == "sarif":
             raise UsageError("--needs-renewal finds no faults to tell in SARIF", "", "Say --json.")
         return _needs_renewal(root, needs_renewal, at.now, form == "json")
-    selection = Selection(include, exclude, Severity[severity.upper()], strict, vendor or "")
+    selection = FindingFilter(include, exclude, Severity[severity.upper()], strict, vendor or "")
     if as_list:
         print_list(selection, form)
         return 0
@@ -293,7 +293,7 @@ def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> in
 _SCHEMA = 1
 
 
-def _print_text(chosen: Chosen, _selection: Selection) -> None:
+def _print_text(chosen: ChosenFindings, _selection: FindingFilter) -> None:
     for each in chosen.shown:
         click.echo(visible("\n".join(finding_lines(each))))
     for choice in dict.fromkeys(each.accepted for each in chosen.accepted):
@@ -311,7 +311,7 @@ def finding_lines(finding: Finding) -> list[str]:
     return [head, f"    {told}{finding.text}{by}", f"    {finding.remedy}"]
 
 
-def _summary(chosen: Chosen) -> str:
+def _summary(chosen: ChosenFindings) -> str:
     counts = _counts(chosen)
     told = [f"{number} {word}{'s' * (number != 1)}" for word, number in counts.items() if number]
     number = chosen.hidden
@@ -319,12 +319,12 @@ def _summary(chosen: Chosen) -> str:
     return f"{', '.join(told) or 'nothing found'}{hidden}"
 
 
-def _counts(chosen: Chosen) -> dict[str, int]:
+def _counts(chosen: ChosenFindings) -> dict[str, int]:
     words = [each.severity.word for each in chosen.shown]
     return {word: words.count(word) for word in ("error", "warning", "note")}
 
 
-def _print_json(chosen: Chosen, _selection: Selection) -> None:
+def _print_json(chosen: ChosenFindings, _selection: FindingFilter) -> None:
     print_json(
         {
             "version": _SCHEMA,
@@ -335,13 +335,13 @@ def _print_json(chosen: Chosen, _selection: Selection) -> None:
     )
 
 
-def _print_sarif(chosen: Chosen, selection: Selection) -> None:
+def _print_sarif(chosen: ChosenFindings, selection: FindingFilter) -> None:
 
     kinds, findings = select_kinds(selection), (*chosen.shown, *chosen.accepted)
     print_json(sarif(findings, kinds, version=__version__, base=Path.cwd()))
 
 
-def print_list(selection: Selection, form: str) -> None:
+def print_list(selection: FindingFilter, form: str) -> None:
     """Show the kinds of findings that are selected."""
 
     kinds = list(select_kinds(selection))
@@ -353,7 +353,7 @@ def print_list(selection: Selection, form: str) -> None:
         click.echo(f"{each.id:{width}}  {each.severity.word:7}  {each.title}")
 
 
-SHOW: Mapping[str, Callable[[Chosen, Selection], None]] = {
+SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
     "text": _print_text,
     "json": _print_json,
     "sarif": _print_sarif,

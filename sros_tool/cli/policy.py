@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sros_tool.errors import Note
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.merge import Merged
-    from sros_tool.policy.rights import Difference, Right
+    from sros_tool.policy.rights import Right, RightsDifference
 
 
 def output_option(help_text: str) -> Callable[[Decorated], Decorated]:
@@ -143,7 +143,7 @@ def _say_added(merged: Merged) -> None:
 
 
 def _print_merged_json(policy: Path, merged: Merged, written: Path | None, *, show: bool) -> None:
-    from sros_tool.policy.merge import Text
+    from sros_tool.policy.merge import EditedText
 
     value: dict[str, Any] = {
         "policy": str(policy),
@@ -152,7 +152,7 @@ def _print_merged_json(policy: Path, merged: Merged, written: Path | None, *, sh
         "output": str(written) if written else None,
     }
     if show:
-        value["document"] = Text(merged.document, str(policy)).text
+        value["document"] = EditedText(merged.document, str(policy)).text
     print_json(value)
 
 
@@ -219,7 +219,7 @@ def diff_policy(a: Path, b: Path, as_json: bool) -> int:
     return 0 if not difference and first.sound and second.sound else 1
 
 
-def _difference_lines(difference: Difference) -> list[str]:
+def _difference_lines(difference: RightsDifference) -> list[str]:
     lines = []
     for sign, right in difference.lines():
         by = ", ".join(each.told() for each in difference.covered.get(right, ()))
@@ -229,7 +229,7 @@ def _difference_lines(difference: Difference) -> list[str]:
 
 
 def _difference_json(
-    first: RightsSource, second: RightsSource, difference: Difference
+    first: RightsSource, second: RightsSource, difference: RightsDifference
 ) -> dict[str, Any]:
     return {
         "equal": not difference,
@@ -304,7 +304,7 @@ def policies(target: Path | None, as_json: bool, dry_run: bool) -> None:
 
 
 if TYPE_CHECKING:
-    from sros_tool.policy.minimize import EnclaveUse, Minimized, Proposal
+    from sros_tool.policy.minimize import EnclaveUse, MinimizedPolicy, WildcardProposal
     from sros_tool.policy.model import Group, Policy
     from sros_tool.policy.rights import Right
 
@@ -408,7 +408,7 @@ def _common() -> Sequence[Group]:
     return [group for each in basics.enclaves for p in each.all_profiles() for group in p.groups]
 
 
-def _notes(given: Policy, result: Minimized, seen: frozenset[Right]) -> Iterator[Note]:
+def _notes(given: Policy, result: MinimizedPolicy, seen: frozenset[Right]) -> Iterator[Note]:
     unseen = [use.enclave for use in result.uses if not use.seen]
     if unseen:
         text = f"never observed, and so left as they are: {', '.join(unseen)}."
@@ -425,10 +425,12 @@ class _Measured:
 
     before: int
     after: int
-    proposals: tuple[Proposal, ...] = ()
+    proposals: tuple[WildcardProposal, ...] = ()
 
 
-def _measure(given: Policy, result: Minimized, seen: frozenset[Right]) -> dict[str, _Measured]:
+def _measure(
+    given: Policy, result: MinimizedPolicy, seen: frozenset[Right]
+) -> dict[str, _Measured]:
     from sros_tool.dds.permissions import MAX_SIGNED_BYTES
     from sros_tool.keystore.issuing.size import Scale, right_bytes
     from sros_tool.policy.minimize import propose_wildcards
@@ -438,7 +440,7 @@ def _measure(given: Policy, result: Minimized, seen: frozenset[Right]) -> dict[s
     measured = {}
     for before, after in zip(given.enclaves, result.policy.enclaves, strict=True):
         sizes = scale.signed_bytes(before), scale.signed_bytes(after)
-        proposals: tuple[Proposal, ...] = ()
+        proposals: tuple[WildcardProposal, ...] = ()
         if sizes[1] > MAX_SIGNED_BYTES - _ROOM:
             proposals = propose_wildcards(
                 after.path,
@@ -499,7 +501,7 @@ def _lines(use: EnclaveUse, measured: _Measured) -> Iterator[str]:
 
 
 def _json(
-    policy: Path, result: Minimized, measured: dict[str, _Measured], output: Path | None
+    policy: Path, result: MinimizedPolicy, measured: dict[str, _Measured], output: Path | None
 ) -> dict[str, Any]:
     from sros_tool.dds.permissions import MAX_SIGNED_BYTES
 

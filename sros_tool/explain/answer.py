@@ -10,7 +10,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sros_tool.dds.decision.answers import Decision, Outcome, Verb
+from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.governance import DomainRule
 from sros_tool.dds.permissions import Grant
@@ -163,7 +163,7 @@ def deciding_lines(policy: Enclave, answer: Answer) -> tuple[PolicyLine, ...]:
     rule = answer.grant.rules[answer.decision.rule or 0]
     qualifier = ALLOW if rule.allow else DENY
     # Cyclone DDS denies a topic as a whole, also by a rule of the other direction.
-    other = Verb.SUBSCRIBE if part.verb is Verb.PUBLISH else Verb.PUBLISH
+    other = AccessVerb.SUBSCRIBE if part.verb is AccessVerb.PUBLISH else AccessVerb.PUBLISH
     for verb in (part.verb, other):
         found = tuple(
             each
@@ -194,6 +194,6 @@ def _lines(policy: Enclave) -> Iterator[PolicyLine]:
                     yield PolicyLine(source, qualifier, right, name, group, profile)
 
 
-def _topics(line: PolicyLine, verb: Verb) -> tuple[str, ...]:
+def _topics(line: PolicyLine, verb: AccessVerb) -> tuple[str, ...]:
     names = dds_names(line.right, expand(line.name, line.profile.ns, line.profile.node))
-    return names.publish if verb is Verb.PUBLISH else names.subscribe
+    return names.publish if verb is AccessVerb.PUBLISH else names.subscribe

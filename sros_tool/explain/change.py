@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from lxml import etree
 
-from sros_tool.dds.decision.answers import Verb
+from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
 from sros_tool.explain.answer import Answer, lines_of_right
@@ -112,7 +112,7 @@ def _blocking(rights: Iterable[Right], answer: Answer) -> list[Right]:
     by a denial of either direction.
     """
     expression = answer.decision.expression or ""
-    publishes = answer.part is not None and answer.part.verb is Verb.PUBLISH
+    publishes = answer.part is not None and answer.part.verb is AccessVerb.PUBLISH
     own: list[Right] = []
     other: list[Right] = []
     for right in rights:

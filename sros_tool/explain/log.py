@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from shlex import quote
 
-from sros_tool.dds.decision.answers import Verb
+from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain.answer import Answer
 from sros_tool.explain.denials import Denial, nodes_served, read_denials, serving_node
@@ -389,5 +389,5 @@ def _in_ros_terms(denial: Denial) -> tuple[str, str]:
 
 def _question(denial: Denial) -> Question:
     """Return the question about that one topic."""
-    part = Part(Verb(denial.direction), denial.topic)
+    part = Part(AccessVerb(denial.direction), denial.topic)
     return Question(denial.direction, "topic", denial.direction, denial.topic, (part,))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from sros_tool.dds.decision.answers import Verb
+from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.errors import UsageError
 from sros_tool.names import ROS_DISCOVERY_TOPIC, expression_problem, is_expression
 from sros_tool.policy.model import ALLOW
@@ -37,7 +37,7 @@ _ROLES = {"rq": "requests", "rr": "replies"}
 class Part:
     """One DDS endpoint that a right needs; ``role`` names it in ROS terms, "" for a topic."""
 
-    verb: Verb
+    verb: AccessVerb
     topic: str
     role: str = ""
 
@@ -47,8 +47,8 @@ class Part:
 
 
 OWN_PARTS = (
-    Part(Verb.PUBLISH, ROS_DISCOVERY_TOPIC, "node names"),
-    Part(Verb.SUBSCRIBE, ROS_DISCOVERY_TOPIC, "node names"),
+    Part(AccessVerb.PUBLISH, ROS_DISCOVERY_TOPIC, "node names"),
+    Part(AccessVerb.SUBSCRIBE, ROS_DISCOVERY_TOPIC, "node names"),
 )
 """What every ROS 2 process needs before anything else."""
 
@@ -73,8 +73,12 @@ class Question:
         if self.only or not self.right:
             return self.only
         names = dds_names(self.right, self.name)
-        published = (Part(Verb.PUBLISH, topic, _role(topic, self.type)) for topic in names.publish)
-        read = (Part(Verb.SUBSCRIBE, topic, _role(topic, self.type)) for topic in names.subscribe)
+        published = (
+            Part(AccessVerb.PUBLISH, topic, _role(topic, self.type)) for topic in names.publish
+        )
+        read = (
+            Part(AccessVerb.SUBSCRIBE, topic, _role(topic, self.type)) for topic in names.subscribe
+        )
         return (*published, *read)
 
     def allowed(self, enclave: str) -> Right:

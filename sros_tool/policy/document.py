@@ -44,7 +44,7 @@ _MAX_BYTES = 64 * 1024 * 1024
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class IncludedFile:
     """A document, and the includes through which it was reached."""
 
     file: Path
@@ -83,8 +83,8 @@ class Includer:
         self._digests.append(hashlib.sha256(content).digest())
 
     def children(
-        self, parent: etree._Element, place: Place
-    ) -> Iterator[tuple[etree._Element, Place]]:
+        self, parent: etree._Element, place: IncludedFile
+    ) -> Iterator[tuple[etree._Element, IncludedFile]]:
         """The child elements of ``parent`` with includes replaced by what they stand for."""
         for child in parent:
             if child.tag in _INCLUDES:
@@ -93,8 +93,8 @@ class Includer:
                 yield child, place
 
     def _included(
-        self, element: etree._Element, place: Place
-    ) -> Iterator[tuple[etree._Element, Place]]:
+        self, element: etree._Element, place: IncludedFile
+    ) -> Iterator[tuple[etree._Element, IncludedFile]]:
         where = f"{place.file}:{element.sourceline}"
         self._count += 1
         if self._count > _MAX_INCLUDES or len(place.trail) >= _MAX_DEPTH:
@@ -118,7 +118,7 @@ class Includer:
             target = self.load(file)
         except DocumentError as error:
             raise PolicyError(f"{where}: {error.what}", error.why, error.remedy) from error
-        inner = Place(file, (*place.trail, step))
+        inner = IncludedFile(file, (*place.trail, step))
         found = [target] if not pointer else _point(target, pointer, where)
         for each in found:
             # What an xpointer selects may itself be an include.
@@ -127,7 +127,7 @@ class Includer:
             else:
                 yield each, inner
 
-    def _resolve(self, href: str, place: Place, where: str) -> Path:
+    def _resolve(self, href: str, place: IncludedFile, where: str) -> Path:
         if not href:
             return place.file
         path = Path(unquote(href))
@@ -192,7 +192,7 @@ class _Reader:
 
     def policy(self) -> Policy:
         root = self._includer.load(self._file)
-        place = Place(self._file)
+        place = IncludedFile(self._file)
         where = self._where(root, place)
         if root.tag != "policy":
             raise PolicyError(
@@ -230,7 +230,7 @@ class _Reader:
         read = tuple(replace(enclave, digest=digest) for enclave in enclaves.values())
         return Policy(read, version, str(self._shown))
 
-    def _enclave(self, element: etree._Element, place: Place) -> Enclave:
+    def _enclave(self, element: etree._Element, place: IncludedFile) -> Enclave:
         self._attributes(element, place, required=("path",))
         try:
             path = check_enclave_name(element.get("path", ""))
@@ -248,7 +248,7 @@ class _Reader:
             )
         return Enclave(path, blocks, self._source(element, place))
 
-    def _profiles(self, element: etree._Element, place: Place) -> Profiles:
+    def _profiles(self, element: etree._Element, place: IncludedFile) -> Profiles:
         self._attributes(element, place, optional=("type",))
         profiles: list[Profile] = []
         metadata = ""
@@ -263,7 +263,7 @@ class _Reader:
             raise PolicyError(f"{self._where(element, place)}: <profiles> holds no <profile>")
         return Profiles(tuple(profiles), element.get("type", ""), metadata)
 
-    def _profile(self, element: etree._Element, place: Place) -> Profile:
+    def _profile(self, element: etree._Element, place: IncludedFile) -> Profile:
         self._attributes(element, place, required=("ns", "node"))
         node = element.get("node", "")
         try:
@@ -281,7 +281,7 @@ class _Reader:
         groups = tuple(self._group(child, at, node) for child, at in self._children(element, place))
         return Profile(ns, node, groups, self._source(element, place))
 
-    def _group(self, element: etree._Element, place: Place, node: str) -> Group:
+    def _group(self, element: etree._Element, place: IncludedFile, node: str) -> Group:
         kind = tag_of(element)
         if kind not in RIGHTS:
             raise PolicyError(
@@ -316,7 +316,7 @@ class _Reader:
             lines = tuple(child.sourceline or 0 for child, _ in items)
         return Group(kind, tuple(rights), names, self._source(element, place), lines)
 
-    def _name(self, element: etree._Element, place: Place, node: str) -> str:
+    def _name(self, element: etree._Element, place: IncludedFile, node: str) -> str:
         name = element.text or ""
         problem = expression_problem(name)
         if not problem and name.startswith("~") and not node:
@@ -334,8 +334,8 @@ class _Reader:
         return name
 
     def _children(
-        self, element: etree._Element, place: Place
-    ) -> list[tuple[etree._Element, Place]]:
+        self, element: etree._Element, place: IncludedFile
+    ) -> list[tuple[etree._Element, IncludedFile]]:
         for text in (element.text, *(child.tail for child in element)):
             if text and not text.isspace():
                 raise PolicyError(
@@ -345,8 +345,8 @@ class _Reader:
         return list(self._includer.children(element, place))
 
     def _expect(
-        self, element: etree._Element, place: Place, tag: str
-    ) -> tuple[etree._Element, Place]:
+        self, element: etree._Element, place: IncludedFile, tag: str
+    ) -> tuple[etree._Element, IncludedFile]:
         if element.tag != tag:
             raise PolicyError(
                 f"{self._where(element, place)}: <{tag_of(element)}> stands where <{tag}> must"
@@ -356,7 +356,7 @@ class _Reader:
     def _attributes(
         self,
         element: etree._Element,
-        place: Place,
+        place: IncludedFile,
         *,
         required: tuple[str, ...] = (),
         optional: tuple[str, ...] = (),
@@ -377,12 +377,12 @@ class _Reader:
                     f"{self._where(element, place)}: <{tag_of(element)}> lacks its {name}="
                 )
 
-    def _source(self, element: etree._Element, place: Place) -> Source:
+    def _source(self, element: etree._Element, place: IncludedFile) -> Source:
         file = place.file
         shown = str(self._shown) if file == self._file else str(file)
         return Source(shown, element.sourceline or 0)
 
-    def _where(self, element: etree._Element, place: Place) -> str:
+    def _where(self, element: etree._Element, place: IncludedFile) -> str:
         return str(self._source(element, place))
 
 

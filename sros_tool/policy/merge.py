@@ -28,13 +28,13 @@ from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Qualifier
 from sros_tool.policy.rights import (
     RIGHT_ORDER,
+    GroupRights,
     Right,
     Rules,
-    Said,
     folded,
+    groupable,
     order,
     policy_rights,
-    sayable,
 )
 from sros_tool.xml import parse, read_bytes, tag_of
 
@@ -55,16 +55,16 @@ class Contradiction:
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class AddedName:
     """A name to be added to a profile, as it is to be written, with the rights to be added."""
 
     kind: str
     name: str
-    rights: Said
+    rights: GroupRights
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class ProfileKey:
     """A profile: of which enclave, namespace and node."""
 
     enclave: str
@@ -73,15 +73,15 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class MergePlan:
     """What is to be added where, the same as rights, and what contradicts."""
 
-    entries: dict[Place, tuple[Entry, ...]]
+    entries: dict[ProfileKey, tuple[AddedName, ...]]
     added: tuple[Right, ...]
     contradictions: tuple[Contradiction, ...]
 
 
-def plan_merge(before: Policy, additions: Policy) -> Plan:
+def plan_merge(before: Policy, additions: Policy) -> MergePlan:
     """What ``before`` lacks of ``additions``.
 
     Not added is what ``before`` says already for that enclave, by whatever profile or wildcard,
@@ -98,11 +98,11 @@ class _Planner:
         self._wanted: dict[Right, bool] = {}
         self._contradictions: list[Contradiction] = []
 
-    def plan(self) -> Plan:
-        names: dict[Place, dict[tuple[str, str], _Name]] = {}
+    def plan(self) -> MergePlan:
+        names: dict[ProfileKey, dict[tuple[str, str], _Name]] = {}
         for enclave in self._additions.enclaves:
             for profile in enclave.all_profiles():
-                place = Place(enclave.path, profile.ns, profile.node)
+                place = ProfileKey(enclave.path, profile.ns, profile.node)
                 here = names.setdefault(place, {})
                 for group in profile.groups:
                     for name in group.names:
@@ -117,7 +117,7 @@ class _Planner:
             if found
         }
         added = [right for right, wanted in self._wanted.items() if wanted]
-        return Plan(entries, tuple(sorted(added, key=order)), tuple(self._contradictions))
+        return MergePlan(entries, tuple(sorted(added, key=order)), tuple(self._contradictions))
 
     def _is_wanted(self, right: Right) -> bool:
         known = self._wanted.get(right)
@@ -147,17 +147,17 @@ class _Name:
     rights: dict[tuple[str, Qualifier], None]
 
 
-def _entries(found: dict[tuple[str, str], _Name]) -> Iterable[Entry]:
+def _entries(found: dict[tuple[str, str], _Name]) -> Iterable[AddedName]:
     for (kind, _), name in found.items():
-        for qualifiers in sayable(name.rights):
-            yield Entry(kind, name.written, qualifiers)
+        for qualifiers in groupable(name.rights):
+            yield AddedName(kind, name.written, qualifiers)
 
 
-def _place_order(place: Place) -> tuple[str, str, str]:
+def _place_order(place: ProfileKey) -> tuple[str, str, str]:
     return place.enclave, place.ns, place.node
 
 
-def _entry_order(entry: Entry) -> tuple[int, Said, str]:
+def _entry_order(entry: AddedName) -> tuple[int, GroupRights, str]:
     return RIGHT_ORDER[entry.rights[0][0]], entry.rights, entry.name
 
 
@@ -194,7 +194,7 @@ _COMMENTS_OF_THE_LINE = re.compile(r"(?:[ \t]*<!--.*?-->)+(?=[ \t]*(?:\r?\n|\Z))
 
 
 @dataclass(slots=True)
-class Element:
+class PlacedElement:
     """An element and its places in the text: characters from the start of the document.
 
     ``inner`` is where its content begins, ``close`` where its end tag does; an element without
@@ -206,7 +206,7 @@ class Element:
     inner: int
     close: int = 0
     end: int = 0
-    children: list[Element] = field(default_factory=list)
+    children: list[PlacedElement] = field(default_factory=list)
 
     @property
     def tag(self) -> str:
@@ -217,12 +217,12 @@ class Element:
         """The value of an attribute, or ""."""
         return self.xml.get(attribute, "")
 
-    def named(self, tag: str) -> Iterator[Element]:
+    def named(self, tag: str) -> Iterator[PlacedElement]:
         """The child elements of that tag which stand here themselves (not through an include)."""
         return (child for child in self.children if child.tag == tag)
 
 
-class Text:
+class EditedText:
     """A policy file as text; edits are collected, and made all at once."""
 
     def __init__(self, data: bytes, name: str) -> None:
@@ -248,11 +248,11 @@ class Text:
             "Save it as UTF-8.",
         )
 
-    def _elements(self, root: etree._Element) -> Element:
+    def _elements(self, root: etree._Element) -> PlacedElement:
         """The tree of places.  lxml knows what the elements are, but not where they stand."""
         nodes = root.iter()
-        top: Element | None = None
-        stack: list[Element] = []
+        top: PlacedElement | None = None
+        stack: list[PlacedElement] = []
         for mark in _MARKUP.finditer(self.text):
             if mark["close"]:
                 stack[-1].close, stack[-1].end = mark.start(), mark.end()
@@ -262,7 +262,7 @@ class Text:
                 if node is None or etree.QName(node).localname != mark["open"].split(":")[-1]:
                     raise self._unsuitable(f"<{mark['open']}> is not where it was expected.")
                 end = mark.end()
-                element = Element(node, mark.start(), end, end, end)
+                element = PlacedElement(node, mark.start(), end, end, end)
                 if stack:
                     stack[-1].children.append(element)
                 top = top or element
@@ -274,7 +274,7 @@ class Text:
 
     # ── how it is laid out ─────────────────────────────────────────────────────────────────
 
-    def indent_of(self, element: Element) -> str | None:
+    def indent_of(self, element: PlacedElement) -> str | None:
         """The white space before an element that begins its line; None for one that does not."""
         line = max(self.text.rfind("\n", 0, element.start), self.text.rfind("\r", 0, element.start))
         before = self.text[line + 1 : element.start].removeprefix("\ufeff")
@@ -295,7 +295,7 @@ class Text:
             stack += parent.children[:1]
         return "  "
 
-    def after(self, element: Element) -> int:
+    def after(self, element: PlacedElement) -> int:
         """The place behind an element and the comments that follow on its line."""
         comments = _COMMENTS_OF_THE_LINE.match(self.text, element.end)
         if comments and self.indent_of(element) is not None:
@@ -404,12 +404,12 @@ def _item(kind: str, name: str) -> _New:
     return _New(kind.removesuffix("s"), name)
 
 
-def _group(kind: str, rights: Said, names: Iterable[str]) -> _New:
+def _group(kind: str, rights: GroupRights, names: Iterable[str]) -> _New:
     attributes = "".join(f' {right}="{qualifier.value}"' for right, qualifier in rights)
     return _New(kind + attributes, children=[_item(kind, name) for name in names])
 
 
-def _groups(entries: Sequence[Entry]) -> list[_New]:
+def _groups(entries: Sequence[AddedName]) -> list[_New]:
     """The groups for names that come sorted by kind and rights."""
     return [
         _group(kind, rights, [entry.name for entry in same])
@@ -417,7 +417,7 @@ def _groups(entries: Sequence[Entry]) -> list[_New]:
     ]
 
 
-def _profile(place: Place, entries: Sequence[Entry]) -> _New:
+def _profile(place: ProfileKey, entries: Sequence[AddedName]) -> _New:
     return _New(f'profile ns="{place.ns}" node="{place.node}"', children=_groups(entries))
 
 
@@ -428,9 +428,9 @@ class _Editor:
     def __init__(self, document: bytes, path: Path, policy: Policy) -> None:
         self._path = path
         self._policy = policy
-        self._text = Text(document, f"the policy file '{path}'")
+        self._text = EditedText(document, f"the policy file '{path}'")
 
-    def add(self, entries: dict[Place, tuple[Entry, ...]]) -> bytes:
+    def add(self, entries: dict[ProfileKey, tuple[AddedName, ...]]) -> bytes:
         """The document with ``entries``."""
         blocks = list(self._text.root.named("enclaves"))
         own = {each.get("path"): each for block in blocks for each in block.named("enclave")}
@@ -452,8 +452,10 @@ class _Editor:
             self._append(blocks[0], _New(f'enclave path="{path}"', children=[profiles]))
         return self._text.document()
 
-    def _add_to_enclave(self, enclave: Element, places: dict[Place, tuple[Entry, ...]]) -> None:
-        own: dict[tuple[str, str], list[Element]] = {}
+    def _add_to_enclave(
+        self, enclave: PlacedElement, places: dict[ProfileKey, tuple[AddedName, ...]]
+    ) -> None:
+        own: dict[tuple[str, str], list[PlacedElement]] = {}
         blocks = list(enclave.named("profiles"))
         for block in blocks:
             for profile in block.named("profile"):
@@ -471,8 +473,8 @@ class _Editor:
         elif new:
             self._append(enclave, _New("profiles", children=new))
 
-    def _add_to_profiles(self, profiles: list[Element], entries: Sequence[Entry]) -> None:
-        groups: dict[tuple[str, Said], Element] = {}
+    def _add_to_profiles(self, profiles: list[PlacedElement], entries: Sequence[AddedName]) -> None:
+        groups: dict[tuple[str, GroupRights], PlacedElement] = {}
         for profile in profiles:
             for child in profile.children:
                 if child.tag in RIGHTS:
@@ -483,7 +485,7 @@ class _Editor:
             if group := groups.get((kind, rights)):
                 self._add_names(group, kind, [entry.name for entry in same])
 
-    def _add_names(self, group: Element, kind: str, names: Sequence[str]) -> None:
+    def _add_names(self, group: PlacedElement, kind: str, names: Sequence[str]) -> None:
         """Put names where they belong in a sorted group, and at the end of any other."""
         present = [child.xml.text or "" for child in group.named(kind.removesuffix("s"))]
         is_sorted = len(present) == len(group.children) and present == sorted(present)
@@ -499,7 +501,7 @@ class _Editor:
 
     # ── writing them there ─────────────────────────────────────────────────────────────────
 
-    def _append(self, parent: Element, new: _New) -> None:
+    def _append(self, parent: PlacedElement, new: _New) -> None:
         """Write an element behind the last one of ``parent`` that is not its metadata."""
         last = next((each for each in reversed(parent.children) if each.tag != "metadata"), None)
         if last:
@@ -507,11 +509,11 @@ class _Editor:
         else:
             self._put_into_empty(parent, new)
 
-    def _put_after(self, sibling: Element, new: _New) -> None:
+    def _put_after(self, sibling: PlacedElement, new: _New) -> None:
         indent = self._text.indent_of(sibling)
         self._text.put(self._text.after(sibling), self._rendered(new, indent))
 
-    def _put_first(self, parent: Element, new: _New) -> None:
+    def _put_first(self, parent: PlacedElement, new: _New) -> None:
         """Write an element before all others, but not before a comment that may be about all."""
         text, first = self._text, parent.children[0]
         if text.text[parent.inner : first.start].strip():
@@ -519,7 +521,7 @@ class _Editor:
         else:
             text.put(parent.inner, self._rendered(new, text.indent_of(first)))
 
-    def _put_into_empty(self, parent: Element, new: _New) -> None:
+    def _put_into_empty(self, parent: PlacedElement, new: _New) -> None:
         text, outer = self._text, self._text.indent_of(parent)
         indent = None if outer is None else outer + text.unit
         rendered = self._rendered(new, indent)
@@ -545,7 +547,7 @@ class _Editor:
         return f"{before}<{new.start}>{children}{before}</{tag}>"
 
 
-def _rights_of(group: Element) -> Said:
+def _rights_of(group: PlacedElement) -> GroupRights:
     return tuple(
         (right, Qualifier(group.get(right))) for right in RIGHTS[group.tag] if group.get(right)
     )

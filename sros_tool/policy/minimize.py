@@ -22,19 +22,19 @@ from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile,
 from sros_tool.policy.patterns import compiled, covers, literal_prefix, matches
 from sros_tool.policy.rights import (
     KIND_OF,
+    GroupRights,
     Right,
     Rules,
-    Said,
     folded,
+    groupable,
     order,
     parts,
     policy_rights,
-    sayable,
     unfolded,
 )
 
 
-def narrowed_enclave(
+def _narrowed_enclave(
     enclave: Enclave, kept: Set[Right], replacements: Mapping[Right, Sequence[Right]]
 ) -> Enclave:
     """``enclave`` with its denials, the ALLOW rights in ``kept``, and names for wildcards.
@@ -67,9 +67,9 @@ def _profile(
                 for each in pending.pop(whole, ()):
                     written = _written(each.name, name, profile)
                     said.setdefault((each.kind, written), {})[each.right, ALLOW] = None
-    groups: dict[tuple[str, Said], list[str]] = {}
+    groups: dict[tuple[str, GroupRights], list[str]] = {}
     for (kind, name), rights in said.items():
-        for together in sayable(rights):
+        for together in groupable(rights):
             groups.setdefault((kind, together), []).append(name)
     return replace(
         profile,
@@ -91,11 +91,11 @@ def _written(fqn: str, like: str, profile: Profile) -> str:
     return f"~/{rest}" if like.startswith("~") else rest
 
 
-Pair = tuple[str, str]
+_Pair = tuple[str, str]
 
 
 @dataclass(frozen=True, slots=True)
-class Wide:
+class _WideRule:
     """A wildcard, the observed rights that rest on it, and what can stand in its place.
 
     ``replacement`` leaves out what other rules of the enclave allow by its exact name.
@@ -119,7 +119,7 @@ class EnclaveUse:
     seen: bool
     unused: tuple[Right, ...]
     common: tuple[Right, ...]
-    wide: tuple[Wide, ...]
+    wide: tuple[_WideRule, ...]
     refused: tuple[Right, ...]
     allowed_pairs: int
     observed_pairs: int
@@ -132,14 +132,16 @@ class EnclaveUse:
 
 
 @dataclass(frozen=True, slots=True)
-class Minimized:
+class MinimizedPolicy:
     """The narrowed policy, without includes, and the use of each enclave."""
 
     policy: Policy
     uses: tuple[EnclaveUse, ...]
 
 
-def minimize(policy: Policy, observed: Iterable[Right], common: Sequence[Group] = ()) -> Minimized:
+def minimize(
+    policy: Policy, observed: Iterable[Right], common: Sequence[Group] = ()
+) -> MinimizedPolicy:
     """Narrow ``policy`` to the ALLOW rights of ``observed``.
 
     A DENY always stays.  ``common`` is what every node needs, said for a node: where the policy
@@ -150,7 +152,7 @@ def minimize(policy: Policy, observed: Iterable[Right], common: Sequence[Group] 
     for right in seen:
         by_enclave[right.enclave].add(right)
     needed = (right for enclave in policy.enclaves for right in _for_nodes(enclave, common))
-    names = KnownNames((policy_rights(policy), seen, needed))
+    names = _KnownNames((policy_rights(policy), seen, needed))
     enclaves, uses = [], []
     for enclave in policy.enclaves:
         enclave, use = _Narrowing(
@@ -158,10 +160,10 @@ def minimize(policy: Policy, observed: Iterable[Right], common: Sequence[Group] 
         ).result()
         enclaves.append(enclave)
         uses.append(use)
-    return Minimized(Policy(tuple(enclaves), policy.version, policy.file), tuple(uses))
+    return MinimizedPolicy(Policy(tuple(enclaves), policy.version, policy.file), tuple(uses))
 
 
-class KnownNames:
+class _KnownNames:
     """All exact names that policies and observations hold, by kind, sorted."""
 
     def __init__(self, all_rights: Iterable[Iterable[Right]]) -> None:
@@ -194,7 +196,7 @@ class _Narrowing:
         enclave: Enclave,
         observed: frozenset[Right],
         common: Sequence[Group],
-        names: KnownNames,
+        names: _KnownNames,
     ) -> None:
         self._enclave = enclave
         self._names = names
@@ -232,9 +234,9 @@ class _Narrowing:
         wide = self._narrowed(kept)
         self._prove([*kept, *(right for each in wide for right in each.replacement)])
         replacements = {each.rule: each.replacement for each in wide}
-        return narrowed_enclave(self._enclave, kept, replacements), self._told(kept, wide)
+        return _narrowed_enclave(self._enclave, kept, replacements), self._told(kept, wide)
 
-    def _told(self, kept: set[Right], wide: Sequence[Wide]) -> EnclaveUse:
+    def _told(self, kept: set[Right], wide: Sequence[_WideRule]) -> EnclaveUse:
         seen = bool(self._observed)
         unused = [right for right in self._stated if not self._is_observed(right)]
         rewritten = {each.rule for each in wide}
@@ -267,7 +269,7 @@ class _Narrowing:
             for seen in self._use.meeting(part)
         )
 
-    def _narrowed(self, kept: set[Right]) -> tuple[Wide, ...]:
+    def _narrowed(self, kept: set[Right]) -> tuple[_WideRule, ...]:
         """The wildcards that were used, or mean common rights, with what no other rule allows."""
         wide = [rule for rule in self._stated if is_expression(rule.name) and rule not in kept]
         owners: dict[Right, list[Right]] = defaultdict(list)
@@ -290,7 +292,7 @@ class _Narrowing:
         for right in folded(p for p in needed if self._is_allowed(p) and not others.cover(p)):
             replacement[homes(right)[0]].append(right)
         return tuple(
-            Wide(
+            _WideRule(
                 rule,
                 tuple(sorted(used[rule], key=order)),
                 tuple(sorted(replacement[rule], key=order)),
@@ -313,10 +315,10 @@ class _Narrowing:
 
     # ── counting ───────────────────────────────────────────────────────────────────────────
 
-    def _pairs(self, rights: Iterable[Right]) -> set[Pair]:
+    def _pairs(self, rights: Iterable[Right]) -> set[_Pair]:
         """The pairs of a right and a known name that ``rights`` allow and nothing denies."""
         rights = folded(rights)
-        found: set[Pair] = set()
+        found: set[_Pair] = set()
         wild = False
         for right in rights:
             if is_expression(right.name):
@@ -335,7 +337,7 @@ class _Narrowing:
             if not self._rules.meeting(Right(self._enclave.path, DENY, *pair))
         }
 
-    def _with_actions(self, found: set[Pair], rules: Rules) -> set[Pair]:
+    def _with_actions(self, found: set[_Pair], rules: Rules) -> set[_Pair]:
         """The pairs, with every action that ``rules`` mean as a whole told as that alone."""
         told = set(found)
         for action in ("call", "execute"):
@@ -362,7 +364,7 @@ _FEWEST = 3  # names that are worth a wildcard
 
 
 @dataclass(frozen=True, slots=True)
-class Proposal:
+class WildcardProposal:
     """A wildcard in place of names: ``saves`` bytes of the signed document.
 
     ``adds`` are the topics and services known from elsewhere that it would newly allow.  A safe
@@ -382,7 +384,7 @@ def propose_wildcards(
     *,
     needed: int,
     size: Callable[[Right], int],
-) -> tuple[Proposal, ...]:
+) -> tuple[WildcardProposal, ...]:
     """Wildcards by which the document of an enclave becomes ``needed`` bytes smaller, if possible.
 
     ``rights`` are the enclave's, ``known`` those of every enclave, ``size`` tells the bytes that a
@@ -392,7 +394,7 @@ def propose_wildcards(
     own = [right for right in rights if right.enclave == enclave and right.qualifier is ALLOW]
     rules = Rules(own)
     foreign = _foreign(enclave, rules, known)
-    candidates: dict[frozenset[Right], Proposal] = {}
+    candidates: dict[frozenset[Right], WildcardProposal] = {}
     for rule, found in _candidates(own).items():
         other = candidates.get(frozenset(found))
         # Of wildcards that stand for the same names, the one that says most grants least.
@@ -400,11 +402,11 @@ def propose_wildcards(
             adds = tuple(sorted(_added(rule, foreign), key=order))
             saves = sum(map(size, found)) - size(rule)
             names = tuple(sorted(found, key=order))
-            candidates[frozenset(found)] = Proposal(rule, names, adds, saves)
+            candidates[frozenset(found)] = WildcardProposal(rule, names, adds, saves)
     best = sorted(
         candidates.values(), key=lambda each: (len(each.adds), -each.saves, order(each.rule))
     )
-    chosen: list[Proposal] = []
+    chosen: list[WildcardProposal] = []
     replaced: set[Right] = set()
     for each in best:
         if needed <= 0:
@@ -413,7 +415,7 @@ def propose_wildcards(
         saves = sum(map(size, names)) - size(each.rule)
         if len(names) < _FEWEST or saves <= 0:
             continue
-        chosen.append(Proposal(each.rule, names, each.adds, saves))
+        chosen.append(WildcardProposal(each.rule, names, each.adds, saves))
         replaced.update(names)
         needed -= saves
     return tuple(chosen)

@@ -75,11 +75,11 @@ def order(right: Right) -> tuple[str, int, str, str]:
     return right.enclave, RIGHT_ORDER[right.right], right.name, right.qualifier
 
 
-Said = tuple[tuple[str, Qualifier], ...]
+GroupRights = tuple[tuple[str, Qualifier], ...]
 """What a group says of its names: rights with their qualifiers, in the order of `RIGHTS`."""
 
 
-def sayable(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[Said]:
+def groupable(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
     """What groups are to say for ``rights`` on a name: two where one is allowed and denied."""
     ordered = sorted(rights, key=lambda each: (RIGHT_ORDER[each[0]], each[1]))
     if len({right for right, _ in ordered}) == len(ordered):
@@ -201,7 +201,7 @@ _Place = tuple[str, Qualifier, str]
 
 
 @dataclass(frozen=True, slots=True)
-class Difference:
+class RightsDifference:
     """The rights that only one side has, in normal form and sorted.
 
     ``covered`` tells for some of them by which wildcards the other side has them all the same.
@@ -222,7 +222,7 @@ class Difference:
 
 def compare(
     first: Iterable[Right], second: Iterable[Right], scope: frozenset[str] | None = None
-) -> Difference:
+) -> RightsDifference:
     """How two sets of rights differ, within the enclaves of ``scope`` (None: all).
 
     The difference is empty just if both allow and deny the same, with actions taken for the
@@ -240,4 +240,4 @@ def compare(
         for right in rights:
             if by := rules.covering(right):
                 covered[right] = tuple(sorted(folded(by), key=order))
-    return Difference(only_first, only_second, covered)
+    return RightsDifference(only_first, only_second, covered)

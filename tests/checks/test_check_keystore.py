@@ -10,7 +10,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
-from sros_tool.checks.registry import Selection
+from sros_tool.checks.registry import FindingFilter
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.keystore.layout import enclave_path
@@ -26,7 +26,7 @@ NOW = datetime.now(UTC)
 
 
 def ids(root: Path, now: datetime = NOW) -> list[str]:
-    chosen = Selection().choose(keystore_findings(root, now=now))
+    chosen = FindingFilter().choose(keystore_findings(root, now=now))
     return [each.id for each in chosen.shown]
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from sros_tool.checks import runtime
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Severity
-from sros_tool.checks.registry import KINDS, Selection
+from sros_tool.checks.registry import KINDS, FindingFilter
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UsageError
 from tests.checks import keystore_cases, policy_cases, runtime_cases, test_policy_findings
@@ -64,27 +64,27 @@ ONE, OTHER = KINDS["keystore.one-authority"], KINDS["portable.grant-name"]
 @pytest.mark.parametrize(
     ("selection", "wanted"),
     [
-        (Selection(), {ONE, OTHER}),
-        (Selection(include=("keystore.*",)), {ONE}),
-        (Selection(exclude=("keystore.one-authority",)), {OTHER}),
-        (Selection(include=("keystore.*",), exclude=("*.one-*",)), set()),
-        (Selection(vendor="cyclonedds"), {ONE}),
-        (Selection(vendor="fastdds"), {ONE, OTHER}),
-        (Selection(severity=ERROR), set()),
+        (FindingFilter(), {ONE, OTHER}),
+        (FindingFilter(include=("keystore.*",)), {ONE}),
+        (FindingFilter(exclude=("keystore.one-authority",)), {OTHER}),
+        (FindingFilter(include=("keystore.*",), exclude=("*.one-*",)), set()),
+        (FindingFilter(vendor="cyclonedds"), {ONE}),
+        (FindingFilter(vendor="fastdds"), {ONE, OTHER}),
+        (FindingFilter(severity=ERROR), set()),
     ],
 )
-def test_selection(selection: Selection, wanted: set[Any]) -> None:
+def test_selection(selection: FindingFilter, wanted: set[Any]) -> None:
     found = [ONE.found("x", "y"), OTHER.found("x", "y")]
     assert {each.kind for each in selection.choose(found).shown} == wanted
 
 
 def test_what_was_accepted_is_named_and_does_not_count() -> None:
     found = [ONE.found("x", "y", accepted="template sros2")]
-    chosen = Selection().choose(found)
+    chosen = FindingFilter().choose(found)
     assert (chosen.shown, len(chosen.accepted)) == ((), 1)
     assert not chosen.fails(WARNING)
-    assert Selection(strict=True).choose(found).fails(WARNING)
-    shown = Selection(severity=NOTE).choose(found)
+    assert FindingFilter(strict=True).choose(found).fails(WARNING)
+    shown = FindingFilter(severity=NOTE).choose(found)
     assert [each.severity for each in shown.shown] == [NOTE]
     assert shown.fails(NOTE)
     assert not shown.fails(WARNING)
@@ -92,11 +92,11 @@ def test_what_was_accepted_is_named_and_does_not_count() -> None:
 
 def test_an_id_that_there_is_not() -> None:
     with pytest.raises(UsageError):
-        Selection(include=("policy.nonsense",))
+        FindingFilter(include=("policy.nonsense",))
 
 
 def test_groups_stand_for_their_kinds() -> None:
-    kinds = [k for k in KINDS.values() if Selection(include=("enclave.not-loadable",)).wants(k)]
+    kinds = [k for k in KINDS.values() if FindingFilter(include=("enclave.not-loadable",)).wants(k)]
     assert len(kinds) > 20
     assert all(kind.severity is Severity.ERROR for kind in kinds)
 

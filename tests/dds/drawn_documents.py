@@ -16,7 +16,7 @@ from random import Random
 
 from hypothesis import strategies as st
 
-from sros_tool.dds.decision.answers import Verb
+from sros_tool.dds.decision.answers import AccessVerb
 from tests.dds.decision_documents import NOW
 from tests.dds.drawn_words import (
     DOMAINS,
@@ -35,7 +35,7 @@ from tests.dds.xml_forms import GOVERNANCE, PERMISSIONS
 
 FORMS = ("form",) * 20
 """So often in place of an oddity a form of XML over which parsers differ."""
-Question = tuple[Verb, str, tuple[str, ...]]
+Question = tuple[AccessVerb, str, tuple[str, ...]]
 
 
 @dataclass(frozen=True)
@@ -122,9 +122,9 @@ class _Draw:
     # ── questions ──────────────────────────────────────────────────────────────────────────
 
     def questions(self) -> Iterator[Question]:
-        yield Verb.JOIN, "", ()
+        yield AccessVerb.JOIN, "", ()
         for _ in range(self.random.randint(3, 7)):
-            verb = self.random.choice((Verb.PUBLISH, Verb.SUBSCRIBE))
+            verb = self.random.choice((AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE))
             topic = self.random.choice(ODD_TOPICS if self.seldom(0.04) else TOPICS)
             few = self.random.sample(PARTITIONS, self.random.choice((1, 1, 2)))
             yield verb, topic, tuple(few) if self.seldom(0.25) else ()

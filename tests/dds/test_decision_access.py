@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import Outcome, Verb
+from sros_tool.dds.decision.answers import AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import (
     NOW,
@@ -43,7 +43,7 @@ def test_a_right_is_given_by_an_allow_rule(vendor: Vendor) -> None:
     assert decided.subscribe("rt/c").outcome is Outcome.ALLOWED
     assert decided.publish("rt/c").outcome is Outcome.DENIED
     assert decided.subscribe("rt/a").outcome is Outcome.DENIED
-    assert decided.decide(Verb.PUBLISH, "rt/d").outcome is Outcome.DENIED
+    assert decided.decide(AccessVerb.PUBLISH, "rt/d").outcome is Outcome.DENIED
 
 
 @pytest.mark.parametrize("vendor", VENDORS)

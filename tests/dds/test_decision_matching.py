@@ -10,7 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from sros_tool.dds.decision.matching import Expressions, matches
+from sros_tool.dds.decision.matching import ExpressionIndex, matches
 from sros_tool.dds.decision.vendors import Style
 from tests.support.children import LONG
 
@@ -61,10 +61,10 @@ def test_cyclone_matches_as_its_plugin(cyclone: ctypes.CDLL, expression: str, na
 
 @given(st.lists(expressions, max_size=8), names)
 def test_positions_are_those_of_one_after_the_other(texts: list[str], name: str) -> None:
-    found = list(Expressions(Style.FNMATCH, texts).matching(name))
+    found = list(ExpressionIndex(Style.FNMATCH, texts).matching(name))
     assert found == [i for i, text in enumerate(texts) if matches(Style.FNMATCH, text, name)]
 
 
 def test_both_ways_takes_the_name_for_an_expression_too() -> None:
-    assert Expressions(Style.FNMATCH, ["rt/open"], both_ways=True).first("rt/o*") == 0
-    assert Expressions(Style.FNMATCH, ["rt/open"]).first("rt/o*") is None
+    assert ExpressionIndex(Style.FNMATCH, ["rt/open"], both_ways=True).first("rt/o*") == 0
+    assert ExpressionIndex(Style.FNMATCH, ["rt/open"]).first("rt/o*") is None

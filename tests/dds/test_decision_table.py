@@ -13,7 +13,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import Outcome, Refusal, Verb
+from sros_tool.dds.decision.answers import AccessVerb, Outcome, Refusal
 from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import (
     NOW,
@@ -49,7 +49,7 @@ class Row:
     permissions: bytes
     answers: str
     topic: str = "rt/a"
-    verb: Verb = Verb.PUBLISH
+    verb: AccessVerb = AccessVerb.PUBLISH
     partitions: tuple[str, ...] = ()
     governance: bytes = governance()
     zone: str = "UTC"
@@ -84,7 +84,7 @@ HOUR = (moment(-1), moment(1))
 OPEN_TOP = "<id_range><max>50</max></id_range>"
 OPEN_END = "<id_range><min>40</min></id_range>"
 WHOLE = "<id_range><min>42</min></id_range>"
-READER = Verb.SUBSCRIBE
+READER = AccessVerb.SUBSCRIBE
 
 ROWS = [
     pattern("rt/*", "rt/a/b/c", "yes yes yes yes"),
@@ -325,7 +325,7 @@ ROWS = [
         one(allow(A)),
         "refused yes yes refused",
         "",
-        Verb.JOIN,
+        AccessVerb.JOIN,
         governance=governance(domains=THERE),
     ),
     Row(

@@ -8,7 +8,7 @@ import pytest
 
 from sros_tool.dds.decision import cyclone as cyclone_xml
 from sros_tool.dds.decision import fastdds
-from sros_tool.dds.decision.elements import Element, Mark, UnreadableError
+from sros_tool.dds.decision.elements import NodeMark, UnreadableError, XmlElement
 
 REFUSED = None
 
@@ -16,8 +16,8 @@ TABLE = [
     # the content of <a>, what TinyXML-2 finds in it, what Cyclone DDS does
     ("x", ["x"], ["x"]),
     (" x ", [" x "], ["x"]),
-    ("<!-- -- -->x", [Mark.COMMENT, "x"], ["x"]),
-    ("x<!-- c -->y", ["x", Mark.COMMENT, "y"], ["xy"]),
+    ("<!-- -- -->x", [NodeMark.COMMENT, "x"], ["x"]),
+    ("x<!-- c -->y", ["x", NodeMark.COMMENT, "y"], ["xy"]),
     ("\n<![CDATA[x]]>", ["x"], ["x"]),
     ("x<![CDATA[<y>]]>", ["x", "<y>"], ["x<y>"]),
     ("<![CDATA[x]]><![CDATA[y]]>", ["x", "y"], REFUSED),
@@ -31,22 +31,24 @@ TABLE = [
     ("\n&x", ["\n\nx"], REFUSED),  # it writes into what it reads, and of & nothing
     ("<?pi?>x", REFUSED, REFUSED),
     ("x<?pi?>", REFUSED, ["x"]),
-    ("<!x>y", [Mark.OTHER, "y"], REFUSED),
-    ("<b/>x", [Element("b"), "x"], REFUSED),
-    ("<b/> ", [Element("b")], [Element("b")]),
-    ("< b/>", [Element("b")], REFUSED),
-    ("<b></b >", [Element("b")], REFUSED),
-    ("<b c='1' c='2'/>", REFUSED, [Element("b", {"c": "2"})]),
-    ("<b c='<&lt;'/>", [Element("b", {"c": "<<"})], [Element("b", {"c": "<<"})]),
-    ("<d:b/>", [Element("d:b")], [Element("d:b")]),
-    ("<_b/>", [Element("_b")], REFUSED),
+    ("<!x>y", [NodeMark.OTHER, "y"], REFUSED),
+    ("<b/>x", [XmlElement("b"), "x"], REFUSED),
+    ("<b/> ", [XmlElement("b")], [XmlElement("b")]),
+    ("< b/>", [XmlElement("b")], REFUSED),
+    ("<b></b >", [XmlElement("b")], REFUSED),
+    ("<b c='1' c='2'/>", REFUSED, [XmlElement("b", {"c": "2"})]),
+    ("<b c='<&lt;'/>", [XmlElement("b", {"c": "<<"})], [XmlElement("b", {"c": "<<"})]),
+    ("<d:b/>", [XmlElement("d:b")], [XmlElement("d:b")]),
+    ("<_b/>", [XmlElement("_b")], REFUSED),
     ("<b></c>", REFUSED, REFUSED),
     ('"x', ['"x'], REFUSED),
 ]
 READERS = {"Fast DDS": fastdds.read, "Cyclone DDS": cyclone_xml.read}
 
 
-def content(read: Callable[[bytes], Element], xml: str) -> list[Element | str | Mark] | None:
+def content(
+    read: Callable[[bytes], XmlElement], xml: str
+) -> list[XmlElement | str | NodeMark] | None:
     try:
         return read(xml.encode()).children
     except UnreadableError:
@@ -92,6 +94,6 @@ def test_documents(xml: str, fast: bool, cyclone: bool) -> None:
 
 
 @pytest.mark.parametrize("read", READERS.values(), ids=READERS)
-def test_bytes_that_are_no_utf_8_stay_apart(read: Callable[[bytes], Element]) -> None:
+def test_bytes_that_are_no_utf_8_stay_apart(read: Callable[[bytes], XmlElement]) -> None:
     assert read("<a>ö</a>".encode()).children == ["ö"]
     assert read(b"<a>\xff</a>").children == ["\udcff"]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 import sros_tool.dds.decision as decision
-from sros_tool.dds.decision.answers import Verb
+from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.errors import UsageError
 from sros_tool.explain.question import TYPES, WORDS, ask
 from sros_tool.explain.remedy import known_causes, remedy
@@ -37,8 +37,10 @@ def test_every_combination(word: str, kind: str) -> None:
     question = ask(word, "/x", kind)
     assert question.right == MEANT[word, kind]
     names = dds_names(question.right, "/x")
-    assert tuple(p.topic for p in question.parts if p.verb is Verb.PUBLISH) == names.publish
-    assert tuple(p.topic for p in question.parts if p.verb is Verb.SUBSCRIBE) == names.subscribe
+    assert tuple(p.topic for p in question.parts if p.verb is AccessVerb.PUBLISH) == names.publish
+    assert (
+        tuple(p.topic for p in question.parts if p.verb is AccessVerb.SUBSCRIBE) == names.subscribe
+    )
     assert all(bool(part.role) == (kind != "topic") for part in question.parts)
 
 

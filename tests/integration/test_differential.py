@@ -20,7 +20,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, seed, settings
 
 from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import Outcome, Refusal, Verb
+from sros_tool.dds.decision.answers import AccessVerb, Outcome, Refusal
 from sros_tool.dds.decision.vendors import Vendor, VendorTraits
 from tests.dds.drawn_documents import documents
 from tests.integration.drawn_cases import cases as drawn_cases
@@ -145,7 +145,9 @@ def draw_sensible(count: int, number: int, now: datetime) -> list[Case]:
             Case(
                 each.governance_xml,
                 each.permissions_xml,
-                tuple(Question(*asked) for asked in each.questions if asked[0] is not Verb.JOIN),
+                tuple(
+                    Question(*asked) for asked in each.questions if asked[0] is not AccessVerb.JOIN
+                ),
                 each.subject,
                 each.domain,
                 each.zone,
@@ -245,7 +247,7 @@ def disagreements(vendor: Vendor, case: Case, reply: Reply, at: datetime) -> Ite
         return
     join = access.join()
     decisions = [
-        access.decide(Verb(each.verb), each.topic, each.partitions) for each in case.questions
+        access.decide(AccessVerb(each.verb), each.topic, each.partitions) for each in case.questions
     ]
     if reply.end == "crashed":
         if not any(each.outcome is Outcome.CRASHES for each in (join, *decisions)):

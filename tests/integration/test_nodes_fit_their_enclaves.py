@@ -20,7 +20,7 @@ from typing import Any
 import pytest
 
 from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import Outcome, Verb
+from sros_tool.dds.decision.answers import AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY, Backend, conditions
@@ -57,7 +57,7 @@ RIGHT = {
 }
 """The right that a process of one node needs beside those of every node."""
 
-Endpoint = tuple[Verb, str]
+Endpoint = tuple[AccessVerb, str]
 Key = tuple[Role, tuple[str, ...], str]
 """What decides which endpoints a process has: its role, the names of its nodes, its ROS name."""
 
@@ -93,8 +93,11 @@ def denied(access: Access, endpoints: set[Endpoint]) -> set[Endpoint]:
 
 def endpoints_of(nodes: list[dict[str, Any]]) -> set[Endpoint]:
     """What these nodes write and read as the graph has it, and what every participant does."""
-    found = {(Verb(way), topic) for each in nodes for way, topic in raw(each)}
-    return found | {(Verb.PUBLISH, ROS_DISCOVERY_TOPIC), (Verb.SUBSCRIBE, ROS_DISCOVERY_TOPIC)}
+    found = {(AccessVerb(way), topic) for each in nodes for way, topic in raw(each)}
+    return found | {
+        (AccessVerb.PUBLISH, ROS_DISCOVERY_TOPIC),
+        (AccessVerb.SUBSCRIBE, ROS_DISCOVERY_TOPIC),
+    }
 
 
 def raw(node: dict[str, Any]) -> Iterator[tuple[str, str]]:
@@ -103,8 +106,8 @@ def raw(node: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 def named(right: str, name: str) -> set[Endpoint]:
     topics = dds_names(right, name)
-    return {(Verb.PUBLISH, topic) for topic in topics.publish} | {
-        (Verb.SUBSCRIBE, topic) for topic in topics.subscribe
+    return {(AccessVerb.PUBLISH, topic) for topic in topics.publish} | {
+        (AccessVerb.SUBSCRIBE, topic) for topic in topics.subscribe
     }
 
 

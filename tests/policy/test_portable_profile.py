@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import Verb
+from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import render_governance
@@ -54,7 +54,7 @@ def test_vendors_agree(policy: Policy, template: str, zone: int) -> None:
         ]
         for direction, topic in sorted(EVERYTHING):
             said = {
-                answer.decide(Verb(direction), topic).outcome.ok
+                answer.decide(AccessVerb(direction), topic).outcome.ok
                 for answer in answers
                 if isinstance(answer, Access)
             }

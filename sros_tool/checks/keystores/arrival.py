@@ -11,7 +11,7 @@ from typing import Any
 from sros_tool.checks.keystores.enclaves import WAITS
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
-from sros_tool.checks.registry import Selection
+from sros_tool.checks.registry import FindingFilter
 from sros_tool.errors import DocumentError
 from sros_tool.keystore.layout import (
     OPTIONAL_FILES,
@@ -119,7 +119,7 @@ def verify_arrival(
             "Name the folder into which `sros distribute_key` or `sros import` has written.",
         )
     found = keystore_findings(root, now=now, zone=zone, domain=domain, only=only, on_robot=True)
-    shown = Selection().choose(found).shown
+    shown = FindingFilter().choose(found).shown
     return Arrival(
         path,
         root,

@@ -10,7 +10,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
@@ -30,7 +30,7 @@ from sros_tool.pki.keys import algorithm, load_key
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
-NOT_A_CA = Kind(
+NOT_A_CA = FindingKind(
     "keystore.not-a-ca",
     ERROR,
     "a CA certificate that does not say that it is one",
@@ -38,7 +38,7 @@ NOT_A_CA = Kind(
     "RFC 5280, 4.2.1.9 and 4.2.1.3 (BasicConstraints, KeyUsage keyCertSign).",
     "Replace it with `sros rotate_ca ROOT`.",
 )
-CA_EXTENSIONS = Kind(
+CA_EXTENSIONS = FindingKind(
     "keystore.ca-extensions",
     NOTE,
     "a CA certificate without key identifiers or key usage",
@@ -47,7 +47,7 @@ CA_EXTENSIONS = Kind(
     "RFC 5280, 4.2.1.1 to 4.2.1.3; openssl verify -x509_strict.",
     "Replace it with `sros rotate_ca ROOT`, if intermediates are to come.",
 )
-INTERMEDIATE = Kind(
+INTERMEDIATE = FindingKind(
     "portable.intermediate",
     WARNING,
     "a CA that is not self-signed",
@@ -57,7 +57,7 @@ INTERMEDIATE = Kind(
     "Fast DDS 2.9.1 and 2.14.5 (FileProvider.cpp), Cyclone DDS 0.10.2; measured.",
     "Use a root for robots of its own, unless all run a Fast DDS that takes it.",
 )
-CA_PURPOSE = Kind(
+CA_PURPOSE = FindingKind(
     "portable.ca-purpose",
     WARNING,
     "a permissions CA whose certificate is not for signing documents",
@@ -68,7 +68,7 @@ CA_PURPOSE = Kind(
     "Replace it with `sros rotate_ca ROOT`, or issue its certificate anew with digitalSignature.",
     vendors=(Vendor.FAST_2_9, Vendor.CYCLONE),
 )
-KEY_ALGORITHM = Kind(
+KEY_ALGORITHM = FindingKind(
     "portable.key-algorithm",
     WARNING,
     "a key that not every vendor takes",
@@ -77,7 +77,7 @@ KEY_ALGORITHM = Kind(
     "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5; measured.",
     "Use EC prime256v1, as sros does.",
 )
-SIGNATURE_HASH = Kind(
+SIGNATURE_HASH = FindingKind(
     "portable.signature-hash",
     WARNING,
     "a certificate that is not signed with SHA-256",
@@ -137,7 +137,7 @@ def _extensions(
         yield CA_EXTENSIONS.found(subject, f"{name} lacks {', '.join(missing)}", file)
 
 
-UNREADABLE = Kind(
+UNREADABLE = FindingKind(
     "keystore.file-unreadable",
     ERROR,
     "a file of the keystore that cannot be read",
@@ -145,7 +145,7 @@ UNREADABLE = Kind(
     "sros keystore layout.",
     "Restore it from a backup.",
 )
-ONE_AUTHORITY = Kind(
+ONE_AUTHORITY = FindingKind(
     "keystore.one-authority",
     WARNING,
     "one CA issues identities and signs permissions",
@@ -154,7 +154,7 @@ ONE_AUTHORITY = Kind(
     "CVE-2023-24011 class; an enclave did so here on Cyclone DDS 0.10.2 and was heard.",
     "Make a keystore with separate CAs, which all templates but sros2 do.",
 )
-CA_ENDS = Kind(
+CA_ENDS = FindingKind(
     "keystore.ca-ends-soon",
     WARNING,
     "a CA that ends soon",
@@ -162,7 +162,7 @@ CA_ENDS = Kind(
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
     "Begin now, with `sros rotate_ca ROOT`.",
 )
-CA_EXPIRED = Kind(
+CA_EXPIRED = FindingKind(
     "keystore.ca-expired",
     ERROR,
     "a CA of the keystore is not valid now",
@@ -170,7 +170,7 @@ CA_EXPIRED = Kind(
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 (Error '10' verifying CA certificate).",
     "Replace it with `sros rotate_ca ROOT`, or correct the clock.",
 )
-CA_MISSING = Kind(
+CA_MISSING = FindingKind(
     "keystore.ca-missing",
     ERROR,
     "the certificate of a CA is missing",
@@ -178,7 +178,7 @@ CA_MISSING = Kind(
     "ROS 2 keystore layout (public/).",
     "Restore it from a backup; any enclave that was exported has a copy.",
 )
-CA_MISMATCH = Kind(
+CA_MISMATCH = FindingKind(
     "keystore.ca-key-mismatch",
     ERROR,
     "the key and the certificate of a CA do not belong together",
@@ -186,7 +186,7 @@ CA_MISMATCH = Kind(
     "RFC 5280, 6.1.3.",
     "Restore the pair from a backup.",
 )
-CA_KEY_PLAIN = Kind(
+CA_KEY_PLAIN = FindingKind(
     "keystore.ca-key-plain",
     NOTE,
     "the key of a CA lies in the keystore without a passphrase",
@@ -194,7 +194,7 @@ CA_KEY_PLAIN = Kind(
     "ros2/sros2 issue 282; NIST SP 800-57 part 1, 6 (protection of keys).",
     "Make keystores with --encrypt-ca-keys or with keys on a token, or keep private/ offline.",
 )
-SETTINGS_MISSING = Kind(
+SETTINGS_MISSING = FindingKind(
     "keystore.settings-missing",
     WARNING,
     "a keystore of sros without its settings",
@@ -203,7 +203,7 @@ SETTINGS_MISSING = Kind(
     "sros: sros.toml holds the choices that a keystore was made by.",
     "Restore sros.toml from a backup.",
 )
-LEDGER_MISSING = Kind(
+LEDGER_MISSING = FindingKind(
     "keystore.ledger-missing",
     WARNING,
     "a keystore of sros without its ledger",
@@ -212,7 +212,7 @@ LEDGER_MISSING = Kind(
     "sros: ledger.jsonl lists everything that was issued.",
     "Restore ledger.jsonl from a backup.",
 )
-CRL_ENDS = Kind(
+CRL_ENDS = FindingKind(
     "keystore.revocation-list-ends",
     ERROR,
     "a revocation list that ends soon, or ended",
@@ -220,7 +220,7 @@ CRL_ENDS = Kind(
     "RFC 5280, 5.1.2.5; Fast DDS 2.14.5; measured.",
     "Run `sros crl ROOT --refresh`.",
 )
-CRL_ISSUER = Kind(
+CRL_ISSUER = FindingKind(
     "keystore.revocation-list-issuer",
     ERROR,
     "a revocation list that is not of the identity CA",

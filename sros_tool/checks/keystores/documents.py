@@ -1,7 +1,11 @@
-"""Signed permissions outside of the portable profile: where vendors read or decide differently."""
+"""Findings in the signed documents of an enclave: permissions, governance, and what vendors decide.
+
+Outside of the portable profile vendors read or decide differently.
+"""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -9,14 +13,14 @@ from math import isfinite
 
 from sros_tool.checks.keystores.enclaves import grant_of, plain, plain_file
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.checks.policies import outside_findings
 from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import Refusal, Verb
+from sros_tool.dds.decision.answers import AccessVerb, Refusal
 from sros_tool.dds.decision.matching import read_moment
 from sros_tool.dds.decision.vendors import FAST_DDS, MEASURED, Moments, Vendor
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
-from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule
+from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Grant, Rule, render_permissions
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import GOVERNANCE_XML
@@ -27,7 +31,7 @@ from sros_tool.policy.patterns import covers, overlap
 from sros_tool.translate import governance_for
 from sros_tool.validity import iso
 
-SEVERAL_GRANTS = Kind(
+SEVERAL_GRANTS = FindingKind(
     "portable.several-grants",
     WARNING,
     "several grants in one document",
@@ -36,7 +40,7 @@ SEVERAL_GRANTS = Kind(
     "Fast DDS 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
     "Write one grant in one document for each enclave.",
 )
-DEFAULT_ALLOW = Kind(
+DEFAULT_ALLOW = FindingKind(
     "portable.default-allow",
     WARNING,
     "a grant that allows by default",
@@ -44,7 +48,7 @@ DEFAULT_ALLOW = Kind(
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write <default>DENY</default>, and allow what is meant.",
 )
-ALLOW_RULES = Kind(
+ALLOW_RULES = FindingKind(
     "portable.several-allow-rules",
     NOTE,
     "several allow rules in one grant",
@@ -54,7 +58,7 @@ ALLOW_RULES = Kind(
     "Put all topics into one allow rule.",
     vendors=FAST_DDS,
 )
-PARTITIONS = Kind(
+PARTITIONS = FindingKind(
     "portable.partitions",
     WARNING,
     "partitions in a rule",
@@ -63,7 +67,7 @@ PARTITIONS = Kind(
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Leave partitions out.",
 )
-DOMAIN_RANGE = Kind(
+DOMAIN_RANGE = FindingKind(
     "portable.domain-range",
     ERROR,
     "a range of domains that vendors read differently",
@@ -72,7 +76,7 @@ DOMAIN_RANGE = Kind(
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write <id>, or <min> and <max> up to 230.",
 )
-GRANT_NAME = Kind(
+GRANT_NAME = FindingKind(
     "portable.grant-name",
     WARNING,
     "a grant without a name",
@@ -81,7 +85,7 @@ GRANT_NAME = Kind(
     'Write <grant name="...">.',
     vendors=FAST_DDS,
 )
-SUBJECT = Kind(
+SUBJECT = FindingKind(
     "portable.subject",
     WARNING,
     "a subject that vendors compare differently",
@@ -90,7 +94,7 @@ SUBJECT = Kind(
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write it as RFC 4514 does, CN=/name, without , | and quotes in the name.",
 )
-TIME_FORMAT = Kind(
+TIME_FORMAT = FindingKind(
     "portable.time-format",
     WARNING,
     "a moment that vendors read differently",
@@ -99,7 +103,7 @@ TIME_FORMAT = Kind(
     "DDS-Security 1.1, 9.4.1.3.2.2; Fast DDS 2.14.5 (mktime), Cyclone DDS 0.10.2; measured.",
     "Write CCYY-MM-DDThh:mm:ssZ.",
 )
-TIME_WINDOW = Kind(
+TIME_WINDOW = FindingKind(
     "portable.validity-window",
     WARNING,
     "a validity that begins or ends within hours, in some time zones",
@@ -109,7 +113,7 @@ TIME_WINDOW = Kind(
     "Sign them with a beginning 14 hours back or more, as sros does, and renew them in time.",
     vendors=FAST_DDS,
 )
-LOCAL_TIME = Kind(
+LOCAL_TIME = FindingKind(
     "enclave.permissions-local-time",
     ERROR,
     "permissions that Fast DDS refuses in the time zone of this host",
@@ -119,7 +123,7 @@ LOCAL_TIME = Kind(
     "Run `sros renew ROOT NAME`, or let the host run in UTC.",
     vendors=FAST_DDS,
 )
-CHARACTER_CLASS = Kind(
+CHARACTER_CLASS = FindingKind(
     "portable.character-class",
     WARNING,
     "a [class] of characters that vendors read differently",
@@ -128,7 +132,7 @@ CHARACTER_CLASS = Kind(
     "Fast DDS 2.14.5 (fnmatch), Cyclone DDS 0.10.2; measured.",
     "Use * or ?, or write the names out.",
 )
-EMPTY_TOPIC = Kind(
+EMPTY_TOPIC = FindingKind(
     "portable.empty-topic",
     ERROR,
     "a <topic> without text",
@@ -136,7 +140,7 @@ EMPTY_TOPIC = Kind(
     "Cyclone DDS 0.10.2 (a fault in create_topic), Fast DDS 2.9.1; measured.",
     "Remove it.",
 )
-NO_EFFECT = Kind(
+NO_EFFECT = FindingKind(
     "permissions.deny-without-effect",
     ERROR,
     "a deny rule behind an allow rule for the same topic",
@@ -144,7 +148,7 @@ NO_EFFECT = Kind(
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Put deny rules first, as sros does.",
 )
-UNREACHABLE = Kind(
+UNREACHABLE = FindingKind(
     "permissions.unreachable-rule",
     WARNING,
     "a topic of a rule that an earlier rule decides",
@@ -152,7 +156,7 @@ UNREACHABLE = Kind(
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Remove it, or put the narrower rule first.",
 )
-DOMAINS = Kind(
+DOMAINS = FindingKind(
     "enclave.permissions-domains",
     WARNING,
     "permissions and governance for different domains",
@@ -298,7 +302,7 @@ def _domains(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Findi
 _GOVERNANCE = "DDS-Security 1.1, 9.4.1.2"
 _TEMPLATE = "Make a keystore by a template with more protection, such as production."
 
-UNAUTHENTICATED = Kind(
+UNAUTHENTICATED = FindingKind(
     "governance.unauthenticated",
     ERROR,
     "participants without an identity may join",
@@ -307,7 +311,7 @@ UNAUTHENTICATED = Kind(
     f"{_GOVERNANCE} (allow_unauthenticated_participants); measured.",
     "Set it to false.",
 )
-NO_JOIN_CONTROL = Kind(
+NO_JOIN_CONTROL = FindingKind(
     "governance.no-join-control",
     WARNING,
     "whoever is authenticated may join, whatever its permissions",
@@ -316,7 +320,7 @@ NO_JOIN_CONTROL = Kind(
     f"{_GOVERNANCE} (enable_join_access_control); Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
     "Set enable_join_access_control to true.",
 )
-NO_ACCESS_CONTROL = Kind(
+NO_ACCESS_CONTROL = FindingKind(
     "governance.no-access-control",
     WARNING,
     "topics that everybody in the domain may read or write",
@@ -324,7 +328,7 @@ NO_ACCESS_CONTROL = Kind(
     f"{_GOVERNANCE} (enable_read_access_control, enable_write_access_control).",
     _TEMPLATE,
 )
-NO_ENCRYPTION = Kind(
+NO_ENCRYPTION = FindingKind(
     "governance.no-encryption",
     WARNING,
     "topics whose payload can be read on the wire",
@@ -332,7 +336,7 @@ NO_ENCRYPTION = Kind(
     f"{_GOVERNANCE} (data_protection_kind, metadata_protection_kind, rtps_protection_kind).",
     _TEMPLATE,
 )
-SIGNED_PAYLOAD = Kind(
+SIGNED_PAYLOAD = FindingKind(
     "governance.signed-payload",
     WARNING,
     "topics of which Fast DDS loses messages",
@@ -342,7 +346,7 @@ SIGNED_PAYLOAD = Kind(
     "Sign the submessage, with the payload in it (data NONE, metadata SIGN), or encrypt (data "
     "ENCRYPT).",
 )
-NOT_AUTHENTIC = Kind(
+NOT_AUTHENTIC = FindingKind(
     "governance.no-authenticity",
     ERROR,
     "topics whose messages anybody can forge",
@@ -350,7 +354,7 @@ NOT_AUTHENTIC = Kind(
     f"{_GOVERNANCE} (rtps, metadata and data protection kinds).",
     _TEMPLATE,
 )
-DISCOVERY_OPEN = Kind(
+DISCOVERY_OPEN = FindingKind(
     "governance.discovery-open",
     WARNING,
     "discovery without protection",
@@ -358,7 +362,7 @@ DISCOVERY_OPEN = Kind(
     f"{_GOVERNANCE} (discovery_protection_kind, enable_discovery_protection).",
     _TEMPLATE,
 )
-LIVELINESS_OPEN = Kind(
+LIVELINESS_OPEN = FindingKind(
     "governance.liveliness-open",
     WARNING,
     "liveliness without protection",
@@ -366,7 +370,7 @@ LIVELINESS_OPEN = Kind(
     f"{_GOVERNANCE} (liveliness_protection_kind, enable_liveliness_protection).",
     _TEMPLATE,
 )
-NO_TOPIC_RULE = Kind(
+NO_TOPIC_RULE = FindingKind(
     "governance.no-topic-rule",
     ERROR,
     "topics for which there is no rule",
@@ -375,7 +379,7 @@ NO_TOPIC_RULE = Kind(
     f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Put a rule for * last.",
 )
-GOVERNANCE_UNREACHABLE = Kind(
+UNREACHABLE_TOPIC_RULE = FindingKind(
     "governance.unreachable-rule",
     WARNING,
     "a topic rule that an earlier one hides",
@@ -383,7 +387,7 @@ GOVERNANCE_UNREACHABLE = Kind(
     f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
     "Put narrower rules first, as sros does.",
 )
-GOVERNANCE_DOMAIN_RANGE = Kind(
+GOVERNANCE_DOMAIN_RANGE = FindingKind(
     "governance.domain-range",
     ERROR,
     "a range of domains that vendors read differently",
@@ -392,7 +396,7 @@ GOVERNANCE_DOMAIN_RANGE = Kind(
     "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write <id>, or <min> and <max> up to 230.",
 )
-DIFFERS = Kind(
+DIFFERS = FindingKind(
     "governance.differs",
     ERROR,
     "enclaves with different governance",
@@ -400,7 +404,7 @@ DIFFERS = Kind(
     "DDS-Security 1.1, 8.4 (the protection attributes of both sides must agree).",
     "Replace the copy by a link to the governance of the keystore, or export the enclave again.",
 )
-XML_DIFFERS = Kind(
+XML_DIFFERS = FindingKind(
     "governance.xml-differs",
     WARNING,
     "governance.xml says something else than what is signed",
@@ -409,6 +413,15 @@ XML_DIFFERS = Kind(
     "Restore it from governance.p7s (`sros inspect` shows it).",
 )
 
+_OPEN = {
+    "allow_unauthenticated_participants": UNAUTHENTICATED,
+    "enable_join_access_control": NO_JOIN_CONTROL,
+    "discovery_protection_kind": DISCOVERY_OPEN,
+    "liveliness_protection_kind": LIVELINESS_OPEN,
+    "enable_discovery_protection": DISCOVERY_OPEN,
+    "enable_liveliness_protection": LIVELINESS_OPEN,
+}
+"""The finding where an attribute by itself protects nothing."""
 _SIGNING = (ProtectionKind.SIGN, ProtectionKind.SIGN_WITH_ORIGIN_AUTHENTICATION)
 _NONE = (ProtectionKind.NONE,)
 
@@ -467,18 +480,23 @@ def _let_in(rule: DomainRule) -> str:
     return f"on Fast DDS 2.14 anybody reads and writes {', '.join(opened[:3])}"
 
 
-def _domain_rule(rule: DomainRule) -> Iterator[tuple[Kind, str]]:
-    if rule.allow_unauthenticated_participants:
-        yield UNAUTHENTICATED, f"allow_unauthenticated_participants is true: {_let_in(rule)}"
-    if not rule.enable_join_access_control:
-        yield NO_JOIN_CONTROL, "enable_join_access_control is false"
-    if rule.discovery_protection_kind is ProtectionKind.NONE:
-        yield DISCOVERY_OPEN, "discovery_protection_kind is NONE"
-    if rule.liveliness_protection_kind is ProtectionKind.NONE:
-        yield LIVELINESS_OPEN, "liveliness_protection_kind is NONE"
+def _domain_rule(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
+    for each, text in _open_attributes(rule):
+        reason = f": {_let_in(rule)}" if _OPEN[each] is UNAUTHENTICATED else ""
+        yield _OPEN[each], f"{text}{reason}"
 
 
-def _topic_rules(rule: DomainRule) -> Iterator[tuple[Kind, str]]:
+def _open_attributes(rule: DomainRule | TopicRule) -> Iterator[tuple[str, str]]:
+    """Yield the attributes that protect nothing and have a finding of their own, in words."""
+    for each in attributes(type(rule)):
+        if each.name in _OPEN and each.is_open(rule):
+            yield (
+                each.name,
+                f"{each.name} is {json.dumps(each.open) if each.is_flag else each.open}",
+            )
+
+
+def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
     expressions = [each.topic_expression for each in rule.topic_access_rules]
     if not any(covers(each, "ros_discovery_info") for each in expressions):
         yield NO_TOPIC_RULE, "none matches ros_discovery_info"
@@ -489,12 +507,12 @@ def _topic_rules(rule: DomainRule) -> Iterator[tuple[Kind, str]]:
         hiding = next((e for e in expressions[:index] if covers(e, topic.topic_expression)), None)
         if hiding is not None:
             yield (
-                GOVERNANCE_UNREACHABLE,
+                UNREACHABLE_TOPIC_RULE,
                 f"the rule for {topic.topic_expression} stands behind that for {hiding}",
             )
 
 
-def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[Kind, str]]:
+def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[FindingKind, str]]:
     name = topic.topic_expression
     open_for = [
         word
@@ -517,10 +535,8 @@ def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[Kind, str]
         yield NO_ENCRYPTION, f"{name} is signed only"
     if topic.data_protection_kind in _SIGNING:
         yield SIGNED_PAYLOAD, f"data_protection_kind is {topic.data_protection_kind} for {name}"
-    if not topic.enable_discovery_protection:
-        yield DISCOVERY_OPEN, f"enable_discovery_protection is false for {name}"
-    if not topic.enable_liveliness_protection:
-        yield LIVELINESS_OPEN, f"enable_liveliness_protection is false for {name}"
+    for each, text in _open_attributes(topic):
+        yield _OPEN[each], f"{text} for {name}"
 
 
 def _copy(keystore: CheckedKeystore) -> Iterator[Finding]:
@@ -538,7 +554,7 @@ def _content(message: bytes) -> bytes:
         return b""
 
 
-DIFFER = Kind(
+DIFFER = FindingKind(
     "portable.vendors-differ",
     WARNING,
     "vendors that decide differently on the same permissions",
@@ -576,7 +592,7 @@ def check_vendors(enclave: CheckedEnclave, *, outside: bool) -> Iterator[Finding
         )
         for vendor in MEASURED
     }
-    differing = list(_differences(answers, _vendors_topics(enclave)))
+    differing = list(_differences(answers, _topics_to_ask(enclave)))
     if differing:
         more = f"; and {len(differing) - _MANY} more" if len(differing) > _MANY else ""
         text = f"on domain {domain}, {'; '.join(differing[:_MANY])}{more}"
@@ -590,8 +606,10 @@ def _is_as_sros_writes(enclave: CheckedEnclave) -> bool:
 
 
 def _differences(answers: dict[Vendor, Access | Refusal], topics: list[str]) -> Iterator[str]:
-    questions = [(Verb.JOIN, "")]
-    questions += [(verb, topic) for topic in topics for verb in (Verb.PUBLISH, Verb.SUBSCRIBE)]
+    questions = [(AccessVerb.JOIN, "")]
+    questions += [
+        (verb, topic) for topic in topics for verb in (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
+    ]
     for verb, topic in questions:
         said = {
             vendor.title: (
@@ -602,11 +620,11 @@ def _differences(answers: dict[Vendor, Access | Refusal], topics: list[str]) -> 
         if len({each.outcome.ok for each in said.values()}) > 1:
             told = ", ".join(f"{title}: {each.outcome.value}" for title, each in said.items())
             yield f"{f'{verb.value} {topic}'.strip()} ({told})"
-            if verb is Verb.JOIN:
+            if verb is AccessVerb.JOIN:
                 return  # everything else differs, too
 
 
-def _vendors_topics(enclave: CheckedEnclave) -> list[str]:
+def _topics_to_ask(enclave: CheckedEnclave) -> list[str]:
     """The topics that are named, an example for each wildcard, and one that nobody names."""
     grant = grant_of(enclave)
     named: dict[str, None] = {ROS_DISCOVERY_TOPIC: None}

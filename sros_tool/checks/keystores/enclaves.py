@@ -11,7 +11,7 @@ from cryptography import x509
 
 from sros_tool.checks.keystores.authorities import key_findings, one_for_both
 from sros_tool.checks.keystores.opened import CheckedEnclave
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind, by_id
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, by_id
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
 from sros_tool.faults import VENDOR_FAULTS, Fault
@@ -25,7 +25,7 @@ NOT_LOADABLE = "enclave.not-loadable"
 
 LOADING_KINDS = by_id(
     *(
-        Kind(
+        FindingKind(
             f"enclave.{fault.id}",
             ERROR,
             fault.title,
@@ -52,7 +52,7 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
         yield kind.found(enclave.name, text, file, remedy=remedy)
 
 
-ENDS_SOON = Kind(
+ENDS_SOON = FindingKind(
     "enclave.ends-soon",
     WARNING,
     "a certificate or permissions that end soon",
@@ -60,7 +60,7 @@ ENDS_SOON = Kind(
     "Fast DDS 2.14.5 (at start), Cyclone DDS 0.10.2 (timer).",
     "Run `sros renew ROOT NAME`, and export the enclave again.",
 )
-OUTLIVES_CA = Kind(
+OUTLIVES_CA = FindingKind(
     "enclave.outlives-ca",
     WARNING,
     "a certificate that is valid for longer than its CA",
@@ -68,7 +68,7 @@ OUTLIVES_CA = Kind(
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
     "Plan by the end of the CA, or renew the enclave after `sros rotate_ca`.",
 )
-PERMISSIONS_OUTLIVE = Kind(
+PERMISSIONS_OUTLIVE = FindingKind(
     "enclave.permissions-outlive",
     WARNING,
     "permissions that are valid for longer than the certificate",
@@ -76,7 +76,7 @@ PERMISSIONS_OUTLIVE = Kind(
     "ros2/sros2 issue 275; DDS-Security 1.1, 9.4.1.3.",
     "Run `sros renew ROOT NAME`, which signs them for the life of the certificate at most.",
 )
-NAME_MISMATCH = Kind(
+NAME_MISMATCH = FindingKind(
     "enclave.name-mismatch",
     WARNING,
     "a certificate with the name of another enclave",
@@ -85,7 +85,7 @@ NAME_MISMATCH = Kind(
     "rcl 9 (security.c); ros2/sros2 (CN is the name of the enclave).",
     "Restore the files of this enclave, or make it anew.",
 )
-IS_A_CA = Kind(
+IS_A_CA = FindingKind(
     "enclave.certificate-is-ca",
     ERROR,
     "an enclave whose certificate may issue others",
@@ -93,7 +93,7 @@ IS_A_CA = Kind(
     "RFC 5280, 4.2.1.9.",
     "Revoke it, and make the enclave anew.",
 )
-NOT_UNIQUE = Kind(
+NOT_UNIQUE = FindingKind(
     "enclave.subject-not-unique",
     WARNING,
     "a subject without the part that makes it unique",
@@ -102,7 +102,7 @@ NOT_UNIQUE = Kind(
     "Cyclone DDS 0.10.2 (subsets of subjects); ros2/sros2 issue 275; measured on both vendors.",
     "Run `sros renew ROOT NAME`.",
 )
-LONG_PERMISSIONS = Kind(
+LONG_PERMISSIONS = FindingKind(
     "enclave.long-permissions",
     WARNING,
     "permissions for years, for a subject that stays the same",
@@ -110,7 +110,7 @@ LONG_PERMISSIONS = Kind(
     "ros2/sros2 issue 275; DDS-Security 1.1, 9.4.1.3 (there is no revocation of permissions).",
     "Use the template production, whose subjects change with every renewal, or shorter ones.",
 )
-EVERYTHING = Kind(
+EVERYTHING = FindingKind(
     "keystore.allow-everything",
     WARNING,
     "an enclave that may do everything",
@@ -118,7 +118,7 @@ EVERYTHING = Kind(
     "ros2/sros2 0.13 grants this to every enclave without a policy.",
     "Give it a policy, with `sros create_permission ROOT NAME POLICY_FILE`.",
 )
-XML_DIFFERS = Kind(
+XML_DIFFERS = FindingKind(
     "enclave.xml-differs",
     WARNING,
     "permissions.xml says something else than what is signed",
@@ -126,7 +126,7 @@ XML_DIFFERS = Kind(
     "DDS-Security 1.1, 9.4.1.3; rcl 9 (security.c).",
     "Sign what is meant with `sros create_permission ROOT NAME POLICY_FILE`.",
 )
-CRL_MISSING = Kind(
+CRL_MISSING = FindingKind(
     "enclave.crl-missing",
     ERROR,
     "an enclave without the revocation list of its keystore",
@@ -134,7 +134,7 @@ CRL_MISSING = Kind(
     "rmw_dds_common (crl.pem), since 2021.",
     "Run `sros crl ROOT --refresh`, and export the enclave again.",
 )
-WAITS = Kind(
+WAITS = FindingKind(
     "enclave.waits-for-answer",
     NOTE,
     "an enclave whose request was not answered yet",

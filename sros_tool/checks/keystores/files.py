@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.keystore.layout import (
     ENCLAVES,
     LEDGER,
@@ -26,7 +26,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
 )
 
-KEY_READABLE = Kind(
+KEY_READABLE = FindingKind(
     "keystore.key-readable",
     ERROR,
     "a private key that others can read",
@@ -35,7 +35,7 @@ KEY_READABLE = Kind(
     "ros2/sros2 0.13; rcl 9, Fast DDS 2.14.5 and Cyclone DDS 0.10.2 check no modes.",
     "Run `chmod 600` on it. If strangers had access, revoke the enclave.",
 )
-WORLD_WRITABLE = Kind(
+WORLD_WRITABLE = FindingKind(
     "keystore.world-writable",
     ERROR,
     "a file or folder that everybody can change",
@@ -43,7 +43,7 @@ WORLD_WRITABLE = Kind(
     "POSIX modes; CWE-732.",
     "Run `chmod o-w` on it.",
 )
-FOLDER_OPEN = Kind(
+FOLDER_OPEN = FindingKind(
     "keystore.folder-open",
     WARNING,
     "a folder of keys that others may enter",
@@ -51,7 +51,7 @@ FOLDER_OPEN = Kind(
     "ros2/sros2 0.13 makes private/ with 0755; sros with 0700.",
     "Run `chmod 700` on it.",
 )
-LINK_DANGLING = Kind(
+LINK_DANGLING = FindingKind(
     "keystore.link-dangling",
     ERROR,
     "a link to nothing",
@@ -59,7 +59,7 @@ LINK_DANGLING = Kind(
     "rcl 9 (security.c) follows links.",
     "Restore the file that it names, or remove the link.",
 )
-LINK_ABSOLUTE = Kind(
+LINK_ABSOLUTE = FindingKind(
     "keystore.link-absolute",
     WARNING,
     "a link with an absolute path",
@@ -67,7 +67,7 @@ LINK_ABSOLUTE = Kind(
     "ros2/sros2 keystore layout (relative links).",
     "Replace it by a relative link, with `ln -sr`.",
 )
-LINK_OUTSIDE = Kind(
+LINK_OUTSIDE = FindingKind(
     "keystore.link-outside",
     WARNING,
     "a link that leads out of the keystore",
@@ -76,7 +76,7 @@ LINK_OUTSIDE = Kind(
     "CWE-59.",
     "Put the file itself into the keystore.",
 )
-INTERRUPTED = Kind(
+INTERRUPTED = FindingKind(
     "keystore.transaction-left",
     WARNING,
     "a write that was interrupted",
@@ -84,7 +84,7 @@ INTERRUPTED = Kind(
     "sros: keystore/transaction.py.",
     "Run any verb of sros that writes, such as `sros create_enclave`; it completes or undoes it.",
 )
-STRAY_KEY = Kind(
+STRAY_KEY = FindingKind(
     "keystore.stray-key",
     WARNING,
     "a private key where none belongs",
@@ -92,7 +92,7 @@ STRAY_KEY = Kind(
     "ROS 2 keystore layout: private/*.pem and enclaves/*/key.pem only.",
     "Move it to a safe place, or delete it.",
 )
-CA_KEY_ON_ROBOT = Kind(
+CA_KEY_ON_ROBOT = FindingKind(
     "keystore.ca-key-on-robot",
     ERROR,
     "the key of a CA among what was exported for a robot",
@@ -100,7 +100,7 @@ CA_KEY_ON_ROBOT = Kind(
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
     "Delete it there; if strangers had access, replace the CA (`sros rotate_ca`).",
 )
-UNKNOWN_FILE = Kind(
+UNKNOWN_FILE = FindingKind(
     "keystore.unknown-file",
     NOTE,
     "a file that is not part of a keystore",

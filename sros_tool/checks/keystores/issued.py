@@ -14,7 +14,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from sros_tool.checks.keystores.documents import DIFFERS as GOVERNANCE_DIFFERS
 from sros_tool.checks.keystores.enclaves import grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, Kind
+from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.checks.policies import ENCLAVE_NAMES
 from sros_tool.dds.portable import mistaken_names, some_pairs
 from sros_tool.errors import SrosError
@@ -23,7 +23,7 @@ from sros_tool.pki.certificates import fingerprints
 from sros_tool.policy.rights import Right, compare, policy_rights
 from sros_tool.translate import grant_rights
 
-SERIAL_TWICE = Kind(
+SERIAL_TWICE = FindingKind(
     "keystore.serial-twice",
     ERROR,
     "two certificates of one CA with the same serial number",
@@ -31,7 +31,7 @@ SERIAL_TWICE = Kind(
     "RFC 5280, 4.1.2.2.",
     "Run `sros renew ROOT NAME` for one of them.",
 )
-KEY_TWICE = Kind(
+KEY_TWICE = FindingKind(
     "keystore.key-twice",
     ERROR,
     "two enclaves with the same key",
@@ -39,7 +39,7 @@ KEY_TWICE = Kind(
     "RFC 5280, 4.1.2.6 (the subject is the holder of the key); DDS-Security 1.1, 9.3.",
     "Run `sros renew ROOT NAME --new-key` for one of them.",
 )
-UNEXPLAINED = Kind(
+UNEXPLAINED = FindingKind(
     "keystore.not-in-ledger",
     WARNING,
     "a certificate or document that the keystore never issued",
@@ -47,7 +47,7 @@ UNEXPLAINED = Kind(
     "sros: ledger.jsonl.",
     "Find out where it is from; `sros renew ROOT NAME` issues both anew.",
 )
-OLD_PERMISSIONS = Kind(
+OLD_PERMISSIONS = FindingKind(
     "enclave.old-permissions",
     ERROR,
     "permissions that were replaced are in place again",
@@ -56,7 +56,7 @@ OLD_PERMISSIONS = Kind(
     "ros2/sros2 issue 275; sros: ledger.jsonl.",
     "Sign what is meant, with `sros create_permission ROOT NAME POLICY_FILE` or `sros renew`.",
 )
-STALE = Kind(
+STALE = FindingKind(
     "enclave.stale-permissions",
     WARNING,
     "permissions that are not what the policy says",
@@ -64,7 +64,7 @@ STALE = Kind(
     "sros: the rights of both, in ROS terms.",
     "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`; `sros diff_policy` shows all.",
 )
-NOT_IN_POLICY = Kind(
+NOT_IN_POLICY = FindingKind(
     "enclave.not-in-policy",
     NOTE,
     "an enclave that no policy speaks of",
@@ -72,7 +72,7 @@ NOT_IN_POLICY = Kind(
     "sros: --policy.",
     "Write a policy for it, or revoke it if nobody needs it.",
 )
-NOT_IN_KEYSTORE = Kind(
+NOT_IN_KEYSTORE = FindingKind(
     "keystore.enclave-missing",
     WARNING,
     "an enclave of the policy that the keystore does not have",
@@ -81,7 +81,7 @@ NOT_IN_KEYSTORE = Kind(
     "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`.",
 )
 
-AUTHORITIES_DIFFER = Kind(
+AUTHORITIES_DIFFER = FindingKind(
     "keystore.authorities-differ",
     ERROR,
     "enclaves that do not trust the same CAs",

@@ -7,9 +7,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, tzinfo
 
-from sros_tool.dds.decision.answers import Decision, Outcome, Refusal, Verb
+from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
-from sros_tool.dds.decision.matching import Expressions, escaped, matches, read_moment, same_subject
+from sros_tool.dds.decision.matching import (
+    ExpressionIndex,
+    escaped,
+    matches,
+    read_moment,
+    same_subject,
+)
 from sros_tool.dds.decision.vendors import (
     DenyPartitions,
     Moments,
@@ -23,7 +29,7 @@ from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, Top
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 
 
-def choose_grant(
+def _choose_grant(
     traits: VendorTraits, permissions: Permissions, subject: str, *, at: datetime, zone: tzinfo
 ) -> int | Refusal:
     """The index of the grant, or why there is none."""
@@ -90,13 +96,13 @@ def holds_for(rule: OpenRange, domains: DomainSet, domain: int) -> bool | None:
     return False
 
 
-DEFAULT_PARTITION = ("",)
-Numbered = tuple[int, Rule]
+_DEFAULT_PARTITION = ("",)
+NumberedRule = tuple[int, Rule]
 """A rule with its index in the grant."""
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class RuleVerdict:
     """What the rules say: ALLOWED, DENIED or CRASHES, why, by which rule and expression."""
 
     outcome: Outcome
@@ -120,43 +126,49 @@ class _Entry:
     expression: str
     partitions: tuple[str, ...]
 
-    def verdict(self, *, fits: bool) -> Verdict:
+    def verdict(self, *, fits: bool) -> RuleVerdict:
         if not self.expression:
-            return Verdict(Outcome.CRASHES, "empty-topic", self.rule)
+            return RuleVerdict(Outcome.CRASHES, "empty-topic", self.rule)
         if not self.allow:
-            return Verdict(Outcome.DENIED, "deny-rule", self.rule, self.expression)
+            return RuleVerdict(Outcome.DENIED, "deny-rule", self.rule, self.expression)
         if not fits:
-            return Verdict(Outcome.DENIED, "partition", self.rule, self.expression)
-        return Verdict(Outcome.ALLOWED, "allow-rule", self.rule, self.expression)
+            return RuleVerdict(Outcome.DENIED, "partition", self.rule, self.expression)
+        return RuleVerdict(Outcome.ALLOWED, "allow-rule", self.rule, self.expression)
 
 
-def rules_for(traits: VendorTraits, grant: Grant, domain: int) -> tuple[list[Numbered], Verdict]:
+def _rules_for(
+    traits: VendorTraits, grant: Grant, domain: int
+) -> tuple[list[NumberedRule], RuleVerdict]:
     """The rules of the grant for ``domain``, and the verdict where none of them matches."""
-    found: list[Numbered] = []
+    found: list[NumberedRule] = []
     for index, rule in enumerate(grant.rules):
         holds = holds_for(traits.open_range, rule.domains, domain)
         if holds is None:
             # Cyclone DDS looks for the next rule before it uses one: the last one is never used.
-            return found[:-1], Verdict(Outcome.CRASHES, "open-range", index)
+            return found[:-1], RuleVerdict(Outcome.CRASHES, "open-range", index)
         if holds:
             found.append((index, rule))
-    return found, last_word(traits, grant)
+    return found, _default_verdict(traits, grant)
 
 
-def last_word(traits: VendorTraits, grant: Grant) -> Verdict:
+def _default_verdict(traits: VendorTraits, grant: Grant) -> RuleVerdict:
     """The verdict where no rule matches."""
     if not traits.honours_default:
-        return Verdict(Outcome.DENIED, "no-rule")
+        return RuleVerdict(Outcome.DENIED, "no-rule")
     if traits.crashes_on_empty_texts and grant.default_empty:
-        return Verdict(Outcome.CRASHES, "empty-default")
-    return Verdict(Outcome.ALLOWED if grant.default_allow else Outcome.DENIED, "default")
+        return RuleVerdict(Outcome.CRASHES, "empty-default")
+    return RuleVerdict(Outcome.ALLOWED if grant.default_allow else Outcome.DENIED, "default")
 
 
-class Rights:
+class GrantRules:
     """Rules in their order, for one verb, or for both where only the topic is asked for."""
 
     def __init__(
-        self, traits: VendorTraits, rules: Iterable[Numbered], otherwise: Verdict, *verbs: str
+        self,
+        traits: VendorTraits,
+        rules: Iterable[NumberedRule],
+        otherwise: RuleVerdict,
+        *verbs: str,
     ) -> None:
         """``otherwise`` is the verdict where no rule matches."""
         self._traits = traits
@@ -171,16 +183,16 @@ class Rights:
                 # Fast DDS weighs the partitions of all criteria of a verb in a rule together.
                 weighed = _partitions(traits, rule, criteria if traits.topic_decides else (each,))
                 self._entries += [
-                    _Entry(count, index, rule.allow, trimmed(traits, expression), weighed)
+                    _Entry(count, index, rule.allow, _trimmed(traits, expression), weighed)
                     for expression in each.topics
-                    if trimmed(traits, expression) or traits.crashes_on_empty_texts
+                    if _trimmed(traits, expression) or traits.crashes_on_empty_texts
                 ]
-        texts = (stand_in(traits, entry.expression) for entry in self._entries)
-        self._topics = Expressions(traits.style, texts)
+        texts = (_usable_expression(traits, entry.expression) for entry in self._entries)
+        self._topics = ExpressionIndex(traits.style, texts)
 
-    def ask(self, topic: str, partitions: tuple[str, ...]) -> Verdict:
+    def ask(self, topic: str, partitions: tuple[str, ...]) -> RuleVerdict:
         """The verdict on an endpoint of ``topic`` in ``partitions`` (none: the default one)."""
-        wanted = partitions or DEFAULT_PARTITION
+        wanted = partitions or _DEFAULT_PARTITION
         passed = 0
         for position in self._topics.matching(topic):
             entry = self._entries[position]
@@ -192,7 +204,7 @@ class Rights:
                 return entry.verdict(fits=fits)
         return self._otherwise
 
-    def ask_topic(self, topic: str) -> Verdict:
+    def ask_topic(self, topic: str) -> RuleVerdict:
         """The verdict on a topic in itself, whatever the partitions."""
         position = self._topics.first(topic)
         if position is None:
@@ -202,7 +214,7 @@ class Rights:
     def _fits(self, entry: _Entry, wanted: tuple[str, ...]) -> bool:
         style, named = self._traits.style, entry.partitions
         if entry.allow:
-            if wanted is DEFAULT_PARTITION is named:
+            if wanted is _DEFAULT_PARTITION is named:
                 return True
             return all(_named(style, named, each) for each in wanted)
         if self._traits.deny_partitions is DenyPartitions.IGNORED:
@@ -214,13 +226,13 @@ def _named(style: Style, expressions: tuple[str, ...], partition: str) -> bool:
     return any(matches(style, expression, partition) for expression in expressions)
 
 
-def stand_in(traits: VendorTraits, text: str) -> str:
+def _usable_expression(traits: VendorTraits, text: str) -> str:
     """An expression that matches every name, for one over which the vendor crashes."""
-    text = trimmed(traits, text)
+    text = _trimmed(traits, text)
     return text or "*" if traits.crashes_on_empty_texts else text
 
 
-def trimmed(traits: VendorTraits, text: str) -> str:
+def _trimmed(traits: VendorTraits, text: str) -> str:
     """The text as the vendor takes it from its element."""
     return text.strip(" \t\v\r\n") if traits.trims_texts else text
 
@@ -230,14 +242,14 @@ def _partitions(
 ) -> tuple[str, ...]:
     """The partitions that ``criteria`` of ``rule`` name; without any, what the vendor implies."""
     everywhere = not rule.allow and traits.deny_partitions is DenyPartitions.ANY_OR_ALL
-    implied = ("*",) if everywhere else DEFAULT_PARTITION
-    if implied is DEFAULT_PARTITION and not any(each.partitions for each in criteria):
-        return DEFAULT_PARTITION
+    implied = ("*",) if everywhere else _DEFAULT_PARTITION
+    if implied is _DEFAULT_PARTITION and not any(each.partitions for each in criteria):
+        return _DEFAULT_PARTITION
     found = [text for each in criteria for text in each.partitions or implied]
-    return tuple(dict.fromkeys(trimmed(traits, text) for text in found))
+    return tuple(dict.fromkeys(_trimmed(traits, text) for text in found))
 
 
-class Governed:
+class _GovernedDomain:
     """The first domain rule that lists the domain (``rule``, None without one), and its topics."""
 
     def __init__(self, traits: VendorTraits, governance: Governance, domain: int) -> None:
@@ -247,9 +259,9 @@ class Governed:
                 self.rule = rule
                 break
         self._topic_rules = self.rule.topic_access_rules if self.rule else ()
-        self._topics = Expressions(
+        self._topics = ExpressionIndex(
             traits.style,
-            (stand_in(traits, each.topic_expression) for each in self._topic_rules),
+            (_usable_expression(traits, each.topic_expression) for each in self._topic_rules),
             both_ways=traits.governance_both_ways,
         )
 
@@ -266,7 +278,7 @@ class Governed:
         )
 
 
-def verdict_text(verdict: Verdict, asked: str, domain: int, *, by_peers: bool = False) -> str:
+def _verdict_text(verdict: RuleVerdict, asked: str, domain: int, *, by_peers: bool = False) -> str:
     """What ``verdict`` says about ``asked`` (``publish rt/a``), as a clause.
 
     ``by_peers`` says that the own participant lets it pass and its peers do not.
@@ -294,7 +306,7 @@ def verdict_text(verdict: Verdict, asked: str, domain: int, *, by_peers: bool = 
 
 
 @dataclass(frozen=True, slots=True)
-class Joining:
+class _Joining:
     """The outcome, why, and a clause that says so."""
 
     outcome: Outcome
@@ -302,48 +314,48 @@ class Joining:
     text: str
 
 
-def decide_join(
+def _decide_join(
     traits: VendorTraits,
-    governed: Governed,
+    governed: _GovernedDomain,
     grant: Grant,
-    rules: list[Numbered],
-    otherwise: Verdict,
+    rules: list[NumberedRule],
+    otherwise: RuleVerdict,
     domain: int,
-) -> Joining:
+) -> _Joining:
     """``rules`` are those of the grant for ``domain``, ``otherwise`` the verdict behind them."""
     where = f"domain {domain}"
     if traits.always_needs_allow_rule and not any(rule.allow for rule in grant.rules):
         text = "the grant has no allow rule, so nothing starts"
-        return Joining(Outcome.REFUSED, "no-rule", text)
+        return _Joining(Outcome.REFUSED, "no-rule", text)
     rule = governed.rule
     if rule is None:
         text = f"the governance does not list {where}"
         if traits.needs_domain_rule:
-            return Joining(Outcome.REFUSED, "domain-not-in-governance", text)
+            return _Joining(Outcome.REFUSED, "domain-not-in-governance", text)
         text += "; the participant starts, but no endpoint can be created"
-        return Joining(Outcome.ALLOWED, "domain-not-in-governance", text)
+        return _Joining(Outcome.ALLOWED, "domain-not-in-governance", text)
     open_door = rule.allow_unauthenticated_participants
     if traits.refuses_open_rtps and open_door and rule.rtps_protection_kind != ProtectionKind.NONE:
         text = "the governance lets unauthenticated participants in and protects RTPS"
-        return Joining(Outcome.REFUSED, "unauthenticated-with-rtps-protection", text)
+        return _Joining(Outcome.REFUSED, "unauthenticated-with-rtps-protection", text)
     if not rule.enable_join_access_control:
         text = f"joining {where} is not access controlled"
-        return Joining(Outcome.ALLOWED, "unrestricted", text)
+        return _Joining(Outcome.ALLOWED, "unrestricted", text)
     if any(each.allow for _, each in rules):
-        return Joining(Outcome.ALLOWED, "allow-rule", f"an allow rule holds on {where}")
+        return _Joining(Outcome.ALLOWED, "allow-rule", f"an allow rule holds on {where}")
     missing = f"no allow rule of the grant holds on {where}"
     opened = not governed.all_controlled() and otherwise.outcome is not Outcome.ALLOWED
     if traits.always_needs_allow_rule or opened:
-        return Joining(Outcome.PEER_DENIES, "no-rule", f"{missing}, so peers refuse it")
+        return _Joining(Outcome.PEER_DENIES, "no-rule", f"{missing}, so peers refuse it")
     if otherwise.outcome is Outcome.DENIED:
-        return Joining(Outcome.REFUSED, "no-rule", missing)
-    return Joining(
-        otherwise.outcome, otherwise.reason, verdict_text(otherwise, f"joining {where}", domain)
+        return _Joining(Outcome.REFUSED, "no-rule", missing)
+    return _Joining(
+        otherwise.outcome, otherwise.reason, _verdict_text(otherwise, f"joining {where}", domain)
     )
 
 
 _TOPIC_NAME = re.compile(r"[A-Za-z_/][A-Za-z0-9_/]*\Z")
-_ENDPOINTS = (Verb.PUBLISH, Verb.SUBSCRIBE)
+_ENDPOINTS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 
 
 class Access:
@@ -369,9 +381,9 @@ class Access:
         """
         self._traits = vendor.traits
         self._domain = domain
-        self._governed = Governed(self._traits, governance, domain)
+        self._governed = _GovernedDomain(self._traits, governance, domain)
         self._grant: int | None = None
-        chosen = choose_grant(self._traits, permissions, subject, at=at, zone=zone)
+        chosen = _choose_grant(self._traits, permissions, subject, at=at, zone=zone)
         if isinstance(chosen, Refusal):
             self._join = chosen.decision()
             return
@@ -399,9 +411,11 @@ class Access:
             return permissions
         return cls(vendor, governance, permissions, subject, domain=domain, at=at, zone=zone)
 
-    def decide(self, verb: Verb, topic: str = "", partitions: tuple[str, ...] = ()) -> Decision:
+    def decide(
+        self, verb: AccessVerb, topic: str = "", partitions: tuple[str, ...] = ()
+    ) -> Decision:
         """The decision on ``verb``; ``topic`` is the DDS name (``rt/chatter``)."""
-        return self.join() if verb is Verb.JOIN else self._endpoint(verb, topic, partitions)
+        return self.join() if verb is AccessVerb.JOIN else self._endpoint(verb, topic, partitions)
 
     def join(self) -> Decision:
         """Whether the participant starts, and peers talk to it."""
@@ -409,30 +423,32 @@ class Access:
 
     def publish(self, topic: str, partitions: tuple[str, ...] = ()) -> Decision:
         """Whether a writer of ``topic`` can be created and heard (no partitions: the default)."""
-        return self._endpoint(Verb.PUBLISH, topic, partitions)
+        return self._endpoint(AccessVerb.PUBLISH, topic, partitions)
 
     def subscribe(self, topic: str, partitions: tuple[str, ...] = ()) -> Decision:
         """Whether a reader of ``topic`` can be created and hears."""
-        return self._endpoint(Verb.SUBSCRIBE, topic, partitions)
+        return self._endpoint(AccessVerb.SUBSCRIBE, topic, partitions)
 
     def _prepare(self, grant: Grant) -> None:
         traits = self._traits
-        rules, otherwise = rules_for(traits, grant, self._domain)
-        joining = decide_join(traits, self._governed, grant, rules, otherwise, self._domain)
+        rules, otherwise = _rules_for(traits, grant, self._domain)
+        joining = _decide_join(traits, self._governed, grant, rules, otherwise, self._domain)
         self._join = self._answer(joining.outcome, joining.reason, joining.text)
-        self._peers = {verb: Rights(traits, rules, otherwise, verb) for verb in _ENDPOINTS}
+        self._peers = {verb: GrantRules(traits, rules, otherwise, verb) for verb in _ENDPOINTS}
         self._own = self._peers
         if not traits.filters_own_domain:
             everywhere = list(enumerate(grant.rules))
-            self._own = {verb: Rights(traits, everywhere, otherwise, verb) for verb in _ENDPOINTS}
+            self._own = {
+                verb: GrantRules(traits, everywhere, otherwise, verb) for verb in _ENDPOINTS
+            }
         if traits.relays_count_for_readers:
-            readers = Rights(traits, rules, otherwise, Verb.SUBSCRIBE, "relay")
-            self._peers = {**self._peers, Verb.SUBSCRIBE: readers}
-        self._either = Rights(traits, rules, otherwise, *_ENDPOINTS)
+            readers = GrantRules(traits, rules, otherwise, AccessVerb.SUBSCRIBE, "relay")
+            self._peers = {**self._peers, AccessVerb.SUBSCRIBE: readers}
+        self._either = GrantRules(traits, rules, otherwise, *_ENDPOINTS)
 
     # ── answering ──────────────────────────────────────────────────────────────────────────
 
-    def _endpoint(self, verb: Verb, topic: str, partitions: tuple[str, ...]) -> Decision:
+    def _endpoint(self, verb: AccessVerb, topic: str, partitions: tuple[str, ...]) -> Decision:
         join = self._join
         if join.outcome in (Outcome.REFUSED, Outcome.CRASHES):
             return join
@@ -451,7 +467,7 @@ class Access:
             )
         return decision
 
-    def _ruled(self, verb: Verb, topic: str, partitions: tuple[str, ...]) -> Decision:
+    def _ruled(self, verb: AccessVerb, topic: str, partitions: tuple[str, ...]) -> Decision:
         """What the governance and the rules of the grant say, for a participant that starts."""
         join, traits = self._join, self._traits
         rule = self._governed.topic_rule(topic)
@@ -466,7 +482,7 @@ class Access:
             verdict = self._either.ask_topic(topic)
             if not verdict.allowed:
                 return self._verdict(verdict, asked, rule)
-        if not (writes if verb is Verb.PUBLISH else reads):
+        if not (writes if verb is AccessVerb.PUBLISH else reads):
             if join.outcome is Outcome.PEER_DENIES and not self._in_the_open(rule):
                 return self._peers_refuse(rule)
             text = f"the governance leaves {asked} open to everybody"
@@ -510,9 +526,9 @@ class Access:
         return self._answer(Outcome.PEER_DENIES, "peer-refuses-participant", text, topic_rule=rule)
 
     def _verdict(
-        self, verdict: Verdict, asked: str, topic_rule: TopicRule, *, by_peers: bool = False
+        self, verdict: RuleVerdict, asked: str, topic_rule: TopicRule, *, by_peers: bool = False
     ) -> Decision:
-        text = verdict_text(verdict, asked, self._domain, by_peers=by_peers)
+        text = _verdict_text(verdict, asked, self._domain, by_peers=by_peers)
         outcome = Outcome.PEER_DENIES if by_peers else verdict.outcome
         return self._answer(outcome, verdict.reason, text, verdict, topic_rule)
 
@@ -521,7 +537,7 @@ class Access:
         outcome: Outcome,
         reason: str,
         text: str,
-        verdict: Verdict | None = None,
+        verdict: RuleVerdict | None = None,
         topic_rule: TopicRule | None = None,
     ) -> Decision:
         return Decision(

@@ -8,7 +8,7 @@ from enum import StrEnum
 from sros_tool.dds.governance import TopicRule
 
 
-class Verb(StrEnum):
+class AccessVerb(StrEnum):
     """What an identity wants to do."""
 
     JOIN = "join"

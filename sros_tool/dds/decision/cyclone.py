@@ -13,7 +13,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from sros_tool.dds.decision.elements import Element, UnreadableError
+from sros_tool.dds.decision.elements import UnreadableError, XmlElement
 from sros_tool.dds.domains import MAX_DOMAIN, DomainRange, DomainSet
 from sros_tool.dds.governance import (
     Attribute,
@@ -40,7 +40,7 @@ _NUMBER = re.compile(rf"#(?:x[{BLANKS}\f]*([+-]?(?:0[xX])?[0-9a-fA-F]+)|[{BLANKS
 _ENTITIES = {"lt": "<", "gt": ">", "amp": "&", "apos": "'", "quot": '"'}
 
 
-def read(xml: bytes) -> Element:
+def read(xml: bytes) -> XmlElement:
     """The root of a document; raises `UnreadableError` where Cyclone DDS refuses it.
 
     A text is without the blanks around it, and decoded as UTF-8, each byte that is none as a
@@ -54,7 +54,7 @@ class _Reader:
         self._text = xml.decode("latin-1").partition("\0")[0]  # each character stands for a byte
         self._index = 0
 
-    def root(self) -> Element:
+    def root(self) -> XmlElement:
         root = self._element(0)
         self._pass_over()
         if self._index < len(self._text):
@@ -94,11 +94,11 @@ class _Reader:
                 return self._unescaped(text)
         raise self._error("an attribute has no value")
 
-    def _element(self, depth: int) -> Element:
+    def _element(self, depth: int) -> XmlElement:
         self._pass_over()
         if self._text.startswith(_CDATA, self._index) or not self._take("<") or depth > _DEEPEST:
             raise self._error("an element was expected")
-        element = Element(self._name())
+        element = XmlElement(self._name())
         self._pass_over()
         while _NAME.match(self._text, self._index):
             name = self._name()
@@ -119,7 +119,7 @@ class _Reader:
             raise self._error(f"<{element.name}> is not closed")
         return element
 
-    def _content(self, element: Element, depth: int) -> None:
+    def _content(self, element: XmlElement, depth: int) -> None:
         start = self._index
         if not self._opens():
             self._index = start
@@ -253,7 +253,7 @@ class _Node:
 
     def __init__(
         self,
-        element: Element,
+        element: XmlElement,
         grammar: Mapping[str, tuple[str, ...]],
         skipped: tuple[str, ...],
     ) -> None:
@@ -292,13 +292,13 @@ class _Node:
         return found[-1] if found else None
 
 
-def _check_attributes(element: Element, tag: str) -> None:
+def _check_attributes(element: XmlElement, tag: str) -> None:
     for name in element.attributes:
         if name.lower() not in _SCHEMA_ATTRIBUTES and (name, tag) != ("name", "grant"):
             raise UnreadableError(f"<{tag}> has the attribute {name!r}")
 
 
-def _check_skipped(element: Element) -> None:
+def _check_skipped(element: XmlElement) -> None:
     _check_attributes(element, "")
     for each in element.elements:
         _check_skipped(each)

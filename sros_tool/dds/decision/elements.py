@@ -29,7 +29,7 @@ class UnreadableError(Exception):
         return Refusal("malformed", f"{title} {how} the {document}: {self}.", self.outcome)
 
 
-class Mark(Enum):
+class NodeMark(Enum):
     """A node that is neither an element nor text."""
 
     COMMENT = auto()
@@ -40,7 +40,7 @@ class Mark(Enum):
 
 
 @dataclass(slots=True)
-class Element:
+class XmlElement:
     """An element; ``children`` are its nodes in order, text and CDATA as strings.
 
     ``name`` and the names of ``attributes`` stand as they are written, with their prefixes.
@@ -48,12 +48,12 @@ class Element:
 
     name: str
     attributes: dict[str, str] = field(default_factory=dict)
-    children: list[Element | str | Mark] = field(default_factory=list)
+    children: list[XmlElement | str | NodeMark] = field(default_factory=list)
 
     @property
-    def elements(self) -> list[Element]:
+    def elements(self) -> list[XmlElement]:
         """The child elements."""
-        return [child for child in self.children if isinstance(child, Element)]
+        return [child for child in self.children if isinstance(child, XmlElement)]
 
 
 def _attributes(rule: type[DomainRule | TopicRule]) -> str:

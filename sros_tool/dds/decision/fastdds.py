@@ -13,7 +13,7 @@ import re
 from typing import Any
 
 from sros_tool.dds.decision.answers import Outcome
-from sros_tool.dds.decision.elements import Element, Mark, UnreadableError
+from sros_tool.dds.decision.elements import NodeMark, UnreadableError, XmlElement
 from sros_tool.dds.domains import DomainRange, DomainSet
 from sros_tool.dds.governance import (
     Attribute,
@@ -41,7 +41,7 @@ _ENTITIES = {"quot": '"', "amp": "&", "apos": "'", "lt": "<", "gt": ">"}
 _REFERENCE = re.compile("&(?:#x?([^;]*)|(quot|amp|apos|lt|gt));")
 
 
-def read(xml: bytes) -> Element:
+def read(xml: bytes) -> XmlElement:
     """The first element of a document; raises `UnreadableError` where TinyXML-2 refuses it.
 
     A text is decoded as UTF-8, each byte that is none as a surrogate.
@@ -56,8 +56,8 @@ class _Reader:
         self._text = canonical.partition("\0")[0].lstrip(_BLANKS).removeprefix(_MARK)
         self._index = 0
 
-    def root(self) -> Element:
-        document = Element("")
+    def root(self) -> XmlElement:
+        document = XmlElement("")
         if not self._text:
             raise self._error("it is empty")
         self._read_into(document)
@@ -69,7 +69,7 @@ class _Reader:
         line = self._text.count("\r\n", 0, self._index) + 1
         return UnreadableError(f"its XML cannot be read, {why} (line {line})")
 
-    def _read_into(self, document: Element) -> None:
+    def _read_into(self, document: XmlElement) -> None:
         text = self._text
         stack = [document]
         while found := _TEXT.match(text, self._index):
@@ -92,7 +92,7 @@ class _Reader:
                 if stack.pop().name != _decoded(name):
                     raise self._error(f"</{name}> closes another element")
                 continue
-            element = Element(_decoded(name), self._attributes(tag[3]) if tag[3] else {})
+            element = XmlElement(_decoded(name), self._attributes(tag[3]) if tag[3] else {})
             children.append(element)
             if not closed:
                 stack.append(element)
@@ -107,7 +107,7 @@ class _Reader:
         if index >= len(self._text):
             raise self._error("it ends with <")
 
-    def _take_special(self, stack: list[Element]) -> None:
+    def _take_special(self, stack: list[XmlElement]) -> None:
         """A declaration, comment, CDATA or anything else that begins with ``<?`` or ``<!``."""
         text, children = self._text, stack[-1].children
         begin, end = next(each for each in _SPECIAL if text.startswith(each[0], self._index))
@@ -117,13 +117,13 @@ class _Reader:
             raise self._error(f"{begin} is not closed")
         self._index = stop + len(end)
         if begin == "<?":
-            if len(stack) > 1 or any(each is not Mark.DECLARATION for each in children):
+            if len(stack) > 1 or any(each is not NodeMark.DECLARATION for each in children):
                 raise self._error("a processing instruction stands behind the prolog")
-            children.append(Mark.DECLARATION)
+            children.append(NodeMark.DECLARATION)
         elif begin == "<![CDATA[":
             children.append(_decoded(_LINE_END.sub("\n", text[start:stop])))
         else:
-            children.append(Mark.COMMENT if begin == "<!--" else Mark.OTHER)
+            children.append(NodeMark.COMMENT if begin == "<!--" else NodeMark.OTHER)
 
     def _attributes(self, text: str) -> dict[str, str]:
         found = {}
@@ -208,7 +208,7 @@ def read_permissions(xml: bytes) -> Permissions:
     )
 
 
-def _first(root: Element, name: str) -> Element:
+def _first(root: XmlElement, name: str) -> XmlElement:
     if root.name != "dds":
         raise UnreadableError("its root is not <dds>")
     children = root.elements
@@ -220,7 +220,7 @@ def _first(root: Element, name: str) -> Element:
     return children[0]
 
 
-def _all(parent: Element, name: str) -> list[Element]:
+def _all(parent: XmlElement, name: str) -> list[XmlElement]:
     """The children, all of one name, at least one."""
     children = parent.elements
     if not children or any(child.name != name for child in children):
@@ -231,23 +231,23 @@ def _all(parent: Element, name: str) -> list[Element]:
 class _Sequence:
     """The child elements of one, taken in order."""
 
-    def __init__(self, element: Element) -> None:
+    def __init__(self, element: XmlElement) -> None:
         self._name = element.name
         self._children = element.elements
         self._index = 0
 
-    def next(self, name: str) -> Element:
+    def next(self, name: str) -> XmlElement:
         """The next child, which must have this name."""
         if self._index == len(self._children) or self._children[self._index].name != name:
             raise UnreadableError(f"<{self._name}> lacks <{name}> in its place")
         self._index += 1
         return self._children[self._index - 1]
 
-    def rest(self) -> list[Element]:
+    def rest(self) -> list[XmlElement]:
         """The children not taken yet."""
         return self._children[self._index :]
 
-    def while_named(self, *names: str) -> list[Element]:
+    def while_named(self, *names: str) -> list[XmlElement]:
         """The children up to the first that has none of these names."""
         found = []
         while self._index < len(self._children):
@@ -266,22 +266,22 @@ class _Sequence:
 # ── texts ──────────────────────────────────────────────────────────────────────────────────
 
 
-def _text(element: Element) -> str | None:
+def _text(element: XmlElement) -> str | None:
     """The text that stands first, comments aside; None if something else does, or nothing."""
     for child in element.children:
-        if child is not Mark.COMMENT:
+        if child is not NodeMark.COMMENT:
             return child if isinstance(child, str) else None
     return None
 
 
-def _required(element: Element) -> str:
+def _required(element: XmlElement) -> str:
     text = _text(element)
     if text is None:
         raise UnreadableError(f"<{element.name}> is empty")
     return text
 
 
-def _first_text(element: Element) -> str:
+def _first_text(element: XmlElement) -> str:
     """The text of a number or a flag, before which not even a comment may stand."""
     first = element.children[0] if element.children else None
     if not isinstance(first, str):
@@ -289,14 +289,14 @@ def _first_text(element: Element) -> str:
     return first
 
 
-def _number(element: Element) -> int:
+def _number(element: XmlElement) -> int:
     found = _INTEGER.match(_first_text(element))
     if not found:
         raise UnreadableError(f"<{element.name}> holds no number")
     return (int(found[1], 16) if found[1] else int(found[2])) % 2**32
 
 
-def _flag(element: Element) -> bool:
+def _flag(element: XmlElement) -> bool:
     text = _first_text(element)
     if found := _INTEGER.match(text):
         return int(found[1], 16) != 0 if found[1] else int(found[2]) != 0
@@ -305,7 +305,7 @@ def _flag(element: Element) -> bool:
     return text in _TRUE
 
 
-def _value(element: Element, attribute: Attribute) -> Value:
+def _value(element: XmlElement, attribute: Attribute) -> Value:
     if attribute.is_flag:
         return _flag(element)
     text = _required(element)
@@ -316,7 +316,7 @@ def _value(element: Element, attribute: Attribute) -> Value:
     return ProtectionKind(text)
 
 
-def _domains(element: Element) -> DomainSet:
+def _domains(element: XmlElement) -> DomainSet:
     ranges = []
     for child in element.elements:
         match child.name:
@@ -332,7 +332,7 @@ def _domains(element: Element) -> DomainSet:
     return DomainSet(tuple(ranges))
 
 
-def _range(element: Element) -> DomainRange:
+def _range(element: XmlElement) -> DomainRange:
     ends = element.elements
     if ends and ends[0].name == "max":
         return DomainRange(None, _number(ends[0]))
@@ -346,7 +346,7 @@ def _range(element: Element) -> DomainRange:
 # ── governance ─────────────────────────────────────────────────────────────────────────────
 
 
-def _domain_rule(element: Element) -> DomainRule:
+def _domain_rule(element: XmlElement) -> DomainRule:
     take = _Sequence(element)
     domains = _domains(take.next("domains"))
     values = _values(take, DomainRule)
@@ -355,7 +355,7 @@ def _domain_rule(element: Element) -> DomainRule:
     return DomainRule(domains=domains, topic_access_rules=rules, **values)
 
 
-def _topic_rule(element: Element) -> TopicRule:
+def _topic_rule(element: XmlElement) -> TopicRule:
     take = _Sequence(element)
     expression = _text(take.next("topic_expression"))
     if expression is None:
@@ -372,7 +372,7 @@ def _values(take: _Sequence, rule: type[DomainRule | TopicRule]) -> dict[str, An
 # ── permissions ────────────────────────────────────────────────────────────────────────────
 
 
-def _grant(element: Element) -> Grant:
+def _grant(element: XmlElement) -> Grant:
     name = element.attributes.get("name")
     if name is None:
         raise UnreadableError("a <grant> has no name")
@@ -386,7 +386,7 @@ def _grant(element: Element) -> Grant:
     return Grant(name, subject, not_before, not_after, rules, default == "ALLOW")
 
 
-def _validity(element: Element) -> tuple[str, str]:
+def _validity(element: XmlElement) -> tuple[str, str]:
     take = _Sequence(element)
     begin = _required(take.next("not_before"))
     end = _text(take.next("not_after"))
@@ -395,7 +395,7 @@ def _validity(element: Element) -> tuple[str, str]:
     return begin, end
 
 
-def _rule(element: Element) -> Rule:
+def _rule(element: XmlElement) -> Rule:
     take = _Sequence(element)
     domains = _domains(take.next("domains"))
     verbs: dict[str, list[Criteria]] = {"publish": [], "subscribe": [], "relay": []}
@@ -411,7 +411,7 @@ def _rule(element: Element) -> Rule:
     )
 
 
-def _criteria(element: Element) -> Criteria:
+def _criteria(element: XmlElement) -> Criteria:
     topics: list[str] = []
     partitions: list[str] = []
     for child in element.elements:
@@ -427,7 +427,7 @@ def _criteria(element: Element) -> Criteria:
     return Criteria(tuple(topics), tuple(partitions))
 
 
-def _partition(element: Element) -> str:
+def _partition(element: XmlElement) -> str:
     text = _text(element)
     if text is None and element.children:
         raise UnreadableError("<partition> holds something else than text")

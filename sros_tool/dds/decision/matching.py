@@ -17,10 +17,10 @@ from math import inf
 from sros_tool.dds.decision.vendors import Moments, Style, Subjects
 from sros_tool.validity import parse_iso
 
-Matcher = Callable[[str], object]
+_Matcher = Callable[[str], object]
 """Truthy if a name matches."""
 
-SPECIAL = frozenset("*?[")
+_SPECIAL = frozenset("*?[")
 """An expression without any of these means itself, for every vendor."""
 
 _BEFORE_SPECIAL = re.compile(r"[^*?\[]*")
@@ -44,9 +44,9 @@ _CLASSES = {
 
 
 @lru_cache(maxsize=65536)
-def matcher(style: Style, expression: str) -> Matcher | None:
+def matcher(style: Style, expression: str) -> _Matcher | None:
     """What matches names against ``expression``; None if it matches only itself."""
-    if SPECIAL.isdisjoint(expression):
+    if _SPECIAL.isdisjoint(expression):
         return None
     take_set = _fnmatch_set if style is Style.FNMATCH else _cyclone_set
     segments = [""]  # what stands between stars
@@ -86,7 +86,7 @@ def matches(style: Style, expression: str, name: str) -> bool:
     return expression == name if match is None else bool(match(name))
 
 
-class Expressions:
+class ExpressionIndex:
     """Expressions in their order, asked which of them match a name.
 
     Plain ones are looked up by the name, those with wildcards by what stands before the first
@@ -98,7 +98,7 @@ class Expressions:
         self._texts = tuple(texts)
         self._both_ways = both_ways
         self._plain: dict[str, list[int]] = {}
-        wild: dict[int, dict[str, list[tuple[int, Matcher]]]] = {}
+        wild: dict[int, dict[str, list[tuple[int, _Matcher]]]] = {}
         for position, text in enumerate(self._texts):
             match = matcher(style, text)
             if match is None:
@@ -111,7 +111,7 @@ class Expressions:
 
     def matching(self, name: str) -> Sequence[int]:
         """The positions of the expressions that match ``name``, in order."""
-        if self._both_ways and not SPECIAL.isdisjoint(name):
+        if self._both_ways and not _SPECIAL.isdisjoint(name):
             return self._either_way(name)
         found = self._plain.get(name, [])
         for length, by_prefix in self._wild:

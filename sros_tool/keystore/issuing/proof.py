@@ -26,7 +26,7 @@ from datetime import UTC, datetime, timedelta
 from functools import lru_cache
 
 from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import Outcome, Verb
+from sros_tool.dds.decision.answers import AccessVerb, Outcome
 from sros_tool.dds.decision.matching import matches as dds_matches
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
@@ -201,7 +201,7 @@ def differences(
             for topic in sorted(topics):
                 for verb in (_OUT, _IN):
                     meant = stated.allow(verb, topic)
-                    outcome = access.decide(Verb(verb), topic).outcome
+                    outcome = access.decide(AccessVerb(verb), topic).outcome
                     if outcome.ok != meant:
                         found.append(Disagreement(verb, topic, meant, vendor, outcome))
     return found
