@@ -17,7 +17,7 @@ from sros_tool.files import replace_file
 from sros_tool.graph.learn import CommonParts, Learned, LearnedProfile
 from sros_tool.names import check_namespace
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.merge import Contradiction, EditedText, PlacedElement, merge_into
+from sros_tool.policy.merge import Contradiction, merge_into
 from sros_tool.policy.model import VERSION
 from sros_tool.policy.rights import Right, Rules, order, policy_rights, profile_rights
 from sros_tool.xml import read_bytes
