@@ -17,7 +17,7 @@ from sros_tool.files import replace_file
 from sros_tool.graph.learn import CommonParts, Learned, LearnedProfile
 from sros_tool.names import check_namespace
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.merge import Contradiction, merge_into
+from sros_tool.policy.merge import Contradiction, EditedText, PlacedElement, merge_into
 from sros_tool.policy.model import VERSION
 from sros_tool.policy.rights import Right, Rules, order, policy_rights, profile_rights
 from sros_tool.xml import read_bytes
@@ -203,8 +203,8 @@ def with_includes(
     ``before`` had gets its includes in front of its content.
     """
     name = f"the policy file '{path}'"
-    known = _profiles(Text(before, name))
-    text = Text(merged, name)
+    known = _profiles(EditedText(before, name))
+    text = EditedText(merged, name)
     rules = Rules(policy_rights(read_policy(path, merged)))
     wanted = {(each.enclave, each.ns, each.node): each for each in profiles if each.includes}
     included: set[str] = set()
@@ -224,7 +224,7 @@ def with_includes(
     return text.document(), tuple(sorted(included))
 
 
-def _profiles(text: Text) -> dict[tuple[str, str, str], Element]:
+def _profiles(text: EditedText) -> dict[tuple[str, str, str], PlacedElement]:
     return {
         (enclave.get("path"), check_namespace(profile.get("ns")), profile.get("node")): profile
         for block in text.root.named("enclaves")
@@ -236,10 +236,10 @@ def _profiles(text: Text) -> dict[tuple[str, str, str], Element]:
 
 def _profiles_of(path: Path, document: bytes) -> frozenset[tuple[str, str, str]]:
     """Return the enclave, namespace and node of each profile in the file itself."""
-    return frozenset(_profiles(Text(document, f"the policy file '{path}'")))
+    return frozenset(_profiles(EditedText(document, f"the policy file '{path}'")))
 
 
-def _in_front(profile: LearnedProfile, element: Element, text: Text) -> str:
+def _in_front(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
     """Return the includes of a profile as text, to put before its content."""
     include = f"{_prefix(text) or 'xi'}:include"
     outer = text.indent_of(element)
@@ -247,7 +247,7 @@ def _in_front(profile: LearnedProfile, element: Element, text: Text) -> str:
     return "".join(lead + line for line in _includes(profile, include))
 
 
-def _inside(profile: LearnedProfile, element: Element, text: Text) -> str:
+def _inside(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
     """Return the content of a profile as text, indented like its neighbours."""
     include = f"{_prefix(text) or 'xi'}:include"
     outer = text.indent_of(element)
@@ -257,6 +257,6 @@ def _inside(profile: LearnedProfile, element: Element, text: Text) -> str:
     return "".join(text.newline + outer + line for line in (*lines, ""))
 
 
-def _prefix(text: Text) -> str | None:
+def _prefix(text: EditedText) -> str | None:
     """Return the prefix of the namespace of includes; None if there is none, and xi is free."""
     return next((p for p, uri in text.root.xml.nsmap.items() if p and uri == _XINCLUDE), None)

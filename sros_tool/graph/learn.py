@@ -26,7 +26,7 @@ from sros_tool.names import (
     expression_problem,
     is_expression,
 )
-from sros_tool.policy.document import Includer
+from sros_tool.policy.document import IncludedFile, Includer
 from sros_tool.policy.model import ALLOW, RIGHTS, Enclave, Group, Policy, Profile, Profiles
 from sros_tool.translate import ros_rights
 from sros_tool.xml import read_bytes, tag_of
@@ -363,7 +363,7 @@ def _part_rights(root: Path, part: str) -> frozenset[NodeRight] | None:
     file = (root / part).resolve()
     rights = set()
     try:
-        for group, _ in includer.children(includer.load(file), Place(file)):
+        for group, _ in includer.children(includer.load(file), IncludedFile(file)):
             for right, qualifier in group.attrib.items():
                 if qualifier != ALLOW:
                     return None
