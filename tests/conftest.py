@@ -7,22 +7,12 @@ import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
-from xdist.scheduler import LoadScopeScheduling  # type: ignore[import-untyped]
 
 from tests.support.children import LONG
 from tests.support.harness import policy_text, publish, sros
-
-STARTED_ONCE = (
-    "test_generate_policy.py",
-    "test_demo_run.py",
-    "test_policies_live.py",
-    "test_nodes_fit_their_enclaves.py",
-)
-"""Files whose tests share many processes that are started once."""
 
 POLICY = policy_text({"/a": publish("old_a"), "/b": publish("old_b")})
 
@@ -39,20 +29,6 @@ for each in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
     # Whoever starts the tests in the background may have had them ignored, and children inherit it.
     if signal.getsignal(each) is signal.SIG_IGN:
         signal.signal(each, signal.SIG_DFL)
-
-
-class _Scheduling(LoadScopeScheduling):  # type: ignore[misc]
-    """Gives each worker one test after the other, but what shares a fixture to one worker."""
-
-    def _split_scope(self, nodeid: str) -> str:
-        file = nodeid.partition("::")[0]
-        return file if file.endswith(STARTED_ONCE) else nodeid
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Schedule so with ``--dist loadscope``."""
-    return _Scheduling(config, log) if config.getvalue("dist") == "loadscope" else None
 
 
 @pytest.fixture(autouse=True)

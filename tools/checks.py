@@ -52,8 +52,8 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
         return _conclude(results, Counter(), started)
     cores = len(os.sched_getaffinity(0))
     parts = {
-        "tests": ["-m", "not dds", "-n", str(cores)],
-        "tests on a real DDS": ["-m", "dds", "-n", str(2 * cores), "--dist", "loadscope"],
+        "tests": ["-m", "not dds", "-n", str(cores), "--dist", "worksteal"],
+        "tests on a real DDS": ["-m", "dds", "-n", str(2 * cores), "--dist", "loadfile"],
     }
     reports = {name: VENV / f"{name.replace(' ', '-')}.xml" for name in parts}
     for report in reports.values():
