@@ -62,8 +62,8 @@ class Denial:
 class MissingRights:
     """The rights that denials ask for, by enclave ("" where the log does not name it).
 
-    ``unclear`` are denials without a direction, ``by_rule`` those by a deny rule, ``remote`` those
-    of peers, ``foreign`` those of topics without a ROS name: all of them are left to the user.
+    Left to the user are the denials without a direction (``unclear``), by a deny rule
+    (``by_rule``), of peers (``remote``), and of topics without a ROS name (``foreign``).
     """
 
     rights: dict[str, frozenset[NodeRight]]
@@ -122,7 +122,7 @@ def _direction(lines: list[str], topic: str) -> tuple[bool, str]:
 
 
 def propose(denials: Iterable[Denial]) -> MissingRights:
-    """The rights that would have let pass what was denied, as far as the log says.
+    """Return the rights that would have allowed what was denied, as far as the log says.
 
     A node stops at its first refusal, so one denied half of a service asks for the service, and
     one denied service of an action for the action.
@@ -151,7 +151,7 @@ _OWN_SERVICE = re.compile(rf"(?P<node>/.+)/(?:{'|'.join(NODE_SERVICES)})\Z")
 
 
 def serving_node(denial: Denial) -> str:
-    """The full name of the node, where a service that every node offers is what it is denied."""
+    """Return the full name of the node that was denied one of every node's own services, or ""."""
     service, begin = service_of(denial.topic)
     if denial.remote or not service:
         return ""
@@ -161,7 +161,7 @@ def serving_node(denial: Denial) -> str:
 
 
 def nodes_served(rights: Iterable[tuple[str, str]]) -> tuple[str, ...]:
-    """The full names of the nodes whose own services these rights (right, name) let be offered."""
+    """Return the full names of the nodes whose own services these rights (right, name) allow."""
     found = (_OWN_SERVICE.match(name) for right, name in rights if right == "reply")
     return tuple(sorted({own["node"] for own in found if own}))
 
@@ -184,7 +184,7 @@ def _right(denial: Denial) -> NodeRight:
 
 
 def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:
-    """The rights without the topics that an action among them stands for."""
+    """Return the rights without the topics that an action among them stands for."""
     parts = {
         NodeRight(way, f"{each.name}{ACTION_INSIDE}{topic}")
         for each in rights
@@ -195,9 +195,8 @@ def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:
     return frozenset(rights - parts)
 
 
-ANY_NODE = ("/", "*")
+_ANY_NODE = ("/", "*")
 """The namespace and node of a profile that is not about a particular node."""
-
 
 _OTHER = (
     "not proposed, as these nodes are not in the policy under that name; start them as it says "
@@ -214,32 +213,34 @@ _SEVERAL = Note(
     "last; check that processes without a label of their own did not write at the same time",
 )
 
-
-NODE_PARTS = ("common/node.xml", "common/node/parameters.xml")
-"""What a node that is denied anything of them most likely lacks as a whole; the widest first."""
+_NODE_PARTS = ("common/node.xml", "common/node/parameters.xml")
+"""The parts that a node most likely lacks as a whole if it is denied anything of them; the widest
+first."""
 
 
 def as_learned(
-    proposal: MissingRights,
+    missing: MissingRights,
     enclave: str,
     node: tuple[str, str] | None,
     policy: Policy | None,
     common: CommonParts | None = None,
 ) -> Learned:
-    """The proposed rights as profiles.
+    """Return the proposed rights as profiles.
 
-    ``enclave`` is for denials of which the log does not name it, ``node`` (namespace and name) the
-    profile; without it, that of the node whose own services were denied, or else the only profile
-    of that enclave in ``policy``, or one for any node: DDS asks for the enclave alone.  A node
-    that the policy does not have under that name gets nothing, and a note.  With ``common``, a
-    node that has nothing of what every node needs gets all of it.  Raises `UsageError` where an
-    enclave is needed.
+    ``enclave`` is for denials of which the log does not name it.  ``node`` (namespace and name)
+    names the profile; without it, it is the profile of the node whose own services were denied, or
+    else the only profile of that enclave in ``policy``, or one for any node: DDS asks for the
+    enclave alone.  A node that the policy does not have under that name gets nothing, and a note.
+    With ``common``, a node that has nothing of what every node needs gets all of it.
+
+    Raises:
+        UsageError: The log does not name the enclave of a denial, and ``enclave`` is "".
     """
     profiles, others, wholes = [], dict[str, str](), dict[str, str]()
-    for path, rights in sorted(_by_enclave(proposal, enclave).items()):
+    for path, rights in sorted(_by_enclave(missing, enclave).items()):
         present = _profiles(policy, path)
         for place, denied in sorted(_by_place(rights, node, present).items()):
-            if present and node is None and place not in (ANY_NODE, *present):
+            if present and node is None and place not in (_ANY_NODE, *present):
                 there = ", ".join(sorted(map(_fqn, present)))
                 others[_fqn(place)] = f"enclave {path} has {there}"
                 continue
@@ -258,13 +259,13 @@ def as_learned(
         )
         if found
     ]
-    return Learned(tuple(profiles), (*_notes(proposal), *notes))
+    return Learned(tuple(profiles), (*_notes(missing), *notes))
 
 
-def _by_enclave(proposal: MissingRights, enclave: str) -> dict[str, frozenset[NodeRight]]:
-    """The rights by enclave: the log may name an enclave that is also given."""
+def _by_enclave(missing: MissingRights, enclave: str) -> dict[str, frozenset[NodeRight]]:
+    """Return the rights by enclave: the log may name an enclave that is also an argument."""
     found: dict[str, frozenset[NodeRight]] = {}
-    for named, rights in proposal.rights.items():
+    for named, rights in missing.rights.items():
         if not (named or enclave):
             raise UsageError(
                 "the log does not say in which enclave the node ran",
@@ -281,14 +282,14 @@ def _by_place(
     node: tuple[str, str] | None,
     present: Mapping[tuple[str, str], frozenset[NodeRight]],
 ) -> dict[tuple[str, str], frozenset[NodeRight]]:
-    """The rights by the namespace and name of the profile that they belong to."""
+    """Return the rights by the namespace and name of the profile that they belong to."""
     if node is not None:
         return {node: rights}
     own = nodes_served((each.right, each.name) for each in rights)
     found: dict[tuple[str, str], set[NodeRight]] = {}
     (only,) = present if len(present) == 1 else (None,)
     (one,) = own if len(own) == 1 else (None,)
-    rest = only or (_place(one, present) if one and not present else ANY_NODE)
+    rest = only or (_place(one, present) if one and not present else _ANY_NODE)
     for each in rights:
         served = nodes_served([(each.right, each.name)])
         found.setdefault(_place(served[0], present) if served else rest, set()).add(each)
@@ -296,7 +297,7 @@ def _by_place(
 
 
 def _place(fqn: str, present: Iterable[tuple[str, str]]) -> tuple[str, str]:
-    """The profile of a node: the one that is there for it, perhaps with a wildcard."""
+    """Return namespace and name of the profile for a node, which may have a wildcard."""
     ns, _, name = fqn.rpartition("/")
     return next((each for each in present if covers(_fqn(each), fqn)), (ns or "/", name))
 
@@ -311,10 +312,10 @@ def _whole_parts(
     has: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
-    """The part of which something was denied to a node that has nothing of it."""
+    """Return the part of which something was denied to a node that has nothing of it, if any."""
     if is_expression(place[1]):
         return ()
-    for part in NODE_PARTS:
+    for part in _NODE_PARTS:
         if part in common.rights:
             given = common.given([part], *place)
             if given & denied and not given & has:
@@ -323,7 +324,7 @@ def _whole_parts(
 
 
 def _profiles(policy: Policy | None, path: str) -> dict[tuple[str, str], frozenset[NodeRight]]:
-    """What each profile of an enclave says, by its namespace and node."""
+    """Return the rights of each profile of an enclave, by its namespace and node."""
     enclave = policy.enclave(path) if policy else None
     found: dict[tuple[str, str], frozenset[NodeRight]] = {}
     for each in enclave.all_profiles() if enclave else ():
@@ -332,28 +333,28 @@ def _profiles(policy: Policy | None, path: str) -> dict[tuple[str, str], frozens
     return found
 
 
-def _notes(proposal: MissingRights) -> tuple[Note, ...]:
+def _notes(missing: MissingRights) -> tuple[Note, ...]:
     texts = {
         "log.unclear": (
-            proposal.unclear,
+            missing.unclear,
             "not proposed, as the log does not say whether these were to be published or "
             "subscribed: {}",
         ),
         "log.denied-by-rule": (
-            proposal.by_rule,
+            missing.by_rule,
             "not proposed, as a DENY in the policy refuses these, and allowing them would not "
             "help: {}",
         ),
         "log.of-a-peer": (
-            proposal.remote,
+            missing.remote,
             "not proposed, as these were denied to a peer, whose enclave the log does not name: {}",
         ),
         "log.no-ros-name": (
-            proposal.foreign,
+            missing.foreign,
             "not proposed, as a policy has no words for these topics: {}",
         ),
     }
-    several = len(proposal.rights) > 1
+    several = len(missing.rights) > 1
     return (_SEVERAL,) * several + tuple(
         Note(name, text.format(", ".join(dict.fromkeys(map(_shown, denials)))))
         for name, (denials, text) in texts.items()
