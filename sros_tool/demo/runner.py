@@ -36,7 +36,7 @@ from sros_tool.demo.scenarios.model import (
 )
 from sros_tool.demo.verdict import PartyRecord, RowRecord, RowResult, judge_row
 from sros_tool.demo.wire import Injection, Wiretap, forged_text, udp_ports, with_other_words
-from sros_tool.runtime.events import Event, EventReader, Kind
+from sros_tool.runtime.events import Event, EventKind, EventReader
 from sros_tool.runtime.vendor_log import plain_text
 
 _LOG = logging.getLogger(__name__)
@@ -262,7 +262,7 @@ class _Runner:
         events = processes[claim.subject].look()
         if claim.relation in (Relation.HEARS, Relation.IS_ANSWERED):
             mark = f"{processes[claim.talker].text}: "
-            heard = [e for e in events if e.kind is Kind.HEARD and e.text.startswith(mark)]
+            heard = [e for e in events if e.kind is EventKind.HEARD and e.text.startswith(mark)]
             return len(heard) >= _ENOUGH_MESSAGES
         if claim.relation is Relation.SEES:
             topic = processes[claim.talker].topic
@@ -410,14 +410,14 @@ class _PartyProcess:
         """Whether the process is ready, or will never be."""
         events = self.look()
         return self._own_status is not None or any(
-            event.kind in (Kind.READY, Kind.REFUSED, Kind.FAILED) for event in events
+            event.kind in (EventKind.READY, EventKind.REFUSED, EventKind.FAILED) for event in events
         )
 
     @property
     def running(self) -> bool:
         """Whether the process is ready and still there."""
         events = self.look()
-        return self._own_status is None and any(event.kind is Kind.READY for event in events)
+        return self._own_status is None and any(event.kind is EventKind.READY for event in events)
 
     @property
     def ended(self) -> bool:
@@ -457,7 +457,7 @@ class _PartyProcess:
     def record(self) -> PartyRecord:
         """Return what the process left behind; to be called after `end`."""
         # A node that is asked to end may report a failure; that is none.
-        late = [event for event in self._reader.new_events() if event.kind is not Kind.FAILED]
+        late = [event for event in self._reader.new_events() if event.kind is not EventKind.FAILED]
         return PartyRecord(
             text=self.text,
             topic=self.topic,

@@ -23,7 +23,7 @@ from sros_tool.demo.scenarios.model import (
     Wire,
 )
 from sros_tool.demo.wire import Injection, WireCount, forged_text
-from sros_tool.runtime.events import Event, Kind, Stage
+from sros_tool.runtime.events import Event, EventKind, ProcessStage
 from sros_tool.runtime.vendor_log import (
     endpoint_refusal,
     missing_security,
@@ -169,7 +169,11 @@ def _lost_import(party: Party, record: PartyRecord) -> str:
     """Return why a node lacks what not every machine has (rclpy, an interface), or ""."""
     if party.role in (Role.TALKER, Role.LISTENER):
         return ""
-    failed = (e.text for e in record.events if e.kind is Kind.FAILED and e.stage is Stage.IMPORT)
+    failed = (
+        e.text
+        for e in record.events
+        if e.kind is EventKind.FAILED and e.stage is ProcessStage.IMPORT
+    )
     what = "rclpy" if party.role is Role.OBSERVER else f"the {party.role}"
     return next((f"{what} cannot be loaded here: {text}" for text in failed), "")
 
@@ -194,13 +198,13 @@ def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
         return _judge_forgery(claim, record, subject, talker)
     if claim.relation is Relation.IS_ANSWERED:
         return _judge_answers(claim, record, subject, talker)
-    sent = {e.text for e in talker.events if e.kind is Kind.SENT and _in_window(e, record)}
+    sent = {e.text for e in talker.events if e.kind is EventKind.SENT and _in_window(e, record)}
     if not sent:
         return _Finding(RowStatus.UNDECIDED, f"{claim.talker} sent nothing in that time")
     if claim.relation is Relation.SEES:
         return _judge_view(claim, record, subject, talker)
     mark = f"{talker.text}: "
-    heard = [e for e in subject.events if e.kind is Kind.HEARD and e.text.startswith(mark)]
+    heard = [e for e in subject.events if e.kind is EventKind.HEARD and e.text.startswith(mark)]
     status = STATUS_OF[Relation.HEARS, bool(heard)]
     seconds = record.window[1] - record.window[0]
     arrived = len(sent & {event.text for event in heard})
@@ -211,10 +215,10 @@ def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
 def _judge_answers(
     claim: Claim, record: RowRecord, client: PartyRecord, server: PartyRecord
 ) -> _Finding:
-    asked = [e for e in client.events if e.kind is Kind.SENT and _in_window(e, record)]
+    asked = [e for e in client.events if e.kind is EventKind.SENT and _in_window(e, record)]
     if not asked:
         return _Finding(RowStatus.UNDECIDED, f"{claim.subject} asked nothing in that time")
-    answers = [e for e in client.events if e.kind is Kind.HEARD and _is_of(e, server)]
+    answers = [e for e in client.events if e.kind is EventKind.HEARD and _is_of(e, server)]
     status = STATUS_OF[Relation.IS_ANSWERED, bool(answers)]
     within = sum(1 for event in answers if _in_window(event, record))
     counted = f"{min(within, len(asked))} right answers of the {claim.talker}"
@@ -227,7 +231,7 @@ def _judge_replay(
     injected = record.injected
     if injected is None or not injected.packets:
         return _Finding(RowStatus.UNDECIDED, "no packets were captured that could be sent again")
-    heard = [e for e in listener.events if e.kind is Kind.HEARD and _is_of(e, talker)]
+    heard = [e for e in listener.events if e.kind is EventKind.HEARD and _is_of(e, talker)]
     again = sum(1 for event in heard if event.time >= injected.time)
     status = STATUS_OF[Relation.HEARS_AGAIN, again > 0]
     return _Finding(
@@ -244,7 +248,9 @@ def _judge_forgery(
     if injected is None or not injected.packets:
         return _Finding(RowStatus.UNDECIDED, "no packet of the talker could be read and changed")
     mark = forged_text(talker.text)
-    believed = sum(1 for e in listener.events if e.kind is Kind.HEARD and e.text.startswith(mark))
+    believed = sum(
+        1 for e in listener.events if e.kind is EventKind.HEARD and e.text.startswith(mark)
+    )
     return _Finding(
         STATUS_OF[Relation.BELIEVES, believed > 0],
         f"{claim.subject} heard {believed} of {injected.packets} messages that the {claim.talker}"
@@ -266,7 +272,7 @@ def _judge_refusal(name: str, record: PartyRecord) -> _Finding:
 def _judge_view(
     claim: Claim, record: RowRecord, observer: PartyRecord, talker: PartyRecord
 ) -> _Finding:
-    looks = [e for e in observer.events if e.kind is Kind.SEEN and _in_window(e, record)]
+    looks = [e for e in observer.events if e.kind is EventKind.SEEN and _in_window(e, record)]
     if not looks:
         return _Finding(RowStatus.UNDECIDED, f"{claim.subject} did not look in that time")
     most = max(event.publishers.get(talker.topic, 0) for event in looks)
@@ -287,7 +293,7 @@ def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> _Findin
     if count.plain:
         return _Finding(RowStatus.READABLE, f"{count.plain} packets show the text")
     sent = sum(
-        1 for event in talker.events if event.kind is Kind.SENT and _in_window(event, record)
+        1 for event in talker.events if event.kind is EventKind.SENT and _in_window(event, record)
     )
     # Silence on the wire proves nothing unless the messages went over the captured wire.
     if count.protected * 2 < max(2, sent):
@@ -302,11 +308,11 @@ def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> _Findin
 
 def _why_not_running(name: str, record: PartyRecord) -> _Finding | None:
     """Return why a party did not run through the row, or None if it did."""
-    ready = any(event.kind is Kind.READY for event in record.events)
+    ready = any(event.kind is EventKind.READY for event in record.events)
     for event in record.events:
-        if event.kind is Kind.REFUSED:
+        if event.kind is EventKind.REFUSED:
             return _refused(name, event.stage, _own_denial(record, "") or event.text)
-        if event.kind is Kind.FAILED:
+        if event.kind is EventKind.FAILED:
             return _failure(name, record, event)
     if record.status is not None:
         return _Finding(RowStatus.CRASHED, f"{name} {_end_of(record)}")
@@ -320,13 +326,13 @@ def _failure(name: str, record: PartyRecord, event: Event) -> _Finding:
     reason = " ".join(event.text.split())
     if lacking := missing_security(reported):
         return _Finding(RowStatus.NOT_STARTED, f"{name}: {lacking}")
-    if event.stage is Stage.ENDPOINT and (refusal := _own_denial(record, event.text)):
-        return _refused(name, Stage.ENDPOINT, refusal)
-    if event.stage in (Stage.PARTICIPANT, Stage.ENDPOINT):
+    if event.stage is ProcessStage.ENDPOINT and (refusal := _own_denial(record, event.text)):
+        return _refused(name, ProcessStage.ENDPOINT, refusal)
+    if event.stage in (ProcessStage.PARTICIPANT, ProcessStage.ENDPOINT):
         # A ROS node has topics and services of its own: denied one of them, it does not start.
         refusal = participant_refusal(reported) or endpoint_refusal(reported)
         if refusal:
-            return _refused(name, Stage.PARTICIPANT, refusal)
+            return _refused(name, ProcessStage.PARTICIPANT, refusal)
     return _Finding(RowStatus.CRASHED, f"{name} failed: {reason}")
 
 
@@ -342,9 +348,9 @@ def _is_about(line: str, topic: str) -> bool:
     return bool(re.search(name, line)) or "not allowed by security" in line.lower()
 
 
-def _refused(name: str, stage: Stage | None, reason: str) -> _Finding:
+def _refused(name: str, stage: ProcessStage | None, reason: str) -> _Finding:
     reason = plain_refusal(reason)
-    if stage is Stage.ENDPOINT:
+    if stage is ProcessStage.ENDPOINT:
         return _Finding(RowStatus.REFUSED, f"{name}: {reason}")
     return _Finding(
         RowStatus.NOT_LET_IN, f"{name} was refused before it came to the topic: {reason}"

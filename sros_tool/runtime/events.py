@@ -19,7 +19,7 @@ from typing import Any
 from sros_tool.errors import DocumentError
 
 
-class Kind(StrEnum):
+class EventKind(StrEnum):
     """What happened."""
 
     READY = "ready"
@@ -31,7 +31,7 @@ class Kind(StrEnum):
     DONE = "done"
 
 
-class Stage(StrEnum):
+class ProcessStage(StrEnum):
     """How far a process had come when it was refused or failed."""
 
     IMPORT = "import"
@@ -48,11 +48,11 @@ class Event:
     many messages there were so far; ``publishers`` says how many an observer counts per topic.
     """
 
-    kind: Kind
+    kind: EventKind
     time: float
     text: str = ""
     count: int = 0
-    stage: Stage | None = None
+    stage: ProcessStage | None = None
     publishers: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -67,11 +67,11 @@ class EventWriter:
 
     def report(
         self,
-        kind: Kind,
+        kind: EventKind,
         text: str = "",
         *,
         count: int = 0,
-        stage: Stage | None = None,
+        stage: ProcessStage | None = None,
         publishers: Mapping[str, int] | None = None,
     ) -> None:
         """Write one event with the present time."""
@@ -132,11 +132,11 @@ def _parse(line: bytes, path: Path) -> Event:
     try:
         record = json.loads(line)
         return Event(
-            kind=Kind(record["event"]),
+            kind=EventKind(record["event"]),
             time=float(record["time"]),
             text=str(record.get("text", "")),
             count=int(record.get("count", 0)),
-            stage=Stage(record["stage"]) if "stage" in record else None,
+            stage=ProcessStage(record["stage"]) if "stage" in record else None,
             publishers={str(k): int(v) for k, v in record.get("publishers", {}).items()},
         )
     except (ValueError, KeyError, TypeError, AttributeError) as error:

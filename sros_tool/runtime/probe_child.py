@@ -23,7 +23,7 @@ from sros_tool.runtime.cyclone import (
     security_properties,
     version_of,
 )
-from sros_tool.runtime.events import EventWriter, Kind, Stage
+from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 from sros_tool.runtime.rcl_security import choose_enclave, domain_of
 from sros_tool.runtime.rmw import MIDDLEWARE
@@ -106,35 +106,35 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         ask, close = JOINS[kind]()
     except Exception as error:
-        stage = Stage.IMPORT if isinstance(error, ImportError) else Stage.PARTICIPANT
-        events.report(Kind.SEEN, _dds_in_memory())
+        stage = ProcessStage.IMPORT if isinstance(error, ImportError) else ProcessStage.PARTICIPANT
+        events.report(EventKind.SEEN, _dds_in_memory())
         _report_failure(events, error, stage, "")
         return 1
-    events.report(Kind.SEEN, _dds_in_memory())
-    events.report(Kind.READY, stage=Stage.PARTICIPANT)
+    events.report(EventKind.SEEN, _dds_in_memory())
+    events.report(EventKind.READY, stage=ProcessStage.PARTICIPANT)
     for what, topic in (("writer", allowed), ("writer", denied), ("reader", denied)):
         try:
             ask(what, topic)
         except Exception as error:
-            _report_failure(events, error, Stage.ENDPOINT, f"{what} {topic}")
+            _report_failure(events, error, ProcessStage.ENDPOINT, f"{what} {topic}")
         else:
-            events.report(Kind.READY, f"{what} {topic}", stage=Stage.ENDPOINT)
+            events.report(EventKind.READY, f"{what} {topic}", stage=ProcessStage.ENDPOINT)
     time.sleep(_LOG_FLUSH_SECONDS)
-    events.report(Kind.DONE)
+    events.report(EventKind.DONE)
     close()
     return 0
 
 
-def _report_failure(events: EventWriter, error: Exception, stage: Stage, asked: str) -> None:
+def _report_failure(events: EventWriter, error: Exception, stage: ProcessStage, asked: str) -> None:
     refused = isinstance(error, SecurityRefusedError)
     reason = f"{type(error).__name__}: {error}"
     if isinstance(error, SrosError):
         # Not the remedy: what to do depends on all that was found.
         reason = str(SrosError(error.what, error.why)).rstrip(".")
-    if stage is not Stage.ENDPOINT:
+    if stage is not ProcessStage.ENDPOINT:
         time.sleep(_LOG_FLUSH_SECONDS)
     text = f"{asked}\n{reason}" if asked else reason
-    events.report(Kind.REFUSED if refused else Kind.FAILED, text, stage=stage)
+    events.report(EventKind.REFUSED if refused else EventKind.FAILED, text, stage=stage)
 
 
 def _dds_in_memory() -> str:

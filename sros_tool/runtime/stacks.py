@@ -23,7 +23,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from sros_tool.runtime.cyclone import INSTALL_ADVICE
-from sros_tool.runtime.events import Event, Kind, Stage, read_events
+from sros_tool.runtime.events import Event, EventKind, ProcessStage, read_events
 from sros_tool.runtime.netns import end_with_parent
 from sros_tool.runtime.rmw import RMW, middleware_of, rmw_implementations
 from sros_tool.runtime.vendor_log import (
@@ -180,7 +180,7 @@ def _absent(name: str, kind: str, dds: str) -> Stack:
 
 def _identity(run: ProbeRun) -> tuple[str, str, str]:
     for event in run.events:
-        if event.kind is Kind.SEEN and event.text.count("\n") == 2:
+        if event.kind is EventKind.SEEN and event.text.count("\n") == 2:
             name, version, where = event.text.split("\n")
             return name, version, where
     return "", "", ""
@@ -266,22 +266,22 @@ def judge(run: ProbeRun, allowed: str, denied: str) -> ProbeVerdict:
     text = "\n".join([run.output, *(event.text for event in run.events)])
     if lacking := missing_security(text):
         return ProbeVerdict(False, f"a secured participant fails: {lacking}")
-    if not _happened(run.events, Kind.READY, Stage.PARTICIPANT):
+    if not _happened(run.events, EventKind.READY, ProcessStage.PARTICIPANT):
         return _untried(_why_not_joined(run, text))
     answers = {
         event.text.partition("\n")[0]: event
         for event in run.events
-        if event.stage is Stage.ENDPOINT
+        if event.stage is ProcessStage.ENDPOINT
     }
     wanted = answers.get(f"writer {allowed}")
-    if wanted is None or wanted.kind is not Kind.READY:
+    if wanted is None or wanted.kind is not EventKind.READY:
         return _untried(f"even the allowed writer on {allowed} failed. {_reason(wanted, run)}")
     asked = [f"writer {denied}", f"reader {denied}"]
     for question in asked:
         answer = answers.get(question)
         if answer is None:
             return _untried(f"no answer about the {question}. {_ending(run)}")
-        if answer.kind is Kind.READY:
+        if answer.kind is EventKind.READY:
             return ProbeVerdict(
                 False, f"it created a {question}, which its permissions do not allow"
             )
@@ -297,14 +297,14 @@ def judge(run: ProbeRun, allowed: str, denied: str) -> ProbeVerdict:
 
 
 def _refusal(answer: Event, run: ProbeRun, topic: str) -> str:
-    if answer.kind is Kind.REFUSED:
+    if answer.kind is EventKind.REFUSED:
         return answer.text.partition("\n")[2]
     lines = [line for line in run.output.splitlines() if topic in line or "SECURITY" in line]
     return endpoint_refusal("\n".join([answer.text, *lines]))
 
 
 def _why_not_joined(run: ProbeRun, text: str) -> str:
-    failed = _first(run.events, Kind.FAILED) or _first(run.events, Kind.REFUSED)
+    failed = _first(run.events, EventKind.FAILED) or _first(run.events, EventKind.REFUSED)
     refusal = participant_refusal(text) or endpoint_refusal(text)
     if refusal:
         return f"the participant itself was refused: {refusal}"
@@ -333,11 +333,11 @@ def _signal_name(number: int) -> str:
         return f"signal {number}"
 
 
-def _happened(events: Sequence[Event], kind: Kind, stage: Stage) -> bool:
+def _happened(events: Sequence[Event], kind: EventKind, stage: ProcessStage) -> bool:
     return any(event.kind is kind and event.stage is stage for event in events)
 
 
-def _first(events: Sequence[Event], kind: Kind) -> Event | None:
+def _first(events: Sequence[Event], kind: EventKind) -> Event | None:
     return next((event for event in events if event.kind is kind), None)
 
 

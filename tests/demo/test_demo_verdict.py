@@ -10,14 +10,14 @@ from sros_tool.demo.scenarios.isolation import ROWS
 from sros_tool.demo.scenarios.model import Row, RowStatus
 from sros_tool.demo.verdict import PartyRecord, RowRecord, RowResult, judge_row
 from sros_tool.demo.wire import WireCount
-from sros_tool.runtime.events import Event, Kind, Stage
+from sros_tool.runtime.events import Event, EventKind, ProcessStage
 
 WINDOW = (100.0, 105.0)
 FAST_DDS_DENIAL = (
     "2026-01-01 12:00:00.000 [SECURITY Error] rt/chatter topic not found in allow rule."
     " -> Function check_create_datareader\n"
 )
-READY = Event(Kind.READY, 99.0)
+READY = Event(EventKind.READY, 99.0)
 
 
 def row(name: str) -> Row:
@@ -25,12 +25,12 @@ def row(name: str) -> Row:
 
 
 def talker(text: str, times: Iterable[float] = (101.0, 102.0), topic: str = "/c") -> PartyRecord:
-    sent = [Event(Kind.SENT, at, f"{text}: {n}", n) for n, at in enumerate(times, 1)]
+    sent = [Event(EventKind.SENT, at, f"{text}: {n}", n) for n, at in enumerate(times, 1)]
     return PartyRecord(text=text, topic=topic, events=(READY, *sent))
 
 
 def listener(*heard: str) -> PartyRecord:
-    events = [Event(Kind.HEARD, 101.5, f"{text}: 1", n) for n, text in enumerate(heard, 1)]
+    events = [Event(EventKind.HEARD, 101.5, f"{text}: 1", n) for n, text in enumerate(heard, 1)]
     return PartyRecord(events=(READY, *events))
 
 
@@ -69,7 +69,7 @@ def test_silence_counts_beside_a_control_that_heard() -> None:
 
 
 def test_one_leaked_message_is_a_failure_even_before_the_window() -> None:
-    leak = PartyRecord(events=(READY, Event(Kind.HEARD, 99.5, "T: 0", 1)))
+    leak = PartyRecord(events=(READY, Event(EventKind.HEARD, 99.5, "T: 0", 1)))
     result = judge(
         NEGATIVE,
         secured_talker=talker("T"),
@@ -98,7 +98,9 @@ CRASHES = {
         "ImportError",
     ),
     "an exception": (
-        PartyRecord(events=(Event(Kind.FAILED, 99, "ValueError: x", stage=Stage.ENDPOINT),)),
+        PartyRecord(
+            events=(Event(EventKind.FAILED, 99, "ValueError: x", stage=ProcessStage.ENDPOINT),)
+        ),
         RowStatus.CRASHED,
         "ValueError: x",
     ),
@@ -107,10 +109,10 @@ CRASHES = {
         PartyRecord(
             events=(
                 Event(
-                    Kind.FAILED,
+                    EventKind.FAILED,
                     99,
                     "This Fast DDS version doesn't have the security libraries",
-                    stage=Stage.PARTICIPANT,
+                    stage=ProcessStage.PARTICIPANT,
                 ),
             )
         ),
@@ -118,7 +120,9 @@ CRASHES = {
         "security libraries",
     ),
     "refused already as a participant": (
-        PartyRecord(events=(Event(Kind.REFUSED, 99, "bad file", stage=Stage.PARTICIPANT),)),
+        PartyRecord(
+            events=(Event(EventKind.REFUSED, 99, "bad file", stage=ProcessStage.PARTICIPANT),)
+        ),
         RowStatus.NOT_LET_IN,
         "before it came to the topic",
     ),
@@ -126,7 +130,7 @@ CRASHES = {
         PartyRecord(
             topic="/chatter",
             output="[SECURITY Error] rt/rosout topic not found in allow rule.\n",
-            events=(Event(Kind.FAILED, 99, "RCLError: x", stage=Stage.ENDPOINT),),
+            events=(Event(EventKind.FAILED, 99, "RCLError: x", stage=ProcessStage.ENDPOINT),),
         ),
         RowStatus.NOT_LET_IN,
         "before it came to the topic",
@@ -162,12 +166,16 @@ def test_a_crash_is_not_silence(case: str) -> None:
 REFUSALS = {
     "Cyclone says so": PartyRecord(
         topic="/chatter",
-        events=(Event(Kind.REFUSED, 99, "Not Allowed By Security", stage=Stage.ENDPOINT),),
+        events=(
+            Event(EventKind.REFUSED, 99, "Not Allowed By Security", stage=ProcessStage.ENDPOINT),
+        ),
     ),
     "rclpy raises, Fast DDS says so on stdout": PartyRecord(
         topic="/chatter",
         output=FAST_DDS_DENIAL,
-        events=(Event(Kind.FAILED, 99, "RCLError: invalid allocator", stage=Stage.ENDPOINT),),
+        events=(
+            Event(EventKind.FAILED, 99, "RCLError: invalid allocator", stage=ProcessStage.ENDPOINT),
+        ),
         status=1,
     ),
 }
@@ -227,13 +235,13 @@ def test_view(of_secured: int, of_open: int, observed: RowStatus) -> None:
         "secured talker in an unsecured node's view",
         secured_talker=talker("S"),
         unsecured_talker_aside=talker("U", topic="/c_open"),
-        observer=PartyRecord(events=(READY, Event(Kind.SEEN, 103, publishers=looks))),
+        observer=PartyRecord(events=(READY, Event(EventKind.SEEN, 103, publishers=looks))),
     )
     assert result.observed is observed
 
 
 def test_an_observer_without_rclpy_is_skipped_with_the_reason() -> None:
-    failed = Event(Kind.FAILED, 99, "ModuleNotFoundError: rclpy", stage=Stage.IMPORT)
+    failed = Event(EventKind.FAILED, 99, "ModuleNotFoundError: rclpy", stage=ProcessStage.IMPORT)
     result = judge(
         "secured talker in an unsecured node's view",
         secured_talker=talker("S"),

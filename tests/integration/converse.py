@@ -18,7 +18,7 @@ from pathlib import Path
 
 from sros_tool.demo.wire import Capture
 from sros_tool.runtime.environment import secured_environment
-from sros_tool.runtime.events import Event, Kind, read_events
+from sros_tool.runtime.events import Event, EventKind, read_events
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 from tests.support.children import LATE, PATIENCE, python
 
@@ -28,7 +28,7 @@ ENOUGH = 11
 SILENCE = 4.0
 """Seconds after which who is not expected is not heard any more; or twice what others needed."""
 
-SETTLED = {Kind.READY, Kind.REFUSED, Kind.FAILED}
+SETTLED = {EventKind.READY, EventKind.REFUSED, EventKind.FAILED}
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class Party:
         """Whether nothing more has to be awaited of it."""
         if self.process.poll() is not None:
             return True
-        wanted = Kind.SENT if self.node.role == "talker" else Kind.HEARD
+        wanted = EventKind.SENT if self.node.role == "talker" else EventKind.HEARD
         return sum(event.kind is wanted for event in self.events()) >= ENOUGH
 
     def end(self) -> Told:
@@ -145,9 +145,9 @@ class Party:
         events = self.events()
         return Told(
             kinds=sorted({event.kind.value for event in events}),
-            sent=sum(event.kind is Kind.SENT for event in events),
-            heard=[event.text for event in events if event.kind is Kind.HEARD],
-            reasons=[e.text for e in events if e.kind in (Kind.REFUSED, Kind.FAILED)],
+            sent=sum(event.kind is EventKind.SENT for event in events),
+            heard=[event.text for event in events if event.kind is EventKind.HEARD],
+            reasons=[e.text for e in events if e.kind in (EventKind.REFUSED, EventKind.FAILED)],
             errors=self._errors.read_text(errors="replace"),
         )
 

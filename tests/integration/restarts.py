@@ -19,7 +19,7 @@ from subprocess import Popen
 
 from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
 from sros_tool.keystore.lifecycle.rotation.state import Stage
-from sros_tool.runtime.events import Kind, read_events
+from sros_tool.runtime.events import EventKind, read_events
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 from tests.integration.converse import SETTLED, SILENCE, Node, start
 from tests.support.children import LATE, PATIENCE, wait_for
@@ -41,7 +41,7 @@ class Nodes:
         process, report = self._processes[node.name] = start(node, self._domain, self._folder)
         wait_for(lambda: self._kinds(node.name) & SETTLED or process.poll() is not None, node.name)
         errors = report.with_suffix(".err").read_text()
-        assert Kind.READY in self._kinds(node.name), (read_events(report), errors)
+        assert EventKind.READY in self._kinds(node.name), (read_events(report), errors)
         return node.name
 
     def stop(self, name: str) -> None:
@@ -59,12 +59,12 @@ class Nodes:
             time.sleep(0.05)
         return True
 
-    def _kinds(self, name: str) -> set[Kind]:
+    def _kinds(self, name: str) -> set[EventKind]:
         return {event.kind for event in read_events(self._processes[name][1])}
 
     def _heard(self, name: str) -> Counter[str]:
         events = read_events(self._processes[name][1])
-        texts = [event.text for event in events if event.kind is Kind.HEARD]
+        texts = [event.text for event in events if event.kind is EventKind.HEARD]
         return Counter(text.partition("from ")[2].partition(";")[0] for text in texts)
 
 

@@ -25,7 +25,7 @@ from sros_tool.demo.scenarios.model import UNSECURED, RowStatus
 from sros_tool.demo.scenarios.services import ACTIONS, SERVICES
 from sros_tool.errors import UnavailableError
 from sros_tool.keystore.template import load_template
-from sros_tool.runtime.events import Event, Kind, Stage, read_events
+from sros_tool.runtime.events import Event, EventKind, ProcessStage, read_events
 from sros_tool.runtime.netns import try_isolation
 from sros_tool.runtime.stacks import rclpy_stacks
 from tests.integration.enforcing import enforcing_backend
@@ -56,7 +56,7 @@ def node(
     )
 
 
-def wait_until(kind: Kind, path: Path, process: subprocess.Popen[str]) -> list[Event]:
+def wait_until(kind: EventKind, path: Path, process: subprocess.Popen[str]) -> list[Event]:
     """Wait until a process has reported an event of that kind; return all that it reported."""
 
     def found() -> list[Event]:
@@ -117,8 +117,8 @@ def test_nodes_take_ros_arguments_and_end_quietly(number: signal.Signals, tmp_pa
     listener = node("listener", tmp_path, *remap, "-r", "__node:=ear")
     talker = node("talker", tmp_path, "--period", "0.1", "--text", "Hi", *remap)
     try:
-        wait_until(Kind.READY, tmp_path / "talker.jsonl", talker)
-        heard = wait_until(Kind.HEARD, tmp_path / "listener.jsonl", listener)
+        wait_until(EventKind.READY, tmp_path / "talker.jsonl", talker)
+        heard = wait_until(EventKind.HEARD, tmp_path / "listener.jsonl", listener)
         assert heard[-1].text.startswith("Hi: ")
     finally:
         for process in (listener, talker):
@@ -126,14 +126,14 @@ def test_nodes_take_ros_arguments_and_end_quietly(number: signal.Signals, tmp_pa
     for process in (listener, talker):
         assert "Traceback" not in finish(process).stderr
     for name in ("talker", "listener"):
-        assert read_events(tmp_path / f"{name}.jsonl")[-1].kind is Kind.DONE
+        assert read_events(tmp_path / f"{name}.jsonl")[-1].kind is EventKind.DONE
 
 
 def test_a_cyclone_talker_is_heard_by_an_rclpy_listener(tmp_path: Path) -> None:
     listener = node("listener", tmp_path)
     talker = node("talker", tmp_path, "--period", "0.1", "--text", "Cyclone", on="cyclone")
     try:
-        heard = wait_until(Kind.HEARD, tmp_path / "listener.jsonl", listener)
+        heard = wait_until(EventKind.HEARD, tmp_path / "listener.jsonl", listener)
         assert heard[-1].text.startswith("Cyclone: ")
     finally:
         for process in (listener, talker):
@@ -151,14 +151,14 @@ def test_a_secured_node_runs_secured_or_not_at_all(tmp_path: Path) -> None:
     variables = keystores.environment(TALKER, 190)
     talker = node("talker", tmp_path, **variables)
     if stack.enforces:
-        wait_until(Kind.READY, tmp_path / "talker.jsonl", talker)
+        wait_until(EventKind.READY, tmp_path / "talker.jsonl", talker)
         talker.terminate()
         talker.communicate(timeout=PATIENCE)
         return
     _, errors = talker.communicate(timeout=PATIENCE)
     assert talker.returncode == 1
     (failed,) = read_events(tmp_path / "talker.jsonl")
-    assert (failed.kind, failed.stage) == (Kind.FAILED, Stage.PARTICIPANT)
+    assert (failed.kind, failed.stage) == (EventKind.FAILED, ProcessStage.PARTICIPANT)
     assert "security" in errors
     with pytest.raises(UnavailableError, match="no RMW under rclpy"):
         choose_backend("rclpy", keystores.probe("/chatter", 190))
@@ -187,4 +187,4 @@ def test_a_node_that_is_ended_while_it_is_made_has_not_failed(
     report = tmp_path / "report.jsonl"
     done = python("-c", STOPPED_WHILE_IT_IS_MADE, report, how, status=status)
     last = read_events(report)[-1]
-    assert last.kind is (Kind.FAILED if status else Kind.DONE), done.stderr
+    assert last.kind is (EventKind.FAILED if status else EventKind.DONE), done.stderr

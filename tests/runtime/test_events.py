@@ -7,19 +7,19 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import DocumentError
-from sros_tool.runtime.events import EventReader, EventWriter, Kind, Stage, read_events
+from sros_tool.runtime.events import EventKind, EventReader, EventWriter, ProcessStage, read_events
 
 
 def test_what_is_written_is_read(tmp_path: Path) -> None:
     path = tmp_path / "report"
     writer = EventWriter(path)
-    writer.report(Kind.HEARD, "Grüße\n: 1", count=1)
-    writer.report(Kind.FAILED, "x", stage=Stage.ENDPOINT)
-    writer.report(Kind.SEEN, publishers={"/a": 2})
+    writer.report(EventKind.HEARD, "Grüße\n: 1", count=1)
+    writer.report(EventKind.FAILED, "x", stage=ProcessStage.ENDPOINT)
+    writer.report(EventKind.SEEN, publishers={"/a": 2})
     writer.close()
     heard, failed, seen = read_events(path)
-    assert (heard.kind, heard.text, heard.count) == (Kind.HEARD, "Grüße\n: 1", 1)
-    assert failed.stage is Stage.ENDPOINT
+    assert (heard.kind, heard.text, heard.count) == (EventKind.HEARD, "Grüße\n: 1", 1)
+    assert failed.stage is ProcessStage.ENDPOINT
     assert seen.publishers == {"/a": 2}
     assert heard.time <= failed.time <= seen.time
 
@@ -45,4 +45,4 @@ def test_foreign_lines_are_errors(line: str, tmp_path: Path) -> None:
 
 
 def test_without_a_file_nothing_is_written() -> None:
-    EventWriter(None).report(Kind.READY)
+    EventWriter(None).report(EventKind.READY)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from sros_tool.runtime.events import Event, Kind, Stage
+from sros_tool.runtime.events import Event, EventKind, ProcessStage
 from sros_tool.runtime.stacks import ProbeRun, judge
 
-JOINED = Event(Kind.READY, 1, stage=Stage.PARTICIPANT)
-ALLOWED = Event(Kind.READY, 2, "writer /ok", stage=Stage.ENDPOINT)
-DONE = Event(Kind.DONE, 9)
+JOINED = Event(EventKind.READY, 1, stage=ProcessStage.PARTICIPANT)
+ALLOWED = Event(EventKind.READY, 2, "writer /ok", stage=ProcessStage.ENDPOINT)
+DONE = Event(EventKind.DONE, 9)
 
 
-def endpoint(kind: Kind, what: str, reason: str = "") -> Event:
-    return Event(kind, 3, f"{what}\n{reason}", stage=Stage.ENDPOINT)
+def endpoint(kind: EventKind, what: str, reason: str = "") -> Event:
+    return Event(kind, 3, f"{what}\n{reason}", stage=ProcessStage.ENDPOINT)
 
 
 def run(*events: Event, output: str = "", status: int | None = 0) -> ProbeRun:
@@ -24,16 +24,16 @@ FAST_DDS = (
     "[SECURITY Error] rt/no topic not found in allow rule. -> Function check_create_datawriter\n"
     "[SECURITY Error] rt/no topic not found in allow rule. -> Function check_create_datareader\n"
 )
-WRITER = endpoint(Kind.FAILED, "writer /no", "RCLError: failed to create publisher")
-READER = endpoint(Kind.FAILED, "reader /no", "RCLError: invalid allocator")
+WRITER = endpoint(EventKind.FAILED, "writer /no", "RCLError: failed to create publisher")
+READER = endpoint(EventKind.FAILED, "reader /no", "RCLError: invalid allocator")
 
 CASES = {
     "Cyclone refuses": (
         run(
             JOINED,
             ALLOWED,
-            endpoint(Kind.REFUSED, "writer /no", "Not Allowed By Security"),
-            endpoint(Kind.REFUSED, "reader /no", "Not Allowed By Security"),
+            endpoint(EventKind.REFUSED, "writer /no", "Not Allowed By Security"),
+            endpoint(EventKind.REFUSED, "reader /no", "Not Allowed By Security"),
             DONE,
         ),
         True,
@@ -47,11 +47,11 @@ CASES = {
     "no security built in": (
         run(
             Event(
-                Kind.FAILED,
+                EventKind.FAILED,
                 1,
                 "RCLError: This Fast DDS version doesn't have the security libraries\nPlease"
                 " compile Fast DDS using the -DSECURITY=ON CMake option",
-                stage=Stage.PARTICIPANT,
+                stage=ProcessStage.PARTICIPANT,
             ),
             status=1,
         ),
@@ -59,7 +59,7 @@ CASES = {
         "security libraries",
     ),
     "it lets a writer pass": (
-        run(JOINED, ALLOWED, endpoint(Kind.READY, "writer /no"), READER, DONE),
+        run(JOINED, ALLOWED, endpoint(EventKind.READY, "writer /no"), READER, DONE),
         False,
         "created a writer /no",
     ),
@@ -67,8 +67,8 @@ CASES = {
         run(
             JOINED,
             ALLOWED,
-            endpoint(Kind.REFUSED, "writer /no", "Not Allowed By Security"),
-            endpoint(Kind.READY, "reader /no"),
+            endpoint(EventKind.REFUSED, "writer /no", "Not Allowed By Security"),
+            endpoint(EventKind.READY, "reader /no"),
             DONE,
         ),
         False,
@@ -80,7 +80,9 @@ CASES = {
         "not by a security refusal",
     ),
     "even the allowed endpoint fails": (
-        run(JOINED, endpoint(Kind.FAILED, "writer /ok", "no"), WRITER, READER, output=FAST_DDS),
+        run(
+            JOINED, endpoint(EventKind.FAILED, "writer /ok", "no"), WRITER, READER, output=FAST_DDS
+        ),
         None,
         "even the allowed writer",
     ),
@@ -88,13 +90,16 @@ CASES = {
     "it crashes on the denied endpoint": (run(JOINED, ALLOWED, status=-6), None, "SIGABRT"),
     "it hangs": (run(JOINED, ALLOWED, status=None), None, "no answer in time"),
     "it cannot be imported": (
-        run(Event(Kind.FAILED, 1, "ImportError: librcl.so", stage=Stage.IMPORT), status=1),
+        run(
+            Event(EventKind.FAILED, 1, "ImportError: librcl.so", stage=ProcessStage.IMPORT),
+            status=1,
+        ),
         None,
         "librcl.so",
     ),
     "the enclave is refused": (
         run(
-            Event(Kind.FAILED, 1, "RCLError: x", stage=Stage.PARTICIPANT),
+            Event(EventKind.FAILED, 1, "RCLError: x", stage=ProcessStage.PARTICIPANT),
             output="[SECURITY Error] PKCS7 data verification failed\n",
             status=1,
         ),

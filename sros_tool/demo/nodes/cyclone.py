@@ -28,7 +28,7 @@ from sros_tool.demo.nodes.options import (
 )
 from sros_tool.errors import SrosError
 from sros_tool.runtime.cyclone import Participant, Reader, SecurityRefusedError, Writer
-from sros_tool.runtime.events import EventWriter, Kind, Stage
+from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 from sros_tool.runtime.rcl_security import choose_loadable, domain_of
 from sros_tool.translate import dds_names
 
@@ -52,7 +52,7 @@ class _Talker:
         self._sent += 1
         text = f"{self._options.text}: {self._sent}"
         self._writer.write(text)
-        self._events.report(Kind.SENT, text, count=self._sent)
+        self._events.report(EventKind.SENT, text, count=self._sent)
 
 
 class _Listener:
@@ -67,7 +67,7 @@ class _Listener:
         """Report what has come."""
         for text in self._reader.take():
             self._heard += 1
-            self._events.report(Kind.HEARD, text, count=self._heard)
+            self._events.report(EventKind.HEARD, text, count=self._heard)
 
 
 class _Observer:
@@ -85,7 +85,7 @@ class _Observer:
         self._due += self._options.period
         found = [publication.topic for publication in self._participant.publications()]
         counts = {topic: found.count(_dds_topic(topic)) for topic in self._topics}
-        self._events.report(Kind.SEEN, " ".join(sorted(set(found))), publishers=counts)
+        self._events.report(EventKind.SEEN, " ".join(sorted(set(found))), publishers=counts)
 
 
 class _Service:
@@ -120,7 +120,7 @@ class _Server:
             self._answered += 1
             answer = f"{self._options.text}: {question} = {first + second}"
             self._service.send(client, number, answer)
-            self._events.report(Kind.SENT, answer, count=self._answered)
+            self._events.report(EventKind.SENT, answer, count=self._answered)
 
 
 class _Client:
@@ -140,12 +140,12 @@ class _Client:
             self._asked += 1
             first, second = _operands(self._asked)
             self._service.send(self._name, str(self._asked), f"{first} + {second}")
-            self._events.report(Kind.SENT, f"{first} + {second}", count=self._asked)
+            self._events.report(EventKind.SENT, f"{first} + {second}", count=self._asked)
         for client, number, answer in self._service.take():
             first, second = _operands(int(number))
             if client == self._name and answer.endswith(f": {first} + {second} = {first + second}"):
                 self._right += 1
-                self._events.report(Kind.HEARD, answer, count=self._right)
+                self._events.report(EventKind.HEARD, answer, count=self._right)
 
 
 class _ActionServer:
@@ -178,7 +178,7 @@ class _ActionServer:
             self._done += 1
             answer = f"{self._options.text}: {result}"
             self._results.send(client, number, answer)
-            self._events.report(Kind.SENT, answer, count=self._done)
+            self._events.report(EventKind.SENT, answer, count=self._done)
         self._cancels.take()
 
 
@@ -205,7 +205,7 @@ class _ActionClient:
             self._due += self._options.period
             self._sent += 1
             self._goals.send(self._name, str(self._sent), str(FIBONACCI_ORDER))
-            self._events.report(Kind.SENT, f"goal {self._sent}", count=self._sent)
+            self._events.report(EventKind.SENT, f"goal {self._sent}", count=self._sent)
         for text in self._feedback.take():
             client, number, _ = text.split(" ", 2)
             if client == self._name:
@@ -225,7 +225,7 @@ class _ActionClient:
                 and answer.endswith(f": {fibonacci(FIBONACCI_ORDER)}")
             ):
                 self._right += 1
-                self._events.report(Kind.HEARD, answer, count=self._right)
+                self._events.report(EventKind.HEARD, answer, count=self._right)
         self._cancels.take()
 
 
@@ -278,29 +278,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse_options("sros_tool.demo.nodes.cyclone", ROLES, arguments)
     _stop_on_signals()
     events = EventWriter(options.report)
-    stage = Stage.PARTICIPANT
+    stage = ProcessStage.PARTICIPANT
     try:
         choice = choose_loadable(os.environ, _enclave_in(arguments))
         _say(options.role, choice.note)
         with Participant(domain_of(os.environ), choice.enclave) as participant:
-            stage = Stage.ENDPOINT
+            stage = ProcessStage.ENDPOINT
             node = ROLES[options.role](participant, options, events)
-            stage = Stage.RUNNING
-            events.report(Kind.READY)
+            stage = ProcessStage.RUNNING
+            events.report(EventKind.READY)
             while True:
                 node.step()
                 time.sleep(_POLL_SECONDS)
     except _Stopped:
         pass
     except SecurityRefusedError as refusal:
-        events.report(Kind.REFUSED, str(refusal), stage=stage)
+        events.report(EventKind.REFUSED, str(refusal), stage=stage)
         _say(options.role, f"refused by DDS Security: {refusal}")
         return 1
     except SrosError as error:
-        events.report(Kind.FAILED, str(error), stage=stage)
+        events.report(EventKind.FAILED, str(error), stage=stage)
         _say(options.role, f"failed: {error}")
         return 1
-    events.report(Kind.DONE)
+    events.report(EventKind.DONE)
     return 0
 
 

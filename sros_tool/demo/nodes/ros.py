@@ -14,7 +14,7 @@ from contextlib import suppress
 from typing import Any
 
 from sros_tool.demo.nodes.options import FIBONACCI_ORDER, NodeOptions, fibonacci, parse_options
-from sros_tool.runtime.events import EventWriter, Kind, Stage
+from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 
 _LOG_FLUSH_SECONDS = 0.3
 """Fast DDS logs from a thread of its own: a process that ends at once loses the reason."""
@@ -44,23 +44,23 @@ def run_role(build: Build, options: NodeOptions, arguments: Sequence[str]) -> in
     try:
         import rclpy
     except ImportError as error:
-        return _fail(name, error, Stage.IMPORT, events)
-    stage = Stage.PARTICIPANT
+        return _fail(name, error, ProcessStage.IMPORT, events)
+    stage = ProcessStage.PARTICIPANT
     nodes: list[Any] = []
     joined = False
     try:
         rclpy.init(args=list(arguments))
         joined = True
         nodes.append(rclpy.create_node(name))
-        stage = Stage.ENDPOINT
+        stage = ProcessStage.ENDPOINT
         nodes += build(nodes[0], options, events) or ()
-        stage = Stage.RUNNING
-        events.report(Kind.READY)
+        stage = ProcessStage.RUNNING
+        events.report(EventKind.READY)
         _spin(nodes)
     except KeyboardInterrupt:
         pass
     except ImportError as error:
-        return _fail(name, error, Stage.IMPORT, events)
+        return _fail(name, error, ProcessStage.IMPORT, events)
     except Exception as error:
         # A signal ends the context, and what is being made then fails because of that.
         if rclpy.ok() or not joined:
@@ -71,7 +71,7 @@ def run_role(build: Build, options: NodeOptions, arguments: Sequence[str]) -> in
             for node in nodes:
                 node.destroy_node()
             rclpy.try_shutdown()
-    events.report(Kind.DONE)
+    events.report(EventKind.DONE)
     return 0
 
 
@@ -92,11 +92,11 @@ def _spin(nodes: Sequence[Any]) -> None:
             raise
 
 
-def _fail(name: str, error: Exception, stage: Stage, events: EventWriter) -> int:
+def _fail(name: str, error: Exception, stage: ProcessStage, events: EventWriter) -> int:
     reason = f"{type(error).__name__}: {error}"
     time.sleep(_LOG_FLUSH_SECONDS)
     sys.stdout.flush()
-    events.report(Kind.FAILED, reason, stage=stage)
+    events.report(EventKind.FAILED, reason, stage=stage)
     print(f"{name}: failed at stage {stage.value}: {reason}", file=sys.stderr)
     return 1
 
@@ -117,7 +117,7 @@ def _talker(node: Any, options: NodeOptions, events: EventWriter) -> None:
         text = f"{options.text}: {sent}"
         node.get_logger().info(f"Publishing: '{text}'")
         publisher.publish(String(data=text))
-        events.report(Kind.SENT, text, count=sent)
+        events.report(EventKind.SENT, text, count=sent)
 
     node.create_timer(options.period, speak)
 
@@ -132,7 +132,7 @@ def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
         nonlocal heard
         heard += 1
         node.get_logger().info(f"I heard: '{message.data}'")
-        events.report(Kind.HEARD, message.data, count=heard)
+        events.report(EventKind.HEARD, message.data, count=heard)
 
     # rclpy keeps subscriptions alive through the node.
     node.create_subscription(String, options.topic, hear, _QUEUE_DEPTH)
@@ -147,7 +147,7 @@ def _observer(node: Any, options: NodeOptions, events: EventWriter) -> None:
         # of publishers says whether a talker is visible.
         listed = " ".join(sorted(name for name, _ in node.get_topic_names_and_types()))
         node.get_logger().info(f"Publishers: {counts}; topics: {listed}")
-        events.report(Kind.SEEN, listed, publishers=counts)
+        events.report(EventKind.SEEN, listed, publishers=counts)
 
     node.create_timer(options.period, look)
 
@@ -171,7 +171,7 @@ def _server(node: Any, options: NodeOptions, events: EventWriter) -> None:
         response.success = not request.data
         response.message = f"{options.text}: not {request.data} = {response.success}"
         node.get_logger().info(f"Answering: '{response.message}'")
-        events.report(Kind.SENT, response.message, count=answered)
+        events.report(EventKind.SENT, response.message, count=answered)
         return response
 
     node.create_service(SetBool, options.service, answer)
@@ -188,7 +188,7 @@ def _client(node: Any, options: NodeOptions, events: EventWriter) -> None:
         nonlocal asked
         asked += 1
         value = bool(asked % 2)
-        events.report(Kind.SENT, f"not {value}", count=asked)
+        events.report(EventKind.SENT, f"not {value}", count=asked)
         future = client.call_async(SetBool.Request(data=value))
         future.add_done_callback(lambda done: check(value, done.result()))
 
@@ -197,7 +197,7 @@ def _client(node: Any, options: NodeOptions, events: EventWriter) -> None:
         if response.success is not value and response.message.endswith(f"= {not value}"):
             right += 1
             node.get_logger().info(f"Answer: '{response.message}'")
-            events.report(Kind.HEARD, response.message, count=right)
+            events.report(EventKind.HEARD, response.message, count=right)
 
     node.create_timer(options.period, ask)
 
@@ -224,7 +224,7 @@ def _action_server(node: Any, options: NodeOptions, events: EventWriter) -> None
         result = action.Result()
         result.sequence = fibonacci(goal.request.order)
         node.get_logger().info(f"Result: {list(result.sequence)}")
-        events.report(Kind.SENT, f"{options.text}: {list(result.sequence)}", count=done)
+        events.report(EventKind.SENT, f"{options.text}: {list(result.sequence)}", count=done)
         return result
 
     node.action = ActionServer(node, action, options.topic, execute)
@@ -245,7 +245,7 @@ def _action_client(node: Any, options: NodeOptions, events: EventWriter) -> None
     def send() -> None:
         nonlocal sent
         sent += 1
-        events.report(Kind.SENT, f"goal {sent}", count=sent)
+        events.report(EventKind.SENT, f"goal {sent}", count=sent)
         goal = action.Goal(order=FIBONACCI_ORDER)
         future = client.send_goal_async(goal, feedback_callback=keep)
         future.add_done_callback(fetch)
@@ -266,7 +266,7 @@ def _action_client(node: Any, options: NodeOptions, events: EventWriter) -> None
         if sequence == fibonacci(FIBONACCI_ORDER) and complete:
             right += 1
             node.get_logger().info(f"Result: {sequence}")
-            events.report(Kind.HEARD, f"{options.server}: {sequence}", count=right)
+            events.report(EventKind.HEARD, f"{options.server}: {sequence}", count=right)
 
     node.create_timer(options.period, send)
 
