@@ -1,4 +1,4 @@
-"""The verb `check`: named findings about policies, keystores, and the environment of nodes."""
+"""The verbs `check` and `doctor`: findings, and which DDS of this machine enforces security."""
 
 from __future__ import annotations
 
@@ -13,9 +13,6 @@ from typing import TYPE_CHECKING
 import click
 
 from sros_tool import __version__
-from sros_tool.checks.kind import Finding
-from sros_tool.checks.registry import ChosenFindings, FindingFilter, select_kinds
-from sros_tool.checks.sarif import sarif
 from sros_tool.cli.common import (
     PATH,
     domain_of,
@@ -31,6 +28,7 @@ from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
+    from sros_tool.checks.registry import ChosenFindings, FindingFilter
     from sros_tool.checks.targets import Circumstances
 
 _FAMILIES = ("policy", "keystore", "runtime")
@@ -38,7 +36,7 @@ _LEVELS = click.Choice(["note", "warning", "error"])
 
 
 def _complete_id(_ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
-    """Completes the names of findings."""
+    """Complete the ids of findings."""
     from sros_tool.checks.registry import KINDS
 
     return [each for each in KINDS if each.startswith(incomplete)]
@@ -162,28 +160,30 @@ def check(
         root = paths[0] if paths else keystore_from_environment()
         at = _circumstances(domain, moment, ())
         if form == "sarif":
-            raise UsageError("--needs-renewal finds no faults to tell in SARIF", "", "Say --json.")
+            raise UsageError("--needs-renewal has no findings for SARIF", "", "Use --json.")
         return _needs_renewal(root, needs_renewal, at.now, form == "json")
     selection = FindingFilter(include, exclude, Severity[severity.upper()], strict, vendor or "")
     if as_list:
-        print_list(selection, form)
+        _print_kinds(selection, form)
         return 0
     at = _circumstances(domain, moment, policies)
     found = [_shown(each) for each in _findings(family, paths, at)]
     chosen = selection.choose(found)
-    SHOW[form](chosen, selection)
+    _SHOW[form](chosen, selection)
     return 1 if fail_on != "never" and chosen.fails(Severity[fail_on.upper()]) else 0
 
 
 def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:
-    """The family that the first word names, or "", and the paths.
+    """Return the family that the first word names, or "", and the paths.
 
     A single word is a path where there is one of that name: `keystore` is what people call theirs.
     """
     word = str(targets[0]) if targets else ""
     if word in _FAMILIES and not (len(targets) == 1 and targets[0].exists()):
         if word == "runtime" and len(targets) > 1:
-            raise UsageError("the runtime is that of this machine", "", "Leave the path out.")
+            raise UsageError(
+                "the runtime is always that of this machine", "", "Leave the path out."
+            )
         return word, targets[1:]
     return "", targets
 
@@ -238,13 +238,13 @@ def _runtime(at: Circumstances) -> list[Finding]:
     environment = dict(os.environ)
     if at.domain is not None:
         environment["ROS_DOMAIN_ID"] = str(at.domain)
-    return findings_here(environment, at.now, {})
+    return _findings_here(environment, at.now, {})
 
 
-def findings_here(
+def _findings_here(
     environment: Mapping[str, str], moment: datetime, insecure_rmws: Mapping[str, str]
 ) -> list[Finding]:
-    """What is found in an environment on this machine; `insecure_rmws` were tried before."""
+    """Return the findings in an environment of this machine; `insecure_rmws` were tried before."""
     from sros_tool.checks.runtime import Setting, running_processes, runtime_findings
     from sros_tool.cli.common import local_zone
     from sros_tool.runtime.rmw import rmw_implementations
@@ -256,7 +256,7 @@ def findings_here(
 
 
 def _shown(finding: Finding) -> Finding:
-    """``finding`` with its file as seen from this folder, where it lies below."""
+    """Return ``finding`` with its file relative to this folder if it lies below it."""
     path = Path(finding.file)
     if path.is_absolute() and path.is_relative_to(Path.cwd()):
         return replace(finding, file=str(path.relative_to(Path.cwd())))
@@ -298,25 +298,25 @@ def _print_text(chosen: ChosenFindings, _selection: FindingFilter) -> None:
         click.echo(visible("\n".join(finding_lines(each))))
     for choice in dict.fromkeys(each.accepted for each in chosen.accepted):
         kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
-        told = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
-        click.echo(f"accepted, as the {choice} chose it: {told}")
+        kinds_text = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
+        click.echo(f"accepted, as the {choice} chose it: {kinds_text}")
     click.echo(_summary(chosen), err=True)
 
 
 def finding_lines(finding: Finding) -> list[str]:
-    """A finding for people: where and what, why here, and what to do."""
+    """Return a finding as lines: where and what, why here, and what to do."""
     head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"
-    told = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
+    subject = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
     by = f" (chosen by the {finding.accepted})" if finding.accepted else ""
-    return [head, f"    {told}{finding.text}{by}", f"    {finding.remedy}"]
+    return [head, f"    {subject}{finding.text}{by}", f"    {finding.remedy}"]
 
 
 def _summary(chosen: ChosenFindings) -> str:
     counts = _counts(chosen)
-    told = [f"{number} {word}{'s' * (number != 1)}" for word, number in counts.items() if number]
+    counted = [f"{number} {word}{'s' * (number != 1)}" for word, number in counts.items() if number]
     number = chosen.hidden
     hidden = f" (not shown: {number} note{'s' * (number != 1)}, --severity note)" if number else ""
-    return f"{', '.join(told) or 'nothing found'}{hidden}"
+    return f"{', '.join(counted) or 'nothing found'}{hidden}"
 
 
 def _counts(chosen: ChosenFindings) -> dict[str, int]:
@@ -336,13 +336,16 @@ def _print_json(chosen: ChosenFindings, _selection: FindingFilter) -> None:
 
 
 def _print_sarif(chosen: ChosenFindings, selection: FindingFilter) -> None:
+    from sros_tool.checks.registry import select_kinds
+    from sros_tool.checks.sarif import sarif
 
     kinds, findings = select_kinds(selection), (*chosen.shown, *chosen.accepted)
     print_json(sarif(findings, kinds, version=__version__, base=Path.cwd()))
 
 
-def print_list(selection: FindingFilter, form: str) -> None:
-    """Show the kinds of findings that are selected."""
+def _print_kinds(selection: FindingFilter, form: str) -> None:
+    """Print the kinds of findings that are selected."""
+    from sros_tool.checks.registry import select_kinds
 
     kinds = list(select_kinds(selection))
     if form != "text":
@@ -353,7 +356,7 @@ def print_list(selection: FindingFilter, form: str) -> None:
         click.echo(f"{each.id:{width}}  {each.severity.word:7}  {each.title}")
 
 
-SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
+_SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
     "text": _print_text,
     "json": _print_json,
     "sarif": _print_sarif,
@@ -394,7 +397,7 @@ def doctor(as_json: bool) -> None:
         for stack in diagnosis.stacks
         if stack.rmw and stack.enforces is False
     }
-    findings = findings_here(os.environ, moment, insecure)
+    findings = _findings_here(os.environ, moment, insecure)
     if as_json:
         shown = [each.as_json() for each in findings]
         print_json({**diagnosis.as_json(), "findings": shown})

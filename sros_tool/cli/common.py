@@ -1,4 +1,4 @@
-"""Makes text of others safe to show: what would steer a terminal is shown, and not obeyed."""
+"""Shared by the verbs: arguments, safe output, secrets, times and logs."""
 
 from __future__ import annotations
 
@@ -12,169 +12,66 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
-from zoneinfo import ZoneInfo
 
 import click
 
 from sros_tool.errors import DocumentError, PkiError, UsageError
 
-_CONTROLS = [
-    *(code for code in range(0x20) if chr(code) not in "\n\t"),
-    *range(0x7F, 0xA0),  # DEL, and C1, which holds CSI as one character
-    *(0x061C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)),  # bidirectional
-]
-_SHOWN = {code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" for code in _CONTROLS}
-_IN_JSON = {code: f"\\u{code:04x}" for code in _CONTROLS}
-
-
-def visible(text: str) -> str:
-    """``text`` with its control characters, but newline and tab, spelled as escapes.
-
-    Names of files, certificates and logs are chosen by others, who could otherwise clear the
-    screen, hide a denial, or let a name read backwards.
-    """
-    return text.translate(_SHOWN)
-
-
-def visible_json(document: str) -> str:
-    """The same for a JSON document, which goes on to mean the same."""
-    return document.translate(_IN_JSON)
-
-
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
 
     from sros_tool.errors import Note
+    from sros_tool.keystore.authorities.keyring import Keyring
     from sros_tool.keystore.transaction.stage import Change
 
-Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 
+# ── arguments ───────────────────────────────────────────────────────────────────────────
+
+
+Decorated = TypeVar("Decorated", bound=Callable[..., Any])
 KEYSTORE_VARIABLE = "ROS_SECURITY_KEYSTORE"
 
 
-class NamedPath(click.Path):
-    """A path that has to be named: "" is an unset variable of a script, and not this folder."""
+class _NamedPath(click.Path):
+    """A path that must not be empty: "" is an unset variable of a script, not this folder."""
 
     def __init__(self) -> None:
         super().__init__(path_type=Path)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """The path; refuses the empty one."""
+        """Return the path; refuse the empty one."""
         if value == "":
             self.fail("the path is empty.", param, ctx)
         return super().convert(value, param, ctx)
 
 
-PATH = NamedPath()
-
-
-def now() -> datetime:
-    """The present moment: the only place where the command line asks the clock."""
-    return datetime.now(UTC)
-
-
-_YEARS = 1970, 2999
-
-
-def moment_of(text: str | None) -> datetime:
-    """The moment that ``--at`` names: a date, or a duration from now; the present one by default.
-
-    Raises `UsageError`.
-    """
-    from sros_tool.validity import parse_duration, parse_iso
-
-    if text is None:
-        return now()
-    try:
-        moment = parse_iso(text)
-        if _YEARS[0] <= moment.year <= _YEARS[1]:
-            return moment
-    except ValueError:
-        with suppress(UsageError):
-            return now() + parse_duration(text)
-    raise UsageError(
-        f"--at {text!r} is no moment",
-        f"It is neither a date of {_YEARS[0]} to {_YEARS[1]} nor a duration.",
-        "Write 2027-06-01, 2027-06-01T12:00:00Z, or 90d from now.",
-    )
-
-
-def domain_of(text: str | None) -> int | None:
-    """The domain that ``--domain`` names, or None without the option.  Raises `UsageError`."""
-    from sros_tool.runtime.environment import DOMAIN, domain_from
-
-    if text == "":
-        raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
-    return None if text is None else domain_from({DOMAIN: text})
+PATH = _NamedPath()
 
 
 def json_option(function: Decorated) -> Decorated:
-    """``--json`` for a verb that reads."""
+    """Add ``--json`` to a verb that reads."""
     return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(function)
 
 
 def dry_run_option(function: Decorated) -> Decorated:
-    """``--dry-run`` for a verb that writes."""
+    """Add ``--dry-run`` to a verb that writes."""
     return click.option(
         "--dry-run", is_flag=True, help="Say what would change, and change nothing."
     )(function)
 
 
-def print_json(value: object) -> None:
-    """Print a value as JSON, on stdout."""
-    click.echo(visible_json(json.dumps(value, indent=2, ensure_ascii=False)))
+def output_option(help_text: str) -> Callable[[Decorated], Decorated]:
+    """Add ``-o FILE`` to a verb that writes a policy."""
+    return click.option("-o", "--output", type=PATH, metavar="FILE", help=help_text)
 
 
-def print_notes(notes: Sequence[Note]) -> None:
-    """Print remarks, on stderr."""
-    for note in notes:
-        click.echo(visible(f"note [{note.id}]: {note.text}"), err=True)
-
-
-def print_plan(root: Path, changes: Sequence[Change]) -> None:
-    """Print what a dry run would have changed."""
-    for change in changes:
-        click.echo(f"would {change.action} {root / change.path}")
-    if not changes:
-        click.echo("nothing would change")
-
-
-def keystore_from_environment() -> Path:
-    """The keystore that $ROS_SECURITY_KEYSTORE names."""
-    root = os.environ.get(KEYSTORE_VARIABLE)
-    if not root:
-        raise UsageError(
-            "no keystore is named",
-            f"Neither is one given, nor is {KEYSTORE_VARIABLE} set.",
-            "Name the folder of the keystore.",
-        )
-    return Path(root)
-
-
-def ros_domain() -> int | None:
-    """The domain of $ROS_DOMAIN_ID, or None where it is not set."""
-    from sros_tool.runtime.environment import domain_from
-
-    return domain_from(os.environ)
-
-
-def split_root(words: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
-    """Take the keystore from the front of the arguments, or else from the environment.
-
-    The first word is the keystore, unless it can only be the name of an enclave: it starts with
-    "/", is no folder, and $ROS_SECURITY_KEYSTORE is set.
-    """
-    first = words[0] if words else ""
-    only_a_name = first.startswith("/") and not Path(first).is_dir()
-    if not first or (only_a_name and os.environ.get(KEYSTORE_VARIABLE)):
-        return keystore_from_environment(), tuple(words)
-    return Path(first), tuple(words[1:])
+force_option = click.option("--force", is_flag=True, help="Replace FILE if it exists.")
 
 
 class SeveralValues(click.Command):
-    """Lets ``-e A B -e C`` mean A, B and C, as ros2/sros2 users write it; every value counts.
+    """A command in which ``-e A B -e C`` means A, B and C, as users of ros2/sros2 write it.
 
-    ``several`` are the options that take values so.
+    ``several`` are the options that take several values.
     """
 
     several: tuple[str, ...] = ()
@@ -196,10 +93,35 @@ class SeveralValues(click.Command):
         return super().parse_args(ctx, spread)
 
 
+def split_root(words: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
+    """Split the arguments into the keystore (or that of the environment) and the rest.
+
+    The first word is the keystore, unless it can only be the name of an enclave: it starts with
+    "/", is no folder, and $ROS_SECURITY_KEYSTORE is set.
+    """
+    first = words[0] if words else ""
+    only_a_name = first.startswith("/") and not Path(first).is_dir()
+    if not first or (only_a_name and os.environ.get(KEYSTORE_VARIABLE)):
+        return keystore_from_environment(), tuple(words)
+    return Path(first), tuple(words[1:])
+
+
+def keystore_from_environment() -> Path:
+    """Return the keystore that $ROS_SECURITY_KEYSTORE names.  Raises `UsageError`."""
+    root = os.environ.get(KEYSTORE_VARIABLE)
+    if not root:
+        raise UsageError(
+            "no keystore is named",
+            f"Neither is one given, nor is {KEYSTORE_VARIABLE} set.",
+            "Name the folder of the keystore.",
+        )
+    return Path(root)
+
+
 def complete_keystore_and_enclave(
     ctx: click.Context, _parameter: click.Parameter, incomplete: str
 ) -> list[CompletionItem | str]:
-    """Completes folders first, then the enclaves of the keystore that was given."""
+    """Complete folders first, then the enclaves of the given keystore."""
     from click.shell_completion import CompletionItem
 
     from sros_tool.keystore.layout import enclave_names, is_keystore
@@ -215,15 +137,60 @@ def complete_keystore_and_enclave(
 def complete_template(
     _ctx: click.Context, _parameter: click.Parameter, incomplete: str
 ) -> list[str]:
-    """Completes the names of templates."""
+    """Complete the names of templates."""
     from sros_tool.keystore.template import template_names
 
     return [name for name in template_names() if name.startswith(incomplete)]
 
 
+# ── output ──────────────────────────────────────────────────────────────────────────────
+
+
+_CONTROLS = [
+    *(code for code in range(0x20) if chr(code) not in "\n\t"),
+    *range(0x7F, 0xA0),  # DEL, and C1, which holds CSI as one character
+    *(0x061C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)),  # bidirectional
+]
+_SHOWN = {code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" for code in _CONTROLS}
+_IN_JSON = {code: f"\\u{code:04x}" for code in _CONTROLS}
+
+
+def visible(text: str) -> str:
+    """Return ``text`` with its control characters, except newline and tab, as escapes.
+
+    Names of files, certificates and logs are chosen by others, who could otherwise clear the
+    screen, hide a denial, or let a name read backwards.
+    """
+    return text.translate(_SHOWN)
+
+
+def visible_json(document: str) -> str:
+    """Return a JSON document with its control characters as escapes; its meaning is the same."""
+    return document.translate(_IN_JSON)
+
+
+def print_json(value: object) -> None:
+    """Print a value as JSON, on stdout."""
+    click.echo(visible_json(json.dumps(value, indent=2, ensure_ascii=False)))
+
+
+def print_notes(notes: Sequence[Note]) -> None:
+    """Print notes on stderr."""
+    for note in notes:
+        click.echo(visible(f"note [{note.id}]: {note.text}"), err=True)
+
+
+def print_plan(root: Path, changes: Sequence[Change]) -> None:
+    """Print the changes that a dry run did not make."""
+    for change in changes:
+        click.echo(f"would {change.action} {root / change.path}")
+    if not changes:
+        click.echo("nothing would change")
+
+
 @contextmanager
 def progress_bar(total: int) -> Iterator[Callable[[str], None] | None]:
-    """A progress bar on a terminal, where there is enough to wait for."""
+    """Show a progress bar on a terminal if there are 50 items or more; yield what advances it."""
     if total < 50 or not sys.stderr.isatty():
         yield None
         return
@@ -231,22 +198,131 @@ def progress_bar(total: int) -> Iterator[Callable[[str], None] | None]:
         yield lambda _name: bar.update(1)
 
 
-if TYPE_CHECKING:
-    from sros_tool.keystore.authorities.keyring import Keyring
+def check_output(output: Path, *, force: bool) -> None:
+    """Refuse an existing file unless ``force``, a folder, and a file in a missing folder.
+
+    A device or a pipe is written to, and needs no permission to be replaced.
+    """
+    if not output.absolute().parent.is_dir():
+        raise UsageError(
+            f"cannot write '{output}'", "Its folder does not exist.", "Make the folder first."
+        )
+    if output.is_dir():
+        raise UsageError(f"cannot write '{output}'", "It is a folder.", "Name a file.")
+    if output.is_file() and not force:
+        raise UsageError(f"'{output}' already exists", "", "Name another file, or add --force.")
+
+
+def save(output: Path, document: bytes) -> str:
+    """Write a document atomically, and return the message about it."""
+    from sros_tool.files import replace_file
+
+    verb = "replaced" if output.exists() else "wrote"
+    replace_file(output, document)
+    return visible(f"{verb} '{output}'")
+
+
+# ── moments, zones and domains ──────────────────────────────────────────────────────────
+
+
+def now() -> datetime:
+    """Return the present moment; nothing else in the command line asks the clock."""
+    return datetime.now(UTC)
+
+
+_YEARS = 1970, 2999
+
+
+def moment_of(text: str | None) -> datetime:
+    """Return the moment that ``--at`` names: a date, or a duration from now; now by default.
+
+    Raises:
+        UsageError: it is neither, or out of range.
+    """
+    from sros_tool.validity import parse_duration, parse_iso
+
+    if text is None:
+        return now()
+    try:
+        moment = parse_iso(text)
+        if _YEARS[0] <= moment.year <= _YEARS[1]:
+            return moment
+    except ValueError:
+        with suppress(UsageError):
+            return now() + parse_duration(text)
+    raise UsageError(
+        f"--at {text!r} is no moment",
+        f"It is neither a date of {_YEARS[0]} to {_YEARS[1]} nor a duration.",
+        "Write 2027-06-01, 2027-06-01T12:00:00Z, or 90d from now.",
+    )
+
+
+_OFFSET = re.compile(r"([+-])(\d\d):?(\d\d)\Z")
+_LOCALTIME = Path("/etc/localtime")
+
+
+def named_zone(name: str) -> tzinfo:
+    """Return the zone of an IANA name (``Asia/Tokyo``) or an offset (``+09:00``)."""
+    from zoneinfo import ZoneInfo
+
+    if match := _OFFSET.match(name):
+        offset = timedelta(hours=int(match[2]), minutes=int(match[3]))
+        if offset < timedelta(hours=24):
+            return timezone(-offset if match[1] == "-" else offset)
+    try:
+        return ZoneInfo(name)
+    except (ValueError, OSError, LookupError) as error:
+        raise UsageError(
+            f"{name!r} is not a time zone", "", "Write for example Asia/Tokyo, UTC or +09:00."
+        ) from error
+
+
+def local_zone(environment: Mapping[str, str]) -> tzinfo:
+    """Return the zone of this machine, with daylight saving if its name can be found."""
+    from zoneinfo import ZoneInfo
+
+    name = environment.get("TZ", "").removeprefix(":")
+    if not name and _LOCALTIME.exists():
+        _, found, name = str(_LOCALTIME.resolve()).partition("zoneinfo/")
+        name = name if found else ""
+    try:
+        return ZoneInfo(name)
+    except (ValueError, OSError, LookupError):
+        return datetime.now().astimezone().tzinfo or UTC
+
+
+def ros_domain() -> int | None:
+    """Return the domain of $ROS_DOMAIN_ID, or None if it is not set."""
+    from sros_tool.runtime.environment import domain_from
+
+    return domain_from(os.environ)
+
+
+def domain_of(text: str | None) -> int | None:
+    """Return the domain that ``--domain`` names, or None without it.  Raises `UsageError`."""
+    from sros_tool.runtime.environment import DOMAIN, domain_from
+
+    if text == "":
+        raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
+    return None if text is None else domain_from({DOMAIN: text})
+
+
+# ── secrets ─────────────────────────────────────────────────────────────────────────────
+
 
 PASSPHRASE, PASSPHRASE_FILE = "SROS_CA_PASSPHRASE", "SROS_CA_PASSPHRASE_FILE"
 PIN = "SROS_PKCS11_PIN"
-PLACES = {"identity": "SROS_IDENTITY_KEY", "permissions": "SROS_PERMISSIONS_KEY"}
+_KEY_PLACES = {"identity": "SROS_IDENTITY_KEY", "permissions": "SROS_PERMISSIONS_KEY"}
 
 
 def keyring(
     identity: str | None = None, permissions: str | None = None, *, encrypt: bool = False
 ) -> Keyring:
-    """The keys at the places that are given, or that the environment names."""
+    """Return the keyring with the CA keys at these URIs, or at those that the environment names."""
     from sros_tool.keystore.authorities.keyring import Keyring
 
     given = {"identity": identity, "permissions": permissions}
-    places = {role: given[role] or os.environ.get(name, "") for role, name in PLACES.items()}
+    places = {role: given[role] or os.environ.get(name, "") for role, name in _KEY_PLACES.items()}
     return Keyring(
         _Answers(encrypt),
         {role: _absolute(place) for role, place in places.items() if place},
@@ -261,7 +337,7 @@ def _absolute(place: str) -> str:
 
 
 class _Answers:
-    """A secrets handler that asks each question once."""
+    """A secrets handler that asks each question once: the environment, a file, or a person."""
 
     def __init__(self, new: bool) -> None:
         self._new = new
@@ -289,34 +365,7 @@ class _Answers:
         return value
 
 
-_OFFSET = re.compile(r"([+-])(\d\d):?(\d\d)\Z")
-_LOCALTIME = Path("/etc/localtime")
-
-
-def named_zone(name: str) -> tzinfo:
-    """The zone of an IANA name (``Asia/Tokyo``) or an offset (``+09:00``)."""
-    if match := _OFFSET.match(name):
-        offset = timedelta(hours=int(match[2]), minutes=int(match[3]))
-        if offset < timedelta(hours=24):
-            return timezone(-offset if match[1] == "-" else offset)
-    try:
-        return ZoneInfo(name)
-    except (ValueError, OSError, LookupError) as error:
-        raise UsageError(
-            f"{name!r} is not a time zone", "", "Write for example Asia/Tokyo, UTC or +09:00."
-        ) from error
-
-
-def local_zone(environment: Mapping[str, str]) -> tzinfo:
-    """The zone of this machine, with its daylight saving where its name can be found."""
-    name = environment.get("TZ", "").removeprefix(":")
-    if not name and _LOCALTIME.exists():
-        _, found, name = str(_LOCALTIME.resolve()).partition("zoneinfo/")
-        name = name if found else ""
-    try:
-        return ZoneInfo(name)
-    except (ValueError, OSError, LookupError):
-        return datetime.now().astimezone().tzinfo or UTC
+# ── logs ────────────────────────────────────────────────────────────────────────────────
 
 
 MAX_LOG = 64 * 1024 * 1024
@@ -324,9 +373,10 @@ MAX_LOG = 64 * 1024 * 1024
 
 
 def read_log(log: str) -> str:
-    """The text of a log, of standard input for "-"; a pipe (``<(journalctl ...)``) is read, too.
+    """Return the text of a log: of a file, a pipe (``<(journalctl ...)``), or stdin for "-".
 
-    Raises `DocumentError` for what cannot be read, is a device, or is larger than ``MAX_LOG``.
+    Raises:
+        DocumentError: it cannot be read, is a device, or is larger than ``MAX_LOG``.
     """
     try:
         if log == "-":

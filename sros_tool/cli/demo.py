@@ -10,8 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from sros_tool.cli.common import PATH, complete_template, json_option, now, print_json
-from sros_tool.cli.policy import check_output, force_option
+from sros_tool.cli.common import (
+    PATH,
+    check_output,
+    complete_template,
+    force_option,
+    json_option,
+    now,
+    print_json,
+)
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""Looks at the ROS graph for a verb: where, how long, and why it failed or saw nothing."""
+"""The verb `generate_policy`: learn a policy from the ROS graph, or from denials in logs."""
 
 from __future__ import annotations
 
@@ -27,210 +27,21 @@ from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
-    from sros_tool.graph.learn import CommonParts
+    from sros_tool.graph.document import Draft
+    from sros_tool.graph.learn import CommonParts, Learned
     from sros_tool.graph.observation import Observation
     from sros_tool.graph.observe import ObserverError, RosGraph, Snapshot
-
-FOREVER = "until Ctrl-C"
-
-
-def observer_environment(
-    enclave: str | None, keystore: Path | None, domain: str | None
-) -> dict[str, str]:
-    """What the observer's environment has more than this one's."""
-    from sros_tool.runtime.environment import DOMAIN, domain_from
-
-    if enclave is None:
-        if keystore is not None:
-            raise UsageError(
-                "--keystore is given without --enclave", "", "Name the observer's enclave."
-            )
-        if domain is None:
-            domain_from(os.environ)
-            return {}
-        return {DOMAIN: str(domain_from({DOMAIN: domain}) or 0)}
-    from sros_tool.cli.running import loadable_environment
-
-    return loadable_environment(keystore or keystore_from_environment(), enclave, domain)
-
-
-def observe(
-    environment: dict[str, str],
-    watch: str | None,
-    spin_time: float | None,
-    common: CommonParts,
-    *,
-    secured: bool,
-) -> tuple[Snapshot, str]:
-    """What was seen, and by which RMW; ``watch`` is a duration or `FOREVER`, in place of a look."""
-    from sros_tool.graph.observe import (
-        SECURED,
-        ObserverError,
-        RosGraph,
-        Settling,
-        identified,
-        look_for,
-        settle,
-    )
-    from sros_tool.validity import parse_duration
-
-    seconds = None
-    enclaves = _enclaves_by_identity({**os.environ, **environment})
-
-    def identify(observation: Observation) -> Observation:
-        return identified(observation, enclaves)
-
-    if watch not in (None, FOREVER):
-        seconds = parse_duration(watch).total_seconds()
-    try:
-        with RosGraph(environment) as graph:
-            if watch is not None:
-                snapshot = _watch(graph, seconds, common, identify)
-            elif spin_time is not None:
-                snapshot = look_for(graph, spin_time, time.monotonic)
-            else:
-                settling = SECURED if secured else Settling()
-                snapshot = settle(graph, settling, time.monotonic)
-            return replace(snapshot, observation=identify(snapshot.observation)), graph.rmw
-    except ObserverError as error:
-        raise _explained(error, environment) from error
-
-
-def _enclaves_by_identity(environment: Mapping[str, str]) -> dict[str, str]:
-    """The enclaves of the observer's keystore, by what the identifiers of participants begin with.
-
-    An enclave whose certificate cannot be read is left out.
-    """
-    from sros_tool.graph.observe import identity_of
-    from sros_tool.keystore.layout import enclave_names, enclave_path, is_keystore
-    from sros_tool.pki.certificates import load_certificate
-    from sros_tool.runtime.environment import ENABLE, KEYSTORE
-    from sros_tool.xml import read_bytes
-
-    root = Path(environment.get(KEYSTORE, ""))
-    if environment.get(ENABLE) != "true" or not is_keystore(root):
-        return {}
-    found = {}
-    for name in enclave_names(root):
-        with suppress(SrosError):
-            data = read_bytes(enclave_path(root, name) / "cert.pem", "certificate")
-            subject = load_certificate(data, name).subject
-            found[identity_of(subject.public_bytes())] = name
-    return found
-
-
-def _watch(
-    graph: RosGraph,
-    seconds: float | None,
-    common: CommonParts,
-    identify: Callable[[Observation], Observation],
-) -> Snapshot:
-    from sros_tool.graph.learn import News
-    from sros_tool.graph.observe import watch
-
-    news = News(common)
-
-    def tell(observation: Observation) -> None:
-        for line in news.lines(identify(observation)):
-            click.echo(line, err=True)
-
-    with _until_signalled() as stopped:
-        until = f"for {seconds:.0f} s, or {FOREVER}" if seconds else FOREVER
-        click.echo(f"watching {until}; then the policy is written", err=True)
-        return watch(graph, seconds, time.monotonic, stop=stopped, tell=tell)
-
-
-@contextmanager
-def _until_signalled() -> Iterator[Callable[[], bool]]:
-    """Gives a function that tells whether Ctrl-C or SIGTERM has come, which then end nothing."""
-    came: list[int] = []
-
-    def note(number: int, _frame: object) -> None:
-        came.append(number)
-
-    before = {each: signal.signal(each, note) for each in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(came)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
-    """The failure of the observer, with what its DDS said about security."""
-    from sros_tool.runtime.environment import ENCLAVE
-    from sros_tool.runtime.vendor_log import (
-        endpoint_refusal,
-        missing_security,
-        participant_refusal,
-        plain_text,
-    )
-
-    said = f"{error.output}\n{error.reason}"
-    if line := missing_security(said):
-        return UnavailableError(
-            "the DDS of this rclpy was built without DDS Security, so it cannot look at a secured "
-            "robot",
-            f"It says: {line}",
-            "Use a ROS 2 whose DDS has it, such as the packages of Ubuntu; `sros doctor` tells "
-            "which DDS here enforces security.",
-        )
-    name = environment.get(ENCLAVE) or os.environ.get(ENCLAVE) or "/"
-    if line := endpoint_refusal(said):
-        return SrosError(
-            f"the enclave {name} does not permit an observer",
-            f"DDS says: {line}",
-            "What an observer needs stands in policies/observer.xml (see `sros policies`), for an "
-            "enclave named /sros_observer.",
-        )
-    if line := participant_refusal(said):
-        return SrosError(
-            f"DDS refuses the enclave {name}",
-            f"It says: {line}",
-            "See what `sros inspect` says of the enclave.",
-        )
-    last = [line for line in plain_text(error.output).splitlines() if line.strip()][-1:]
-    why = error.reason + (f" The last that it said: {last[0].strip()}" if last else "")
-    return UnavailableError(error.what, why, "`sros doctor` tells what works here.")
-
-
-def why_empty(environment: dict[str, str], seconds: float, rmw: str, enclave: str | None) -> str:
-    """Why there may be nothing to see: a person has to know where to look."""
-    from sros_tool.runtime.environment import DOMAIN, ENABLE, KEYSTORE
-
-    merged = {**os.environ, **environment}
-    looked = f"Looked at domain {merged.get(DOMAIN) or 0} for {seconds:.0f} s with {rmw}. "
-    if enclave is not None:
-        return looked + (
-            f"The observer ran secured, in enclave {enclave}: it sees no node that runs unsecured, "
-            "has a certificate of another CA, or another DDS."
-        )
-    if merged.get(KEYSTORE) and merged.get(ENABLE) != "true":
-        return looked + (
-            f"{KEYSTORE} is set, so the robot may be secured, and secured nodes are invisible to "
-            "an observer without an enclave. Observe with --enclave /sros_observer, made from "
-            "policies/observer.xml (see `sros policies`)."
-        )
-    return looked + (
-        "Nodes may be in another domain (ROS_DOMAIN_ID, --domain), on another network, or secured: "
-        "secured nodes are invisible to an observer without --enclave and --keystore."
-    )
-
-
-if TYPE_CHECKING:
-    from sros_tool.graph.document import Draft
-    from sros_tool.graph.learn import Learned
-    from sros_tool.graph.observation import Observation
     from sros_tool.policy.model import Policy
 
-NO_NODES = "No nodes detected in the ROS graph. No policy file was generated."
-"""What ros2/sros2 says; scripts look for it."""
 
+NO_NODES = "No nodes detected in the ROS graph. No policy file was generated."
+"""The message of ros2/sros2; scripts look for it."""
+_FOREVER = "until Ctrl-C"
 _DURATION = re.compile(r"\d+[smhdwy]\Z", re.ASCII)
 
 
 class _Words(click.Command):
-    """Lets ``--watch`` go without its duration, and ``--from-log`` take several files."""
+    """A command in which ``--watch`` may lack its value, and ``--from-log`` takes several."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         words: list[str] = []
@@ -245,7 +56,7 @@ class _Words(click.Command):
                 continue  # it is repeated before each file
             words.append(word)
             if word == "--watch" and not _DURATION.match(follows):
-                words.append(FOREVER)
+                words.append(_FOREVER)
         return super().parse_args(ctx, words)
 
 
@@ -341,13 +152,13 @@ def generate_policy(
     from sros_tool.resources import policies_dir
 
     common = common_parts(file.parent, policies_dir())
-    environment = observer_environment(enclave, keystore, domain)
-    snapshot, rmw = observe(environment, watch, spin_time, common, secured=enclave is not None)
+    environment = _observer_environment(enclave, keystore, domain)
+    snapshot, rmw = _observe(environment, watch, spin_time, common, secured=enclave is not None)
     learned = learn(snapshot.observation, None if flat else common)
     if not learned.profiles:
         click.echo(NO_NODES, err=True)
         print_notes(learned.notes)
-        click.echo(why_empty(environment, snapshot.seconds, rmw, enclave), err=True)
+        click.echo(_why_empty(environment, snapshot.seconds, rmw, enclave), err=True)
         return 1
     plan = draft(file, learned, None if flat else common)
     if not dry_run:
@@ -363,7 +174,7 @@ def generate_policy(
 
 
 def _present_policy(file: Path | None) -> Policy | None:
-    """The policy to be added to, read first: not after ten minutes is it to be found broken."""
+    """Return the existing policy, if any; read before observing, as it may be broken."""
     from sros_tool.policy import read_policy
 
     if file is None:
@@ -375,7 +186,241 @@ def _present_policy(file: Path | None) -> Policy | None:
     return None
 
 
-# ── logs ───────────────────────────────────────────────────────────────────────────────────
+def _show(
+    plan: Draft, learned: Learned, observation: Observation, dry_run: bool, as_json: bool
+) -> None:
+    from sros_tool.graph.observation import to_json
+    from sros_tool.policy.merge import merge_notes
+
+    notes = (*merge_notes(plan.contradictions), *learned.notes)
+    if as_json:
+        print_json(
+            {
+                "file": str(plan.path),
+                "created": plan.before is None,
+                "changed": plan.changes,
+                "dry_run": dry_run,
+                **to_json(observation),
+                "added": as_plain(plan.added),
+                "copied": sorted(plan.copies),
+                "notes": as_plain(notes),
+            }
+        )
+        return
+    would = "would have " if dry_run else ""
+    if plan.before is None:
+        enclaves = {each.enclave for each in learned.profiles}
+        click.echo(
+            f"{would}{'written' if dry_run else 'wrote'} '{plan.path}': "
+            f"{_count(len(enclaves), 'enclave')}, {_count(len(learned.profiles), 'node')}, "
+            f"{_count(len(plan.added), 'right')}"
+        )
+    elif plan.added:
+        click.echo(f"{would}added {_count(len(plan.added), 'right')} to '{plan.path}'")
+        for each in plan.added:
+            click.echo(f"  {each}")
+    else:
+        click.echo(f"nothing to add: '{plan.path}' says all that was seen")
+    if plan.copies:
+        click.echo(f"{would}copied {', '.join(sorted(plan.copies))} beside it")
+    print_notes(notes)
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
+# ── observing ───────────────────────────────────────────────────────────────────────────
+
+
+def _observer_environment(
+    enclave: str | None, keystore: Path | None, domain: str | None
+) -> dict[str, str]:
+    """Return the variables to add for the observer: its domain, and its enclave if it has one."""
+    from sros_tool.runtime.environment import DOMAIN, domain_from
+
+    if enclave is None:
+        if keystore is not None:
+            raise UsageError(
+                "--keystore is given without --enclave", "", "Name the observer's enclave."
+            )
+        if domain is None:
+            domain_from(os.environ)
+            return {}
+        return {DOMAIN: str(domain_from({DOMAIN: domain}) or 0)}
+    from sros_tool.cli.running import loadable_environment
+
+    return loadable_environment(keystore or keystore_from_environment(), enclave, domain)
+
+
+def _observe(
+    environment: dict[str, str],
+    watch: str | None,
+    spin_time: float | None,
+    common: CommonParts,
+    *,
+    secured: bool,
+) -> tuple[Snapshot, str]:
+    """Return what was seen, and by which RMW.
+
+    ``watch`` is a duration or `_FOREVER`; without it the graph is looked at once, for ``spin_time``
+    seconds if given.
+    """
+    from sros_tool.graph.observe import (
+        SECURED,
+        ObserverError,
+        RosGraph,
+        Settling,
+        identified,
+        look_for,
+        settle,
+    )
+    from sros_tool.validity import parse_duration
+
+    seconds = None
+    enclaves = _enclaves_by_identity({**os.environ, **environment})
+
+    def identify(observation: Observation) -> Observation:
+        return identified(observation, enclaves)
+
+    if watch not in (None, _FOREVER):
+        seconds = parse_duration(watch).total_seconds()
+    try:
+        with RosGraph(environment) as graph:
+            if watch is not None:
+                snapshot = _watch(graph, seconds, common, identify)
+            elif spin_time is not None:
+                snapshot = look_for(graph, spin_time, time.monotonic)
+            else:
+                settling = SECURED if secured else Settling()
+                snapshot = settle(graph, settling, time.monotonic)
+            return replace(snapshot, observation=identify(snapshot.observation)), graph.rmw
+    except ObserverError as error:
+        raise _explained(error, environment) from error
+
+
+def _enclaves_by_identity(environment: Mapping[str, str]) -> dict[str, str]:
+    """Return the enclaves of the observer's keystore by `identity_of` their certificates.
+
+    An enclave whose certificate cannot be read is left out.
+    """
+    from sros_tool.graph.observe import identity_of
+    from sros_tool.keystore.layout import enclave_names, enclave_path, is_keystore
+    from sros_tool.pki.certificates import load_certificate
+    from sros_tool.runtime.environment import ENABLE, KEYSTORE
+    from sros_tool.xml import read_bytes
+
+    root = Path(environment.get(KEYSTORE, ""))
+    if environment.get(ENABLE) != "true" or not is_keystore(root):
+        return {}
+    found = {}
+    for name in enclave_names(root):
+        with suppress(SrosError):
+            data = read_bytes(enclave_path(root, name) / "cert.pem", "certificate")
+            subject = load_certificate(data, name).subject
+            found[identity_of(subject.public_bytes())] = name
+    return found
+
+
+def _watch(
+    graph: RosGraph,
+    seconds: float | None,
+    common: CommonParts,
+    identify: Callable[[Observation], Observation],
+) -> Snapshot:
+    from sros_tool.graph.learn import News
+    from sros_tool.graph.observe import watch
+
+    news = News(common)
+
+    def tell(observation: Observation) -> None:
+        for line in news.lines(identify(observation)):
+            click.echo(line, err=True)
+
+    with _until_signalled() as stopped:
+        until = f"for {seconds:.0f} s, or {_FOREVER}" if seconds else _FOREVER
+        click.echo(f"watching {until}; then the policy is written", err=True)
+        return watch(graph, seconds, time.monotonic, stop=stopped, tell=tell)
+
+
+@contextmanager
+def _until_signalled() -> Iterator[Callable[[], bool]]:
+    """Catch Ctrl-C and SIGTERM; yield a function that returns whether one has come."""
+    came: list[int] = []
+
+    def note(number: int, _frame: object) -> None:
+        came.append(number)
+
+    before = {each: signal.signal(each, note) for each in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield lambda: bool(came)
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
+    """Return the failure of the observer, with what its DDS said about security."""
+    from sros_tool.runtime.environment import ENCLAVE
+    from sros_tool.runtime.vendor_log import (
+        endpoint_refusal,
+        missing_security,
+        participant_refusal,
+        plain_text,
+    )
+
+    said = f"{error.output}\n{error.reason}"
+    if line := missing_security(said):
+        return UnavailableError(
+            "the DDS of this rclpy was built without DDS Security, so it cannot look at a secured "
+            "robot",
+            f"It says: {line}",
+            "Use a ROS 2 whose DDS has it, such as the packages of Ubuntu; `sros doctor` tells "
+            "which DDS here enforces security.",
+        )
+    name = environment.get(ENCLAVE) or os.environ.get(ENCLAVE) or "/"
+    if line := endpoint_refusal(said):
+        return SrosError(
+            f"the enclave {name} does not permit an observer",
+            f"DDS says: {line}",
+            "What an observer needs stands in policies/observer.xml (see `sros policies`), for an "
+            "enclave named /sros_observer.",
+        )
+    if line := participant_refusal(said):
+        return SrosError(
+            f"DDS refuses the enclave {name}",
+            f"It says: {line}",
+            "See what `sros inspect` says of the enclave.",
+        )
+    last = [line for line in plain_text(error.output).splitlines() if line.strip()][-1:]
+    why = error.reason + (f" The last that it said: {last[0].strip()}" if last else "")
+    return UnavailableError(error.what, why, "`sros doctor` tells what works here.")
+
+
+def _why_empty(environment: dict[str, str], seconds: float, rmw: str, enclave: str | None) -> str:
+    """Return why there may be nothing to see, and where to look."""
+    from sros_tool.runtime.environment import DOMAIN, ENABLE, KEYSTORE
+
+    merged = {**os.environ, **environment}
+    looked = f"Looked at domain {merged.get(DOMAIN) or 0} for {seconds:.0f} s with {rmw}. "
+    if enclave is not None:
+        return looked + (
+            f"The observer ran secured, in enclave {enclave}: it sees no node that runs unsecured, "
+            "has a certificate of another CA, or another DDS."
+        )
+    if merged.get(KEYSTORE) and merged.get(ENABLE) != "true":
+        return looked + (
+            f"{KEYSTORE} is set, so the robot may be secured, and secured nodes are invisible to "
+            "an observer without an enclave. Observe with --enclave /sros_observer, made from "
+            "policies/observer.xml (see `sros policies`)."
+        )
+    return looked + (
+        "Nodes may be in another domain (ROS_DOMAIN_ID, --domain), on another network, or secured: "
+        "secured nodes are invisible to an observer without --enclave and --keystore."
+    )
+
+
+# ── from logs ───────────────────────────────────────────────────────────────────────────
 
 
 def _from_logs(
@@ -440,50 +485,3 @@ def _place(node: str | None) -> tuple[str, str] | None:
     if problem := expression_problem(name):
         raise UsageError(f"--node {node!r} is not a node", problem, "Write it as /namespace/name.")
     return check_namespace(ns), name
-
-
-# ── showing ────────────────────────────────────────────────────────────────────────────────
-
-
-def _show(
-    plan: Draft, learned: Learned, observation: Observation, dry_run: bool, as_json: bool
-) -> None:
-    from sros_tool.graph.observation import to_json
-    from sros_tool.policy.merge import merge_notes
-
-    notes = (*merge_notes(plan.contradictions), *learned.notes)
-    if as_json:
-        print_json(
-            {
-                "file": str(plan.path),
-                "created": plan.before is None,
-                "changed": plan.changes,
-                "dry_run": dry_run,
-                **to_json(observation),
-                "added": as_plain(plan.added),
-                "copied": sorted(plan.copies),
-                "notes": as_plain(notes),
-            }
-        )
-        return
-    would = "would have " if dry_run else ""
-    if plan.before is None:
-        enclaves = {each.enclave for each in learned.profiles}
-        click.echo(
-            f"{would}{'written' if dry_run else 'wrote'} '{plan.path}': "
-            f"{_count(len(enclaves), 'enclave')}, {_count(len(learned.profiles), 'node')}, "
-            f"{_count(len(plan.added), 'right')}"
-        )
-    elif plan.added:
-        click.echo(f"{would}added {_count(len(plan.added), 'right')} to '{plan.path}'")
-        for each in plan.added:
-            click.echo(f"  {each}")
-    else:
-        click.echo(f"nothing to add: '{plan.path}' says all that was seen")
-    if plan.copies:
-        click.echo(f"{would}copied {', '.join(sorted(plan.copies))} beside it")
-    print_notes(notes)
-
-
-def _count(number: int, thing: str) -> str:
-    return f"{number} {thing}{'' if number == 1 else 's'}"

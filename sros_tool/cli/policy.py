@@ -1,9 +1,9 @@
-"""The verbs that add policies to each other, and compare what they and keystores allow."""
+"""The verbs on policies: `merge_policy`, `diff_policy`, `minimize_policy` and `policies`."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,13 +12,15 @@ import click
 
 from sros_tool.cli.common import (
     PATH,
-    Decorated,
     SeveralValues,
+    check_output,
     dry_run_option,
+    force_option,
     json_option,
+    output_option,
     print_json,
     print_notes,
-    visible,
+    save,
 )
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.values import as_plain
@@ -27,42 +29,12 @@ if TYPE_CHECKING:
     from sros_tool.errors import Note
     from sros_tool.keystore.rights import RightsSource
     from sros_tool.policy.merge import Merged
+    from sros_tool.policy.minimize import EnclaveUse, MinimizedPolicy, WildcardProposal
+    from sros_tool.policy.model import Group, Policy
     from sros_tool.policy.rights import Right, RightsDifference
 
 
-def output_option(help_text: str) -> Callable[[Decorated], Decorated]:
-    """``-o FILE`` for a verb that writes a policy."""
-    return click.option("-o", "--output", type=PATH, metavar="FILE", help=help_text)
-
-
-force_option = click.option("--force", is_flag=True, help="Replace FILE if it exists.")
-
-
-def check_output(output: Path, *, force: bool) -> None:
-    """Refuse a file that exists, unless it may be replaced, and what cannot be written.
-
-    A device or a pipe is written to, and needs no permission to be replaced.
-    """
-    if not output.absolute().parent.is_dir():
-        raise UsageError(
-            f"cannot write '{output}'", "Its folder does not exist.", "Make the folder first."
-        )
-    if output.is_dir():
-        raise UsageError(f"cannot write '{output}'", "It is a folder.", "Name a file.")
-    if output.is_file() and not force:
-        raise UsageError(f"'{output}' already exists", "", "Name another file, or add --force.")
-
-
-def save(output: Path, document: bytes) -> str:
-    """Write a document as a whole, and return what to say about it."""
-    from sros_tool.files import replace_file
-
-    verb = "replaced" if output.exists() else "wrote"
-    replace_file(output, document)
-    return visible(f"{verb} '{output}'")
-
-
-# ── merge_policy ───────────────────────────────────────────────────────────────────────────
+# ── merge_policy ────────────────────────────────────────────────────────────────────────
 
 
 @click.command(
@@ -157,7 +129,7 @@ def _print_merged_json(policy: Path, merged: Merged, written: Path | None, *, sh
 
 
 def _check_includes(policy: Path, output: Path, document: bytes) -> None:
-    """Refuse a place from where the includes of the policy would lead elsewhere."""
+    """Refuse an output from which the relative includes of the policy would lead elsewhere."""
     from sros_tool.policy.document import read_policy
 
     try:
@@ -172,7 +144,7 @@ def _check_includes(policy: Path, output: Path, document: bytes) -> None:
         )
 
 
-# ── diff_policy ────────────────────────────────────────────────────────────────────────────
+# ── diff_policy ─────────────────────────────────────────────────────────────────────────
 
 
 @click.command(
@@ -254,59 +226,8 @@ def _difference_json(
     }
 
 
-@click.command(
-    "policies",
-    epilog="""\b
-Example:
-  $ sros policies
-  add_two_ints.xml     /add_two_ints/client, /add_two_ints/server
-  ...
-  $ sros policies --copy my_policies
-  copied the policies to 'my_policies'""",
-)
-@click.option(
-    "--copy",
-    "target",
-    type=PATH,
-    metavar="DIR",
-    help="Copy them to the new folder DIR, to start your own from.",
-)
-@json_option
-@dry_run_option
-def policies(target: Path | None, as_json: bool, dry_run: bool) -> None:
-    """List the policies that ship with sros, with their enclaves, or copy them."""
-    from sros_tool.policy import read_policy
-    from sros_tool.resources import policies_dir
+# ── minimize_policy ─────────────────────────────────────────────────────────────────────
 
-    source = policies_dir()
-    if target is not None:
-        if target.exists():
-            raise UsageError(f"'{target}' already exists", "", "Name a folder that does not.")
-        if dry_run:
-            click.echo(f"would copy the policies to '{target}'")
-            return
-        shutil.copytree(source, target)
-        click.echo(f"copied the policies to '{target}'")
-        return
-    found = {path: read_policy(path) for path in sorted(source.glob("*.xml"))}
-    if as_json:
-        print_json(
-            [
-                {"file": str(path), "enclaves": [each.path for each in policy.enclaves]}
-                for path, policy in found.items()
-            ]
-        )
-        return
-    width = max(len(path.name) for path in found)
-    for path, policy in found.items():
-        click.echo(f"{path.name:{width}}  {', '.join(each.path for each in policy.enclaves)}")
-    click.echo(f"they are in '{source}'", err=True)
-
-
-if TYPE_CHECKING:
-    from sros_tool.policy.minimize import EnclaveUse, MinimizedPolicy, WildcardProposal
-    from sros_tool.policy.model import Group, Policy
-    from sros_tool.policy.rights import Right
 
 _SHOWN = 5
 _ROOM = 256  # bytes below the limit, as names of CAs and signatures vary in length
@@ -377,20 +298,20 @@ def minimize_policy(
     given = read_policy(policy)
     sources = [load_rights(path) for path in observed]
     seen = frozenset(right for source in sources for right in source.rights)
-    result = minimize(given, seen, () if strict else _common())
+    result = minimize(given, seen, () if strict else _node_basics())
     notes = [note for source in sources for note in source.notes]
-    notes += _notes(given, result, seen)
+    notes += _scope_notes(given, result, seen)
     measured = _measure(given, result, seen)
     document = write_policy(result.policy)
     if output and read_policy(output, document) != result.policy:
         raise PolicyError("the narrowed policy does not read as it was meant")
     saved = save(output, document) if output and not dry_run else ""
     if as_json:
-        value = _json(policy, result, measured, output if not dry_run else None)
+        value = _minimized_json(policy, result, measured, output if not dry_run else None)
         print_json({**value, "notes": as_plain(notes)})
     else:
         for use in result.uses:
-            for line in _lines(use, measured[use.enclave]):
+            for line in _use_lines(use, measured[use.enclave]):
                 click.echo(line)
     print_notes(notes)
     if output and dry_run:
@@ -399,8 +320,8 @@ def minimize_policy(
         click.echo(saved, err=True)
 
 
-def _common() -> Sequence[Group]:
-    """What every node needs, said for a node."""
+def _node_basics() -> Sequence[Group]:
+    """Return the rights that every node needs, as groups of a profile."""
     from sros_tool.policy.document import read_policy
     from sros_tool.resources import policies_dir
 
@@ -408,7 +329,7 @@ def _common() -> Sequence[Group]:
     return [group for each in basics.enclaves for p in each.all_profiles() for group in p.groups]
 
 
-def _notes(given: Policy, result: MinimizedPolicy, seen: frozenset[Right]) -> Iterator[Note]:
+def _scope_notes(given: Policy, result: MinimizedPolicy, seen: frozenset[Right]) -> Iterator[Note]:
     unseen = [use.enclave for use in result.uses if not use.seen]
     if unseen:
         text = f"never observed, and so left as they are: {', '.join(unseen)}."
@@ -453,22 +374,19 @@ def _measure(
     return measured
 
 
-# ── telling ────────────────────────────────────────────────────────────────────────────────
-
-
-def ratio_text(ratio: float | None) -> str:
-    """The over-privilege ratio, such as 3.5x."""
+def _ratio_text(ratio: float | None) -> str:
+    """Return the over-privilege ratio as text, such as 3.5x."""
     return "nothing of it is in use" if ratio is None else f"{ratio:.1f}x"
 
 
-def _lines(use: EnclaveUse, measured: _Measured) -> Iterator[str]:
+def _use_lines(use: EnclaveUse, measured: _Measured) -> Iterator[str]:
     from sros_tool.dds.permissions import MAX_SIGNED_BYTES
 
     if not use.seen:
         yield f"{use.enclave}: allowed {use.allowed_pairs}, never observed, left as it is"
     else:
         counts = f"allowed {use.allowed_pairs}, observed {use.observed_pairs}"
-        yield f"{use.enclave}: {counts}: {ratio_text(use.ratio)}"
+        yield f"{use.enclave}: {counts}: {_ratio_text(use.ratio)}"
         if use.unused:
             yield "  never observed, and removed"
             yield from (f"    {right.told()}" for right in use.unused)
@@ -500,7 +418,7 @@ def _lines(use: EnclaveUse, measured: _Measured) -> Iterator[str]:
         yield f"      would save {proposal.saves} bytes and add {adds}"
 
 
-def _json(
+def _minimized_json(
     policy: Path, result: MinimizedPolicy, measured: dict[str, _Measured], output: Path | None
 ) -> dict[str, Any]:
     from sros_tool.dds.permissions import MAX_SIGNED_BYTES
@@ -530,3 +448,55 @@ def _json(
             for use in result.uses
         ],
     }
+
+
+# ── policies ────────────────────────────────────────────────────────────────────────────
+
+
+@click.command(
+    "policies",
+    epilog="""\b
+Example:
+  $ sros policies
+  add_two_ints.xml     /add_two_ints/client, /add_two_ints/server
+  ...
+  $ sros policies --copy my_policies
+  copied the policies to 'my_policies'""",
+)
+@click.option(
+    "--copy",
+    "target",
+    type=PATH,
+    metavar="DIR",
+    help="Copy them to the new folder DIR, to start your own from.",
+)
+@json_option
+@dry_run_option
+def policies(target: Path | None, as_json: bool, dry_run: bool) -> None:
+    """List the policies that ship with sros, with their enclaves, or copy them."""
+    from sros_tool.policy import read_policy
+    from sros_tool.resources import policies_dir
+
+    source = policies_dir()
+    if target is not None:
+        if target.exists():
+            raise UsageError(f"'{target}' already exists", "", "Name a folder that does not.")
+        if dry_run:
+            click.echo(f"would copy the policies to '{target}'")
+            return
+        shutil.copytree(source, target)
+        click.echo(f"copied the policies to '{target}'")
+        return
+    found = {path: read_policy(path) for path in sorted(source.glob("*.xml"))}
+    if as_json:
+        print_json(
+            [
+                {"file": str(path), "enclaves": [each.path for each in policy.enclaves]}
+                for path, policy in found.items()
+            ]
+        )
+        return
+    width = max(len(path.name) for path in found)
+    for path, policy in found.items():
+        click.echo(f"{path.name:{width}}  {', '.join(each.path for each in policy.enclaves)}")
+    click.echo(f"they are in '{source}'", err=True)

@@ -13,12 +13,12 @@ import click
 
 from sros_tool import __version__
 from sros_tool.cli.common import visible
-from sros_tool.errors import SrosError, UsageError
+from sros_tool.errors import SrosError
 
 
 @dataclass(frozen=True, slots=True)
 class VerbEntry:
-    """A verb: the module that holds it, what it does, other names, and its name in the module."""
+    """A verb: its module, its summary, its other names, and its name in the module if different."""
 
     module: str
     help: str
@@ -252,7 +252,6 @@ def _prefixed(text: str) -> str:
 
 
 def _verb() -> str | None:
-
     for word in sys.argv[1:]:
         if not word.startswith("-"):
             return _NAMES.get(word.replace("-", "_"))
@@ -280,6 +279,3 @@ def _defect(error: BaseException) -> int:
         ),
         1,
     )
-
-
-__all__ = ["UsageError", "report_error"]

@@ -1,4 +1,4 @@
-"""The verbs that give a process the environment of an enclave."""
+"""The verbs `env`, `run` and `completion`: a process, or a shell, with the environment it needs."""
 
 from __future__ import annotations
 
@@ -61,10 +61,10 @@ def env(words: tuple[str, ...], form: str, as_json: bool, domain: str | None) ->
 
 
 class _WithCommand(click.Command):
-    """Leaves alone what follows ``--``, or, without it, what follows the first two arguments."""
+    """A command that leaves alone what follows ``--``, or else the first two arguments."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Part the command to run from the arguments of sros."""
+        """Split the command to run from the arguments of sros."""
         own, command = args, []
         if "--" in args:
             own, command = args[: args.index("--")], args[args.index("--") + 1 :]
@@ -127,7 +127,7 @@ def run(ctx: click.Context, words: tuple[str, ...], domain: str | None, no_ros_a
 
 
 def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict[str, str]:
-    """The variables of an enclave, once it is checked that a process can run in it.
+    """Return the variables of an enclave after checking that a process can run in it.
 
     ``domain_text`` is an option's value; without it $ROS_DOMAIN_ID counts.
     """

@@ -1,4 +1,4 @@
-"""The verb that draws who may do what: as a page, SVG, DOT, Mermaid or JSON."""
+"""The verb `view`: draw who may do what, as a page, SVG, DOT, Mermaid or JSON."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ import click
 from sros_tool.cli.common import (
     PATH,
     SeveralValues,
+    check_output,
     complete_template,
     dry_run_option,
+    force_option,
     now,
+    save,
 )
-from sros_tool.cli.policy import check_output, force_option, save
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
@@ -169,7 +171,7 @@ def _picture(
         return overlay(read[0], read[1], "use", context)
     if kinds[0] == kinds[1]:
         return overlay(read[0], read[1], "change", context)
-    # Drift is told from the policy, whichever was named first.
+    # Drift is shown from the side of the policy, whichever was named first.
     first, second = sorted(read, key=lambda each: each.origin.kind != "policy")
     return overlay(first, second, "drift", context)
 
@@ -187,7 +189,7 @@ def _check_no_governance(sources: tuple[Path, ...], read: list[PictureSource]) -
 
 
 def _checked(path: Path, moment: datetime) -> list[PicturedFinding]:
-    """What `sros check` finds there; of permissions or an enclave alone, what it can."""
+    """Return what `sros check` finds there; nothing where it cannot check."""
     from sros_tool.checks.targets import Circumstances, path_findings
     from sros_tool.cli.common import local_zone
     from sros_tool.errors import SrosError
@@ -198,13 +200,13 @@ def _checked(path: Path, moment: datetime) -> list[PicturedFinding]:
     except SrosError:
         return []
     return [
-        PicturedFinding(each.id, each.severity.word, _told(each), each.remedy, each.subject)
+        PicturedFinding(each.id, each.severity.word, _finding_text(each), each.remedy, each.subject)
         for each in found
     ]
 
 
-def _told(finding: Checked) -> str:
-    """What was found, with the line of a file, of which no more than the base name is told."""
+def _finding_text(finding: Checked) -> str:
+    """Return the text of a finding, with the base name of its file and the line."""
     if not finding.line:
         return finding.text
     return f"{Path(finding.file).name}:{finding.line}: {finding.text}"
