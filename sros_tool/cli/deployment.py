@@ -143,15 +143,15 @@ Example:
   /arm/camera  loadable in domain 0 until 2027-05-20T07:45:12Z
   /arm/gripper  loadable in domain 0 until 2027-05-20T07:45:12Z
   /arm/wrist  NOT LOADABLE
-  robot/enclaves/arm/wrist/key.pem: error: a private key that others can read [keystore.key-rea...
+  robot/enclaves/arm/wrist/key.pem: error: a private key that others can ...
       its mode is 0644
       Run `chmod 600 robot/enclaves/arm/wrist/key.pem`.
   ...
   $ sros verify robot --at 2027-06-01 || echo 'renew before June'""",
 )
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
-@click.option("--domain", metavar="ID", help="Ask also whether it may join this ROS domain.")
-@click.option("--at", metavar="MOMENT", help="As if it were then: 2027-06-01, or 90d from now.")
+@click.option("--domain", metavar="ID", help="Check also whether it may join this ROS domain.")
+@click.option("--at", metavar="MOMENT", help="Check as of this moment: 2027-06-01, or 90d from now.")
 @json_option
 def verify(folder: Path | None, domain: str | None, at: str | None, as_json: bool) -> int:
     """On a robot: say whether the enclaves in DIR, or the enclave DIR, can be used as they are.
