@@ -109,7 +109,7 @@ in one line; --strict reports it as a finding. Exit status: 1 if a finding of th
     "--domain", metavar="ID", help="The ROS domain that the enclaves must be able to join."
 )
 @click.option(
-    "--at", "moment", metavar="MOMENT", help="Check as of this moment: 2027-06-01, or 90d from now."
+    "--at", "moment", metavar="MOMENT", help="Check as of then: 2027-06-01, or 90d from now."
 )
 @click.option(
     "--format",

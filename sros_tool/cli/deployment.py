@@ -151,7 +151,7 @@ Example:
 )
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
 @click.option("--domain", metavar="ID", help="Check also whether it may join this ROS domain.")
-@click.option("--at", metavar="MOMENT", help="Check as of this moment: 2027-06-01, or 90d from now.")
+@click.option("--at", metavar="MOMENT", help="Check as of then: 2027-06-01, or 90d from now.")
 @json_option
 def verify(folder: Path | None, domain: str | None, at: str | None, as_json: bool) -> int:
     """On a robot: say whether the enclaves in DIR, or the enclave DIR, can be used as they are.
