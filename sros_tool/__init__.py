@@ -41,6 +41,7 @@ if TYPE_CHECKING:
         SrosError,
         UsageError,
     )
+    from sros_tool.keystore.lifecycle.create import Creation
     from sros_tool.keystore.template import Template
     from sros_tool.policy.model import Policy
 
@@ -48,6 +49,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "AccessAnswer",
+    "Creation",
     "DocumentError",
     "Finding",
     "Keystore",
@@ -68,6 +70,7 @@ __all__ = [
 ]
 
 _ELSEWHERE = {
+    "Creation": "sros_tool.keystore.lifecycle.create",
     "Finding": "sros_tool.checks.kind",
     "Policy": "sros_tool.policy.model",
     "Template": "sros_tool.keystore.template",
