@@ -189,7 +189,7 @@ def test_a_node_that_dies_makes_its_row_fail(victim: str, tmp_path: Path) -> Non
                 "import os, sys; from pathlib import Path;"
                 "from sros_tool.runtime.events import *;"
                 "report = Path(sys.argv[sys.argv.index('--report') + 1]);"
-                "EventWriter(report).report(Kind.READY);"
+                "EventWriter(report).report(EventKind.READY);"
                 "import time; time.sleep(0.5); os.kill(os.getpid(), 11)"
             )
             return [sys.executable, "-c", code, *options]
@@ -231,15 +231,15 @@ def test_doctor_says_what_to_install(tmp_path: Path) -> None:
 FAST_DDS_NODE = """
 import sys
 from pathlib import Path
-from sros_tool.runtime.events import EventWriter, Kind, Stage
+from sros_tool.runtime.events import EventWriter, EventKind, ProcessStage
 argument = dict(zip(sys.argv, sys.argv[1:]))
 events = EventWriter(Path(argument["--report"]))
 if "without_permission" in argument["--report"]:
     print("\\x1b[37;1m2026-01-01 12:00:00.000 [\\x1b[31;1mSECURITY Error\\x1b[37;1m] "
           f"\\x1b[0mrt{argument['--topic']} topic not found in allow rule. -> Function check")
-    events.report(Kind.FAILED, "RCLError: invalid allocator", stage=Stage.ENDPOINT)
+    events.report(EventKind.FAILED, "RCLError: invalid allocator", stage=ProcessStage.ENDPOINT)
     sys.exit(1)
-events.report(Kind.READY)
+events.report(EventKind.READY)
 import time; time.sleep(600)
 """
 
