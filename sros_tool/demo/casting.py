@@ -189,7 +189,7 @@ def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
 
 
 def _within(short: str, long: str) -> bool:
-    """Return whether the parts of an enclave's name are a part of those of another's."""
+    """Return whether all parts of an enclave's name, and more, are in another's."""
     return set(short.strip("/").split("/")) < set(long.strip("/").split("/"))
 
 
@@ -236,7 +236,7 @@ def may(grant: Grant, verb: str, topic: str) -> bool:
 
 
 def _topics_of_its_own(grant: Grant, verb: str) -> Iterator[str]:
-    """Yield the DDS topics without wildcards that a grant allows, but for those of every node."""
+    """Yield the DDS topics without wildcards that a grant allows, except those of every node."""
     for topic in _allowed(grant, verb):
         private = topic.startswith("rt/_") or ACTION_INSIDE in topic
         if topic not in _TOPICS_OF_EVERY_NODE and not private:
@@ -291,8 +291,8 @@ OWN_NAMES: Mapping[Role, tuple[str, ...]] = {
 def node_names(role: Role, grant: Grant | None) -> tuple[str, ...]:
     """Return the absolute names of a role's nodes under a grant (None: without security).
 
-    A node keeps its own name where the grant allows it.  Otherwise it gets that of a node which
-    the grant names, the most similar one first, and its own one where there is none.
+    A node keeps its own name where the grant allows it.  Otherwise it gets the name of a node
+    that the grant names, the most similar one first, and its own one where there is none.
     """
     wanted = [f"/{name}" for name in OWN_NAMES[role]]
     if grant is None:

@@ -1,4 +1,4 @@
-"""Examine this machine: which DDS stacks are here, and which of them enforce security."""
+"""The examination behind `sros doctor`: which DDS stacks are here, and which enforce security."""
 
 from __future__ import annotations
 

@@ -146,7 +146,7 @@ class KeystoreCopy:
         grant = permissions.grants[0]
         place = next(place for place, rule in enumerate(grant.rules) if rule.allow)
         rules = list(grant.rules)
-        rules[place] = _with(rules[place], publish, subscribe)
+        rules[place] = _with_topics(rules[place], publish, subscribe)
         grants = (replace(grant, rules=tuple(rules)), *permissions.grants[1:])
         return render_permissions(Permissions(grants))
 
@@ -160,7 +160,7 @@ class KeystoreCopy:
     ) -> None:
         """Give an enclave another certificate, and perhaps a new key.
 
-        Its subject stays, or becomes that of the part ``subject_of``.
+        Its subject stays, or becomes the subject of the part ``subject_of``.
         """
         subject = self.certificate(subject_of or part).subject
         key = generate_key() if new_key else self.key(part)
@@ -198,15 +198,15 @@ def name_of(forgery: Forge | Undefended) -> str:
     return forgery.__name__
 
 
-def _with(rule: Rule, publish: Sequence[str], subscribe: Sequence[str]) -> Rule:
+def _with_topics(rule: Rule, publish: Sequence[str], subscribe: Sequence[str]) -> Rule:
     return replace(
         rule,
-        publish=_more(rule.publish, publish),
-        subscribe=_more(rule.subscribe, subscribe),
+        publish=_widened(rule.publish, publish),
+        subscribe=_widened(rule.subscribe, subscribe),
     )
 
 
-def _more(criteria: tuple[Criteria, ...], topics: Sequence[str]) -> tuple[Criteria, ...]:
+def _widened(criteria: tuple[Criteria, ...], topics: Sequence[str]) -> tuple[Criteria, ...]:
     if not topics:
         return criteria
     if not criteria:
@@ -215,7 +215,7 @@ def _more(criteria: tuple[Criteria, ...], topics: Sequence[str]) -> tuple[Criter
     return (replace(first, topics=(*first.topics, *topics)), *criteria[1:])
 
 
-def _weak(copy: KeystoreCopy) -> bytes:
+def _weak_governance(copy: KeystoreCopy) -> bytes:
     """Return a governance that lets everybody in and protects nothing, as XML."""
     governance = parse_governance(copy.governance())
     return render_governance(
@@ -239,8 +239,8 @@ def edited_governance(copy: KeystoreCopy) -> None:
     """Write a weak governance over the XML inside of the listener's signed document."""
     signed = copy.read("listener", GOVERNANCE_FILE)
     kept = copy.governance().replace(b"\r\n", b"\n")
-    # The comment changes also what is as weak already.
-    weak = _weak(copy) + b"<!-- edited -->\n"
+    # The comment makes a difference where the governance was as weak already.
+    weak = _weak_governance(copy) + b"<!-- edited -->\n"
     edited = signed.replace(kept.replace(b"\n", b"\r\n"), weak.replace(b"\n", b"\r\n"))
     if edited == signed:
         raise DocumentError("the signed governance cannot be edited", "Its XML is not found in it.")
@@ -249,17 +249,17 @@ def edited_governance(copy: KeystoreCopy) -> None:
 
 def governance_of_another_ca(copy: KeystoreCopy) -> None:
     """Give the listener a weak governance, signed by another CA."""
-    copy.put("listener", GOVERNANCE_FILE, copy.sign(_weak(copy), copy.foreign))
+    copy.put("listener", GOVERNANCE_FILE, copy.sign(_weak_governance(copy), copy.foreign))
 
 
 def weaker_governance(copy: KeystoreCopy) -> None:
     """Give talker and listener a weak governance, signed by the CA, as it once was."""
-    signed = copy.sign(_weak(copy))
+    signed = copy.sign(_weak_governance(copy))
     for part in ("talker", "listener"):
         copy.put(part, GOVERNANCE_FILE, signed)
 
 
-def _wanted(copy: KeystoreCopy) -> bytes:
+def _wider_permissions(copy: KeystoreCopy) -> bytes:
     """Return the guest's permissions with the right to publish the topic, as XML."""
     return copy.widened("guest", publish=[copy.dds_topic])
 
@@ -283,12 +283,12 @@ def edited_permissions(copy: KeystoreCopy) -> None:
 
 def unsigned_permissions(copy: KeystoreCopy) -> None:
     """Give the guest permissions with one more topic, as plain XML."""
-    copy.put("guest", PERMISSIONS_FILE, _wanted(copy))
+    copy.put("guest", PERMISSIONS_FILE, _wider_permissions(copy))
 
 
 def permissions_of_another_ca(copy: KeystoreCopy) -> None:
     """Give the guest permissions with one more topic, signed by another CA."""
-    copy.put("guest", PERMISSIONS_FILE, copy.sign(_wanted(copy), copy.foreign))
+    copy.put("guest", PERMISSIONS_FILE, copy.sign(_wider_permissions(copy), copy.foreign))
 
 
 def own_permissions_ca(copy: KeystoreCopy) -> None:
@@ -304,7 +304,9 @@ def another_permissions_ca_trusted(copy: KeystoreCopy) -> None:
 
 def _trust_another_permissions_ca(copy: KeystoreCopy, part: str) -> None:
     certificate = copy.authorities(copy.foreign).permissions.certificate
-    document = _wanted(copy) if part == "guest" else render_permissions(copy.permissions(part))
+    document = (
+        _wider_permissions(copy) if part == "guest" else render_permissions(copy.permissions(part))
+    )
     copy.put(part, PERMISSIONS_FILE, copy.sign(document, copy.foreign))
     copy.put(part, GOVERNANCE_FILE, copy.sign(copy.governance(), copy.foreign))
     copy.put(part, PERMISSIONS_CA_FILE, pem(certificate))
@@ -312,7 +314,7 @@ def _trust_another_permissions_ca(copy: KeystoreCopy, part: str) -> None:
 
 def permissions_signed_by_itself(copy: KeystoreCopy) -> None:
     """Give the guest permissions with one more topic, signed with its own key."""
-    signed = smime.sign(_wanted(copy), copy.certificate("guest"), copy.key("guest"))
+    signed = smime.sign(_wider_permissions(copy), copy.certificate("guest"), copy.key("guest"))
     copy.put("guest", PERMISSIONS_FILE, signed)
 
 
@@ -351,19 +353,19 @@ def borrowed_permissions_and_subject(copy: KeystoreCopy) -> None:
 
 def permissions_signed_by_the_ca(copy: KeystoreCopy) -> None:
     """Give the guest permissions with one more topic, signed by the CA, as they once were."""
-    copy.put("guest", PERMISSIONS_FILE, copy.sign(_wanted(copy)))
+    copy.put("guest", PERMISSIONS_FILE, copy.sign(_wider_permissions(copy)))
 
 
 def old_permissions_after_renewal(copy: KeystoreCopy) -> None:
     """Renew the guest, and put its permissions from before back."""
-    old = copy.sign(_wanted(copy))
+    old = copy.sign(_wider_permissions(copy))
     renew(copy.root, [copy.enclave("guest")], now=copy.now, keyring=copy.keyring)
     copy.put("guest", PERMISSIONS_FILE, old)
 
 
 def permissions_for_another_domain(copy: KeystoreCopy) -> None:
     """Give the guest permissions with one more topic, signed by the CA for another domain."""
-    permissions = Permissions(_only_elsewhere(_wanted(copy), copy.domain))
+    permissions = Permissions(_only_elsewhere(_wider_permissions(copy), copy.domain))
     copy.put("guest", PERMISSIONS_FILE, copy.sign(render_permissions(permissions)))
 
 

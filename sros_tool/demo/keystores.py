@@ -59,9 +59,9 @@ class KeystoreSpec:
 class KeystoreSet:
     """The keystores of a scenario, sound and forged, and the enclave of each part.
 
-    ``missing`` has the reason for which a keystore could not be made.  Its own keystore is a copy
-    of the ``user``'s, if any: that and the forgeries made from it have the user's cast, and all
-    others that of the scenario.
+    ``missing`` has the reason for which a keystore could not be made.  The scenario's own keystore
+    is a copy of the ``user``'s, if any: this copy and the forgeries made from it have the user's
+    cast, the other keystores ``cast``.
     """
 
     keystores: Mapping[KeystoreChoice, Path]

@@ -153,6 +153,12 @@ def test_claims_in_a_list(folder: Path) -> None:
     assert row.expected is RowStatus.UNDISTURBED
 
 
+def test_a_party_that_is_no_table(folder: Path) -> None:
+    text = 'policy = "robot.xml"\nparty = [{ name = "a", role = "talker" }, 3]\n'
+    with pytest.raises(DocumentError, match=r"line 2: there is no party"):
+        read_scenario(write(folder, text))
+
+
 def test_broken_toml_and_missing_files(folder: Path) -> None:
     ended = sros("demo", "--scenario", write(folder, "a = = 1\n"))
     assert ended.status == 1

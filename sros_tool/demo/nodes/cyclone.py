@@ -273,7 +273,7 @@ class _Stopped(Exception):  # noqa: N818 - not an error
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Play a role until told to stop; returns the exit status."""
+    """Play a role until stopped; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = parse_options("sros_tool.demo.nodes.cyclone", ROLES, arguments)
     _stop_on_signals()

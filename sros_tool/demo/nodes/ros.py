@@ -27,14 +27,14 @@ Build = Callable[[Any, NodeOptions, EventWriter], Sequence[Any] | None]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Play a role until told to stop; returns the exit status."""
+    """Play a role until stopped; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = parse_options("sros_tool.demo.nodes.ros", ROLES, arguments)
     return run_role(ROLES[options.role], options, [sys.argv[0], *arguments])
 
 
 def run_role(build: Build, options: NodeOptions, arguments: Sequence[str]) -> int:
-    """Create a node, let ``build`` add its endpoints, and spin until told to stop.
+    """Create a node, let ``build`` add its endpoints, and spin until stopped.
 
     ``arguments`` is the whole command line, from which rclpy takes its ``--ros-args``.  Returns
     the exit status.
@@ -62,11 +62,11 @@ def run_role(build: Build, options: NodeOptions, arguments: Sequence[str]) -> in
     except ImportError as error:
         return _fail(name, error, ProcessStage.IMPORT, events)
     except Exception as error:
-        # A signal ends the context, and what is being made then fails because of that.
+        # A signal ends the context, and whatever is being created fails because of it.
         if rclpy.ok() or not joined:
             return _fail(name, error, stage, events)
     finally:
-        # Leaves the domain, and nothing in shared memory; what is half made may well complain.
+        # Leaves the domain, and nothing in shared memory; a half-made node may well complain.
         with suppress(Exception):
             for node in nodes:
                 node.destroy_node()

@@ -126,12 +126,14 @@ def read_scenario(path: Path) -> Scenario:
 
 
 class _Reader:
+    """Reads one file; tables are numbered by their place in it, for the line of an error."""
+
     def __init__(self, path: Path, text: str) -> None:
         self._path = path
         self._lines = text.splitlines()
 
     def scenario(self, data: Mapping[str, Any]) -> Scenario:
-        self._known(data, "", 0)
+        self._check_keys(data, "", 0)
         file = self._path.parent / self._text(data, "policy", "", 0)
         try:
             policy = read_policy(file)
@@ -151,7 +153,7 @@ class _Reader:
         return Scenario(self._path.stem, title, rows, policy=lambda _topic: policy)
 
     def _party(self, table: Mapping[str, Any], place: int, policy: Policy) -> Party:
-        self._known(table, "party", place)
+        self._check_keys(table, "party", place)
         name = self._text(table, "name", "party", place)
         roles = {role.value: role for role in Role}
         word = self._text(table, "role", "party", place)
@@ -161,9 +163,8 @@ class _Reader:
         role = roles[word]
         topic = self._text(table, "topic", "party", place, "")
         if not topic and role in _NAMED:
-            raise self._error(
-                "party", place, "name", f"the {word} {name!r} needs a topic: its name"
-            )
+            problem = f"the {word} {name!r} needs a topic: the name of its service or action"
+            raise self._error("party", place, "name", problem)
         try:
             topic = check_topic(topic) if topic else ""
         except SrosError as error:
@@ -198,7 +199,7 @@ class _Reader:
         return Identity(keystores[word], enclave, tuple(variables.items()))
 
     def _row(self, table: Mapping[str, Any], place: int, parties: Mapping[str, Party]) -> Row:
-        self._known(table, "row", place)
+        self._check_keys(table, "row", place)
         name = self._text(table, "name", "row", place)
         claims = self._claims(table, "claim", place, parties)
         controls = self._claims(table, "control", place, parties)
@@ -280,11 +281,15 @@ class _Reader:
 
     def _tables(self, data: Mapping[str, Any], kind: str) -> list[dict[str, Any]]:
         tables = data.get(kind, [])
-        if not isinstance(tables, list) or not tables or not isinstance(tables[0], dict):
+        if (
+            not isinstance(tables, list)
+            or not tables
+            or not all(isinstance(each, dict) for each in tables)
+        ):
             raise self._error("", 0, kind, f"there is no {kind}", f"Add a table [[{kind}]].")
         return tables
 
-    def _known(self, table: Mapping[str, Any], kind: str, place: int) -> None:
+    def _check_keys(self, table: Mapping[str, Any], kind: str, place: int) -> None:
         for key in table:
             if key in ("claims", "controls"):
                 problem = f"{key!r} is not a key here; there are tables [[row.{key[:-1]}]]"

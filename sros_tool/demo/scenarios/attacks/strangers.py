@@ -67,7 +67,7 @@ ROWS: tuple[Row, ...] = (
     Row(
         "packets of a secured talker sent again",
         RowStatus.NOT_HEARD_AGAIN,
-        "keys are agreed on anew with each peer, so that old packets fit nobody's",
+        "each two peers agree on new keys, so that nobody's fit old packets",
         (
             Party("talker", Role.TALKER, Identity(OWN, "talker")),
             Party("listener", Role.LISTENER, Identity(OWN, "listener")),
