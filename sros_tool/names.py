@@ -90,7 +90,7 @@ def _enclave_problem(name: str) -> str:
 
 
 def is_expression(name: str) -> bool:
-    """Whether ``name`` holds a wildcard, and so stands for many names."""
+    """Return whether ``name`` holds a wildcard, and so stands for many names."""
     return not _WILDCARDS.isdisjoint(name)
 
 
@@ -141,7 +141,7 @@ def check_namespace(ns: str) -> str:
 
 
 def expand(name: str, ns: str, node: str) -> str:
-    """The absolute name of ``name`` used by ``node`` in ``ns``.
+    """Return the absolute name of ``name`` used by ``node`` in ``ns``.
 
     ``/x`` stays; ``~`` and ``~/x`` become ns/node and ns/node/x; anything else ns/name.
     """

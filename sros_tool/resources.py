@@ -16,15 +16,15 @@ def _shipped(name: str) -> Path:
 
 
 def policies_dir() -> Path:
-    """The folder of the example policies and of the common parts that they include."""
+    """Return the folder of the example policies and of the common parts that they include."""
     return _shipped("policies")
 
 
 def templates_dir() -> Path:
-    """The folder of the keystore templates, one TOML file each."""
+    """Return the folder of the keystore templates, one TOML file each."""
     return _shipped("keystore_templates")
 
 
 def unpacked_dds_dir() -> Path:
-    """The folder of a checkout in which its demo command unpacks a DDS, where apt cannot."""
+    """Return the folder of a checkout in which its demo command unpacks a DDS, where apt cannot."""
     return _PACKAGE.parent / ".dds"

@@ -85,7 +85,7 @@ def service_of(topic: str) -> tuple[str, str]:
 def permissions_for(
     enclave: Enclave, *, subject: str, validity: Window, domains: DomainSet
 ) -> Permissions:
-    """The permissions document of an enclave: one grant, denials before permissions.
+    """Return the permissions document of an enclave: one grant, denials before permissions.
 
     Beside the policy's rights it holds one more: every ROS 2 participant writes and reads
     ``ros_discovery_info``, without which none starts.
@@ -153,7 +153,7 @@ def governance_for(protection: DomainProtection, domains: DomainSet) -> Governan
 
 
 def _expressions(named: NamedProtection) -> list[str]:
-    """The DDS topics of a ROS name, whichever side uses it."""
+    """Return the DDS topics of a ROS name, whichever side uses it."""
     expressions: dict[str, None] = {}
     for right in RIGHTS[named.kind]:
         names = dds_names(right, expand(named.name, "/", ""))
@@ -207,9 +207,9 @@ class RosRight:
 
 
 def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
-    """What a rule says in ROS terms: actions and services are folded back from their topics.
+    """Return what a rule says in ROS terms: actions and services are folded back from their topics.
 
-    Whatever is left over (half a service, a topic without ROS prefix) is told as it is, with
+    Whatever is left over (half a service, a topic without ROS prefix) stays as it is, with
     ``kind`` "dds".  Partitions and relay criteria are not part of the answer.
     """
     qualifier = ALLOW if rule.allow else DENY
@@ -218,9 +218,9 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
     rights: list[RosRight] = []
     for kind, right, found in _candidates(publish, subscribe):
         names = dds_names(right, found)
-        told_already = [publish.get(topic) for topic in names.publish]
-        told_already += [subscribe.get(topic) for topic in names.subscribe]
-        if all(told_already):
+        uses = [publish.get(topic) for topic in names.publish]
+        uses += [subscribe.get(topic) for topic in names.subscribe]
+        if all(uses):
             continue  # as part of an action
         if all(topic in publish for topic in names.publish) and all(
             topic in subscribe for topic in names.subscribe
@@ -233,8 +233,8 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
                     subscribe[topic] = True
     rest = []
     for right, topics in (("publish", publish), ("subscribe", subscribe)):
-        for topic, told in topics.items():
-            if told:
+        for topic, listed in topics.items():
+            if listed:
                 continue
             if topic.startswith("rt/"):
                 rest.append(RosRight(qualifier, right, "topics", topic[2:]))
@@ -244,7 +244,7 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
 
 
 def grant_rights(enclave: str, grant: Grant) -> frozenset[Right]:
-    """The rights of a grant, those of an ``enclave``, without what every participant has.
+    """Return the rights of a grant, those of an ``enclave``, without what every participant has.
 
     Domains, partitions, relay criteria and the default of the grant are not part of the answer,
     nor is the order of its rules.
@@ -258,7 +258,7 @@ def grant_rights(enclave: str, grant: Grant) -> frozenset[Right]:
 
 
 def _all_topics(criteria: Iterable[Criteria]) -> dict[str, bool]:
-    """The topics, each with whether it was told as part of a service or action."""
+    """Return the topics, each with whether it was listed as part of a service or action."""
     return dict.fromkeys((topic for each in criteria for topic in each.topics), False)
 
 

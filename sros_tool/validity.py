@@ -40,11 +40,11 @@ class Window:
             )
 
     def contains(self, moment: datetime) -> bool:
-        """Whether ``moment`` lies within the window."""
+        """Return whether ``moment`` lies within the window."""
         return self.not_before <= moment <= self.not_after
 
     def within(self, outer: Window) -> Window:
-        """The part of this window that lies in ``outer``."""
+        """Return the part of this window that lies in ``outer``."""
         return Window(max(self.not_before, outer.not_before), min(self.not_after, outer.not_after))
 
 
@@ -65,7 +65,7 @@ Span = timedelta | Lifespan
 
 
 def window(now: datetime, span: Span) -> Window:
-    """The window of something made ``now``; back-dated unless its start is fixed."""
+    """Return the window of something made ``now``; back-dated unless its start is fixed."""
     moment = now.astimezone(UTC).replace(microsecond=0)
     if isinstance(span, timedelta):
         return Window(moment - BACKDATE, moment + span)

@@ -33,7 +33,7 @@ def _parser() -> etree.XMLParser:
 
 
 def read_bytes(path: Path, what: str) -> bytes:
-    """The bytes of a regular file of bounded size; ``what`` names it in errors."""
+    """Return the bytes of a regular file of bounded size; ``what`` names it in errors."""
     try:
         there = path.stat()  # asked first, for to open a pipe is to wait
         if not stat.S_ISREG(there.st_mode):
@@ -58,7 +58,7 @@ def read_bytes(path: Path, what: str) -> bytes:
 
 
 def parse(data: bytes, name: str) -> etree._Element:
-    """The root element of an XML document, without comments and processing instructions.
+    """Return the root element of an XML document, without comments and processing instructions.
 
     ``name`` stands for the document in errors.  Raises `DocumentError` for anything that is not
     well-formed, and for a document type declaration (entities are a way to read other files).
@@ -81,7 +81,7 @@ def parse(data: bytes, name: str) -> etree._Element:
 
 
 def text_of(element: etree._Element) -> str:
-    """The character data of an element without child elements, as it stands."""
+    """Return the character data of an element without child elements, as it stands."""
     return element.text or ""
 
 
@@ -93,5 +93,5 @@ def serialize(root: etree._Element, *, indent: bool = True) -> bytes:
 
 
 def tag_of(element: etree._Element) -> str:
-    """The tag of an element as text."""
+    """Return the tag of an element as text."""
     return str(element.tag)

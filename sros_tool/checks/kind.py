@@ -62,11 +62,11 @@ class FindingKind:
         remedy: str = "",
         accepted: str = "",
     ) -> Finding:
-        """A finding of this kind."""
+        """Return a finding of this kind."""
         return Finding(self, subject, text, file, line or None, remedy, accepted)
 
     def as_json(self) -> dict[str, Any]:
-        """The kind as `sros check --list --json` shows it."""
+        """Return the kind as `sros check --list --json` shows it."""
         return {
             "id": self.id,
             "severity": self.severity.word,
@@ -119,7 +119,7 @@ class Finding:
         return f"{self.file}:{self.line}" if self.line else self.file
 
     def as_json(self) -> dict[str, Any]:
-        """The finding as `sros check --json` shows it."""
+        """Return the finding as `sros check --json` shows it."""
         return {
             "id": self.id,
             "severity": self.severity.word,
@@ -134,7 +134,7 @@ class Finding:
 
 
 def by_id(*kinds: FindingKind) -> Mapping[str, FindingKind]:
-    """A table of kinds by their ids, each of which is given once."""
+    """Return a table of kinds by their ids, each of which is given once."""
     table = {kind.id: kind for kind in kinds}
     assert len(table) == len(kinds), "an id is given twice"
     return table

@@ -60,7 +60,7 @@ class _Statement:
         return self.right.name
 
     def found(self, kind: FindingKind, text: str, remedy: str = "") -> Finding:
-        """A finding of that kind about this line."""
+        """Return a finding of that kind about this line."""
         file, line = self.source.file, self.source.line
         return kind.found(self.right.enclave, text, file, line, remedy)
 
@@ -178,7 +178,7 @@ _OTHER_SIDE = {"subscribe": "publish", "request": "reply", "call": "execute"}
 
 
 def _check_names(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Every name by itself."""
+    """Yield the findings about every name by itself."""
     for each in checked.statements:
         if reason := _never(each.name):
             yield each.found(NEVER_MATCHES, f"{each.name} matches nothing: {reason}")
@@ -215,7 +215,7 @@ def _never(name: str) -> str:
 
 
 def _belongs(each: _Statement) -> str:
-    """The kind that the name has everywhere, where it is another than here."""
+    """Return the kind that the name has everywhere, where it is another than here."""
     kind, name = each.right.kind, each.name
     if kind != "services":
         is_service = (
@@ -315,7 +315,7 @@ _OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
 
 
 def _check_nodes(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Every node of a policy, by what its enclave allows as a whole.
+    """Yield the findings about every node, by what its enclave allows as a whole.
 
     Nodes whose names begin with an underscore are hidden ones, tools that are started without
     log, parameters and types (ROS 2 design, "Topic and Service Names"; ros2cli does so).
@@ -414,7 +414,7 @@ _DOMAINS = DomainSet.of((0, 0))
 
 
 def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Every enclave as its permissions would be signed."""
+    """Yield the findings about every enclave as its permissions would be signed."""
     for enclave in checked.policy.enclaves:
         source = enclave.source
         permissions = permissions_for(
@@ -446,13 +446,13 @@ def _at_denial(found: Finding, checked: _CheckedPolicy) -> Finding:
 def outside_findings(
     permissions: Permissions, signed_bytes: int, subject: str, file: str, line: int | None = None
 ) -> Iterator[Finding]:
-    """What of a permissions document lies outside of the portable profile."""
+    """Yield what of a permissions document lies outside of the portable profile."""
     for identity, fact in outside(permissions, signed_bytes, overlap):
         yield _OUTSIDE[identity].found(subject, fact, file, line)
 
 
 def _signed_bytes(enclave: Enclave) -> int:
-    """The size of the signed permissions; small ones are not measured."""
+    """Return the size of the signed permissions; small ones are not measured."""
     rights = policy_rights(Policy((enclave,)))
     estimate = sum(map(right_bytes, rights))
     return Scale().signed_bytes(enclave) if estimate > _FROM_ALL_SIZES_ON else estimate
@@ -510,7 +510,7 @@ HALF_ACTION = FindingKind(
 
 
 def _check_rules(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Every statement against the others of its enclave."""
+    """Yield the findings about every statement against the others of its enclave."""
     for each in checked.statements:
         if each.allows:
             yield from _permission(each, checked.rules)
@@ -594,14 +594,14 @@ _MANY = 1000
 
 
 def policy_findings(policy: Policy) -> Iterator[Finding]:
-    """Everything that is found in a policy that could be read."""
+    """Yield everything that is found in a policy that could be read."""
     checked = _CheckedPolicy(policy)
     for check in _CHECKS:
         yield from check(checked)
 
 
 def policy_file_findings(path: Path) -> Iterator[Finding]:
-    """Everything that is found in a policy file, also where it cannot be read."""
+    """Yield everything that is found in a policy file, also where it cannot be read."""
     try:
         policy = read_policy(path)
     except SrosError as error:
@@ -641,7 +641,7 @@ def _duplicates(path: Path) -> Iterator[tuple[str, int]]:
 
 
 def _includes(path: Path) -> Iterator[Finding]:
-    """The includes in the file itself; what they include in turn is looked into once."""
+    """Yield the findings about the includes of a file; each included file is read once."""
     root = parse(read_bytes(path, "policy file"), str(path))
     below: dict[Path, frozenset[Path]] = {}
     for parent in root.iter():
@@ -667,7 +667,7 @@ def _target(path: Path, element: etree._Element) -> Path:
 
 
 def _reached(file: Path, known: dict[Path, frozenset[Path]]) -> frozenset[Path]:
-    """The files that one includes, itself or through others."""
+    """Return the files that one includes, itself or through others."""
     if file in known:
         return known[file]
     known[file] = frozenset()  # for includes in a circle

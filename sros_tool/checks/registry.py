@@ -61,7 +61,7 @@ class FindingFilter:
                 )
 
     def wants(self, kind: FindingKind) -> bool:
-        """Whether findings of that kind are wanted, if they are severe enough."""
+        """Return whether findings of that kind are wanted, if they are severe enough."""
         included = not self.include or any(_matches(kind, each) for each in self.include)
         if self.vendor and kind.vendors and self.vendor not in kind.vendors:
             return False
@@ -90,12 +90,12 @@ class ChosenFindings:
     hidden: int
 
     def fails(self, level: Severity) -> bool:
-        """Whether something is shown that is at least as bad as that."""
+        """Return whether something is shown that is at least as bad as that."""
         return any(each.severity >= level for each in self.shown)
 
 
 def select_kinds(selection: FindingFilter) -> Sequence[FindingKind]:
-    """The kinds that are wanted, in the order in which they are listed."""
+    """Return the kinds that are wanted, in the order in which they are listed."""
     return [kind for kind in KINDS.values() if selection.wants(kind)]
 
 

@@ -66,7 +66,7 @@ class Setting:
 
 
 def running_processes(proc: Path = Path("/proc")) -> Iterator[Process]:
-    """The processes whose environment this user may read, but for this one."""
+    """Yield the processes whose environment this user may read, but for this one."""
     ticks = os.sysconf("SC_CLK_TCK")
     begin = _boot_time(proc)
     for folder in sorted(proc.glob("[0-9]*"), key=lambda each: int(each.name)):
@@ -170,7 +170,7 @@ _LOADED = ("cert.pem", "permissions.p7s", "governance.p7s", "crl.pem", "identity
 
 
 def _check_host(setting: Setting) -> Iterator[Finding]:
-    """The RMW that nodes would use, the clock, and what runs."""
+    """Yield the findings about the RMW, the clock, and the processes that run."""
     yield from _rmw(setting)
     yield from _clock(setting)
     yield from _processes(setting)
@@ -258,7 +258,7 @@ def _outdated(process: Process) -> Iterator[Finding]:
 
 
 def _is_secured(environment: Mapping[str, str]) -> bool:
-    """Whether security is on."""
+    """Return whether security is on."""
     return environment.get(ENABLE) == "true"
 
 
@@ -267,7 +267,7 @@ def _is_daemon(process: Process) -> bool:
 
 
 def _is_node_beside(process: Process, environment: Mapping[str, str]) -> bool:
-    """Whether a process is a node in the same domain, as far as its command tells."""
+    """Return whether a process is a node in the same domain, as far as its command shows."""
     return "--ros-args" in process.command and _domain(process.environment) == _domain(environment)
 
 
@@ -418,7 +418,7 @@ _CLOSE = 0.88
 
 
 def _check_variables(setting: Setting) -> Iterator[Finding]:
-    """The variables, and the enclave that they name, as a node would load it."""
+    """Yield the findings about the variables, and the enclave that they name."""
     environment = setting.environment
     yield from _spelling(environment)
     if environment.get(ENABLE) != "true":
@@ -495,7 +495,7 @@ def _enclave(setting: Setting, root: Path, domain: int | None) -> Iterator[Findi
 
 
 def _governed(root: Path) -> DomainSet | None:
-    """The domains that the governance of a keystore names, as far as it can be read."""
+    """Return the domains that the governance of a keystore names, as far as it can be read."""
     try:
         signed = smime.parse(read_bytes(root / GOVERNANCE_P7S, "governance document"))
         return parse_governance(signed.document).domains().closed()
@@ -509,5 +509,5 @@ def _value(environment: Mapping[str, str], name: str) -> str:
 
 
 def runtime_findings(setting: Setting) -> list[Finding]:
-    """Everything that is found in an environment and on its host."""
+    """Return everything that is found in an environment and on its host."""
     return joined([*_check_variables(setting), *_check_host(setting)])

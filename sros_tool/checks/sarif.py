@@ -17,7 +17,7 @@ _BASE = "SRCROOT"
 def sarif(
     findings: Sequence[Finding], kinds: Sequence[FindingKind], *, version: str, base: Path
 ) -> dict[str, Any]:
-    """A SARIF log of one run, in which ``kinds`` are the rules.
+    """Return a SARIF log of one run, in which ``kinds`` are the rules.
 
     Paths are relative to the folder ``base``; a file without a line is told at its first one.
     Accepted findings are there too, as suppressed.
@@ -76,7 +76,7 @@ def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
 
 
 def relative(file: str, base: Path) -> str:
-    """The path of ``file`` as seen from the folder ``base``, with "/" between its parts."""
+    """Return the path of ``file`` as seen from the folder ``base``, with "/" between its parts."""
     path, start = (base / file).absolute(), base.absolute()
     common = start
     ups = 0

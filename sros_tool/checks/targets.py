@@ -29,7 +29,7 @@ class Circumstances:
 
 
 def path_findings(path: Path, at: Circumstances) -> list[Finding]:
-    """What is found at a path: a policy, a keystore, an enclave, or a folder of policies.
+    """Return what is found at a path: a policy, a keystore, an enclave, or a folder of policies.
 
     Raises `DocumentError` for anything else.
     """

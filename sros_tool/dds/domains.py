@@ -71,7 +71,7 @@ class DomainSet:
 
     @classmethod
     def of(cls, *pairs: tuple[int, int]) -> DomainSet:
-        """The set of these ranges, sorted, and joined where they touch."""
+        """Return the set of these ranges, sorted, and joined where they touch."""
         joined: list[tuple[int, int]] = []
         for first, last in sorted(pairs):
             if joined and first <= joined[-1][1] + 1:
@@ -84,14 +84,14 @@ class DomainSet:
         return any(domain in part for part in self.ranges)
 
     def __iter__(self) -> Iterator[int]:
-        """Every domain from 0 to 230 that is in the set."""
+        """Yield every domain from 0 to 230 that is in the set."""
         return (domain for domain in range(MAX_DOMAIN + 1) if domain in self)
 
     def __str__(self) -> str:
         return ",".join(map(str, self.ranges))
 
     def closed(self) -> DomainSet:
-        """The set with both ends of every range given, sorted and joined.
+        """Return the set with both ends of every range given, sorted and joined.
 
         An open range means what Fast DDS and Cyclone make of it: from N on is N alone, up to N
         begins at 0.
@@ -103,13 +103,13 @@ class DomainSet:
         return DomainSet.of(*pairs)
 
     def only(self) -> int | None:
-        """The domain, if the set has just one, else None."""
+        """Return the domain, if the set has just one, else None."""
         domains = list(self)
         return domains[0] if len(domains) == 1 else None
 
 
 def domain_lines(domains: DomainSet) -> list[str]:
-    """The ``<domains>`` element, a line each: ids alone, ranges with both ends."""
+    """Return the ``<domains>`` element, a line each: ids alone, ranges with both ends."""
     lines = ["<domains>"]
     for part in domains.ranges:
         if part.first == part.last:

@@ -73,7 +73,7 @@ class Permissions:
 
 
 def grant(name: str, subject: str, validity: Window, rules: tuple[Rule, ...]) -> Grant:
-    """A grant of the portable profile: UTC moments, and what no rule names is denied."""
+    """Return a grant of the portable profile: UTC moments, and what no rule names is denied."""
     return Grant(name, subject, iso(validity.not_before), iso(validity.not_after), rules)
 
 
@@ -81,7 +81,7 @@ def grant(name: str, subject: str, validity: Window, rules: tuple[Rule, ...]) ->
 
 
 def render_permissions(permissions: Permissions) -> bytes:
-    """The document as XML in UTF-8, with its elements in the order of the schema."""
+    """Return the document as XML in UTF-8, with its elements in the order of the schema."""
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
         f'<dds xmlns:xsi="{XSI}" xsi:noNamespaceSchemaLocation="{SCHEMA}">',

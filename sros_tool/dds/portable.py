@@ -13,7 +13,7 @@ from itertools import combinations
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Criteria, Permissions
 from sros_tool.errors import Note
 
-_MANY = 3
+_SHOWN = 3
 _LONGEST_TOPIC = 251  # bytes, of DDS names
 _LONGEST_NAME = 8  # parts; longer enclave names are not compared, the subsets would be too many
 
@@ -46,9 +46,9 @@ def outside(
     signed_bytes: int,
     share: Callable[[str, str], bool] = either_matches,
 ) -> Iterator[tuple[str, str]]:
-    """What of a document lies outside of the profile: the id of the remark, and a clause.
+    """Yield what of a document lies outside of the profile: the id of the remark, and a clause.
 
-    ``share`` tells whether two expressions mean a name in common.
+    ``share`` returns whether two expressions mean a name in common.
     """
     if signed_bytes >= MAX_SIGNED_BYTES:
         yield "portable.document-size", f"the signed permissions have {signed_bytes} bytes"
@@ -91,7 +91,7 @@ def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:
 def _blocked(
     denied: list[str], denied_too: set[str], allowed: list[str], share: Callable[[str, str], bool]
 ) -> list[str]:
-    """The denied expressions that share a name with one allowed in the other direction."""
+    """Return the denied expressions that share a name with one allowed in the other direction."""
     return [
         expression
         for expression in denied
@@ -100,7 +100,7 @@ def _blocked(
 
 
 def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
-    """A remark on enclaves of which Cyclone DDS takes one for the other.
+    """Yield a remark on enclaves of which Cyclone DDS takes one for the other.
 
     ``names`` are all enclaves, ``new`` those just added.
     """
@@ -116,7 +116,7 @@ def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
 
 
 def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
-    """The pairs of which Cyclone DDS takes the identity of the first for the second, sorted.
+    """Return the pairs of which Cyclone DDS takes the identity of the first for the second, sorted.
 
     It compares the parts of two subjects as sets, one way: the identity ``/robot`` fits the
     permissions of ``/robot/admin``.
@@ -137,9 +137,9 @@ def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def some_pairs(pairs: Sequence[tuple[str, str]]) -> str:
-    """A few pairs in words: "/robot as /robot/admin and 2 more"."""
-    shown = ", ".join(f"{inner} as {outer}" for inner, outer in pairs[:_MANY])
-    return f"{shown} and {len(pairs) - _MANY} more" if len(pairs) > _MANY else shown
+    """Return a few pairs in words: "/robot as /robot/admin and 2 more"."""
+    shown = ", ".join(f"{inner} as {outer}" for inner, outer in pairs[:_SHOWN])
+    return f"{shown} and {len(pairs) - _SHOWN} more" if len(pairs) > _SHOWN else shown
 
 
 def _contained(
@@ -151,5 +151,5 @@ def _contained(
 
 
 def _some(topics: list[str]) -> str:
-    shown = ", ".join(topics[:_MANY])
-    return f"{shown} and {len(topics) - _MANY} more" if len(topics) > _MANY else shown
+    shown = ", ".join(topics[:_SHOWN])
+    return f"{shown} and {len(topics) - _SHOWN} more" if len(topics) > _SHOWN else shown

@@ -85,7 +85,7 @@ _A_CA = x509.BasicConstraints(ca=True, path_length=1)
 
 
 def common_name(text: str) -> x509.Name:
-    """The distinguished name ``CN=text``, all that a portable subject consists of."""
+    """Return the distinguished name ``CN=text``, all that a portable subject consists of."""
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
 
 
@@ -104,7 +104,7 @@ def enclave_subject(name: str, *, unique: bool) -> x509.Name:
 
 
 def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certificate:
-    """A self-signed certificate authority.
+    """Return a self-signed certificate authority.
 
     It carries BasicConstraints, KeyUsage and both key identifiers, without which OpenSSL's
     strict check (``-x509_strict``, used by Fast DDS) refuses chains.
@@ -135,7 +135,7 @@ class Issuer:
         self._authority_id = authority_identifier(certificate)
 
     def issue(self, subject: x509.Name, public: PublicKey, validity: Window) -> x509.Certificate:
-        """A leaf certificate; its validity is cut to that of the CA."""
+        """Return a leaf certificate; its validity is cut to that of the CA."""
         return (
             _builder(subject, self._name, public, validity.within(self._validity))
             .add_extension(_NOT_A_CA, critical=True)
@@ -147,7 +147,7 @@ class Issuer:
 
 
 def authority_identifier(certificate: x509.Certificate) -> x509.AuthorityKeyIdentifier:
-    """The identifier by which what ``certificate`` signs refers to its key."""
+    """Return the identifier by which what ``certificate`` signs refers to its key."""
     try:
         extension = certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
     except x509.ExtensionNotFound:  # a CA made by ros2/sros2 has none
@@ -170,12 +170,12 @@ def _builder(
 
 
 def validity_of(certificate: x509.Certificate) -> Window:
-    """The validity of a certificate."""
+    """Return the validity of a certificate."""
     return Window(certificate.not_valid_before_utc, certificate.not_valid_after_utc)
 
 
 def pem(certificate: x509.Certificate) -> bytes:
-    """The certificate as PEM."""
+    """Return the certificate as PEM."""
     return certificate.public_bytes(serialization.Encoding.PEM)
 
 
@@ -187,12 +187,12 @@ def load_certificate(data: bytes, name: str) -> x509.Certificate:
         raise PkiError(
             f"the certificate {name} cannot be read",
             "It is not a PEM certificate, it is damaged, or its key is of an unknown kind.",
-            "Restore it from a backup, or issue it anew.",
+            "Restore it from a backup, or issue it again.",
         ) from error
 
 
 def load_certificates(data: bytes, name: str) -> tuple[x509.Certificate, ...]:
-    """All certificates of a PEM file, one at least; ``name`` stands for it in errors."""
+    """Return all certificates of a PEM file, one at least; ``name`` stands for it in errors."""
     first = load_certificate(data, name)
     try:
         others = [read_in_full(each) for each in x509.load_pem_x509_certificates(data)[1:]]
@@ -219,7 +219,7 @@ def read_in_full(certificate: x509.Certificate) -> x509.Certificate:
 
 
 def same_key(certificate: x509.Certificate, key: PrivateKey) -> bool:
-    """Whether ``key`` is the private key of ``certificate``."""
+    """Return whether ``key`` is the private key of ``certificate``."""
     return certificate.public_key() == key.public_key()
 
 
@@ -233,12 +233,12 @@ def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> boo
 
 
 def digest(certificate: x509.Certificate) -> str:
-    """The SHA-256 of a certificate, in hexadecimal: its fingerprint."""
+    """Return the SHA-256 of a certificate, in hexadecimal: its fingerprint."""
     return certificate.fingerprint(hashes.SHA256()).hex()
 
 
 def subject_text(name: x509.Name) -> str:
-    """A distinguished name as OpenSSL prints it by RFC 2253, and vendors compare it.
+    """Return a distinguished name as OpenSSL prints it by RFC 2253, and vendors compare it.
 
     The most general attribute stands last, also of those that share one RDN; non-ASCII characters
     stand as they are.
@@ -260,12 +260,12 @@ def _attribute_text(attribute: x509.NameAttribute[str | bytes]) -> str:
 
 
 def subject_of(text: str) -> x509.Name:
-    """The distinguished name that `subject_text` prints so.  Raises `ValueError`."""
+    """Return the distinguished name that `subject_text` prints so.  Raises `ValueError`."""
     return x509.Name.from_rfc4514_string(text, _OIDS)
 
 
 def common_name_of(name: x509.Name) -> str:
-    """The common name of a distinguished name, or ""."""
+    """Return the common name of a distinguished name, or ""."""
     attributes = name.get_attributes_for_oid(NameOID.COMMON_NAME)
     return str(attributes[0].value) if attributes else ""
 

@@ -27,7 +27,7 @@ def chain_fault(
     for_documents: bool = False,
     strict: bool = False,
 ) -> str:
-    """Why ``start`` has no valid chain to a self-signed one of ``authorities``, or "".
+    """Return why ``start`` has no valid chain to a self-signed one of ``authorities``, or "".
 
     The chain may lead over ``others``.  ``for_documents`` asks for the purpose of S/MIME,
     ``strict`` for what RFC 5280 asks of chains (OpenSSL's ``X509_V_FLAG_X509_STRICT``, with

@@ -45,7 +45,7 @@ class RevocationList:
     list: x509.CertificateRevocationList
 
     def names(self, serial: int) -> bool:
-        """Whether the certificate of that serial number is revoked."""
+        """Return whether the certificate of that serial number is revoked."""
         return any(each.serial == serial for each in self.revoked)
 
 
@@ -58,7 +58,7 @@ def sign_crl(
     this_update: datetime,
     next_update: datetime,
 ) -> bytes:
-    """A revocation list as PEM, signed by ``key`` of ``issuer``."""
+    """Return a revocation list as PEM, signed by ``key`` of ``issuer``."""
     builder = (
         x509.CertificateRevocationListBuilder()
         .issuer_name(issuer.subject)
@@ -96,7 +96,7 @@ def load_crl(pem: bytes, name: str) -> RevocationList:
 
 
 def signed_by(crl: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:
-    """Whether ``authority`` issued and signed a list."""
+    """Return whether ``authority`` issued and signed a list."""
     try:
         public = authority.public_key()
         return crl.issuer == authority.subject and crl.is_signature_valid(public)  # type: ignore[arg-type]

@@ -23,7 +23,7 @@ class Value(NamedTuple):
 
 
 def children(data: bytes) -> list[Value]:
-    """The values that ``data`` (the content of a constructed value) consists of.
+    """Return the values that ``data`` (the content of a constructed value) consists of.
 
     Raises `PkiError` where a value is cut short, or of a form that DER does not have.
     """
@@ -53,7 +53,7 @@ def children(data: bytes) -> list[Value]:
 
 
 def first(data: bytes) -> Value:
-    """The first value in ``data``."""
+    """Return the first value in ``data``."""
     values = children(data)
     if not values:
         raise PkiError("a DER value is empty")
@@ -61,7 +61,7 @@ def first(data: bytes) -> Value:
 
 
 def encode_oid(dotted: str) -> bytes:
-    """The content of an object identifier, from its dotted form."""
+    """Return the content of an object identifier, from its dotted form."""
     one, two, *rest = map(int, dotted.split("."))
     content = bytearray([40 * one + two])
     for number in rest:

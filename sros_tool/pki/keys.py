@@ -21,7 +21,7 @@ def generate_key() -> ec.EllipticCurvePrivateKey:
 
 
 def key_pem(key: PrivateKey, passphrase: str | None = None) -> bytes:
-    """The key as PKCS#8 PEM, encrypted where a passphrase is given.
+    """Return the key as PKCS#8 PEM, encrypted where a passphrase is given.
 
     The keys of enclaves never are: no RMW can give a password.
     """
@@ -72,7 +72,7 @@ def _decrypted(pem: bytes, name: str, passphrase: str) -> PrivateKeyTypes:
 
 
 def algorithm(key: object) -> str:
-    """The kind of a key in words, such as ``EC secp256r1`` or ``RSA 2048``."""
+    """Return the kind of a key in words, such as ``EC secp256r1`` or ``RSA 2048``."""
     if isinstance(key, (ec.EllipticCurvePrivateKey, ec.EllipticCurvePublicKey)):
         return f"EC {key.curve.name}"
     if isinstance(key, (rsa.RSAPrivateKey, rsa.RSAPublicKey)):

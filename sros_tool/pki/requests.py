@@ -29,7 +29,7 @@ class SigningRequest:
 
 
 def make_request(key: PrivateKey, name: str) -> bytes:
-    """A request, as PEM, for a certificate of ``key`` with the common name ``name``."""
+    """Return a request, as PEM, for a certificate of ``key`` with the common name ``name``."""
     builder = x509.CertificateSigningRequestBuilder().subject_name(common_name(name))
     return builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
 
@@ -89,7 +89,7 @@ def _holds(request: x509.CertificateSigningRequest) -> bool:
 
 
 def key_digest(key: PublicKey) -> str:
-    """The SHA-256 of a public key (its DER SubjectPublicKeyInfo), in hexadecimal."""
+    """Return the SHA-256 of a public key (its DER SubjectPublicKeyInfo), in hexadecimal."""
     der = key.public_bytes(
         serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
     )

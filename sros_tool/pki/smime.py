@@ -51,7 +51,7 @@ _DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
 
 
 def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
-    """The S/MIME message that carries ``document``, signed by ``key`` of ``certificate``."""
+    """Return the S/MIME message that carries ``document``, signed by ``key`` of ``certificate``."""
     content = _TEXT_HEADER + document.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n")
     signature = (
         pkcs7.PKCS7SignatureBuilder()
@@ -95,7 +95,7 @@ class SignedDocument:
     _issuer_and_serial: tuple[bytes, int]
 
     def signer(self) -> x509.Certificate | None:
-        """The certificate that the signature names, if it is embedded."""
+        """Return the certificate that the signature names, if it is embedded."""
         return self.signer_among(self.certificates)
 
     def signer_among(self, certificates: Iterable[x509.Certificate]) -> x509.Certificate | None:
@@ -136,7 +136,7 @@ class SignedDocument:
         return digest.finalize() == self._message_digest
 
     def is_intact(self, signer: x509.Certificate) -> bool:
-        """Whether the key of ``signer`` signed this content."""
+        """Return whether the key of ``signer`` signed this content."""
         if self._signed_attributes and not self.carries_digest():
             return False
         signed = self._signed_attributes or self.content
@@ -175,7 +175,7 @@ def _document(content: bytes) -> bytes:
 
 
 def _split(message: bytes) -> tuple[bytes | None, bytes]:
-    """The signed part, with CRLF line ends, and the DER of its signature.
+    """Return the signed part, with CRLF line ends, and the DER of its signature.
 
     An opaque message has no signed part of its own: it is in its signature.
     """
@@ -216,7 +216,7 @@ def _certificate(data: bytes) -> x509.Certificate:
 
 
 def _parts(value: der.Value, *tags: int) -> list[der.Value]:
-    """What a value consists of; the first of its parts must have ``tags``."""
+    """Return what a value consists of; the first of its parts must have ``tags``."""
     parts = der.children(value.content)
     if [part.tag for part in parts[: len(tags)]] != list(tags):
         raise ValueError("not of the structure of a signature")

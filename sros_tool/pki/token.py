@@ -69,7 +69,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
         self._public = public
 
     def public_key(self) -> ec.EllipticCurvePublicKey:
-        """The public half."""
+        """Return the public key."""
         return self._public
 
     @property
@@ -119,7 +119,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
 
 
 def holds_token_key(uri: str, secrets: Secrets) -> bool:
-    """Whether the token has the key that ``uri`` names."""
+    """Return whether the token has the key that ``uri`` names."""
     _need_package()
     import pkcs11
 
@@ -132,12 +132,12 @@ def holds_token_key(uri: str, secrets: Secrets) -> bool:
 
 
 def open_token_key(uri: str, secrets: Secrets) -> TokenKey:
-    """The key that ``uri`` names; `PkiError` if the token has none."""
+    """Return the key that ``uri`` names; `PkiError` if the token has none."""
     return _open(uri, secrets, create=False)
 
 
 def create_token_key(uri: str, secrets: Secrets) -> TokenKey:
-    """A new key pair on the token; `PkiError` if there is one of that name already."""
+    """Return a new key pair on the token; `PkiError` if there is one of that name already."""
     return _open(uri, secrets, create=True)
 
 

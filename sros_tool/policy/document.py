@@ -1,10 +1,11 @@
-"""Resolves the ``xi:include`` elements of a policy without ever leaving its root folder.
-
-Included documents are read into the model where they lie; their nodes are never moved into
-another document (a moved node of lxml can crash the interpreter).
+"""Policy files (SROS2 policy XML 0.2.0): reading them with their includes, and writing them.
 
 The grammar is that of the schema of ros2/sros2, and beyond it every name is checked: a rule that
 can never match anything is an error, for it is a right or a denial that somebody relies on.
+
+Includes (``xi:include``) never leave the root folder of the policy.  Included documents are read
+into the model where they lie; their nodes are never moved into another document (a moved node of
+lxml can crash the interpreter).
 """
 
 from __future__ import annotations
@@ -62,11 +63,11 @@ class Includer:
     _digests: list[bytes] = field(default_factory=list)
 
     def digest(self) -> str:
-        """The SHA-256, hexadecimal, of all documents read so far, whatever their order."""
+        """Return the SHA-256, hexadecimal, of all documents read so far, whatever their order."""
         return hashlib.sha256(b"".join(sorted(self._digests))).hexdigest()
 
     def load(self, file: Path) -> etree._Element:
-        """The root element of a document (its real path)."""
+        """Return the root element of a document (its real path)."""
         if file not in self._documents:
             self.hold(file, read_bytes(file, "policy file"))
         return self._documents[file]
@@ -85,7 +86,7 @@ class Includer:
     def children(
         self, parent: etree._Element, place: IncludedFile
     ) -> Iterator[tuple[etree._Element, IncludedFile]]:
-        """The child elements of ``parent`` with includes replaced by what they stand for."""
+        """Yield the child elements of ``parent`` with includes replaced by what they stand for."""
         for child in parent:
             if child.tag in _INCLUDES:
                 yield from self._included(child, place)
@@ -387,7 +388,7 @@ class _Reader:
 
 
 def write_policy(policy: Policy) -> bytes:
-    """The policy as XML in UTF-8; `read_policy` gives the same value back."""
+    """Return the policy as XML in UTF-8; `read_policy` gives the same value back."""
     root = etree.Element("policy", version=policy.version)
     enclaves = etree.SubElement(root, "enclaves")
     metadata: list[tuple[etree._Element, str]] = []

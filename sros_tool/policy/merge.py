@@ -1,9 +1,8 @@
-"""Decides what of one policy another one lacks: the values behind `edit.merge_into`.
+"""Merging policies into a policy file: what it lacks, and the edits that add it in place.
 
 Nothing here weakens: a denial stays whatever asks for more, and a right is added for the one
-direction in which it was asked.
-
-What is not concerned stays byte for byte, comments and line ends included.
+direction in which it was asked.  All other text of the file stays byte for byte, comments and line
+ends included.
 
 Names go into a group that has exactly their rights, of a profile with their namespace and node, in
 the file itself and never in what it includes; where there is none, it is made.  What comes out is
@@ -38,7 +37,7 @@ from sros_tool.policy.rights import (
 )
 from sros_tool.xml import parse, read_bytes, tag_of
 
-_MANY = 3
+_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +81,7 @@ class MergePlan:
 
 
 def plan_merge(before: Policy, additions: Policy) -> MergePlan:
-    """What ``before`` lacks of ``additions``.
+    """Return what ``before`` lacks of ``additions``.
 
     Not added is what ``before`` says already for that enclave, by whatever profile or wildcard,
     and what it denies as a whole.
@@ -161,20 +160,20 @@ def _entry_order(entry: AddedName) -> tuple[int, GroupRights, str]:
     return RIGHT_ORDER[entry.rights[0][0]], entry.rights, entry.name
 
 
-# ── telling ────────────────────────────────────────────────────────────────────────────────
+# ── notes ────────────────────────────────────────────────────────────────────────────────
 
 
 def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
-    """One remark for each denial that a merge met."""
+    """Return one remark for each denial that a merge met."""
     by_denial: dict[tuple[Right, bool], list[Right]] = {}
     for each in contradictions:
         by_denial.setdefault((each.denied, each.new), []).append(each.allowed)
     notes = []
     for (denied, new), allowed in by_denial.items():
-        told = [right.told() for right in dict.fromkeys(sorted(allowed, key=order))]
-        some = ", ".join(told[:_MANY])
-        if len(told) > _MANY:
-            some += f" and {len(told) - _MANY} more"
+        shown = [right.told() for right in dict.fromkeys(sorted(allowed, key=order))]
+        some = ", ".join(shown[:_SHOWN])
+        if len(shown) > _SHOWN:
+            some += f" and {len(shown) - _SHOWN} more"
         if new:
             text = f"{denied} was added. It takes away from what the file allows: {some}."
             notes.append(Note("merge.newly-denied", text))
@@ -214,7 +213,7 @@ class PlacedElement:
         return tag_of(self.xml)
 
     def get(self, attribute: str) -> str:
-        """The value of an attribute, or ""."""
+        """Return the value of an attribute, or ""."""
         return self.xml.get(attribute, "")
 
     def named(self, tag: str) -> Iterator[PlacedElement]:
@@ -283,7 +282,7 @@ class EditedText:
         return before
 
     def _unit(self) -> str:
-        """What a line is indented by more than that of its parent."""
+        """Return what a line is indented by more than that of its parent."""
         stack = [self.root]
         while stack:
             parent = stack.pop()
@@ -296,7 +295,7 @@ class EditedText:
         return "  "
 
     def after(self, element: PlacedElement) -> int:
-        """The place behind an element and the comments that follow on its line."""
+        """Return the place behind an element and the comments that follow on its line."""
         comments = _COMMENTS_OF_THE_LINE.match(self.text, element.end)
         if comments and self.indent_of(element) is not None:
             return comments.end()
@@ -309,7 +308,7 @@ class EditedText:
         self._edits.append((place, place if until is None else until, text))
 
     def document(self) -> bytes:
-        """The document with all edits."""
+        """Return the document with all edits."""
         pieces, done = [], 0
         for start, end, text in sorted(self._edits, key=lambda edit: edit[0]):
             pieces += [self.text[done:start], text]
@@ -318,7 +317,7 @@ class EditedText:
 
 
 def _encoding(data: bytes, root: etree._Element) -> str:
-    """The encoding of a document; a byte order mark stays a character of it."""
+    """Return the encoding of a document; a byte order mark stays a character of it."""
     declared = root.getroottree().docinfo.encoding or "utf-8"
     if data.startswith(codecs.BOM_UTF16_LE):
         return "utf-16-le"
@@ -340,7 +339,7 @@ class Merged:
 
 
 def merge_into(path: Path, additions: Policy) -> Merged:
-    """The policy file at ``path`` with the rights of ``additions``; nothing is written.
+    """Return the policy file at ``path`` with the rights of ``additions``; nothing is written.
 
     Raises `PolicyError` (or another `DocumentError`) if the file is no policy, or where a right
     has no place: its enclave stands in an included file, or a changed part is included elsewhere
@@ -367,7 +366,7 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
 
 
 def _proven(path: Path, document: bytes, before: Policy, added: Sequence[Right]) -> Policy:
-    """The policy that a document says, if it is ``before`` with ``added``; else an error."""
+    """Return the policy that a document says, if it is ``before`` with ``added``; else an error."""
     try:
         after = read_policy(path, document)
     except DocumentError as error:
@@ -410,7 +409,7 @@ def _group(kind: str, rights: GroupRights, names: Iterable[str]) -> _New:
 
 
 def _groups(entries: Sequence[AddedName]) -> list[_New]:
-    """The groups for names that come sorted by kind and rights."""
+    """Return the groups for names that come sorted by kind and rights."""
     return [
         _group(kind, rights, [entry.name for entry in same])
         for (kind, rights), same in groupby(entries, key=lambda each: (each.kind, each.rights))
@@ -431,7 +430,7 @@ class _Editor:
         self._text = EditedText(document, f"the policy file '{path}'")
 
     def add(self, entries: dict[ProfileKey, tuple[AddedName, ...]]) -> bytes:
-        """The document with ``entries``."""
+        """Return the document with ``entries``."""
         blocks = list(self._text.root.named("enclaves"))
         own = {each.get("path"): each for block in blocks for each in block.named("enclave")}
         for path, found in groupby(entries.items(), key=lambda item: item[0].enclave):
@@ -537,7 +536,7 @@ class _Editor:
         text.put(place, rendered)
 
     def _rendered(self, new: _New, indent: str | None) -> str:
-        """The text of an element, on lines of its own if its neighbours stand so."""
+        """Return the text of an element, on lines of its own if its neighbours stand so."""
         tag = new.start.split(" ", 1)[0]
         before = "" if indent is None else self._text.newline + indent
         if not new.children:

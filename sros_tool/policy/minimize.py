@@ -1,4 +1,4 @@
-"""Rewrites an enclave with fewer rights: rules that go, and names in place of wildcards.
+"""Minimizing a policy to what was observed, and wildcards that make a large one smaller.
 
 Over-privilege of an enclave is the number of pairs (right, name) that it is allowed, divided by
 the number of those that were observed.  A pair is one of publish, subscribe, request, reply, call,
@@ -55,7 +55,7 @@ def _narrowed_enclave(
 def _profile(
     path: str, profile: Profile, kept: Set[Right], pending: dict[Right, Sequence[Right]]
 ) -> Profile:
-    """The profile; what it takes of ``pending`` is removed there."""
+    """Return the profile; what it takes of ``pending`` is removed there."""
     said: dict[tuple[str, str], dict[tuple[str, Qualifier], None]] = {}
     for group in profile.groups:
         for name in group.names:
@@ -175,11 +175,11 @@ class _KnownNames:
         self._names = {kind: sorted(names) for kind, names in found.items()}
 
     def of(self, kind: str) -> Sequence[str]:
-        """The known names of topics, services or actions."""
+        """Return the known names of topics, services or actions."""
         return self._names.get(kind, ())
 
     def matched(self, kind: str, expression: str) -> Iterator[str]:
-        """The known names that a wildcard matches."""
+        """Yield the known names that a wildcard matches."""
         names, prefix = self.of(kind), literal_prefix(expression)
         for name in names[bisect_left(names, prefix) :]:
             if not name.startswith(prefix):
@@ -219,7 +219,7 @@ class _Narrowing:
         return self._rules.cover(part) and not self._rules.cover(part._replace(qualifier=DENY))
 
     def _is_usable(self, part: Right) -> bool:
-        """Whether it, or for a wildcard some of what it means, is allowed."""
+        """Return whether it, or for a wildcard some of what it means, is allowed."""
         if self._is_allowed(part):
             return True
         return is_expression(part.name) and bool(self._rules.meeting(part))
@@ -316,7 +316,7 @@ class _Narrowing:
     # ── counting ───────────────────────────────────────────────────────────────────────────
 
     def _pairs(self, rights: Iterable[Right]) -> set[_Pair]:
-        """The pairs of a right and a known name that ``rights`` allow and nothing denies."""
+        """Return the pairs of a right and a known name that ``rights`` allow and nothing denies."""
         rights = folded(rights)
         found: set[_Pair] = set()
         wild = False
@@ -338,19 +338,19 @@ class _Narrowing:
         }
 
     def _with_actions(self, found: set[_Pair], rules: Rules) -> set[_Pair]:
-        """The pairs, with every action that ``rules`` mean as a whole told as that alone."""
-        told = set(found)
+        """Return the pairs, with every action that ``rules`` mean as a whole counted once."""
+        pairs = set(found)
         for action in ("call", "execute"):
             for name in self._names.of(KIND_OF[action]):
                 whole = Right(self._enclave.path, ALLOW, action, name)
                 if rules.cover(whole):
-                    told.difference_update((part.right, part.name) for part in parts(whole))
-                    told.add((action, name))
-        return told
+                    pairs.difference_update((part.right, part.name) for part in parts(whole))
+                    pairs.add((action, name))
+        return pairs
 
 
 def _for_nodes(enclave: Enclave, common: Sequence[Group]) -> Iterator[Right]:
-    """What every node needs, for each node that the enclave has a profile for."""
+    """Yield what every node needs, for each node that the enclave has a profile for."""
     for profile in enclave.all_profiles():
         for group in common:
             for name in group.names:
@@ -387,9 +387,9 @@ def propose_wildcards(
 ) -> tuple[WildcardProposal, ...]:
     """Wildcards by which the document of an enclave becomes ``needed`` bytes smaller, if possible.
 
-    ``rights`` are the enclave's, ``known`` those of every enclave, ``size`` tells the bytes that a
-    right takes.  Those that save most come first; such that grant something known are used only
-    if the safe ones do not suffice.
+    ``rights`` are the enclave's, ``known`` those of every enclave, and ``size`` returns the
+    bytes that a right takes.  Those that save most come first; such that grant something known are
+    used only if the safe ones do not suffice.
     """
     own = [right for right in rights if right.enclave == enclave and right.qualifier is ALLOW]
     rules = Rules(own)
@@ -422,7 +422,7 @@ def propose_wildcards(
 
 
 def _candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
-    """The wildcards that stand for several names of one right, with these."""
+    """Return the wildcards that stand for several names of one right, with these."""
     found: dict[Right, list[Right]] = defaultdict(list)
     for right in rights:
         if right.name.startswith("/") and not is_expression(right.name):
@@ -444,7 +444,7 @@ def _wider(name: str) -> Iterator[str]:
 
 
 def _foreign(enclave: str, own: Rules, known: Iterable[Right]) -> dict[str, list[str]]:
-    """The known names by right (in parts of actions) that the enclave is not allowed."""
+    """Return the known names by right (in parts of actions) that the enclave is not allowed."""
     by_service: dict[bool, set[str]] = {True: set(), False: set()}
     for part in unfolded(known):
         if not is_expression(part.name):

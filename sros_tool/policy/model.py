@@ -60,7 +60,7 @@ class Group:
     lines: tuple[int, ...] = field(default=(), compare=False)
 
     def source_of(self, index: int) -> Source:
-        """Where the name of that index stands."""
+        """Return where the name of that index stands."""
         if index < len(self.lines):
             return Source(self.source.file, self.lines[index])
         return self.source
@@ -98,7 +98,7 @@ class Enclave:
     digest: str = field(default="", compare=False)
 
     def all_profiles(self) -> tuple[Profile, ...]:
-        """Every profile of the enclave, in order."""
+        """Return every profile of the enclave, in order."""
         return tuple(profile for block in self.profiles for profile in block.profiles)
 
 
@@ -111,5 +111,5 @@ class Policy:
     file: str = field(default="", compare=False)
 
     def enclave(self, path: str) -> Enclave | None:
-        """The enclave of that path, or None."""
+        """Return the enclave of that path, or None."""
         return next((each for each in self.enclaves if each.path == path), None)

@@ -1,10 +1,10 @@
-"""What the wildcards of names mean: which names they match, cover and share with each other.
+"""Names with wildcards: which names they match, cover and have in common.
 
 ``*`` stands for any characters, "/" among them, ``?`` for one, ``[abc]``, ``[a-c]`` and ``[!a-c]``
 for one of a set or outside of it: glibc's fnmatch without escapes, as the DDS vendors match.
 
-What `patterns.overlap` answers for two expressions, for any number, with exceptions, and with a
-name to show for it.  Names are absolute ROS names: an overlap that no ROS name can have is none.
+`overlap` compares two expressions; `common_name` any number, with exceptions, and finds an example.
+Its names are absolute ROS names: an overlap that no ROS name can have is none.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ ANY: frozenset[str] = frozenset()
 
 @lru_cache(maxsize=_MANY)
 def compiled(expression: str) -> re.Pattern[str]:
-    """The regular expression that matches the same names."""
+    """Return the regular expression that matches the same names."""
     return re.compile(translate(expression))
 
 
 def matches(expression: str, name: str) -> bool:
-    """Whether ``name``, which has no wildcards, is meant by ``expression``."""
+    """Return whether ``name``, which has no wildcards, is meant by ``expression``."""
     return compiled(expression).match(name) is not None
 
 
 def literal_prefix(expression: str) -> str:
-    """The characters before the first wildcard."""
+    """Return the characters before the first wildcard."""
     return _WILDCARD.split(expression, maxsplit=1)[0]
 
 
 def covers(wide: str, narrow: str) -> bool:
-    """Whether everything that ``narrow`` means is also meant by ``wide``.
+    """Return whether everything that ``narrow`` means is also meant by ``wide``.
 
     True is always right.  Exotic patterns such as ``?*`` and ``*?`` mean the same and yet do not
     cover each other here; whoever relies on that keeps a rule too many, never one too few.
@@ -76,7 +76,7 @@ def _covers(wide: str, narrow: str) -> bool:
 
 
 def overlap(one: str, other: str) -> bool:
-    """Whether some name is meant by both."""
+    """Return whether some name is meant by both."""
     if not is_expression(one):
         return matches(other, one) if is_expression(other) else one == other
     if not is_expression(other):
@@ -114,7 +114,7 @@ def _overlap(one: str, other: str) -> bool:
 
 
 def _after_stars(reached: set[int], pieces: tuple[frozenset[str], ...]) -> set[int]:
-    """The places reached when stars that follow stand for nothing."""
+    """Return the places reached when stars that follow stand for nothing."""
     grown = set(reached)
     for i in sorted(reached):
         while i < len(pieces) and pieces[i] is ANY:
@@ -158,11 +158,11 @@ _State = tuple[int, tuple[frozenset[int], ...]]
 def common_name(
     wanted: Iterable[str], unwanted: Iterable[str] = (), *, absolute: bool = True
 ) -> str | None:
-    """The shortest absolute ROS name that all of ``wanted`` mean and none of ``unwanted``.
+    """Return the shortest absolute ROS name that all of ``wanted`` mean and none of ``unwanted``.
 
     Unless ``absolute``, one without its first "/", as DDS topics are.  None if there is no such
     name.  Where the search grows beyond all bounds (many ``?`` behind ``*``), the exceptions are
-    left out of account: an overlap too many is told, never one too few.
+    left out of account: an overlap too many is reported, never one too few.
     """
     inner, outer = tuple(dict.fromkeys(wanted)), tuple(dict.fromkeys(unwanted))
     for name in inner:
@@ -215,7 +215,7 @@ def _spelt(state: _State, before: dict[_State, tuple[_State, str] | None]) -> st
 
 
 def _representatives(patterns: list[_Pieces]) -> str:
-    """One letter of each kind that the patterns, and the grammar of names, tell apart."""
+    """Return one letter of each kind that the patterns, and the grammar of names, tell apart."""
     told = {piece for pattern in patterns for piece in pattern if piece is not ANY}
     kinds: dict[tuple[object, ...], str] = {}
     for letter in _LETTERS:
@@ -225,7 +225,7 @@ def _representatives(patterns: list[_Pieces]) -> str:
 
 
 def _after(place: int, letter: str) -> int | None:
-    """Where in a name the letter leads, or None where it cannot stand."""
+    """Return where in a name the letter leads, or None where it cannot stand."""
     if letter == "/":
         return None if place == _SLASH else _SLASH
     if place == _START or (place == _SLASH and letter in digits):

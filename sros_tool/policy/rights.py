@@ -1,4 +1,4 @@
-"""What a policy comes down to: a set of rights and denials on absolute names.
+"""Rights and denials on absolute names: what a policy states, and how two policies differ.
 
 Two documents mean the same if their rights in normal form are equal.  An action is nothing but
 three services and two topics (ROS 2 design "Actions"): `unfolded` says it in those, `folded` puts
@@ -21,7 +21,7 @@ KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
 """The kind of group in which a right stands, such as topics for publish."""
 
 RIGHT_ORDER = {right: number for number, right in enumerate(KIND_OF)}
-"""The order in which rights are told: publish, subscribe, request, reply, call, execute."""
+"""The order in which rights are listed: publish, subscribe, request, reply, call, execute."""
 
 WHOLE = {"request": "call", "reply": "execute"}
 """The right to an action that consists of that right to its services."""
@@ -100,7 +100,7 @@ def policy_rights(policy: Policy) -> frozenset[Right]:
 
 
 def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
-    """The rights that one profile of an enclave states."""
+    """Yield the rights that one profile of an enclave states."""
     ns, node = profile.ns, profile.node
     for group in profile.groups:
         for name in group.names:
@@ -123,12 +123,12 @@ def parts(right: Right) -> tuple[Right, ...]:
 
 
 def unfolded(rights: Iterable[Right]) -> frozenset[Right]:
-    """The same rights with every action as its parts."""
+    """Return the same rights with every action as its parts."""
     return frozenset(part for right in rights for part in parts(right))
 
 
 def folded(rights: Iterable[Right]) -> frozenset[Right]:
-    """The normal form: all parts of an action are told as the action, and not a second time."""
+    """The normal form: all parts of an action become the action, and do not count a second time."""
     remaining = set(unfolded(rights))
     actions = [
         Right(each.enclave, each.qualifier, WHOLE[each.right], each.name.removesuffix(GOAL))
@@ -158,16 +158,16 @@ class Rules:
                 self._wild[place].append(name)
 
     def cover(self, right: Right) -> bool:
-        """Whether all that ``right`` says (an ALLOW, or a DENY) is said here too."""
+        """Return whether all that ``right`` says (an ALLOW, or a DENY) is said here too."""
         return all(self._covering(part) for part in parts(right))
 
     def covering(self, right: Right) -> tuple[Right, ...]:
-        """The rights by which `cover` is true, without repetition; empty where it is not."""
+        """Return the rights by which `cover` is true, without repetition; empty where it is not."""
         found = [self._covering(part) for part in parts(right)]
         return tuple(dict.fromkeys(each for each in found if each)) if all(found) else ()
 
     def meeting(self, right: Right) -> tuple[Right, ...]:
-        """The rights here that share a name with ``right``."""
+        """Return the rights here that share a name with ``right``."""
         found: dict[Right, None] = {}
         for part in parts(right):
             place = part[:3]
@@ -204,7 +204,7 @@ _Place = tuple[str, Qualifier, str]
 class RightsDifference:
     """The rights that only one side has, in normal form and sorted.
 
-    ``covered`` tells for some of them by which wildcards the other side has them all the same.
+    ``covered`` maps some of them to the wildcards by which the other side has them all the same.
     """
 
     only_first: tuple[Right, ...]
@@ -215,7 +215,7 @@ class RightsDifference:
         return bool(self.only_first or self.only_second)
 
     def lines(self) -> list[tuple[str, Right]]:
-        """Every difference with its sign, "-" for the first side, in the order of telling."""
+        """Every difference with its sign, "-" for the first side, in the order of `order`."""
         found = [("-", each) for each in self.only_first] + [("+", e) for e in self.only_second]
         return sorted(found, key=lambda line: (*order(line[1]), line[0] == "+"))
 
@@ -223,7 +223,7 @@ class RightsDifference:
 def compare(
     first: Iterable[Right], second: Iterable[Right], scope: frozenset[str] | None = None
 ) -> RightsDifference:
-    """How two sets of rights differ, within the enclaves of ``scope`` (None: all).
+    """Return how two sets of rights differ, within the enclaves of ``scope`` (None: all).
 
     The difference is empty just if both allow and deny the same, with actions taken for the
     services and topics that they consist of.

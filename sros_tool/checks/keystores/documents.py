@@ -175,7 +175,7 @@ _DIRECTIONS = ("publish", "subscribe")
 
 
 def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """The permissions of an enclave, whoever signed them."""
+    """Yield the findings in the permissions of an enclave, whoever signed them."""
     permissions = enclave.state.permissions
     if permissions is None:
         return
@@ -192,7 +192,7 @@ def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
 
 
 def domain_problems(domains: DomainSet) -> Iterator[str]:
-    """What vendors read differently in a set of domains."""
+    """Yield what vendors read differently in a set of domains."""
     for part in domains.ranges:
         if part.first is None or part.last is None:
             yield f"{part} has one end only"
@@ -240,7 +240,7 @@ def _times(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding
         for each in (grant.not_before, grant.not_after)
     )
     if begin is None or end is None:
-        return  # which is told by the form of the dates
+        return  # which the form of the dates reports
     if not begin <= int(now.timestamp()) <= end:
         here = f"in {enclave.keystore.zone} Fast DDS takes that for {_utc(begin)} to {_utc(end)}"
         yield LOCAL_TIME.found(enclave.name, f"{text}, and {here}", file)
@@ -427,10 +427,10 @@ _NONE = (ProtectionKind.NONE,)
 
 
 def check_governance(enclave: CheckedEnclave, *, alone: bool) -> Iterator[Finding]:
-    """The governance that an enclave loads.
+    """Yield the findings in the governance that an enclave loads.
 
-    It is told once for a keystore, by the first enclave; ``alone`` says that this one is not the
-    first, and has a copy of its own that may differ.
+    It is reported once for a keystore, by the first enclave; ``alone`` says that this one is not
+    the first, and has a copy of its own that may differ.
     """
     governance = enclave.state.governance
     if governance is None:
@@ -448,7 +448,7 @@ def check_governance(enclave: CheckedEnclave, *, alone: bool) -> Iterator[Findin
 def governance_findings(
     keystore: CheckedKeystore, governance: Governance, file: str
 ) -> Iterator[Finding]:
-    """What a governance document leaves open; ``file`` is where it stands."""
+    """Yield what a governance document leaves open; ``file`` is where it stands."""
     domains = governance.domains().closed()
     accepted = keystore.accepts(lambda s: governance == governance_for(s.protection, domains))
     for rule in governance.domain_access_rules:
@@ -547,7 +547,7 @@ def _copy(keystore: CheckedKeystore) -> Iterator[Finding]:
 
 
 def _content(message: bytes) -> bytes:
-    """What is signed; b"" where that cannot be read, which is told elsewhere."""
+    """Return what is signed; b"" where that cannot be read, which is reported elsewhere."""
     try:
         return plain(smime.parse(message).document)
     except SrosError:
@@ -564,7 +564,7 @@ DIFFER = FindingKind(
 )
 
 _UNHEARD_OF = "rt/sros_nobody_has_this"
-_MANY = 3
+_SHOWN = 3
 
 
 def check_vendors(enclave: CheckedEnclave, *, outside: bool) -> Iterator[Finding]:
@@ -594,8 +594,8 @@ def check_vendors(enclave: CheckedEnclave, *, outside: bool) -> Iterator[Finding
     }
     differing = list(_differences(answers, _topics_to_ask(enclave)))
     if differing:
-        more = f"; and {len(differing) - _MANY} more" if len(differing) > _MANY else ""
-        text = f"on domain {domain}, {'; '.join(differing[:_MANY])}{more}"
+        more = f"; and {len(differing) - _SHOWN} more" if len(differing) > _SHOWN else ""
+        text = f"on domain {domain}, {'; '.join(differing[:_SHOWN])}{more}"
         yield DIFFER.found(enclave.name, text, enclave.file("permissions.p7s"))
 
 
@@ -618,14 +618,16 @@ def _differences(answers: dict[Vendor, Access | Refusal], topics: list[str]) -> 
             for vendor, answer in answers.items()
         }
         if len({each.outcome.ok for each in said.values()}) > 1:
-            told = ", ".join(f"{title}: {each.outcome.value}" for title, each in said.items())
-            yield f"{f'{verb.value} {topic}'.strip()} ({told})"
+            answers_text = ", ".join(
+                f"{title}: {each.outcome.value}" for title, each in said.items()
+            )
+            yield f"{f'{verb.value} {topic}'.strip()} ({answers_text})"
             if verb is AccessVerb.JOIN:
                 return  # everything else differs, too
 
 
 def _topics_to_ask(enclave: CheckedEnclave) -> list[str]:
-    """The topics that are named, an example for each wildcard, and one that nobody names."""
+    """Return the topics that are named, an example for each wildcard, and one that nobody names."""
     grant = grant_of(enclave)
     named: dict[str, None] = {ROS_DISCOVERY_TOPIC: None}
     for rule in grant.rules if grant else ():
@@ -636,7 +638,7 @@ def _topics_to_ask(enclave: CheckedEnclave) -> list[str]:
 
 
 def _example(expression: str) -> str:
-    """A name that a plain wildcard means; sets of characters stand for their first one."""
+    """Return a name that a plain wildcard means; sets of characters stand for their first one."""
     if not is_expression(expression):
         return expression
     name, index = "", 0

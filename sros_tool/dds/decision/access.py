@@ -1,4 +1,9 @@
-"""Which grant of a permissions document holds for an identity at a moment."""
+"""The access control of one vendor: who may join, publish and subscribe under two documents.
+
+A decision chooses the grant of the subject (`_choose_grant`), takes its rules for the domain
+(`_rules_for`), asks them for a topic (`GrantRules`), and weighs them with what the governance
+controls (`_GovernedDomain`, `_decide_join`, `Access`).
+"""
 
 from __future__ import annotations
 
@@ -32,7 +37,7 @@ from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 def _choose_grant(
     traits: VendorTraits, permissions: Permissions, subject: str, *, at: datetime, zone: tzinfo
 ) -> int | Refusal:
-    """The index of the grant, or why there is none."""
+    """Return the index of the grant, or why there is none."""
     now = at.timestamp()
     outdated: Refusal | None = None
     certified = escaped(subject) if traits.escapes_subjects else subject
@@ -59,7 +64,7 @@ def _choose_grant(
 def _state(
     traits: VendorTraits, index: int, grant: Grant, now: float, zone: tzinfo
 ) -> Refusal | None:
-    """Why the grant does not hold now, if so."""
+    """Return why the grant does not hold now, if so."""
     begin = read_moment(traits.moments, grant.not_before, zone)
     end = read_moment(traits.moments, grant.not_after, zone)
     name = f"grant {grant.name!r}" if grant.name else f"grant {index + 1}"
@@ -80,7 +85,7 @@ def _state(
 
 
 def holds_for(rule: OpenRange, domains: DomainSet, domain: int) -> bool | None:
-    """Whether ``domain`` is in ``domains``; None if the vendor crashes over the answer."""
+    """Return whether ``domain`` is in ``domains``; None if the vendor crashes over the answer."""
     for part in domains.ranges:
         first, last = part.first, part.last
         if first is None:
@@ -139,7 +144,7 @@ class _Entry:
 def _rules_for(
     traits: VendorTraits, grant: Grant, domain: int
 ) -> tuple[list[NumberedRule], RuleVerdict]:
-    """The rules of the grant for ``domain``, and the verdict where none of them matches."""
+    """Return the rules of the grant for ``domain``, and the verdict where none of them matches."""
     found: list[NumberedRule] = []
     for index, rule in enumerate(grant.rules):
         holds = holds_for(traits.open_range, rule.domains, domain)
@@ -152,7 +157,7 @@ def _rules_for(
 
 
 def _default_verdict(traits: VendorTraits, grant: Grant) -> RuleVerdict:
-    """The verdict where no rule matches."""
+    """Return the verdict where no rule matches."""
     if not traits.honours_default:
         return RuleVerdict(Outcome.DENIED, "no-rule")
     if traits.crashes_on_empty_texts and grant.default_empty:
@@ -205,7 +210,7 @@ class GrantRules:
         return self._otherwise
 
     def ask_topic(self, topic: str) -> RuleVerdict:
-        """The verdict on a topic in itself, whatever the partitions."""
+        """Return the verdict on a topic in itself, whatever the partitions."""
         position = self._topics.first(topic)
         if position is None:
             return self._otherwise
@@ -227,13 +232,13 @@ def _named(style: Style, expressions: tuple[str, ...], partition: str) -> bool:
 
 
 def _usable_expression(traits: VendorTraits, text: str) -> str:
-    """An expression that matches every name, for one over which the vendor crashes."""
+    """Return an expression that matches every name, for one over which the vendor crashes."""
     text = _trimmed(traits, text)
     return text or "*" if traits.crashes_on_empty_texts else text
 
 
 def _trimmed(traits: VendorTraits, text: str) -> str:
-    """The text as the vendor takes it from its element."""
+    """Return the text as the vendor takes it from its element."""
     return text.strip(" \t\v\r\n") if traits.trims_texts else text
 
 
@@ -271,7 +276,7 @@ class _GovernedDomain:
         return None if position is None else self._topic_rules[position]
 
     def all_controlled(self) -> bool:
-        """Whether every topic rule controls reading and writing."""
+        """Return whether every topic rule controls reading and writing."""
         return all(
             rule.enable_read_access_control and rule.enable_write_access_control
             for rule in self._topic_rules
@@ -279,7 +284,7 @@ class _GovernedDomain:
 
 
 def _verdict_text(verdict: RuleVerdict, asked: str, domain: int, *, by_peers: bool = False) -> str:
-    """What ``verdict`` says about ``asked`` (``publish rt/a``), as a clause.
+    """Return what ``verdict`` says about ``asked`` (``publish rt/a``), as a clause.
 
     ``by_peers`` says that the own participant lets it pass and its peers do not.
     """
@@ -414,11 +419,11 @@ class Access:
     def decide(
         self, verb: AccessVerb, topic: str = "", partitions: tuple[str, ...] = ()
     ) -> Decision:
-        """The decision on ``verb``; ``topic`` is the DDS name (``rt/chatter``)."""
+        """Return the decision on ``verb``; ``topic`` is the DDS name (``rt/chatter``)."""
         return self.join() if verb is AccessVerb.JOIN else self._endpoint(verb, topic, partitions)
 
     def join(self) -> Decision:
-        """Whether the participant starts, and peers talk to it."""
+        """Return whether the participant starts, and peers talk to it."""
         return self._join
 
     def publish(self, topic: str, partitions: tuple[str, ...] = ()) -> Decision:
@@ -426,7 +431,7 @@ class Access:
         return self._endpoint(AccessVerb.PUBLISH, topic, partitions)
 
     def subscribe(self, topic: str, partitions: tuple[str, ...] = ()) -> Decision:
-        """Whether a reader of ``topic`` can be created and hears."""
+        """Return whether a reader of ``topic`` can be created and hears."""
         return self._endpoint(AccessVerb.SUBSCRIBE, topic, partitions)
 
     def _prepare(self, grant: Grant) -> None:
@@ -499,7 +504,7 @@ class Access:
         return self._verdict(verdict, asked, rule)
 
     def _in_the_open(self, rule: TopicRule) -> bool:
-        """Whether even participants that refuse each other exchange the topic."""
+        """Return whether even participants that refuse each other exchange the topic."""
         domain = self._governed.rule
         return (
             self._traits.shares_open_topics

@@ -86,5 +86,5 @@ class Refusal:
     outcome: Outcome = Outcome.REFUSED
 
     def decision(self) -> Decision:
-        """The answer to every question under such a document."""
+        """Return the answer to every question under such a document."""
         return Decision(self.outcome, self.reason, self.text)

@@ -1,6 +1,6 @@
-"""XML as Cyclone DDS 0.10 reads it (ddsrt/src/xmlparser.c).
+"""Governance and permissions as Cyclone DDS 0.10 reads them, with its own XML parser.
 
-Names are of ASCII letters, digits, ``_ - :``; comments, processing instructions and ``<!...>`` are
+In its XML (ddsrt/src/xmlparser.c) names are of ASCII letters, digits, ``_ - :``; comments, processing instructions and ``<!...>`` are
 passed over between any two tokens; an element holds either elements or one text.
 
 Tags may be written in capitals, come in any order, and the last of several counts; blanks around
@@ -41,7 +41,7 @@ _ENTITIES = {"lt": "<", "gt": ">", "amp": "&", "apos": "'", "quot": '"'}
 
 
 def read(xml: bytes) -> XmlElement:
-    """The root of a document; raises `UnreadableError` where Cyclone DDS refuses it.
+    """Return the root of a document; raises `UnreadableError` where Cyclone DDS refuses it.
 
     A text is without the blanks around it, and decoded as UTF-8, each byte that is none as a
     surrogate.
@@ -130,7 +130,7 @@ class _Reader:
             element.children.append(self._element(depth + 1))
 
     def _opens(self) -> bool:
-        """Whether the next token begins an element; raises where it is none at all."""
+        """Return whether the next token begins an element; raises where it is none at all."""
         self._pass_over()
         text, index = self._text, self._index
         if text[index : index + 1] == "<" and not text.startswith(_CDATA, index):
@@ -225,7 +225,7 @@ _PERMISSIONS = _DOMAINS | {
 
 
 def read_governance(xml: bytes) -> Governance:
-    """Its governance; raises `UnreadableError`."""
+    """Return the governance; raises `UnreadableError`."""
     dds = _Node.root(xml, _GOVERNANCE, ())
     parent = dds.last("domain_access_rules")
     rules = parent.all("domain_rule") if parent else []
@@ -235,7 +235,7 @@ def read_governance(xml: bytes) -> Governance:
 
 
 def read_permissions(xml: bytes) -> Permissions:
-    """Its permissions; raises `UnreadableError`.
+    """Return the permissions; raises `UnreadableError`.
 
     A ``<topic>`` without text is "", a rule without domains has a range without ends, and a
     ``<default>`` may be empty: over each it crashes once it comes to it.

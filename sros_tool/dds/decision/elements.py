@@ -1,4 +1,4 @@
-"""Elements of a document as a vendor's own XML parser sees them.
+"""XML elements as the vendors' parsers see them, and the schemas that the standard checks.
 
 DDS-Security 1.1, the schemas omg_shared_ca_permissions and omg_shared_ca_governance of 20170901.
 """
@@ -24,7 +24,7 @@ class UnreadableError(Exception):
         self.outcome = outcome
 
     def refusal(self, title: str, document: str) -> Refusal:
-        """The same as a value; ``title`` names the vendor."""
+        """Return the same as a value; ``title`` names the vendor."""
         how = "crashes over" if self.outcome is Outcome.CRASHES else "refuses"
         return Refusal("malformed", f"{title} {how} the {document}: {self}.", self.outcome)
 
@@ -122,7 +122,7 @@ def check_governance(xml: bytes) -> None:
 
 
 def _root(xml: bytes) -> etree._Element:
-    """The root; blanks may stand before the XML declaration."""
+    """Return the root; blanks may stand before the XML declaration."""
     parser = etree.XMLParser(
         remove_pis=True, resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False
     )

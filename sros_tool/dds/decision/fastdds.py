@@ -1,10 +1,11 @@
-"""XML as TinyXML-2 9 reads it, the parser of Fast DDS: it forgives much that XML forbids.
+"""Governance and permissions as Fast DDS reads them, with its parser TinyXML-2 9.
 
-It knows bytes, not encodings, and neither namespaces nor entities of a document: ``--`` in a
-comment, a lone ``&``, control characters, ``]]>`` in a text and a second root are all taken.
+The parser forgives much that XML forbids.  It knows bytes, not encodings, and neither namespaces
+nor entities of a document: ``--`` in a comment, a lone ``&``, control characters, ``]]>`` in a text
+and a second root are all taken.
 
 The order of elements is compulsory, texts keep their blanks, and words are written in one way.
-What stands behind the last element that it looks for goes unread.
+What follows the last element that it looks for goes unread.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ _REFERENCE = re.compile("&(?:#x?([^;]*)|(quot|amp|apos|lt|gt));")
 
 
 def read(xml: bytes) -> XmlElement:
-    """The first element of a document; raises `UnreadableError` where TinyXML-2 refuses it.
+    """Return the first element of a document; raises `UnreadableError` where TinyXML-2 refuses it.
 
     A text is decoded as UTF-8, each byte that is none as a surrogate.
     """
@@ -139,7 +140,7 @@ def _decoded(text: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """The text with its line ends and references resolved, up to a NUL."""
+    """Return the text with its line ends and references resolved, up to a NUL."""
     if "&" not in text:
         return _decoded(_LINE_END.sub("\n", text) if "\r" in text or "\n" in text else text)
     # It writes into the text that it reads: of a lone "&" nothing is written, so that the
@@ -166,7 +167,7 @@ def _plain(text: str) -> str:
 
 
 def _referred(found: re.Match[str]) -> str | None:
-    """The bytes of a reference; None where it is malformed."""
+    """Return the bytes of a reference; None where it is malformed."""
     if found[2]:
         return _ENTITIES[found[2]]
     # It reads the digits from the last one on, back to the mark before them.
@@ -192,7 +193,7 @@ _TRUE, _FALSE = ("true", "True", "TRUE"), ("false", "False", "FALSE")
 
 
 def read_governance(xml: bytes) -> Governance:
-    """Its governance; raises `UnreadableError`."""
+    """Return the governance; raises `UnreadableError`."""
     root = read(xml)
     parent = _first(root, "domain_access_rules")
     if root.children[-1] is not parent:
@@ -202,7 +203,7 @@ def read_governance(xml: bytes) -> Governance:
 
 
 def read_permissions(xml: bytes) -> Permissions:
-    """Its permissions; raises `UnreadableError`."""
+    """Return the permissions; raises `UnreadableError`."""
     return Permissions(
         tuple(_grant(each) for each in _all(_first(read(xml), "permissions"), "grant"))
     )
@@ -221,7 +222,7 @@ def _first(root: XmlElement, name: str) -> XmlElement:
 
 
 def _all(parent: XmlElement, name: str) -> list[XmlElement]:
-    """The children, all of one name, at least one."""
+    """Return the children, all of one name, at least one."""
     children = parent.elements
     if not children or any(child.name != name for child in children):
         raise UnreadableError(f"<{parent.name}> needs <{name}> elements and nothing else")
@@ -237,18 +238,18 @@ class _Sequence:
         self._index = 0
 
     def next(self, name: str) -> XmlElement:
-        """The next child, which must have this name."""
+        """Return the next child, which must have this name."""
         if self._index == len(self._children) or self._children[self._index].name != name:
             raise UnreadableError(f"<{self._name}> lacks <{name}> in its place")
         self._index += 1
         return self._children[self._index - 1]
 
     def rest(self) -> list[XmlElement]:
-        """The children not taken yet."""
+        """Return the children not taken yet."""
         return self._children[self._index :]
 
     def while_named(self, *names: str) -> list[XmlElement]:
-        """The children up to the first that has none of these names."""
+        """Return the children up to the first that has none of these names."""
         found = []
         while self._index < len(self._children):
             if self._children[self._index].name not in names:
@@ -282,7 +283,7 @@ def _required(element: XmlElement) -> str:
 
 
 def _first_text(element: XmlElement) -> str:
-    """The text of a number or a flag, before which not even a comment may stand."""
+    """Return the text of a number or a flag, before which not even a comment may stand."""
     first = element.children[0] if element.children else None
     if not isinstance(first, str):
         raise UnreadableError(f"<{element.name}> does not begin with its value")

@@ -1,4 +1,4 @@
-"""Expressions with wildcards, as each vendor matches topics and partitions against them.
+"""Comparing expressions with topics, grants with subjects, and dates with moments, by vendor.
 
 Certificates' subjects are the text that OpenSSL and `sros_tool.pki.certificates.subject_text` print
 by RFC 2253, the most specific attribute first.
@@ -45,7 +45,7 @@ _CLASSES = {
 
 @lru_cache(maxsize=65536)
 def matcher(style: Style, expression: str) -> _Matcher | None:
-    """What matches names against ``expression``; None if it matches only itself."""
+    """Return what matches names against ``expression``; None if it matches only itself."""
     if _SPECIAL.isdisjoint(expression):
         return None
     take_set = _fnmatch_set if style is Style.FNMATCH else _cyclone_set
@@ -68,7 +68,7 @@ def matcher(style: Style, expression: str) -> _Matcher | None:
 
 
 def _joined(segments: list[str]) -> str:
-    """The pattern of what stands between stars.
+    """Return the pattern of what stands between stars.
 
     Each segment matches a fixed number of characters, so the first place where one fits is as good
     as any later one: the atomic group keeps to it, or else many stars take exponential time.
@@ -81,7 +81,7 @@ def _joined(segments: list[str]) -> str:
 
 
 def matches(style: Style, expression: str, name: str) -> bool:
-    """Whether ``name`` matches ``expression``."""
+    """Return whether ``name`` matches ``expression``."""
     match = matcher(style, expression)
     return expression == name if match is None else bool(match(name))
 
@@ -110,7 +110,7 @@ class ExpressionIndex:
         self._wild = tuple(wild.items())
 
     def matching(self, name: str) -> Sequence[int]:
-        """The positions of the expressions that match ``name``, in order."""
+        """Return the positions of the expressions that match ``name``, in order."""
         if self._both_ways and not _SPECIAL.isdisjoint(name):
             return self._either_way(name)
         found = self._plain.get(name, [])
@@ -121,7 +121,7 @@ class ExpressionIndex:
         return sorted(found)
 
     def first(self, name: str) -> int | None:
-        """The position of the first expression that matches ``name``."""
+        """Return the position of the first expression that matches ``name``."""
         found = self.matching(name)
         return found[0] if found else None
 
@@ -140,7 +140,7 @@ def _set_of(members: list[str], negated: bool) -> str:
 
 
 def _fnmatch_set(text: str, start: int) -> tuple[str, int]:
-    """The set that begins behind ``[``, as glibc reads it, and where the expression goes on.
+    """Return the set that begins behind ``[``, as glibc reads it, and where the expression goes on.
 
     Behind an unknown class or symbol, and behind a range without its end, no further character
     matches; a set that is never closed is a plain ``[`` otherwise, and if ``[`` was in it before.
@@ -176,7 +176,7 @@ def _fnmatch_set(text: str, start: int) -> tuple[str, int]:
 
 
 def _member(text: str, index: int) -> tuple[str | None, int]:
-    """One character of a set, also as ``[.a.]``, for a pattern; None where there is none."""
+    """Return one character of a set, also as ``[.a.]``, for a pattern; None where there is none."""
     if text[index : index + 2] != "[.":
         return (re.escape(text[index]) if index < len(text) else None), index + 1
     end = text.find(".]", index + 2)
@@ -186,7 +186,7 @@ def _member(text: str, index: int) -> tuple[str | None, int]:
 
 
 def _cyclone_set(text: str, start: int) -> tuple[str, int]:
-    """The set that begins behind ``[``, as Cyclone DDS 0.10 reads it, and what follows it.
+    """Return the set that begins behind ``[``, as Cyclone DDS 0.10 reads it, and what follows it.
 
     Its loop ends only after it took the closing bracket for a member, and looks for a range there
     as well: ``[ab]`` also matches ``]``, and ``[ab]-x`` is one set with the range ``]`` to ``x``.
@@ -217,12 +217,12 @@ _MOST_PARTS = 20  # Cyclone DDS 0.10 refuses a grant's subject of more
 
 
 def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
-    """Whether a grant for ``granted`` is one for the certificate's subject ``certified``."""
+    """Return whether a grant for ``granted`` is one for the certificate's subject ``certified``."""
     return _COMPARE[rule](granted, certified)
 
 
 def escaped(certified: str) -> str:
-    """The subject of a certificate with every byte beyond ASCII as ``\\C3``."""
+    """Return the subject of a certificate with every byte beyond ASCII as ``\\C3``."""
     parts = (
         each if each.isascii() else "".join(f"\\{b:02X}" for b in each.encode())
         for each in certified
@@ -276,7 +276,7 @@ def _types_and_values(name: str) -> list[tuple[str, str]]:
 
 
 def _outside_quotes(text: str, wanted: str) -> int:
-    """Where a character stands first, not escaped and not in quotes; -1 if nowhere."""
+    """Return where a character stands first, not escaped and not in quotes; -1 if nowhere."""
     index = 0
     while index < len(text):
         found = _UNQUOTED.match(text, index)
@@ -350,7 +350,7 @@ _FARTHEST = timedelta(hours=12)
 
 
 def read_moment(rule: Moments, text: str, zone: tzinfo) -> float | None:
-    """The moment that ``text`` means; None if the vendor calls the document malformed.
+    """Return the moment that ``text`` means; None if the vendor calls the document malformed.
 
     ``zone`` is that of the host.  What Cyclone DDS cannot read is minus infinity: a grant that
     begins then has begun, one that ends then has ended.
