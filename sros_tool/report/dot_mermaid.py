@@ -1,4 +1,4 @@
-"""Tells a scene as DOT for Graphviz, or as Mermaid for Markdown; these place it themselves."""
+"""Render a scene as DOT for Graphviz or as Mermaid for Markdown; both place cards themselves."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _WAIT = 60
 
 
 def render_dot(picture: Picture, scene: Scene) -> str:
-    """The scene as a directed graph in the DOT language."""
+    """Return the scene as a directed graph in the DOT language."""
     lines = [
         f"digraph {_quoted(picture.title)} {{",
         '  graph [rankdir=LR, fontname="sans-serif", ranksep=1.2, nodesep=0.15]',
@@ -46,7 +46,7 @@ def render_dot(picture: Picture, scene: Scene) -> str:
 
 
 def render_mermaid(picture: Picture, scene: Scene) -> str:
-    """The scene as a Mermaid flowchart."""
+    """Return the scene as a Mermaid flowchart."""
     cards = _once(scene)
     clusters = _clusters(cards)
     lines = ["---", f"title: {_yaml(picture.title)}", "---", "flowchart LR"]
@@ -72,7 +72,7 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
 
 
 def graphviz_svg(dot: str) -> str:
-    """The DOT text drawn by Graphviz's ``dot``; raises `UnavailableError` without it."""
+    """Return the SVG that Graphviz draws of DOT text; raises `UnavailableError` without it."""
     try:
         done = subprocess.run(
             ["dot", "-Tsvg"], input=dot, capture_output=True, text=True, timeout=_WAIT, check=True
@@ -90,7 +90,7 @@ def graphviz_svg(dot: str) -> str:
 
 
 def _once(scene: Scene) -> Mapping[str, Card]:
-    """The cards by what they stand for: an enclave on either side of a scene is one node here."""
+    """Return the nodes: the two cards of an enclave on both sides of a scene are one node here."""
     found: dict[str, Card] = {}
     for card in sorted(scene.cards, key=lambda each: (each.role, each.members, each.column)):
         found.setdefault(_key(card.id), card)
@@ -98,7 +98,7 @@ def _once(scene: Scene) -> Mapping[str, Card]:
 
 
 def _clusters(cards: Mapping[str, Card]) -> dict[str, list[str]]:
-    """The enclaves by their groups; none where there is but one, which would say nothing."""
+    """Return the enclaves by their groups; none if there is only one group."""
     found: dict[str, list[str]] = defaultdict(list)
     for key, card in cards.items():
         if card.role == "enclave":
@@ -107,7 +107,7 @@ def _clusters(cards: Mapping[str, Card]) -> dict[str, list[str]]:
 
 
 def _key(card: str) -> str:
-    """The same for the two cards of an enclave: e for a node, n for names."""
+    """Return the id of the node of a card: e and the enclave, or n and the number of the names."""
     return card if card[0] == "n" else f"e{card[1:]}"
 
 
@@ -180,7 +180,7 @@ def _end(card: str) -> str:
 
 
 def _id(key: str) -> str:
-    """An identifier of letters: two enclaves never share one."""
+    """Return an identifier of ASCII letters and digits, unique for each key."""
     plain = "".join(
         each if each.isalnum() and each.isascii() else f"_{ord(each):x}_" for each in key
     )
@@ -188,7 +188,7 @@ def _id(key: str) -> str:
 
 
 def _entities(text: str) -> str:
-    """Everything that could be markup as Mermaid's numbered entities."""
+    """Return ``text`` with everything that could be markup as Mermaid's numbered entities."""
     return re.sub(r"[^A-Za-z0-9 /_.,:+-]", lambda found: f"#{ord(found[0])};", text)
 
 

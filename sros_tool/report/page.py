@@ -28,7 +28,7 @@ _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 
 def render_page(picture: Picture, scenes: tuple[Scene, ...], now: datetime) -> str:
-    """The page of a picture with its scenes; ``now`` is when its findings were found."""
+    """Return the page of a picture with its scenes; ``now`` is the time of its findings."""
     script, style = asset("view.js"), asset("view.css")
     origins = ", ".join(f"{each.kind} {each.title}" for each in picture.origins)
     made = f"{origins}. Findings are as of {iso(now)[:10]}."
@@ -42,12 +42,12 @@ def render_page(picture: Picture, scenes: tuple[Scene, ...], now: datetime) -> s
 
 
 def asset(name: str) -> str:
-    """A file that was built for pages (from web/, see its package.json)."""
+    """Return a file that was built for pages (from web/, see its package.json)."""
     return (_ASSETS / name).read_text("utf-8")
 
 
 def document(title: str, body: str, style: str, script: str = "", data: object = None) -> str:
-    """A self-contained HTML document; ``body`` is markup, ``data`` becomes JSON for the script."""
+    """Return a self-contained HTML document; ``body`` is markup, ``data`` is for the script."""
     policy = f"default-src 'none'; style-src {_digest(style)}; base-uri 'none'; form-action 'none'"
     if script:
         policy += f"; script-src {_digest(script)}"
@@ -65,14 +65,14 @@ def document(title: str, body: str, style: str, script: str = "", data: object =
         f"<body>{body}",
     ]
     if data is not None:
-        lines.append(f'<script type="application/json" id="picture">{safe_json(data)}</script>')
+        lines.append(f'<script type="application/json" id="picture">{_safe_json(data)}</script>')
     if script:
         lines.append(f"<script>{script}</script>")
     return "\n".join((*lines, "</body>", "</html>", ""))
 
 
-def safe_json(value: object) -> str:
-    """JSON that can stand in a script element: without < > & and line separators as such."""
+def _safe_json(value: object) -> str:
+    """Return JSON for a script element: < > & and line separators are escaped."""
     text = json.dumps(value, ensure_ascii=False, separators=(",", ":"), sort_keys=True)
     return text.translate(_ESCAPES)
 
@@ -86,7 +86,7 @@ def _digest(text: str) -> str:
 
 
 def _data(picture: Picture, scenes: tuple[Scene, ...]) -> dict[str, Any]:
-    """The picture as the script wants it: names by bundles, which is much shorter than edges."""
+    """Return the data for the script: names by bundles, which is much shorter than edges."""
     return {
         "overlay": as_plain(picture.overlay),
         "enclaves": [_enclave(each) for each in picture.enclaves],
@@ -99,18 +99,18 @@ def _data(picture: Picture, scenes: tuple[Scene, ...]) -> dict[str, Any]:
 
 
 def _enclave(enclave: PicturedEnclave) -> dict[str, Any]:
-    """An enclave; of its rights as written only the wildcards, for the others are names."""
-    wild = [_said(as_plain(each)) for each in enclave.statements if is_expression(each.name)]
+    """Return an enclave; of its rights as written only the wildcards, as the others are names."""
+    wild = [_with_deny(as_plain(each)) for each in enclave.statements if is_expression(each.name)]
     return {**as_plain(enclave), "statements": wild}
 
 
-def _said(value: dict[str, Any]) -> dict[str, Any]:
+def _with_deny(value: dict[str, Any]) -> dict[str, Any]:
     value["deny"] = value.pop("qualifier") != ALLOW
     return value
 
 
 def _bundle(bundle: Bundle) -> dict[str, Any]:
-    ties = [_said(as_plain(tie)) for tie in bundle.ties]
+    ties = [_with_deny(as_plain(tie)) for tie in bundle.ties]
     for tie in ties:
         tie["enclave"] = tie.pop("node")
     return {
@@ -124,7 +124,7 @@ def _bundle(bundle: Bundle) -> dict[str, Any]:
 def _scene(scene: Scene) -> dict[str, Any]:
     value: dict[str, Any] = as_plain(scene)
     value["cards"] = _table(value["cards"])
-    value["links"] = _table([_said(link) for link in value["links"]])
+    value["links"] = _table([_with_deny(link) for link in value["links"]])
     return value
 
 

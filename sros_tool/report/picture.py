@@ -19,10 +19,10 @@ from sros_tool.values import as_plain, shows
 SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
     ("subscribe", "reply", "execute"), False
 )
-"""Whether a right lets an enclave speak first on a name: the arrow leads to the name."""
+"""Whether the arrow of a right leads to the name: the enclave sends first."""
 
 KINDS = (*RIGHTS, "dds")
-"""The kinds of names in the order of telling; dds is a topic that ROS has no word for."""
+"""The kinds of names in the order they are shown; dds is a topic without a ROS name."""
 
 
 class OverlaySide(StrEnum):
@@ -60,7 +60,7 @@ class Protection:
 
 
 UNKNOWN = Protection(WireLevel.UNKNOWN)
-"""The protection where no governance is known, as that of a policy alone."""
+"""The protection where no governance is known, as in a policy alone."""
 
 
 @shows(
@@ -93,7 +93,7 @@ class Edge:
 
     @property
     def direction(self) -> str:
-        """The way of the arrow in words."""
+        """The direction of the arrow in words."""
         return "to the name" if self.sends else "from the name"
 
 
@@ -143,7 +143,7 @@ class PicturedEnclave:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Validity:
-    """When something ends: a certificate, an authority, a permissions document, a CRL.
+    """When something expires: a certificate, an authority, a permissions document, a CRL.
 
     ``not_before`` and ``not_after`` are CCYY-MM-DDThh:mm:ssZ in UTC.
     """
@@ -168,7 +168,7 @@ class PicturedFinding:
 
 @dataclass(frozen=True, slots=True)
 class SourceTitle:
-    """A source as it is called in the picture: its base name, and what kind of thing it is."""
+    """The title of a source in the picture: its base name, and its kind."""
 
     title: str
     kind: str
@@ -250,7 +250,7 @@ class Bundle:
 def fold(
     names: Iterable[Name], edges: Iterable[Edge], owner: Callable[[str], str] = str
 ) -> tuple[Bundle, ...]:
-    """The names that have an edge, in bundles, sorted by kind and first name.
+    """Return the names that have an edge, in bundles, sorted by kind and first name.
 
     ``owner`` says what stands for an enclave: itself, or a group that it is folded into.
     """
@@ -279,9 +279,9 @@ def fold(
 
 
 def coarsened(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
-    """Bundles joined where the same nodes send, whoever listens; what is lost is who hears which.
+    """Return bundles joined where the same nodes send; which node hears which name is lost.
 
-    Denials and differences stay apart: they are what one looks for.
+    Denials and differences stay separate: they are what people look for.
     """
     found: dict[tuple[object, ...], list[Bundle]] = defaultdict(list)
     for bundle in bundles:
@@ -305,5 +305,5 @@ def _order(tie: Tie) -> tuple[int, str, str, tuple[str, ...], tuple[str, ...], s
 
 
 def render_json(picture: Picture) -> str:
-    """The whole picture: every enclave, name and edge, by the names of `Picture`'s fields."""
+    """Return the whole picture as JSON by the names of `Picture`'s fields."""
     return json.dumps(as_plain(picture), indent=1, ensure_ascii=False) + "\n"

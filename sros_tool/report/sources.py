@@ -1,7 +1,7 @@
-"""Reads the sources of pictures: policies, permissions, keystores and observations.
+"""Read the sources of pictures: policies, permissions, keystores and observations.
 
-Whatever is read is told by its base name: where it lies on this machine is nobody's business who
-gets the picture.  Of private keys nothing is read but whether they are there.
+Every source is shown by its base name, as its path on this machine is private.  Of private keys
+nothing is read but whether they exist.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _AUTHORITY_FILES = "*_ca.cert.pem"
 
 
 def read_source(path: Path, *, now: datetime) -> PictureSource:
-    """What lies at ``path``: a policy, permissions, an enclave, a keystore, or an observation.
+    """Return the source at ``path``: a policy, permissions, an enclave, a keystore, an observation.
 
     An observation is a policy that was learned, or what ``sros generate_policy --json`` prints.
     Raises `DocumentError` for anything else.  Of a keystore, what is broken becomes a finding.
@@ -96,13 +96,13 @@ def base_name(path: Path) -> str:
 
 
 def common_rights() -> tuple[Right, ...]:
-    """What every node needs, by the policy that ships for it."""
+    """Return the rights that every node needs, by the shipped policy."""
     policy = read_policy(policies_dir() / "defaults" / "node_basics.xml")
     return tuple(sorted(policy_rights(policy)))
 
 
 def template_governance(choice: str) -> Governance:
-    """The governance that a keystore by this template would have."""
+    """Return the governance that a keystore by this template would have."""
     from sros_tool.dds.domains import DomainSet
 
     return governance_for(load_template(choice).protection, DomainSet.of((0, 0)))
@@ -210,7 +210,7 @@ def _certificate(certificate: x509.Certificate, kind: str, title: str, name: str
 
 
 def _authorities(root: Path) -> Iterator[Validity]:
-    """Every certificate of the CAs, and every revocation list."""
+    """Yield the validity of every CA certificate and revocation list."""
     roles: dict[x509.Certificate, list[str]] = defaultdict(list)
     for path in sorted((root / PUBLIC).glob(_AUTHORITY_FILES)):
         role = path.name.removesuffix("_ca.cert.pem")

@@ -1,4 +1,4 @@
-"""Draws a scene as SVG: one file that needs nothing else, for light and dark surroundings."""
+"""Draw a scene as SVG: one file that needs nothing else, for light and dark backgrounds."""
 
 from __future__ import annotations
 
@@ -64,23 +64,23 @@ markerUnits="userSpaceOnUse" orient="auto"><path class="tip2" d="M0 4L4 0L8 4L4 
 <marker id="no" viewBox="0 0 14 14" refX="13" refY="7" markerWidth="14" markerHeight="14" \
 markerUnits="userSpaceOnUse" orient="0"><path class="cross" d="M7 1.5a5.5 5.5 0 1 0 .01 0z\
 M3.2 10.8L10.8 3.2"/></marker>"""
-GLYPHS = {
+_GLYPHS = {
     "topics": "M1 2.5h11M1 6.5h11M1 10.5h7",
     "services": "M1 4h10.5l-3-3M12 9H1.5l3 3",
     "actions": "M6.5 1a5.5 5.5 0 1 0 .01 0zM6.5 4.5a2 2 0 1 0 .01 0z",
     "dds": "M6.5 1L12 6.5L6.5 12L1 6.5z",
 }
-"""What stands for a kind of names, 13 by 13: lines, two arrows, a target, a rhombus."""
-LOCKS = {
+"""The symbol of each kind of names, 13 by 13: lines, two arrows, a target, a rhombus."""
+_LOCKS = {
     WireLevel.ENCRYPT: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 5 0V6M6.5 8.3v2",
     WireLevel.SIGN: "M1.5 12h10M2.5 9.5l1-2.6L9.3 1.2l1.8 1.8L5.2 8.7z",
     WireLevel.NONE: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 4.8-1",
 }
-"""What stands for a protection, 13 by 13: a lock, a pen, an open lock."""
+"""The symbol of each level of protection, 13 by 13: a lock, a pen, an open lock."""
 
 
 def render_svg(picture: Picture, scene: Scene) -> str:
-    """The scene as an SVG document; the same scene gives the same bytes."""
+    """Return the scene as an SVG document; the same scene gives the same bytes."""
     legend = list(_legend(picture, scene))
     used = _USE if picture.overlay and picture.overlay.kind == "use" else ""
     height = scene.height + _HEAD + 16 + 20 * len(legend)
@@ -133,15 +133,15 @@ def _heads(scene: Scene) -> Iterable[str]:
         yield (f'<text class="head" x="{x}" y="4" text-anchor="{anchor}">{text.upper()}</text>')
 
 
-def curve(link: Link, source: Card, target: Card) -> str:
-    """The path of a link, as SVG path data."""
+def _curve(link: Link, source: Card, target: Card) -> str:
+    """Return the curve of a link as SVG path data."""
     x1, x2 = source.x + source.width, target.x - 1
     middle = (x1 + x2) // 2
     return f"M{x1} {link.y1}C{middle} {link.y1} {middle} {link.y2} {x2} {link.y2}"
 
 
-def link_text(link: Link, overlay: Overlay | None) -> str:
-    """What a link says, for who points at it."""
+def _link_text(link: Link, overlay: Overlay | None) -> str:
+    """Return the tooltip of a link."""
     text = f"{link.qualifier.value} {', '.join(link.rights)}"
     if link.wildcard:
         text += " (by a wildcard)"
@@ -150,8 +150,8 @@ def link_text(link: Link, overlay: Overlay | None) -> str:
     return f"{text}, {LEVEL_NAMES[link.level]}"
 
 
-def link_classes(link: Link) -> str:
-    """The classes of a link: how it is protected, said, marked."""
+def _link_classes(link: Link) -> str:
+    """Return the CSS classes of a link: its protection, wildcard, side and denial."""
     classes = ["link", link.level.value]
     classes += ["wild"] if link.wildcard else []
     classes += [link.mark.value] if link.mark is not OverlaySide.BOTH else []
@@ -162,8 +162,8 @@ def link_classes(link: Link) -> str:
 def _link(link: Link, cards: dict[str, Card], overlay: Overlay | None) -> str:
     source, target = cards[link.source], cards[link.target]
     return (
-        f'<path class="{link_classes(link)}" d="{curve(link, source, target)}">'
-        f"<title>{escape(link_text(link, overlay))}</title></path>"
+        f'<path class="{_link_classes(link)}" d="{_curve(link, source, target)}">'
+        f"<title>{escape(_link_text(link, overlay))}</title></path>"
     )
 
 
@@ -175,8 +175,8 @@ def _card(card: Card) -> Iterable[str]:
         f'<rect width="{card.width}" height="{card.height}" rx="6"/>'
     )
     if names:
-        yield (f'<path class="glyph" transform="translate(10 9)" d="{GLYPHS[card.kind]}"/>')
-        if lock := LOCKS.get(card.level):
+        yield f'<path class="glyph" transform="translate(10 9)" d="{_GLYPHS[card.kind]}"/>'
+        if lock := _LOCKS.get(card.level):
             yield (
                 f'<path class="lock lock-{card.level.value}" '
                 f'transform="translate({card.width - 23} 8)" d="{lock}"/>'
@@ -186,7 +186,7 @@ def _card(card: Card) -> Iterable[str]:
         yield f'<text x="{x}" y="{y}">{escape(line)}</text>'
         y += LINE
     for number, tag in enumerate(reversed(card.tags)):
-        right = card.width - (32 if card.level in LOCKS else 12) - 18 * number
+        right = card.width - (32 if card.level in _LOCKS else 12) - 18 * number
         yield f'<text class="tag" x="{right}" y="{PAD + 12}" text-anchor="end">{tag}</text>'
     for note in card.notes:
         yield f'<text class="small" x="{x}" y="{y - 1}">{escape(note)}</text>'
@@ -195,18 +195,21 @@ def _card(card: Card) -> Iterable[str]:
 
 
 def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
-    """One line for each thing that this picture holds and that needs to be explained."""
-    kinds = sorted({card.kind for card in scene.cards if card.kind}, key=list(GLYPHS).index)
+    """Yield one line of the legend for each kind of thing in this scene."""
+    kinds = sorted({card.kind for card in scene.cards if card.kind}, key=list(_GLYPHS).index)
     yield _row(
-        (f'<path class="glyph" transform="translate(0 -10)" d="{GLYPHS[kind]}"/>', KIND_NAMES[kind])
+        (
+            f'<path class="glyph" transform="translate(0 -10)" d="{_GLYPHS[kind]}"/>',
+            KIND_NAMES[kind],
+        )
         for kind in kinds
     )
-    levels = [level for level in LOCKS if any(link.level is level for link in scene.links)]
+    levels = [level for level in _LOCKS if any(link.level is level for link in scene.links)]
     if levels:
         yield _row(
             (
                 f'<path class="lock lock-{level.value}" transform="translate(0 -10)" '
-                f'd="{LOCKS[level]}"/><path class="link {level.value}" d="M20 -4h40"/>',
+                f'd="{_LOCKS[level]}"/><path class="link {level.value}" d="M20 -4h40"/>',
                 LEVEL_NAMES[level],
             )
             for level in levels
