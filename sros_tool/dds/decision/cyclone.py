@@ -1,7 +1,8 @@
 """Governance and permissions as Cyclone DDS 0.10 reads them, with its own XML parser.
 
-In its XML (ddsrt/src/xmlparser.c) names are of ASCII letters, digits, ``_ - :``; comments, processing instructions and ``<!...>`` are
-passed over between any two tokens; an element holds either elements or one text.
+In its XML (ddsrt/src/xmlparser.c) names are of ASCII letters, digits, ``_ - :``; comments,
+processing instructions and ``<!...>`` are passed over between any two tokens; an element holds
+either elements or one text.
 
 Tags may be written in capitals, come in any order, and the last of several counts; blanks around
 texts do not.  Any element or attribute that it does not know makes the document malformed.
