@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.dds.decision.vendors import TRAITS, Signers, Vendor
+from sros_tool.dds.decision.vendors import Signers, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
@@ -243,7 +243,7 @@ def test_permissions_signed_by_the_enclave_itself(
     """
     cyclone = request.node.callspec.params["ask"] == "Cyclone DDS"
     vendor = Vendor.CYCLONE if cyclone else fastdds_vendor()
-    any_signer = TRAITS[vendor].signers is Signers.CHAIN
+    any_signer = vendor.traits.signers is Signers.CHAIN
     expected = HEARD if template == "sros2" and any_signer else REFUSED
     root = tmp_path / "ks"
     make(root, load_template(template), {"/robot": publish("/chatter"), "/listener": LISTENS})
