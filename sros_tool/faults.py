@@ -19,8 +19,8 @@ _CLOCK = "Set the clock of this host; if it is right, sign again: `sros renew {r
 _SIGN = "Sign the permissions again: `sros create_permission {root} {enclave} POLICY`."
 _COMPLETE = "Make what is missing: `sros create_enclave {root} {enclave}`."
 REPLACE = (
-    "Put a good one in its place: `rm {path} && sros create_enclave {root} {enclave}` takes that "
-    "of the keystore, or issues it again."
+    "Put a good one in its place: `rm {path} && sros create_enclave {root} {enclave}` takes "
+    "the keystore's, or issues it again."
 )
 _RESTORE = "Restore {path} from a backup."
 _GOVERNANCE = (
@@ -145,8 +145,8 @@ class Fault(Enum):
     )
     KEY_MISMATCH = (
         "key-mismatch",
-        "a private key that is not that of the certificate",
-        "Fast DDS refuses it; Cyclone DDS starts, and every peer ends the handshake.",
+        "a private key that does not belong to the certificate",
+        "Fast DDS refuses it; Cyclone DDS starts, and every peer aborts the handshake.",
         'Fast DDS 2.14.5 ("Error verifying private key"), Cyclone DDS 0.10.2; measured.',
         _NEW_KEY,
     )

@@ -112,7 +112,7 @@ def _keystore(d: dict[str, Any]) -> Iterator[str]:
         )
         for other in authority.get("further", ()):
             yield (
-                f"    beside it {other['subject']}, {other['key']}, "
+                f"    next to it {other['subject']}, {other['key']}, "
                 f"valid until {other['not_after']}, serial {other['serial']}"
             )
         if "crl" in authority:
@@ -149,7 +149,7 @@ def _certificate(d: dict[str, Any]) -> Iterator[str]:
     yield f"{kind} {d['path']}"
     yield from _indented(_facts(d))
     for other in d.get("further", ()):
-        yield "beside it, in the same file"
+        yield "next to it, in the same file"
         yield from _indented(_facts(other))
     if "crl" in d:
         yield from _list(d["crl"])

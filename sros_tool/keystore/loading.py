@@ -20,7 +20,14 @@ from sros_tool.dds.decision.vendors import MEASURED, Hashes, Keys, Signers, Vend
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES
 from sros_tool.errors import PkiError
 from sros_tool.faults import Fault
-from sros_tool.keystore.layout import IDENTITY
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    GOVERNANCE_FILE,
+    IDENTITY,
+    IDENTITY_CA_FILE,
+    PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
+)
 from sros_tool.keystore.reader import OpenedEnclave, Problem
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
@@ -32,13 +39,14 @@ from sros_tool.pki.keys import algorithm
 
 Certificates = tuple[x509.Certificate, ...]
 
-IDENTITY_CA, PERMISSIONS_CA = "identity_ca.cert.pem", "permissions_ca.cert.pem"
-CERTIFICATE, GOVERNANCE, PERMISSIONS = "cert.pem", "governance.p7s", "permissions.p7s"
-_SIDES = ((IDENTITY_CA, CERTIFICATE), (PERMISSIONS_CA, GOVERNANCE, PERMISSIONS))
-_JUDGED = frozenset(
+_SIDES = (
+    (IDENTITY_CA_FILE, CERTIFICATE_FILE),
+    (PERMISSIONS_CA_FILE, GOVERNANCE_FILE, PERMISSIONS_FILE),
+)
+_VENDOR_SPECIFIC = frozenset(
     {Fault.CA_EXPIRED, Fault.CA_NOT_YET_VALID, Fault.CERTIFICATE_ISSUER, Fault.SIGNATURE}
 )
-"""Faults that do not hold for every vendor."""
+"""Faults that only some vendors have."""
 
 _certificates = lru_cache(maxsize=16)(load_certificates)
 
@@ -46,38 +54,42 @@ _certificates = lru_cache(maxsize=16)(load_certificates)
 def vendor_problems(
     traits: VendorTraits, state: OpenedEnclave, at: datetime
 ) -> tuple[Problem, ...]:
-    """The problems that a vendor has with an enclave when it loads it, at the moment ``at``.
+    """Return the problems that a vendor has with an enclave when it loads it at ``at``.
 
-    Those of its documents' content are not among them, beyond what `EnclaveState` says.
+    What its documents say is not judged here, beyond what `OpenedEnclave` reports.
     """
-    kept = [each for each in state.problems if each.fault not in _JUDGED]
-    # What is wrong with these for every vendor is not told twice.
+    kept = [each for each in state.problems if each.fault not in _VENDOR_SPECIFIC]
+    # What is wrong with these for every vendor is not reported twice.
     known = {
-        each.file for each in kept if each.file == CERTIFICATE or each.fault is Fault.NOT_SIGNED
+        each.file
+        for each in kept
+        if each.file == CERTIFICATE_FILE or each.fault is Fault.NOT_SIGNED
     }
     faults = [each for each in _faults(traits, state, at) if each.file not in known]
     for side in _SIDES:
         of_side = [each for each in faults if each.file in side]
         files = {each.file for each in of_side} | ({side[0]} if of_side else set())
-        named = [each for each in state.problems if each.fault in _JUDGED and each.file in files]
+        named = [
+            each for each in state.problems if each.fault in _VENDOR_SPECIFIC and each.file in files
+        ]
         kept += named or of_side
     return tuple(kept)
 
 
 def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterator[Problem]:
     read: dict[str, Certificates] = {}
-    for file in (IDENTITY_CA, PERMISSIONS_CA):
+    for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE):
         if file in state.files:
             with suppress(PkiError):
                 read[file] = _certificates(state.files[file], file)
     for file, certificates in read.items():
         if fault := authority_fault(traits, certificates, at):
             yield Problem(file, *fault)
-    authorities = read.get(IDENTITY_CA)
+    authorities = read.get(IDENTITY_CA_FILE)
     if authorities and state.certificate:
         yield from _identity_faults(traits, state.certificate, authorities, at)
-    signers = read.get(PERMISSIONS_CA)
-    for file in (GOVERNANCE, PERMISSIONS):
+    signers = read.get(PERMISSIONS_CA_FILE)
+    for file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
         if not signers or file not in state.files:
             continue
         if text := _signature_fault(traits, state.files[file], signers, at):
@@ -85,7 +97,7 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
     largest = traits.largest_document
     if largest is not None and state.permissions_bytes > largest:
         text = f"it has {state.permissions_bytes} bytes, and from {MAX_SIGNED_BYTES} on the "
-        yield Problem(PERMISSIONS, f"{text}handshake never ends", Fault.DOCUMENT_SIZE)
+        yield Problem(PERMISSIONS_FILE, f"{text}handshake never finishes", Fault.DOCUMENT_SIZE)
 
 
 @lru_cache(maxsize=8)
@@ -103,9 +115,9 @@ def _signature_fault(
 def authority_fault(
     traits: VendorTraits, certificates: Certificates, at: datetime
 ) -> tuple[str, Fault] | None:
-    """Why the vendor refuses a CA file as such, and the fault.
+    """Return why the vendor refuses a CA file as such, and the fault; None if it takes it.
 
-    ``certificates`` are those of the file, in their order.
+    ``certificates`` are all of the file, in their order.
     """
     trusted = _trusted(traits, certificates)
     if not trusted:
@@ -119,9 +131,9 @@ def authority_fault(
 
 
 def authority_refusals(role: str, certificates: Certificates, at: datetime) -> dict[Vendor, str]:
-    """Which vendors refuse what a CA issues (identity) or signs (permissions), and why.
+    """Return the vendors that refuse what a CA issues (identity) or signs (permissions), and why.
 
-    ``certificates`` are those of its file, that of the CA itself first.  Only the vendors that were
+    ``certificates`` are all of its file, the CA itself first.  Only the vendors that were
     measured are asked.
     """
     refusals = {}
@@ -141,7 +153,7 @@ def authority_refusals(role: str, certificates: Certificates, at: datetime) -> d
 
 
 def refusals_text(refusals: Mapping[Vendor, str]) -> str:
-    """Which of the measured vendors refuse a CA and why, and which take it, as clauses."""
+    """Return in clauses which of the measured vendors refuse a CA and why, and which take it."""
     by_text: dict[str, list[str]] = {}
     for vendor, text in refusals.items():
         by_text.setdefault(text, []).append(vendor.title)
@@ -159,9 +171,9 @@ def refusals_text(refusals: Mapping[Vendor, str]) -> str:
 def signer_fault(
     traits: VendorTraits, signed: smime.SignedDocument, certificates: Certificates, at: datetime
 ) -> str:
-    """Why the vendor does not take the signature of a document, or "".
+    """Return why the vendor refuses the signature of a document, or "".
 
-    ``certificates`` are those of the permissions CA's file, in their order.
+    ``certificates`` are all of the permissions CA's file, in their order.
     """
     trusted = _trusted(traits, certificates)
     if traits.signers is Signers.AUTHORITY:
@@ -203,13 +215,13 @@ def _identity_faults(
     traits: VendorTraits, certificate: x509.Certificate, authorities: Certificates, at: datetime
 ) -> Iterator[Problem]:
     if not _hash_fits(traits, certificate):
-        yield Problem(CERTIFICATE, "it is not signed with SHA-256", Fault.SIGNATURE_HASH)
-    for file, each in ((CERTIFICATE, certificate), (IDENTITY_CA, authorities[0])):
+        yield Problem(CERTIFICATE_FILE, "it is not signed with SHA-256", Fault.SIGNATURE_HASH)
+    for file, each in ((CERTIFICATE_FILE, certificate), (IDENTITY_CA_FILE, authorities[0])):
         if not _key_fits(traits, each):
             text = f"it has a key of {algorithm(each.public_key())}"
             yield Problem(file, text, Fault.KEY_ALGORITHM)
     if fault := chain_fault(certificate, _trusted(traits, authorities), at=at):
-        yield Problem(CERTIFICATE, fault, Fault.CERTIFICATE_ISSUER)
+        yield Problem(CERTIFICATE_FILE, fault, Fault.CERTIFICATE_ISSUER)
 
 
 def _key_fits(traits: VendorTraits, certificate: x509.Certificate) -> bool:

@@ -46,7 +46,7 @@ def _revocation(root: Path, name: str) -> Entry | None:
     ]
     if not of_enclave or of_enclave[-1].what != "revocation":
         return None
-    # Earlier certificates of it were revoked with it; the files are those of one.
+    # Earlier certificates were revoked with it; only one of them has files.
     kept = (e for e in reversed(of_enclave) if e.serial and (root / REVOKED / e.serial).is_dir())
     return next(kept, of_enclave[-1])
 

@@ -1,4 +1,4 @@
-"""What vendors ask of certificates: algorithms, extensions, and no intermediate CA."""
+"""Checks of the CAs: what vendors ask of their certificates, their keys, their expiry, the list."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ CA_PURPOSE = FindingKind(
     '("unsuitable certificate purpose"): keyUsage must have digitalSignature, extendedKeyUsage '
     "emailProtection, if they are there. Fast DDS 2.14 does not look at them.",
     "RFC 8550, 4.4.2; Fast DDS 2.9.1 and 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
-    "Replace it with `sros rotate_ca ROOT`, or issue its certificate anew with digitalSignature.",
+    "Replace it with `sros rotate_ca ROOT`, or issue its certificate again with digitalSignature.",
     vendors=(Vendor.FAST_2_9, Vendor.CYCLONE),
 )
 KEY_ALGORITHM = FindingKind(
@@ -91,13 +91,13 @@ SIGNATURE_HASH = FindingKind(
 def authority_findings(
     role: str, chain: tuple[x509.Certificate, ...], at: datetime, subject: str, file: str
 ) -> Iterator[Finding]:
-    """Whether every vendor takes a CA; ``chain`` are the certificates of its file, in order."""
+    """Yield what some vendor refuses of a CA; ``chain`` are its file's certificates, in order."""
     certificate = chain[0]
     name = subject_text(certificate.subject)
     if certificate.issuer != certificate.subject:
         issuer = subject_text(certificate.issuer)
-        told = refusals_text(authority_refusals(role, chain, at))
-        yield INTERMEDIATE.found(subject, f"{name} is issued by {issuer}. {told}", file)
+        refused = refusals_text(authority_refusals(role, chain, at))
+        yield INTERMEDIATE.found(subject, f"{name} is issued by {issuer}. {refused}", file)
     elif role == PERMISSIONS and (fault := next(purpose_faults(chain[:1]), "")):
         yield CA_PURPOSE.found(subject, fault, file)
     yield from key_findings(certificate, subject, file, what=f"{name} has")
@@ -107,7 +107,7 @@ def authority_findings(
 def key_findings(
     certificate: x509.Certificate, subject: str, file: str, *, what: str = "it has"
 ) -> Iterator[Finding]:
-    """Whether every vendor takes the key and the signature of a certificate."""
+    """Yield what some vendor refuses of the key or the signature of a certificate."""
     key = certificate.public_key()
     fits = (isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name == "secp256r1") or (
         isinstance(key, rsa.RSAPublicKey) and key.key_size == 2048
@@ -150,15 +150,15 @@ ONE_AUTHORITY = FindingKind(
     WARNING,
     "one CA issues identities and signs permissions",
     "Cyclone DDS 0.10.2 and Fast DDS 2.9.1 then accept permissions that an enclave signed for "
-    "itself: they verify a chain, and the certificate of every enclave ends at that CA.",
+    "itself: they verify a chain, and the chain of every enclave's certificate leads to that CA.",
     "CVE-2023-24011 class; an enclave did so here on Cyclone DDS 0.10.2 and was heard.",
     "Make a keystore with separate CAs, which all templates but sros2 do.",
 )
-CA_ENDS = FindingKind(
+CA_EXPIRES_SOON = FindingKind(
     "keystore.ca-ends-soon",
     WARNING,
-    "a CA that ends soon",
-    "With it ends everything that it issued or signed, at one moment; to replace it takes stages.",
+    "a CA that expires soon",
+    "All that it issued or signed expires with it, at one moment; replacing it takes stages.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
     "Begin now, with `sros rotate_ca ROOT`.",
 )
@@ -207,16 +207,16 @@ LEDGER_MISSING = FindingKind(
     "keystore.ledger-missing",
     WARNING,
     "a keystore of sros without its ledger",
-    "Permissions that were replaced, and certificates from elsewhere, cannot be told from those "
-    "that are meant.",
+    "Permissions that were replaced, and certificates from elsewhere, cannot be distinguished "
+    "from those that are meant.",
     "sros: ledger.jsonl lists everything that was issued.",
     "Restore ledger.jsonl from a backup.",
 )
-CRL_ENDS = FindingKind(
+CRL_EXPIRES_SOON = FindingKind(
     "keystore.revocation-list-ends",
     ERROR,
-    "a revocation list that ends soon, or ended",
-    "From its end on DDS refuses everybody.",
+    "a revocation list that expires soon, or has expired",
+    "From its expiry on, DDS refuses everybody.",
     "RFC 5280, 5.1.2.5; Fast DDS 2.14.5; measured.",
     "Run `sros crl ROOT --refresh`.",
 )
@@ -234,7 +234,7 @@ _LIST_SOON = timedelta(days=30)
 
 
 def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
-    """The certificates of the CAs, their keys where these lie in the keystore, and the list."""
+    """Yield what is found in the certificates and keys of the CAs, and in the revocation list."""
     for each in keystore.unread:
         why = f"{each.error.what}. {each.error.why}".strip()
         yield UNREADABLE.found(each.path, why, keystore.shown(each.path), remedy=each.error.remedy)
@@ -246,18 +246,18 @@ def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
                 text = f"there is no certificate of the {role} CA"
                 yield CA_MISSING.found(f"{role} CA", text, keystore.shown(path))
     yield from _records(keystore)
-    told: set[bytes] = set()
+    seen: set[bytes] = set()
     for role, chain in keystore.authorities.items():
         fingerprint = chain[0].fingerprint(hashes.SHA256())
-        if fingerprint not in told:
-            told.add(fingerprint)
+        if fingerprint not in seen:
+            seen.add(fingerprint)
             yield from _authority(keystore, role, chain)
     yield from _one_for_both(keystore)
     yield from _revocation_list(keystore)
 
 
 def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
-    """Keystores of ros2/sros2 have neither settings nor a ledger, those of sros have both."""
+    """Keystores of ros2/sros2 have neither settings nor a ledger; keystores of sros have both."""
     settings, ledger = ((keystore.root / name).exists() for name in (SETTINGS, LEDGER))
     if ledger and not settings:
         yield SETTINGS_MISSING.found("settings", f"there is no {SETTINGS}", str(keystore.root))
@@ -275,7 +275,7 @@ def _authority(
     if not validity.contains(keystore.now):
         yield CA_EXPIRED.found(subject, f"{name} is valid from {begin} to {end}", file)
     elif validity.not_after - keystore.now < _SOON:
-        yield CA_ENDS.found(subject, f"{name} ends at {end}", file)
+        yield CA_EXPIRES_SOON.found(subject, f"{name} expires at {end}", file)
     yield from authority_findings(role, chain, keystore.now, subject, file)
     yield from _key(keystore, role, certificate)
 
@@ -316,7 +316,7 @@ def _one_for_both(keystore: CheckedKeystore) -> Iterator[Finding]:
 def one_for_both(
     keystore: CheckedKeystore, identity: x509.Certificate, permissions: x509.Certificate, file: str
 ) -> Iterator[Finding]:
-    """Whether one CA does both jobs."""
+    """Yield a finding if one CA does both jobs."""
     if identity.public_key() == permissions.public_key():
         text = f"{subject_text(identity.subject)} does both jobs"
         accepted = keystore.accepts(lambda settings: not settings.separate_authorities)
@@ -329,8 +329,8 @@ def _revocation_list(keystore: CheckedKeystore) -> Iterator[Finding]:
         return
     file = keystore.shown(CRL)
     if crl.next_update - keystore.now < _LIST_SOON:
-        text = f"it ends at {iso(crl.next_update)}, and DDS then refuses everybody"
-        yield CRL_ENDS.found("revocation list", text, file)
+        text = f"it expires at {iso(crl.next_update)}, and DDS then refuses everybody"
+        yield CRL_EXPIRES_SOON.found("revocation list", text, file)
     identity = keystore.authorities.get(IDENTITY, ())
     if identity and not any(signed_by(crl.list, each) for each in identity):
         yield CRL_ISSUER.found("revocation list", "no identity CA of the keystore signed it", file)

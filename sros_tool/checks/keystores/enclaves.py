@@ -21,7 +21,7 @@ from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
 from sros_tool.xml import read_bytes
 
 NOT_LOADABLE = "enclave.not-loadable"
-"""The id that stands for all of them in `--include` and `--exclude`."""
+"""The id that stands for all faults in `--include` and `--exclude`."""
 
 LOADING_KINDS = by_id(
     *(
@@ -41,7 +41,7 @@ LOADING_KINDS = by_id(
 
 
 def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """Every problem of an enclave; at home, that its key stays on its robot is none."""
+    """Yield every problem of an enclave; at home, a key that stays on its robot is none."""
     state = enclave.state
     for problem in state.problems_at_home if enclave.keystore.is_home else state.problems:
         kind = LOADING_KINDS[f"enclave.{problem.fault.id}"]
@@ -52,10 +52,10 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
         yield kind.found(enclave.name, text, file, remedy=remedy)
 
 
-ENDS_SOON = FindingKind(
+EXPIRES_SOON = FindingKind(
     "enclave.ends-soon",
     WARNING,
-    "a certificate or permissions that end soon",
+    "a certificate or permissions that expire soon",
     "From then on the node does not start any more; on Cyclone DDS a running one stops.",
     "Fast DDS 2.14.5 (at start), Cyclone DDS 0.10.2 (timer).",
     "Run `sros renew ROOT NAME`, and export the enclave again.",
@@ -64,9 +64,9 @@ OUTLIVES_CA = FindingKind(
     "enclave.outlives-ca",
     WARNING,
     "a certificate that is valid for longer than its CA",
-    "It ends with the CA, whatever it says itself.",
+    "It expires with the CA, whatever it says itself.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
-    "Plan by the end of the CA, or renew the enclave after `sros rotate_ca`.",
+    "Plan by the expiry of the CA, or renew the enclave after `sros rotate_ca`.",
 )
 PERMISSIONS_OUTLIVE = FindingKind(
     "enclave.permissions-outlive",
@@ -83,7 +83,7 @@ NAME_MISMATCH = FindingKind(
     "DDS does not ask where a certificate lies. The files of two enclaves were mixed up, and the "
     "node has the rights of the other one.",
     "rcl 9 (security.c); ros2/sros2 (CN is the name of the enclave).",
-    "Restore the files of this enclave, or make it anew.",
+    "Restore the files of this enclave, or make it again.",
 )
 IS_A_CA = FindingKind(
     "enclave.certificate-is-ca",
@@ -91,7 +91,7 @@ IS_A_CA = FindingKind(
     "an enclave whose certificate may issue others",
     "Whoever has its key can make identities that every node accepts.",
     "RFC 5280, 4.2.1.9.",
-    "Revoke it, and make the enclave anew.",
+    "Revoke it, and make the enclave again.",
 )
 NOT_UNIQUE = FindingKind(
     "enclave.subject-not-unique",
@@ -206,18 +206,18 @@ def _expiry(
     if grant:
         windows.append(("permissions.p7s", "the permissions", grant.validity))
         if grant.validity.not_after > validity.not_after:
-            text = f"they end at {grant.not_after}, the certificate at {iso(validity.not_after)}"
+            text = f"they expire at {grant.not_after}, the certificate at {iso(validity.not_after)}"
             file = enclave.file("permissions.p7s")
             yield PERMISSIONS_OUTLIVE.found(enclave.name, text, file)
     for file, what, window in windows:
-        if window.contains(now) and _ends_soon(window, now):
-            verb = "ends" if what == "the certificate" else "end"
+        if window.contains(now) and _expires_soon(window, now):
+            verb = "expires" if what == "the certificate" else "expire"
             text = f"{what} {verb} at {iso(window.not_after)}"
-            yield ENDS_SOON.found(enclave.name, text, enclave.file(file))
+            yield EXPIRES_SOON.found(enclave.name, text, enclave.file(file))
 
 
-def _ends_soon(window: Window, now: datetime) -> bool:
-    """Within 30 days; what lives for less than 90, within its last third."""
+def _expires_soon(window: Window, now: datetime) -> bool:
+    """Whether it expires within 30 days, or is in the last third of a life of less than 90."""
     return window.not_after - now < min(_SOON, (window.not_after - window.not_before) / 3)
 
 
@@ -245,7 +245,7 @@ def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
 
 
 def _is_as_long(chosen: Span, length: timedelta) -> bool:
-    """Whether a keystore chose permissions of that length; what has fixed ends was chosen too."""
+    """Whether a keystore chose permissions of that length; a fixed expiry was chosen, too."""
     return not isinstance(chosen, timedelta) or length <= chosen + BACKDATE
 
 

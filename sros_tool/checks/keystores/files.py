@@ -109,7 +109,7 @@ UNKNOWN_FILE = FindingKind(
     "Delete it, or keep it elsewhere.",
 )
 
-_OF_KEYS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
+_KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
 _KEY_MARK = b"PRIVATE KEY-----"
 _MOST_READ = 65536
 _KNOWN = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml", REQUEST, "governance.xml")
@@ -171,8 +171,8 @@ def _folder(path: str, root: str, home: bool, links: _Links) -> Iterator[Finding
         return
     yield from _mode(path, mode)
     inside = Path(path).relative_to(root)
-    # Below the top folder nobody gets in where that is closed.
-    asked = inside.parts[0] in _OF_KEYS and (len(inside.parts) == 1 or not home)
+    # Below a closed top folder nobody gets in.
+    asked = inside.parts[0] in _KEY_FOLDERS and (len(inside.parts) == 1 or not home)
     if asked and mode & 0o077 and not mode & stat.S_IWOTH:
         yield FOLDER_OPEN.found(path, f"its mode is {stat.S_IMODE(mode):04o}", path)
 
@@ -189,17 +189,17 @@ def _key_mode(path: str, mode: int) -> Iterator[Finding]:
 
 
 class _Links:
-    """Looks where links lead; most lead into one of few folders, whose real path is kept."""
+    """Follows links; most lead into one of few folders, whose real paths are cached."""
 
     def __init__(self, root: str) -> None:
         self._real_root = os.path.realpath(root)
         self._folders: dict[Path, str] = {}
 
     def check(self, link: Path) -> Iterator[Finding]:
-        """What is wrong with one link."""
+        """Yield what is wrong with one link."""
         target, shown = link.readlink(), str(link)
         if not link.exists():
-            # That an enclave lacks what it needs is told of the enclave.
+            # A missing file that an enclave needs is a finding of the enclave.
             if not (link.name in REQUIRED_FILES and ENCLAVES in link.parts):
                 yield LINK_DANGLING.found(shown, f"it leads to '{target}'", shown)
             return
@@ -210,7 +210,7 @@ class _Links:
             yield LINK_OUTSIDE.found(shown, f"it leads to '{real}'", shown)
 
     def _end_of(self, link: Path, target: Path) -> str:
-        """Where a link leads in the end.
+        """Return the real path that a link leads to.
 
         The folder of the link is a real one, so its path can be shortened before it is followed.
         """
@@ -223,14 +223,14 @@ class _Links:
 
 
 def _other(path: str, inside: str, info: os.stat_result, home: bool) -> Iterator[Finding]:
-    """A file that is not one of an enclave's: a key in its place or out of it, or anything."""
+    """Yield what is wrong with a file that is not an enclave's: perhaps a key out of place."""
     place = inside.partition(os.sep)[0]
     if info.st_size <= _MOST_READ and _holds_key(path):
         yield from _key_mode(path, info.st_mode)
         if place in (PRIVATE, REVOKED, RETIRED) and home:
             return
         if place == PRIVATE or not home:
-            text = "a private key that is not that of an enclave"
+            text = "a private key that belongs to no enclave"
             yield CA_KEY_ON_ROBOT.found(path, text, path)
         else:
             yield STRAY_KEY.found(path, "a private key out of place", path)

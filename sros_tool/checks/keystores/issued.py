@@ -1,4 +1,4 @@
-"""What the enclaves of a keystore are to each other, to its ledger, and to the policies."""
+"""Checks of all enclaves together: against each other, the ledger, and the policies."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ UNEXPLAINED = FindingKind(
     "a certificate or document that the keystore never issued",
     "It came from elsewhere, or the ledger was put back to an earlier state.",
     "sros: ledger.jsonl.",
-    "Find out where it is from; `sros renew ROOT NAME` issues both anew.",
+    "Find out where it is from; `sros renew ROOT NAME` issues both again.",
 )
 OLD_PERMISSIONS = FindingKind(
     "enclave.old-permissions",
@@ -87,7 +87,7 @@ AUTHORITIES_DIFFER = FindingKind(
     "enclaves that do not trust the same CAs",
     "Their nodes never talk to each other, and neither Fast DDS nor Cyclone DDS says why.",
     "DDS-Security 1.1, 9.3; Fast DDS 2.9.1, Cyclone DDS 0.10.2; measured.",
-    "Export the enclave again from the keystore of the others, or make it anew there.",
+    "Export the enclave again from the keystore of the others, or make it again there.",
 )
 
 _Key = TypeVar("_Key")
@@ -99,7 +99,7 @@ _AUTHORITY_FILES = (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 
 @dataclass(frozen=True, slots=True)
 class EnclaveSummary:
-    """What is compared among enclaves: small, for it is carried between processes."""
+    """What is compared among enclaves: small, as it is passed between processes."""
 
     name: str
     serial: int
@@ -113,7 +113,7 @@ class EnclaveSummary:
 
 
 def summary_of(enclave: CheckedEnclave) -> EnclaveSummary | None:
-    """Those of an enclave that has a certificate."""
+    """Return the summary of an enclave; None without a certificate."""
     certificate = enclave.state.certificate
     if certificate is None:
         return None
@@ -138,7 +138,7 @@ def summary_of(enclave: CheckedEnclave) -> EnclaveSummary | None:
 
 @lru_cache(maxsize=8)
 def _trusted(data: bytes) -> frozenset[str]:
-    """The certificates in the file of a CA; nothing where it cannot be read, which is told."""
+    """Return the certificates in a CA's file; none if it is unreadable, which is a finding."""
     try:
         return fingerprints(data)
     except SrosError:
@@ -177,9 +177,9 @@ def _twice(pairs: Iterable[tuple[_Key, str]]) -> Iterator[tuple[_Key, list[str]]
 
 
 def _trust(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:
-    """Enclaves that have no CA in common; while one is replaced, each trusts the old and the new.
+    """Yield enclaves that have no CA in common; during a rotation each trusts the old and the new.
 
-    The CAs of the keystore are the right ones; in an export, those of most enclaves.
+    The CAs of the keystore are the right ones; in an export, the CAs of most enclaves.
     """
     for index, (role, file) in enumerate(zip(ROLES, _AUTHORITY_FILES, strict=True)):
         everyone = [each for each in summaries if each.trusted[index]]
@@ -193,19 +193,19 @@ def _trust(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> It
         for each in everyone:
             if not each.trusted[index] & usual:
                 place = f"{keystore.root}/{enclave_folder(each.name)}/{file}"
-                text = f"{file} is of another CA than that of {others}"
+                text = f"{file} is of another CA than {others} have"
                 yield AUTHORITIES_DIFFER.found(each.name, text, place)
 
 
 def _exported_governance(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
-    """Exported enclaves have copies of the governance, and each may be from another time."""
+    """Yield exported enclaves whose copy of the governance is from another time."""
     copies = [each for each in summaries if each.governance]
     for each in copies[1:]:
         if each.governance != copies[0].governance:
             file = f"{keystore.root}/{enclave_folder(each.name)}/governance.p7s"
-            text = f"its governance is not that of {copies[0].name}"
+            text = f"its governance differs from that of {copies[0].name}"
             yield GOVERNANCE_DIFFERS.found(each.name, text, file)
 
 
@@ -232,7 +232,7 @@ def _ledger(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> I
 
 
 def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -> Iterator[Finding]:
-    """The rights of an enclave beside those that the policies state for it."""
+    """Yield how the rights of an enclave differ from those that the policies state for it."""
     if not wanted:
         return
     name, grant = enclave.name, grant_of(enclave)
@@ -250,7 +250,7 @@ def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -
 
 
 def wanted_rights(keystore: CheckedKeystore) -> dict[str, frozenset[Right]]:
-    """The rights of every enclave that the policies speak of."""
+    """Return the rights of every enclave that the policies have."""
     found: dict[str, frozenset[Right]] = {}
     for policy in keystore.policies:
         rights = defaultdict(set)

@@ -40,7 +40,7 @@ from sros_tool.policy.rights import Right
 
 _NAMES_SHOWN = 3
 _OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id})
-"""What enclaves have in common by the way in which their keystore was made."""
+"""Kinds that all enclaves share because of how their keystore was made."""
 
 
 def keystore_findings(
@@ -123,8 +123,8 @@ def joined(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def _governance_alone(keystore: CheckedKeystore) -> Iterator[Finding]:
-    """The governance of a keystore that has no enclave yet."""
-    with suppress(SrosError):  # whoever makes an enclave is told
+    """Yield what is found in the governance of a keystore that has no enclave yet."""
+    with suppress(SrosError):  # making an enclave reports it
         document = smime.parse(keystore.governance).document
         governance = parse_governance(document, GOVERNANCE_P7S)
         yield from governance_findings(keystore, governance, keystore.shown(GOVERNANCE_P7S))
