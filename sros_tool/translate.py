@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
@@ -15,9 +15,11 @@ from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, grant
 from sros_tool.names import ROS_DISCOVERY_TOPIC, expand
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Qualifier
 from sros_tool.policy.patterns import covers
-from sros_tool.policy.protection import DomainProtection, NamedProtection, TopicProtection
 from sros_tool.policy.rights import ACTION_PARTS, GOAL, Right
 from sros_tool.validity import Window
+
+if TYPE_CHECKING:
+    from sros_tool.policy.protection import DomainProtection, NamedProtection, TopicProtection
 
 SERVICE_ENDS = {"rq": "Request", "rr": "Reply"}
 """What the topics of a service begin and end with: its requests, and its replies."""
