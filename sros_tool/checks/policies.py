@@ -20,7 +20,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
 from sros_tool.dds.portable import mistaken_names, outside, some_pairs
 from sros_tool.errors import SrosError
-from sros_tool.keystore.issuing.size import Scale, right_bytes
+from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
 from sros_tool.names import (
     ACTION_SERVICES,
     ACTION_TOPICS,
@@ -455,7 +455,7 @@ def _signed_bytes(enclave: Enclave) -> int:
     """Return the size of the signed permissions; small ones are not measured."""
     rights = policy_rights(Policy((enclave,)))
     estimate = sum(map(right_bytes, rights))
-    return Scale().signed_bytes(enclave) if estimate > _FROM_ALL_SIZES_ON else estimate
+    return SizeEstimator().signed_bytes(enclave) if estimate > _FROM_ALL_SIZES_ON else estimate
 
 
 _ORDER = (

@@ -365,7 +365,7 @@ def rotate_ca(
     """
     from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca
     from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca as work
-    from sros_tool.keystore.lifecycle.rotation.state import Stage, rotation_status
+    from sros_tool.keystore.lifecycle.rotation.state import RotationStage, rotation_status
     from sros_tool.validity import parse_span
 
     if sum((status, go_on, to is not None, finish, same_key)) > 1:
@@ -390,7 +390,7 @@ def rotate_ca(
         with progress_bar(50) as tick:
             step = work(
                 root,
-                Stage(to) if to else None,
+                RotationStage(to) if to else None,
                 roles=roles,
                 now=now(),
                 finish=finish,

@@ -353,11 +353,11 @@ def _measure(
     given: Policy, result: MinimizedPolicy, seen: frozenset[Right]
 ) -> dict[str, _Measured]:
     from sros_tool.dds.permissions import MAX_SIGNED_BYTES
-    from sros_tool.keystore.issuing.size import Scale, right_bytes
+    from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
     from sros_tool.policy.minimize import propose_wildcards
     from sros_tool.policy.rights import policy_rights
 
-    scale = Scale()
+    scale = SizeEstimator()
     measured = {}
     for before, after in zip(given.enclaves, result.policy.enclaves, strict=True):
         sizes = scale.signed_bytes(before), scale.signed_bytes(after)

@@ -22,7 +22,7 @@ from sros_tool.keystore.layout import (
     ca_certificate,
     enclave_path,
 )
-from sros_tool.keystore.lifecycle.rotation.state import Stage, read_rotation
+from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
 
 _ROTATION = (
     "The CAs of this keystore are being replaced: do the next stage with `sros rotate_ca {root} "
@@ -103,7 +103,7 @@ def _is_own_copy(keystore: Path, enclave: str, file: str) -> bool:
 
 def _is_rotating(keystore: Path) -> bool:
     try:
-        return read_rotation(keystore).stage is not Stage.NONE
+        return read_rotation(keystore).stage is not RotationStage.NONE
     except SrosError:
         return False
 

@@ -30,7 +30,7 @@ _KINDS: dict[str, str] = {"topic": "topics", "service": "services", "action": "a
 
 @dataclass(frozen=True, slots=True)
 class Template:
-    """The choices by which a keystore is made.
+    """The choices that a keystore is made by.
 
     Durations count from the moment at which something is created.  ``identity_key`` and
     ``permissions_key`` name the keys of the CAs by URI, where they are not in the keystore.  With
@@ -53,14 +53,15 @@ class Template:
 
 
 def template_names() -> tuple[str, ...]:
-    """The names of the templates that ship with sros."""
+    """Return the names of the templates that ship with sros."""
     return tuple(sorted(path.stem for path in templates_dir().glob("*.toml")))
 
 
 def load_template(choice: str) -> Template:
-    """The template of that name, or in the file of that path.
+    """Return the template of that name, or in the file of that path.
 
-    Raises `DocumentError` if there is none, or if it holds anything that is not understood.
+    Raises:
+        DocumentError: there is none, or it holds anything that is not understood.
     """
     if choice in template_names():
         return read_template(templates_dir() / f"{choice}.toml")
@@ -75,7 +76,7 @@ def load_template(choice: str) -> Template:
 
 
 def read_template(path: Path) -> Template:
-    """Read a template file."""
+    """Return the template in a file; raise `DocumentError` if it is not understood."""
     data = read_bytes(path, "template")
     try:
         text = data.decode()
@@ -93,7 +94,7 @@ class _TemplateError(ValueError):
 
 
 def parse_template(text: str, name: str) -> Template:
-    """Read the text of a template; unknown keys are errors, for a typo must not pass unseen."""
+    """Return the template in a text; an unknown key is an error, for it may be a typo."""
     table = _Table(parse_toml(text), "")
     authorities = table.table("authorities")
     certificates = table.table("certificates")
@@ -120,7 +121,7 @@ def parse_template(text: str, name: str) -> Template:
 
 
 def render_template(template: Template) -> str:
-    """The template as TOML text; `parse_template` gives the same value back."""
+    """Return the template as TOML text; `parse_template` returns the same value again."""
     protection = template.protection
     lines = [
         f"name = {_toml(template.name)}",
@@ -227,7 +228,7 @@ def _topic_protection(table: _Table, default: TopicProtection) -> TopicProtectio
 
 
 class _Table:
-    """A TOML table whose keys are taken one by one; what is left over at the end is an error."""
+    """A TOML table whose keys are taken one by one; a key that is left over is an error."""
 
     def __init__(self, values: object, path: str) -> None:
         if not isinstance(values, dict):

@@ -18,7 +18,7 @@ from pathlib import Path
 from subprocess import Popen
 
 from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import Stage
+from sros_tool.keystore.lifecycle.rotation.state import RotationStage
 from sros_tool.runtime.events import EventKind, read_events
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 from tests.integration.converse import SETTLED, SILENCE, Node, start
@@ -75,7 +75,7 @@ def go(root: Path, step: str) -> None:
     elif step == "finish":
         rotate_ca(root, finish=True, now=now)
     else:
-        assert rotate_ca(root, Stage(step), now=now).changes
+        assert rotate_ca(root, RotationStage(step), now=now).changes
 
 
 def main() -> None:

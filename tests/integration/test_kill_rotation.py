@@ -13,7 +13,11 @@ from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import Stage, read_rotation, rotation_status
+from sros_tool.keystore.lifecycle.rotation.state import (
+    RotationStage,
+    read_rotation,
+    rotation_status,
+)
 from sros_tool.keystore.reader import open_enclave, read_lists
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import filesystem
@@ -26,7 +30,7 @@ __all__ = ["server"]
 NOW = datetime.now(UTC)
 LATER = NOW + timedelta(hours=1)
 KILLS = 8
-STAGES = (Stage.DISTRIBUTE, Stage.REISSUE, Stage.RETIRE)
+STAGES = (RotationStage.DISTRIBUTE, RotationStage.REISSUE, RotationStage.RETIRE)
 
 State = tuple[tuple[str, ...], str, tuple[tuple[str, int], ...], tuple[int, ...]]
 
@@ -76,7 +80,7 @@ def revoke_once(root: Path) -> None:
 
 @pytest.mark.parametrize("stage", STAGES[:2])
 def test_death_at_every_step_of_revoking_between_stages(
-    stage: Stage, life: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    stage: RotationStage, life: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two lists change, and the file of the CAs: all at one moment."""
     monkeypatch.setattr(filesystem, "flush_file_system", lambda _: None)

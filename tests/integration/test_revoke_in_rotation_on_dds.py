@@ -13,7 +13,7 @@ from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import Stage
+from sros_tool.keystore.lifecycle.rotation.state import RotationStage
 from tests.integration.test_life_on_dds import (
     ANY,
     DOMAIN,
@@ -70,13 +70,13 @@ def vendor(request: pytest.FixtureRequest) -> str:
     ("stage", "template", "earlier"),
     [
         # Whether there is a list already decides whether Fast DDS asks for one of every CA.
-        (Stage.DISTRIBUTE, "production", False),
-        (Stage.REISSUE, "production", True),
-        (Stage.REISSUE, "sros2", True),
+        (RotationStage.DISTRIBUTE, "production", False),
+        (RotationStage.REISSUE, "production", True),
+        (RotationStage.REISSUE, "sros2", True),
     ],
 )
 def test_a_revocation_takes_effect_in_every_stage(
-    stage: Stage,
+    stage: RotationStage,
     template: str,
     earlier: bool,
     ask: Ask,
@@ -89,10 +89,10 @@ def test_a_revocation_takes_effect_in_every_stage(
     if earlier:
         revoke(root, ["/other"], now=now())
     before = copy(root, "before")
-    rotate_ca(root, Stage.DISTRIBUTE, now=now())
+    rotate_ca(root, RotationStage.DISTRIBUTE, now=now())
     thieves = {"distributed": (copy(root, "distributed"), LOST)}
-    both_trusted = vendor(request) == "Fast" or stage is Stage.DISTRIBUTE
-    if stage is Stage.REISSUE:
+    both_trusted = vendor(request) == "Fast" or stage is RotationStage.DISTRIBUTE
+    if stage is RotationStage.REISSUE:
         rotate_ca(root, stage, now=now())
         reissued = copy(root, "reissued")
         thieves["reissued"] = (reissued, LOST)
@@ -106,10 +106,10 @@ def test_a_revocation_takes_effect_in_every_stage(
     assert not revoke(root, [LOST], now=now()).remarks
     refused = dict.fromkeys(thieves, False)
     hears(ask, root, thieves | friends, refused | dict.fromkeys(friends, True))
-    if stage is Stage.DISTRIBUTE:  # it stays so when the other CA issues
-        rotate_ca(root, Stage.REISSUE, now=now())
+    if stage is RotationStage.DISTRIBUTE:  # it stays so when the other CA issues
+        rotate_ca(root, RotationStage.REISSUE, now=now())
         hears(ask, root, thieves | restarted, refused | {"restarted": True})
-    rotate_ca(root, Stage.RETIRE, now=now())
+    rotate_ca(root, RotationStage.RETIRE, now=now())
     hears(ask, root, thieves | restarted, refused | {"restarted": True})
 
 
@@ -120,16 +120,16 @@ def test_without_the_old_key_it_takes_effect_with_the_end_of_the_rotation(
     root = tmp_path / "ks"
     make(root, open_template("production"), {}, TALKER, LISTENER, LOST, "/other")
     revoke(root, ["/other"], now=now())
-    rotate_ca(root, Stage.DISTRIBUTE, now=now())
+    rotate_ca(root, RotationStage.DISTRIBUTE, now=now())
     old = {"old": (copy(root, "distributed"), LOST)}
-    rotate_ca(root, Stage.REISSUE, now=now(), delete_old_key=True)
+    rotate_ca(root, RotationStage.REISSUE, now=now(), delete_old_key=True)
     new = {"new": (copy(root, "reissued"), LOST)}
     assert revoke(root, [LOST], now=now(), until_retired=True).remarks
     friend = {"friend": (root, TALKER)}
     trusted = vendor(request) == "Fast"
     expected = {"old": trusted, "new": False, "friend": True}
     hears(ask, root, old | new | friend, expected)
-    rotate_ca(root, Stage.RETIRE, now=now())
+    rotate_ca(root, RotationStage.RETIRE, now=now())
     hears(ask, root, old | new | friend, expected | {"old": False})
 
 
@@ -146,9 +146,9 @@ def test_the_keystore_of_ros2(ask: Ask, tmp_path: Path) -> None:
     renew(root, [TALKER], now=now())
     revoke(root, ["/other"], now=now())
     hears(ask, root, friend | thieves, {"friend": True, "before": True})
-    rotate_ca(root, Stage.DISTRIBUTE, now=now())
+    rotate_ca(root, RotationStage.DISTRIBUTE, now=now())
     hears(ask, root, friend | thieves, {"friend": True, "before": True})
-    rotate_ca(root, Stage.REISSUE, now=now())
+    rotate_ca(root, RotationStage.REISSUE, now=now())
     thieves["reissued"] = (copy(root, "reissued"), LOST)
     mixed = with_earlier_identity(thieves["reissued"][0], thieves["before"][0], "mixed")
     thieves["mixed"] = (mixed, LOST)
@@ -157,5 +157,5 @@ def test_the_keystore_of_ros2(ask: Ask, tmp_path: Path) -> None:
     assert not revoke(root, [LOST], now=now()).remarks
     silent = dict.fromkeys(thieves, False)
     hears(ask, root, friend | thieves, {"friend": True, **silent})
-    rotate_ca(root, Stage.RETIRE, now=now())
+    rotate_ca(root, RotationStage.RETIRE, now=now())
     hears(ask, root, friend | thieves, {"friend": True, **silent})

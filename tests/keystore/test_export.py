@@ -14,7 +14,7 @@ from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.keystore.delivery.archive import unpack
-from sros_tool.keystore.delivery.export import Selection, distribute, pack_enclaves, select
+from sros_tool.keystore.delivery.export import ExportSelection, distribute, pack_enclaves, select
 from sros_tool.keystore.delivery.request import create_request
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
@@ -78,7 +78,7 @@ def test_selection(
     made_fleet: Path,
 ) -> None:
     found = select(made_fleet, names, patterns, every=every)
-    assert found == Selection(tuple(chosen), tuple(left_out))
+    assert found == ExportSelection(tuple(chosen), tuple(left_out))
 
 
 @pytest.mark.parametrize(

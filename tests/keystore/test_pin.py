@@ -21,7 +21,7 @@ from sros_tool.keystore.delivery.trust import read_pin
 from sros_tool.keystore.layout import PERMISSIONS
 from sros_tool.keystore.lifecycle.create import create_keystore
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import Stage
+from sros_tool.keystore.lifecycle.rotation.state import RotationStage
 from sros_tool.keystore.reader import load_settings
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import digest
@@ -110,7 +110,7 @@ def resigned(home: Path, files: dict[str, bytes], subject: str) -> dict[str, byt
 def test_after_a_rotation_the_new_ca_is_named(robot: Path, tmp_path: Path) -> None:
     home = made(tmp_path, "home")
     old = pin(home)
-    for stage in (Stage.DISTRIBUTE, Stage.REISSUE, Stage.RETIRE):
+    for stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE, RotationStage.RETIRE):
         rotate_ca(home, stage, now=NOW)
     archive = answer_of(home, robot)
     with pytest.raises(KeystoreError, match="not signed by the CA that is named"):

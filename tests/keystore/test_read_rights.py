@@ -9,7 +9,7 @@ import pytest
 
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import SrosError
-from sros_tool.keystore.issuing.size import Scale
+from sros_tool.keystore.issuing.size import SizeEstimator
 from sros_tool.keystore.rights import RightsSource, load_rights
 from sros_tool.policy import read_policy
 from sros_tool.translate import grant_rights
@@ -154,4 +154,4 @@ def test_a_size_is_that_of_a_real_document(keystore: Path) -> None:
     policy = keystore.parent / "policy.xml"
     policy.write_text(policy_text({"/a": publish("old_a")}))
     real = (keystore / "enclaves" / "a" / "permissions.p7s").stat().st_size
-    assert abs(Scale().signed_bytes(read_policy(policy).enclaves[0]) - real) < 100
+    assert abs(SizeEstimator().signed_bytes(read_policy(policy).enclaves[0]) - real) < 100

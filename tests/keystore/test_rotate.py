@@ -23,7 +23,7 @@ from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotation.stages import RotationStep, renew_identity_ca, rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import Stage, retired_key, rotation_status
+from sros_tool.keystore.lifecycle.rotation.state import RotationStage, retired_key, rotation_status
 from sros_tool.keystore.reader import (
     authority_files,
     certificates_of,
@@ -39,7 +39,7 @@ from tests.keystore.test_transaction import DIED, in_child
 from tests.support.harness import check_enclave_whole, policy_text, publish, remains, snapshot, sros
 
 NOW = datetime.now(UTC)
-STAGES = (Stage.DISTRIBUTE, Stage.REISSUE, Stage.RETIRE)
+STAGES = (RotationStage.DISTRIBUTE, RotationStage.REISSUE, RotationStage.RETIRE)
 NAMES = ("/a", "/a/inner", "/b")
 
 
@@ -98,7 +98,7 @@ def test_every_stage_is_whole(root: Path) -> None:
     assert states(root) == [(role, "issuing", 3) for role in roles]
 
     step = rotate_ca(root, now=NOW)
-    assert (step.stage, sorted(step.files)) == (Stage.DISTRIBUTE, files)
+    assert (step.stage, sorted(step.files)) == (RotationStage.DISTRIBUTE, files)
     check(root)
     assert states(root) == [
         state for role in roles for state in ((role, "issuing", 3), (role, "next", 0))
@@ -176,7 +176,7 @@ def test_all_at_once_from_every_stage(root: Path, tmp_path: Path) -> None:
         for _ in range(steps):
             rotate_ca(copy, now=NOW)
         step = rotate_ca(copy, finish=True, now=NOW)
-        assert step.stage is Stage.RETIRE
+        assert step.stage is RotationStage.RETIRE
         check(copy)
         assert {standing for _, standing, _ in states(copy)} == {"issuing"}
         assert certificates_of(copy, step.files[0]) != certificates_of(root, step.files[0])
@@ -264,8 +264,8 @@ def test_same_key_is_not_for_a_ca_that_signs_permissions(tmp_path: Path) -> None
 # ── old keys, and keys elsewhere ───────────────────────────────────────────────────────────
 
 
-@pytest.mark.parametrize("when", [Stage.REISSUE, Stage.RETIRE])
-def test_the_old_key_is_deleted_when_asked(when: Stage, root: Path) -> None:
+@pytest.mark.parametrize("when", [RotationStage.REISSUE, RotationStage.RETIRE])
+def test_the_old_key_is_deleted_when_asked(when: RotationStage, root: Path) -> None:
     for stage in STAGES:
         rotate_ca(root, stage, now=NOW, delete_old_key=stage is when)
     assert not list(root.glob("retired/*.key.pem"))
@@ -338,7 +338,7 @@ def test_revocation_lists_go_along(separate: Path) -> None:
         assert crl
         numbers.append(crl.number)
         text = (separate / "public/identity_ca.cert.pem").read_text()
-        assert text.count("BEGIN X509 CRL") == (0 if stage is Stage.RETIRE else 1)
+        assert text.count("BEGIN X509 CRL") == (0 if stage is RotationStage.RETIRE else 1)
         folder = enclave_path(separate, "/a")
         ca, own = folder / "identity_ca.cert.pem", folder / "crl.pem"
         openssl("verify", "-crl_check", "-CAfile", ca, "-CRLfile", own, folder / "cert.pem")
@@ -381,7 +381,7 @@ def test_a_revocation_in_between(earlier: bool, root: Path, tmp_path: Path) -> N
     if earlier:
         create_enclaves(root, ["/e"], now=NOW)
         revoke(root, ["/e"], now=NOW)
-    rotate_ca(root, Stage.DISTRIBUTE, now=NOW)
+    rotate_ca(root, RotationStage.DISTRIBUTE, now=NOW)
     assert not revoke(root, ["/c"], now=NOW).remarks
     if (public / "identity_ca.cert.pem").is_symlink():
         assert (public / "identity_ca.cert.pem").resolve() == (public / "ca.cert.pem").resolve()
@@ -390,7 +390,7 @@ def test_a_revocation_in_between(earlier: bool, root: Path, tmp_path: Path) -> N
     assert serials["/c"] in first
     assert not second  # the new CA has issued nothing yet
     numbers = [each.number for each in read_lists(root)]
-    assert rotate_ca(root, now=NOW).stage is Stage.REISSUE  # all is there that it needs
+    assert rotate_ca(root, now=NOW).stage is RotationStage.REISSUE  # all is there that it needs
     check(root)
     assert [each.number for each in read_lists(root)] == [numbers[1] + 1, numbers[0]]
     new = Path(shutil.copy(enclave_path(root, "/d") / "cert.pem", tmp_path / "new"))
@@ -403,7 +403,7 @@ def test_a_revocation_in_between(earlier: bool, root: Path, tmp_path: Path) -> N
         revoked_by_all(root, path)
     refresh_crl(root, now=NOW)
     assert lists_of(root) == [(_subject(root), first), (_subject(root, 1), second)]
-    rotate_ca(root, Stage.RETIRE, now=NOW)
+    rotate_ca(root, RotationStage.RETIRE, now=NOW)
     check(root)
     ((_, third),) = lists_of(root)
     assert third == first
@@ -425,8 +425,8 @@ def test_without_the_old_key_revoking_waits_for_the_end(
     """Fast DDS would accept what the old CA has issued, which nobody could revoke."""
     create_enclaves(separate, ["/c", "/d"], now=NOW)
     revoke(separate, ["/c"], now=NOW)
-    rotate_ca(separate, Stage.DISTRIBUTE, now=NOW)
-    rotate_ca(separate, Stage.REISSUE, now=NOW, delete_old_key=how == "deleted")
+    rotate_ca(separate, RotationStage.DISTRIBUTE, now=NOW)
+    rotate_ca(separate, RotationStage.REISSUE, now=NOW, delete_old_key=how == "deleted")
     if how != "deleted":
         kept = separate / retired_key(certificates_of(separate, "identity_ca")[1])
         assert kept.exists()
@@ -447,7 +447,7 @@ def test_without_the_old_key_revoking_waits_for_the_end(
     refreshed = sros("crl", separate, "--refresh").ok()
     assert "was not signed anew" in refreshed.err
     check(separate)
-    rotate_ca(separate, Stage.RETIRE, now=NOW)
+    rotate_ca(separate, RotationStage.RETIRE, now=NOW)
     assert "was not signed" not in sros("crl", separate, "--refresh").ok().err
     check(separate)
 
@@ -461,8 +461,8 @@ def test_an_old_key_outside_of_the_keystore_is_found_again(tmp_path: Path) -> No
     create_enclaves(root, ["/a", "/b"], now=NOW)
     old = Path(shutil.copy(root / "enclaves/b/cert.pem", tmp_path / "old.pem"))
     new = Keyring(places={role: f"{place}2" for role, place in places.items()})
-    rotate_ca(root, Stage.DISTRIBUTE, new_keys=new, now=NOW)
-    rotate_ca(root, Stage.REISSUE, now=NOW)
+    rotate_ca(root, RotationStage.DISTRIBUTE, new_keys=new, now=NOW)
+    rotate_ca(root, RotationStage.REISSUE, now=NOW)
     assert not revoke(root, ["/b"], now=NOW).remarks
     revoked_by_all(root, old)
 
@@ -475,12 +475,12 @@ def test_revoking_while_the_next_key_is_away(separate: Path) -> None:
     assert not revoke(separate, ["/b"], now=NOW).remarks
     assert len(lists_of(separate)) == 1
     (separate.parent / "away").rename(key)
-    assert rotate_ca(separate, now=NOW).stage is Stage.DISTRIBUTE
+    assert rotate_ca(separate, now=NOW).stage is RotationStage.DISTRIBUTE
     assert len(lists_of(separate)) == 2
     check(separate)
-    assert rotate_ca(separate, now=NOW).stage is Stage.REISSUE
+    assert rotate_ca(separate, now=NOW).stage is RotationStage.REISSUE
     check(separate)
-    assert rotate_ca(separate, now=NOW).stage is Stage.RETIRE
+    assert rotate_ca(separate, now=NOW).stage is RotationStage.RETIRE
     check(separate)
 
 
@@ -503,7 +503,7 @@ def shape(root: Path) -> tuple[object, ...]:
 
 
 @pytest.mark.parametrize("stage", [*STAGES, None])
-def test_death_at_every_step(stage: Stage | None, tmp_path: Path) -> None:
+def test_death_at_every_step(stage: RotationStage | None, tmp_path: Path) -> None:
     """Killed at any step, and run again: the same end state (None is all stages at once)."""
     base = make(tmp_path, "production")
     for before in STAGES[: STAGES.index(stage) if stage else 0]:
@@ -559,12 +559,12 @@ def refused(call: Callable[[], object], root: Path, match: str) -> None:
 
 
 def test_refusals(separate: Path, tmp_path: Path) -> None:
-    refused(lambda: rotate_ca(separate, Stage.REISSUE, now=NOW), separate, "distribute")
+    refused(lambda: rotate_ca(separate, RotationStage.REISSUE, now=NOW), separate, "distribute")
     rotate_ca(separate, now=NOW)
-    refused(lambda: rotate_ca(separate, Stage.RETIRE, now=NOW), separate, "reissue")
+    refused(lambda: rotate_ca(separate, RotationStage.RETIRE, now=NOW), separate, "reissue")
     refused(lambda: renew_identity_ca(separate, now=NOW), separate, "under way")
     rotate_ca(separate, now=NOW)
-    refused(lambda: rotate_ca(separate, Stage.DISTRIBUTE, now=NOW), separate, "is over")
+    refused(lambda: rotate_ca(separate, RotationStage.DISTRIBUTE, now=NOW), separate, "is over")
     (separate / ROTATION).write_text("{}")
     refused(lambda: rotate_ca(separate, now=NOW), separate, "cannot be continued")
 

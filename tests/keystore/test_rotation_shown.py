@@ -13,14 +13,14 @@ from sros_tool.keystore.history import HistoryStatus, history
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import Stage
+from sros_tool.keystore.lifecycle.rotation.state import RotationStage
 from sros_tool.keystore.reader import authority_files, certificates_of
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import digest
 from tests.support.harness import sros
 
 NOW = datetime.now(UTC)
-STAGES = (Stage.DISTRIBUTE, Stage.REISSUE, Stage.RETIRE)
+STAGES = (RotationStage.DISTRIBUTE, RotationStage.REISSUE, RotationStage.RETIRE)
 
 
 @pytest.fixture(params=["production", "sros2"])
@@ -51,12 +51,12 @@ def test_the_history_knows_both_cas_and_their_lists(root: Path) -> None:
             new = next(each for each in certificates_of(root, file) if each != first)
             assert standing(root)[digest(new)] == (HistoryStatus.CURRENT, path)
             expected = (HistoryStatus.CURRENT, path)
-            if stage is Stage.RETIRE:
+            if stage is RotationStage.RETIRE:
                 expected = (HistoryStatus.RETIRED, f"retired/{first.serial_number:x}.cert.pem")
             assert standing(root)[digest(first)] == expected
         lists = [each for each in history(root, now=NOW).items if each.entry.what == "crl"]
         current = [each for each in lists if each.status is HistoryStatus.CURRENT]
-        assert len(current) == (1 if stage is Stage.RETIRE else 2)
+        assert len(current) == (1 if stage is RotationStage.RETIRE else 2)
     gone = [each for each in history(root, now=NOW).items if each.entry.enclave == "/c"]
     # Its permissions were put away with its certificate; the new CA's list names neither.
     assert Counter(each.status for each in gone) == {HistoryStatus.REVOKED: 3}

@@ -25,7 +25,7 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
-from sros_tool.keystore.lifecycle.rotation.state import Stage, read_rotation
+from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
 from sros_tool.keystore.reader import certificates_of, open_enclave, read_crl, read_lists
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import filesystem
@@ -49,7 +49,7 @@ TEMPLATE = replace(
     revocation_validity=timedelta(days=150),
 )
 ENCLAVES, CHANGED = (200, 3) if LONG else (15, 1)  # of which so many get new rights each month
-ROTATION = {60: Stage.DISTRIBUTE, 63: Stage.REISSUE, 68: Stage.RETIRE}
+ROTATION = {60: RotationStage.DISTRIBUTE, 63: RotationStage.REISSUE, 68: RotationStage.RETIRE}
 REVOKED = {*range(1, MONTHS + 1, 6), 62, 65}  # so there is one in every stage
 PERSONAL = ("cert.pem", "permissions.p7s", "key.pem")
 COMMON = ("identity_ca.cert.pem", "permissions_ca.cert.pem", "governance.p7s")
@@ -270,7 +270,7 @@ def test_ten_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     verified = Verified(root)
     rights: dict[str, str] = {}
     thieves: list[Thief] = []
-    refused: Counter[tuple[Stage, str]] = Counter()
+    refused: Counter[tuple[RotationStage, str]] = Counter()
     longest = renewed = 0
     for month in range(1, MONTHS + 1):
         now = BEGIN + month * MONTH
@@ -312,12 +312,12 @@ def test_ten_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for name, topic in rights.items():
         assert topic in topics_of(enclave_path(root, name)), name
     assert {stage for stage, why in refused if why == "revoked"} == {
-        Stage.NONE,
-        Stage.DISTRIBUTE,
-        Stage.REISSUE,
+        RotationStage.NONE,
+        RotationStage.DISTRIBUTE,
+        RotationStage.REISSUE,
     }
-    assert refused[Stage.NONE, "not trusted"]
-    assert refused[Stage.NONE, "ended"]
+    assert refused[RotationStage.NONE, "not trusted"]
+    assert refused[RotationStage.NONE, "ended"]
     counts = check_history(root, end)
     assert counts["current"] == 2 * ENCLAVES + 4  # and two CAs, governance and the list
     assert counts["retired"] == 2

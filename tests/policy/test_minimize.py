@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.keystore.issuing.size import Scale, right_bytes
+from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
 from sros_tool.names import is_expression
 from sros_tool.policy import ALLOW, Group, Policy, read_policy
 from sros_tool.policy.minimize import EnclaveUse, minimize, propose_wildcards
@@ -183,7 +183,7 @@ def test_wildcards_of_services_and_topics_count_known_actions() -> None:
 
 
 def test_the_size_of_a_right_is_what_it_adds() -> None:
-    scale = Scale()
+    scale = SizeEstimator()
     bare = group("topics", "/x", "publish subscribe") + group("services", "/s", "request reply")
     before = scale.signed_bytes(policy(bare).enclaves[0])
     for right in ("publish /longer/name", "request /srv", "call /fibonacci", "execute /f"):

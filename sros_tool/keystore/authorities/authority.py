@@ -1,7 +1,7 @@
 """The identity CA and the permissions CA of a keystore: making them, and loading them to sign.
 
-It holds the issuing CA first, for Cyclone DDS 0.10.2 reads nothing else of it (ran); Fast DDS
-2.9.1 trusts all that it holds, and reads a revocation list in it, too (ran).
+A CA file holds the issuing CA first, for Cyclone DDS 0.10.2 reads nothing else of it (ran); Fast
+DDS 2.9.1 trusts all that it holds, and reads a revocation list in it, too (ran).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Authority:
     key: PrivateKey
 
     def issuer(self) -> Issuer:
-        """What issues the certificates of enclaves in this authority's name."""
+        """Return what issues certificates in this authority's name."""
         return Issuer(self.certificate, self.key)
 
     def sign(self, document: bytes, what: str) -> bytes:
@@ -102,7 +102,7 @@ def create_authorities(
     now: datetime,
     imported: Mapping[str, bytes],
 ) -> Authorities:
-    """Make the CA or CAs of a new keystore; those whose certificate is ``imported`` exist."""
+    """Stage the CAs of a new keystore; a CA whose certificate is ``imported`` exists already."""
     check_places(keyring, template)
     check_keys_of(imported, keyring, template)
     validity = window(now, template.authority_validity)
@@ -141,7 +141,7 @@ def create_authorities(
 def load_authorities(
     root: Path, template: Template, keyring: Keyring, now: datetime
 ) -> Authorities:
-    """Both authorities of a keystore, with their keys, checked and ready to sign."""
+    """Return both authorities of a keystore, with their keys, checked and ready to sign."""
     identity = load_authority(root, IDENTITY, template, keyring, now)
     permissions = load_authority(root, PERMISSIONS, template, keyring, now)
     return Authorities(identity, permissions)
@@ -150,7 +150,11 @@ def load_authorities(
 def load_authority(
     root: Path, role: str, template: Template, keyring: Keyring, now: datetime
 ) -> Authority:
-    """The identity or permissions CA of a keystore, with its key, checked and ready to sign."""
+    """Return the identity or permissions CA, with its key, checked and ready to sign.
+
+    Raises:
+        KeystoreError: it is missing, does not fit its key, or is not valid at ``now``.
+    """
     if not (root / ca_certificate(role)).exists() and not (root / ca_key(role)).exists():
         raise KeystoreError(
             f"keystore '{root}' has no {role} CA",

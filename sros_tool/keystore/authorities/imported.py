@@ -1,4 +1,4 @@
-"""Checks a CA that was made elsewhere before a keystore is built upon it."""
+"""Checking a CA that was made elsewhere, before a keystore uses it."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MOST_CERTIFICATES = 8
 
 @dataclass(frozen=True, slots=True)
 class ImportedAuthority:
-    """The certificate that issues, all that lead from it to the root, and remarks.
+    """An existing CA: its certificate, the chain up to the root, and notes.
 
     ``bundle`` is the PEM for the CA file: the issuing certificate first, the root last.
     """
@@ -43,10 +43,12 @@ class ImportedAuthority:
 
 
 def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> ImportedAuthority:
-    """Read a CA certificate with its chain (PEM, any order), the CA of ``key``.
+    """Return the CA of ``key`` with its chain; ``data`` is PEM, in any order.
 
-    Raises `PkiError` where it cannot serve as the ``role`` CA at all; what only some DDS vendors
-    refuse becomes a remark.
+    What only some DDS vendors refuse becomes a note.
+
+    Raises:
+        PkiError: it cannot serve as the ``role`` CA.
     """
     try:
         certificates = [read_in_full(each) for each in x509.load_pem_x509_certificates(data)]
@@ -124,8 +126,9 @@ def _notes(
 ) -> Iterator[Note]:
     name = subject_text(chain[0].subject)
     if len(chain) > 1:
-        told = refusals_text(refusals)
-        yield Note("portable.intermediate", f"{name} is below another CA. {told}.")
+        yield Note(
+            "portable.intermediate", f"{name} is below another CA. {refusals_text(refusals)}."
+        )
     elif role == PERMISSIONS and (fault := next(purpose_faults(chain), "")):
         yield Note(
             "portable.ca-purpose",

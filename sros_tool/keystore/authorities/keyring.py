@@ -1,7 +1,6 @@
-"""Where the keys of the authorities are, and how they are opened: in the keystore, elsewhere, or
-on a token.
+"""The keys of the CAs: where they are (keystore, another file, token), and how they are opened.
 
-The library never asks a person: a secrets handler does, which the caller brings.
+The library never prompts: the caller brings a secrets handler, which may.
 """
 
 from __future__ import annotations
@@ -27,13 +26,13 @@ Secrets = Callable[[str], str]
 
 
 def no_secrets(what: str) -> str:
-    """A handler that has no secret to give."""
+    """Raise `PkiError`: the secrets handler where there is no secret to give."""
     raise PkiError(f"{what} is needed, and nobody is there to give it")
 
 
 @dataclass(frozen=True, slots=True)
 class Keyring:
-    """How the keys of the two authorities are reached.
+    """The places of the keys of the two authorities, and the secrets that open them.
 
     ``places`` names the key of a role ("identity", "permissions") by URI, ``file:PATH`` or
     ``pkcs11:...``, where it is not at the place that the keystore's settings say.  ``secrets``
@@ -45,12 +44,16 @@ class Keyring:
     encrypt: bool = False
 
     def place(self, role: str, template: Template) -> str:
-        """The URI of the key of a role, or the path of its file within the keystore."""
+        """Return the URI of the key of a role, or the path of its file within the keystore."""
         role_key = {IDENTITY: template.identity_key}.get(role, template.permissions_key)
         return self.places.get(role) or role_key or ca_key(role)
 
     def open(self, root: Path, role: str, template: Template) -> PrivateKey:
-        """The key of a role; raises `KeystoreError` where it is not there or cannot be used."""
+        """Return the key of a role.
+
+        Raises:
+            KeystoreError: it is not there, or cannot be used.
+        """
         place = self.place(role, template)
         try:
             if place.startswith(SCHEME):
@@ -76,7 +79,7 @@ class Keyring:
     def make(
         self, transaction: Transaction, file: str, role: str, template: Template
     ) -> PrivateKey:
-        """The key for a new authority: one that is at its place already, or else a new one there.
+        """Return the key for a new authority: the one at its place, or else a new one there.
 
         ``file`` is where in the keystore it goes, unless a place is named.
         """
@@ -100,7 +103,7 @@ class Keyring:
         return key
 
     def remembered(self, template: Template) -> Template:
-        """``template`` with the places of the keys, for the settings of a new keystore."""
+        """Return ``template`` with the places of the keys, for the settings of a new keystore."""
         identity = self.places.get(IDENTITY) or template.identity_key
         permissions = self.places.get(PERMISSIONS) or template.permissions_key
         if not template.separate_authorities:
@@ -148,7 +151,7 @@ def _path(place: str, root: Path) -> Path:
 
 
 def _write_outside(path: Path, pem: bytes, transaction: Transaction) -> None:
-    """Write a key file outside of the keystore; it goes if the keystore does not come."""
+    """Write a key file outside of the keystore; remove it if the transaction fails."""
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
 
     def undo() -> None:

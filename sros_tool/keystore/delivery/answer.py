@@ -44,8 +44,8 @@ Without it, one who carries an answer could put an earlier governance or a furth
 
 
 @dataclass(frozen=True, slots=True)
-class Answer:
-    """The files for one enclave, by their paths in a keystore; its key is not among them.
+class RequestAnswer:
+    """The answer to a request: the files of one enclave by their paths, without its key.
 
     ``seal`` is the signed list of the files.
     """
@@ -55,13 +55,13 @@ class Answer:
     seal: bytes
 
     def file(self, name: str) -> bytes | None:
-        """The content of a file of the enclave, such as ``cert.pem``."""
+        """Return the content of a file of the enclave, such as ``cert.pem``, or None."""
         return self.files.get(f"{enclave_folder(self.name)}/{name}")
 
 
 @dataclass(frozen=True, slots=True)
-class Imported:
-    """What an answer brought; without changes, everything was there already.
+class ImportedEnclave:
+    """The enclave that an answer was imported for; without changes, it was there already.
 
     ``first`` is whether the CAs were unknown in the folder, so that nothing there vouches for them.
     """
@@ -88,10 +88,11 @@ def _lines(document: bytes) -> bytes:
     return document.replace(b"\r\n", b"\n")
 
 
-def read_answer(data: bytes) -> Answer:
-    """Read the archive that ``sign_request`` makes; nothing is written.
+def read_answer(data: bytes) -> RequestAnswer:
+    """Return the answer in an archive that ``sign_request`` made; nothing is written.
 
-    Raises `DocumentError` where it holds anything but the files of one enclave.
+    Raises:
+        DocumentError: it holds anything but the files of one enclave.
     """
     try:
         files = unpack(data)
@@ -112,10 +113,10 @@ def read_answer(data: bytes) -> Answer:
         raise DocumentError(
             f"the answer cannot be used: {error.what}", error.why, _AGAIN
         ) from error
-    return Answer(name, files, signed)
+    return RequestAnswer(name, files, signed)
 
 
-def check_answer(answer: Answer, key: PublicKey, *, now: datetime) -> OpenedEnclave:
+def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> OpenedEnclave:
     """Check that DDS would load an answer together with the private half of ``key``.
 
     Raises `PkiError` with all that is wrong: another key's certificate, another enclave's, a
@@ -141,8 +142,8 @@ def check_answer(answer: Answer, key: PublicKey, *, now: datetime) -> OpenedEncl
     return state
 
 
-def _broken_seal(answer: Answer, authorities: Iterable[x509.Certificate]) -> str:
-    """Why the list of the files does not hold by any of the authorities; "" if it does."""
+def _broken_seal(answer: RequestAnswer, authorities: Iterable[x509.Certificate]) -> str:
+    """Return why none of the authorities has signed the files, or "" if one has."""
     try:
         signed = smime.parse(answer.seal)
     except SrosError as error:
@@ -167,8 +168,8 @@ def import_answer(
     pinned: frozenset[str] = frozenset(),
     force: bool = False,
     dry_run: bool = False,
-) -> Imported:
-    """Put the answer to a request of ``folder`` beside the key that waits there, or change nothing.
+) -> ImportedEnclave:
+    """Put an answer next to the key that waits for it in ``folder``, or change nothing.
 
     An answer that is older than what is there, or that comes from other CAs, needs ``force``.
     Where CAs are ``pinned``, by their SHA-256, one of them has to have signed it in any case.
@@ -208,7 +209,7 @@ def import_answer(
     subject = subject_text(state.certificate.subject)
     ends = [each.validity.not_after for each in state.permissions.grants if each.subject == subject]
     until = min(validity_of(state.certificate).not_after, ends[0])
-    return Imported(
+    return ImportedEnclave(
         name,
         state.identity_ca,
         state.permissions_ca,
@@ -219,14 +220,14 @@ def import_answer(
 
 
 def _check_pinned(
-    answer: Answer,
+    answer: RequestAnswer,
     identity_ca: x509.Certificate,
     permissions_ca: x509.Certificate,
     pinned: frozenset[str],
 ) -> None:
-    """See that a CA that a person named vouches for all of the answer: its seal says so.
+    """Check that a CA that a person named has signed the seal, and so the whole answer.
 
-    The identity CA vouches for the certificate alone, which anybody may put beside permissions and
+    The identity CA vouches for the certificate alone, which anybody may put next to permissions and
     a governance of his own.
     """
     if not pinned or digest(permissions_ca) in pinned:
@@ -241,8 +242,8 @@ def _check_pinned(
     )
 
 
-def _check_known(folder: Path, answer: Answer, known: list[x509.Certificate]) -> None:
-    """The answer to the first request of a robot tells it whom to trust; later ones have to fit."""
+def _check_known(folder: Path, answer: RequestAnswer, known: list[x509.Certificate]) -> None:
+    """Refuse an answer of other CAs than the first one, which said whom to trust."""
     if known and (problem := _broken_seal(answer, known)):
         raise KeystoreError(
             f"the answer for enclave {answer.name} comes from another keystore",
@@ -252,8 +253,8 @@ def _check_known(folder: Path, answer: Answer, known: list[x509.Certificate]) ->
     check_same_authority(folder, answer.files)
 
 
-def _check_newer(place: Path, answer: Answer, certificate: x509.Certificate) -> None:
-    """Refuse what would bring back an earlier state: who held the answer back may want that."""
+def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certificate) -> None:
+    """Refuse an answer that brings back an earlier state: an attacker may have kept it."""
     remedy = "Have a new answer made, or add --force if going back is meant."
     path = place / "cert.pem"
     if path.exists():

@@ -1,4 +1,4 @@
-"""Archives that are sent to robots: the same files give the same bytes, and nothing is trusted."""
+"""Archives that are sent to robots: packed reproducibly, unpacked without trusting them."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ _GZIP = 16 + zlib.MAX_WBITS
 
 
 def file_mode(path: str) -> int:
-    """The permission bits of a file that is sent: private keys are their owner's alone."""
+    """Return the permission bits of a file that is sent: a private key is its owner's alone."""
     return 0o600 if path.rpartition("/")[2] == "key.pem" else 0o644
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
-    """A gzipped tar that depends on the files alone: no names, numbers or moments of a machine."""
+    """Return a gzipped tar that depends on the files alone: no users, groups or times."""
     buffer = io.BytesIO()
     with (
         gzip.GzipFile(fileobj=buffer, mode="wb", filename="", mtime=0) as packed,
@@ -54,11 +54,13 @@ def pack(files: Mapping[str, bytes]) -> bytes:
 
 
 def unpack(data: bytes) -> dict[str, bytes]:
-    """The files of an archive by their paths, in memory; nothing is written.
+    """Return the files of an archive by their paths, in memory; nothing is written.
 
-    Raises `DocumentError` for anything but plain files and folders of bounded size and number:
-    links, devices, sparse files, a name that comes twice, bytes behind the end.  Whether the names
-    are welcome is for the caller to say.
+    The caller checks the names.
+
+    Raises:
+        DocumentError: it holds anything but plain files and folders of bounded size and number:
+            links, devices, sparse files, a name twice, bytes after the end.
     """
     try:
         with tarfile.open(fileobj=io.BytesIO(_unzip(data)), mode="r:") as tar:
@@ -105,7 +107,7 @@ def _members(tar: tarfile.TarFile) -> Iterator[tuple[str, bytes]]:
 
 @contextmanager
 def staged_file(target: Path, data: bytes) -> Iterator[Callable[[], None]]:
-    """Write a file beside ``target``; calling what is yielded puts it in place, as a whole.
+    """Write a file next to ``target``; calling what is yielded moves it there, as a whole.
 
     It is readable by its owner only, and on the disk before it can be put in place.
     """

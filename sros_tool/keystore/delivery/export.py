@@ -1,4 +1,4 @@
-"""Exports enclaves for a robot: a keystore of real files, without links and without any CA key."""
+"""Exporting enclaves for a robot: a keystore of real files, without links and without CA keys."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _ANSWER_AGAIN = (
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """What was exported, and where to."""
+    """The enclaves that were exported, and where to."""
 
     target: Path
     enclaves: tuple[str, ...]
@@ -45,8 +45,8 @@ class Export:
 
 
 @dataclass(frozen=True, slots=True)
-class Selection:
-    """The enclaves to export, and those that fit but whose key is on their robot."""
+class ExportSelection:
+    """The enclaves to export, and those that match but whose key is on their robot."""
 
     names: tuple[str, ...]
     left_out: tuple[str, ...]
@@ -54,8 +54,8 @@ class Selection:
 
 def select(
     root: Path, names: Sequence[str], patterns: Sequence[str] = (), *, every: bool = False
-) -> Selection:
-    """The named enclaves, and those of the keystore that fit a pattern, or ``every`` one.
+) -> ExportSelection:
+    """Return the named enclaves, and those of the keystore that match a pattern, or ``every`` one.
 
     In a pattern ``*`` stands for any part of a name, "/" included, as in policies.  Those that are
     found so are left out if their key is not at home; those that are named are refused later.
@@ -81,7 +81,7 @@ def select(
             "They were made on their robots and stay there.",
             _ANSWER_AGAIN,
         )
-    return Selection(tuple(chosen), tuple(left_out))
+    return ExportSelection(tuple(chosen), tuple(left_out))
 
 
 def distribute(
@@ -98,7 +98,7 @@ def distribute(
     The same enclaves give the same bytes.  An enclave that cannot run is not exported.  In a
     folder that already is an export, other enclaves stay; files that would change need ``force``.
     """
-    files = collect(root, names, now)
+    files = _collect(root, names, now)
     if target.name.endswith(ARCHIVE_SUFFIXES):
         changes = _write_archive(target, files, force, dry_run)
     else:
@@ -107,21 +107,21 @@ def distribute(
 
 
 @dataclass(frozen=True, slots=True)
-class Packed:
+class PackedEnclaves:
     """An archive, and the paths of the files in it."""
 
     data: bytes
     paths: tuple[str, ...]
 
 
-def pack_enclaves(root: Path, names: Sequence[str], *, now: datetime) -> Packed:
-    """Export enclaves as the bytes of an archive, for a pipe."""
-    files = collect(root, names, now)
-    return Packed(pack(files), tuple(files))
+def pack_enclaves(root: Path, names: Sequence[str], *, now: datetime) -> PackedEnclaves:
+    """Return enclaves as the bytes of an archive, for a pipe."""
+    files = _collect(root, names, now)
+    return PackedEnclaves(pack(files), tuple(files))
 
 
-def collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]:
-    """The files that are sent, by their paths; raises `KeystoreError` for what would not run."""
+def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]:
+    """Return the files that are sent, by their paths; raise for an enclave that cannot run."""
     existing = set(list_enclaves(root))
     files: dict[str, bytes] = {}
     for name in names:

@@ -1,4 +1,4 @@
-"""Makes the key of an enclave on its robot, where it stays, and the request to certify it."""
+"""The signing request of an enclave: made on its robot, with a key that stays there."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sros_tool.xml import read_bytes
 
 @dataclass(frozen=True, slots=True)
 class Requested:
-    """A request that was made: its file, the SHA-256 of its public key, and the changed files."""
+    """A request that was made: its file, the SHA-256 of its public key, and the changes."""
 
     name: str
     file: Path
@@ -33,7 +33,7 @@ def create_request(
     """Make a key, which stays in ``folder``, and the request to have it certified.
 
     ``folder`` becomes a keystore without CAs, in which the enclave waits for the answer.  With
-    ``again`` the request is made anew for the key that is there; no key is ever replaced.
+    ``again`` the request is made for the key that is there; no key is ever replaced.
     """
     check_enclave_name(name)
     if not dry_run and folder.is_dir():
@@ -60,7 +60,7 @@ def create_request(
             key = generate_key()
             transaction.write(f"{place}/key.pem", key_pem(key), private=True)
         request = make_request(key, name)
-        load_request(request, "as it was made")  # so that a key of a wrong kind is told here
+        load_request(request, "as it was made")  # so that a key of a wrong kind is reported here
         transaction.write(f"{place}/{REQUEST}", request)
         transaction.commit()
     digest = key_digest(key.public_key())

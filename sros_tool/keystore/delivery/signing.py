@@ -13,7 +13,7 @@ from sros_tool.dds.portable import name_notes
 from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
 from sros_tool.keystore.authorities.authority import load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.delivery.answer import SEAL, Answer, check_answer, seal
+from sros_tool.keystore.delivery.answer import SEAL, RequestAnswer, check_answer, seal
 from sros_tool.keystore.delivery.archive import pack, staged_file
 from sros_tool.keystore.issuing.enclave import (
     EarlierRights,
@@ -137,7 +137,7 @@ def sign_request(
         notes += [*issued.notes(), *writer.notes]
         files = _answer_files(root, issued)
         sealed = seal(files, authorities.permissions)
-        _check_result(Answer(name, files, sealed), request, now)
+        _check_result(RequestAnswer(name, files, sealed), request, now)
         archive = pack({SEAL: sealed, **files})
         sent = document_entry(now, "answer", sealed, enclave=name)
         append(transaction, [*writer.entries, sent])
@@ -207,7 +207,7 @@ def _check_key(root: Path, request: SigningRequest) -> None:
             )
 
 
-def _check_result(answer: Answer, request: SigningRequest, now: datetime) -> None:
+def _check_result(answer: RequestAnswer, request: SigningRequest, now: datetime) -> None:
     """Check that the robot will accept the answer, before anybody relies on it."""
     try:
         check_answer(answer, request.public_key, now=now)

@@ -1,4 +1,4 @@
-"""Measures how large the signed permissions of an enclave become, by signing them for nobody."""
+"""The size of signed permissions, by signing them with a throwaway key."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from sros_tool.validity import window
 _LINE = len("            <topic></topic>\r\n")
 
 
-class Scale:
-    """Signs with a key of its own that is thrown away.
+class SizeEstimator:
+    """Estimates the size of signed permissions, with a key of its own that is thrown away.
 
     A keystore's own CA may have a longer or shorter name, and a signature varies by some bytes: the
     sizes are right to within 100 bytes.
@@ -32,7 +32,7 @@ class Scale:
         )
 
     def signed_bytes(self, enclave: Enclave) -> int:
-        """The size in bytes of ``permissions.p7s`` for an enclave of a policy."""
+        """Return the size in bytes of ``permissions.p7s`` for an enclave of a policy."""
         permissions = permissions_for(
             enclave,
             subject=subject_text(common_name(enclave.path)),
@@ -43,6 +43,6 @@ class Scale:
 
 
 def right_bytes(right: Right) -> int:
-    """The bytes that one right takes in a signed document: a line for each of its DDS topics."""
+    """Return the bytes that one right takes in a signed document: a line for each DDS topic."""
     names = dds_names(right.right, right.name)
     return sum(_LINE + len(name) for name in (*names.publish, *names.subscribe))

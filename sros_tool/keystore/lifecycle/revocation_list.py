@@ -21,7 +21,7 @@ from sros_tool.keystore.layout import CRL, IDENTITY, REVOKED
 from sros_tool.keystore.ledger import Entry, document_entry
 from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
-    Stage,
+    RotationStage,
     lists_confusable,
     read_rotation,
 )
@@ -48,7 +48,7 @@ from sros_tool.validity import BACKDATE, Window, iso
 
 @dataclass(frozen=True, slots=True)
 class SignedList:
-    """A list as PEM, when it ends, and what the ledger is told of it."""
+    """A list as PEM, when it expires, and its ledger entry."""
 
     document: bytes
     end: datetime
@@ -63,7 +63,7 @@ def sign_list(
     template: Template,
     now: datetime,
 ) -> SignedList:
-    """A list that ends with its CA at the latest.  An expired one locks everybody out."""
+    """Sign a list that expires with its CA at the latest: an expired one locks everybody out."""
     validity = validity_of(authority.certificate)
     moment = now.replace(microsecond=0)
     begin = max(moment - BACKDATE, validity.not_before)
@@ -80,12 +80,12 @@ def sign_list(
     return SignedList(document, end, entry)
 
 
-def carried_over(old: RevocationList | None, ends: Mapping[int, str]) -> list[Revoked]:
-    """What a new list has to say again: all but what ended before the old list was made.
+def _carried_over(old: RevocationList | None, ends: Mapping[int, str]) -> list[Revoked]:
+    """Return the entries that a new list takes over: all that had not expired at the old list.
 
     RFC 5280, 3.3: an entry stays until it was on one list that was issued after its certificate
-    ended.  ``ends`` are the ends of certificates (ISO 8601, UTC) by serial number; one that is not
-    there is kept for ever.
+    expired.  ``ends`` maps serial numbers to the expiry of the certificate (ISO 8601, UTC); an
+    entry that is not in it is kept for ever.
     """
     if old is None:
         return []
@@ -122,18 +122,21 @@ class Lists:
     def sign(
         self, newly: Sequence[Revoked], names: Sequence[str], *, incomplete: bool
     ) -> tuple[datetime, list[Entry]]:
-        """Stage the lists with what is ``newly`` revoked; the first end, and ledger entries.
+        """Stage the lists with what is ``newly`` revoked; return the first expiry and entries.
 
-        Each names all: a serial number that another CA has given does no harm, and the ledger does
-        not tell which of two did.  With ``incomplete``, the key of a CA that is being replaced may
-        be missing, which is else a `KeystoreError`.
+        Each list has all serial numbers: one that another CA has given does no harm, and the ledger
+        does not say which of two CAs gave it.  With ``incomplete``, the key of a CA that is being
+        replaced may be missing.
+
+        Raises:
+            KeystoreError: that key is missing, and ``incomplete`` is not set.
         """
         ends = self._ends()
         signed = self._sign(self._authority, self.present, newly, ends, 0)
         self._transaction.write(CRL, signed.document)
         found = [signed]
-        if beside := self._beside(newly, names, ends, incomplete=incomplete):
-            found.append(beside)
+        if second := self._sign_second(newly, names, ends, incomplete=incomplete):
+            found.append(second)
         return min(each.end for each in found), [each.entry for each in found]
 
     def _sign(
@@ -144,14 +147,14 @@ class Lists:
         ends: Mapping[int, str],
         least: int,
     ) -> SignedList:
-        kept = carried_over(old, ends)
+        kept = _carried_over(old, ends)
         listed = {each.serial for each in kept}
         kept += [each for each in newly if each.serial not in listed]
         number = max(old.number + 1 if old else 1, least)
         return sign_list(authority, kept, number=number, template=self._template, now=self._now)
 
     def _ends(self) -> dict[int, str]:
-        """When each certificate ends; of those that no ledger knows, by the files put away."""
+        """Map serial numbers to expiry, by the ledger, or else by the files in ``revoked``."""
         ends = {
             int(each.serial, 16): each.not_after
             for each in self._ledger
@@ -165,7 +168,7 @@ class Lists:
 
     # ── the other CA, while one replaces the other ─────────────────────────────────────────
 
-    def _beside(
+    def _sign_second(
         self,
         newly: Sequence[Revoked],
         names: Sequence[str],
@@ -173,13 +176,13 @@ class Lists:
         *,
         incomplete: bool,
     ) -> SignedList | None:
-        """Stage the list of the identity CA that comes or goes, in the file of the CAs."""
+        """Stage the list of the other trusted identity CA, in the file of the CAs."""
         rotation = read_rotation(self._root)
         file = identity_file(self._root)
         replaced = next((each for each in rotation.replacements if each.file == file), None)
         if not replaced or not file:
             return None
-        coming = rotation.stage is Stage.DISTRIBUTE
+        coming = rotation.stage is RotationStage.DISTRIBUTE
         certificates = certificates_of(self._root, file)
         wanted = replaced.new if coming else replaced.old
         (other,) = [each for each in certificates if digest(each) == wanted]
@@ -220,7 +223,7 @@ class Lists:
         *,
         incomplete: bool,
     ) -> None:
-        """Say that the CA that goes cannot sign its list, or refuse to revoke without."""
+        """Note that the old CA cannot sign its list, or refuse to revoke without it."""
         name = subject_text(old_ca.subject)
         if newly and not incomplete:
             raise KeystoreError(

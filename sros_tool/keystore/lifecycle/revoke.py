@@ -1,4 +1,4 @@
-"""Revokes enclaves: the list, its way to everybody else, and the files out of the way."""
+"""Revoking enclaves: their certificates go on the list, their files move to ``revoked``."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _PRIVATE = "key.pem"
 
 @dataclass(frozen=True, slots=True)
 class Revocation:
-    """What was revoked, and until when the list holds.
+    """What was revoked, and until when the list is valid.
 
     ``restart`` are the enclaves whose processes go on trusting the revoked ones until they are
     started again.  ``remarks`` are sentences on what is still to be done.
@@ -67,7 +67,7 @@ def revoke(
 ) -> Revocation:
     """Revoke the certificates of enclaves and move their files to ``revoked`` in the keystore.
 
-    Every certificate of an enclave is revoked that the ledger knows and that has not ended: an
+    Every certificate of an enclave is revoked that the ledger knows and that has not expired: an
     earlier one would serve whoever has a copy of it, with the key, just as well.
     Every other enclave gets ``crl.pem``, a link to the one list.  ``reason`` is one of `REASONS`.
     While the identity CA is being replaced, both CAs revoke; where the key of the old one is not at
@@ -116,9 +116,9 @@ def revoke(
 def refresh_crl(
     root: Path, *, now: datetime, keyring: Keyring = IN_KEYSTORE, dry_run: bool = False
 ) -> Revocation:
-    """Sign the revocation list anew, so that it holds for longer.
+    """Sign the revocation list again, so that it is valid for longer.
 
-    What it revokes is kept, but for certificates that have ended and were on it since.
+    What it revokes is kept, but for certificates that expired and were on a list since.
     """
     if not dry_run:
         tidy(root)
@@ -137,7 +137,7 @@ def refresh_crl(
 
 
 def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
-    """All enclaves of the keystore, after those that are named were found among them."""
+    """Return all enclaves of the keystore; raise unless the named ones are among them."""
     existing = list_enclaves(root)
     for name in names:
         check_enclave_name(name)
@@ -147,7 +147,7 @@ def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def still_valid(issued: Sequence[Entry], name: str, now: datetime) -> dict[int, str]:
-    """Serial numbers and subjects of what was issued to an enclave and has not ended."""
+    """Map the serial numbers of an enclave's certificates that have not expired to subjects."""
     return {
         int(each.serial, 16): each.subject
         for each in issued
@@ -156,7 +156,7 @@ def still_valid(issued: Sequence[Entry], name: str, now: datetime) -> dict[int, 
 
 
 def _move_away(transaction: Transaction, authority: Authority, name: str) -> tuple[int, str]:
-    """Have the files of an enclave moved; the serial number and subject of its certificate."""
+    """Stage the move of an enclave's files; return its certificate's serial number and subject."""
     folder = enclave_folder(name)
     path = transaction.root / folder / "cert.pem"
     certificate = read_certificate(path)
@@ -181,7 +181,7 @@ def _move_away(transaction: Transaction, authority: Authority, name: str) -> tup
 
 
 def link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
-    """Have the ``crl.pem`` of each enclave lead to the one list."""
+    """Stage links to the revocation list, in each enclave where the link is missing."""
     for name in names:
         folder = enclave_folder(name)
         path = transaction.root / folder / "crl.pem"

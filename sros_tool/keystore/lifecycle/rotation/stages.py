@@ -50,7 +50,7 @@ from sros_tool.keystore.lifecycle.revocation_list import sign_list
 from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
     Rotation,
-    Stage,
+    RotationStage,
     lists_confusable,
     read_rotation,
     render_rotation,
@@ -94,7 +94,7 @@ class RotationStep:
     """
 
     root: Path
-    stage: Stage
+    stage: RotationStage
     files: tuple[str, ...]
     enclaves: tuple[str, ...]
     changes: tuple[Change, ...]
@@ -104,7 +104,7 @@ class RotationStep:
 
 def rotate_ca(
     root: Path,
-    to: Stage | None = None,
+    to: RotationStage | None = None,
     *,
     roles: Sequence[str] = (),
     now: datetime,
@@ -128,11 +128,11 @@ def rotate_ca(
     with Transaction(root, dry_run=dry_run) as transaction:
         names = list_enclaves(root)
         rotation = read_rotation(root)
-        stage = Stage.RETIRE if finish else _wanted(root, rotation, to)
+        stage = RotationStage.RETIRE if finish else _wanted(root, rotation, to)
         rotator = _Rotator(
             transaction, rotation, names, keyring, now, delete_old_key=delete_old_key
         )
-        if finish or stage not in (rotation.stage, Stage.NONE):
+        if finish or stage not in (rotation.stage, RotationStage.NONE):
             stage = rotator.go_to(stage, roles, new_keys, validity, progress)
             transaction.commit()
     return RotationStep(
@@ -146,7 +146,7 @@ def rotate_ca(
     )
 
 
-def _wanted(root: Path, rotation: Rotation, to: Stage | None) -> Stage:
+def _wanted(root: Path, rotation: Rotation, to: RotationStage | None) -> RotationStage:
     """Return the stage to go to; NONE where there is nothing to do.
 
     Raises:
@@ -154,9 +154,9 @@ def _wanted(root: Path, rotation: Rotation, to: Stage | None) -> Stage:
     """
     if to is None:
         return rotation.following()
-    if to is Stage.RETIRE and rotation.stage is Stage.NONE:
-        return Stage.NONE  # it is done
-    order = list(Stage)
+    if to is RotationStage.RETIRE and rotation.stage is RotationStage.NONE:
+        return RotationStage.NONE  # it is done
+    order = list(RotationStage)
     ahead = order.index(to) - order.index(rotation.stage)
     if ahead > 1:
         raise UsageError(
@@ -198,7 +198,7 @@ def renew_identity_ca(
                 "It signs permissions, too, and DDS takes these from the very certificate only.",
                 "Rotate it without --same-key.",
             )
-        if read_rotation(root).stage is not Stage.NONE:
+        if read_rotation(root).stage is not RotationStage.NONE:
             raise KeystoreError("a rotation is under way", "", "Bring it to its end first.")
         template = load_settings(root)
         key = keyring.open(root, IDENTITY, template)
@@ -214,7 +214,9 @@ def renew_identity_ca(
         transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
         append(transaction, [certificate_entry(now, "ca", new)])
         transaction.commit()
-    return RotationStep(root, Stage.NONE, ("identity_ca",), names, tuple(transaction.changes))
+    return RotationStep(
+        root, RotationStage.NONE, ("identity_ca",), names, tuple(transaction.changes)
+    )
 
 
 class _Rotator:
@@ -249,29 +251,31 @@ class _Rotator:
 
     def go_to(
         self,
-        stage: Stage,
+        stage: RotationStage,
         roles: Sequence[str],
         new_keys: Keyring,
         validity: Span | None,
         progress: Progress | None,
-    ) -> Stage:
+    ) -> RotationStage:
         """Stage all that leads to ``stage``; return the stage that is reached.
 
         It is the present one where the new identity CA has no revocation list yet, which has to be
         distributed first: Fast DDS 2.9.1 refuses every enclave of a CA without one (ran).
         """
-        if self._rotation.stage is Stage.REISSUE:
+        if self._rotation.stage is RotationStage.REISSUE:
             self._retire()
-        elif self._rotation.stage is Stage.NONE:
-            successors = self._begin(roles, new_keys, validity, next_to=stage is Stage.DISTRIBUTE)
-            if stage is Stage.DISTRIBUTE:
+        elif self._rotation.stage is RotationStage.NONE:
+            successors = self._begin(
+                roles, new_keys, validity, next_to=stage is RotationStage.DISTRIBUTE
+            )
+            if stage is RotationStage.DISTRIBUTE:
                 self._distribute(successors)
             else:
                 self._reissue(successors, stage, progress)
         else:
             successors = _distributed(self._root, self._rotation, self._keyring, self._template)
-            if stage is Stage.REISSUE and self._lacks_crl(successors):
-                stage = Stage.DISTRIBUTE
+            if stage is RotationStage.REISSUE and self._lacks_crl(successors):
+                stage = RotationStage.DISTRIBUTE
                 self._distribute(successors)
             else:
                 self._reissue(successors, stage, progress)
@@ -305,7 +309,7 @@ class _Rotator:
             if self._takes_crl(each) and (old := read_crl(self._root)):
                 bundle += self._empty_crl(each.new, old.number + 1)
             write_bundle(self._transaction, each.file, each.roles, bundle, self._names)
-        self._write_state(Stage.DISTRIBUTE)
+        self._write_state(RotationStage.DISTRIBUTE)
 
     def _empty_crl(self, authority: Authority, number: int) -> bytes:
         """Return a list of the new CA, which has issued nothing yet that could be revoked."""
@@ -324,16 +328,16 @@ class _Rotator:
         return IDENTITY in each.roles and not lists_confusable(each.old[0], each.new.certificate)
 
     def _reissue(
-        self, successors: list[_Successor], stage: Stage, progress: Progress | None
+        self, successors: list[_Successor], stage: RotationStage, progress: Progress | None
     ) -> None:
         of = {role: each for each in successors for role in each.roles}
         self._issue_again(of.get(IDENTITY), of.get(PERMISSIONS), progress)
         self.replacements = []
         for each in successors:
-            trusted = (each.new.certificate, *(each.old if stage is Stage.REISSUE else ()))
+            trusted = (each.new.certificate, *(each.old if stage is RotationStage.REISSUE else ()))
             bundle = b"".join(map(pem, trusted))
             if IDENTITY in each.roles and (old := read_crl(self._root)):
-                if stage is Stage.REISSUE:
+                if stage is RotationStage.REISSUE:
                     bundle += read_bytes(self._root / CRL, "revocation list")
                 crl = self._empty_crl(each.new, old.number + 2)
                 self._transaction.write(CRL, crl)
@@ -341,12 +345,12 @@ class _Rotator:
             write_bundle(self._transaction, each.file, each.roles, bundle, self._names)
             old_key = self._install_key(each)
             self.replacements.append(replace(each.replacement(), old_key=old_key))
-            if stage is Stage.RETIRE:
+            if stage is RotationStage.RETIRE:
                 self._keep_certificate(each.old[0])
         self._write_settings(successors)
-        if stage is Stage.REISSUE:
+        if stage is RotationStage.REISSUE:
             self._write_state(stage)
-        elif self._rotation.stage is not Stage.NONE:
+        elif self._rotation.stage is not RotationStage.NONE:
             self._transaction.remove(ROTATION)
 
     def _issue_again(
@@ -417,7 +421,7 @@ class _Rotator:
 
     # ── files ──────────────────────────────────────────────────────────────────────────────
 
-    def _write_state(self, stage: Stage) -> None:
+    def _write_state(self, stage: RotationStage) -> None:
         rotation = Rotation(stage, tuple(self.replacements))
         self._transaction.write(ROTATION, render_rotation(rotation))
 

@@ -1,4 +1,7 @@
-"""How far a rotation of CAs has come: its one small file, and who is on which CA."""
+"""The state of a rotation of CAs: its stage, the CAs it replaces, and the enclaves of each CA.
+
+This module only reads; `stages` changes.
+"""
 
 from __future__ import annotations
 
@@ -34,25 +37,25 @@ from sros_tool.validity import Window, iso
 from sros_tool.values import as_plain
 from sros_tool.xml import read_bytes
 
-SOON = timedelta(days=90)
-"""How long before its end a CA should be replaced."""
+_SOON = timedelta(days=90)
+"""How long before its expiry a CA should be replaced."""
 
 
-class Stage(StrEnum):
+class RotationStage(StrEnum):
     """The stages of a rotation, in their order; NONE is before the first and after the last."""
 
     NONE = "none"
     DISTRIBUTE = "distribute"
-    """The new CA stands beside the old one, which still issues."""
+    """The new CA is trusted next to the old one, which still issues."""
     REISSUE = "reissue"
-    """Everything is of the new CA; the old one is still trusted."""
+    """The new CA has issued everything; the old one is still trusted."""
     RETIRE = "retire"
-    """The old CA is trusted no longer, which ends the rotation."""
+    """The old CA is trusted no longer; the rotation is complete."""
 
 
 @dataclass(frozen=True, slots=True)
 class Replacement:
-    """A CA and the one that takes its place.
+    """A CA and the one that replaces it.
 
     ``file`` is the stem of its files ("identity_ca", "permissions_ca", or "ca" for both jobs);
     ``old`` and ``new`` are SHA-256 of the certificates; ``key`` is where the new key is, by URI or
@@ -66,25 +69,25 @@ class Replacement:
     old_key: str = ""
 
     def place_of_old(self, certificate: x509.Certificate) -> str:
-        """Where the key of the old CA, which has this ``certificate``, is once it was replaced."""
+        """Return the place of the old CA's key after the reissue, by the old ``certificate``."""
         return self.old_key or retired_key(certificate)
 
 
 @dataclass(frozen=True, slots=True)
 class Rotation:
-    """The stage that was reached, and the CAs that it is about."""
+    """The stage that was reached, and the CAs that are replaced."""
 
-    stage: Stage = Stage.NONE
+    stage: RotationStage = RotationStage.NONE
     replacements: tuple[Replacement, ...] = ()
 
-    def following(self) -> Stage:
-        """The next stage."""
-        order = list(Stage)
+    def following(self) -> RotationStage:
+        """Return the next stage."""
+        order = list(RotationStage)
         return order[order.index(self.stage) + 1]
 
 
 @dataclass(frozen=True, slots=True)
-class AuthorityState:
+class AuthorityStatus:
     """A CA that is trusted: ``standing`` is issuing, next or old; ``enclaves`` are on it."""
 
     file: str
@@ -98,31 +101,35 @@ class AuthorityState:
 
 @dataclass(frozen=True, slots=True)
 class RotationStatus:
-    """The stage of a keystore, its CAs, how many enclaves it has, and what vendors make of it."""
+    """The stage of a keystore, its CAs, its number of enclaves, and what to do, by vendor."""
 
     root: Path
     rotation: Rotation
-    authorities: tuple[AuthorityState, ...]
+    authorities: tuple[AuthorityStatus, ...]
     enclaves: int
     remarks: tuple[str, ...]
 
 
 def retired_key(certificate: x509.Certificate) -> str:
-    """The path of the key of a CA that was replaced."""
+    """Return the path of the key of a CA that was replaced."""
     return f"{RETIRED}/{certificate.serial_number:x}.key.pem"
 
 
 def read_rotation(root: Path) -> Rotation:
-    """The rotation that is under way, if one is; `KeystoreError` where it does not fit the CAs."""
+    """Return the rotation that is under way, or an empty one.
+
+    Raises:
+        KeystoreError: its file does not fit the CAs.
+    """
     path = root / ROTATION
     if not path.exists():
         return Rotation()
     try:
-        told = json.loads(path.read_bytes())
-        replacements = tuple(Replacement(**each) for each in told["replacements"])
-        rotation = Rotation(Stage(told["stage"]), replacements)
+        read = json.loads(path.read_bytes())
+        replacements = tuple(Replacement(**each) for each in read["replacements"])
+        rotation = Rotation(RotationStage(read["stage"]), replacements)
         for each in replacements:
-            issuing = each.old if rotation.stage is Stage.DISTRIBUTE else each.new
+            issuing = each.old if rotation.stage is RotationStage.DISTRIBUTE else each.new
             there = [digest(found) for found in certificates_of(root, each.file)]
             if there[0] != issuing or not {each.old, each.new} <= set(there):
                 raise ValueError
@@ -136,16 +143,16 @@ def read_rotation(root: Path) -> Rotation:
 
 
 def render_rotation(rotation: Rotation) -> bytes:
-    """The file of a rotation."""
-    told = {
+    """Return the content of the file of a rotation."""
+    content = {
         "stage": rotation.stage.value,
         "replacements": as_plain(rotation.replacements),
     }
-    return json.dumps(told, indent=2).encode() + b"\n"
+    return json.dumps(content, indent=2).encode() + b"\n"
 
 
 def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
-    """Where the keystore stands: each CA that is trusted, its end, and the enclaves on it."""
+    """Return the stage of a keystore, and each trusted CA with its expiry and its enclaves."""
     names = list_enclaves(root)
     rotation = read_rotation(root)
     by_file = {each.file: each for each in rotation.replacements}
@@ -159,7 +166,7 @@ def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
             if replaced and index and digest(certificate) == replaced.new:
                 standing = "next"
             states.append(
-                AuthorityState(
+                AuthorityStatus(
                     file,
                     roles,
                     standing,
@@ -169,14 +176,16 @@ def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
                     counts[index],
                 )
             )
-    remarks = _ending(states, now) if rotation.stage is Stage.NONE else _remarks(root, rotation)
+    remarks = (
+        _ending(states, now) if rotation.stage is RotationStage.NONE else _remarks(root, rotation)
+    )
     return RotationStatus(root, rotation, tuple(states), len(names), tuple(remarks))
 
 
 def _count(
     root: Path, names: Sequence[str], role: str, authorities: tuple[x509.Certificate, ...]
 ) -> Counter[int]:
-    """How many enclaves are on each CA, by certificate or else by signature."""
+    """Count the enclaves of each CA, by their certificates or by their signed permissions."""
     counts: Counter[int] = Counter()
     for name in names:
         folder = root / enclave_folder(name)
@@ -199,11 +208,11 @@ def _count(
 # ── what the vendors make of it ────────────────────────────────────────────────────────────
 
 
-def _ending(states: Sequence[AuthorityState], now: datetime) -> list[str]:
-    """What to do about CAs that end soon, or have ended."""
+def _ending(states: Sequence[AuthorityStatus], now: datetime) -> list[str]:
+    """Return what to do about CAs that expire soon, or have expired."""
     remarks = []
     for each in states:
-        if each.standing != "issuing" or each.validity.not_after - now > SOON:
+        if each.standing != "issuing" or each.validity.not_after - now > _SOON:
             continue
         name = "CA" if len(each.roles) > 1 else f"{each.roles[0]} CA"
         end = iso(each.validity.not_after)
@@ -226,14 +235,14 @@ def _ending(states: Sequence[AuthorityState], now: datetime) -> list[str]:
 
 
 def _remarks(root: Path, rotation: Rotation) -> list[str]:
-    """What to restart at this stage, and how, by vendor."""
+    """Return what to restart at this stage, and how, by vendor."""
     files = [each.file for each in rotation.replacements]
-    if rotation.stage is Stage.DISTRIBUTE:
+    if rotation.stage is RotationStage.DISTRIBUTE:
         return [
             "All vendors: restart the processes one by one, when it suits; those restarted and "
             "those not yet restarted talk with each other. Go on when all have been restarted."
         ]
-    hindrance = fast_dds_hindrance(root, files)
+    hindrance = _fast_dds_hindrance(root, files)
     remarks = [
         f"Fast DDS: {hindrance} Restart all processes together."
         if hindrance
@@ -251,7 +260,7 @@ def _remarks(root: Path, rotation: Rotation) -> list[str]:
 
 
 def lists_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
-    """Whether a revocation list of the one CA may be taken for one of the other.
+    """Whether OpenSSL may take a revocation list of one CA for a list of the other.
 
     OpenSSL looks for a list by name and key identifier.  Where the old CA has no identifier and the
     new one has its name, Fast DDS 2.9.1 finds the wrong list and starts no process at all (ran).
@@ -267,8 +276,8 @@ def _has_identifier(certificate: x509.Certificate) -> bool:
     return True
 
 
-def fast_dds_hindrance(root: Path, files: Sequence[str]) -> str:
-    """Why Fast DDS cannot trust the old and the new CA at once, as a sentence, or "".
+def _fast_dds_hindrance(root: Path, files: Sequence[str]) -> str:
+    """Return why Fast DDS cannot trust the old and the new CA at once, as a sentence, or "".
 
     Fast DDS 2.9.1 (ran): two CAs of one name are told apart by their key identifiers, and
     permissions CAs need to have one name and one algorithm on both sides.
