@@ -22,7 +22,7 @@ _LOG_FLUSH_SECONDS = 0.3
 _QUEUE_DEPTH = 10
 _FIBONACCI_PACKAGES = ("example_interfaces", "test_msgs", "action_tutorials_interfaces")
 
-Build = Callable[[Any, NodeOptions, EventWriter], Sequence[Any] | None]
+_Build = Callable[[Any, NodeOptions, EventWriter], Sequence[Any] | None]
 """Adds the endpoints and timers of a role to a node; returns further nodes of the process."""
 
 
@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_role(ROLES[options.role], options, [sys.argv[0], *arguments])
 
 
-def run_role(build: Build, options: NodeOptions, arguments: Sequence[str]) -> int:
+def run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> int:
     """Create a node, let ``build`` add its endpoints, and spin until stopped.
 
     ``arguments`` is the whole command line, from which rclpy takes its ``--ros-args``.  Returns
@@ -307,7 +307,7 @@ def _composed(node: Any, options: NodeOptions, events: EventWriter) -> list[Any]
     return [listener, server]
 
 
-ROLES: Mapping[str, Build] = {
+ROLES: Mapping[str, _Build] = {
     "talker": _talker,
     "listener": _listener,
     "observer": _observer,
