@@ -144,12 +144,7 @@ def render_template(template: Template) -> str:
         "\n[revocation]",
         f"validity = {_toml(duration_text(template.revocation_validity))}",
         "\n[protection]",
-        f"rtps = {_toml(protection.rtps)}",
-        f"discovery = {_toml(protection.discovery)}",
-        f"liveliness = {_toml(protection.liveliness)}",
-        f"allow_unauthenticated_participants = "
-        f"{_toml(protection.allow_unauthenticated_participants)}",
-        f"join_access_control = {_toml(protection.join_access_control)}",
+        *(f"{name} = {_toml(getattr(protection, name))}" for name in _OF_DOMAIN),
         "\n[protection.default]",
         *_topic_lines(protection.default),
     ]
@@ -184,14 +179,20 @@ def _toml(value: str | bool) -> str:
     return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
+_OF_DOMAIN: dict[str, Any] = {
+    field.name: field.default
+    for field in fields(DomainProtection)
+    if field.name not in ("default", "named")
+}
+"""What [protection] says of the whole domain, with its usual value."""
+
+
 def _protection(table: _Table) -> DomainProtection:
-    domain = DomainProtection(
-        rtps=table.level("rtps"),
-        discovery=table.level("discovery"),
-        liveliness=table.level("liveliness"),
-        allow_unauthenticated_participants=table.flag("allow_unauthenticated_participants", False),
-        join_access_control=table.flag("join_access_control", True),
-    )
+    values: dict[str, Any] = {}
+    for name, usual in _OF_DOMAIN.items():
+        is_flag = isinstance(usual, bool)
+        values[name] = table.flag(name, usual) if is_flag else table.level(name)
+    domain = DomainProtection(**values)
     if domain.allow_unauthenticated_participants and domain.rtps is not Level.NONE:
         raise _TemplateError(
             'protection.allow_unauthenticated_participants goes with rtps = "NONE" only, since '

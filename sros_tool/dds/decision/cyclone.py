@@ -389,12 +389,12 @@ def _topic_rule(node: _Node) -> TopicRule:
 
 
 def _values(node: _Node, rule: type[DomainRule | TopicRule]) -> dict[str, Any]:
-    values = {}
+    values: dict[str, Any] = {}
     for each in attributes(rule):
         child = node.last(each.name)
-        if child is None:
+        if child is None and each.default is None:
             raise UnreadableError(f"a <{node.tag}> lacks its <{each.name}>")
-        values[each.name] = _value(child, each)
+        values[each.name] = each.default if child is None else _value(child, each)
     return values
 
 

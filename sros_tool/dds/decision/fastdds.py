@@ -237,9 +237,13 @@ class _Sequence:
         self._children = element.elements
         self._index = 0
 
+    def is_next(self, name: str) -> bool:
+        """Return whether the next child has this name."""
+        return self._index < len(self._children) and self._children[self._index].name == name
+
     def next(self, name: str) -> XmlElement:
         """Return the next child, which must have this name."""
-        if self._index == len(self._children) or self._children[self._index].name != name:
+        if not self.is_next(name):
             raise UnreadableError(f"<{self._name}> lacks <{name}> in its place")
         self._index += 1
         return self._children[self._index - 1]
@@ -367,7 +371,11 @@ def _topic_rule(element: XmlElement) -> TopicRule:
 
 
 def _values(take: _Sequence, rule: type[DomainRule | TopicRule]) -> dict[str, Any]:
-    return {each.name: _value(take.next(each.name), each) for each in attributes(rule)}
+    values: dict[str, Any] = {}
+    for each in attributes(rule):
+        left_out = each.default is not None and not take.is_next(each.name)
+        values[each.name] = each.default if left_out else _value(take.next(each.name), each)
+    return values
 
 
 # ── permissions ────────────────────────────────────────────────────────────────────────────
