@@ -295,6 +295,16 @@ def test_every_check_is_run_and_shown_and_the_worst_counts(
     assert lines[-1].startswith("ruff check ok; ruff format ok; ")
 
 
+def test_every_test_on_a_real_dds_is_in_the_folders_that_are_searched_for_them() -> None:
+    marked = {
+        str(path.relative_to(CHECKOUT))
+        for path in (CHECKOUT / "tests").rglob("test_*.py")
+        if path.name != "test_dev_commands.py" and "pytest.mark.dds" in path.read_text()
+    }
+    assert marked
+    assert not [name for name in marked if not name.startswith(checks.WITH_DDS)]
+
+
 def test_one_package_that_fails_does_not_keep_the_others_away(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

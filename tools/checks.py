@@ -23,6 +23,9 @@ _PLUGINS = "xdist.plugin,_hypothesis_pytestplugin"
 LONG = "--long"
 """The argument that brings the long forms of the tests, as the variable SROS_LONG does."""
 
+WITH_DDS = ("tests/integration", "tests/explain")
+"""The folders with all tests that start DDS processes; the others need not be imported for them."""
+
 RUFF = {
     "ruff check": ["-m", "ruff", "check", "--quiet"],
     "ruff format": ["-m", "ruff", "format", "--check", "--quiet"],
@@ -53,7 +56,7 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     cores = len(os.sched_getaffinity(0))
     parts = {
         "tests": ["-m", "not dds", "-n", str(cores), "--dist", "worksteal"],
-        "tests on a real DDS": ["-m", "dds", "-n", str(2 * cores), "--dist", "loadfile"],
+        "tests on a real DDS": ["-m", "dds", "-n", str(2 * cores), "--dist", "loadfile", *WITH_DDS],
     }
     reports = {name: VENV / f"{name.replace(' ', '-')}.xml" for name in parts}
     for report in reports.values():
