@@ -99,7 +99,7 @@ def _timed(action: Callable[[int], object], rounds: int) -> float:
 def _artifacts(folder: Path, count: int, rounds: int) -> list[Row]:
     from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
     from sros_tool.keystore.template import load_template
-    from sros_tool.policy import read_policy
+    from sros_tool.policy.document import read_policy
 
     now = datetime.now(UTC)
     policy = folder / "enclaves.xml"
@@ -133,7 +133,7 @@ def _topics(folder: Path, most: int, rounds: int) -> list[Row]:
         create_permission,
     )
     from sros_tool.keystore.template import load_template
-    from sros_tool.policy import read_policy
+    from sros_tool.policy.document import read_policy
 
     now = datetime.now(UTC)
     root = folder / "topics"

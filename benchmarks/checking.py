@@ -21,7 +21,7 @@ def checking(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Figur
     from sros_tool.checks.policies import policy_file_findings
     from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
     from sros_tool.keystore.template import load_template
-    from sros_tool.policy import read_policy
+    from sros_tool.policy.document import read_policy
 
     now = datetime.now(UTC)
     root, file = folder / "checked", folder / "checked.xml"

@@ -26,7 +26,7 @@ def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fig
     from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
     from sros_tool.keystore.rights import load_rights
     from sros_tool.keystore.template import load_template
-    from sros_tool.policy import read_policy
+    from sros_tool.policy.document import read_policy
     from sros_tool.translate import permissions_for
     from sros_tool.validity import window
 

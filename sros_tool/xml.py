@@ -15,7 +15,7 @@ from sros_tool.errors import DocumentError
 
 _LOG = logging.getLogger(__name__)
 
-MAX_BYTES = 16 * 1024 * 1024
+_MAX_BYTES = 16 * 1024 * 1024
 """Largest document that is read, in bytes."""
 
 
@@ -39,7 +39,7 @@ def read_bytes(path: Path, what: str) -> bytes:
         if not stat.S_ISREG(there.st_mode):
             raise DocumentError(f"the {what} '{path}' is not a regular file")
         data = b""
-        if there.st_size <= MAX_BYTES:
+        if there.st_size <= _MAX_BYTES:
             with path.open("rb", buffering=0) as file:
                 data = file.readall()
     except (OSError, ValueError) as error:
@@ -49,9 +49,9 @@ def read_bytes(path: Path, what: str) -> bytes:
         raise DocumentError(
             f"the {what} '{path}' cannot be read", f"{os.strerror(number)}."
         ) from error
-    if max(there.st_size, len(data)) > MAX_BYTES:
+    if max(there.st_size, len(data)) > _MAX_BYTES:
         raise DocumentError(
-            f"the {what} '{path}' is too large", f"More than {MAX_BYTES // 1024**2} MiB."
+            f"the {what} '{path}' is too large", f"More than {_MAX_BYTES // 1024**2} MiB."
         )
     _LOG.debug("read the %s '%s', %d bytes", what, path, len(data))
     return data
@@ -80,7 +80,7 @@ def parse(data: bytes, name: str) -> etree._Element:
     return root
 
 
-def text_of(element: etree._Element) -> str:
+def _text_of(element: etree._Element) -> str:
     """Return the character data of an element without child elements, as it stands."""
     return element.text or ""
 

@@ -14,7 +14,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Permissions, Rule
 from sros_tool.names import ROS_DISCOVERY_TOPIC, expand
-from sros_tool.policy import ALLOW, DENY, RIGHTS, Enclave, Group, Profile, Profiles, Qualifier
+from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Group, Profile, Profiles, Qualifier
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.protection import (
     DomainProtection,

@@ -193,7 +193,7 @@ def _circumstances(
 ) -> Circumstances:
     from sros_tool.checks.targets import Circumstances
     from sros_tool.cli.common import local_zone
-    from sros_tool.policy import read_policy
+    from sros_tool.policy.document import read_policy
 
     read = tuple(read_policy(each) for each in policies)
     return Circumstances(moment_of(moment), local_zone(os.environ), domain_of(domain), read)

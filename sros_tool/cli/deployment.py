@@ -27,7 +27,7 @@ from sros_tool.cli.common import (
 )
 from sros_tool.errors import DocumentError, UsageError
 
-STREAM = Path("-")
+_STREAM = Path("-")
 """Standard input or output, where a file could be named."""
 
 
@@ -78,15 +78,15 @@ def distribute_key(
     target = PATH.convert(rest[-1], None, None)
     _check_target(root, rest[-1])
     selection = select(root, names, patterns, every=every)
-    if target == STREAM:
+    if target == _STREAM:
         if not dry_run:
-            refuse_terminal()
+            _refuse_terminal()
         packed = pack_enclaves(root, selection.names, now=now())
         if dry_run:
             for path in packed.paths:
                 click.echo(f"would send {path}")
         else:
-            write_stdout(packed.data)
+            _write_stdout(packed.data)
         where, done = "standard output", not dry_run
     else:
         export = distribute(root, selection.names, target, now=now(), force=force, dry_run=dry_run)
@@ -101,7 +101,7 @@ def distribute_key(
             if change.action == "replace":
                 click.echo(f"replaced {change.path}", err=True)
     for name in selection.names if done else ():
-        click.echo(f"exported enclave {name} to {where}", err=target == STREAM)
+        click.echo(f"exported enclave {name} to {where}", err=target == _STREAM)
     for name in selection.left_out:
         click.echo(f"left out enclave {name}: its key was made on its robot", err=True)
 
@@ -118,14 +118,14 @@ def _check_target(root: Path, word: str) -> None:
         )
 
 
-def write_stdout(data: bytes) -> None:
+def _write_stdout(data: bytes) -> None:
     """Write binary data on standard output, after what was printed."""
     sys.stdout.flush()
     sys.stdout.buffer.write(data)
     sys.stdout.buffer.flush()
 
 
-def refuse_terminal() -> None:
+def _refuse_terminal() -> None:
     """Raise `UsageError` where binary data would land on a terminal."""
     if sys.stdout is not None and sys.stdout.isatty():
         raise UsageError(
@@ -269,7 +269,7 @@ def sign_request(
     from sros_tool.keystore.layout import PERMISSIONS
     from sros_tool.keystore.reader import load_ca_certificate
     from sros_tool.pki.certificates import digest
-    from sros_tool.policy import read_policy
+    from sros_tool.policy.document import read_policy
     from sros_tool.runtime.environment import domain_from
 
     root, rest = split_root(words) if len(words) > 1 else (keystore_from_environment(), words)
@@ -277,10 +277,10 @@ def sign_request(
         raise UsageError("sign_request takes a keystore and one request")
     request = PATH.convert(rest[0], None, None)
     if output is None:
-        output = STREAM if request == STREAM else Path(request.name).with_suffix(".answer.tar.gz")
-    stream = output == STREAM
+        output = _STREAM if request == _STREAM else Path(request.name).with_suffix(".answer.tar.gz")
+    stream = output == _STREAM
     if stream and not dry_run:
-        refuse_terminal()
+        _refuse_terminal()
     signed = sign(
         root,
         _read(request, "signing request"),
@@ -299,7 +299,7 @@ def sign_request(
             click.echo(f"would {'replace' if output.exists() else 'create'} {output}")
     else:
         if stream:
-            write_stdout(signed.archive)
+            _write_stdout(signed.archive)
         word = "renewed" if renew else "signed the request of"
         click.echo(f"{word} enclave {signed.name} for the key {signed.key}", err=stream)
         permissions_ca = load_ca_certificate(root, PERMISSIONS)
@@ -377,7 +377,7 @@ def _read(path: Path, what: str) -> bytes:
     from sros_tool.keystore.delivery.archive import MAX_PACKED
     from sros_tool.xml import read_bytes
 
-    if path != STREAM:
+    if path != _STREAM:
         return read_bytes(path, what)
     data = sys.stdin.buffer.read(MAX_PACKED + 1) if sys.stdin else b""
     if not data:

@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from sros_tool.policy.model import Policy
 
 
-NO_NODES = "No nodes detected in the ROS graph. No policy file was generated."
+_NO_NODES = "No nodes detected in the ROS graph. No policy file was generated."
 """The message of ros2/sros2; scripts look for it."""
 _FOREVER = "until Ctrl-C"
 _DURATION = re.compile(r"\d+[smhdwy]\Z", re.ASCII)
@@ -156,7 +156,7 @@ def generate_policy(
     snapshot, rmw = _observe(environment, watch, spin_time, common, secured=enclave is not None)
     learned = learn(snapshot.observation, None if flat else common)
     if not learned.profiles:
-        click.echo(NO_NODES, err=True)
+        click.echo(_NO_NODES, err=True)
         print_notes(learned.notes)
         click.echo(_why_empty(environment, snapshot.seconds, rmw, enclave), err=True)
         return 1
@@ -175,7 +175,7 @@ def generate_policy(
 
 def _present_policy(file: Path | None) -> Policy | None:
     """Return the existing policy, if any; read before observing, as it may be broken."""
-    from sros_tool.policy import read_policy
+    from sros_tool.policy.document import read_policy
 
     if file is None:
         return None

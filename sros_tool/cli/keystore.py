@@ -87,7 +87,7 @@ Example:
 def create_permission(words: tuple[str, ...], dry_run: bool) -> None:
     """Give the enclave NAME the permissions that the policy in POLICY_FILE states for it."""
     from sros_tool.keystore.lifecycle.create import create_permission as create
-    from sros_tool.policy import read_policy
+    from sros_tool.policy.document import read_policy
 
     root, rest = split_root(words)
     if len(rest) != 2:
@@ -153,7 +153,7 @@ def generate_artifacts(
     """
     from sros_tool.keystore.lifecycle.create import generate_artifacts as generate
     from sros_tool.keystore.template import load_template
-    from sros_tool.policy import read_policy
+    from sros_tool.policy.document import read_policy
 
     root = keystore_root_path or keystore_from_environment()
     if not enclaves and not policy_files:
@@ -177,7 +177,7 @@ def generate_artifacts(
         )
     if result.new_keystore and not dry_run:
         click.echo(f"'{root}' is not a valid keystore, creating new keystore", err=True)
-        say_new_keystore(root, template, result.domains)
+        _say_new_keystore(root, template, result.domains)
     _show(result, dry_run)
 
 
@@ -325,7 +325,7 @@ def create_keystore(
     if dry_run:
         print_plan(root, result.changes)
         return
-    say_new_keystore(root, template, result.domains)
+    _say_new_keystore(root, template, result.domains)
     _say_what_is_open(template)
 
 
@@ -367,7 +367,7 @@ def _imported(files: dict[str, Path | None]) -> dict[str, bytes]:
     }
 
 
-def say_new_keystore(root: Path, template: Template, domains: DomainSet) -> None:
+def _say_new_keystore(root: Path, template: Template, domains: DomainSet) -> None:
     """Say what was made, and by which choices."""
     from sros_tool.keystore.layout import ROLES
     from sros_tool.keystore.reader import load_ca_certificate

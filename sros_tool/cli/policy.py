@@ -474,7 +474,7 @@ Example:
 @dry_run_option
 def policies(target: Path | None, as_json: bool, dry_run: bool) -> None:
     """List the policies that ship with sros, with their enclaves, or copy them."""
-    from sros_tool.policy import read_policy
+    from sros_tool.policy.document import read_policy
     from sros_tool.resources import policies_dir
 
     source = policies_dir()

@@ -20,7 +20,7 @@ from sros_tool.dds.permissions import XSI
 from sros_tool.errors import DocumentError
 from sros_tool.xml import parse, tag_of
 
-SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_governance.xsd"
+_SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_governance.xsd"
 
 
 class ProtectionKind(StrEnum):
@@ -157,7 +157,7 @@ def render_governance(governance: Governance) -> bytes:
     """Return the document as XML in UTF-8, with its elements in the order of the schema."""
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
-        f'<dds xmlns:xsi="{XSI}" xsi:noNamespaceSchemaLocation="{SCHEMA}">',
+        f'<dds xmlns:xsi="{XSI}" xsi:noNamespaceSchemaLocation="{_SCHEMA}">',
         "  <domain_access_rules>",
     ]
     for rule in governance.domain_access_rules:

@@ -16,7 +16,7 @@ from sros_tool.errors import DocumentError
 from sros_tool.validity import Window, iso, parse_iso
 from sros_tool.xml import parse, tag_of
 
-SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_permissions.xsd"
+_SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_permissions.xsd"
 XSI = "http://www.w3.org/2001/XMLSchema-instance"
 MAX_SIGNED_BYTES = 64 * 1024
 """From so many bytes of signed permissions on, Fast DDS 2.9 never finishes a handshake."""
@@ -84,7 +84,7 @@ def render_permissions(permissions: Permissions) -> bytes:
     """Return the document as XML in UTF-8, with its elements in the order of the schema."""
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
-        f'<dds xmlns:xsi="{XSI}" xsi:noNamespaceSchemaLocation="{SCHEMA}">',
+        f'<dds xmlns:xsi="{XSI}" xsi:noNamespaceSchemaLocation="{_SCHEMA}">',
         "  <permissions>",
     ]
     for each in permissions.grants:

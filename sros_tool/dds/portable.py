@@ -36,7 +36,7 @@ _CONSEQUENCES = {
 }
 
 
-def either_matches(one: str, other: str) -> bool:
+def _either_matches(one: str, other: str) -> bool:
     """Whether one expression means the other; two that only share some names are not seen."""
     return fnmatchcase(one, other) or fnmatchcase(other, one)
 
@@ -44,7 +44,7 @@ def either_matches(one: str, other: str) -> bool:
 def outside(
     permissions: Permissions,
     signed_bytes: int,
-    share: Callable[[str, str], bool] = either_matches,
+    share: Callable[[str, str], bool] = _either_matches,
 ) -> Iterator[tuple[str, str]]:
     """Yield what of a document lies outside of the profile: the id of the remark, and a clause.
 

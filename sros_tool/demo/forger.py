@@ -174,11 +174,11 @@ Forge = Callable[[KeystoreCopy], None]
 """Turns a keystore into what an attacker would use."""
 
 
-def unchanged(_copy: KeystoreCopy) -> None:
+def _unchanged(_copy: KeystoreCopy) -> None:
     """Leave the keystore as it is."""
 
 
-def same_template(template: Template) -> Template:
+def _same_template(template: Template) -> Template:
     """Return the template as it is."""
     return template
 
@@ -187,8 +187,8 @@ def same_template(template: Template) -> Template:
 class Undefended:
     """A keystore made again without a defence: from a changed template, then forged in."""
 
-    forge: Forge = unchanged
-    template: Callable[[Template], Template] = same_template
+    forge: Forge = _unchanged
+    template: Callable[[Template], Template] = _same_template
 
 
 def name_of(forgery: Forge | Undefended) -> str:

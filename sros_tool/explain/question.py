@@ -15,7 +15,7 @@ from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right
 from sros_tool.translate import dds_names, service_of
 
-JOIN = "join"
+_JOIN = "join"
 TYPES = ("topic", "service", "action")
 _RIGHTS = {
     ("publish", "topic"): "publish",
@@ -27,7 +27,7 @@ _RIGHTS = {
     ("request", "service"): "request",
     ("reply", "service"): "reply",
 }
-WORDS = (*dict.fromkeys(word for word, _ in _RIGHTS), JOIN)
+WORDS = (*dict.fromkeys(word for word, _ in _RIGHTS), _JOIN)
 """What can be asked for; request and reply are the policy's words for call and serve."""
 
 _ROLES = {"rq": "requests", "rr": "replies"}
@@ -107,10 +107,10 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
             "",
             f"Ask for {', '.join(WORDS[:-1])} or {WORDS[-1]}.",
         )
-    if word == JOIN:
+    if word == _JOIN:
         if name or kind:
             raise UsageError("join takes neither a name nor a type", "It is about the domain.")
-        return Question(JOIN)
+        return Question(_JOIN)
     fitting = [each for each in TYPES if (word, each) in _RIGHTS]
     chosen = kind or fitting[0]
     if chosen not in fitting:

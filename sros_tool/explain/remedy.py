@@ -113,6 +113,6 @@ def _has_authorities(keystore: Path) -> bool:
     return (keystore / PRIVATE).is_dir() or (keystore / LEDGER).is_file()
 
 
-def known_causes() -> frozenset[str]:
+def _known_causes() -> frozenset[str]:
     """Return the ids of the faults and the reasons of decisions for which there is a remedy."""
     return frozenset((*FAULTS, *_BY_REASON))

@@ -73,7 +73,7 @@ def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
     if common and document != before:
         by_name, shown = _parted(path, before, merged.document, learned, common)
         document = merge_into(path, by_name.policy()).document
-        document, included = with_includes(path, before, document, shown)
+        document, included = _with_includes(path, before, document, shown)
     least = policy_rights(read_policy(path, merged.document))
     return Draft(
         path,
@@ -194,7 +194,7 @@ def _includes(profile: LearnedProfile, include: str) -> Iterator[str]:
         yield f'<{include} href="{part}" xpointer="xpointer(/profile/*)"/>'
 
 
-def with_includes(
+def _with_includes(
     path: Path, before: bytes, merged: bytes, profiles: Iterable[LearnedProfile]
 ) -> tuple[bytes, tuple[str, ...]]:
     """Return ``merged`` (the file ``before`` with learned rights) with includes, and those parts.

@@ -66,7 +66,7 @@ class RosGraph:
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
-        require_rclpy()
+        _require_rclpy()
         self._environment = {**os.environ, **(environment or {})}
         self.rmw = ""
 
@@ -123,7 +123,7 @@ class RosGraph:
             (participant, ns, name, Endpoint(topic, direction))
             for participant, ns, name, topic, direction in line["endpoints"]
         )
-        return resolve(Sighting(parse_listed(line["listed"]), endpoints, line["ordered"]))
+        return resolve(Sighting(_parse_listed(line["listed"]), endpoints, line["ordered"]))
 
     def close(self) -> None:
         """End the observer, politely first, so that the graph forgets it at once."""
@@ -173,7 +173,7 @@ class RosGraph:
         return ObserverError(what, f"{answer['reason']}".rstrip(".") + ".", output)
 
 
-def require_rclpy() -> None:
+def _require_rclpy() -> None:
     """Raise `UnavailableError` if this Python has no rclpy."""
     if importlib.util.find_spec("rclpy") is None:
         raise UnavailableError(
@@ -185,7 +185,7 @@ def require_rclpy() -> None:
         )
 
 
-def parse_listed(listed: Sequence[Sequence[str]]) -> tuple[Listed, ...]:
+def _parse_listed(listed: Sequence[Sequence[str]]) -> tuple[Listed, ...]:
     """Return the announced nodes from the JSON of the observer."""
     return tuple((enclave, ns, name) for enclave, ns, name in listed)
 

@@ -58,7 +58,7 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
             return {
                 "kind": "enclave",
                 "path": str(path),
-                **describe_enclave(open_enclave(path, now=now)),
+                **_describe_enclave(open_enclave(path, now=now)),
             }
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
@@ -128,12 +128,12 @@ def _keystore(root: Path, now: datetime) -> Description:
 
 def _enclave(name: str, state: OpenedEnclave) -> Description:
     """Return an enclave of a keystore; that its key stays on its robot is no problem there."""
-    described = describe_enclave(state)
+    described = _describe_enclave(state)
     described["problems"] = [str(problem) for problem in state.problems_at_home]
     return {"name": name, "key_on_robot": state.key_on_robot, **described}
 
 
-def describe_enclave(state: OpenedEnclave) -> Description:
+def _describe_enclave(state: OpenedEnclave) -> Description:
     """Return the state of an enclave: ``loadable`` says whether a process can run in it now."""
     domains = state.domains()
     return {
@@ -151,7 +151,7 @@ def describe_enclave(state: OpenedEnclave) -> Description:
     }
 
 
-def describe_certificate(certificate: x509.Certificate, now: datetime) -> Description:
+def _describe_certificate(certificate: x509.Certificate, now: datetime) -> Description:
     """Return the parts of a certificate that matter to DDS Security."""
     validity = validity_of(certificate)
     try:
@@ -176,9 +176,9 @@ def describe_certificate(certificate: x509.Certificate, now: datetime) -> Descri
 def _certificates(data: bytes, name: str, now: datetime) -> Description:
     """Return the first certificate of a file, with what else it holds as "further" and "crl"."""
     certificate, *further = load_certificates(data, name)
-    described = describe_certificate(certificate, now)
+    described = _describe_certificate(certificate, now)
     if further:  # the chain of a CA, or the other one while a CA is being replaced
-        described["further"] = [describe_certificate(each, now) for each in further]
+        described["further"] = [_describe_certificate(each, now) for each in further]
     if CRL_MARK in data:
         described["crl"] = _list(load_crl(data, name), now)
     return described

@@ -90,7 +90,7 @@ def parse_threshold(text: str) -> Threshold:
     return Threshold(elapsed=int(match[1]) / 100)
 
 
-def lifetimes(root: Path) -> tuple[Lifetime, ...]:
+def _lifetimes(root: Path) -> tuple[Lifetime, ...]:
     """Return the lifetime of each enclave of a keystore, in the order of names.
 
     Raises:

@@ -83,7 +83,7 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
             with suppress(PkiError):
                 read[file] = _certificates(state.files[file], file)
     for file, certificates in read.items():
-        if fault := authority_fault(traits, certificates, at):
+        if fault := _authority_fault(traits, certificates, at):
             yield Problem(file, *fault)
     authorities = read.get(IDENTITY_CA_FILE)
     if authorities and state.certificate:
@@ -106,13 +106,13 @@ def _signature_fault(
 ) -> str:
     # The enclaves of a keystore have their governance in common.
     try:
-        return signer_fault(traits, smime.parse(message), signers, at)
+        return _signer_fault(traits, smime.parse(message), signers, at)
     except PkiError as error:
         return str(error)
 
 
 @lru_cache(maxsize=16)
-def authority_fault(
+def _authority_fault(
     traits: VendorTraits, certificates: Certificates, at: datetime
 ) -> tuple[str, Fault] | None:
     """Return why the vendor refuses a CA file as such, and the fault; None if it takes it.
@@ -139,7 +139,7 @@ def authority_refusals(role: str, certificates: Certificates, at: datetime) -> d
     refusals = {}
     for vendor in MEASURED:
         traits = vendor.traits
-        fault = authority_fault(traits, certificates, at)
+        fault = _authority_fault(traits, certificates, at)
         if fault:
             refusals[vendor] = fault[0]
         elif role == IDENTITY:
@@ -168,7 +168,7 @@ def refusals_text(refusals: Mapping[Vendor, str]) -> str:
     return "; ".join(clauses)
 
 
-def signer_fault(
+def _signer_fault(
     traits: VendorTraits, signed: smime.SignedDocument, certificates: Certificates, at: datetime
 ) -> str:
     """Return why the vendor refuses the signature of a document, or "".

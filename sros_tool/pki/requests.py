@@ -14,7 +14,7 @@ from sros_tool.errors import PkiError
 from sros_tool.pki.certificates import common_name, common_name_of, subject_text
 from sros_tool.pki.keys import PrivateKey, PublicKey, algorithm
 
-MAX_BYTES = 64 * 1024
+_MAX_BYTES = 64 * 1024
 """Largest request that is read."""
 _DIGESTS = (hashes.SHA256, hashes.SHA384, hashes.SHA512)
 
@@ -41,7 +41,7 @@ def load_request(data: bytes, what: str) -> SigningRequest:
     request asks for have no effect: the keystore decides what a certificate says.
     """
     try:
-        if len(data) > MAX_BYTES:
+        if len(data) > _MAX_BYTES:
             raise ValueError("too large")
         request = x509.load_pem_x509_csr(data)
         subject, public, digest = (

@@ -17,7 +17,7 @@ from cryptography.hazmat.primitives.serialization import load_der_public_key
 from sros_tool.errors import PkiError, UnavailableError, UsageError
 
 SCHEME = "pkcs11:"
-MODULE_VARIABLE = "PKCS11_MODULE_PATH"
+_MODULE_VARIABLE = "PKCS11_MODULE_PATH"
 Secrets = Callable[[str], str]
 """Answers with the secret for what it is told; never asked more than once for one thing."""
 
@@ -32,7 +32,7 @@ class TokenUri:
     pin_source: str = ""
 
 
-def parse_uri(uri: str) -> TokenUri:
+def _parse_uri(uri: str) -> TokenUri:
     """Read ``pkcs11:token=NAME;object=LABEL?module-path=FILE``.
 
     Without ``module-path``, $PKCS11_MODULE_PATH names the module.  A ``pin-value`` is refused: a
@@ -47,13 +47,13 @@ def parse_uri(uri: str) -> TokenUri:
             "The PIN would be written into the keystore's settings.",
             "Leave it out; SROS_PKCS11_PIN or pin-source=FILE says it.",
         )
-    module = options.get("module-path", os.environ.get(MODULE_VARIABLE, ""))
+    module = options.get("module-path", os.environ.get(_MODULE_VARIABLE, ""))
     token, label = unquote(parts.get("token", "")), unquote(parts.get("object", ""))
     if not uri.startswith(SCHEME) or not token or not label or not module:
         raise UsageError(
             f"{uri!r} does not name a key on a token",
             "It needs a token, an object and a module.",
-            f"Write pkcs11:token=NAME;object=LABEL?module-path=FILE, or set {MODULE_VARIABLE}.",
+            f"Write pkcs11:token=NAME;object=LABEL?module-path=FILE, or set {_MODULE_VARIABLE}.",
         )
     return TokenUri(token, label, module, options.get("pin-source", "").removeprefix("file:"))
 
@@ -123,7 +123,7 @@ def holds_token_key(uri: str, secrets: Secrets) -> bool:
     _need_package()
     import pkcs11
 
-    parsed = parse_uri(uri)
+    parsed = _parse_uri(uri)
     try:
         session = _session(parsed, secrets, write=False)
         return any(True for _ in session.get_objects({pkcs11.Attribute.LABEL: parsed.object}))
@@ -142,7 +142,7 @@ def create_token_key(uri: str, secrets: Secrets) -> TokenKey:
 
 
 def _open(uri: str, secrets: Secrets, *, create: bool) -> TokenKey:
-    parsed = parse_uri(uri)
+    parsed = _parse_uri(uri)
     _need_package()
     import pkcs11
     from pkcs11.util.ec import encode_ec_public_key

@@ -23,7 +23,7 @@ _WILDCARD = re.compile(r"[*?\[]")
 _PIECE = re.compile(r"\*+|\?|\[(!?)([^\]]+)\]|(.)", re.DOTALL)
 _RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
 _ALPHABET = frozenset(map(chr, range(33, 127)))  # wider than ROS names: DDS topics may be foreign
-ANY: frozenset[str] = frozenset()
+_ANY: frozenset[str] = frozenset()
 """Stands for ``*`` among the pieces of a pattern."""
 
 
@@ -60,16 +60,16 @@ def covers(wide: str, narrow: str) -> bool:
 
 @lru_cache(maxsize=_MANY)
 def _covers(wide: str, narrow: str) -> bool:
-    outer, inner = pieces(wide), pieces(narrow)
+    outer, inner = _pieces(wide), _pieces(narrow)
     # reached[i]: the first i pieces of outer cover the pieces of inner that were seen so far.
     reached = _after_stars({0}, outer)
     for piece in inner:
-        following = {i for i in reached if i < len(outer) and outer[i] is ANY}
-        if piece is not ANY:
+        following = {i for i in reached if i < len(outer) and outer[i] is _ANY}
+        if piece is not _ANY:
             following |= {
                 i + 1
                 for i in reached
-                if i < len(outer) and outer[i] is not ANY and piece <= outer[i]
+                if i < len(outer) and outer[i] is not _ANY and piece <= outer[i]
             }
         reached = _after_stars(following, outer)
     return len(outer) in reached
@@ -87,7 +87,7 @@ def overlap(one: str, other: str) -> bool:
 
 @lru_cache(maxsize=_MANY)
 def _overlap(one: str, other: str) -> bool:
-    first, second = pieces(one), pieces(other)
+    first, second = _pieces(one), _pieces(other)
     seen: set[tuple[int, int]] = set()
     states = [(0, 0)]
     while states:
@@ -100,11 +100,11 @@ def _overlap(one: str, other: str) -> bool:
             return True
         here = first[i] if i < len(first) else None
         there = second[j] if j < len(second) else None
-        if here is ANY:
+        if here is _ANY:
             states.append((i + 1, j))
             if there is not None:
                 states.append((i, j + 1))
-        if there is ANY:
+        if there is _ANY:
             states.append((i, j + 1))
             if here is not None:
                 states.append((i + 1, j))
@@ -117,14 +117,14 @@ def _after_stars(reached: set[int], pieces: tuple[frozenset[str], ...]) -> set[i
     """Return the places reached when stars that follow stand for nothing."""
     grown = set(reached)
     for i in sorted(reached):
-        while i < len(pieces) and pieces[i] is ANY:
+        while i < len(pieces) and pieces[i] is _ANY:
             i += 1
             grown.add(i)
     return grown
 
 
 @lru_cache(maxsize=_MANY)
-def pieces(expression: str) -> tuple[frozenset[str], ...]:
+def _pieces(expression: str) -> tuple[frozenset[str], ...]:
     """An expression piece by piece: `ANY` for ``*``, else the characters that fit one place."""
     found: list[frozenset[str]] = []
     for piece in _PIECE.finditer(expression):
@@ -135,7 +135,7 @@ def pieces(expression: str) -> tuple[frozenset[str], ...]:
             chosen = _members(members)
             found.append(_ALPHABET - chosen if negated else chosen)
         else:
-            found.append(_ALPHABET if piece[0] == "?" else ANY)
+            found.append(_ALPHABET if piece[0] == "?" else _ANY)
     return tuple(found)
 
 
@@ -175,7 +175,7 @@ def common_name(
 
 @lru_cache(maxsize=4096)
 def _search(wanted: tuple[str, ...], unwanted: tuple[str, ...], begin: int) -> str | None:
-    patterns = [pieces(each) for each in (*wanted, *unwanted)]
+    patterns = [_pieces(each) for each in (*wanted, *unwanted)]
     alphabet = _representatives(patterns)
     start: _State = (begin, tuple(_closed({0}, each) for each in patterns))
     before: dict[_State, tuple[_State, str] | None] = {start: None}
@@ -216,7 +216,7 @@ def _spelt(state: _State, before: dict[_State, tuple[_State, str] | None]) -> st
 
 def _representatives(patterns: list[_Pieces]) -> str:
     """Return one letter of each kind that the patterns, and the grammar of names, tell apart."""
-    told = {piece for pattern in patterns for piece in pattern if piece is not ANY}
+    told = {piece for pattern in patterns for piece in pattern if piece is not _ANY}
     kinds: dict[tuple[object, ...], str] = {}
     for letter in _LETTERS:
         kind = (letter == "/", letter in digits, *(letter in piece for piece in told))
@@ -238,7 +238,7 @@ def _step(reached: frozenset[int], letter: str, pattern: _Pieces) -> frozenset[i
     for at in reached:
         if at == len(pattern):
             continue
-        if pattern[at] is ANY:
+        if pattern[at] is _ANY:
             following.add(at)
         elif letter in pattern[at]:
             following.add(at + 1)
@@ -252,6 +252,6 @@ def _closed(reached: set[int], pattern: _Pieces) -> frozenset[int]:
 
 def _onward(at: int, pattern: _Pieces) -> Iterator[int]:
     yield at
-    while at < len(pattern) and pattern[at] is ANY:
+    while at < len(pattern) and pattern[at] is _ANY:
         at += 1
         yield at

@@ -85,7 +85,7 @@ class Context:
 def compose(first: PictureSource, context: Context = Context()) -> Picture:
     """Return the picture of one source."""
     known = Known(first.rights)
-    edges = edges_of(first.rights, known, context.common)
+    edges = _edges_of(first.rights, known, context.common)
     stated = dict.fromkeys(folded(first.rights), OverlaySide.BOTH)
     return _picture((first,), edges, stated, known, context)
 
@@ -100,7 +100,7 @@ def overlay(
         for side in (first, second)
     ]
     known = Known(rights[0] | rights[1])
-    sides = [edges_of(each, known, context.common) for each in rights]
+    sides = [_edges_of(each, known, context.common) for each in rights]
     edges = _marked(*sides, allowed_by=kind == "use")
     normal = [folded(each) for each in rights]
     stated = {
@@ -156,7 +156,7 @@ def _picture(
             Name(
                 kind,
                 name,
-                namespace_of(name),
+                _namespace_of(name),
                 protection_of(governance, kind, name),
                 is_expression(name),
             )
@@ -208,10 +208,10 @@ def group_of(enclave: str, hosts: Mapping[str, str]) -> str:
         if place in hosts:
             return hosts[place]
         place = place.rpartition("/")[0]
-    return hosts.get("/", namespace_of(enclave))
+    return hosts.get("/", _namespace_of(enclave))
 
 
-def namespace_of(name: str) -> str:
+def _namespace_of(name: str) -> str:
     """Return the namespace of a name: the part before its last slash."""
     return name.rpartition("/")[0] or "/"
 
@@ -356,7 +356,7 @@ _WHOLE: dict[str, frozenset[tuple[str, str]]] = {
 _Found = dict[Qualifier, set[str]]
 
 
-def edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = ()) -> list[Edge]:
+def _edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = ()) -> list[Edge]:
     """Return every right and denial as edges to the names that it reaches; unsorted.
 
     A wildcard that reaches no known name leads to a name of its own.  ``common`` are the rights

@@ -15,7 +15,7 @@ from sros_tool.report.cost_plot import cost_section
 from sros_tool.report.page import asset, document
 
 Json = Mapping[str, Any]
-SKIPPED = "skipped"
+_SKIPPED = "skipped"
 
 
 def render_demo_page(result: Json) -> str:
@@ -45,7 +45,7 @@ def _sentence(text: str) -> str:
 def _head(result: Json) -> str:
     rows = result["rows"]
     good = sum(bool(row["as_expected"]) for row in rows)
-    skipped = sum(row["observed"] == SKIPPED for row in rows)
+    skipped = sum(row["observed"] == _SKIPPED for row in rows)
     opened = sum(bool(row.get("open_because")) for row in rows)
     where = "in a network of its own" if result["own_network"] else "in the network of the machine"
     facts = [
@@ -108,7 +108,7 @@ def _table(rows: Sequence[Json]) -> str:
 
 
 def _row(row: Json) -> Iterator[str]:
-    if row["observed"] == SKIPPED:
+    if row["observed"] == _SKIPPED:
         mark = '<span class="chip">skipped</span>'
     elif row["as_expected"]:
         mark = '<span class="chip good">ok</span>'

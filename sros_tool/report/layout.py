@@ -55,7 +55,7 @@ ONLOOKERS = {
     "call": "also called by",
     "execute": "also carried out by",
 }
-REACHES = {
+_REACHES = {
     "publish": "writes",
     "subscribe": "reads",
     "request": "calls",
@@ -63,7 +63,7 @@ REACHES = {
     "call": "calls",
     "execute": "carries out",
 }
-COMMON = {
+_COMMON = {
     "topics": "used by every node",
     "services": "served by every node",
     "actions": "used by every node",
@@ -335,10 +335,10 @@ class _Draft:
         notes += [
             f"{reach} {counted(self._looking[node, right], 'name')}: see {tag}"
             for (other, right), tag in self._tags.items()
-            for reach in (REACHES[right],)
+            for reach in (_REACHES[right],)
             if other == node and SENDS[right] is sends
         ]
-        lines = wrapped(label, _SIDE_LETTERS)
+        lines = _wrapped(label, _SIDE_LETTERS)
         return Card(
             id=side,
             role="group" if is_group else "enclave",
@@ -355,10 +355,10 @@ class _Draft:
 
     def _names_card(self, number: int, bundle: Bundle) -> Card:
         titles, notes = _names_title(bundle)
-        lines = tuple(line for title in titles for line in wrapped(title, _NAMES_LETTERS))
+        lines = tuple(line for title in titles for line in _wrapped(title, _NAMES_LETTERS))
         drawn = {tie.node for tie in bundle.ties}
         if len(self._everybody[bundle.kind, bundle.names[0]] - drawn):
-            notes = (*notes, COMMON[bundle.kind])
+            notes = (*notes, _COMMON[bundle.kind])
         tags = "".join(
             sorted({self._tags[tie.node, tie.right] for tie in bundle.ties if self._looks(tie)})
         )
@@ -472,7 +472,7 @@ def _common_namespace(names: Sequence[str]) -> str:
     return "/".join(found)
 
 
-def wrapped(text: str, letters: int) -> tuple[str, ...]:
+def _wrapped(text: str, letters: int) -> tuple[str, ...]:
     """Return ``text`` in lines of so many letters, cut at a slash or underscore if one is near."""
     lines = []
     while len(text) > letters:

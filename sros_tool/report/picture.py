@@ -21,7 +21,7 @@ SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
 )
 """Whether the arrow of a right leads to the name: the enclave sends first."""
 
-KINDS = (*RIGHTS, "dds")
+_KINDS = (*RIGHTS, "dds")
 """The kinds of names in the order they are shown; dds is a topic without a ROS name."""
 
 
@@ -275,7 +275,7 @@ def fold(
         Bundle(kind, protection, tuple(sorted(members)), tuple(sorted(found, key=_order)))
         for (kind, protection, found), members in bundles.items()
     )
-    return tuple(sorted(folded, key=lambda each: (KINDS.index(each.kind), each.names)))
+    return tuple(sorted(folded, key=lambda each: (_KINDS.index(each.kind), each.names)))
 
 
 def coarsened(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:

@@ -58,7 +58,7 @@ def read_source(path: Path, *, now: datetime) -> PictureSource:
     read = load_rights(path)
     findings = tuple(PicturedFinding(note.id, "warning", note.text) for note in read.notes)
     source = PictureSource(
-        SourceTitle(base_name(path), read.kind), read.rights, findings=findings, scope=read.scope
+        SourceTitle(_base_name(path), read.kind), read.rights, findings=findings, scope=read.scope
     )
     if read.kind == "policy":
         source = replace(source, nodes=_nodes(read_policy(path)))
@@ -87,7 +87,7 @@ def with_findings(
     return replace(source, findings=tuple(dict.fromkeys((*source.findings, *found))))
 
 
-def base_name(path: Path) -> str:
+def _base_name(path: Path) -> str:
     """How a source is called in a picture, in characters that every format can hold."""
     name = path.absolute().name or "/"
     return "".join(
@@ -129,7 +129,7 @@ def _observation(path: Path) -> PictureSource:
     policy = learned.policy()
     notes = tuple(PicturedFinding(note.id, "note", note.text) for note in learned.notes)
     return PictureSource(
-        SourceTitle(base_name(path), "observation"),
+        SourceTitle(_base_name(path), "observation"),
         policy_rights(policy),
         _nodes(policy),
         findings=notes,
@@ -167,7 +167,7 @@ def _with_keystore(source: PictureSource, root: Path, now: datetime) -> PictureS
 
 def _with_enclave(source: PictureSource, folder: Path, now: datetime) -> PictureSource:
     state = open_enclave(folder, now=now)
-    name = next(iter(sorted(source.scope or ())), base_name(folder))
+    name = next(iter(sorted(source.scope or ())), _base_name(folder))
     return replace(
         source,
         enclaves=(_described(name, state, state.problems),),
@@ -244,5 +244,5 @@ def _without_path(text: str, path: Path) -> str:
     places = {str(path), str(path.absolute()), str(path.resolve())}
     for place in sorted(places, key=len, reverse=True):
         if "/" in place and place != "/":
-            text = text.replace(place, base_name(path))
+            text = text.replace(place, _base_name(path))
     return _LINK.sub(r"\1", text)

@@ -114,7 +114,7 @@ def _docker(name: str, value: str) -> str:
 
 
 _LINES = {"sh": _sh, "fish": _fish, "systemd": _systemd, "docker": _docker}
-FORMS = ("sh", "fish", "json", "systemd", "docker")
+_FORMS = ("sh", "fish", "json", "systemd", "docker")
 
 # ── the command line of a node ─────────────────────────────────────────────────────────────
 

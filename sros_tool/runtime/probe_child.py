@@ -37,7 +37,7 @@ Close = Callable[[], None]
 """Leaves the domain, so that nothing stays behind."""
 
 
-def join_rclpy() -> tuple[Ask, Close]:
+def _join_rclpy() -> tuple[Ask, Close]:
     """Join as a node of rclpy with the RMW of ``RMW_IMPLEMENTATION``, or rclpy's default."""
     import rclpy
     from std_msgs.msg import String
@@ -58,7 +58,7 @@ def join_rclpy() -> tuple[Ask, Close]:
     return ask, close
 
 
-def join_cyclone() -> tuple[Ask, Close]:
+def _join_cyclone() -> tuple[Ask, Close]:
     """Join as a participant of the Cyclone DDS that sros itself uses."""
     participant = Participant(domain_of(os.environ), choose_enclave(os.environ).enclave)
 
@@ -71,7 +71,7 @@ def join_cyclone() -> tuple[Ask, Close]:
     return ask, participant.close
 
 
-def join_cyclonedds_package() -> tuple[Ask, Close]:
+def _join_cyclonedds_package() -> tuple[Ask, Close]:
     """Join as a participant of the Python package ``cyclonedds``, with the libddsc it brings."""
     core, domain, idl, pub, sub, topics = (
         importlib.import_module(f"cyclonedds.{name}")
@@ -90,10 +90,10 @@ def join_cyclonedds_package() -> tuple[Ask, Close]:
     return ask, lambda: None
 
 
-JOINS: dict[str, Callable[[], tuple[Ask, Close]]] = {
-    "rclpy": join_rclpy,
-    "cyclone": join_cyclone,
-    "cyclonedds": join_cyclonedds_package,
+_JOINS: dict[str, Callable[[], tuple[Ask, Close]]] = {
+    "rclpy": _join_rclpy,
+    "cyclone": _join_cyclone,
+    "cyclonedds": _join_cyclonedds_package,
 }
 
 
@@ -104,7 +104,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         enter_isolation()
     events = EventWriter(Path(report))
     try:
-        ask, close = JOINS[kind]()
+        ask, close = _JOINS[kind]()
     except Exception as error:
         stage = ProcessStage.IMPORT if isinstance(error, ImportError) else ProcessStage.PARTICIPANT
         events.report(EventKind.SEEN, _dds_in_memory())

@@ -82,7 +82,7 @@ class Stack:
 
 def survey(probe: ProbeEnclave) -> tuple[Stack, ...]:
     """Return every stack that sros can look for, also those that are not here."""
-    return (*rclpy_stacks(probe), cyclone_stack(probe), cyclonedds_package_stack(probe))
+    return (*rclpy_stacks(probe), cyclone_stack(probe), _cyclonedds_package_stack(probe))
 
 
 def rclpy_stacks(probe: ProbeEnclave) -> Iterator[Stack]:
@@ -115,7 +115,7 @@ def cyclone_stack(probe: ProbeEnclave) -> Stack:
     )
 
 
-def cyclonedds_package_stack(probe: ProbeEnclave) -> Stack:
+def _cyclonedds_package_stack(probe: ProbeEnclave) -> Stack:
     """Return the Python package ``cyclonedds``, which brings a libddsc of its own."""
     spec = importlib.util.find_spec("cyclonedds")
     if spec is None:

@@ -34,7 +34,7 @@ class Refused(Enum):
     """A topic, a writer or a reader."""
 
 
-ROS = None
+_ROS = None
 """The vendor of texts that rcl or an RMW prints, whatever DDS lies below."""
 
 
@@ -133,34 +133,34 @@ _ASK_FOR_TOPIC = (
     "ROS_SECURITY_LOG_FILE; or ask `sros explain` for each topic of the node."
 )
 
-LOG_TEXTS: tuple[LogText, ...] = (
+_LOG_TEXTS: tuple[LogText, ...] = (
     # ── rcl and the RMWs ───────────────────────────────────────────────────────────────────
     _text(
-        "not-built-in", ROS, r"doesn't have the security libraries|compile Fast DDS using the"
+        "not-built-in", _ROS, r"doesn't have the security libraries|compile Fast DDS using the"
         r"|-DSECURITY=ON|security (?:is )?not supported|compiled without security",
         "this DDS was built without DDS Security, so no secured node can start with it",
         "Use the ROS 2 packages of the distribution; `sros doctor` shows which DDS enforces.",
         refuses=Refused.ALL_SECURITY,
     ),
     _text(
-        "enclave-missing", ROS,
+        "enclave-missing", _ROS,
         r"rcl: SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
         "the enclave's folder {path} does not exist: ROS_SECURITY_KEYSTORE or the enclave's name "
         "is not right", "Correct it: `sros list_enclaves KEYSTORE` shows the names.",
     ),
     _text(
-        "runs-unsecured", ROS, r"SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
+        "runs-unsecured", _ROS, r"SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
         "the enclave's folder {path} does not exist, and as ROS_SECURITY_STRATEGY is not exactly "
         "Enforce, the node GOES ON UNSECURED",
         "Start it by `sros run`, which runs it secured or not at all.",
     ),
     _text(
-        "keystore-unset", ROS, r"failed to initialize rcl: error not set",
+        "keystore-unset", _ROS, r"failed to initialize rcl: error not set",
         "security is on, and ROS_SECURITY_KEYSTORE is unset or empty",
         "Set it to the folder of the keystore: `sros env KEYSTORE ENCLAVE` prints all variables.",
     ),
     _text(
-        "files-missing", ROS, r"couldn't find all security files",
+        "files-missing", _ROS, r"couldn't find all security files",
         "a file of the enclave is missing or a link to nothing; which one, it does not say",
         "Complete it: `sros create_enclave KEYSTORE ENCLAVE`, or export it again.", _FILES,
         refuses=Refused.PARTICIPANT,
@@ -416,7 +416,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "the file of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL, unseen=_FILE, weak=2,
     ),
     _text(
-        "service", ROS, r"(?:could not|failed to) create (?:service|client)"
+        "service", _ROS, r"(?:could not|failed to) create (?:service|client)"
         r"|create_(?:service|client)\(\) failed",
         "a service or client is denied by the permissions, and this text does not say which. Of a "
         "node that fails when it is created it is a service of its own: it runs under another "
@@ -425,12 +425,12 @@ LOG_TEXTS: tuple[LogText, ...] = (
         "names the topic is on standard output or in the file of ROS_SECURITY_LOG_FILE.", weak=2,
     ),
     _text(
-        "endpoint", ROS, r"Not Allowed By Security", _DENIED_ENDPOINT, _ASK_FOR_TOPIC,
+        "endpoint", _ROS, r"Not Allowed By Security", _DENIED_ENDPOINT, _ASK_FOR_TOPIC,
         weak=3,
         refuses=Refused.TOPIC,
     ),
     _text(
-        "endpoint", ROS, r"invalid allocator|Problem creating associated (?:Reader|Writer)"
+        "endpoint", _ROS, r"invalid allocator|Problem creating associated (?:Reader|Writer)"
         r"|(?:could not|failed to) create (?:publisher|subscription|topic)"
         r"|create_(?:publisher|subscription)\(\) could not create",
         _DENIED_ENDPOINT, _ASK_FOR_TOPIC, weak=3,
@@ -463,7 +463,7 @@ LOG_TEXTS: tuple[LogText, ...] = (
 
 UNKNOWN = LogText(
     "not-understood",
-    ROS,
+    _ROS,
     re.compile(
         r"\[SECURITY\w* (?:Error|Warning)\]"
         r"|\[(?:EMERGENCY|ALERT|CRITICAL|ERROR|WARNING)\] \S+ \d+ \w+::\w+ :"
@@ -533,7 +533,7 @@ def endpoint_refusal(text: str) -> str:
 
 
 def _first_refusal(refused: Refused, text: str) -> str:
-    patterns = [each.pattern for each in LOG_TEXTS if each.refuses is refused]
+    patterns = [each.pattern for each in _LOG_TEXTS if each.refuses is refused]
     for line in plain_text(text).splitlines():
         if any(pattern.search(line) for pattern in patterns):
             return plain_refusal(line)
@@ -549,13 +549,13 @@ def denied_topic(line: str) -> tuple[Vendor, re.Match[str]] | None:
 
 
 _TOPIC_DENIED = [
-    (each.vendor, each.pattern) for each in LOG_TEXTS if each.id == "topic-denied" and each.vendor
+    (each.vendor, each.pattern) for each in _LOG_TEXTS if each.id == "topic-denied" and each.vendor
 ]
 
 
 def log_text(line: str) -> tuple[LogText, re.Match[str]] | None:
     """Return the row that gives the cause of a line, or None; denied topics have none."""
-    for text in LOG_TEXTS:
+    for text in _LOG_TEXTS:
         if text.cause and (match := text.pattern.search(line)):
             return text, match
     return None

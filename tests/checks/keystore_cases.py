@@ -15,7 +15,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from tests.checks.bench import DAY, Bench, name_of, new_key
 
 Break = Callable[[Bench], object]

@@ -6,7 +6,7 @@ import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.pki.certificates import pem
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from tests.checks.bench import Bench
 from tests.checks.keystore_cases import CASES
 

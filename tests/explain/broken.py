@@ -17,7 +17,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import Issuer, common_name, issue_ca, load_certificate, pem
 from sros_tool.pki.crl import Revoked, sign_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.resources import policies_dir
 from sros_tool.validity import Window, iso
 

@@ -22,7 +22,8 @@ from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave, p
 from sros_tool.explain.question import Question, ask
 from sros_tool.keystore.template import load_template
 from sros_tool.names import is_expression
-from sros_tool.policy import ALLOW, DENY, Enclave, Policy, read_policy
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Policy
 from sros_tool.policy.patterns import common_name, matches
 from sros_tool.policy.rights import Right, Rules, policy_rights
 from sros_tool.resources import policies_dir

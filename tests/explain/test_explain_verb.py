@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from sros_tool.cli.common import now
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.resources import policies_dir
 from tests.explain.broken import BREAKAGES, ENCLAVE, OTHER, Enclave, make_keystore

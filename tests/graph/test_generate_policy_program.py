@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from tests.support.children import python
 from tests.support.harness import sros

@@ -19,7 +19,7 @@ from sros_tool.keystore.delivery.request import create_request
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_keystore, generate_artifacts
 from sros_tool.keystore.template import load_template
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.runtime.environment import secured_environment
 from tests.integration.converse import converse, listener, talker
 from tests.support.children import importing, python, run

@@ -24,7 +24,8 @@ from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC
-from sros_tool.policy import Enclave, Group, Policy, read_policy
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import Enclave, Group, Policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.resources import policies_dir
 from sros_tool.translate import permissions_for

@@ -17,7 +17,7 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.template import Template, load_template
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from tests.integration.converse import ENOUGH, converse, listener, talker
 from tests.integration.fastdds import build, fastdds_vendor, isolated
 from tests.integration.vendor_oracle import MATCH_SECONDS

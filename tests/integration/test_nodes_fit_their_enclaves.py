@@ -34,7 +34,8 @@ from sros_tool.keystore.template import load_template
 from sros_tool.names import NODE_SERVICES, ROS_DISCOVERY_TOPIC, expand
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate, subject_text
-from sros_tool.policy import Enclave, read_policy
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import Enclave
 from sros_tool.resources import policies_dir
 from sros_tool.translate import dds_names
 from tests.integration.test_policies_live import all_dds_endpoints, observed_in, run_script, without

@@ -24,7 +24,8 @@ from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.names import ROS_DISCOVERY_TOPIC, expand
-from sros_tool.policy import Enclave, Group, Policy, Profile, read_policy
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import Enclave, Group, Policy, Profile
 from sros_tool.resources import policies_dir
 from sros_tool.translate import dds_names, permissions_for
 from sros_tool.validity import Window

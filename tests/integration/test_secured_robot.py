@@ -18,7 +18,8 @@ from sros_tool.explain.log import explain_log
 from sros_tool.keystore.lifecycle.create import generate_artifacts
 from sros_tool.keystore.template import load_template
 from sros_tool.names import expand
-from sros_tool.policy import Policy, read_policy
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.resources import policies_dir
 from tests.integration.enforcing import enforcing_backend

@@ -12,7 +12,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
 from sros_tool.keystore.template import Template, load_template
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.resources import policies_dir
 from tests.integration.converse import ENOUGH, converse, listener, talker
 from tests.support.children import run

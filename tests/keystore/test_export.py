@@ -21,7 +21,7 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.template import load_template
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from tests.support.harness import policy_text, publish, snapshot
 
 NOW = datetime.now(UTC)

@@ -25,7 +25,8 @@ from sros_tool.keystore.issuing.proof import (
     telling_topics,
 )
 from sros_tool.pki import smime
-from sros_tool.policy import Enclave, Policy, Qualifier, read_policy
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import Enclave, Policy, Qualifier
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Rules, policy_rights
 from sros_tool.resources import policies_dir

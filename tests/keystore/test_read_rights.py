@@ -11,7 +11,7 @@ from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import SrosError
 from sros_tool.keystore.issuing.size import SizeEstimator
 from sros_tool.keystore.rights import RightsSource, load_rights
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.translate import grant_rights
 from tests.support.harness import policy_text, publish, sros
 

@@ -12,7 +12,7 @@ import pytest
 
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.errors import KeystoreError, SrosError, UsageError
-from sros_tool.keystore.expiry import Threshold, lifetimes, parse_threshold
+from sros_tool.keystore.expiry import Threshold, _lifetimes, parse_threshold
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
@@ -21,7 +21,7 @@ from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.reader import open_enclave, read_crl
 from sros_tool.keystore.template import load_template
 from sros_tool.pki import smime
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from tests.support.harness import (
     certificate,
     check_whole,
@@ -133,7 +133,7 @@ def test_nothing_outlives_its_authority(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     late = NOW + timedelta(days=5 * 365 - 10)
     renew(root, ["/a"], now=late)
-    (life,) = lifetimes(root)
+    (life,) = _lifetimes(root)
     end = certificate(root / "public/identity_ca.cert.pem").not_valid_after_utc
     assert life.certificate.not_after == life.permissions.not_after == end
     assert not problems(root, "/a", end)
@@ -181,7 +181,7 @@ def test_what_is_no_threshold(text: str) -> None:
 )
 def test_due(threshold: str, day: int, due: bool, tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
-    (life,) = lifetimes(root)
+    (life,) = _lifetimes(root)
     assert life.due(parse_threshold(threshold), NOW + timedelta(days=day)) is due
 
 
@@ -190,7 +190,7 @@ def test_a_short_life_is_not_over_as_it_begins(hours: int, tmp_path: Path) -> No
     """It is back-dated by a day, which is not part of its life."""
     short = timedelta(hours=hours)
     root = made(tmp_path / "ks", "/a", certificate_validity=short, permissions_validity=short)
-    (life,) = lifetimes(root)
+    (life,) = _lifetimes(root)
     assert not life.due(parse_threshold("66%"), NOW)
     assert not life.due(parse_threshold("66%"), NOW + 0.6 * short)
     assert life.due(parse_threshold("66%"), NOW + 0.7 * short)
@@ -306,7 +306,7 @@ def test_every_one_that_cannot_be_renewed_is_named_at_once(tmp_path: Path) -> No
     for call in (
         lambda: renew(root, names, now=LATER),
         lambda: renew(root, now=LATER, expiring=parse_threshold("100y")),
-        lambda: lifetimes(root),
+        lambda: _lifetimes(root),
     ):
         with pytest.raises(KeystoreError, match="2 enclaves cannot be re.*: /n003, /n229"):  # noqa: RUF043
             call()

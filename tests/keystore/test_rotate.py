@@ -34,7 +34,7 @@ from sros_tool.keystore.reader import (
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import common_name, digest, pem
 from sros_tool.pki.keys import generate_key, key_pem
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from tests.keystore.test_transaction import DIED, in_child
 from tests.support.harness import check_enclave_whole, policy_text, publish, remains, snapshot, sros
 

@@ -17,7 +17,7 @@ from cryptography import x509
 
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore import history as history_of_keystores
-from sros_tool.keystore.expiry import Threshold, lifetimes
+from sros_tool.keystore.expiry import Threshold, _lifetimes
 from sros_tool.keystore.history import HistoryStatus, history
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.ledger import read_ledger
@@ -32,7 +32,7 @@ from sros_tool.keystore.transaction import filesystem
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import issued_by, validity_of
 from sros_tool.pki.crl import load_crl, signed_by
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.validity import Window
 from tests.support.children import LONG
 from tests.support.harness import certificate, policy_text, publish, topics_of
@@ -351,7 +351,7 @@ def test_without_renewal_the_checks_of_ten_years_would_fail(tmp_path: Path) -> N
         assert not early.problems(["/a"], BEGIN)
         assert bool(early.problems(["/a"], now)) == bool(expected), days
         assert sorted({problem.file for problem in found}) == expected, days
-        (life,) = lifetimes(root)
+        (life,) = _lifetimes(root)
         assert life.due(Threshold(remaining=timedelta(0)), now) == (days > 270)
     late = BEGIN + timedelta(days=400)
     with pytest.raises(AssertionError):

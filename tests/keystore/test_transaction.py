@@ -30,7 +30,8 @@ from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import filesystem, recovery
 from sros_tool.keystore.transaction import stage as stage_of
 from sros_tool.keystore.transaction.transaction import Transaction
-from sros_tool.policy import Policy, read_policy
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import Policy
 from tests.support.harness import check_whole, policy_text, publish, remains, snapshot, topics_of
 
 NOW = datetime.now(UTC)
@@ -520,7 +521,7 @@ def test_a_transaction_waits_for_another(keystore: Path) -> None:
 
 
 def test_a_busy_keystore_is_told(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(filesystem, "LOCK_SECONDS", 0.05)
+    monkeypatch.setattr(filesystem, "_LOCK_SECONDS", 0.05)
     with Transaction(keystore):
         before = snapshot(keystore)
         with pytest.raises(KeystoreError, match="is busy"), Transaction(keystore):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from hypothesis import given
 
-from sros_tool.policy import ALLOW, DENY, Policy
+from sros_tool.policy.model import ALLOW, DENY, Policy
 from sros_tool.policy.rights import Right, Rules, compare, policy_rights
 from tests.policy.drawn_policies import PATHS, listed, policies
 

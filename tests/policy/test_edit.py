@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import DocumentError, PolicyError
-from sros_tool.policy import Policy, read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import merge_into
+from sros_tool.policy.model import Policy
 from sros_tool.policy.rights import policy_rights
 
 POLICY = """\

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 
-from sros_tool.policy import ALLOW, DENY, Group, Policy, read_policy, write_policy
+from sros_tool.policy.document import read_policy, write_policy
 from sros_tool.policy.merge import merge_all, merge_into, merge_notes, plan_merge
-from sros_tool.policy.model import Enclave, Profile, Profiles
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles
 from sros_tool.policy.rights import Right, policy_rights
 from tests.policy.drawn_policies import PATHS, effective, meant, policies
 

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
 from sros_tool.names import is_expression
-from sros_tool.policy import ALLOW, Group, Policy, read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.minimize import EnclaveUse, minimize, propose_wildcards
+from sros_tool.policy.model import ALLOW, Group, Policy
 from sros_tool.policy.rights import Right, Rules, policy_rights
 from tests.policy.drawn_policies import effective, exact_names, listed, meant, policies
 

@@ -12,17 +12,8 @@ from hypothesis import strategies as st
 from lxml import etree
 
 from sros_tool.errors import PolicyError
-from sros_tool.policy import (
-    RIGHTS,
-    Enclave,
-    Group,
-    Policy,
-    Profile,
-    Profiles,
-    Qualifier,
-    read_policy,
-    write_policy,
-)
+from sros_tool.policy.document import read_policy, write_policy
+from sros_tool.policy.model import RIGHTS, Enclave, Group, Policy, Profile, Profiles, Qualifier
 from tests.support.harness import with_includes
 
 names = st.sampled_from(("x", "/x/y", "~/z", "~", "*", "a?", "[!a-c]d", "/a/*/b"))

@@ -18,7 +18,7 @@ from sros_tool.dds.governance import render_governance
 from sros_tool.dds.permissions import render_permissions
 from sros_tool.dds.portable import outside
 from sros_tool.keystore.template import load_template, template_names
-from sros_tool.policy import Enclave, Policy
+from sros_tool.policy.model import Enclave, Policy
 from sros_tool.policy.patterns import overlap
 from sros_tool.translate import governance_for, permissions_for
 from sros_tool.validity import window

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.policy import ALLOW, DENY, Policy
+from sros_tool.policy.model import ALLOW, DENY, Policy
 from sros_tool.policy.patterns import covers, overlap
 from sros_tool.policy.rights import Right, Rules, folded, parts, policy_rights, unfolded
 from sros_tool.translate import grant_rights

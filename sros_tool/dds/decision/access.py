@@ -165,7 +165,7 @@ def _default_verdict(traits: VendorTraits, grant: Grant) -> RuleVerdict:
     return RuleVerdict(Outcome.ALLOWED if grant.default_allow else Outcome.DENIED, "default")
 
 
-class GrantRules:
+class _GrantRules:
     """Rules in their order, for one verb, or for both where only the topic is asked for."""
 
     def __init__(
@@ -439,17 +439,17 @@ class Access:
         rules, otherwise = _rules_for(traits, grant, self._domain)
         joining = _decide_join(traits, self._governed, grant, rules, otherwise, self._domain)
         self._join = self._answer(joining.outcome, joining.reason, joining.text)
-        self._peers = {verb: GrantRules(traits, rules, otherwise, verb) for verb in _ENDPOINTS}
+        self._peers = {verb: _GrantRules(traits, rules, otherwise, verb) for verb in _ENDPOINTS}
         self._own = self._peers
         if not traits.filters_own_domain:
             everywhere = list(enumerate(grant.rules))
             self._own = {
-                verb: GrantRules(traits, everywhere, otherwise, verb) for verb in _ENDPOINTS
+                verb: _GrantRules(traits, everywhere, otherwise, verb) for verb in _ENDPOINTS
             }
         if traits.relays_count_for_readers:
-            readers = GrantRules(traits, rules, otherwise, AccessVerb.SUBSCRIBE, "relay")
+            readers = _GrantRules(traits, rules, otherwise, AccessVerb.SUBSCRIBE, "relay")
             self._peers = {**self._peers, AccessVerb.SUBSCRIBE: readers}
-        self._either = GrantRules(traits, rules, otherwise, *_ENDPOINTS)
+        self._either = _GrantRules(traits, rules, otherwise, *_ENDPOINTS)
 
     # ── answering ──────────────────────────────────────────────────────────────────────────
 

@@ -53,7 +53,7 @@ class Decision:
     topic_rule: TopicRule | None = None
 
 
-REASONS = {
+_REASONS = {
     "allow-rule": "an allow rule matches",
     "deny-rule": "a deny rule matches",
     "partition": "the rule that decides does not name the partitions",

@@ -27,17 +27,17 @@ from sros_tool.dds.governance import (
 )
 from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 
-BLANKS = " \t\v\r\n"
+_BLANKS = " \t\v\r\n"
 _CDATA = "<![CDATA["
 _ROOM = len(_CDATA) - 2  # it looks for more text only where so many characters are left
 _DEEPEST = 200  # of elements within each other; any such document is refused for its names
 _NAME = re.compile("[A-Za-z][A-Za-z0-9_:-]*")
 _PASSED_OVER = re.compile(
-    rf"(?:[{BLANKS}]++|<!--.*?-->|<\?(?:.*?\?>|.*)|<!(?!--|\[CDATA\[)(?:[^>]*>|.*))*+", re.DOTALL
+    rf"(?:[{_BLANKS}]++|<!--.*?-->|<\?(?:.*?\?>|.*)|<!(?!--|\[CDATA\[)(?:[^>]*>|.*))*+", re.DOTALL
 )
 _QUOTES = {'"': '"', "'": "'", "\xe2\x80\x9c": "\xe2\x80\x9d", "\xe2\x80\x98": "\xe2\x80\x99"}
 _REFERENCE = re.compile("&(.{0,15}?;)?", re.DOTALL)
-_NUMBER = re.compile(rf"#(?:x[{BLANKS}\f]*([+-]?(?:0[xX])?[0-9a-fA-F]+)|[{BLANKS}\f]*([+-]?\d+))")
+_NUMBER = re.compile(rf"#(?:x[{_BLANKS}\f]*([+-]?(?:0[xX])?[0-9a-fA-F]+)|[{_BLANKS}\f]*([+-]?\d+))")
 _ENTITIES = {"lt": "<", "gt": ">", "amp": "&", "apos": "'", "quot": '"'}
 
 
@@ -168,7 +168,7 @@ class _Reader:
                 self._index = stop + len("-->")
             if len(text) - self._index < _ROOM:
                 break
-        content = (done + self._unescaped(pending)).strip(BLANKS)
+        content = (done + self._unescaped(pending)).strip(_BLANKS)
         return _decoded(content.partition("\0")[0])
 
     def _unescaped(self, text: str) -> str:

@@ -44,7 +44,7 @@ _CLASSES = {
 
 
 @lru_cache(maxsize=65536)
-def matcher(style: Style, expression: str) -> _Matcher | None:
+def _matcher(style: Style, expression: str) -> _Matcher | None:
     """Return what matches names against ``expression``; None if it matches only itself."""
     if _SPECIAL.isdisjoint(expression):
         return None
@@ -82,7 +82,7 @@ def _joined(segments: list[str]) -> str:
 
 def matches(style: Style, expression: str, name: str) -> bool:
     """Return whether ``name`` matches ``expression``."""
-    match = matcher(style, expression)
+    match = _matcher(style, expression)
     return expression == name if match is None else bool(match(name))
 
 
@@ -100,7 +100,7 @@ class ExpressionIndex:
         self._plain: dict[str, list[int]] = {}
         wild: dict[int, dict[str, list[tuple[int, _Matcher]]]] = {}
         for position, text in enumerate(self._texts):
-            match = matcher(style, text)
+            match = _matcher(style, text)
             if match is None:
                 self._plain.setdefault(text, []).append(position)
                 continue

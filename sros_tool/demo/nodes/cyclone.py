@@ -246,7 +246,7 @@ _Node = (
     _Talker | _Listener | _Observer | _Server | _Client | _ActionServer | _ActionClient | _Composed
 )
 
-ROLES: Mapping[str, type[_Node]] = {
+_ROLES: Mapping[str, type[_Node]] = {
     "talker": _Talker,
     "listener": _Listener,
     "observer": _Observer,
@@ -275,7 +275,7 @@ class _Stopped(Exception):  # noqa: N818 - not an error
 def main(arguments: Sequence[str] | None = None) -> int:
     """Play a role until stopped; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    options = parse_options("sros_tool.demo.nodes.cyclone", ROLES, arguments)
+    options = parse_options("sros_tool.demo.nodes.cyclone", _ROLES, arguments)
     _stop_on_signals()
     events = EventWriter(options.report)
     stage = ProcessStage.PARTICIPANT
@@ -284,7 +284,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         _say(options.role, choice.note)
         with Participant(domain_of(os.environ), choice.enclave) as participant:
             stage = ProcessStage.ENDPOINT
-            node = ROLES[options.role](participant, options, events)
+            node = _ROLES[options.role](participant, options, events)
             stage = ProcessStage.RUNNING
             events.report(EventKind.READY)
             while True:

@@ -29,11 +29,11 @@ _Build = Callable[[Any, NodeOptions, EventWriter], Sequence[Any] | None]
 def main(arguments: Sequence[str] | None = None) -> int:
     """Play a role until stopped; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
-    options = parse_options("sros_tool.demo.nodes.ros", ROLES, arguments)
-    return run_role(ROLES[options.role], options, [sys.argv[0], *arguments])
+    options = parse_options("sros_tool.demo.nodes.ros", _ROLES, arguments)
+    return _run_role(_ROLES[options.role], options, [sys.argv[0], *arguments])
 
 
-def run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> int:
+def _run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> int:
     """Create a node, let ``build`` add its endpoints, and spin until stopped.
 
     ``arguments`` is the whole command line, from which rclpy takes its ``--ros-args``.  Returns
@@ -307,7 +307,7 @@ def _composed(node: Any, options: NodeOptions, events: EventWriter) -> list[Any]
     return [listener, server]
 
 
-ROLES: Mapping[str, _Build] = {
+_ROLES: Mapping[str, _Build] = {
     "talker": _talker,
     "listener": _listener,
     "observer": _observer,

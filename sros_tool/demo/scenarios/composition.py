@@ -22,7 +22,7 @@ _LISTENER = Party("listener", Role.LISTENER, Identity(OWN, "listener"))
 _CLIENT = Party("client", Role.CLIENT, Identity(OWN, "client"), SERVICE)
 _OPEN_LISTENER = Party("unsecured listener", Role.LISTENER, UNSECURED)
 
-ROWS: tuple[Row, ...] = (
+_ROWS: tuple[Row, ...] = (
     Row(
         "listener of a container hears a talker",
         RowStatus.HEARD,
@@ -94,7 +94,7 @@ ROWS: tuple[Row, ...] = (
 COMPOSITION = Scenario(
     "composition",
     "several nodes in one process share one enclave",
-    ROWS,
+    _ROWS,
     {
         "container": "/composition",
         "talker": "/talker_listener/talker",

@@ -62,7 +62,8 @@ from sros_tool.demo.scenarios.model import (
 from sros_tool.demo.scenarios.policies import check_topic
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.files import parse_toml
-from sros_tool.policy import Policy, read_policy
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import Policy
 from sros_tool.xml import read_bytes
 
 _PARTIES: Mapping[Relation, tuple[str, ...]] = {

@@ -16,7 +16,7 @@ from sros_tool.demo.scenarios.model import (
 )
 from sros_tool.demo.scenarios.policies import measured_policy
 
-KINDS = {
+_KINDS = {
     "none": Undefended(template=forger.unprotected),
     "sign": Undefended(template=forger.signed),
     "encrypt": Undefended(template=forger.encrypted),
@@ -37,8 +37,8 @@ def _row(kind: str) -> Row:
         expected,
         _MECHANISMS[kind],
         (
-            Party("talker", Role.TALKER, Identity(KINDS[kind], "talker")),
-            Party("listener", Role.LISTENER, Identity(KINDS[kind], "listener")),
+            Party("talker", Role.TALKER, Identity(_KINDS[kind], "talker")),
+            Party("listener", Role.LISTENER, Identity(_KINDS[kind], "listener")),
         ),
         (Claim(Relation.READABLE, "talker").expecting(expected),),
         (Claim(Relation.HEARS, "listener", "talker"),),
@@ -53,8 +53,8 @@ def _changed(kind: str, expected: RowStatus, mechanism: str) -> Row:
         expected,
         mechanism,
         (
-            Party("talker", Role.TALKER, Identity(KINDS[kind], "talker")),
-            Party("listener", Role.LISTENER, Identity(KINDS[kind], "listener")),
+            Party("talker", Role.TALKER, Identity(_KINDS[kind], "talker")),
+            Party("listener", Role.LISTENER, Identity(_KINDS[kind], "listener")),
         ),
         (Claim(Relation.BELIEVES, "listener", "talker").expecting(expected),),
         (Claim(Relation.HEARS, "listener", "talker"),),
@@ -71,7 +71,7 @@ _CHANGES = (
 GOVERNANCE = Scenario(
     "governance",
     "the same talk without protection, signed and encrypted: on the wire, and its cost",
-    (*(_row(kind) for kind in KINDS), *_CHANGES),
+    (*(_row(kind) for kind in _KINDS), *_CHANGES),
     {
         "talker": "/talker_listener/talker",
         "listener": "/talker_listener/listener",
@@ -79,5 +79,5 @@ GOVERNANCE = Scenario(
         "pong": "/cost/pong",
     },
     measured_policy,
-    measured=KINDS,
+    measured=_KINDS,
 )

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from sros_tool.demo.forger import Forge, Undefended
-from sros_tool.policy import Policy
+from sros_tool.policy.model import Policy
 
 
 class Role(StrEnum):

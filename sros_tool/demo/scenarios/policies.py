@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Final
 
 from sros_tool.errors import UsageError
-from sros_tool.policy import Enclave, Group, Policy, Profile, read_policy
-from sros_tool.policy.model import ALLOW, Profiles
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import ALLOW, Enclave, Group, Policy, Profile, Profiles
 from sros_tool.resources import policies_dir
 
 DEFAULT_TOPIC: Final = "/chatter"

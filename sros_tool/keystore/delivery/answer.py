@@ -88,7 +88,7 @@ def _lines(document: bytes) -> bytes:
     return document.replace(b"\r\n", b"\n")
 
 
-def read_answer(data: bytes) -> RequestAnswer:
+def _read_answer(data: bytes) -> RequestAnswer:
     """Return the answer in an archive that ``sign_request`` made; nothing is written.
 
     Raises:
@@ -174,7 +174,7 @@ def import_answer(
     An answer that is older than what is there, or that comes from other CAs, needs ``force``.
     Where CAs are ``pinned``, by their SHA-256, one of them has to have signed it in any case.
     """
-    answer = read_answer(data)
+    answer = _read_answer(data)
     name = answer.name
     place = folder / enclave_folder(name)
     if not dry_run and folder.is_dir():

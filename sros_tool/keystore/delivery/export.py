@@ -28,7 +28,7 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
 from sros_tool.xml import read_bytes
 
-ARCHIVE_SUFFIXES = SUFFIXES
+_ARCHIVE_SUFFIXES = SUFFIXES
 _ANSWER_AGAIN = (
     "Send the robot a new answer, by `sros sign_request --renew` of the request.pem that lies in "
     "the enclave's folder."
@@ -99,7 +99,7 @@ def distribute(
     folder that already is an export, other enclaves stay; files that would change need ``force``.
     """
     files = _collect(root, names, now)
-    if target.name.endswith(ARCHIVE_SUFFIXES):
+    if target.name.endswith(_ARCHIVE_SUFFIXES):
         changes = _write_archive(target, files, force, dry_run)
     else:
         changes = _write_folder(root, target, files, force, dry_run)

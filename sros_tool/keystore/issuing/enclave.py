@@ -45,7 +45,7 @@ from sros_tool.parallel import Progress, map_slices
 from sros_tool.pki.certificates import pem, subject_text, validity_of
 from sros_tool.pki.keys import PrivateKey, PublicKey, key_pem
 from sros_tool.pki.token import TokenKey
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.resources import policies_dir
 from sros_tool.translate import permissions_for

@@ -37,7 +37,7 @@ from sros_tool.names import ROS_DISCOVERY_TOPIC, expand, is_expression
 from sros_tool.policy.model import ALLOW, Enclave
 from sros_tool.policy.patterns import common_name, matches, overlap
 
-ASKED = (Vendor.STANDARD, Vendor.FAST)
+_ASKED = (Vendor.STANDARD, Vendor.FAST)
 """The vendors that have to decide as the policy does; Fast DDS 2.9 reads such documents as 2.14.
 
 Not Cyclone DDS 0.10: it denies a topic in both directions if one is denied, which is noted
@@ -137,7 +137,7 @@ def matched_as_meant(expression: str) -> bool:
     return all(
         dds_matches(vendor.traits.style, expression, name) == matches(expression, name)
         for name in telling_topics([expression])
-        for vendor in ASKED
+        for vendor in _ASKED
     )
 
 
@@ -183,7 +183,7 @@ def differences(
     policy: Enclave,
     permissions: Permissions,
     domains: DomainSet,
-    vendors: Iterable[Vendor] = ASKED,
+    vendors: Iterable[Vendor] = _ASKED,
 ) -> list[Disagreement]:
     """Return where the vendors' decisions are not what the policy says.
 

@@ -23,7 +23,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Entry, append, read_ledger
 from sros_tool.keystore.lifecycle.revocation_list import Lists
 from sros_tool.keystore.missing import no_such_enclave
-from sros_tool.keystore.reader import load_settings, read_certificate, read_crl
+from sros_tool.keystore.reader import load_settings, read_certificate
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
@@ -32,8 +32,6 @@ from sros_tool.pki.certificates import issued_by, subject_text
 from sros_tool.pki.crl import REASONS, Revoked
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
-
-__all__ = ["Revocation", "read_crl", "refresh_crl", "revoke"]
 
 _FILES = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml", REQUEST)
 _PRIVATE = "key.pem"

@@ -17,7 +17,7 @@ from pathlib import Path
 from sros_tool.errors import KeystoreError
 from sros_tool.keystore.layout import ENCLAVES, folder_mode
 
-LOCK_SECONDS = 60.0
+_LOCK_SECONDS = 60.0
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
 _NOT_SUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
@@ -32,7 +32,7 @@ def lock_folder(folder: Path, wait: float | None = None) -> int:
     Raises:
         KeystoreError: another process held the lock all the time.
     """
-    wait = LOCK_SECONDS if wait is None else wait
+    wait = _LOCK_SECONDS if wait is None else wait
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     deadline = time.monotonic() + wait
     while True:

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from sros_tool.errors import SrosError
-from sros_tool.policy import read_policy
+from sros_tool.policy.document import read_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.runtime.netns import end_with_parent, enter_isolation, try_isolation
 from tests.support.children import run
