@@ -36,7 +36,11 @@ ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")
 """The services that an action consists of (ROS 2 design "Actions")."""
 
 ACTION_TOPICS = ("feedback", "status")
-"""The topics that an action consists of; the server publishes them."""
+"""The topics that an action consists of; the server publishes them.
+
+`keystore/issuing/proof.py` has a second list of all these parts on purpose: a proof that shared
+this one would prove nothing of it.
+"""
 
 # By far the most names need no closer look: relative, private or absolute, without wildcards.
 _PLAIN = re.compile(r"(?:~?/)?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")

@@ -3,7 +3,3 @@
 A check is a function from values to findings; nothing here repairs anything, prints, or asks the
 clock.  `sros_tool.checks.registry` knows all kinds of findings.
 """
-
-from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, Severity
-
-__all__ = ["ERROR", "NOTE", "WARNING", "Finding", "FindingKind", "Severity"]

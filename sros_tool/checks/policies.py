@@ -593,7 +593,7 @@ _INCLUDE = re.compile(r"\{http://www\.w3\.org/200[13]/XInclude\}include\Z")
 _MANY = 1000
 
 
-def policy_findings(policy: Policy) -> Iterator[Finding]:
+def _policy_findings(policy: Policy) -> Iterator[Finding]:
     """Yield everything that is found in a policy that could be read."""
     checked = _CheckedPolicy(policy)
     for check in _CHECKS:
@@ -607,7 +607,7 @@ def policy_file_findings(path: Path) -> Iterator[Finding]:
     except SrosError as error:
         yield from _unreadable(path, error)
         return
-    yield from policy_findings(policy)
+    yield from _policy_findings(policy)
     yield from _includes(path)
 
 

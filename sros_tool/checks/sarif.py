@@ -9,8 +9,8 @@ from urllib.parse import quote
 
 from sros_tool.checks.kind import Finding, FindingKind
 
-VERSION = "2.1.0"
-SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
+_VERSION = "2.1.0"
+_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
 _BASE = "SRCROOT"
 
 
@@ -35,7 +35,7 @@ def sarif(
         "originalUriBaseIds": {_BASE: {"uri": f"{base.absolute().as_uri()}/"}},
         "results": [_result(each, rules[each.id], base) for each in findings],
     }
-    return {"$schema": SCHEMA, "version": VERSION, "runs": [run]}
+    return {"$schema": _SCHEMA, "version": _VERSION, "runs": [run]}
 
 
 def _rule(kind: FindingKind) -> dict[str, Any]:
@@ -61,7 +61,7 @@ def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
             {
                 "physicalLocation": {
                     "artifactLocation": {
-                        "uri": quote(relative(finding.file, base)),
+                        "uri": quote(_relative(finding.file, base)),
                         "uriBaseId": _BASE,
                     },
                     "region": {"startLine": finding.line or 1},
@@ -75,7 +75,7 @@ def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
     return result
 
 
-def relative(file: str, base: Path) -> str:
+def _relative(file: str, base: Path) -> str:
     """Return the path of ``file`` as seen from the folder ``base``, with "/" between its parts."""
     path, start = (base / file).absolute(), base.absolute()
     common = start

@@ -310,7 +310,7 @@ def domain_of(text: str | None) -> int | None:
 # ── secrets ─────────────────────────────────────────────────────────────────────────────
 
 
-PASSPHRASE, PASSPHRASE_FILE = "SROS_CA_PASSPHRASE", "SROS_CA_PASSPHRASE_FILE"
+_PASSPHRASE, _PASSPHRASE_FILE = "SROS_CA_PASSPHRASE", "SROS_CA_PASSPHRASE_FILE"
 _PIN = "SROS_PKCS11_PIN"
 _KEY_PLACES = {"identity": "SROS_IDENTITY_KEY", "permissions": "SROS_PERMISSIONS_KEY"}
 
@@ -350,8 +350,8 @@ class _Answers:
 
     def _find(self, what: str) -> str:
         is_pin = " PIN " in f" {what} "
-        value = os.environ.get(_PIN if is_pin else PASSPHRASE, "")
-        file = "" if is_pin else os.environ.get(PASSPHRASE_FILE, "")
+        value = os.environ.get(_PIN if is_pin else _PASSPHRASE, "")
+        file = "" if is_pin else os.environ.get(_PASSPHRASE_FILE, "")
         if not value and file:
             value = Path(file).read_text(encoding="utf-8").partition("\n")[0]
         if not value and sys.stdin.isatty():
@@ -360,7 +360,7 @@ class _Answers:
                 what.capitalize(), hide_input=True, err=True, confirmation_prompt=confirm
             )
         if not value:
-            names = _PIN if is_pin else f"{PASSPHRASE} or {PASSPHRASE_FILE}"
+            names = _PIN if is_pin else f"{_PASSPHRASE} or {_PASSPHRASE_FILE}"
             raise PkiError(f"{what} is needed", "There is no terminal to ask at.", f"Set {names}.")
         return value
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sros_tool.report.compose import PictureSource
     from sros_tool.report.picture import Picture, PicturedFinding
 
-FORMATS = ("html", "svg", "dot", "mermaid", "json")
+_FORMATS = ("html", "svg", "dot", "mermaid", "json")
 _ENDINGS = {".htm": "html", ".mmd": "mermaid", ".gv": "dot"}
 
 
@@ -52,7 +52,7 @@ Examples:
 @click.option(
     "--format",
     "form",
-    type=click.Choice(FORMATS),
+    type=click.Choice(_FORMATS),
     help="What to write. [default: by the suffix of FILE, else html]",
 )
 @click.option("--json", "as_json", is_flag=True, help="The same as --format json.")
@@ -129,7 +129,7 @@ def view(
 def _format(form: str | None, output: Path | None, graphviz: bool) -> str:
     ending = output.suffix.lower() if output else ""
     found = form or _ENDINGS.get(ending, ending.removeprefix("."))
-    if found not in FORMATS:
+    if found not in _FORMATS:
         found = "html"
     if graphviz and found != "svg":
         raise UsageError("--graphviz is for SVG only", "", "Add --format svg, or leave it out.")

@@ -28,7 +28,7 @@ from sros_tool.report.picture import (
     fold,
 )
 
-SIDE_WIDTH, NAMES_WIDTH, GUTTER = 184, 330, 110
+_SIDE_WIDTH, _NAMES_WIDTH, _GUTTER = 184, 330, 110
 LINE, PAD, SMALL = 16, 7, 14
 """The heights of a line of text, of the room around it, and of a line of a note."""
 _GAP, _LEAD, _TOP, _MARGIN = 9.0, 24.0, 34.0, 14
@@ -273,7 +273,7 @@ class _Draft:
         return Scene(
             id=name,
             title=title,
-            width=2 * (_MARGIN + SIDE_WIDTH + GUTTER) + NAMES_WIDTH,
+            width=2 * (_MARGIN + _SIDE_WIDTH + _GUTTER) + _NAMES_WIDTH,
             height=0,
             cards=tuple(cards.values()),
             links=self._links(cards),
@@ -343,9 +343,9 @@ class _Draft:
             id=side,
             role="group" if is_group else "enclave",
             column=0 if sends else 2,
-            x=_MARGIN if sends else _MARGIN + SIDE_WIDTH + NAMES_WIDTH + 2 * GUTTER,
+            x=_MARGIN if sends else _MARGIN + _SIDE_WIDTH + _NAMES_WIDTH + 2 * _GUTTER,
             y=0,
-            width=SIDE_WIDTH,
+            width=_SIDE_WIDTH,
             height=2 * PAD + LINE * len(lines) + SMALL * len(notes),
             lines=lines,
             notes=tuple(notes),
@@ -366,9 +366,9 @@ class _Draft:
             id=f"n{number}",
             role="names",
             column=1,
-            x=_MARGIN + SIDE_WIDTH + GUTTER,
+            x=_MARGIN + _SIDE_WIDTH + _GUTTER,
             y=0,
-            width=NAMES_WIDTH,
+            width=_NAMES_WIDTH,
             height=2 * PAD + LINE * len(lines) + SMALL * len(notes),
             lines=lines,
             notes=notes,
@@ -523,7 +523,7 @@ def _frames(columns: Sequence[Sequence[ColumnItem]], cards: dict[str, Card]) -> 
             if all(card.role == "group" for card in found):
                 continue
             top, bottom = found[0].y - 24, found[-1].y + found[-1].height + 6
-            yield Frame(title, found[0].x - 6, top, SIDE_WIDTH + 12, bottom - top)
+            yield Frame(title, found[0].x - 6, top, _SIDE_WIDTH + 12, bottom - top)
 
 
 @dataclass(frozen=True, slots=True)

@@ -88,7 +88,7 @@ SIGNATURE_HASH = FindingKind(
 )
 
 
-def authority_findings(
+def _authority_findings(
     role: str, chain: tuple[x509.Certificate, ...], at: datetime, subject: str, file: str
 ) -> Iterator[Finding]:
     """Yield what some vendor refuses of a CA; ``chain`` are its file's certificates, in order."""
@@ -276,7 +276,7 @@ def _authority(
         yield CA_EXPIRED.found(subject, f"{name} is valid from {begin} to {end}", file)
     elif validity.not_after - keystore.now < _SOON:
         yield CA_EXPIRES_SOON.found(subject, f"{name} expires at {end}", file)
-    yield from authority_findings(role, chain, keystore.now, subject, file)
+    yield from _authority_findings(role, chain, keystore.now, subject, file)
     yield from _key(keystore, role, certificate)
 
 

@@ -191,7 +191,7 @@ def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
         yield from _domains(enclave, own, file)
 
 
-def domain_problems(domains: DomainSet) -> Iterator[str]:
+def _domain_problems(domains: DomainSet) -> Iterator[str]:
     """Yield what vendors read differently in a set of domains."""
     for part in domains.ranges:
         if part.first is None or part.last is None:
@@ -213,7 +213,7 @@ def _form(grant: Grant, name: str, file: str) -> Iterator[Finding]:
             yield TIME_FORMAT.found(name, f"it says {moment!r}", file)
     if sum(rule.allow for rule in grant.rules) > 1:
         yield ALLOW_RULES.found(name, "it has more than one", file)
-    problems = [text for rule in grant.rules for text in domain_problems(rule.domains)]
+    problems = [text for rule in grant.rules for text in _domain_problems(rule.domains)]
     for problem in dict.fromkeys(problems):
         yield DOMAIN_RANGE.found(name, f"the range {problem}", file)
     criteria = [each for rule in grant.rules for each in (*rule.publish, *rule.subscribe)]
@@ -457,7 +457,7 @@ def governance_findings(
             # A template chooses what is open, but nobody chooses that messages are lost.
             chosen = "" if kind is SIGNED_PAYLOAD else accepted
             yield kind.found(subject, text, file, accepted=chosen)
-        for problem in domain_problems(rule.domains):
+        for problem in _domain_problems(rule.domains):
             yield GOVERNANCE_DOMAIN_RANGE.found(subject, f"the range {problem}", file)
     yield from _copy(keystore)
 

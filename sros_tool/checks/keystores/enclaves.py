@@ -20,10 +20,10 @@ from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
 from sros_tool.xml import read_bytes
 
-NOT_LOADABLE = "enclave.not-loadable"
+_NOT_LOADABLE = "enclave.not-loadable"
 """The id that stands for all faults in `--include` and `--exclude`."""
 
-LOADING_KINDS = by_id(
+_LOADING_KINDS = by_id(
     *(
         FindingKind(
             f"enclave.{fault.id}",
@@ -32,7 +32,7 @@ LOADING_KINDS = by_id(
             fault.why,
             fault.source,
             fault.remedy.format(root="ROOT", enclave="NAME", path="FILE"),
-            NOT_LOADABLE,
+            _NOT_LOADABLE,
         )
         for fault in Fault
         if fault not in VENDOR_FAULTS
@@ -44,7 +44,7 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
     """Yield every problem of an enclave; at home, a key that stays on its robot is none."""
     state = enclave.state
     for problem in state.problems_at_home if enclave.keystore.is_home else state.problems:
-        kind = LOADING_KINDS[f"enclave.{problem.fault.id}"]
+        kind = _LOADING_KINDS[f"enclave.{problem.fault.id}"]
         text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
         file = enclave.file(problem.file)
         remedy = problem.fault.remedy_in(problem.file)

@@ -80,7 +80,7 @@ def keystore_findings(
         for name in share:
             state = open_enclave(enclave_path(root, name), now=now, domain=domain)
             enclave = CheckedEnclave(keystore, name, state)
-            found += enclave_findings(enclave, wanted, alone=name != first)
+            found += _enclave_findings(enclave, wanted, alone=name != first)
             if each := summary_of(enclave):
                 issued.append(each)
         return found, issued
@@ -100,7 +100,7 @@ def keystore_findings(
     return joined([_with_names(each, root) for each in located])
 
 
-def enclave_findings(
+def _enclave_findings(
     enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]], *, alone: bool
 ) -> Iterator[Finding]:
     """Yield everything that is found in one enclave."""

@@ -17,7 +17,7 @@ from sros_tool.demo.scenarios.attacks import (
 from sros_tool.demo.scenarios.model import Row, Scenario
 from sros_tool.demo.scenarios.policies import GUEST, SERVICE, attacked_policy
 
-ROWS: tuple[Row, ...] = (
+_ROWS: tuple[Row, ...] = (
     *strangers.ROWS,
     *rights.ROWS,
     *identities.ROWS,
@@ -28,7 +28,7 @@ ROWS: tuple[Row, ...] = (
 ATTACKS = Scenario(
     "attacks",
     "every known way in, tried; and each again without the defence that closes it",
-    ROWS,
+    _ROWS,
     {
         "talker": "/talker_listener/talker",
         "listener": "/talker_listener/listener",
