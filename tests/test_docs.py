@@ -49,14 +49,11 @@ def test_the_readme_begins_with_the_two_commands_and_is_short() -> None:
     assert len(lines) <= 150
 
 
-def test_every_verb_is_described_and_in_the_readme() -> None:
+def test_every_verb_is_described() -> None:
     verbs = {name for family in FAMILIES.values() for name in family}
     rows = re.findall(r"^\| (`.+?) \| ", read("docs/verbs.md"), re.MULTILINE)
     assert {word for row in rows for word in re.findall(r"`([a-z_]+)", row)} >= verbs
-    readme = read("README.md")
-    assert [
-        verb for verb in verbs if f"`{verb}`" not in readme and f"sros {verb}" not in readme
-    ] == []
+    assert "(docs/verbs.md)" in read("README.md")
 
 
 def test_every_attack_is_in_the_table_of_attacks() -> None:
