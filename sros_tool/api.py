@@ -52,14 +52,14 @@ class Keystore:
 
 @dataclass(frozen=True, slots=True)
 class AccessAnswer:
-    """What the DDS of one vendor makes of an access, and why.
+    """One vendor's decision on an access, and the reason.
 
     ``outcome`` is "allowed", "denied" (the endpoint is not created), "peer-denies" (it is created,
     and no peer talks to it), "refused" (no node of the enclave starts) or "crashes".  ``reason`` is
     a clause for people; ``expression`` is the DDS topic expression of the rule that decided, or
     "".  ``policy_lines`` are the places ``FILE:LINE`` in the policy that the rule comes from, where
     a policy was given.  ``until`` is when the first of the enclave's files expires, in UTC.
-    ``remedy`` says what to do where it is denied, if the policy is not what has to change.
+    ``remedy`` says what to do about a denial that no policy change would lift.
     """
 
     allowed: bool
@@ -393,7 +393,7 @@ def _keyring(secrets: Secrets | None, *, encrypt: bool = False) -> Keyring:
 
 
 def _several(parameter: str, given: Iterable[Item]) -> Iterable[Item]:
-    """``given``, unless it is one string, whose letters nobody means."""
+    """Return ``given``; refuse a single string, which would be read letter by letter."""
     if isinstance(given, str):
         raise UsageError(f"{parameter} is one string", "", f"Pass a list: [{given!r}].")
     return given

@@ -31,7 +31,7 @@ class SrosError(Exception):
 
 
 class UsageError(SrosError):
-    """An argument or an option that cannot be meant."""
+    """A wrong argument or option."""
 
     exit_status = 2
 
@@ -41,7 +41,7 @@ class InvalidNameError(SrosError):
 
 
 class DocumentError(SrosError):
-    """An XML, TOML or S/MIME document that cannot be read as what it claims to be."""
+    """An XML, TOML or S/MIME document that cannot be parsed."""
 
 
 class PolicyError(DocumentError):
@@ -49,7 +49,7 @@ class PolicyError(DocumentError):
 
 
 class PkiError(SrosError):
-    """A key, certificate or signature that does not hold."""
+    """An invalid key, certificate or signature."""
 
 
 class KeystoreError(SrosError):
@@ -57,7 +57,7 @@ class KeystoreError(SrosError):
 
 
 class UnavailableError(SrosError):
-    """A DDS stack, an RMW or a privilege that is not there."""
+    """A missing DDS stack, RMW or privilege."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""What can be wrong with the files of an enclave, each with its title, its reason and its remedy.
+"""The faults of an enclave's files, each with title, reason and remedy.
 
 Keystores are read, checked and explained with these faults, and the messages of DDS vendors stand
 for some of them.  A command in a remedy is one that runs on a keystore with that fault, and mends
@@ -17,9 +17,9 @@ _RENEW = "Renew it: `sros renew {root} {enclave}`."
 _NEW_KEY = "Give the enclave another key: `sros renew {root} {enclave} --new-key`."
 _CLOCK = "Set the clock of this host; if it is right, sign again: `sros renew {root} {enclave}`."
 _SIGN = "Sign the permissions again: `sros create_permission {root} {enclave} POLICY`."
-_COMPLETE = "Make what is missing: `sros create_enclave {root} {enclave}`."
+_COMPLETE = "Create the missing file: `sros create_enclave {root} {enclave}`."
 REPLACE = (
-    "Put a good one in its place: `rm {path} && sros create_enclave {root} {enclave}` takes "
+    "Replace it with a good one: `rm {path} && sros create_enclave {root} {enclave}` takes "
     "the keystore's, or issues it again."
 )
 _RESTORE = "Restore {path} from a backup."
@@ -41,7 +41,7 @@ class Fault(Enum):
     """A fault of an enclave's files that keeps a process from running in it.
 
     ``id`` is stable, for programs.  ``title`` is a clause; ``why``, ``source`` and ``remedy`` are
-    sentences: what DDS makes of it, where that is specified or was measured, and what to do, with
+    sentences: how DDS reacts, where that is specified or was measured, and what to do, with
     ``{root}``, ``{enclave}`` and ``{path}`` for the keystore, the enclave and the file.
     """
 
@@ -56,7 +56,7 @@ class Fault(Enum):
     )
     LINK_DANGLING = (
         "link-dangling",
-        "a file of an enclave is a link to nothing",
+        "a file of an enclave is a broken link",
         "It counts as missing. It happens where an enclave is copied without what it links to; "
         "`sros distribute_key` exports files in place of links.",
         _RCL,
@@ -73,7 +73,7 @@ class Fault(Enum):
     FILE_EMPTY = (
         "file-empty",
         "a file of an enclave is empty",
-        "It was lost, perhaps on a full disk.",
+        "Its content was lost, perhaps because the disk was full.",
         _RCL,
         REPLACE,
         {
@@ -137,7 +137,7 @@ class Fault(Enum):
     KEY_ENCRYPTED = (
         "key-encrypted",
         "a private key that is protected by a passphrase",
-        'No RMW can give a passphrase, so no node can use it (Fast DDS: "Error obtaining private '
+        'No RMW can supply a passphrase, so no node can use it (Fast DDS: "Error obtaining private '
         'key").',
         "rmw_fastrtps 8.4 and rmw_cyclonedds 2.2 (they set no password property).",
         f"{_NEW_KEY} Or keep it without a passphrase, which DDS never asks for: `openssl pkey -in "
@@ -174,7 +174,7 @@ class Fault(Enum):
     CRL_EXPIRED = (
         "crl-expired",
         "a revocation list that has expired",
-        "Everybody is refused, and Fast DDS says nothing about it.",
+        "Everybody is refused, and Fast DDS does not report it.",
         "RFC 5280, 5.1.2.5; Fast DDS 2.14.5; measured.",
         _CRL,
     )
@@ -183,7 +183,8 @@ class Fault(Enum):
         "an enclave whose certificate is revoked",
         "Everybody who reads crl.pem drops it, Fast DDS in silence.",
         "RFC 5280, 5; Fast DDS 2.14.5; measured.",
-        "It is meant to be kept out. If not, give it a new key and certificate: `sros renew {root} "
+        "This is intended after a revocation. If not, give it a new key and certificate: `sros "
+        "renew {root} "
         "{enclave} --new-key`.",
     )
     NOT_SIGNED = (
@@ -261,7 +262,7 @@ class Fault(Enum):
     )
     CA_CHAIN = (
         "ca-chain",
-        "a CA that a vendor does not accept as such",
+        "a CA certificate that a vendor refuses",
         "Fast DDS 2.14 verifies the CA itself, strictly.",
         "RFC 5280, 6.1; Fast DDS 2.14.5 (FileProvider.cpp); measured.",
         "Use a self-signed CA with keyCertSign, first in its file.",
@@ -275,8 +276,9 @@ class Fault(Enum):
     )
     KEY_ALGORITHM = (
         "key-algorithm",
-        "a key that not every vendor takes",
-        "Cyclone DDS takes EC prime256v1 and RSA of exactly 2048 bits alone; Fast DDS fails in its "
+        "a key that not every vendor accepts",
+        "Cyclone DDS accepts only EC prime256v1 and RSA of exactly 2048 bits; Fast DDS fails in "
+        "its "
         "handshake with Ed25519.",
         "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5; measured.",
         "Use keys of EC prime256v1, which every vendor takes.",

@@ -11,7 +11,7 @@ import re
 from sros_tool.errors import InvalidNameError
 
 MAX_COMMON_NAME = 64
-"""Longest enclave name in characters: that of an X.509 common name (RFC 5280)."""
+"""Longest enclave name in characters: the limit of an X.509 common name (RFC 5280)."""
 
 ROS_DISCOVERY_TOPIC = "ros_discovery_info"
 """The DDS topic by which every ROS 2 participant announces its nodes (rmw_dds_common)."""
@@ -30,7 +30,7 @@ NODE_SERVICES = (*PARAMETER_SERVICES, "get_type_description")
 """All services that a node of ROS 2 Jazzy offers under its own name, as ``~/NAME``."""
 
 ACTION_INSIDE = "/_action/"
-"""Stands between the name of an action and those of its services and topics."""
+"""Separates the name of an action from the names of its services and topics."""
 
 ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")
 """The services that an action consists of (ROS 2 design "Actions")."""

@@ -1,6 +1,6 @@
 """Run a function over slices of a list in forked workers.
 
-Signing is bound by the processor, and forked processes share everything that was read and checked
+Signing is limited by the CPU, and forked processes share everything that was read and checked
 before.  They also share the lock on the keystore: it is held until the last of them has exited.
 """
 

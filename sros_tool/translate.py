@@ -1,6 +1,6 @@
 """The translation between the languages of ROS and of DDS Security, both ways.
 
-The mapping of names is that of ros2/sros2, so that a policy gives the same rights with both.
+Names are mapped as in ros2/sros2, so that a policy gives the same rights with both.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def dds_names(right: str, fqn: str) -> DdsNames:
 def service_of(topic: str) -> tuple[str, str]:
     """Return the service of a DDS topic, and ``rq`` for its requests or ``rr`` for its replies.
 
-    Both are "" where the topic is not that of a service.
+    Both are "" if the topic does not belong to a service.
     """
     begin, name = topic[:2], topic[2:]
     end = SERVICE_ENDS.get(begin)
@@ -246,7 +246,7 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
 
 
 def grant_rights(enclave: str, grant: Grant) -> frozenset[Right]:
-    """Return the rights of a grant, those of an ``enclave``, without what every participant has.
+    """Return the rights of an ``enclave``'s grant, without the rights of every participant.
 
     Domains, partitions, relay criteria and the default of the grant are not part of the answer,
     nor is the order of its rules.
@@ -267,7 +267,7 @@ def _all_topics(criteria: Iterable[Criteria]) -> dict[str, bool]:
 def _candidates(publish: Iterable[str], subscribe: Iterable[str]) -> Iterable[tuple[str, str, str]]:
     """Actions, then services, of which a topic that only they have is in the rule.
 
-    Services of an action are not told apart from it unless some of its topics are missing.
+    Services of an action count as the action unless some of its topics are missing.
     """
     requests_out = [name for name, begin in map(service_of, publish) if begin == "rq"]
     requests_in = [name for name, begin in map(service_of, subscribe) if begin == "rq"]

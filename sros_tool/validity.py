@@ -35,7 +35,7 @@ class Window:
     def __post_init__(self) -> None:
         if self.not_after <= self.not_before:
             raise UsageError(
-                f"the validity ends at {iso(self.not_after)} before it begins at "
+                f"the validity expires at {iso(self.not_after)}, before it begins at "
                 f"{iso(self.not_before)}"
             )
 
@@ -72,7 +72,7 @@ def window(now: datetime, span: Span) -> Window:
     begin = span.start or moment
     end = span.end or begin + (span.length or timedelta(0))
     if end <= moment:
-        raise UsageError(f"the validity ended at {iso(end)} already")
+        raise UsageError(f"the validity expired at {iso(end)} already")
     return Window(span.start or moment - BACKDATE, end)
 
 

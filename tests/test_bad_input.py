@@ -679,7 +679,7 @@ ENCLAVES: dict[str, tuple[Callable[[Path], object], str]] = {
     "garbage for a CRL": (lambda folder: (folder / "crl.pem").write_text("x"), "crl.pem"),
     "a link to nothing": (
         lambda folder: _replace(folder / "cert.pem", lambda path: path.symlink_to("no")),
-        "link to nothing",
+        "broken link",
     ),
 }
 

@@ -1,4 +1,4 @@
-"""What a check can find: a kind of finding is data, and a finding says where and why."""
+"""Findings and their kinds: a kind is data, and a finding has a place and a reason."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from sros_tool.dds.decision.vendors import Vendor
 
 
 class Severity(IntEnum):
-    """How bad it is; the words of `--severity` and `--fail-on` are the names in small letters."""
+    """Severity of a finding; `--severity` and `--fail-on` take the names in lower case."""
 
     NOTE = 1
-    """Worth knowing; it may well be meant so."""
+    """Worth knowing; it may be intended."""
     WARNING = 2
-    """It works today, and is a weakness, or will break."""
+    """Works today, but is a weakness or will break."""
     ERROR = 3
-    """Something does not work, or is not protected, although it was meant to be."""
+    """Does not work, or is not protected although it should be."""
 
     @property
     def word(self) -> str:
@@ -66,7 +66,7 @@ class FindingKind:
         return Finding(self, subject, text, file, line or None, remedy, accepted)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the kind as `sros check --list --json` shows it."""
+        """Return the JSON value that `sros check --list --json` prints."""
         return {
             "id": self.id,
             "severity": self.severity.word,
@@ -80,9 +80,9 @@ class FindingKind:
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """Something that was found.
+    """A problem found at one place.
 
-    ``subject`` is what it is about (an enclave, a variable, a file); ``file`` is a path, or "";
+    ``subject`` is the thing concerned (an enclave, a variable, a file); ``file`` is a path, or "";
     ``line`` counts from 1.  ``text`` says why here, ``own_remedy`` what to do here, if that says
     more than the kind does.  ``accepted`` names the choice by which its owner took it into
     account: such a finding counts as a note.
@@ -103,7 +103,7 @@ class Finding:
 
     @property
     def severity(self) -> Severity:
-        """That of its kind, or `NOTE` where it was accepted."""
+        """The severity of its kind, or `NOTE` if it was accepted."""
         return NOTE if self.accepted else self.kind.severity
 
     @property
@@ -119,7 +119,7 @@ class Finding:
         return f"{self.file}:{self.line}" if self.line else self.file
 
     def as_json(self) -> dict[str, Any]:
-        """Return the finding as `sros check --json` shows it."""
+        """Return the JSON value that `sros check --json` prints."""
         return {
             "id": self.id,
             "severity": self.severity.word,
@@ -134,7 +134,7 @@ class Finding:
 
 
 def by_id(*kinds: FindingKind) -> Mapping[str, FindingKind]:
-    """Return a table of kinds by their ids, each of which is given once."""
+    """Map each kind's id to the kind; raise for a duplicate id."""
     table = {kind.id: kind for kind in kinds}
     assert len(table) == len(kinds), "an id is given twice"
     return table

@@ -1,4 +1,4 @@
-"""Findings in policies: names, nodes, rules, portability, and the files themselves."""
+"""Checks of policies: names, nodes, rules, portability, and the files themselves."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ from sros_tool.xml import parse, read_bytes
 
 @dataclass(frozen=True, slots=True)
 class _Statement:
-    """One right as one line of a policy states it; ``written`` is the name as it stands there."""
+    """One right in one line of a policy; ``written`` is the name as written there."""
 
     right: Right
     written: str
@@ -60,13 +60,13 @@ class _Statement:
         return self.right.name
 
     def found(self, kind: FindingKind, text: str, remedy: str = "") -> Finding:
-        """Return a finding of that kind about this line."""
+        """Return a finding of this kind about this line."""
         file, line = self.source.file, self.source.line
         return kind.found(self.right.enclave, text, file, line, remedy)
 
 
 class _CheckedPolicy:
-    """A policy, its statements, and its rights in a form that can be asked."""
+    """A policy, its statements, and its rights in a form that can be queried."""
 
     def __init__(self, policy: Policy) -> None:
         self.policy = policy
@@ -105,25 +105,24 @@ DDS_NAME = FindingKind(
     "policy.dds-name",
     WARNING,
     "a DDS name where a ROS name is meant",
-    "rt/, rq/ and rr/ are put before ROS names when these become DDS topics; in a policy the name "
-    "stands without.",
+    "rt/, rq/ and rr/ are prefixed to ROS names when they become DDS topics; in a policy the name "
+    "has no prefix.",
     "ROS 2 design, Topic and Service name mapping to DDS.",
     "Write the ROS name, without its prefix.",
 )
 WRONG_KIND = FindingKind(
     "policy.wrong-kind",
     WARNING,
-    "a topic said to be a service, or a service said to be a topic",
-    "The name is one that every node of ROS 2 has, and it has it for something else, so the rule "
-    "allows nothing that is used.",
+    "a topic named as a service, or a service named as a topic",
+    "Every ROS 2 node uses this name for something else, so the rule allows nothing that is used.",
     "ROS 2 Jazzy (rclcpp 28, rclpy 7); ROS 2 design, Actions.",
-    "Move the name to the group of its kind.",
+    "Move the name to the right group of rules.",
 )
 EVERYTHING = FindingKind(
     "policy.everything",
     WARNING,
-    "a wildcard that allows to act on everything",
-    "Who holds it can command every node and answer in the place of every other.",
+    "a wildcard that allows acting on everything",
+    "The enclave can command every node and answer in place of every other node.",
     "ROS 2 design, ROS 2 Security Enclaves: the least that is needed.",
     "Name what the node uses; `sros minimize_policy` narrows it to what was observed.",
 )
@@ -131,7 +130,7 @@ WIDE = FindingKind(
     "policy.wide-wildcard",
     WARNING,
     "a wildcard wider than a namespace",
-    "* crosses slashes, so the rule reaches nodes and namespaces that were not thought of.",
+    "* also matches slashes, so the rule reaches nodes and namespaces that you may not expect.",
     "DDS-Security 1.1, 9.4.1.3 (POSIX fnmatch, in which * also matches a slash).",
     "Begin it with a whole namespace, as in /arm/*, or end it with a whole name.",
 )
@@ -139,15 +138,15 @@ READS_EVERYTHING = FindingKind(
     "policy.reads-everything",
     NOTE,
     "a wildcard by which an enclave reads across namespaces",
-    "A recorder needs it; anything else learns more than it has to.",
+    "A recorder needs it; any other enclave learns more than it needs.",
     "ROS 2 design, ROS 2 Security Enclaves: the least that is needed.",
-    "Name the topics, or deny those that are nobody's business.",
+    "Name the topics, or deny the confidential ones.",
 )
 SETS_PARAMETERS = FindingKind(
     "policy.sets-all-parameters",
     WARNING,
     "a wildcard by which an enclave sets the parameters of every node",
-    "Parameters switch use_sim_time, remove limits, and change what drivers do.",
+    "Parameters switch use_sim_time, remove limits, and change how drivers behave.",
     "ROS 2 Jazzy: set_parameters of every node.",
     "Name the nodes whose parameters it has to set.",
 )
@@ -155,16 +154,17 @@ SETS_CLOCK = FindingKind(
     "policy.sets-clock",
     NOTE,
     "an enclave that may publish /clock",
-    "Who sets the clock can let every timeout expire on nodes that use simulated time.",
+    "An enclave that sets the clock can make every timeout expire on nodes that use simulated "
+    "time.",
     "ROS 2 design, Clock and Time.",
-    "Give it to a simulator alone.",
+    "Allow it for a simulator only.",
 )
 NO_COUNTERPART = FindingKind(
     "policy.no-counterpart",
     NOTE,
     "nobody in the policy is allowed the other side",
-    "What is read here, nobody may publish; what is asked for, nobody may answer. It may be a "
-    "typing error, or the other side is in another policy.",
+    "Nobody may publish a topic that is subscribed here, or serve a service that is called here. "
+    "It may be a typing error, or the other side is in another policy.",
     "sros: the policy as a whole.",
     "Compare the names on both sides, after remapping.",
 )
@@ -178,7 +178,7 @@ _OTHER_SIDE = {"subscribe": "publish", "request": "reply", "call": "execute"}
 
 
 def _check_names(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield the findings about every name by itself."""
+    """Yield the findings about single names."""
     for each in checked.statements:
         if reason := _never(each.name):
             yield each.found(NEVER_MATCHES, f"{each.name} matches nothing: {reason}")
@@ -191,7 +191,7 @@ def _check_names(checked: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Names that one side is allowed and the other side nobody."""
+    """Yield findings for names that only one side (publisher, subscriber, …) is allowed."""
     names: dict[str, set[str]] = {right: set() for pair in RIGHTS.values() for right in pair}
     for each in checked.statements:
         if each.allows:
@@ -215,7 +215,7 @@ def _never(name: str) -> str:
 
 
 def _belongs(each: _Statement) -> str:
-    """Return the kind that the name has everywhere, where it is another than here."""
+    """Return the kind that ROS 2 gives to this name, if it differs from the rule's kind."""
     kind, name = each.right.kind, each.name
     if kind != "services":
         is_service = (
@@ -231,17 +231,18 @@ def _breadth(each: _Statement) -> Iterator[Finding]:
         yield each.found(SETS_CLOCK, f"{each.right.enclave} may publish /clock")
     if not is_expression(name):
         return
-    told = each.right.told()
+    text = each.right.told()
     if _ALL.match(name):
         kind = READS_EVERYTHING if right == "subscribe" else EVERYTHING
-        yield each.found(kind, f"{told} stands for every name")
+        yield each.found(kind, f"{text} stands for every name")
     elif literal_prefix(name).count("/") < 2 and is_expression(name.rpartition("/")[2]):
         kind = READS_EVERYTHING if right == "subscribe" else WIDE
         yield each.found(
-            kind, f"{told} begins with no whole namespace, and ends with no whole name"
+            kind,
+            f"{text} does not begin with a whole namespace, and does not end with a whole name",
         )
     elif right == "request" and covers(name, "/*/set_parameters"):
-        yield each.found(SETS_PARAMETERS, f"{told} reaches every node")
+        yield each.found(SETS_PARAMETERS, f"{text} reaches every node")
 
 
 _INCLUDE_HINT = (
@@ -253,7 +254,7 @@ NO_TYPE_DESCRIPTION = FindingKind(
     "policy.no-type-description",
     ERROR,
     "a node that may not offer ~/get_type_description",
-    "Nodes of Jazzy offer this service, and one that is denied it ends as soon as it starts.",
+    "Nodes of Jazzy offer this service, and a node that is denied it exits as soon as it starts.",
     "ROS 2 Jazzy, rclcpp 28 and rclpy 7 (node type descriptions interface); REP-2016.",
     f'Allow <services reply="ALLOW"><service>~/get_type_description</service></services>. '
     f"{_INCLUDE_HINT}",
@@ -262,7 +263,7 @@ NO_ROSOUT = FindingKind(
     "policy.no-rosout",
     ERROR,
     "a node that may not publish /rosout",
-    "Every node makes a publisher for its log when it starts, and fails where it may not.",
+    "Every node creates a publisher for its log when it starts, and fails if this is denied.",
     "ROS 2 Jazzy, rcl 9 (rcl_logging_rosout_init_publisher_for_node).",
     f'Allow <topics publish="ALLOW"><topic>/rosout</topic></topics>. {_INCLUDE_HINT}',
 )
@@ -270,7 +271,7 @@ NO_PARAMETER_EVENTS = FindingKind(
     "policy.no-parameter-events",
     ERROR,
     "a node that may not publish /parameter_events",
-    "Every node announces its parameters there, and fails at its start where it may not.",
+    "Every node announces its parameters there, and fails at its start if this is denied.",
     "ROS 2 Jazzy, rclcpp 28 (NodeParameters) and rclpy 7 (Node).",
     f'Allow <topics publish="ALLOW"><topic>/parameter_events</topic></topics>. {_INCLUDE_HINT}',
 )
@@ -278,8 +279,8 @@ NO_PARAMETER_SERVICES = FindingKind(
     "policy.no-parameter-services",
     ERROR,
     "a node that may not offer all of its parameter services",
-    "Every node offers all six unless it was made without, and fails at its start where it may "
-    "not.",
+    "Every node offers all six unless it was created without them, and fails at its start if this "
+    "is denied.",
     "ROS 2 Jazzy, rclcpp 28 (ParameterService) and rclpy 7 (start_parameter_services).",
     f'Allow <services reply="ALLOW"> with ~/get_parameters and the others. {_INCLUDE_HINT}',
 )
@@ -287,15 +288,15 @@ NO_PARAMETERS = FindingKind(
     "policy.without-parameters",
     NOTE,
     "a node that may offer no parameter service at all",
-    "It has everything else that it needs, so it may well have been made without parameters; "
+    "It has everything else that it needs, so it was perhaps created without parameters; "
     "otherwise it fails at its start.",
     "ROS 2 Jazzy, rclcpp 28 (NodeOptions) and rclpy 7 (start_parameter_services).",
-    f"If it has parameters, let it offer them. {_INCLUDE_HINT}",
+    f"If it has parameters, allow these services. {_INCLUDE_HINT}",
 )
 RELATIVE_GLOBAL = FindingKind(
     "policy.relative-global-name",
     ERROR,
-    "a name that ROS has at the root, said relative to a namespace",
+    "a root name of ROS that is written relative to a namespace",
     "/rosout, /parameter_events and /clock are absolute also for nodes in a namespace, so the "
     "rule allows a topic that nobody uses. Sample policies of ros2/sros2 have this.",
     "rcl 9 (logging_rosout.h: /rosout); rclcpp 28 (/parameter_events, /clock).",
@@ -310,12 +311,12 @@ _BASICS = (
     (NO_PARAMETER_SERVICES, "reply", tuple(f"~/{name}" for name in PARAMETER_SERVICES)),
 )
 _LISTENER = "transform_listener_impl_"
-"""Begins the names of the nodes that tf2_ros makes; they have no parameters, and no events."""
+"""Prefix of the nodes that tf2_ros creates; they have no parameters and no events."""
 _OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
 
 
 def _check_nodes(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield the findings about every node, by what its enclave allows as a whole.
+    """Yield the findings about every node, by all rights of its enclave.
 
     Nodes whose names begin with an underscore are hidden ones, tools that are started without
     log, parameters and types (ROS 2 design, "Topic and Service Names"; ros2cli does so).
@@ -352,8 +353,8 @@ DOCUMENT_SIZE = FindingKind(
     "portable.document-size",
     WARNING,
     "signed permissions of 64 KB or more",
-    "The handshake carries them. Fast DDS 2.9 never finishes it, and sometimes aborts; Fast DDS "
-    "2.14 and Cyclone DDS take them.",
+    "They are sent in the handshake. Fast DDS 2.9 never finishes it, and sometimes aborts; Fast "
+    "DDS 2.14 and Cyclone DDS accept them.",
     "ros2/sros2 issue 228; Fast DDS 2.9.1 (SecurityManager.cpp) and 2.14.5, Cyclone DDS 0.10.2; "
     "measured.",
     "Use wildcards (`sros minimize_policy` proposes them), or split the enclave.",
@@ -364,7 +365,7 @@ LONG_NAME = FindingKind(
     WARNING,
     "a topic whose name is too long for Fast DDS",
     "From 252 bytes on (prefix and suffix included) an endpoint is created on Fast DDS, and never "
-    "matched; Cyclone DDS takes it.",
+    "matched; Cyclone DDS accepts it.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Use shorter namespaces and names.",
     vendors=FAST_DDS,
@@ -373,10 +374,10 @@ DENY_BLOCKS = FindingKind(
     "portable.deny-blocks-topic",
     WARNING,
     "a denial of one direction of a topic that is allowed in the other",
-    "Cyclone DDS asks whether the topic may be made at all, and a denial of either direction "
-    "answers no; Fast DDS allows it.",
+    "Cyclone DDS checks whether the topic may be created at all, and a denial of either direction "
+    "forbids it; Fast DDS allows it.",
     "Cyclone DDS 0.10.2 (access_control.c), Fast DDS 2.9.1 and 2.14.5; measured.",
-    "Remove the denial: what no rule allows is denied anyway.",
+    "Remove the denial: everything that no rule allows is denied anyway.",
     vendors=(Vendor.CYCLONE,),
 )
 CHARACTER_SET = FindingKind(
@@ -390,12 +391,12 @@ CHARACTER_SET = FindingKind(
 ENCLAVE_NAMES = FindingKind(
     "portable.enclave-names",
     WARNING,
-    "an enclave whose name consists of parts of another's",
-    "Cyclone DDS compares the parts of two subjects as sets, one way: /robot fits the (public) "
-    "permissions of /robot/admin, and gets in with them.",
-    "Cyclone DDS 0.10.2 (access_control.c); an enclave did so here and was heard.",
-    "Choose names none of which is made of parts of another, such as /robot_admin, or subjects "
-    "with a part of their own (template production).",
+    "an enclave whose name consists of parts of another enclave's name",
+    "Cyclone DDS compares the parts of two subjects as sets, one way: /robot matches the (public) "
+    "permissions of /robot/admin, and can join with them.",
+    "Cyclone DDS 0.10.2 (access_control.c); reproduced: such an enclave was heard.",
+    "Choose names that do not consist of parts of another, such as /robot_admin, or unique "
+    "subjects (template production).",
     vendors=(Vendor.CYCLONE,),
 )
 SEVERAL_PROFILES = FindingKind(
@@ -414,7 +415,7 @@ _DOMAINS = DomainSet.of((0, 0))
 
 
 def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield the findings about every enclave as its permissions would be signed."""
+    """Yield the findings about the permissions that would be signed for every enclave."""
     for enclave in checked.policy.enclaves:
         source = enclave.source
         permissions = permissions_for(
@@ -446,7 +447,7 @@ def _at_denial(found: Finding, checked: _CheckedPolicy) -> Finding:
 def outside_findings(
     permissions: Permissions, signed_bytes: int, subject: str, file: str, line: int | None = None
 ) -> Iterator[Finding]:
-    """Yield what of a permissions document lies outside of the portable profile."""
+    """Yield the parts of a permissions document that are outside of the portable profile."""
     for identity, fact in outside(permissions, signed_bytes, overlap):
         yield _OUTSIDE[identity].found(subject, fact, file, line)
 
@@ -467,14 +468,14 @@ CONTRADICTION = FindingKind(
     "policy.contradiction",
     WARNING,
     "the same name is allowed and denied",
-    "The denial counts, so the permission does nothing; one of them is not meant.",
+    "The denial wins, so the permission has no effect; one of them is a mistake.",
     _ORDER,
-    "Remove the one that is not meant.",
+    "Remove the wrong one.",
 )
 UNREACHABLE = FindingKind(
     "policy.unreachable-rule",
     WARNING,
-    "a permission that a denial takes away as a whole",
+    "a permission that a denial covers completely",
     "A denial of the same enclave, perhaps of another node in it, covers every name of the rule, "
     "so it never allows anything.",
     _ORDER,
@@ -483,8 +484,9 @@ UNREACHABLE = FindingKind(
 NO_EFFECT = FindingKind(
     "policy.deny-without-effect",
     WARNING,
-    "a denial of what nothing allows",
-    "What no rule allows is denied anyway. The denial takes nothing away, and on Cyclone DDS it "
+    "a denial of something that no rule allows",
+    "Everything that no rule allows is denied anyway. The denial has no effect, and on Cyclone "
+    "DDS it "
     "can close the other direction of the topic.",
     "DDS-Security 1.1, 9.4.1.3 (the default is DENY); Cyclone DDS 0.10.2 refuses a topic of "
     "which one direction is denied.",
@@ -493,8 +495,9 @@ NO_EFFECT = FindingKind(
 REDUNDANT_RULE = FindingKind(
     "policy.redundant-rule",
     NOTE,
-    "a permission that a wildcard beside it gives already",
-    "The name stands under a wildcard of the same profile, so it only makes the document longer.",
+    "a permission that a wildcard next to it already gives",
+    "A wildcard in the same profile already covers the name, so the name only makes the document "
+    "longer.",
     "sros: rights of a profile are joined.",
     "Remove the name, or better the wildcard.",
 )
@@ -510,7 +513,7 @@ HALF_ACTION = FindingKind(
 
 
 def _check_rules(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield the findings about every statement against the others of its enclave."""
+    """Yield contradictions and repetitions among the statements of each enclave."""
     for each in checked.statements:
         if each.allows:
             yield from _permission(each, checked.rules)
@@ -559,12 +562,12 @@ MALFORMED = FindingKind(
     "a policy that cannot be read",
     "Nothing can be made from it.",
     "SROS2 policy XML 0.2.0 (policy.xsd of ros2/sros2) and the names of ROS 2.",
-    "Correct it where the text says.",
+    "Correct it at the reported place.",
 )
 DUPLICATE = FindingKind(
     "policy.duplicate-enclave",
     ERROR,
-    "an enclave that is given twice",
+    "an enclave that is defined twice",
     "One verb of ros2/sros2 takes the first and another one the last, so rights change with the "
     "command; sros takes neither.",
     "ros2/sros2 0.13 (create_permission, generate_artifacts).",
@@ -574,15 +577,15 @@ FALLBACK = FindingKind(
     "policy.include-fallback",
     WARNING,
     "an include whose file does not exist",
-    "Its <xi:fallback> stands in, so the rights are others than those that were meant.",
+    "Its <xi:fallback> is used instead, so the rights are not the intended ones.",
     "XInclude 1.0, 4.4.",
     "Put the file there, or remove the include.",
 )
 REDUNDANT_INCLUDE = FindingKind(
     "policy.redundant-include",
     NOTE,
-    "an include that brings nothing new",
-    "The same profile includes the file once more, itself or through another.",
+    "an include that adds nothing",
+    "The same profile includes the file again, directly or through another file.",
     "XInclude 1.0.",
     "Remove it.",
 )
@@ -594,14 +597,14 @@ _MANY = 1000
 
 
 def _policy_findings(policy: Policy) -> Iterator[Finding]:
-    """Yield everything that is found in a policy that could be read."""
+    """Yield all findings in a policy that could be read."""
     checked = _CheckedPolicy(policy)
     for check in _CHECKS:
         yield from check(checked)
 
 
 def policy_file_findings(path: Path) -> Iterator[Finding]:
-    """Yield everything that is found in a policy file, also where it cannot be read."""
+    """Yield all findings in a policy file, even if it cannot be read."""
     try:
         policy = read_policy(path)
     except SrosError as error:
@@ -615,7 +618,7 @@ def _unreadable(path: Path, error: SrosError) -> Iterator[Finding]:
     found = False
     for name, line in _duplicates(path):
         found = True
-        yield DUPLICATE.found(name, f"{name} stands here once more", str(path), line)
+        yield DUPLICATE.found(name, f"{name} is defined here again", str(path), line)
     if found:
         return
     match = _PLACE.match(error.what)
@@ -658,7 +661,7 @@ def _includes(path: Path) -> Iterator[Finding]:
                 each.get("xpointer") for each in includes[:index]
             )
             if twice or any(file != o and file in _reached(o, below) for o in others):
-                text = f"'{href}' comes with another include of the same profile"
+                text = f"'{href}' is already included in the same profile by another include"
                 yield REDUNDANT_INCLUDE.found(str(path), text, str(path), line)
 
 
@@ -667,7 +670,7 @@ def _target(path: Path, element: etree._Element) -> Path:
 
 
 def _reached(file: Path, known: dict[Path, frozenset[Path]]) -> frozenset[Path]:
-    """Return the files that one includes, itself or through others."""
+    """Return the files that a file includes, directly or through others."""
     if file in known:
         return known[file]
     known[file] = frozenset()  # for includes in a circle

@@ -33,9 +33,9 @@ KINDS: Mapping[str, FindingKind] = by_id(
 
 @dataclass(frozen=True, slots=True)
 class FindingFilter:
-    """Which findings are wanted.
+    """The selection of findings to report.
 
-    With ``vendor``, what concerns others only is left out, and so is that vendors differ.
+    With ``vendor``, findings about other vendors only, and about differences, are left out.
     ``include`` and ``exclude`` hold ids, ids of groups, or patterns with ``*`` and ``?``; nothing
     to include means all.  ``severity`` is the least that is shown.  ``strict`` takes back what
     was accepted: a choice of the keystore's template counts like any other finding.
@@ -61,7 +61,7 @@ class FindingFilter:
                 )
 
     def wants(self, kind: FindingKind) -> bool:
-        """Return whether findings of that kind are wanted, if they are severe enough."""
+        """Return whether this kind is selected, apart from its severity."""
         included = not self.include or any(_matches(kind, each) for each in self.include)
         if self.vendor and kind.vendors and self.vendor not in kind.vendors:
             return False
@@ -90,7 +90,7 @@ class ChosenFindings:
     hidden: int
 
     def fails(self, level: Severity) -> bool:
-        """Return whether something is shown that is at least as bad as that."""
+        """Return whether a finding of at least this severity is shown."""
         return any(each.severity >= level for each in self.shown)
 
 

@@ -33,7 +33,7 @@ from sros_tool.xml import read_bytes
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """A process that runs: its command, environment, and the moment of its start."""
+    """A running process: its command, environment, and start time."""
 
     pid: int
     command: tuple[str, ...]
@@ -41,19 +41,19 @@ class Process:
     started: datetime
 
     @property
-    def told(self) -> str:
-        """As "process 4711 (talker)"."""
+    def label(self) -> str:
+        """Its name in messages, such as "process 4711 (talker)"."""
         program = Path(self.command[0]).name if self.command else "?"
         return f"process {self.pid} ({program})"
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What checks of the runtime look at.
+    """The input of the runtime checks: environment, clock, RMWs and processes.
 
-    ``clock`` is what the clock of the host says, where ``now`` is another moment.
-    ``rmws`` are the installed RMWs; ``insecure_rmws`` those that were tried and do not enforce
-    security, with what was seen.  ``zone`` is that of the host.
+    ``clock`` is the time on the host's clock, if ``now`` is another moment.
+    ``rmws`` are the installed RMWs; ``insecure_rmws`` maps tried RMWs that do not enforce security
+    to the observed result.  ``zone`` is the host's time zone.
     """
 
     environment: Mapping[str, str]
@@ -102,15 +102,15 @@ RMW_NOT_INSTALLED = FindingKind(
     "RMW_IMPLEMENTATION names an RMW that is not installed",
     "No node starts.",
     "rmw_implementation 2.15 (functions.cpp).",
-    "Install it, or choose one that is there.",
+    "Install it, or choose an installed one.",
 )
 RMW_INSECURE = FindingKind(
     "runtime.rmw-without-security",
     ERROR,
     "an RMW that does not enforce DDS Security",
-    "It was built without, or is not on DDS; nodes fail, or run unsecured.",
-    "Found by trying (`sros doctor`); rmw_zenoh reads none of the files of an enclave.",
-    "Use an RMW of which `sros doctor` says that it enforces security.",
+    "It was built without security, or does not use DDS; nodes fail, or run unsecured.",
+    "Found by a test (`sros doctor`); rmw_zenoh reads none of the files of an enclave.",
+    "Use an RMW that enforces security according to `sros doctor`.",
 )
 CLOCK_BEHIND = FindingKind(
     "runtime.clock-behind",
@@ -125,23 +125,23 @@ DAEMON_UNSECURED = FindingKind(
     "runtime.daemon-unsecured",
     WARNING,
     "the daemon of ros2 runs without security",
-    "`ros2 topic list` and others ask it, and it sees nothing of a secured robot, so the graph "
+    "`ros2 topic list` and other commands ask it, and it cannot see a secured robot, so the graph "
     "seems empty.",
     "ros2cli 0.32 (daemon); it keeps the environment in which it was started.",
-    "Run `ros2 daemon stop`; it is started anew by the next command, with this environment.",
+    "Run `ros2 daemon stop`; the next command starts it again, with this environment.",
 )
 DAEMON_OTHER = FindingKind(
     "runtime.daemon-differs",
     WARNING,
     "the daemon of ros2 runs with another keystore or enclave",
-    "`ros2 topic list` and others ask it, and show what that enclave sees.",
+    "`ros2 topic list` and other commands ask it, and show the graph as that enclave sees it.",
     "ros2cli 0.32 (daemon); it keeps the environment in which it was started.",
     "Run `ros2 daemon stop`.",
 )
 PROCESS_UNSECURED = FindingKind(
     "runtime.process-unsecured",
     WARNING,
-    "a node that runs without security beside secured ones",
+    "a node without security next to secured nodes",
     "It and the secured nodes do not see each other.",
     "DDS-Security 1.1, 9.4.1.2 (allow_unauthenticated_participants is false).",
     "Start it with `sros run ROOT NAME -- COMMAND...`.",
@@ -158,7 +158,7 @@ MIXED_VENDORS = FindingKind(
     "runtime.mixed-vendors",
     WARNING,
     "secured processes on different RMWs",
-    "Vendors do not talk to each other securely on these versions, and say nothing about it.",
+    "Vendors do not talk to each other securely on these versions, and do not report it.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Use one RMW per robot.",
 )
@@ -210,15 +210,15 @@ def _processes(setting: Setting) -> Iterator[Finding]:
     for process in setting.processes:
         environment = process.environment
         if _is_daemon(process):
-            # Each domain has a daemon of its own; commands ask that of theirs.
+            # Each domain has its own daemon; commands ask the daemon of their domain.
             if secured_here and _domain(environment) == _domain(setting.environment):
                 yield from _daemon(process, setting.environment)
         elif _is_secured(environment):
-            rmws.setdefault(environment.get(RMW) or DEFAULT_RMW, []).append(process.told)
+            rmws.setdefault(environment.get(RMW) or DEFAULT_RMW, []).append(process.label)
             yield from _outdated(process)
         elif secured_here and _is_node_beside(process, setting.environment):
             text = f"it is in domain {_domain(environment)}, and {ENABLE} is not 'true' for it"
-            yield PROCESS_UNSECURED.found(process.told, text)
+            yield PROCESS_UNSECURED.found(process.label, text)
     if secured_here:
         rmws.setdefault(setting.environment.get(RMW) or DEFAULT_RMW, []).append("this environment")
     if len({_vendor(rmw) for rmw in rmws}) > 1:
@@ -228,8 +228,8 @@ def _processes(setting: Setting) -> Iterator[Finding]:
 
 def _daemon(process: Process, wanted: Mapping[str, str]) -> Iterator[Finding]:
     if not _is_secured(process.environment):
-        text = f"{ENABLE} is not 'true' for {process.told}"
-        yield DAEMON_UNSECURED.found(process.told, text)
+        text = f"{ENABLE} is not 'true' for {process.label}"
+        yield DAEMON_UNSECURED.found(process.label, text)
         return
     differing = [
         name
@@ -238,7 +238,7 @@ def _daemon(process: Process, wanted: Mapping[str, str]) -> Iterator[Finding]:
     ]
     if differing:
         text = f"it has another {', '.join(differing)}"
-        yield DAEMON_OTHER.found(process.told, text)
+        yield DAEMON_OTHER.found(process.label, text)
 
 
 def _outdated(process: Process) -> Iterator[Finding]:
@@ -254,7 +254,7 @@ def _outdated(process: Process) -> Iterator[Finding]:
     ]
     if newer:
         text = f"it runs since {iso(process.started)}; {', '.join(newer)} of {name} are newer"
-        yield PROCESS_OUTDATED.found(process.told, text)
+        yield PROCESS_OUTDATED.found(process.label, text)
 
 
 def _is_secured(environment: Mapping[str, str]) -> bool:
@@ -290,16 +290,16 @@ ENABLE_MISSPELT = FindingKind(
     "runtime.enable-misspelt",
     ERROR,
     "ROS_SECURITY_ENABLE is neither true nor false",
-    "Only exactly `true` switches security on; with anything else every node runs unsecured, and "
-    "says nothing about it.",
+    "Only `true`, spelled exactly so, enables security; with any other value every node runs "
+    "unsecured, and does not report it.",
     _RCL,
     f"Write ROS_SECURITY_ENABLE=true. {_ENV}",
 )
 NOT_ENABLED = FindingKind(
     "runtime.not-enabled",
     WARNING,
-    "security is prepared and not switched on",
-    "Without ROS_SECURITY_ENABLE=true nodes run unsecured, whatever the other variables say.",
+    "security is configured but not enabled",
+    "Without ROS_SECURITY_ENABLE=true nodes run unsecured, whatever the other variables are.",
     _RCL,
     f"Write ROS_SECURITY_ENABLE=true, or unset the others. {_ENV}",
 )
@@ -307,7 +307,7 @@ MISSPELT = FindingKind(
     "runtime.variable-misspelt",
     ERROR,
     "a variable that nobody reads",
-    "It is all but the name of one that rcl reads, so what it says is ignored in silence.",
+    "It looks like a typo of a variable that rcl reads, so its value is silently ignored.",
     _RCL,
     "Correct the name.",
 )
@@ -315,24 +315,24 @@ STRATEGY_MISSPELT = FindingKind(
     "runtime.strategy-misspelt",
     ERROR,
     "ROS_SECURITY_STRATEGY is neither Enforce nor Permissive",
-    "Only exactly `Enforce` enforces; with anything else a node whose enclave is missing runs "
-    "unsecured.",
+    "Only `Enforce`, spelled exactly so, enforces security; with any other value a node whose "
+    "enclave is missing runs unsecured.",
     _RCL,
     f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV}",
 )
 NOT_ENFORCED = FindingKind(
     "runtime.not-enforced",
     WARNING,
-    "security is on and not enforced",
-    "A node whose enclave, or one of whose files, is missing runs unsecured, even while it logs "
-    "that it found a security directory.",
+    "security is enabled but not enforced",
+    "A node runs unsecured if its enclave or one of its files is missing, even if it logs that it "
+    "found a security directory.",
     _RCL,
     f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV}",
 )
 KEYSTORE_UNSET = FindingKind(
     "runtime.keystore-unset",
     ERROR,
-    "security is on and no keystore is named",
+    "security is enabled but no keystore is named",
     "With Enforce no node starts (error not set); without, all run unsecured.",
     _RCL,
     f"Set ROS_SECURITY_KEYSTORE. {_ENV}",
@@ -349,9 +349,9 @@ KEYSTORE_RELATIVE = FindingKind(
     "runtime.keystore-relative",
     WARNING,
     "ROS_SECURITY_KEYSTORE is a relative path",
-    "It means something else to each process that is started in another folder, as services are.",
+    "It means a different folder for each process that is started elsewhere, such as a service.",
     _RCL,
-    f"Write the whole path. {_ENV}",
+    f"Write the absolute path. {_ENV}",
 )
 ENCLAVE_NOT_FOUND = FindingKind(
     "runtime.enclave-not-found",
@@ -359,14 +359,14 @@ ENCLAVE_NOT_FOUND = FindingKind(
     "the enclave is not in the keystore",
     "With Enforce the node does not start; without, it runs unsecured. Names are compared exactly.",
     _RCL,
-    "Correct the name, or make it with `sros create_enclave`.",
+    "Correct the name, or create the enclave with `sros create_enclave`.",
 )
 NO_ENCLAVE = FindingKind(
     "runtime.enclave-unset",
     WARNING,
     "no enclave is named",
-    "Every process has to say --ros-args --enclave NAME; one that does not uses the enclave /, "
-    "which the keystore does not have, and does not start.",
+    "Every process has to say --ros-args --enclave NAME; otherwise it uses the enclave /, which "
+    "the keystore does not have, and does not start.",
     _RCL,
     _NAME_IT,
 )
@@ -390,7 +390,7 @@ DOMAIN_MALFORMED = FindingKind(
 DOMAIN_NOT_GOVERNED = FindingKind(
     "runtime.domain-not-governed",
     ERROR,
-    "the keystore is not made for this domain",
+    "the keystore does not cover this domain",
     'No node starts: Fast DDS says "Not found topic access rule for topic ros_discovery_info", '
     'Cyclone DDS "Could not find domain in governance".',
     "DDS-Security 1.1, 9.4.1.2; measured.",
@@ -400,7 +400,7 @@ CA_KEY_HERE = FindingKind(
     "runtime.ca-key-present",
     NOTE,
     "nodes run with the keystore that has the keys of the CAs",
-    "Who breaks into a node can make any enclave, with any rights.",
+    "An attacker who takes over a node can make any enclave, with any rights.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6.",
     "Run them with an export (`sros distribute_key`), and keep the keystore elsewhere.",
 )
@@ -499,7 +499,7 @@ def _governed(root: Path) -> DomainSet | None:
     try:
         signed = smime.parse(read_bytes(root / GOVERNANCE_P7S, "governance document"))
         return parse_governance(signed.document).domains().closed()
-    except SrosError:  # told of the enclave; an export has a copy in each
+    except SrosError:  # reported with the enclave; in an export each has a copy
         return None
 
 
@@ -509,5 +509,5 @@ def _value(environment: Mapping[str, str], name: str) -> str:
 
 
 def runtime_findings(setting: Setting) -> list[Finding]:
-    """Return everything that is found in an environment and on its host."""
+    """Return all findings in an environment and on its host."""
     return joined([*_check_variables(setting), *_check_host(setting)])

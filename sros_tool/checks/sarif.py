@@ -19,7 +19,7 @@ def sarif(
 ) -> dict[str, Any]:
     """Return a SARIF log of one run, in which ``kinds`` are the rules.
 
-    Paths are relative to the folder ``base``; a file without a line is told at its first one.
+    Paths are relative to the folder ``base``; a finding without a line is placed at line 1.
     Accepted findings are there too, as suppressed.
     """
     rules = {kind.id: index for index, kind in enumerate(kinds)}

@@ -1,4 +1,4 @@
-"""Finds out what a path is, and checks it."""
+"""Detects the kind of a path (policy, keystore, enclave) and checks it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Circumstances:
 
 
 def path_findings(path: Path, at: Circumstances) -> list[Finding]:
-    """Return what is found at a path: a policy, a keystore, an enclave, or a folder of policies.
+    """Return the findings at a path: a policy, a keystore, an enclave, or a folder of policies.
 
     Raises `DocumentError` for anything else.
     """

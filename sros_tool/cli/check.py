@@ -182,7 +182,7 @@ def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:
     if word in _FAMILIES and not (len(targets) == 1 and targets[0].exists()):
         if word == "runtime" and len(targets) > 1:
             raise UsageError(
-                "the runtime is always that of this machine", "", "Leave the path out."
+                "the runtime is always the one of this machine", "", "Leave the path out."
             )
         return word, targets[1:]
     return "", targets
@@ -229,7 +229,7 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
     if root and is_keystore(Path(root)):
         found += path_findings(Path(root), at)
     elif not root:
-        looked = "looked at the runtime only: no path is given, nor is ROS_SECURITY_KEYSTORE set"
+        looked = "checked the runtime only: no path is given and ROS_SECURITY_KEYSTORE is not set"
         click.echo(looked, err=True)
     return list(dict.fromkeys(found))
 
@@ -286,7 +286,7 @@ def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> in
         for each in due:
             click.echo(describe_lifetime(each, moment))
         for other in unreadable:
-            click.echo(f"{other.name}  nobody can tell: {other.error}")
+            click.echo(f"{other.name}  unknown: {other.error}")
     return 1 if due or unreadable else 0
 
 

@@ -56,7 +56,7 @@ def json_option(function: Decorated) -> Decorated:
 def dry_run_option(function: Decorated) -> Decorated:
     """Add ``--dry-run`` to a verb that writes."""
     return click.option(
-        "--dry-run", is_flag=True, help="Say what would change, and change nothing."
+        "--dry-run", is_flag=True, help="Show what would change, and change nothing."
     )(function)
 
 
@@ -94,7 +94,7 @@ class SeveralValues(click.Command):
 
 
 def split_root(words: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
-    """Split the arguments into the keystore (or that of the environment) and the rest.
+    """Split the arguments into the keystore (or the environment's) and the rest.
 
     The first word is the keystore, unless it can only be the name of an enclave: it starts with
     "/", is no folder, and $ROS_SECURITY_KEYSTORE is set.
@@ -205,7 +205,7 @@ def check_output(output: Path, *, force: bool) -> None:
     """
     if not output.absolute().parent.is_dir():
         raise UsageError(
-            f"cannot write '{output}'", "Its folder does not exist.", "Make the folder first."
+            f"cannot write '{output}'", "Its folder does not exist.", "Create the folder first."
         )
     if output.is_dir():
         raise UsageError(f"cannot write '{output}'", "It is a folder.", "Name a file.")
@@ -251,7 +251,7 @@ def moment_of(text: str | None) -> datetime:
         with suppress(UsageError):
             return now() + parse_duration(text)
     raise UsageError(
-        f"--at {text!r} is no moment",
+        f"--at {text!r} is not a date",
         f"It is neither a date of {_YEARS[0]} to {_YEARS[1]} nor a duration.",
         "Write 2027-06-01, 2027-06-01T12:00:00Z, or 90d from now.",
     )

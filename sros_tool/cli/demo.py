@@ -59,7 +59,7 @@ reason), 1 if not.""",
     type=click.Choice(["auto", "rclpy", "cyclone"]),
     default="auto",
     show_default=True,
-    help="What the nodes run on; auto takes rclpy where its RMW enforces security.",
+    help="What the nodes run on; auto uses rclpy if its RMW enforces security.",
 )
 @click.option(
     "--scenario",
@@ -67,7 +67,7 @@ reason), 1 if not.""",
     multiple=True,
     metavar="NAME",
     shell_complete=_complete_scenario,
-    help="What to show: a name of --list, `all`, or a TOML file of yours; can be repeated.",
+    help="What to show: a name of --list, `all`, or your own TOML file; can be repeated.",
 )
 @click.option("--list", "list_them", is_flag=True, help="List the scenarios.")
 @click.option(
@@ -101,7 +101,7 @@ reason), 1 if not.""",
     type=click.Choice(["auto", "host"]),
     default="auto",
     show_default=True,
-    help="auto takes a network namespace of its own where the system allows it.",
+    help="auto uses a separate network namespace if the system allows it.",
 )
 @click.option(
     "--keep",
@@ -125,7 +125,7 @@ reason), 1 if not.""",
     "--report",
     type=PATH,
     metavar="FILE.html",
-    help="Write all of it as one page, with the plots of what security costs.",
+    help="Write everything as one page, with plots of what security costs.",
 )
 @force_option
 @json_option

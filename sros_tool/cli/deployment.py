@@ -57,9 +57,9 @@ Example:
     "patterns",
     multiple=True,
     metavar="PATTERN",
-    help="Export those that fit, such as '/arm/*'; * also stands for '/'.  May be repeated.",
+    help="Export matching enclaves, such as '/arm/*'; * also matches '/'.  Can be repeated.",
 )
-@click.option("--force", is_flag=True, help="Replace what TARGET holds of another version.")
+@click.option("--force", is_flag=True, help="Replace files of another version in TARGET.")
 @dry_run_option
 def distribute_key(
     words: tuple[str, ...], every: bool, patterns: tuple[str, ...], force: bool, dry_run: bool
@@ -131,7 +131,7 @@ def _refuse_terminal() -> None:
         raise UsageError(
             "an archive would be written to this terminal",
             "It is binary, and it may hold private keys.",
-            "Lead it into a pipe, such as `| ssh robot tar -xz -C /etc/robot`, or name a file.",
+            "Use a pipe, such as `| ssh robot tar -xz -C /etc/robot`, or name a file.",
         )
 
 
@@ -202,8 +202,8 @@ Example:
 def create_request(name: str, folder: Path | None, again: bool, dry_run: bool) -> None:
     """On a robot: make the key of the enclave NAME in the folder DIR, and a signing request.
 
-    The key never leaves DIR.  Send the request home, where `sros sign_request` answers it; `sros
-    import` installs the answer next to the key.
+    The key never leaves DIR.  Send the request to the keystore, where `sros sign_request` answers
+    it; `sros import` installs the answer next to the key.
     """
     from sros_tool.keystore.delivery.request import create_request as create
 
@@ -213,7 +213,7 @@ def create_request(name: str, folder: Path | None, again: bool, dry_run: bool) -
         print_plan(folder, made.changes)
         return
     if again:
-        click.echo(f"made the request of enclave {name} anew, for the key that is there")
+        click.echo(f"made the request of enclave {name} again, for the existing key")
     else:
         click.echo(f"made the key of enclave {name}, which stays in '{folder}'")
     click.echo(f"  its SHA-256 is {made.key}")
@@ -259,11 +259,12 @@ def sign_request(
     force: bool,
     dry_run: bool,
 ) -> None:
-    """At home: certify the key of the file REQUEST (or -), and sign the enclave's permissions.
+    """At the keystore: certify the key in REQUEST (or -), and sign the enclave's permissions.
 
     The answer is one .tar.gz for `sros import` on the robot.  It holds no secret: certificate,
     permissions, governance, the certificates of the CAs, and what was revoked.  The keystore knows
-    the enclave from then on, without its key.  Compare the key's SHA-256 with what the robot says.
+    the enclave from then on, without its key.  Compare the key's SHA-256 with the one that the
+    robot printed.
     """
     from sros_tool.keystore.delivery.signing import sign_request as sign
     from sros_tool.keystore.layout import PERMISSIONS
@@ -322,7 +323,7 @@ Example:
   imported enclave /arm/camera, which can run until 2027-05-20T07:45:12Z
     it trusts CN=sros identity CA 4f122aed, SHA-256 5fe417aa...
     and CN=sros permissions CA 4f122aed, SHA-256 e15ab4af...
-    compare both with what sign_request said, or say --ca: ...
+    compare both with the output of sign_request, or use --ca: ...
   $ sros import request.answer.tar.gz robot --ca e15ab4af9ee8c94bd8a5e4c6c1...
   $ sros run robot /arm/camera -- ros2 run camera driver""",
 )
@@ -333,8 +334,8 @@ Example:
     "--ca",
     "pin",
     metavar="FILE|SHA-256",
-    help="Accept it only if this permissions CA has signed it: its certificate, or the SHA-256 "
-    "that sign_request and create_keystore say.",
+    help="Accept it only if this permissions CA signed it: its certificate, or the SHA-256 that "
+    "sign_request and create_keystore print.",
 )
 @dry_run_option
 def import_verb(
@@ -343,9 +344,9 @@ def import_verb(
     """On a robot: install the file ANSWER (or -) next to the key in DIR, or change nothing.
 
     All of it is checked first: that the certificate is for this key, the chain, the signatures,
-    the dates, and that the archive holds nothing else.  The first answer tells the robot whom to
-    trust; whoever carries it could send one of his own, unless --ca says whose it has to be.  Later
-    ones have to come from the same CAs.
+    the dates, and that the archive holds nothing else.  The first answer defines whom the robot
+    trusts; whoever carries it could replace it, unless --ca names the CA.  Later answers have to
+    come from the same CAs.
     """
     from sros_tool.keystore.delivery.answer import import_answer
     from sros_tool.keystore.delivery.trust import read_pin
@@ -368,7 +369,8 @@ def import_verb(
         click.echo(f"  and {_named(done.permissions_ca)}")
     if done.first and not pinned:
         click.echo(
-            "  compare both with what sign_request said, or say --ca: nothing else vouches for them"
+            "  compare both with the output of sign_request, or use --ca: nothing else vouches "
+            "for them"
         )
 
 
@@ -382,7 +384,9 @@ def _read(path: Path, what: str) -> bytes:
     data = sys.stdin.buffer.read(MAX_PACKED + 1) if sys.stdin else b""
     if not data:
         raise DocumentError(
-            f"the {what} is empty", "Nothing came from standard input.", "See what sends it."
+            f"the {what} is empty",
+            "Nothing came from standard input.",
+            "Check the command that sends it.",
         )
     return data
 

@@ -133,7 +133,7 @@ Example:
     "--policy",
     type=PATH,
     metavar="FILE",
-    help="Where the permissions came from; without a keystore, what is asked.",
+    help="The policy that the permissions came from; without a keystore, the policy that is asked.",
 )
 @click.option(
     "--vendor",
@@ -153,21 +153,19 @@ Example:
     help="Time zone of the robot, in which Fast DDS reads dates: Asia/Tokyo. "
     "[default: this machine's]",
 )
-@click.option("--who", is_flag=True, help="Say which enclaves of the keystore may.")
+@click.option("--who", is_flag=True, help="Show which enclaves of the keystore may.")
 @click.option(
     "--reach",
     metavar="ENCLAVE",
     shell_complete=_complete_enclave,
-    help="Say whom this enclave can influence and learn from, over any number of hops.",
+    help="Show whom this enclave can influence and learn from, over any number of hops.",
 )
 @click.option(
     "--infrastructure",
     is_flag=True,
     help="With --reach, count /parameter_events too, which all nodes share.",
 )
-@click.option(
-    "--log", metavar="FILE", help="Say what the lines of a DDS log mean; - is standard input."
-)
+@click.option("--log", metavar="FILE", help="Explain the lines of a DDS log; - is standard input.")
 @json_option
 def explain(
     words: tuple[str, ...],
@@ -185,7 +183,7 @@ def explain(
     log: str | None,
     as_json: bool,
 ) -> int:
-    """Say whether DDS lets an enclave do something, by which rule, and what would change that.
+    """Show whether DDS lets an enclave do something, by which rule, and how to change that.
 
     call and serve are about services, or with --type action call is about an action; execute is
     about actions. ROOT is a keystore, here or on a robot; ENCLAVE can also be an enclave's folder.
@@ -214,7 +212,7 @@ def _split(
 ) -> tuple[Path | None, tuple[str, ...]]:
     """Return the keystore, if it is the first word or named by the option, and the other words.
 
-    ``verb`` is the place of what is to be done, where no keystore is named.
+    ``verb`` is the position of the action word, if no keystore is named.
     """
     from sros_tool.keystore.layout import is_keystore
 
@@ -399,7 +397,7 @@ def _name_of(folder: Path, options: _ContextOptions) -> str:
 
 
 def _planned_enclave(policy: Enclave, root: Path | None, options: _ContextOptions) -> LoadedEnclave:
-    """Return what the policy would give, under the governance of the keystore or a new one."""
+    """Return the rights the policy would give, under the keystore's governance or a new one."""
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.evaluator import plan_enclave
     from sros_tool.keystore.reader import governance_of
@@ -420,8 +418,8 @@ def _provenance_notes(answer: Answer, policy: Path | None) -> list[Note]:
     match answer.provenance:
         case Provenance.CHANGED:
             text = (
-                f"the permissions were not made from '{policy}' as it is now: it has changed "
-                "since, or it is another file. Lines are those of the file as it is now."
+                f"the permissions were not made from '{policy}' in its current form: it has "
+                "changed since, or it is another file. The lines are from the current file."
             )
         case Provenance.UNKNOWN:
             text = f"whether the permissions were made from '{policy}' is not recorded."
@@ -440,7 +438,7 @@ def _other_type(evaluator: Evaluator, answer: Answer, kind: str | None) -> list[
     action = ask("call", question.name, "action")
     if not evaluator.answer(action).allowed:
         return []
-    text = f"it may {action}: add --type action if that is what {question.name} is."
+    text = f"it may {action}: add --type action if {question.name} is an action."
     return [Note("explain.an-action", text)]
 
 
@@ -746,7 +744,7 @@ def _show_who(
             action = ask("call", question.name, "action")
             as_action = who(keystore, action, chosen, options.context, at=options.at)
             if any(each.outcome.ok for each in as_action):
-                text = f"enclaves may {action}: add --type action if that is what it is."
+                text = f"enclaves may {action}: add --type action if it is an action."
                 print_notes([Note("explain.an-action", text)])
     return 0 if allowed else 1
 

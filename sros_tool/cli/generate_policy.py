@@ -132,10 +132,10 @@ def generate_policy(
     dry_run: bool,
     as_json: bool,
 ) -> int:
-    """Write to FILE the least policy under which the robot does what it is seen to do.
+    """Write to FILE the smallest policy that allows everything the robot is seen to do.
 
     Looks at the running nodes until nothing has changed for a while, some four seconds. An
-    existing FILE keeps all that it says; what is new is added to it. Read the result before you
+    existing FILE keeps its content; new rights are added to it. Read the result before you
     enforce it: on a robot that is not secured yet, anybody may have added to what is seen.
     """
     present = _present_policy(file)
@@ -182,7 +182,7 @@ def _present_policy(file: Path | None) -> Policy | None:
     if os.path.lexists(file):
         return read_policy(file)
     if not file.parent.is_dir():
-        raise UsageError(f"the folder '{file.parent}' does not exist", "", "Make it first.")
+        raise UsageError(f"the folder '{file.parent}' does not exist", "", "Create it first.")
     return None
 
 
@@ -220,9 +220,9 @@ def _show(
         for each in plan.added:
             click.echo(f"  {each}")
     else:
-        click.echo(f"nothing to add: '{plan.path}' says all that was seen")
+        click.echo(f"nothing to add: '{plan.path}' already covers everything that was seen")
     if plan.copies:
-        click.echo(f"{would}copied {', '.join(sorted(plan.copies))} beside it")
+        click.echo(f"{would}copied {', '.join(sorted(plan.copies))} next to it")
     print_notes(notes)
 
 
@@ -261,7 +261,7 @@ def _observe(
     *,
     secured: bool,
 ) -> tuple[Snapshot, str]:
-    """Return what was seen, and by which RMW.
+    """Return the observation, and the RMW that made it.
 
     ``watch`` is a duration or `_FOREVER`; without it the graph is looked at once, for ``spin_time``
     seconds if given.
@@ -333,14 +333,14 @@ def _watch(
 
     news = News(common)
 
-    def tell(observation: Observation) -> None:
+    def report(observation: Observation) -> None:
         for line in news.lines(identify(observation)):
             click.echo(line, err=True)
 
     with _until_signalled() as stopped:
         until = f"for {seconds:.0f} s, or {_FOREVER}" if seconds else _FOREVER
         click.echo(f"watching {until}; then the policy is written", err=True)
-        return watch(graph, seconds, time.monotonic, stop=stopped, tell=tell)
+        return watch(graph, seconds, time.monotonic, stop=stopped, tell=report)
 
 
 @contextmanager
@@ -375,7 +375,7 @@ def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
             "the DDS of this rclpy was built without DDS Security, so it cannot look at a secured "
             "robot",
             f"It says: {line}",
-            "Use a ROS 2 whose DDS has it, such as the packages of Ubuntu; `sros doctor` tells "
+            "Use a ROS 2 whose DDS has it, such as the packages of Ubuntu; `sros doctor` shows "
             "which DDS here enforces security.",
         )
     name = environment.get(ENCLAVE) or os.environ.get(ENCLAVE) or "/"
@@ -383,18 +383,19 @@ def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
         return SrosError(
             f"the enclave {name} does not permit an observer",
             f"DDS says: {line}",
-            "What an observer needs stands in policies/observer.xml (see `sros policies`), for an "
+            "The rights that an observer needs are in policies/observer.xml (see `sros "
+            "policies`), for an "
             "enclave named /sros_observer.",
         )
     if line := participant_refusal(said):
         return SrosError(
             f"DDS refuses the enclave {name}",
             f"It says: {line}",
-            "See what `sros inspect` says of the enclave.",
+            "See `sros inspect` of the enclave.",
         )
     last = [line for line in plain_text(error.output).splitlines() if line.strip()][-1:]
-    why = error.reason + (f" The last that it said: {last[0].strip()}" if last else "")
-    return UnavailableError(error.what, why, "`sros doctor` tells what works here.")
+    why = error.reason + (f" Its last message: {last[0].strip()}" if last else "")
+    return UnavailableError(error.what, why, "`sros doctor` shows what works here.")
 
 
 def _why_empty(environment: dict[str, str], seconds: float, rmw: str, enclave: str | None) -> str:
@@ -450,7 +451,7 @@ def _from_logs(
     if not learned.profiles:
         print_notes(learned.notes)
         click.echo(
-            "Nothing is to be proposed." if denials else "The logs tell of no denial.", err=True
+            "There is nothing to propose." if denials else "The logs report no denial.", err=True
         )
         return 1
     if file is None and as_json:

@@ -263,7 +263,7 @@ Example:
 @click.option(
     "--ca-validity",
     metavar="SPAN",
-    help="How long the CAs last: 5y, until 2031-01-01, or from 2026-12-01/5y.",
+    help="How long the CAs are valid: 5y, until 2031-01-01, or from 2026-12-01/5y.",
 )
 @click.option("--validity", metavar="SPAN", help="The same for certificates.")
 @click.option("--permissions-validity", metavar="SPAN", help="The same for permissions.")

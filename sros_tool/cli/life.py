@@ -65,11 +65,11 @@ def renew(
 ) -> None:
     """Issue new certificates for the enclaves NAME..., and sign their permissions again.
 
-    The rights stay as they are.  Processes that run go on with what they have loaded; restart
-    them before it expires.
+    The rights stay as they are.  Running processes keep the files they have loaded; restart them
+    before these expire.
 
-    A certificate that is replaced works until it expires, with the permissions of its time, for
-    whoever has a copy of the files.  --revoke-old revokes it: nobody who reads the new crl.pem
+    A replaced certificate works until it expires, with the permissions of its time, for anyone
+    who has a copy of the files.  --revoke-old revokes it: nobody who reads the new crl.pem
     accepts it. Then restart the renewed processes first, and after them the others.
     """
     from sros_tool.keystore.expiry import parse_threshold
@@ -148,7 +148,7 @@ Example:
     default="unspecified",
     shell_complete=_complete_reason,
     show_default=True,
-    help="Why, in a word of RFC 5280, such as key_compromise, superseded, cessation_of_operation.",
+    help="Reason as in RFC 5280, such as key_compromise, superseded, cessation_of_operation.",
 )
 @click.option(
     "--until-retired",
@@ -172,12 +172,12 @@ def revoke(words: tuple[str, ...], reason: str, until_retired: bool, dry_run: bo
     if not names:
         raise UsageError("no enclave is named", "", "Name one or more, such as /talker.")
     words_of_rfc = reason.replace("-", "_").split("_")
-    told = words_of_rfc[0] + "".join(word.capitalize() for word in words_of_rfc[1:])
+    reason_text = words_of_rfc[0] + "".join(word.capitalize() for word in words_of_rfc[1:])
     result = work(
         root,
         names,
         now=now(),
-        reason=told,
+        reason=reason_text,
         keyring=keyring(),
         until_retired=until_retired,
         dry_run=dry_run,
@@ -208,7 +208,7 @@ Example:
 def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
     """Show the revocation list of the keystore ROOT, or sign it again.
 
-    An expired list makes DDS refuse everybody, so the exit status is 1 when it ends within 30
+    An expired list makes DDS refuse everybody, so the exit status is 1 when it expires within 30
     days.
     """
     from datetime import timedelta
@@ -233,7 +233,7 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
     if not lists:
         print_json(None) if as_json else click.echo("nothing was ever revoked", err=True)
         return 0
-    found, *beside = lists
+    found, *others = lists
     soon = min(each.next_update for each in lists) - now() < timedelta(days=30)
     if as_json:
         print_json(
@@ -254,7 +254,7 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
                         "next_update": iso(each.next_update),
                         "revoked": [f"{one.serial:x}" for one in each.revoked],
                     }
-                    for each in beside
+                    for each in others
                 ],
             }
         )
@@ -262,14 +262,14 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
         click.echo(f"revocation list {found.number}, until {iso(found.next_update)}")
         for each in found.revoked:
             click.echo(f"  {each.serial:x}  {iso(each.date)}  {each.reason}")
-        for other in beside:  # of the CA that comes or goes, while one replaces the other
+        for other in others:  # of the CA that comes or goes, while one replaces the other
             click.echo(
-                f"beside it, list {other.number} of {subject_text(other.list.issuer)}, until "
+                f"next to it, list {other.number} of {subject_text(other.list.issuer)}, until "
                 f"{iso(other.next_update)}: {len(other.revoked)} revoked"
             )
     if soon:
         click.echo(
-            f"it ends soon, and DDS then refuses everybody: run `sros crl {root} --refresh`.",
+            f"it expires soon, and DDS then refuses everybody: run `sros crl {root} --refresh`.",
             err=True,
         )
     return 1 if soon else 0
@@ -290,8 +290,8 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.rotation.state import RotationStatus
 
 _DONE = {
-    "distribute": "distributed the new CA beside the old one",
-    "reissue": "issued and signed everything anew by the new CA",
+    "distribute": "distributed the new CA next to the old one",
+    "reissue": "issued and signed everything again with the new CA",
     "retire": "retired the old CA",
 }
 
@@ -301,13 +301,13 @@ _DONE = {
     epilog="""\b
 Example:
   $ sros rotate_ca keystore --next
-  distributed the new CA beside the old one: identity_ca, permissions_ca
+  distributed the new CA next to the old one: identity_ca, permissions_ca
   $ sros rotate_ca keystore --status
   stage: distribute, next: reissue
     identity CA    issuing 2 of 2 enclaves  until 2036-11-18T07:37:42Z  ...
     identity CA    next    0 of 2 enclaves  until 2036-11-18T07:37:45Z  ...
   $ sros rotate_ca keystore --next     # once all processes were restarted
-  issued and signed everything anew by the new CA: identity_ca, permissions_ca
+  issued and signed everything again with the new CA: identity_ca, permissions_ca
   $ sros rotate_ca keystore --next     # once they were restarted again
   retired the old CA: identity_ca, permissions_ca
   $ sros rotate_ca keystore --finish   # or all at once; then restart all""",
@@ -315,18 +315,18 @@ Example:
 @click.argument("root", type=PATH, required=False)
 @click.option("--identity", is_flag=True, help="Only the identity CA.")
 @click.option("--permissions", is_flag=True, help="Only the permissions CA.")
-@click.option("--status", is_flag=True, help="Say where the keystore stands (the default).")
+@click.option("--status", is_flag=True, help="Show the stage of the keystore (the default).")
 @click.option("--next", "go_on", is_flag=True, help="Do the next stage.")
 @click.option(
     "--to",
     type=click.Choice(["distribute", "reissue", "retire"]),
-    help="Do the next stage if it is that one, and nothing if it is done.",
+    help="Do this stage if it is the next one; nothing if it is done.",
 )
 @click.option("--finish", is_flag=True, help="Do all stages that remain, at once.")
 @click.option(
     "--same-key",
     is_flag=True,
-    help="Give the identity CA a longer life without a new key; no stages are needed.",
+    help="Extend the identity CA without a new key; no stages are needed.",
 )
 @click.option("--ca-validity", metavar="SPAN", help="How long the new CA is valid, such as 10y.")
 @click.option("--identity-key", metavar="URI", help="Where the new key is made: file: or pkcs11:.")
@@ -360,8 +360,8 @@ def rotate_ca(
     stage, and export again what was exported.
 
     Fast DDS (2.9.1) lets processes talk at every moment of this. Cyclone DDS (0.10.2) trusts one
-    CA at a time: after stage 2, restart all its processes together. There, an identity CA that
-    only comes to its end is better renewed with --same-key, which disturbs nobody.
+    CA at a time: after stage 2, restart all its processes together. There, if the
+    identity CA is only about to expire, --same-key renews it and disturbs nobody.
     """
     from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca
     from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca as work
@@ -421,8 +421,8 @@ def _say(step: RotationStep, status: RotationStatus, *, together: bool, same_key
             err=True,
         )
         return
-    anew = any(each.path.endswith("/cert.pem") for each in step.changes)
-    done = f"{_DONE['reissue']}, and " if together and anew else ""
+    reissued = any(each.path.endswith("/cert.pem") for each in step.changes)
+    done = f"{_DONE['reissue']}, and " if together and reissued else ""
     click.echo(f"{done}{_DONE[step.stage]}: {', '.join(step.files)}")
     for place in step.kept_elsewhere:
         click.echo(f"the old key at '{place}' is used no longer, and was left there", err=True)

@@ -66,10 +66,10 @@ def merge_policy(
 ) -> None:
     """Print POLICY with the rights of every OTHER policy added.
 
-    Comments, includes, metadata and layout of POLICY stay as they are; those of the others are
-    not taken over. A right is added for its one direction only, and only where the enclave does
-    not have it yet, be it through an include or a wildcard. A DENY always stays and always wins
-    over an ALLOW; contradictions between the policies are reported.
+    Comments, includes, metadata and layout of POLICY stay as they are; the other policies only add
+    rights. A right is added for one direction only, and only if the enclave does not have it yet,
+    also through an include or a wildcard. A DENY always stays and always wins over an ALLOW;
+    contradictions between the policies are reported.
     """
     from sros_tool.policy.document import read_policy
     from sros_tool.policy.merge import merge_all, merge_notes
@@ -285,7 +285,7 @@ def minimize_policy(
 
     The number behind "allowed" and "observed" counts pairs of a right and an exact name; a
     wildcard counts as the names it matches among all that are known: from the policy, from the
-    observations, and as what every node needs. What is written is one self-contained file:
+    observations, and from what every node needs. The result is one self-contained file:
     includes are resolved and comments are not kept, metadata is. A DENY always stays, and an
     enclave that was not observed at all stays as it is.
     """

@@ -63,7 +63,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
             "policy", "Compare the rights of policies, permissions, keystores."
         ),
         "minimize_policy": VerbEntry("policy", "Narrow a policy to what was observed."),
-        "explain": VerbEntry("explain", "Say what DDS will decide, by which rule, and why."),
+        "explain": VerbEntry("explain", "Show what DDS will decide, by which rule, and why."),
         "view": VerbEntry("view", "Draw who may do what, as a page, SVG, DOT or Mermaid."),
         "policies": VerbEntry("policy", "List or copy the policies that ship with sros."),
     },

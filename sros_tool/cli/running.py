@@ -50,7 +50,7 @@ Example:
 @click.option("--json", "as_json", is_flag=True, help="The same as --format json.")
 @_DOMAIN
 def env(words: tuple[str, ...], form: str, as_json: bool, domain: str | None) -> None:
-    """Print the variables with which a process runs in the enclave NAME, and only there."""
+    """Print the variables that make a process run in the enclave NAME, and only there."""
     from sros_tool.runtime.environment import render_environment
 
     root, rest = split_root(words)
@@ -97,10 +97,10 @@ Example:
 def run(ctx: click.Context, words: tuple[str, ...], domain: str | None, no_ros_args: bool) -> None:
     """Run COMMAND in the enclave NAME of the keystore ROOT, or not at all (strategy Enforce).
 
-    The enclave is checked first; what would keep the command from starting is reported here, not
-    by an obscure message of the middleware. A COMMAND that is known to start a ROS node (`ros2
-    run`, or an executable of a ROS package) gets the arguments `--ros-args --enclave NAME`, so
-    that the ROS graph shows the enclave.
+    The enclave is checked first; any problem that would keep the command from starting is reported
+    here, not by an obscure message of the middleware. A COMMAND that is known to start a ROS node
+    (`ros2 run`, or an executable of a ROS package) gets the arguments `--ros-args --enclave NAME`,
+    so that the ROS graph shows the enclave.
     """
     from sros_tool.runtime.environment import with_enclave
 

@@ -38,7 +38,7 @@ Description = dict[str, Any]
 
 
 def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Description:
-    """Return what ``path`` is and says; its ``kind`` says which description follows.
+    """Describe the content of ``path`` as a JSON value; ``kind`` selects the other fields.
 
     Kinds: keystore, enclave, certificate, revocation list, private key, permissions, governance.
 
@@ -127,7 +127,7 @@ def _keystore(root: Path, now: datetime) -> Description:
 
 
 def _enclave(name: str, state: OpenedEnclave) -> Description:
-    """Return an enclave of a keystore; that its key stays on its robot is no problem there."""
+    """Describe an enclave of a keystore, where a key that stays on its robot is not a problem."""
     described = _describe_enclave(state)
     described["problems"] = [str(problem) for problem in state.problems_at_home]
     return {"name": name, "key_on_robot": state.key_on_robot, **described}

@@ -25,7 +25,7 @@ from sros_tool.validity import BACKDATE, Window, iso, parse_duration
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """When an enclave is due: with so much ``remaining``, or ``elapsed`` (0 to 1) of its life."""
+    """When an enclave is due: at a ``remaining`` time, or an ``elapsed`` fraction (0 to 1)."""
 
     remaining: timedelta | None = None
     elapsed: float | None = None
@@ -81,7 +81,7 @@ class UnreadableEnclave:
 
 
 def parse_threshold(text: str) -> Threshold:
-    """Return the threshold that ``30d`` (so much is left) or ``66%`` (so much is over) means."""
+    """Parse a threshold: ``30d`` of remaining time, or ``66%`` of elapsed validity."""
     match = re.fullmatch(r"(\d{1,3})%", text.strip(), re.ASCII)
     if not match:
         return Threshold(remaining=parse_duration(text))
@@ -122,7 +122,7 @@ def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> N
         raise KeystoreError(
             f"{len(unreadable)} enclaves cannot be {verb}: {names}",
             f"{reasons} Nothing was changed.",
-            "Mend or revoke them, or name those that are meant.",
+            "Repair or revoke them, or name the enclaves that you want.",
         )
 
 
@@ -164,7 +164,7 @@ def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
 
 
 def _elapsed(validity: Window, now: datetime) -> float:
-    """Return how much of a life is over, from 0 to 1, without the time it was back-dated by."""
+    """Return the elapsed fraction of a validity, from 0 to 1, without its back-dating."""
     begin = validity.not_before
     if validity.not_after - begin > BACKDATE:
         begin += BACKDATE

@@ -1,4 +1,4 @@
-"""What became of everything that a keystore ever issued, by its ledger and its files."""
+"""The state of everything that a keystore ever issued, from its ledger and its files."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _PEM = re.compile(rb"-----BEGIN ([A-Z0-9 ]+)-----(.*?)-----END \1-----\n?", re.D
 
 
 class HistoryStatus(StrEnum):
-    """What became of something that was issued."""
+    """The state of an issued certificate or document."""
 
     CURRENT = "current"
     """It is in the keystore, and in date."""
@@ -48,7 +48,7 @@ class HistoryStatus(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class HistoryItem:
-    """An entry of the ledger, what became of it, and the path where it lies (or "")."""
+    """An entry of the ledger, its state, and the path of its file (or "")."""
 
     entry: Entry
     status: HistoryStatus

@@ -31,8 +31,8 @@ class Entry:
     """A line of the ledger: what was issued (or revoked), when, for whom, and how long it is valid.
 
     ``what`` is ca, certificate, permissions, governance, crl, revocation, or answer (the signed
-    list of what was sent to a robot).  ``sha256`` is that of the DER of a certificate or of the
-    bytes of a document; ``serial`` is hexadecimal; ``policy`` is the SHA-256 of the policy file,
+    list of the files sent to a robot).  ``sha256`` is the hash of a certificate's DER or of a
+    document's bytes; ``serial`` is hexadecimal; ``policy`` is the SHA-256 of the policy file,
     with its includes, that permissions were made from.  Moments are ISO 8601 in UTC.
     """
 

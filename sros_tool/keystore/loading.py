@@ -1,4 +1,4 @@
-"""What each DDS vendor refuses when it loads an enclave or a CA.
+"""Reasons for which a DDS vendor refuses to load an enclave or a CA.
 
 Vendors differ by the traits in `sros_tool.dds.decision.vendors`; what all of them check alike, and
 `sros_tool.keystore.reader` says by name, is not checked here again.

@@ -1,4 +1,4 @@
-"""The error for an enclave that a keystore does not have: was it revoked, or is another meant?"""
+"""The error for a missing enclave: was it revoked, or is its name a typo?"""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _ALIKE = 0.75
 
 
 def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
-    """Return the error for ``name``, which is none of the enclaves that are ``there``."""
+    """Return the error for the missing enclave ``name``; ``there`` are the existing ones."""
     if revocation := _revocation(root, name):
         return _was_revoked(root, revocation)
     what = f"enclave {name} does not exist in keystore '{root}'"

@@ -143,7 +143,7 @@ def open_keystore(root: Path) -> OpenedKeystore:
 
 
 def load_settings(root: Path) -> Template:
-    """Return the choices that the keystore was made by; those of ros2/sros2 where it has none."""
+    """Return the keystore's settings, or ros2/sros2's defaults if it has none."""
     from sros_tool.keystore.template import load_template, read_template
 
     path = root / SETTINGS
@@ -307,7 +307,7 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class OpenedEnclave:
-    """What the files of an enclave say, as far as they can be read, and what is wrong with them."""
+    """The readable content of an enclave's files, and the problems in them."""
 
     certificate: x509.Certificate | None
     identity_ca: x509.Certificate | None
@@ -360,7 +360,7 @@ class OpenedEnclave:
 
 
 def open_enclave(folder: Path, *, now: datetime, domain: int | None = None) -> OpenedEnclave:
-    """Return what the files of an enclave say at ``now``, and what is wrong with them.
+    """Return the content of an enclave's files at ``now``, and the problems in them.
 
     With ``domain``, also whether it may join that ROS domain.
     """
@@ -374,7 +374,7 @@ _EXPIRY_OF_PERMISSIONS = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_V
 _ENCRYPTED = re.compile(rb"ENCRYPTED")
 _SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
 
-# The enclaves of a keystore have all but their own files in common: these are read once.
+# Enclaves of a keystore share all files except their own: shared files are read once.
 _load_certificate = lru_cache(maxsize=8)(load_certificate)
 _parse_governance = lru_cache(maxsize=8)(parse_governance)
 
@@ -447,7 +447,7 @@ class _EnclaveFiles:
         path = self._folder / name
         if not path.exists():
             if path.is_symlink():
-                text = f"it is a link to nothing ({path.readlink()})"
+                text = f"it is a broken link ({path.readlink()})"
                 self._add(name, text, Fault.LINK_DANGLING)
             else:
                 self._add(name, "missing", Fault.FILE_MISSING)

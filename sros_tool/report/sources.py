@@ -43,7 +43,7 @@ from sros_tool.translate import governance_for
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
-_LINK = re.compile(r"(it is a link to nothing) \([^)]*\)")
+_LINK = re.compile(r"(it is a broken link) \([^)]*\)")
 _AUTHORITY_FILES = "*_ca.cert.pem"
 
 

@@ -161,7 +161,7 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     ),
     _text(
         "files-missing", _ROS, r"couldn't find all security files",
-        "a file of the enclave is missing or a link to nothing; which one, it does not say",
+        "a file of the enclave is missing or a broken link; which one, it does not say",
         "Complete it: `sros create_enclave KEYSTORE ENCLAVE`, or export it again.", _FILES,
         refuses=Refused.PARTICIPANT,
     ),

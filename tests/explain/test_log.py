@@ -46,7 +46,7 @@ CAUSES = {
     "permissions without default": ("refuses the permissions",),
     "governance malformed": ("refuses the governance",),
     "file missing": ("permissions.p7s: missing",),
-    "link to nothing": ("identity_ca.cert.pem: it is a link to nothing",),
+    "link to nothing": ("identity_ca.cert.pem: it is a broken link",),
     "file empty": ("key.pem: it is empty",),
 }
 """What `explain --log` is to find in an enclave with each breakage."""

@@ -118,7 +118,7 @@ def test_a_dry_run_of_a_log_writes_nothing(tmp_path: Path) -> None:
 def test_a_log_without_denials(tmp_path: Path) -> None:
     (tmp_path / "quiet.log").write_text("[INFO] [talker]: Publishing: 'Hello World: 1'\n")
     ended = sros("generate_policy", "--from-log", tmp_path / "quiet.log")
-    assert (ended.status, ended.err) == (1, "The logs tell of no denial.\n")
+    assert (ended.status, ended.err) == (1, "The logs report no denial.\n")
 
 
 def test_the_enclave_has_to_be_known() -> None:

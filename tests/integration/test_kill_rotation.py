@@ -54,7 +54,7 @@ def see(root: Path) -> State:
             assert not open_enclave(folder, now=LATER).problems, name
             names.append(name)
     for path in (*root.glob("private/*.pem"), *root.glob("retired/*.key.pem")):
-        # One that is on its way out may be a link to nothing for a moment.
+        # One that is on its way out may be a broken link for a moment.
         assert not path.exists() or path.stat().st_mode & 0o777 == 0o600, path
     lists = tuple(len(each.revoked) for each in read_lists(root))
     on = tuple(

@@ -139,7 +139,7 @@ def test_what_is_wrong_is_found(wrong: str, tmp_path: Path) -> None:
     made = permissions_of(enclave)
     prove(enclave, made, DOMAINS)
     changed = only_grant(made, WRONG[wrong])
-    with pytest.raises(KeystoreError, match="would not be what the policy says"):
+    with pytest.raises(KeystoreError, match="would not match the policy"):
         prove(enclave, changed, DOMAINS)
 
 
@@ -236,7 +236,7 @@ def test_nothing_is_written_where_it_does_not_hold(
         monkeypatch.setattr(writer_of_enclaves, "permissions_for", wrong)
         found = sros("generate_artifacts", "-k", keystore, "-p", policy)
         assert found.status == 1
-        assert "would not be what the policy says" in found.err
+        assert "would not match the policy" in found.err
         assert "rt/" in found.err
         assert snapshot(keystore) == before
     monkeypatch.undo()

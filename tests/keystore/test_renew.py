@@ -451,7 +451,7 @@ def test_the_check_goes_on_after_one_that_cannot_be_read(tmp_path: Path) -> None
     check = ("check", "keystore", root, "--needs-renewal")
     told = sros(*check, "30d")
     assert (told.status, told.out.count("\n")) == (1, 1), told
-    assert told.out.startswith("/b  nobody can tell: enclave /b cannot be read")
+    assert told.out.startswith("/b  unknown: enclave /b cannot be read")
     told = sros(*check, "181d")
     assert [line.split()[0] for line in told.out.splitlines()] == ["/a", "/c", "/b"]
     *due, unreadable = json.loads(sros(*check, "181d", "--json").out)

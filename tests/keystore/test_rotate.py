@@ -284,7 +284,7 @@ def test_keys_in_files_elsewhere(tmp_path: Path) -> None:
     before = snapshot(tmp_path)
     with pytest.raises(KeystoreError, match="--identity-key"):
         rotate_ca(root, now=NOW)
-    with pytest.raises(KeystoreError, match="that of the present"):
+    with pytest.raises(KeystoreError, match="belongs to the present"):
         rotate_ca(root, now=NOW, new_keys=places("old"))
     assert snapshot(tmp_path) == before
     rotate_ca(root, now=NOW, new_keys=places("new"))
@@ -445,7 +445,7 @@ def test_without_the_old_key_revoking_waits_for_the_end(
     assert "Fast DDS accepts the revoked certificates that it issued" in done.err
     assert lists_of(separate)[1] == carried
     refreshed = sros("crl", separate, "--refresh").ok()
-    assert "was not signed anew" in refreshed.err
+    assert "was not signed again" in refreshed.err
     check(separate)
     rotate_ca(separate, RotationStage.RETIRE, now=NOW)
     assert "was not signed" not in sros("crl", separate, "--refresh").ok().err
@@ -613,7 +613,7 @@ def test_the_verb(separate: Path) -> None:
     told = json.loads(sros("rotate_ca", separate, "--json").ok().out)
     assert (told["stage"], told["next"], told["enclaves"]) == ("none", "distribute", 3)
     assert sros("rotate-ca", separate, "--next").ok().out == (
-        "distributed the new CA beside the old one: identity_ca, permissions_ca\n"
+        "distributed the new CA next to the old one: identity_ca, permissions_ca\n"
     )
     told = json.loads(sros("inspect", separate / "public/identity_ca.cert.pem", "--json").ok().out)
     assert [each["is_ca"] for each in told["further"]] == [True]

@@ -118,9 +118,9 @@ def test_inspect_shows_a_revocation_list(root: Path) -> None:
 
 def test_crl_shows_the_list_beside(root: Path) -> None:
     revoke(root, ["/c"], now=NOW)
-    assert "beside it" not in sros("crl", root).ok().out
+    assert "next to it" not in sros("crl", root).ok().out
     rotate_ca(root, now=NOW)
-    assert "beside it, list 2 of CN=" in sros("crl", root).ok().out
+    assert "next to it, list 2 of CN=" in sros("crl", root).ok().out
     (beside,) = json.loads(sros("crl", root, "--json").ok().out)["beside"]
     assert (beside["number"], beside["revoked"]) == (2, [])
     for _ in range(2):

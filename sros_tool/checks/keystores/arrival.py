@@ -1,4 +1,4 @@
-"""What arrived on a robot: which enclaves can be used there, until when, and all that is wrong."""
+"""The state of enclaves on a robot: which can be used, until when, and every problem."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _FILES = (*REQUIRED_FILES, *OPTIONAL_FILES)
 
 @dataclass(frozen=True, slots=True)
 class ArrivedEnclave:
-    """An enclave that arrived: whether a process can run in it, where, and until when."""
+    """An enclave on a robot: whether a process can run in it, in which domain, and until when."""
 
     name: str
     loadable: bool
@@ -41,9 +41,9 @@ class ArrivedEnclave:
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """All enclaves of a folder, or the one that it is, and everything that is wrong.
+    """The enclaves of a folder, or a single one, and everything that is wrong with them.
 
-    ``root`` is the folder that has the enclaves folder in it; ``kind`` is keystore or enclave.
+    ``root`` is the folder that contains the enclaves folder; ``kind`` is keystore or enclave.
     """
 
     path: Path
@@ -53,7 +53,7 @@ class Arrival:
     findings: tuple[Finding, ...]
 
     def as_json(self) -> dict[str, Any]:
-        """Return it as `sros verify --json` shows it."""
+        """Return the JSON value that `sros verify --json` prints."""
         return {
             "path": str(self.path),
             "kind": self.kind,
@@ -92,9 +92,9 @@ class Arrival:
 def verify_arrival(
     path: Path, *, now: datetime, domain: int | None = None, zone: tzinfo = UTC
 ) -> Arrival:
-    """Return what `sros check` shows of a robot's folder, or of the folder of one enclave.
+    """Return the findings in a robot's folder, or in the folder of one enclave.
 
-    A request that was not answered yet is shown as well: on a robot nothing works before.
+    A request without an answer is reported too: on a robot nothing works before.
 
     Args:
         path: a folder with enclaves, or the folder of an enclave.
@@ -116,7 +116,7 @@ def verify_arrival(
             "It does not exist."
             if not path.exists()
             else "It has no enclaves folder in use, and neither cert.pem nor key.pem.",
-            "Name the folder into which `sros distribute_key` or `sros import` has written.",
+            "Name the folder that `sros distribute_key` or `sros import` has written to.",
         )
     found = keystore_findings(root, now=now, zone=zone, domain=domain, only=only, on_robot=True)
     shown = FindingFilter().choose(found).shown

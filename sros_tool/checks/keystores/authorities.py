@@ -1,4 +1,4 @@
-"""Checks of the CAs: what vendors ask of their certificates, their keys, their expiry, the list."""
+"""Checks of the CAs: certificates, keys, expiry and revocation list, as vendors require them."""
 
 from __future__ import annotations
 
@@ -42,25 +42,26 @@ CA_EXTENSIONS = FindingKind(
     "keystore.ca-extensions",
     NOTE,
     "a CA certificate without key identifiers or key usage",
-    "Fast DDS checks strictly, and refuses it as soon as an intermediate CA is in play. CAs of "
-    "ros2/sros2 are so.",
+    "Fast DDS checks strictly, and refuses it as soon as an intermediate CA is in play. CAs made "
+    "by ros2/sros2 are like this.",
     "RFC 5280, 4.2.1.1 to 4.2.1.3; openssl verify -x509_strict.",
-    "Replace it with `sros rotate_ca ROOT`, if intermediates are to come.",
+    "Before you add intermediate CAs, replace it with `sros rotate_ca ROOT`.",
 )
 INTERMEDIATE = FindingKind(
     "portable.intermediate",
     WARNING,
     "a CA that is not self-signed",
-    "Cyclone DDS takes a self-signed CA only, the first of its file. Fast DDS follows a chain of "
-    "identity CAs, 2.14 only where each has keyUsage and key identifiers. What a permissions CA "
-    "below another signs, Fast DDS 2.14 takes if it has keyUsage, 2.9 if it may sign documents.",
+    "Cyclone DDS accepts only a self-signed CA, the first one in its file. Fast DDS follows a "
+    "chain of "
+    "identity CAs, 2.14 only where each has keyUsage and key identifiers. Fast DDS 2.14 accepts "
+    "documents of an intermediate permissions CA if it has keyUsage, 2.9 if it may sign documents.",
     "Fast DDS 2.9.1 and 2.14.5 (FileProvider.cpp), Cyclone DDS 0.10.2; measured.",
-    "Use a root for robots of its own, unless all run a Fast DDS that takes it.",
+    "Use a separate root CA for robots, unless all of them run a Fast DDS that accepts it.",
 )
 CA_PURPOSE = FindingKind(
     "portable.ca-purpose",
     WARNING,
-    "a permissions CA whose certificate is not for signing documents",
+    "a permissions CA whose certificate does not allow signing documents",
     "Fast DDS 2.9 and Cyclone DDS verify the purpose of S/MIME, and refuse every document "
     '("unsuitable certificate purpose"): keyUsage must have digitalSignature, extendedKeyUsage '
     "emailProtection, if they are there. Fast DDS 2.14 does not look at them.",
@@ -71,9 +72,9 @@ CA_PURPOSE = FindingKind(
 KEY_ALGORITHM = FindingKind(
     "portable.key-algorithm",
     WARNING,
-    "a key that not every vendor takes",
-    "Cyclone DDS takes EC prime256v1 and RSA of exactly 2048 bits alone. Fast DDS takes larger "
-    "ones of both kinds too, but no Ed25519, which fails in its handshake.",
+    "a key that not every vendor accepts",
+    "Cyclone DDS accepts only EC prime256v1 and RSA of exactly 2048 bits. Fast DDS also accepts "
+    "larger keys of both kinds, but not Ed25519, which fails in its handshake.",
     "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5; measured.",
     "Use EC prime256v1, as sros does.",
 )
@@ -91,7 +92,7 @@ SIGNATURE_HASH = FindingKind(
 def _authority_findings(
     role: str, chain: tuple[x509.Certificate, ...], at: datetime, subject: str, file: str
 ) -> Iterator[Finding]:
-    """Yield what some vendor refuses of a CA; ``chain`` are its file's certificates, in order."""
+    """Yield findings about a CA that some vendor refuses; ``chain`` has its file's certificates."""
     certificate = chain[0]
     name = subject_text(certificate.subject)
     if certificate.issuer != certificate.subject:
@@ -107,7 +108,7 @@ def _authority_findings(
 def key_findings(
     certificate: x509.Certificate, subject: str, file: str, *, what: str = "it has"
 ) -> Iterator[Finding]:
-    """Yield what some vendor refuses of the key or the signature of a certificate."""
+    """Yield findings about a certificate's key or signature that some vendor refuses."""
     key = certificate.public_key()
     fits = (isinstance(key, ec.EllipticCurvePublicKey) and key.curve.name == "secp256r1") or (
         isinstance(key, rsa.RSAPublicKey) and key.key_size == 2048
@@ -151,14 +152,15 @@ ONE_AUTHORITY = FindingKind(
     "one CA issues identities and signs permissions",
     "Cyclone DDS 0.10.2 and Fast DDS 2.9.1 then accept permissions that an enclave signed for "
     "itself: they verify a chain, and the chain of every enclave's certificate leads to that CA.",
-    "CVE-2023-24011 class; an enclave did so here on Cyclone DDS 0.10.2 and was heard.",
+    "CVE-2023-24011 class; reproduced on Cyclone DDS 0.10.2, where such an enclave was heard.",
     "Make a keystore with separate CAs, which all templates but sros2 do.",
 )
 CA_EXPIRES_SOON = FindingKind(
     "keystore.ca-ends-soon",
     WARNING,
     "a CA that expires soon",
-    "All that it issued or signed expires with it, at one moment; replacing it takes stages.",
+    "Everything that it issued or signed expires with it at the same time, and replacing it takes "
+    "several stages.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
     "Begin now, with `sros rotate_ca ROOT`.",
 )
@@ -166,7 +168,7 @@ CA_EXPIRED = FindingKind(
     "keystore.ca-expired",
     ERROR,
     "a CA of the keystore is not valid now",
-    "Nothing can be issued or signed with it, and DDS refuses what was.",
+    "Nothing can be issued or signed with it, and DDS refuses everything that it issued or signed.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 (Error '10' verifying CA certificate).",
     "Replace it with `sros rotate_ca ROOT`, or correct the clock.",
 )
@@ -174,7 +176,7 @@ CA_MISSING = FindingKind(
     "keystore.ca-missing",
     ERROR,
     "the certificate of a CA is missing",
-    "The links of every enclave lead to it.",
+    "Every enclave has links to it.",
     "ROS 2 keystore layout (public/).",
     "Restore it from a backup; any enclave that was exported has a copy.",
 )
@@ -189,8 +191,8 @@ CA_MISMATCH = FindingKind(
 CA_KEY_PLAIN = FindingKind(
     "keystore.ca-key-plain",
     NOTE,
-    "the key of a CA lies in the keystore without a passphrase",
-    "Who copies the folder can make any enclave with any rights.",
+    "a CA key is in the keystore without a passphrase",
+    "Anyone who copies the folder can make any enclave with any rights.",
     "ros2/sros2 issue 282; NIST SP 800-57 part 1, 6 (protection of keys).",
     "Make keystores with --encrypt-ca-keys or with keys on a token, or keep private/ offline.",
 )
@@ -207,8 +209,7 @@ LEDGER_MISSING = FindingKind(
     "keystore.ledger-missing",
     WARNING,
     "a keystore of sros without its ledger",
-    "Permissions that were replaced, and certificates from elsewhere, cannot be distinguished "
-    "from those that are meant.",
+    "Replaced permissions, and certificates from another source, cannot be detected.",
     "sros: ledger.jsonl lists everything that was issued.",
     "Restore ledger.jsonl from a backup.",
 )
@@ -216,15 +217,15 @@ CRL_EXPIRES_SOON = FindingKind(
     "keystore.revocation-list-ends",
     ERROR,
     "a revocation list that expires soon, or has expired",
-    "From its expiry on, DDS refuses everybody.",
+    "Once it has expired, DDS refuses every participant.",
     "RFC 5280, 5.1.2.5; Fast DDS 2.14.5; measured.",
     "Run `sros crl ROOT --refresh`.",
 )
 CRL_ISSUER = FindingKind(
     "keystore.revocation-list-issuer",
     ERROR,
-    "a revocation list that is not of the identity CA",
-    "DDS cannot verify anybody with it, and refuses everybody.",
+    "a revocation list that the identity CA did not sign",
+    "DDS cannot verify any certificate with it, and refuses every participant.",
     "RFC 5280, 6.3.3; Fast DDS 2.14.5.",
     "Run `sros crl ROOT --refresh`.",
 )
@@ -234,7 +235,7 @@ _LIST_SOON = timedelta(days=30)
 
 
 def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
-    """Yield what is found in the certificates and keys of the CAs, and in the revocation list."""
+    """Yield findings in the certificates and keys of the CAs, and in the revocation list."""
     for each in keystore.unread:
         why = f"{each.error.what}. {each.error.why}".strip()
         yield UNREADABLE.found(each.path, why, keystore.shown(each.path), remedy=each.error.remedy)
@@ -298,7 +299,7 @@ def _key(keystore: CheckedKeystore, role: str, certificate: x509.Certificate) ->
 
 
 class _LockedError(Exception):
-    """A key has a passphrase, so nothing can be said about it."""
+    """The key has a passphrase, so it cannot be checked."""
 
 
 def _locked() -> str:

@@ -35,8 +35,8 @@ SEVERAL_GRANTS = FindingKind(
     "portable.several-grants",
     WARNING,
     "several grants in one document",
-    "For a subject, Fast DDS takes the first grant that is in date, Cyclone DDS the first one "
-    "alone; Cyclone DDS also takes one whose subject only contains the wanted one.",
+    "For a subject, Fast DDS uses the first grant that is currently valid, Cyclone DDS only the "
+    "first one; Cyclone DDS also uses a grant whose subject only contains the requested one.",
     "Fast DDS 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
     "Write one grant in one document for each enclave.",
 )
@@ -53,7 +53,7 @@ ALLOW_RULES = FindingKind(
     NOTE,
     "several allow rules in one grant",
     "Fast DDS decides by the first rule whose topic matches, and then by its partitions; Cyclone "
-    "DDS goes on to a rule in which both match.",
+    "DDS continues to a rule in which both match.",
     "Fast DDS 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
     "Put all topics into one allow rule.",
     vendors=FAST_DDS,
@@ -63,7 +63,7 @@ PARTITIONS = FindingKind(
     WARNING,
     "partitions in a rule",
     "Fast DDS ignores them in denials, and denies where an allow rule matches the topic and not "
-    "the partition; Cyclone DDS goes on searching. ROS 2 uses the default partition only.",
+    "the partition; Cyclone DDS continues searching. ROS 2 uses the default partition only.",
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Leave partitions out.",
 )
@@ -71,8 +71,8 @@ DOMAIN_RANGE = FindingKind(
     "portable.domain-range",
     ERROR,
     "a range of domains that vendors read differently",
-    "Without <max> it means one domain alone; without <min> Cyclone DDS crashes; domains above 230 "
-    "it refuses.",
+    "Without <max> it means a single domain; without <min> Cyclone DDS crashes; Cyclone DDS "
+    "refuses domains above 230.",
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write <id>, or <min> and <max> up to 230.",
 )
@@ -90,14 +90,14 @@ SUBJECT = FindingKind(
     WARNING,
     "a subject that vendors compare differently",
     "Cyclone DDS splits subjects at commas, slashes and bars, and compares characters beyond ASCII "
-    "in their escaped form; Fast DDS 2.9 takes spaces around = for part of the name.",
+    "in their escaped form; Fast DDS 2.9 treats spaces around = as part of the name.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write it as RFC 4514 does, CN=/name, without , | and quotes in the name.",
 )
 TIME_FORMAT = FindingKind(
     "portable.time-format",
     WARNING,
-    "a moment that vendors read differently",
+    "a date that vendors read differently",
     "Fast DDS drops the offset and reads local time; Cyclone DDS refuses dates without a time, and "
     "years from 2263 on.",
     "DDS-Security 1.1, 9.4.1.3.2.2; Fast DDS 2.14.5 (mktime), Cyclone DDS 0.10.2; measured.",
@@ -106,11 +106,12 @@ TIME_FORMAT = FindingKind(
 TIME_WINDOW = FindingKind(
     "portable.validity-window",
     WARNING,
-    "a validity that begins or ends within hours, in some time zones",
+    "a validity that in some time zones begins too late or expires too early",
     "Fast DDS reads the dates of permissions in the host's local time: they begin up to 12 hours "
-    "late in the west, and end up to 14 hours early in the east.",
+    "late in the west, and expire up to 14 hours early in the east.",
     "Fast DDS 2.9.1 and 2.14.5 (mktime); measured in Los Angeles and Tokyo.",
-    "Sign them with a beginning 14 hours back or more, as sros does, and renew them in time.",
+    "Sign them with a not_before at least 14 hours in the past, as sros does, and renew them in "
+    "time.",
     vendors=FAST_DDS,
 )
 LOCAL_TIME = FindingKind(
@@ -127,8 +128,8 @@ CHARACTER_CLASS = FindingKind(
     "portable.character-class",
     WARNING,
     "a [class] of characters that vendors read differently",
-    "Cyclone DDS takes [^...] and [[:class:]] for plain characters; Fast DDS negates and knows "
-    "classes. Spaces around a name Cyclone DDS drops, and Fast DDS does not.",
+    "Cyclone DDS reads [^...] and [[:class:]] as plain characters; Fast DDS supports negation and "
+    "classes. Cyclone DDS strips spaces around a name, and Fast DDS does not.",
     "Fast DDS 2.14.5 (fnmatch), Cyclone DDS 0.10.2; measured.",
     "Use * or ?, or write the names out.",
 )
@@ -136,22 +137,22 @@ EMPTY_TOPIC = FindingKind(
     "portable.empty-topic",
     ERROR,
     "a <topic> without text",
-    "Cyclone DDS crashes as soon as it comes to it; Fast DDS refuses the document.",
+    "Cyclone DDS crashes when it reaches it; Fast DDS refuses the document.",
     "Cyclone DDS 0.10.2 (a fault in create_topic), Fast DDS 2.9.1; measured.",
     "Remove it.",
 )
 NO_EFFECT = FindingKind(
     "permissions.deny-without-effect",
     ERROR,
-    "a deny rule behind an allow rule for the same topic",
-    "The first rule that matches decides, so the denial takes nothing away.",
+    "a deny rule after an allow rule for the same topic",
+    "The first rule that matches decides, so the denial has no effect.",
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Put deny rules first, as sros does.",
 )
 UNREACHABLE = FindingKind(
     "permissions.unreachable-rule",
     WARNING,
-    "a topic of a rule that an earlier rule decides",
+    "a topic in a rule that an earlier rule already decides",
     "The first rule that matches decides, so this one is never reached.",
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Remove it, or put the narrower rule first.",
@@ -160,9 +161,9 @@ DOMAINS = FindingKind(
     "enclave.permissions-domains",
     WARNING,
     "permissions and governance for different domains",
-    "In a domain that only one of them names, no node of the enclave gets through.",
+    "In a domain that only one of them names, no node of the enclave can communicate.",
     "DDS-Security 1.1, 9.4.1.2 and 9.4.1.3; measured.",
-    "Sign both for the same domains: `sros create_permission` takes those of the governance.",
+    "Sign both for the same domains: `sros create_permission` uses the domains of the governance.",
 )
 
 _MOMENT = re.compile(r"(\d{4})-\d\d-\d\dT\d\d:\d\d:\d\dZ\Z")
@@ -306,17 +307,17 @@ UNAUTHENTICATED = FindingKind(
     "governance.unauthenticated",
     ERROR,
     "participants without an identity may join",
-    "What no rule of a topic controls or protects, they read and write: on Fast DDS 2.14, which "
-    "refuses the document where whole messages are protected. Fast DDS 2.9 ignores it.",
+    "They can read and write every topic that no rule controls or protects: on Fast DDS 2.14, "
+    "which refuses the document if whole messages are protected. Fast DDS 2.9 ignores it.",
     f"{_GOVERNANCE} (allow_unauthenticated_participants); measured.",
     "Set it to false.",
 )
 NO_JOIN_CONTROL = FindingKind(
     "governance.no-join-control",
     WARNING,
-    "whoever is authenticated may join, whatever its permissions",
-    "The permissions of a participant are not asked when it joins; vendors then decide "
-    "differently on one without any.",
+    "any authenticated participant may join, whatever its permissions",
+    "The permissions of a participant are not checked when it joins; vendors then decide "
+    "differently on a participant without permissions.",
     f"{_GOVERNANCE} (enable_join_access_control); Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
     "Set enable_join_access_control to true.",
 )
@@ -324,7 +325,7 @@ NO_ACCESS_CONTROL = FindingKind(
     "governance.no-access-control",
     WARNING,
     "topics that everybody in the domain may read or write",
-    "Permissions are not asked for these topics, so a policy for them does nothing.",
+    "Permissions are not checked for these topics, so a policy for them does nothing.",
     f"{_GOVERNANCE} (enable_read_access_control, enable_write_access_control).",
     _TEMPLATE,
 )
@@ -358,7 +359,8 @@ DISCOVERY_OPEN = FindingKind(
     "governance.discovery-open",
     WARNING,
     "discovery without protection",
-    "Who listens learns every node, topic and type, and who writes can make up others.",
+    "Anyone who listens learns every node, topic and type, and anyone who writes can announce "
+    "false ones.",
     f"{_GOVERNANCE} (discovery_protection_kind, enable_discovery_protection).",
     _TEMPLATE,
 )
@@ -366,7 +368,7 @@ LIVELINESS_OPEN = FindingKind(
     "governance.liveliness-open",
     WARNING,
     "liveliness without protection",
-    "A stranger can keep a dead writer alive in the eyes of its readers.",
+    "An attacker can make readers believe that a dead writer is still alive.",
     f"{_GOVERNANCE} (liveliness_protection_kind, enable_liveliness_protection).",
     _TEMPLATE,
 )
@@ -374,7 +376,7 @@ NO_TOPIC_RULE = FindingKind(
     "governance.no-topic-rule",
     ERROR,
     "topics for which there is no rule",
-    "Where no topic rule matches, the endpoint cannot be made; without a rule for "
+    "If no topic rule matches, the endpoint cannot be created; without a rule for "
     "ros_discovery_info no node of ROS 2 starts.",
     f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Put a rule for * last.",
@@ -391,7 +393,7 @@ GOVERNANCE_DOMAIN_RANGE = FindingKind(
     "governance.domain-range",
     ERROR,
     "a range of domains that vendors read differently",
-    "Without <max> it means one domain alone; without <min>, or above 230, Cyclone DDS refuses "
+    "Without <max> it means a single domain; without <min>, or above 230, Cyclone DDS refuses "
     "the document.",
     "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write <id>, or <min> and <max> up to 230.",
@@ -400,15 +402,15 @@ DIFFERS = FindingKind(
     "governance.differs",
     ERROR,
     "enclaves with different governance",
-    "Nodes that protect a topic differently do not match, and say nothing about it.",
+    "Nodes that protect a topic differently do not match, and do not report it.",
     "DDS-Security 1.1, 8.4 (the protection attributes of both sides must agree).",
-    "Replace the copy by a link to the governance of the keystore, or export the enclave again.",
+    "Replace the copy with a link to the governance of the keystore, or export the enclave again.",
 )
 XML_DIFFERS = FindingKind(
     "governance.xml-differs",
     WARNING,
-    "governance.xml says something else than what is signed",
-    "DDS loads governance.p7s. Somebody changed the readable copy, and it was never signed.",
+    "governance.xml differs from the signed governance.p7s",
+    "DDS loads governance.p7s. The readable copy was changed and never signed.",
     "rcl 9 (security.c).",
     "Restore it from governance.p7s (`sros inspect` shows it).",
 )
@@ -421,7 +423,7 @@ _OPEN = {
     "enable_discovery_protection": DISCOVERY_OPEN,
     "enable_liveliness_protection": LIVELINESS_OPEN,
 }
-"""The finding where an attribute by itself protects nothing."""
+"""The kind of finding for each attribute that by itself protects nothing."""
 _SIGNING = (ProtectionKind.SIGN, ProtectionKind.SIGN_WITH_ORIGIN_AUTHENTICATION)
 _NONE = (ProtectionKind.NONE,)
 
@@ -448,7 +450,7 @@ def check_governance(enclave: CheckedEnclave, *, alone: bool) -> Iterator[Findin
 def governance_findings(
     keystore: CheckedKeystore, governance: Governance, file: str
 ) -> Iterator[Finding]:
-    """Yield what a governance document leaves open; ``file`` is where it stands."""
+    """Yield findings about everything a governance document leaves open; ``file`` is its path."""
     domains = governance.domains().closed()
     accepted = keystore.accepts(lambda s: governance == governance_for(s.protection, domains))
     for rule in governance.domain_access_rules:
@@ -463,7 +465,7 @@ def governance_findings(
 
 
 def _let_in(rule: DomainRule) -> str:
-    """What comes of unauthenticated participants on Fast DDS 2.14, which heeds them; measured."""
+    """Describe what unauthenticated participants can do on Fast DDS 2.14, which admits them."""
     if rule.rtps_protection_kind is not ProtectionKind.NONE:
         return "with protected RTPS messages Fast DDS 2.14 refuses the document"
     hidden = rule.discovery_protection_kind is not ProtectionKind.NONE
@@ -487,7 +489,7 @@ def _domain_rule(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
 
 
 def _open_attributes(rule: DomainRule | TopicRule) -> Iterator[tuple[str, str]]:
-    """Yield the attributes that protect nothing and have a finding of their own, in words."""
+    """Yield the attributes that protect nothing and have their own kind of finding, in words."""
     for each in attributes(type(rule)):
         if each.name in _OPEN and each.is_open(rule):
             yield (
@@ -547,7 +549,7 @@ def _copy(keystore: CheckedKeystore) -> Iterator[Finding]:
 
 
 def _content(message: bytes) -> bytes:
-    """Return what is signed; b"" where that cannot be read, which is reported elsewhere."""
+    """Return the signed content, or b"" if it cannot be read (reported elsewhere)."""
     try:
         return plain(smime.parse(message).document)
     except SrosError:
@@ -558,9 +560,10 @@ DIFFER = FindingKind(
     "portable.vendors-differ",
     WARNING,
     "vendors that decide differently on the same permissions",
-    "What works with one RMW is denied, or open, with another.",
+    "An access that works with one RMW is denied, or open to everybody, with another.",
     "sros: its decision engine, compared with Fast DDS 2.9.1 and 2.14.5 and Cyclone DDS 0.10.2.",
-    "Stay inside the portable profile; `sros explain --all-vendors` tells each decision.",
+    "Stay inside the portable profile; `sros explain --all-vendors` shows the decision of each "
+    "vendor.",
 )
 
 _UNHEARD_OF = "rt/sros_nobody_has_this"
@@ -627,7 +630,7 @@ def _differences(answers: dict[Vendor, Access | Refusal], topics: list[str]) -> 
 
 
 def _topics_to_ask(enclave: CheckedEnclave) -> list[str]:
-    """Return the topics that are named, an example for each wildcard, and one that nobody names."""
+    """Return the named topics, an example for each wildcard, and a topic that no rule names."""
     grant = grant_of(enclave)
     named: dict[str, None] = {ROS_DISCOVERY_TOPIC: None}
     for rule in grant.rules if grant else ():
@@ -638,7 +641,7 @@ def _topics_to_ask(enclave: CheckedEnclave) -> list[str]:
 
 
 def _example(expression: str) -> str:
-    """Return a name that a plain wildcard means; sets of characters stand for their first one."""
+    """Return an example name for a wildcard; a set of characters becomes its first one."""
     if not is_expression(expression):
         return expression
     name, index = "", 0

@@ -1,4 +1,4 @@
-"""Checks of an enclave by itself: what keeps a process from running in it, and what is weak."""
+"""Checks of a single enclave: problems that stop a process from running in it, and weaknesses."""
 
 from __future__ import annotations
 
@@ -41,7 +41,10 @@ _LOADING_KINDS = by_id(
 
 
 def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """Yield every problem of an enclave; at home, a key that stays on its robot is none."""
+    """Yield every problem of an enclave.
+
+    In the keystore itself, a key that stays on its robot is not a problem.
+    """
     state = enclave.state
     for problem in state.problems_at_home if enclave.keystore.is_home else state.problems:
         kind = _LOADING_KINDS[f"enclave.{problem.fault.id}"]
@@ -56,7 +59,7 @@ EXPIRES_SOON = FindingKind(
     "enclave.ends-soon",
     WARNING,
     "a certificate or permissions that expire soon",
-    "From then on the node does not start any more; on Cyclone DDS a running one stops.",
+    "After that the node no longer starts; on Cyclone DDS a running node stops.",
     "Fast DDS 2.14.5 (at start), Cyclone DDS 0.10.2 (timer).",
     "Run `sros renew ROOT NAME`, and export the enclave again.",
 )
@@ -64,7 +67,7 @@ OUTLIVES_CA = FindingKind(
     "enclave.outlives-ca",
     WARNING,
     "a certificate that is valid for longer than its CA",
-    "It expires with the CA, whatever it says itself.",
+    "It expires with the CA, whatever its own dates say.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
     "Plan by the expiry of the CA, or renew the enclave after `sros rotate_ca`.",
 )
@@ -72,7 +75,8 @@ PERMISSIONS_OUTLIVE = FindingKind(
     "enclave.permissions-outlive",
     WARNING,
     "permissions that are valid for longer than the certificate",
-    "A later certificate with the same subject can be used with them, whatever was changed since.",
+    "They can be used with a later certificate of the same subject, even if its rights were "
+    "changed since.",
     "ros2/sros2 issue 275; DDS-Security 1.1, 9.4.1.3.",
     "Run `sros renew ROOT NAME`, which signs them for the life of the certificate at most.",
 )
@@ -80,8 +84,8 @@ NAME_MISMATCH = FindingKind(
     "enclave.name-mismatch",
     WARNING,
     "a certificate with the name of another enclave",
-    "DDS does not ask where a certificate lies. The files of two enclaves were mixed up, and the "
-    "node has the rights of the other one.",
+    "DDS does not check the folder of a certificate. The files of two enclaves were mixed up, and "
+    "the node has the rights of the other enclave.",
     "rcl 9 (security.c); ros2/sros2 (CN is the name of the enclave).",
     "Restore the files of this enclave, or make it again.",
 )
@@ -89,16 +93,17 @@ IS_A_CA = FindingKind(
     "enclave.certificate-is-ca",
     ERROR,
     "an enclave whose certificate may issue others",
-    "Whoever has its key can make identities that every node accepts.",
+    "Anyone who has its key can issue identities that every node accepts.",
     "RFC 5280, 4.2.1.9.",
     "Revoke it, and make the enclave again.",
 )
 NOT_UNIQUE = FindingKind(
     "enclave.subject-not-unique",
     WARNING,
-    "a subject without the part that makes it unique",
+    "a subject without its unique part",
     "The keystore gives every certificate such a part, so that neither permissions of another "
-    "enclave nor earlier ones fit; this certificate is older, or from elsewhere.",
+    "enclave nor earlier permissions match it; this certificate is older, or comes from another "
+    "source.",
     "Cyclone DDS 0.10.2 (subsets of subjects); ros2/sros2 issue 275; measured on both vendors.",
     "Run `sros renew ROOT NAME`.",
 )
@@ -106,7 +111,7 @@ LONG_PERMISSIONS = FindingKind(
     "enclave.long-permissions",
     WARNING,
     "permissions for years, for a subject that stays the same",
-    "Permissions that were replaced stay valid until they expire, for whoever kept a copy.",
+    "Replaced permissions stay valid until they expire, for anyone who kept a copy.",
     "ros2/sros2 issue 275; DDS-Security 1.1, 9.4.1.3 (there is no revocation of permissions).",
     "Use the template production, whose subjects change with every renewal, or shorter ones.",
 )
@@ -114,31 +119,31 @@ EVERYTHING = FindingKind(
     "keystore.allow-everything",
     WARNING,
     "an enclave that may do everything",
-    "It is authenticated and encrypted, and can command every node all the same.",
+    "It is authenticated and encrypted, but can still command every node.",
     "ros2/sros2 0.13 grants this to every enclave without a policy.",
     "Give it a policy, with `sros create_permission ROOT NAME POLICY_FILE`.",
 )
 XML_DIFFERS = FindingKind(
     "enclave.xml-differs",
     WARNING,
-    "permissions.xml says something else than what is signed",
-    "DDS loads permissions.p7s. Somebody changed the readable copy, and it was never signed.",
+    "permissions.xml differs from the signed permissions.p7s",
+    "DDS loads permissions.p7s. The readable copy was changed and never signed.",
     "DDS-Security 1.1, 9.4.1.3; rcl 9 (security.c).",
-    "Sign what is meant with `sros create_permission ROOT NAME POLICY_FILE`.",
+    "Sign the intended permissions with `sros create_permission ROOT NAME POLICY_FILE`.",
 )
 CRL_MISSING = FindingKind(
     "enclave.crl-missing",
     ERROR,
     "an enclave without the revocation list of its keystore",
-    "Its node goes on talking to enclaves that were revoked.",
+    "Its node continues to talk to revoked enclaves.",
     "rmw_dds_common (crl.pem), since 2021.",
     "Run `sros crl ROOT --refresh`, and export the enclave again.",
 )
 WAITS = FindingKind(
     "enclave.waits-for-answer",
     NOTE,
-    "an enclave whose request was not answered yet",
-    "It has a key, and no certificate.",
+    "an enclave whose signing request is not answered yet",
+    "It has a key but no certificate.",
     "sros: create_request, sign_request, import.",
     "Answer it with `sros sign_request`, and put the answer in place with `sros import`.",
 )
@@ -149,7 +154,7 @@ _EVERY_TOPIC = frozenset({"*", "rt/*"})
 
 
 def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """Yield what is found in an enclave by itself."""
+    """Yield the findings in a single enclave."""
     if waits_for_answer(enclave.folder):
         yield WAITS.found(enclave.name, "its certificate is missing", enclave.file(REQUEST))
         return
@@ -169,7 +174,7 @@ def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
 
 
 def grant_of(enclave: CheckedEnclave) -> Grant | None:
-    """Return the grant that DDS reads for the enclave, if it is valid at any time."""
+    """Return the grant that DDS reads for the enclave, if its validity is not empty."""
     grant = enclave.state.grant
     if grant is None or parse_iso(grant.not_after) <= parse_iso(grant.not_before):
         return None
@@ -217,7 +222,7 @@ def _expiry(
 
 
 def _expires_soon(window: Window, now: datetime) -> bool:
-    """Whether it expires within 30 days, or is in the last third of a life of less than 90."""
+    """Whether it expires within 30 days, or is in the last third of a validity under 90 days."""
     return window.not_after - now < min(_SOON, (window.not_after - window.not_before) / 3)
 
 
@@ -245,7 +250,7 @@ def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
 
 
 def _is_as_long(chosen: Span, length: timedelta) -> bool:
-    """Whether a keystore chose permissions of that length; a fixed expiry was chosen, too."""
+    """Whether the keystore's template chose this validity, such as a fixed expiry."""
     return not isinstance(chosen, timedelta) or length <= chosen + BACKDATE
 
 
@@ -260,12 +265,12 @@ def _copies(enclave: CheckedEnclave) -> Iterator[Finding]:
 
 
 def plain(document: bytes) -> bytes:
-    """Return a document as it is compared: line endings and surrounding space do not count."""
+    """Return a document for comparison, with uniform line endings and no surrounding space."""
     return document.replace(b"\r\n", b"\n").strip()
 
 
 def plain_file(path: Path) -> bytes:
-    """Return a file as it is compared; b"" where it cannot be read."""
+    """Return a file's content for comparison, or b"" if it cannot be read."""
     try:
         return plain(read_bytes(path, "file"))
     except SrosError:

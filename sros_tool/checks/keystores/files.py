@@ -1,4 +1,4 @@
-"""The files of a keystore as files: who can read them, where links lead, what does not belong."""
+"""Checks of a keystore's files: modes, links, and files that do not belong there."""
 
 from __future__ import annotations
 
@@ -30,16 +30,17 @@ KEY_READABLE = FindingKind(
     "keystore.key-readable",
     ERROR,
     "a private key that others can read",
-    "Who reads it is that enclave, or with the key of a CA any enclave. Neither rcl nor DDS looks "
+    "Anyone who can read it can act as that enclave, or with a CA key as any enclave. Neither rcl "
+    "nor DDS looks "
     "at modes, and ros2/sros2 makes keys with 0644.",
     "ros2/sros2 0.13; rcl 9, Fast DDS 2.14.5 and Cyclone DDS 0.10.2 check no modes.",
-    "Run `chmod 600` on it. If strangers had access, revoke the enclave.",
+    "Run `chmod 600` on it. If others had access, revoke the enclave.",
 )
 WORLD_WRITABLE = FindingKind(
     "keystore.world-writable",
     ERROR,
     "a file or folder that everybody can change",
-    "Who can replace certificates of CAs, links or documents decides whom a node trusts.",
+    "Anyone who can replace CA certificates, links or documents decides whom a node trusts.",
     "POSIX modes; CWE-732.",
     "Run `chmod o-w` on it.",
 )
@@ -47,17 +48,17 @@ FOLDER_OPEN = FindingKind(
     "keystore.folder-open",
     WARNING,
     "a folder of keys that others may enter",
-    "A key that is written there with a mode too wide, by whatever tool, is readable at once.",
+    "If any tool writes a key there with a too permissive mode, others can read it at once.",
     "ros2/sros2 0.13 makes private/ with 0755; sros with 0700.",
     "Run `chmod 700` on it.",
 )
 LINK_DANGLING = FindingKind(
     "keystore.link-dangling",
     ERROR,
-    "a link to nothing",
-    "What it stands for is missing.",
+    "a broken link",
+    "The file that it points to is missing.",
     "rcl 9 (security.c) follows links.",
-    "Restore the file that it names, or remove the link.",
+    "Restore the file that it points to, or remove the link.",
 )
 LINK_ABSOLUTE = FindingKind(
     "keystore.link-absolute",
@@ -65,14 +66,13 @@ LINK_ABSOLUTE = FindingKind(
     "a link with an absolute path",
     "It breaks as soon as the keystore is moved, copied to a robot, or mounted in a container.",
     "ros2/sros2 keystore layout (relative links).",
-    "Replace it by a relative link, with `ln -sr`.",
+    "Replace it with a relative link: `ln -sr`.",
 )
 LINK_OUTSIDE = FindingKind(
     "keystore.link-outside",
     WARNING,
-    "a link that leads out of the keystore",
-    "The file is not copied or backed up with the keystore, and whoever owns it there can change "
-    "it.",
+    "a link to a file outside of the keystore",
+    "The file is not copied or backed up with the keystore, and its owner there can change it.",
     "CWE-59.",
     "Put the file itself into the keystore.",
 )
@@ -80,7 +80,7 @@ INTERRUPTED = FindingKind(
     "keystore.transaction-left",
     WARNING,
     "a write that was interrupted",
-    "What DDS loads is whole, old or new; the rest waits for the next verb that writes.",
+    "DDS still loads a complete set of files, old or new; the next verb that writes does the rest.",
     "sros: keystore/transaction.py.",
     "Run any verb of sros that writes, such as `sros create_enclave`; it completes or undoes it.",
 )
@@ -88,23 +88,23 @@ STRAY_KEY = FindingKind(
     "keystore.stray-key",
     WARNING,
     "a private key where none belongs",
-    "It is a copy, perhaps of a backup, that nobody looks after.",
+    "It is a copy, perhaps from a backup, that nobody maintains.",
     "ROS 2 keystore layout: private/*.pem and enclaves/*/key.pem only.",
     "Move it to a safe place, or delete it.",
 )
 CA_KEY_ON_ROBOT = FindingKind(
     "keystore.ca-key-on-robot",
     ERROR,
-    "the key of a CA among what was exported for a robot",
-    "Who breaks into the robot can make any enclave, with any rights.",
+    "a CA key in an export for a robot",
+    "An attacker on the robot can make any enclave, with any rights.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "Delete it there; if strangers had access, replace the CA (`sros rotate_ca`).",
+    "Delete it there; if others had access, replace the CA (`sros rotate_ca`).",
 )
 UNKNOWN_FILE = FindingKind(
     "keystore.unknown-file",
     NOTE,
     "a file that is not part of a keystore",
-    "It is left over, or somebody's notes; nothing reads it.",
+    "It is a leftover or a note; nothing reads it.",
     "ROS 2 keystore layout.",
     "Delete it, or keep it elsewhere.",
 )
@@ -120,7 +120,7 @@ _KNOWN_ANYWHERE = re.compile(
 
 
 def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -> Iterator[Finding]:
-    """Yield what is found in every file, folder and link, without reading what DDS reads.
+    """Yield findings about the modes, links and names of files, without reading the DDS files.
 
     Args:
         keystore: the keystore.
@@ -189,14 +189,14 @@ def _key_mode(path: str, mode: int) -> Iterator[Finding]:
 
 
 class _Links:
-    """Follows links; most lead into one of few folders, whose real paths are cached."""
+    """Resolves links; most lead into one of few folders, whose real paths are cached."""
 
     def __init__(self, root: str) -> None:
         self._real_root = os.path.realpath(root)
         self._folders: dict[Path, str] = {}
 
     def check(self, link: Path) -> Iterator[Finding]:
-        """Yield what is wrong with one link."""
+        """Yield the findings about one link."""
         target, shown = link.readlink(), str(link)
         if not link.exists():
             # A missing file that an enclave needs is a finding of the enclave.
@@ -223,7 +223,7 @@ class _Links:
 
 
 def _other(path: str, inside: str, info: os.stat_result, home: bool) -> Iterator[Finding]:
-    """Yield what is wrong with a file that is not an enclave's: perhaps a key out of place."""
+    """Yield findings about a file outside of enclaves, such as a misplaced key."""
     place = inside.partition(os.sep)[0]
     if info.st_size <= _MOST_READ and _holds_key(path):
         yield from _key_mode(path, info.st_mode)
@@ -243,7 +243,7 @@ def _other(path: str, inside: str, info: os.stat_result, home: bool) -> Iterator
         or place == RETIRED
     )
     if not known:
-        yield UNKNOWN_FILE.found(path, "nothing of ROS 2 or sros has this name there", path)
+        yield UNKNOWN_FILE.found(path, "neither ROS 2 nor sros has a file of this name there", path)
 
 
 def _holds_key(path: str) -> bool:

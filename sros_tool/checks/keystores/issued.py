@@ -35,7 +35,7 @@ KEY_TWICE = FindingKind(
     "keystore.key-twice",
     ERROR,
     "two enclaves with the same key",
-    "Who has one of them is the other one, too.",
+    "Each of them can act as the other.",
     "RFC 5280, 4.1.2.6 (the subject is the holder of the key); DDS-Security 1.1, 9.3.",
     "Run `sros renew ROOT NAME --new-key` for one of them.",
 )
@@ -43,31 +43,33 @@ UNEXPLAINED = FindingKind(
     "keystore.not-in-ledger",
     WARNING,
     "a certificate or document that the keystore never issued",
-    "It came from elsewhere, or the ledger was put back to an earlier state.",
+    "It came from another source, or the ledger was reset to an earlier state.",
     "sros: ledger.jsonl.",
-    "Find out where it is from; `sros renew ROOT NAME` issues both again.",
+    "Find out where it comes from; `sros renew ROOT NAME` issues both again.",
 )
 OLD_PERMISSIONS = FindingKind(
     "enclave.old-permissions",
     ERROR,
-    "permissions that were replaced are in place again",
-    "Their signature holds, and where subjects stay the same DDS takes them until they expire. "
-    "Perhaps a backup was restored, or somebody wants back a right that was taken away.",
+    "replaced permissions are in use again",
+    "Their signature is valid, and if the subject stays the same DDS accepts them until they "
+    "expire. Perhaps a backup was restored, or someone tries to get back a removed right.",
     "ros2/sros2 issue 275; sros: ledger.jsonl.",
-    "Sign what is meant, with `sros create_permission ROOT NAME POLICY_FILE` or `sros renew`.",
+    "Sign the intended permissions with `sros create_permission ROOT NAME POLICY_FILE` or `sros "
+    "renew`.",
 )
 STALE = FindingKind(
     "enclave.stale-permissions",
     WARNING,
-    "permissions that are not what the policy says",
-    "The policy was changed and not signed since, or the permissions were made from another one.",
+    "permissions that differ from the policy",
+    "The policy was changed and not signed since, or the permissions were made from another "
+    "policy.",
     "sros: the rights of both, in ROS terms.",
     "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`; `sros diff_policy` shows all.",
 )
 NOT_IN_POLICY = FindingKind(
     "enclave.not-in-policy",
     NOTE,
-    "an enclave that no policy speaks of",
+    "an enclave that no policy names",
     "Its rights cannot be compared with anything.",
     "sros: --policy.",
     "Write a policy for it, or revoke it if nobody needs it.",
@@ -85,7 +87,7 @@ AUTHORITIES_DIFFER = FindingKind(
     "keystore.authorities-differ",
     ERROR,
     "enclaves that do not trust the same CAs",
-    "Their nodes never talk to each other, and neither Fast DDS nor Cyclone DDS says why.",
+    "Their nodes never talk to each other, and neither Fast DDS nor Cyclone DDS reports why.",
     "DDS-Security 1.1, 9.3; Fast DDS 2.9.1, Cyclone DDS 0.10.2; measured.",
     "Export the enclave again from the keystore of the others, or make it again there.",
 )
@@ -94,12 +96,12 @@ _Key = TypeVar("_Key")
 
 _RIGHTS_SHOWN = 3
 _AUTHORITY_FILES = (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
-"""The files of an enclave that say whom it trusts."""
+"""The files of an enclave that define whom it trusts."""
 
 
 @dataclass(frozen=True, slots=True)
 class EnclaveSummary:
-    """What is compared among enclaves: small, as it is passed between processes."""
+    """The summary of an enclave for comparison: small, as it is passed between processes."""
 
     name: str
     serial: int
@@ -138,7 +140,7 @@ def summary_of(enclave: CheckedEnclave) -> EnclaveSummary | None:
 
 @lru_cache(maxsize=8)
 def _trusted(data: bytes) -> frozenset[str]:
-    """Return the certificates in a CA's file; none if it is unreadable, which is a finding."""
+    """Return the certificates in a CA's file; none if it is unreadable (reported elsewhere)."""
     try:
         return fingerprints(data)
     except SrosError:
@@ -148,7 +150,7 @@ def _trusted(data: bytes) -> frozenset[str]:
 def check_issued(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
-    """Yield what is found in all enclaves together."""
+    """Yield the findings in all enclaves together."""
     for (_, serial), names in _twice(((t.issuer, t.serial), t.name) for t in summaries):
         yield SERIAL_TWICE.found(", ".join(names), f"the serial number is {serial:x}")
     for _, names in _twice((each.key, each.name) for each in summaries):
@@ -193,7 +195,7 @@ def _trust(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> It
         for each in everyone:
             if not each.trusted[index] & usual:
                 place = f"{keystore.root}/{enclave_folder(each.name)}/{file}"
-                text = f"{file} is of another CA than {others} have"
+                text = f"{file} was issued by another CA than {others} have"
                 yield AUTHORITIES_DIFFER.found(each.name, text, place)
 
 
@@ -205,7 +207,7 @@ def _exported_governance(
     for each in copies[1:]:
         if each.governance != copies[0].governance:
             file = f"{keystore.root}/{enclave_folder(each.name)}/governance.p7s"
-            text = f"its governance differs from that of {copies[0].name}"
+            text = f"its governance differs from the one of {copies[0].name}"
             yield GOVERNANCE_DIFFERS.found(each.name, text, file)
 
 
@@ -237,7 +239,7 @@ def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -
         return
     name, grant = enclave.name, grant_of(enclave)
     if name not in wanted:
-        yield NOT_IN_POLICY.found(name, "no policy that was given has it", str(enclave.folder))
+        yield NOT_IN_POLICY.found(name, "none of the given policies names it", str(enclave.folder))
         return
     if grant is None:
         return

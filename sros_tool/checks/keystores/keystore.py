@@ -40,7 +40,7 @@ from sros_tool.policy.rights import Right
 
 _NAMES_SHOWN = 3
 _OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id})
-"""Kinds that all enclaves share because of how their keystore was made."""
+"""Kinds that apply to all enclaves because of the choices of their keystore."""
 
 
 def keystore_findings(
@@ -53,7 +53,7 @@ def keystore_findings(
     only: Sequence[str] | None = None,
     on_robot: bool = False,
 ) -> list[Finding]:
-    """Return everything that is found in a keystore, or in some of its enclaves.
+    """Return all findings in a keystore, or in some of its enclaves.
 
     Args:
         root: the keystore.
@@ -103,7 +103,7 @@ def keystore_findings(
 def _enclave_findings(
     enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]], *, alone: bool
 ) -> Iterator[Finding]:
-    """Yield everything that is found in one enclave."""
+    """Yield all findings in one enclave."""
     yield from check_enclave(enclave)
     documents = list(check_documents(enclave))
     yield from documents
@@ -113,7 +113,7 @@ def _enclave_findings(
 
 
 def joined(findings: Sequence[Finding]) -> list[Finding]:
-    """Return ``findings`` with one for all that say the same of one file, or by one choice."""
+    """Return ``findings`` without repetitions for a shared file or the same choice."""
     together: dict[tuple[object, ...], list[Finding]] = {}
     for each in findings:
         one = each.accepted or each.id in _OF_THE_KEYSTORE
@@ -123,7 +123,7 @@ def joined(findings: Sequence[Finding]) -> list[Finding]:
 
 
 def _governance_alone(keystore: CheckedKeystore) -> Iterator[Finding]:
-    """Yield what is found in the governance of a keystore that has no enclave yet."""
+    """Yield the findings in the governance of a keystore that has no enclave yet."""
     with suppress(SrosError):  # making an enclave reports it
         document = smime.parse(keystore.governance).document
         governance = parse_governance(document, GOVERNANCE_P7S)
@@ -131,7 +131,7 @@ def _governance_alone(keystore: CheckedKeystore) -> Iterator[Finding]:
 
 
 def _at_real_file(finding: Finding, root: Path, real_root: str) -> Finding:
-    """Return ``finding`` at the file that all enclaves share, if theirs is a link to it."""
+    """Return ``finding`` with the shared file instead of an enclave's link to it."""
     if "/enclaves/" not in finding.file or finding.id.startswith("keystore.link"):
         return finding
     real = Path(os.path.realpath(finding.file))

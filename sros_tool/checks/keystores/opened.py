@@ -1,4 +1,4 @@
-"""A keystore made ready for checks: every part that can be read, and those that cannot."""
+"""A keystore opened for checks: its readable parts, and the unreadable ones."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _Part = TypeVar("_Part")
 
 @dataclass(frozen=True, slots=True)
 class UnreadablePart:
-    """A file that is there and cannot be read as what it is; ``path`` is relative to the root."""
+    """A file that exists but cannot be parsed; ``path`` is relative to the root."""
 
     path: str
     error: SrosError
@@ -64,7 +64,7 @@ class CheckedKeystore:
     is_home: bool = True
 
     def accepts(self, chosen: Callable[[Template], bool]) -> str:
-        """Return who accepted what was ``chosen``: a template, or the keystore that exported it.
+        """Return the name of whoever accepted ``chosen``: a template, or the exporting keystore.
 
         "" where nobody did, by its settings, or in a keystore of ros2/sros2, which has none.
         """
@@ -79,7 +79,7 @@ class CheckedKeystore:
 
 @dataclass(frozen=True, slots=True)
 class CheckedEnclave:
-    """An enclave, what its files say, and the keystore that it is in."""
+    """An enclave, the content of its files, and its keystore."""
 
     keystore: CheckedKeystore
     name: str
@@ -103,7 +103,7 @@ def read_keystore(
     policies: tuple[Policy, ...] = (),
     on_robot: bool = False,
 ) -> CheckedKeystore:
-    """Return every part of a keystore, and what cannot be read of it.
+    """Return the readable parts of a keystore, and the list of unreadable ones.
 
     Args:
         root: the keystore, or an export of it.

@@ -52,11 +52,11 @@ class Authority:
     key: PrivateKey
 
     def issuer(self) -> Issuer:
-        """Return what issues certificates in this authority's name."""
+        """Return the issuer that signs certificates for this authority."""
         return Issuer(self.certificate, self.key)
 
     def sign(self, document: bytes, what: str) -> bytes:
-        """Return the S/MIME message of a document, checked before anybody relies on it.
+        """Return the S/MIME message of a document, after verifying it.
 
         The message is taken apart again: its digest has to fit, and it has to carry ``document``.
         ``what`` names the document in the error.
@@ -73,10 +73,10 @@ class Authority:
 
 
 def check_meaning(read: object, meant: object, what: str) -> None:
-    """Raise `PkiError` unless what was read back from a document is what was meant."""
+    """Raise `PkiError` unless the document read back equals the intended one."""
     if read != meant:
         raise PkiError(
-            f"{what} as signed does not say what was meant",
+            f"{what} as signed differs from the intended one",
             "Nothing was written.",
             "This is a defect of sros: please report it with the policy.",
         )
@@ -88,7 +88,7 @@ def _lines(document: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Authorities:
-    """The two authorities of a keystore, which may be one and the same."""
+    """The identity CA and permissions CA of a keystore; both may be the same CA."""
 
     identity: Authority
     permissions: Authority
@@ -106,7 +106,7 @@ def create_authorities(
     check_places(keyring, template)
     check_keys_of(imported, keyring, template)
     validity = window(now, template.authority_validity)
-    # Every keystore's CA has a name of its own, so that messages and pictures can tell them apart.
+    # Every keystore's CA has a name of its own, so that messages and pictures distinguish them.
     serial = secrets.token_hex(4)
     notes: list[Note] = []
 

@@ -71,7 +71,7 @@ def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> Im
         raise PkiError(
             f"{subject_text(own[0].subject)} cannot be the {role} CA: no DDS takes it",
             f"{refusals_text(refusals)}.",
-            "Issue the CA's certificate anew, self-signed with SHA-256 and keyUsage keyCertSign "
+            "Issue the CA's certificate again, self-signed with SHA-256 and keyUsage keyCertSign "
             "and digitalSignature.",
         )
     return ImportedAuthority(

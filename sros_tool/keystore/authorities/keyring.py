@@ -26,7 +26,7 @@ Secrets = Callable[[str], str]
 
 
 def no_secrets(what: str) -> str:
-    """Raise `PkiError`: the secrets handler where there is no secret to give."""
+    """Raise `PkiError`: the secrets handler when no secret is available."""
     raise PkiError(f"{what} is needed, and nobody is there to give it")
 
 
@@ -140,7 +140,7 @@ def check_keys_of(roles: Iterable[str], keyring: Keyring, template: Template) ->
             )
         if not template.separate_authorities and role != IDENTITY:
             raise UsageError(
-                "with one CA for both jobs, its certificate is that of the identity CA",
+                "with one CA for both jobs, its certificate is the identity CA's",
                 "",
                 "Give --identity-ca alone, or --ca-layout separate.",
             )

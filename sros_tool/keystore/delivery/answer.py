@@ -1,4 +1,4 @@
-"""The answer to a signing request, on the robot: checked in full, then put in place as a whole."""
+"""Importing the answer to a signing request on the robot: verified in full, installed at once."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
 
 
 def _broken_seal(answer: RequestAnswer, authorities: Iterable[x509.Certificate]) -> str:
-    """Return why none of the authorities has signed the files, or "" if one has."""
+    """Return why no authority's signature of the files verifies, or "" if one does."""
     try:
         signed = smime.parse(answer.seal)
     except SrosError as error:
@@ -169,7 +169,7 @@ def import_answer(
     force: bool = False,
     dry_run: bool = False,
 ) -> ImportedEnclave:
-    """Put an answer next to the key that waits for it in ``folder``, or change nothing.
+    """Install an answer next to its key in ``folder``, or change nothing.
 
     An answer that is older than what is there, or that comes from other CAs, needs ``force``.
     Where CAs are ``pinned``, by their SHA-256, one of them has to have signed it in any case.
@@ -183,8 +183,7 @@ def import_answer(
     if not (place / _KEY).is_file():
         raise KeystoreError(
             f"'{folder}' has no key of enclave {name}",
-            "An answer is for the key that its request was made with, and that stayed where it "
-            "was made.",
+            "An answer is for the key of its request, which stays where the request was made.",
             f"Make key and request with `sros create_request {name} {folder}`, and have that "
             "signed.",
         )
@@ -233,9 +232,9 @@ def _check_pinned(
     if not pinned or digest(permissions_ca) in pinned:
         return
     why = f"It comes from {subject_text(permissions_ca.subject)}, SHA-256 {digest(permissions_ca)}."
-    remedy = "Ask for the SHA-256 at home: `sros sign_request` says it. Nothing was changed."
+    remedy = "Ask for the SHA-256 that `sros sign_request` printed. Nothing was changed."
     if digest(identity_ca) in pinned:
-        why = "What is named is its identity CA, which vouches for the certificate alone."
+        why = "The named CA is its identity CA, which vouches for the certificate only."
         remedy = "Name the permissions CA: it signs the whole answer. Nothing was changed."
     raise KeystoreError(
         f"the answer for enclave {answer.name} is not signed by the CA that is named", why, remedy
@@ -243,7 +242,7 @@ def _check_pinned(
 
 
 def _check_known(folder: Path, answer: RequestAnswer, known: list[x509.Certificate]) -> None:
-    """Refuse an answer of other CAs than the first one, which said whom to trust."""
+    """Refuse an answer from other CAs than those of the first answer."""
     if known and (problem := _broken_seal(answer, known)):
         raise KeystoreError(
             f"the answer for enclave {answer.name} comes from another keystore",
@@ -254,7 +253,7 @@ def _check_known(folder: Path, answer: RequestAnswer, known: list[x509.Certifica
 
 
 def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certificate) -> None:
-    """Refuse an answer that brings back an earlier state: an attacker may have kept it."""
+    """Refuse an answer that is older than the present state: an attacker may replay it."""
     remedy = "Have a new answer made, or add --force if going back is meant."
     path = place / "cert.pem"
     if path.exists():

@@ -79,7 +79,7 @@ def _unzip(data: bytes) -> bytes:
     if not stream.eof:
         raise EOFError
     if stream.unused_data:
-        raise DocumentError("there is more behind its end")
+        raise DocumentError("there is data after its end")
     return plain
 
 
@@ -95,7 +95,7 @@ def _members(tar: tarfile.TarFile) -> Iterator[tuple[str, bytes]]:
         if entry.isdir():
             continue
         if entry.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or entry.issparse():
-            raise DocumentError(f"it holds {name!r}, which is no plain file")
+            raise DocumentError(f"it holds {name!r}, which is not a regular file")
         if entry.size > MAX_MEMBER:
             raise DocumentError(f"it holds {name!r}, which has {entry.size} bytes")
         content = tar.extractfile(entry)

@@ -55,7 +55,7 @@ class ExportSelection:
 def select(
     root: Path, names: Sequence[str], patterns: Sequence[str] = (), *, every: bool = False
 ) -> ExportSelection:
-    """Return the named enclaves, and those of the keystore that match a pattern, or ``every`` one.
+    """Return the named enclaves and the keystore's enclaves that match a pattern, or ``every`` one.
 
     In a pattern ``*`` stands for any part of a name, "/" included, as in policies.  Those that are
     found so are left out if their key is not at home; those that are named are refused later.

@@ -46,7 +46,8 @@ def create_request(
             raise KeystoreError(
                 f"enclave {name} has a key in '{folder}' already",
                 "A key is never replaced, for its certificate would be useless without it.",
-                "Add --again to have the request made anew for this key, or choose another folder.",
+                "Add --again to have the request made again for this key, or choose another "
+                "folder.",
             )
         if again:
             key = load_key(read_bytes(path, "private key"), f"'{path}'")

@@ -192,7 +192,7 @@ def _check_key(root: Path, request: SigningRequest) -> None:
         if certificate.public_key() == request.public_key:
             raise KeystoreError(
                 f"the key of the request for {request.name} was revoked",
-                f"It is that of the certificate {certificate.serial_number:x} of "
+                f"It is the key of certificate {certificate.serial_number:x} of "
                 f"{text_of(certificate.subject)}.",
                 "Have a new key made on the robot, in another folder.",
             )

@@ -1,4 +1,4 @@
-"""Whom the enclaves of a robot trust: all of one folder have an identity CA in common."""
+"""Checks that all enclaves in a robot's folder trust a common identity CA."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sros_tool.xml import read_bytes
 
 
 def read_pin(text: str) -> frozenset[str]:
-    """Return the SHA-256 of the CAs that a person named: by a fingerprint, or a certificate file.
+    """Return the SHA-256 of the pinned CAs, from a fingerprint or a certificate file.
 
     Colons and capitals in a fingerprint do not matter, so that one may be copied from
     ``openssl x509 -fingerprint -sha256``.
@@ -32,7 +32,7 @@ def read_pin(text: str) -> frozenset[str]:
     raise UsageError(
         f"{text!r} is neither the file of a certificate nor its SHA-256",
         "A fingerprint has 64 hexadecimal digits.",
-        "Copy the one that `sros sign_request` says, or name a file.",
+        "Copy the one that `sros sign_request` prints, or name a file.",
     )
 
 

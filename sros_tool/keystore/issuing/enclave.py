@@ -93,7 +93,7 @@ class EarlierRights:
 
 @dataclass(frozen=True, slots=True)
 class Issuance:
-    """What is issued for one enclave.
+    """The certificate and permissions to issue for one enclave.
 
     ``identity`` is a certificate that the enclave keeps, or what a new one is issued for.  Without
     ``rights`` the permissions stay as they are.
@@ -173,7 +173,7 @@ class EnclaveWriter:
         self._key_on_token = any(isinstance(key, TokenKey) for key in keys)
 
     def write(self, issuance: Issuance) -> Issued:
-        """Issue, prove, sign and stage what ``issuance`` says, and record it for the ledger.
+        """Issue, prove, sign and stage ``issuance``, and record it for the ledger.
 
         A certificate expires with the identity CA at the latest; permissions expire with their
         certificate and with the permissions CA at the latest.
@@ -296,7 +296,7 @@ def _early_expiry(
 
 
 def stated_enclave(policy: Policy, name: str) -> Enclave:
-    """Return what a policy states for an enclave; raise `PolicyError` if it states nothing."""
+    """Return a policy's rights for an enclave; raise `PolicyError` if it has none."""
     enclave = policy.enclave(name)
     if enclave is None:
         present = ", ".join(each.path for each in policy.enclaves)
@@ -312,12 +312,12 @@ def _default_policy(choice: str) -> Enclave:
 
 
 def default_rights(template: Template, name: str) -> Enclave:
-    """Return what an enclave without a policy may do, by the choice of the keystore's template."""
+    """Return the rights of an enclave without a policy, by the keystore's template."""
     return replace(_default_policy(template.default_permissions), path=name)
 
 
 def policies_of(root: Path) -> dict[str, str]:
-    """Map the SHA-256 of each signed document in the ledger to that of the policy it is from."""
+    """Map the SHA-256 of each signed document in the ledger to its policy's SHA-256."""
     return {each.sha256: each.policy for each in read_ledger(root)}
 
 

@@ -1,13 +1,13 @@
-"""The proof that permissions say what the policy says that they are made from.
+"""Proof that permissions give exactly the rights of the policy they are made from.
 
 A policy allows what something allows and nothing denies; DDS takes the first rule that matches.
 Both mean the same, for every name, mentioned or not, if
 
 - the document has one grant, its denials come first, every rule is for all of its domains and
-  without partitions, nothing else is allowed, and its expressions are those of the policy: a
+  without partitions, nothing else is allowed, and its expressions equal the policy's: a
   comparison of sets;
 - the vendors match each expression with wildcards as a policy means it (one without wildcards
-  matches itself for all of them): a comparison of matchers, for names that tell them apart.
+  matches itself for all of them): a comparison of matchers, for names that distinguish them.
 
 Both are made of every document, whatever its size and however many are signed at once.  For a
 document of another form, the decision engine is asked for every name that either of them mentions,
@@ -82,11 +82,11 @@ class ExpressionSets:
 
     @classmethod
     def none(cls) -> ExpressionSets:
-        """Nothing allowed, nothing denied."""
+        """No right and no denial."""
         return cls({_OUT: set(), _IN: set()}, {_OUT: set(), _IN: set()})
 
     def allow(self, verb: str, topic: str) -> bool:
-        """Whether a policy allows it: something allows it, and nothing denies it."""
+        """Whether a policy allows it: one rule allows it, and no rule denies it."""
         return _meant(self.allowed[verb], topic) and not _meant(self.denied[verb], topic)
 
     def all(self) -> Iterator[str]:
@@ -124,7 +124,7 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
     found = differences(policy, permissions, domains)
     if found:
         raise KeystoreError(
-            f"the permissions of {policy.path} would not be what the policy says",
+            f"the permissions of {policy.path} would not match the policy",
             f"For the policy, {found[0]}"
             + (f" ({len(found) - 1} differences more)." if len(found) > 1 else "."),
             "Nothing was written. This is an error of sros: please report it with the policy.",
@@ -133,7 +133,7 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
 
 @lru_cache(maxsize=4096)
 def matched_as_meant(expression: str) -> bool:
-    """Whether the vendors match the names that an expression tells apart as a policy means it."""
+    """Whether the vendors match an expression with the same names as the policy does."""
     return all(
         dds_matches(vendor.traits.style, expression, name) == matches(expression, name)
         for name in telling_topics([expression])
@@ -142,7 +142,7 @@ def matched_as_meant(expression: str) -> bool:
 
 
 def stated_expressions(policy: Enclave) -> ExpressionSets:
-    """Return what a policy states for an enclave, in DDS names, with what every participant has."""
+    """Return a policy's rights for an enclave in DDS names, including every participant's."""
     found = ExpressionSets.none()
     for verb in (_OUT, _IN):
         found.allowed[verb].add(ROS_DISCOVERY_TOPIC)
@@ -158,7 +158,7 @@ def stated_expressions(policy: Enclave) -> ExpressionSets:
 
 
 def signed_expressions(permissions: Permissions, domains: DomainSet) -> ExpressionSets | None:
-    """Return what permissions say, or None where the order of their rules could matter."""
+    """Return the rights of permissions, or None if the order of their rules could matter."""
     if len(permissions.grants) != 1 or permissions.grants[0].default_allow:
         return None
     found = ExpressionSets.none()
@@ -185,7 +185,7 @@ def differences(
     domains: DomainSet,
     vendors: Iterable[Vendor] = _ASKED,
 ) -> list[Disagreement]:
-    """Return where the vendors' decisions are not what the policy says.
+    """Return the differences between the vendors' decisions and the policy.
 
     They are asked for the `telling_topics` of all expressions, and of each one alone.
     """
@@ -208,7 +208,7 @@ def differences(
 
 
 def telling_topics(expressions: Iterable[str]) -> tuple[str, ...]:
-    """Return topics that tell the expressions apart, sorted.
+    """Return topics that distinguish the expressions, sorted.
 
     Each topic that is mentioned; for each wildcard one that it matches, one that only it matches,
     and one for each other wildcard that it overlaps; and one that nothing matches, for each prefix

@@ -1,4 +1,4 @@
-"""The size of signed permissions, by signing them with a throwaway key."""
+"""The size of signed permissions, measured with a temporary key."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LINE = len("            <topic></topic>\r\n")
 
 
 class SizeEstimator:
-    """Estimates the size of signed permissions, with a key of its own that is thrown away.
+    """Estimates the size of signed permissions by signing them with a temporary key.
 
     A keystore's own CA may have a longer or shorter name, and a signature varies by some bytes: the
     sizes are right to within 100 bytes.

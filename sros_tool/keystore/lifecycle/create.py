@@ -145,11 +145,11 @@ def create_enclaves(
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> Creation:
-    """Create enclaves; what they may do is the default of the keystore's template.
+    """Create enclaves with the default rights of the keystore's template.
 
     An enclave that exists is left as it is, and completed where a file is missing: neither its
     key nor its permissions are ever replaced.  ``domain`` is the one that the caller will use
-    (its ROS_DOMAIN_ID); it must be among those of the keystore.
+    (its ROS_DOMAIN_ID); it must be one of the keystore's.
     """
     return generate_artifacts(
         root,
@@ -199,7 +199,7 @@ def generate_artifacts(
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> Creation:
-    """Create the named enclaves and those of the policies, with their permissions, all or nothing.
+    """Create the named enclaves and the policies' enclaves, with permissions, all or nothing.
 
     Permissions that a policy states replace those that an enclave had.  Where there is no
     keystore, one is created by the template ``create``, if that is given.
@@ -222,7 +222,7 @@ def generate_artifacts(
 
 
 def _wanted(names: Sequence[str], policies: Sequence[Policy]) -> dict[str, Enclave | None]:
-    """Return each enclave with what a policy states for it; raise where two policies differ."""
+    """Map each enclave to the rights of its policy; raise if two policies differ."""
     wanted: dict[str, Enclave | None] = {check_enclave_name(name): None for name in names}
     for policy in policies:
         for enclave in policy.enclaves:
@@ -298,7 +298,7 @@ def _check_free(root: Path) -> None:
     if is_keystore(root):
         raise _already_exists(root)
     if root.resolve() == Path("/"):
-        raise KeystoreError("the root of the file system is no place for a keystore")
+        raise KeystoreError("the root of the file system cannot be a keystore")
     if os.path.lexists(root) and not root.is_dir():
         raise KeystoreError(f"'{root}' is in the way", "It is not a folder.")
     remains = [part for part in (PUBLIC, PRIVATE, ENCLAVES) if (root / part).exists()]
@@ -306,7 +306,7 @@ def _check_free(root: Path) -> None:
         if is_keystore(root):  # another process has just completed it
             raise _already_exists(root)
         raise KeystoreError(
-            f"'{root}' holds parts of a keystore already",
+            f"'{root}' already holds parts of a keystore",
             f"There are {', '.join(remains)}; a new CA next to them would lock out every enclave "
             "that trusts the old one.",
             "Restore what is missing, or choose another path.",
@@ -331,7 +331,7 @@ def _check_typo(root: Path) -> None:
     for name in close:
         if is_keystore(root.absolute().parent / name):
             raise UsageError(
-                f"'{root}' does not exist, and '{name}' beside it is a keystore",
+                f"'{root}' does not exist, and '{name}' next to it is a keystore",
                 "This may be a typing error, so no second keystore is made.",
                 f"Name '{root.with_name(name)}', or run `sros create_keystore {root}` first.",
             )
@@ -341,7 +341,7 @@ def _check_typo(root: Path) -> None:
 
 
 class _Outcome(Enum):
-    """What was done to an enclave."""
+    """The change made to an enclave."""
 
     CREATED = "created"
     CHANGED = "changed"
@@ -403,7 +403,7 @@ def _write_enclave(
     policy: Enclave | None,
     now: datetime,
 ) -> tuple[_Outcome, tuple[Note, ...]]:
-    """Stage what an enclave lacks, and the permissions of its policy if there is one."""
+    """Stage an enclave's missing files, and the permissions of its policy if there is one."""
     present = present_files(transaction.root, name)
     before = len(transaction.changes)
     identity = _identity(transaction.root, keystore, name, present, now)
@@ -425,7 +425,7 @@ def _write_enclave(
 def _identity(
     root: Path, keystore: _Keystore, name: str, present: set[str], now: datetime
 ) -> NewIdentity | x509.Certificate:
-    """Return the certificate of an enclave, or what to issue one for; a key is never replaced."""
+    """Return an enclave's certificate, or the subject and key for a new one; keep its key."""
     folder = enclave_path(root, name)
     if CERTIFICATE_FILE in present:
         if not present & {KEY_FILE, REQUEST}:

@@ -218,7 +218,7 @@ class _Renewer:
         return _Replaced(name, old.serial_number, state.grant.subject, until)
 
     def _issuance(self, state: Credentials) -> Issuance:
-        """Return what is issued in place of what an enclave has, after that was verified."""
+        """Verify an enclave's documents, and return the issuance that replaces them."""
         name = state.name
         if not issued_by(state.certificate, self._authorities.identity.certificate):
             raise KeystoreError(

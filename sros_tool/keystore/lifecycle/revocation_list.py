@@ -233,9 +233,10 @@ class Lists:
                 f"Restart all processes and run `sros rotate_ca {self._root} --to retire` first; "
                 "or add --until-retired, and retire it soon.",
             )
-        text = f"The list of the old identity CA {name} was not signed anew"
+        text = f"The list of the old identity CA {name} was not signed again"
         if newly:
             text += "; Fast DDS accepts the revoked certificates that it issued until it is retired"
         elif old:
-            text += f"; it ends at {iso(old.next_update)}, and Fast DDS then refuses who is of it"
+            text += f"; it expires at {iso(old.next_update)}, and Fast DDS then refuses "
+            text += "the enclaves of that CA"
         self.remarks.append(f"{text}: run `sros rotate_ca {self._root} --to retire`.")

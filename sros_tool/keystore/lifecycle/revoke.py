@@ -39,7 +39,7 @@ _PRIVATE = "key.pem"
 
 @dataclass(frozen=True, slots=True)
 class Revocation:
-    """What was revoked, and until when the list is valid.
+    """The revoked certificates, and the expiry of the list.
 
     ``restart`` are the enclaves whose processes go on trusting the revoked ones until they are
     started again.  ``remarks`` are sentences on what is still to be done.
@@ -116,7 +116,7 @@ def refresh_crl(
 ) -> Revocation:
     """Sign the revocation list again, so that it is valid for longer.
 
-    What it revokes is kept, but for certificates that expired and were on a list since.
+    Its entries stay, except for certificates that expired and were on a list after that.
     """
     if not dry_run:
         tidy(root)
@@ -161,7 +161,7 @@ def _move_away(transaction: Transaction, authority: Authority, name: str) -> tup
     if not issued_by(certificate, authority.certificate):
         raise KeystoreError(
             f"the certificate of enclave {name} was not issued by the identity CA of this keystore",
-            "Only its own CA can revoke it.",
+            "Only the CA that issued it can revoke it.",
         )
     serial = certificate.serial_number
     target = f"{REVOKED}/{serial:x}"

@@ -1,4 +1,4 @@
-"""What a transaction needs of the file system: locks, flushes, exchanges, moves of folders."""
+"""File system operations of a transaction: locks, flushes, exchanges, moves of folders."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def is_folder(path: str | Path) -> bool:
     if stat.S_ISLNK(mode):
         raise KeystoreError(
             f"'{path}' is a symbolic link",
-            "What is written below it would land elsewhere, outside of the keystore.",
+            "Files written below it would be stored elsewhere, outside of the keystore.",
             "Put a real folder in its place.",
         )
     if not stat.S_ISDIR(mode):
@@ -118,7 +118,7 @@ def is_folder(path: str | Path) -> bool:
 
 
 def make_folders(root: Path, folders: Iterable[str]) -> None:
-    """Make those of the folders that are missing; raise `KeystoreError` if one is not real."""
+    """Create the missing folders; raise `KeystoreError` if one is not a real folder."""
     seen = {""}
 
     def make(folder: str) -> None:

@@ -1,6 +1,6 @@
 """Recovery: completes or undoes what a transaction that was stopped left in a keystore.
 
-A transaction ends with it as well: after its commit the links into the stage give way to the plain
+A transaction also finishes with it: after its commit the links into the stage give way to the plain
 files, and new folders move to their places.  Each step may be repeated: it finds what is done
 already, so a recovery that was stopped is recovered, too.
 """
@@ -45,7 +45,7 @@ _KNOWN = re.compile(
 
 
 def tidy(root: Path) -> None:
-    """Complete or undo what an interrupted transaction left in the keystore, if there is anything.
+    """Complete or undo an interrupted transaction of the keystore, if there is one.
 
     Raises:
         KeystoreError: the keystore is busy, or the stage is not one of this version.
@@ -74,7 +74,7 @@ def recover(root: Path) -> None:
         _LOG.info("undoing the transaction that was not committed in the keystore '%s'", root)
         _undo(root, stage, read_manifest(stage))
     with contextlib.suppress(FileNotFoundError):
-        os.unlink(live)  # first: without it, what is left of the stage is only to be removed
+        os.unlink(live)  # first: without it, the rest of the stage only needs to be removed
     shutil.rmtree(stage)
 
 
@@ -126,7 +126,7 @@ def _complete(root: Path, stage: Path, moves: Sequence[Move]) -> None:
 
 
 def _undo(root: Path, stage: Path, moves: Sequence[Move]) -> None:
-    """Put back everything that a link into the stage took the place of."""
+    """Restore everything that a link into the stage replaced."""
     spare = f"{stage}/spare"
     for path, before, _ in moves:
         real = f"{root}/{path}"

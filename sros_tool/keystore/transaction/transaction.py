@@ -192,7 +192,7 @@ class Transaction:
         self._moves.append(Move(path, before, None))
 
     def _prepare(self, path: str, after: str) -> str | None:
-        """Return where to write what is staged for a path; ``after`` is that of `Move`."""
+        """Return the path to write a staged file to; ``after`` has the meaning of `Move.after`."""
         exists = self._prepare_folder(path.rpartition("/")[0])
         before = self._at(path) if exists else None
         self._begin_change(path, "create" if before is None else "replace")
@@ -209,7 +209,7 @@ class Transaction:
         self.changes.append(Change(action, path))
 
     def _at(self, path: str) -> str | None:
-        """Return what is at a path, as `Move` says it."""
+        """Return the present state of a path, in the terms of `Move`."""
         real = f"{self.root}/{path}"
         try:
             mode = os.lstat(real).st_mode

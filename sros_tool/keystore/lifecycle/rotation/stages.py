@@ -1,4 +1,4 @@
-"""The stages of replacing CAs: what each of them changes in a keystore.
+"""The stages of a CA rotation, and the changes that each makes in a keystore.
 
 distribute: a new CA is trusted next to the old one.  reissue: the new CA issues and signs
 everything again.  retire: the old CA is trusted no longer.  Each is one transaction.
@@ -199,7 +199,7 @@ def renew_identity_ca(
                 "Rotate it without --same-key.",
             )
         if read_rotation(root).stage is not RotationStage.NONE:
-            raise KeystoreError("a rotation is under way", "", "Bring it to its end first.")
+            raise KeystoreError("a rotation is under way", "", "Finish it first.")
         template = load_settings(root)
         key = keyring.open(root, IDENTITY, template)
         old, *above = certificates_of(root, "identity_ca")
@@ -257,7 +257,7 @@ class _Rotator:
         validity: Span | None,
         progress: Progress | None,
     ) -> RotationStage:
-        """Stage all that leads to ``stage``; return the stage that is reached.
+        """Stage all changes up to ``stage``; return the reached stage.
 
         It is the present one where the new identity CA has no revocation list yet, which has to be
         distributed first: Fast DDS 2.9.1 refuses every enclave of a CA without one (ran).
@@ -359,7 +359,7 @@ class _Rotator:
         permissions: _Successor | None,
         progress: Progress | None,
     ) -> None:
-        """Stage what the new CAs have to issue: certificates, governance and permissions.
+        """Stage the certificates, governance and permissions that the new CAs issue.
 
         Keys, subjects and rights stay.  What a CA that is not replaced has issued is left as it
         is, so its key is not needed.
@@ -392,7 +392,7 @@ class _Rotator:
         self.notes = writer.notes
 
     def _sign_governance(self, permissions: _Successor) -> None:
-        """Sign the keystore's governance again, as it is, and that of enclaves with a copy."""
+        """Sign the unchanged governance of the keystore, and enclaves' copies, again."""
         copies = [
             f"{enclave_folder(each)}/{GOVERNANCE_FILE}" for each in self._names if each != "/"
         ]
@@ -536,7 +536,7 @@ class _Successor:
     key: str
 
     def replacement(self) -> Replacement:
-        """Return the record of it for the file of the rotation."""
+        """Return its record for the rotation's file."""
         return Replacement(self.file, digest(self.old[0]), digest(self.new.certificate), self.key)
 
 
@@ -607,7 +607,7 @@ def _make_successor(
     )
     if same_key(old[0], key):
         raise KeystoreError(
-            f"the key at '{place}' is that of the present {roles[0]} CA",
+            f"the key at '{place}' belongs to the present {roles[0]} CA",
             "A new CA needs a new key.",
             "Name another place.",
         )
@@ -622,7 +622,7 @@ def _make_successor(
 def _distributed(
     root: Path, rotation: Rotation, keyring: Keyring, template: Template
 ) -> list[_Successor]:
-    """Return the new CAs that were distributed, with their keys."""
+    """Return the distributed new CAs, with their keys."""
     found = []
     files = authority_files(root)
     for each in rotation.replacements:
@@ -633,7 +633,7 @@ def _distributed(
         key = replace(keyring, places={}).open(root, roles[0], moved)
         if not same_key(new, key):
             raise KeystoreError(
-                f"the key at '{each.key}' is not that of the new {roles[0]} CA",
+                f"the key at '{each.key}' does not belong to the new {roles[0]} CA",
                 "",
                 "Restore it from a backup.",
             )

@@ -218,17 +218,18 @@ def _ending(states: Sequence[AuthorityStatus], now: datetime) -> list[str]:
         end = iso(each.validity.not_after)
         if each.validity.not_after < now:
             remarks.append(
-                f"The {name} ended at {end}, and no process starts any more: replace it at once "
+                f"The {name} expired at {end}, and no process starts any more: replace it at once "
                 "with --finish."
             )
         elif each.roles == (IDENTITY,):
             remarks.append(
-                f"The {name} ends at {end}: --same-key gives it a longer life and disturbs nobody; "
+                f"The {name} expires at {end}: --same-key extends it and disturbs nobody; "
                 "--next begins to replace it."
             )
         else:
             remarks.append(
-                f"The {name} ends at {end}: --next begins to replace it. With Fast DDS, robots run "
+                f"The {name} expires at {end}: --next begins to replace it. With Fast DDS, robots "
+                "run "
                 "on; with Cyclone DDS, plan a common restart of all processes."
             )
     return remarks
@@ -279,7 +280,7 @@ def _has_identifier(certificate: x509.Certificate) -> bool:
 def _fast_dds_hindrance(root: Path, files: Sequence[str]) -> str:
     """Return why Fast DDS cannot trust the old and the new CA at once, as a sentence, or "".
 
-    Fast DDS 2.9.1 (ran): two CAs of one name are told apart by their key identifiers, and
+    Fast DDS 2.9.1 (ran): two CAs of one name are distinguished by their key identifiers, and
     permissions CAs need to have one name and one algorithm on both sides.
     """
     for file in files:
@@ -291,6 +292,7 @@ def _fast_dds_hindrance(root: Path, files: Sequence[str]) -> str:
             if not _has_identifier(certificate):
                 return (
                     f"the old {'CA' if file == 'ca' else f'{PERMISSIONS} CA'} has no key "
-                    "identifier (ros2/sros2 made it), so it cannot be told from the new one."
+                    "identifier (ros2/sros2 made it), so it cannot be distinguished from the new "
+                    "one."
                 )
     return ""
