@@ -291,7 +291,7 @@ if TYPE_CHECKING:
 
 _DONE = {
     "distribute": "distributed the new CA next to the old one",
-    "reissue": "issued and signed everything again with the new CA",
+    "reissue": "issued and signed everything with the new CA",
     "retire": "retired the old CA",
 }
 
@@ -307,7 +307,7 @@ Example:
     identity CA    issuing 2 of 2 enclaves  until 2036-11-18T07:37:42Z  ...
     identity CA    next    0 of 2 enclaves  until 2036-11-18T07:37:45Z  ...
   $ sros rotate_ca keystore --next     # once all processes were restarted
-  issued and signed everything again with the new CA: identity_ca, permissions_ca
+  issued and signed everything with the new CA: identity_ca, permissions_ca
   $ sros rotate_ca keystore --next     # once they were restarted again
   retired the old CA: identity_ca, permissions_ca
   $ sros rotate_ca keystore --finish   # or all at once; then restart all""",
