@@ -372,7 +372,7 @@ def check(
 
 
 def _moment(now: datetime | None) -> datetime:
-    """The moment that a caller gave, which must have a time zone, or the present one."""
+    """Return ``now``, which must have a time zone, or the present moment if it is None."""
     if now is None:
         return datetime.now(UTC)
     if now.tzinfo is None:

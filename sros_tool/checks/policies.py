@@ -123,7 +123,7 @@ EVERYTHING = FindingKind(
     WARNING,
     "a wildcard that allows acting on everything",
     "The enclave can command every node and answer in place of every other node.",
-    "ROS 2 design, ROS 2 Security Enclaves: the least that is needed.",
+    "ROS 2 design, ROS 2 Security Enclaves: least privilege.",
     "Name what the node uses; `sros minimize_policy` narrows it to what was observed.",
 )
 WIDE = FindingKind(
@@ -139,7 +139,7 @@ READS_EVERYTHING = FindingKind(
     NOTE,
     "a wildcard by which an enclave reads across namespaces",
     "A recorder needs it; any other enclave learns more than it needs.",
-    "ROS 2 design, ROS 2 Security Enclaves: the least that is needed.",
+    "ROS 2 design, ROS 2 Security Enclaves: least privilege.",
     "Name the topics, or deny the confidential ones.",
 )
 SETS_PARAMETERS = FindingKind(

@@ -51,7 +51,7 @@ Example:
   $ sros demo --scenario governance --plot cost.svg
   $ sros demo --scenario all
 
-Exit status: 0 if every row is as expected, known to be open ones included (or skipped with its
+Exit status: 0 if every row is as expected, including rows known to be open (or skipped with its
 reason), 1 if not.""",
 )
 @click.option(
@@ -146,7 +146,7 @@ def demo(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Show on a real DDS that nobody hears secured nodes or gets in without permission.
+    """Show on a real DDS that nobody reads from or joins secured nodes without permission.
 
     Makes keystores, starts nodes with and without them, and compares what was expected with what
     happened. The scenario isolation takes some ten seconds on Cyclone DDS and some twenty on rclpy,

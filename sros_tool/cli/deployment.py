@@ -375,7 +375,7 @@ def import_verb(
 
 
 def _read(path: Path, what: str) -> bytes:
-    """The bytes of a file, or of standard input; more than any answer has is refused."""
+    """Return the bytes of a file or of standard input; refuse more than an answer can have."""
     from sros_tool.keystore.delivery.archive import MAX_PACKED
     from sros_tool.xml import read_bytes
 

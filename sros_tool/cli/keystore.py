@@ -149,7 +149,7 @@ def generate_artifacts(
 ) -> None:
     """Create enclaves, and the permissions that policies state for them, all or nothing.
 
-    Permissions that a policy states replace those that an enclave has.
+    The permissions in a policy replace the enclave's present ones.
     """
     from sros_tool.keystore.lifecycle.create import generate_artifacts as generate
     from sros_tool.keystore.template import load_template

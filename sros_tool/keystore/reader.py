@@ -95,7 +95,7 @@ class OpenedKeystore:
 
     @cached_property
     def settings(self) -> Template | None:
-        """The choices it was made by; None where ros2/sros2 made it, or in an export."""
+        """Its settings; None for a keystore of ros2/sros2 and for an export."""
         return load_settings(self.root) if (self.root / SETTINGS).exists() else None
 
     @cached_property

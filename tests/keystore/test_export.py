@@ -193,11 +193,11 @@ FINDINGS: dict[str, tuple[Callable[[Path], object], str, str, str]] = {
     "another CA": (_other_ca, "/zebra", "identity_ca.cert.pem", "do not trust the same CAs"),
     "a link that leads out": (
         lambda robot: (robot / "enclaves/base/notes").symlink_to("/etc/hostname"),
-        *("", "enclaves/base/notes", "leads out of the keystore"),
+        *("", "enclaves/base/notes", "link to a file outside of the keystore"),
     ),
     "a folder that is elsewhere": (
         lambda robot: (robot / "enclaves/more").symlink_to("/etc"),
-        *("", "enclaves/more", "leads out of the keystore"),
+        *("", "enclaves/more", "link to a file outside of the keystore"),
     ),
     "a key too many": (
         lambda robot: shutil.copy(robot / "enclaves/base/key.pem", robot / "enclaves/ca.key.pem"),

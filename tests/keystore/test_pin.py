@@ -83,7 +83,7 @@ def test_the_identity_ca_does_not_vouch_for_the_permissions(robot: Path, tmp_pat
     authority = load_authority(evil, PERMISSIONS, load_settings(evil), IN_KEYSTORE, NOW)
     archive = pack({SEAL: seal(files, authority), **files})
     before = snapshot(robot)
-    with pytest.raises(KeystoreError, match="vouches for the certificate alone"):
+    with pytest.raises(KeystoreError, match="vouches for the certificate only"):
         import_answer(robot, archive, now=NOW, pinned=pin(home, "identity"))
     with pytest.raises(KeystoreError, match=digest(authority.certificate)):
         import_answer(robot, archive, now=NOW, pinned=pin(home))

@@ -58,7 +58,7 @@ class Authority:
     def sign(self, document: bytes, what: str) -> bytes:
         """Return the S/MIME message of a document, after verifying it.
 
-        The message is taken apart again: its digest has to fit, and it has to carry ``document``.
+        The message is parsed again: its digest has to match, and it has to contain ``document``.
         ``what`` names the document in the error.
 
         Raises:

@@ -95,8 +95,8 @@ def renew(
 
     The new certificate is for the same key, or with ``new_key`` for a new one; the rights stay as
     they are signed.  Certificate, key and permissions of an enclave change at one moment.  A
-    certificate that is replaced works until it expires, for whoever has its files, unless it is
-    revoked; with ``revoke_old`` all earlier ones of the renewed enclaves are, at the same moment.
+    replaced certificate works until it expires, for anyone who has its files, unless revoked; with
+    ``revoke_old`` all earlier ones of the renewed enclaves are revoked at the same moment.
 
     Raises:
         KeystoreError: an enclave cannot be renewed; one error names every such enclave.
