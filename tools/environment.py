@@ -93,16 +93,16 @@ def _usable(record: Record, now: Record) -> bool:
     if not VENV.exists():
         return False
     if UNFINISHED.exists():
-        say("the last setup was interrupted: making .venv anew")
+        say("the last setup was interrupted: making .venv again")
         return False
     if record.checkout:
         reason = difference(record, now)
         if reason:
-            say(f"{reason}: making .venv anew")
+            say(f"{reason}: making .venv again")
         return reason is None
     answer = output_of([PYTHON, "-I", "-c", "import platform; print(platform.python_version())"])
     if not (VENV / "pyvenv.cfg").exists() or answer is None:
-        say("the .venv here does not run: making it anew")
+        say("the .venv here does not run: making it again")
         return False
     if answer.strip() != now.version or output_of([PYTHON, "-m", "pip", "--version"]) is None:
         raise SetupError(

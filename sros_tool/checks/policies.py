@@ -231,7 +231,7 @@ def _breadth(each: _Statement) -> Iterator[Finding]:
         yield each.found(SETS_CLOCK, f"{each.right.enclave} may publish /clock")
     if not is_expression(name):
         return
-    text = each.right.told()
+    text = each.right.describe()
     if _ALL.match(name):
         kind = READS_EVERYTHING if right == "subscribe" else EVERYTHING
         yield each.found(kind, f"{text} stands for every name")
@@ -518,7 +518,7 @@ def _check_rules(checked: _CheckedPolicy) -> Iterator[Finding]:
         if each.allows:
             yield from _permission(each, checked.rules)
         elif not checked.rules.meeting(each.right._replace(qualifier=ALLOW)):
-            yield each.found(NO_EFFECT, f"nothing allows to {each.right.told()}")
+            yield each.found(NO_EFFECT, f"nothing allows to {each.right.describe()}")
     yield from _redundant(checked)
 
 
@@ -528,10 +528,10 @@ def _permission(each: _Statement, rules: Rules) -> Iterator[Finding]:
         same = set(parts(denial)) == set(denials)
         shown = ", ".join(sorted({f"{by.right} {by.name}" for by in denials}))
         if same:
-            text = f"{each.right.told()} is allowed here and denied in the same enclave"
+            text = f"{each.right.describe()} is allowed here and denied in the same enclave"
             yield each.found(CONTRADICTION, text)
         else:
-            yield each.found(UNREACHABLE, f"{each.right.told()} is denied by {shown}")
+            yield each.found(UNREACHABLE, f"{each.right.describe()} is denied by {shown}")
         return
     if each.name.endswith(GOAL) and each.right.right in WHOLE:
         action = each.name.removesuffix(GOAL)
@@ -552,7 +552,7 @@ def _redundant(checked: _CheckedPolicy) -> Iterator[Finding]:
             continue
         for wide in wild.get((id(each.profile), each.right.right), ()):
             if wide != each.name and covers(wide, each.name):
-                yield each.found(REDUNDANT_RULE, f"{each.right.told()} is part of {wide}")
+                yield each.found(REDUNDANT_RULE, f"{each.right.describe()} is part of {wide}")
                 break
 
 

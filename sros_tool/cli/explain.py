@@ -536,7 +536,7 @@ def _change_lines(change: PolicyChange) -> Iterator[str]:
         else:
             yield f"    remove the group at {_shown(edit.source)}"
     if change.lift and not change.edits:
-        yield from (f"    remove: {right.qualifier} {right.told()}" for right in change.lift)
+        yield from (f"    remove: {right.qualifier} {right.describe()}" for right in change.lift)
     for right in change.lift:
         if is_expression(right.name):
             yield f"    which lifts the denial of everything else in {right.name}, too"

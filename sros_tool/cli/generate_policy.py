@@ -340,7 +340,7 @@ def _watch(
     with _until_signalled() as stopped:
         until = f"for {seconds:.0f} s, or {_FOREVER}" if seconds else _FOREVER
         click.echo(f"watching {until}; then the policy is written", err=True)
-        return watch(graph, seconds, time.monotonic, stop=stopped, tell=report)
+        return watch(graph, seconds, time.monotonic, stop=stopped, report=report)
 
 
 @contextmanager

@@ -194,7 +194,7 @@ def diff_policy(a: Path, b: Path, as_json: bool) -> int:
 def _difference_lines(difference: RightsDifference) -> list[str]:
     lines = []
     for sign, right in difference.lines():
-        by = ", ".join(each.told() for each in difference.covered.get(right, ()))
+        by = ", ".join(each.describe() for each in difference.covered.get(right, ()))
         remark = f"  ({'B' if sign == '-' else 'A'} has it by {by})" if by else ""
         lines.append(f"{sign} {right}{remark}")
     return lines
@@ -389,32 +389,32 @@ def _use_lines(use: EnclaveUse, measured: _Measured) -> Iterator[str]:
         yield f"{use.enclave}: {counts}: {_ratio_text(use.ratio)}"
         if use.unused:
             yield "  never observed, and removed"
-            yield from (f"    {right.told()}" for right in use.unused)
+            yield from (f"    {right.describe()}" for right in use.unused)
     if use.wide:
         yield "  wider than its use" if len(use.wide) == 1 else "  wider than their use"
     for wide in use.wide:
-        used = ", ".join(right.told() for right in wide.used) or "nothing"
-        instead = ", ".join(right.told() for right in wide.replacement)
+        used = ", ".join(right.describe() for right in wide.used) or "nothing"
+        instead = ", ".join(right.describe() for right in wide.replacement)
         if instead == used:
-            yield f"    {wide.rule.told()}  becomes  {instead}"
+            yield f"    {wide.rule.describe()}  becomes  {instead}"
         else:
-            yield f"    {wide.rule.told()}  covered {used}"
+            yield f"    {wide.rule.describe()}  covered {used}"
             yield f"      {f'becomes {instead}' if instead else 'not needed: other rules have it'}"
     if use.common:
         yield f"  never observed, and kept as every node needs it: {len(use.common)}"
     if use.refused:
         yield "  observed, and not allowed"
-        yield from (f"    {right.told()}" for right in use.refused)
+        yield from (f"    {right.describe()}" for right in use.refused)
     sizes = f"{measured.before} bytes"
     if measured.after != measured.before:
         sizes += f", then {measured.after}"
     too_large = "" if measured.after < MAX_SIGNED_BYTES else ": TOO LARGE for Fast DDS 2.9"
     yield f"  permissions.p7s: {sizes}, of at most {MAX_SIGNED_BYTES - 1}{too_large}"
     for proposal in measured.proposals:
-        names = [right.told() for right in proposal.adds]
+        names = [right.describe() for right in proposal.adds]
         adds = ", ".join(names[:_SHOWN]) or "no name known here"
         adds += f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-        yield f"    {proposal.rule.told()}  in place of {len(proposal.replaces)} names"
+        yield f"    {proposal.rule.describe()}  in place of {len(proposal.replaces)} names"
         yield f"      would save {proposal.saves} bytes and add {adds}"
 
 

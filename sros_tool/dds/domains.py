@@ -21,8 +21,8 @@ _ONE = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?\Z", re.ASCII)
 class DomainRange:
     """The domains from ``first`` to ``last``, both included.
 
-    In documents of others one end may be open (None); vendors read that differently, and sros
-    itself never writes it.
+    In documents not made by sros one end may be open (None); vendors read that differently, and
+    sros itself never writes it.
     """
 
     first: int | None
@@ -147,5 +147,5 @@ def read_domains(element: etree._Element) -> DomainSet:
 def _number(element: etree._Element) -> int:
     text = (element.text or "").strip()
     if not (text.isascii() and text.isdigit() and len(text) < 10):
-        raise DocumentError(f"<{tag_of(element)}> holds {text!r}, which is no domain id")
+        raise DocumentError(f"<{tag_of(element)}> holds {text!r}, which is not a domain id")
     return int(text)

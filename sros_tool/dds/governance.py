@@ -1,6 +1,6 @@
 """The governance document of DDS Security: what a domain protects, and its XML.
 
-Names are those of the specification (DDS-Security 1.1, 9.4.1.2 and the schema
+Names follow the specification (DDS-Security 1.1, 9.4.1.2 and the schema
 omg_shared_ca_governance of 20170901).
 """
 
@@ -42,8 +42,8 @@ class Attribute:
     """One setting of a domain rule or a topic rule, as its field below declares it.
 
     Reading, rendering, describing, translating, the readers of the vendors and the proof of a
-    signed document go through `attributes`, in the order of the schema, which is that of the
-    fields: an attribute is added by adding its field.
+    signed document go through `attributes`, in the order of the schema, which the fields have
+    too: an attribute is added by adding its field.
 
     ``name`` is its element and its field; ``term`` is the field of `sros_tool.policy.protection`
     from which it is made.  ``values`` are those it may have.  ``open`` is the value that protects
@@ -236,7 +236,7 @@ def _read(element: etree._Element, rule: type[DomainRule | TopicRule]) -> dict[s
         elif text.upper() in ProtectionKind.__members__:
             values[each.name] = ProtectionKind(text.upper())
         else:
-            raise DocumentError(f"<{each.name}> holds {text!r}, which is no protection kind")
+            raise DocumentError(f"<{each.name}> holds {text!r}, which is not a protection kind")
     return values
 
 

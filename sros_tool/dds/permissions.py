@@ -1,6 +1,6 @@
 """The permissions document of DDS Security: grants, rules, and their XML.
 
-Names are those of the specification (DDS-Security 1.1, 9.4.1.3 and the schema
+Names follow the specification (DDS-Security 1.1, 9.4.1.3 and the schema
 omg_shared_ca_permissions of 20170901).
 """
 
@@ -19,12 +19,12 @@ from sros_tool.xml import parse, tag_of
 _SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_permissions.xsd"
 XSI = "http://www.w3.org/2001/XMLSchema-instance"
 MAX_SIGNED_BYTES = 64 * 1024
-"""From so many bytes of signed permissions on, Fast DDS 2.9 never finishes a handshake."""
+"""Size in bytes from which signed permissions keep Fast DDS 2.9 from finishing a handshake."""
 
 
 @dataclass(frozen=True, slots=True)
 class Criteria:
-    """Topics that a rule speaks of; no partitions means the default partition."""
+    """The topics of a rule; no partitions means the default partition."""
 
     topics: tuple[str, ...]
     partitions: tuple[str, ...] = ()
@@ -44,7 +44,7 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """What one subject may do, and when; the moments stand as in the document."""
+    """What one subject may do, and when; the moments are kept as written in the document."""
 
     name: str
     subject: str
@@ -53,7 +53,7 @@ class Grant:
     rules: tuple[Rule, ...]
     default_allow: bool = False
     default_empty: bool = False
-    """Its ``<default>`` is there without a word, over which one vendor crashes."""
+    """Its ``<default>`` is empty; one vendor crashes on that."""
 
     @property
     def validity(self) -> Window:
@@ -73,7 +73,7 @@ class Permissions:
 
 
 def grant(name: str, subject: str, validity: Window, rules: tuple[Rule, ...]) -> Grant:
-    """Return a grant of the portable profile: UTC moments, and what no rule names is denied."""
+    """Return a grant of the portable profile: UTC moments, default DENY."""
     return Grant(name, subject, iso(validity.not_before), iso(validity.not_after), rules)
 
 
@@ -177,7 +177,7 @@ def _read_grant(element: etree._Element) -> Grant:
         try:
             parse_iso(moment)
         except ValueError as error:
-            raise DocumentError(f"{moment!r} is no XML date and time") from error
+            raise DocumentError(f"{moment!r} is not an XML date and time") from error
     return Grant(
         element.get("name", ""), subject, not_before, not_after, tuple(rules), default == "ALLOW"
     )

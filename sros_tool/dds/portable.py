@@ -1,4 +1,4 @@
-"""The portable profile: what every vendor decides alike, and remarks on what lies outside it.
+"""The portable profile: documents that every vendor reads alike, and remarks on others.
 
 Each remark rests on a difference between vendors that was measured on Fast DDS 2.9.1 and 2.14.5
 and on Cyclone DDS 0.10.2.
@@ -19,7 +19,7 @@ _LONGEST_NAME = 8  # parts; longer enclave names are not compared, the subsets w
 
 
 def document_notes(what: str, permissions: Permissions, signed_bytes: int) -> Iterator[Note]:
-    """Remarks on one permissions document; ``what`` names it, ``signed_bytes`` is its size."""
+    """Yield remarks on a permissions document named ``what``; ``signed_bytes`` is its size."""
     for identity, fact in outside(permissions, signed_bytes):
         yield Note(identity, f"{what}: {fact}{_CONSEQUENCES[identity]}")
 
@@ -46,7 +46,7 @@ def outside(
     signed_bytes: int,
     share: Callable[[str, str], bool] = _either_matches,
 ) -> Iterator[tuple[str, str]]:
-    """Yield what of a document lies outside of the profile: the id of the remark, and a clause.
+    """Yield what in a document is outside of the profile: the id of the remark, and a clause.
 
     ``share`` returns whether two expressions mean a name in common.
     """

@@ -100,7 +100,7 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario) -> UserKeysto
         raise KeystoreError(
             f"no two enclaves of keystore '{root}' talk on {topic or 'a topic'}",
             "An attack on it needs one enclave that may publish a topic and another one that may"
-            " subscribe it, by a name without wildcards.",
+            " subscribe to it, by a name without wildcards.",
             "Name the topic with --topic, or attack a keystore made by the demo.",
         )
     service = _service(rights, cast) if "server" in cast else ""

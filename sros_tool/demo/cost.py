@@ -32,10 +32,10 @@ from sros_tool.errors import SrosError
 _UNSECURED = "unsecured"
 _PAYLOADS = (64, 1024, 16 * 1024, 256 * 1024, 1024 * 1024)
 NOTE = (
-    "medians; latency is half a round trip, throughput is that of bursts which are waited for;"
-    " both ends are Python, whose overhead is in all numbers alike and makes the ratios smaller"
-    " than those of nodes in C++; messages go over UDP, not through shared memory; the numbers of"
-    " payloads that do not fit into the buffer of a socket scatter"
+    "medians; latency is half a round trip, throughput is measured in bursts that are waited"
+    " for; both ends are Python, whose overhead is in all numbers alike and makes the ratios"
+    " smaller than with nodes in C++; messages go over UDP, not through shared memory; the numbers"
+    " of payloads that do not fit into the buffer of a socket scatter"
 )
 _LONGEST_START = 60.0
 _TICK = 0.02

@@ -243,7 +243,9 @@ def edited_governance(copy: KeystoreCopy) -> None:
     weak = _weak_governance(copy) + b"<!-- edited -->\n"
     edited = signed.replace(kept.replace(b"\n", b"\r\n"), weak.replace(b"\n", b"\r\n"))
     if edited == signed:
-        raise DocumentError("the signed governance cannot be edited", "Its XML is not found in it.")
+        raise DocumentError(
+            "the signed governance cannot be edited", "Its XML was not found in the signed message."
+        )
     copy.put("listener", GOVERNANCE_FILE, edited)
 
 
@@ -276,7 +278,7 @@ def edited_permissions(copy: KeystoreCopy) -> None:
     edited = re.sub(rb"(<publish>\s*)<topics>", lambda found: found[1] + topic, signed, count=1)
     if edited == signed:
         raise DocumentError(
-            "the signed permissions cannot be edited", "They allow to publish nothing."
+            "the signed permissions cannot be edited", "They do not allow publishing anything."
         )
     copy.put("guest", PERMISSIONS_FILE, edited)
 

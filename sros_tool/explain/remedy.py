@@ -43,7 +43,7 @@ _BY_REASON: dict[str, str | Fault] = {
     "long-name": "Use a shorter name: on DDS at most 251 characters, prefix and suffix included.",
     "no-topic-rule": "Make a keystore from a template: its governance has a rule for every topic.",
     "invalid-name": "Use a name of letters, digits, '_' and '/'.",
-    "partition": "Say nothing of partitions in permissions; sros never does.",
+    "partition": "Leave partitions out of permissions; sros never writes them.",
 }
 """The reasons of decisions that are no right of the policy: the fault they come from, or a text."""
 

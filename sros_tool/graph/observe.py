@@ -253,13 +253,13 @@ def watch(
     clock: Clock,
     *,
     stop: Callable[[], bool],
-    tell: Callable[[Observation], None],
+    report: Callable[[Observation], None],
     still: float = 0.5,
     patience: float = 2.0,
 ) -> Snapshot:
     """Return the union of everything seen in so many seconds (None: forever), or until ``stop()``.
 
-    ``tell`` gets the union whenever it has grown and then not changed for ``still`` seconds, so
+    ``report`` gets the union whenever it has grown and then not changed for ``still`` seconds, so
     that a half discovered node is not reported; it waits no longer than ``patience``.
     """
     begin = clock()
@@ -275,10 +275,10 @@ def watch(
                     grown = now
                 union, changed = both, now
         if union is not reported and (now - changed >= still or now - grown >= patience):
-            tell(union)
+            report(union)
             reported = union
     if union is not reported:
-        tell(union)
+        report(union)
     return Snapshot(union, clock() - begin, True)
 
 

@@ -85,15 +85,15 @@ _A_CA = x509.BasicConstraints(ca=True, path_length=1)
 
 
 def common_name(text: str) -> x509.Name:
-    """Return the distinguished name ``CN=text``, all that a portable subject consists of."""
+    """Return the distinguished name ``CN=text``, the only part of a portable subject."""
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
 
 
 def enclave_subject(name: str, *, unique: bool) -> x509.Name:
-    """The subject of an enclave's certificate: its name, and perhaps a part that no other has.
+    """The subject of an enclave's certificate: its name, and optionally a unique part.
 
-    With the part, permissions made for another subject never fit: not those of an enclave whose
-    name contains this one's (Cyclone DDS compares parts), and not those of an earlier certificate.
+    With the unique part, no other permissions fit: neither of an enclave whose
+    name contains this one's (Cyclone DDS compares parts), nor of an earlier certificate.
     RFC 4514 text of this order of parts, CN first, is what Fast DDS 2.9.1 and Cyclone DDS 0.10.2
     both compare with.
     """
@@ -135,7 +135,7 @@ class Issuer:
         self._authority_id = authority_identifier(certificate)
 
     def issue(self, subject: x509.Name, public: PublicKey, validity: Window) -> x509.Certificate:
-        """Return a leaf certificate; its validity is cut to that of the CA."""
+        """Return a leaf certificate; its validity is cut to the CA's."""
         return (
             _builder(subject, self._name, public, validity.within(self._validity))
             .add_extension(_NOT_A_CA, critical=True)
@@ -147,7 +147,7 @@ class Issuer:
 
 
 def authority_identifier(certificate: x509.Certificate) -> x509.AuthorityKeyIdentifier:
-    """Return the identifier by which what ``certificate`` signs refers to its key."""
+    """Return the AuthorityKeyIdentifier for what ``certificate`` signs."""
     try:
         extension = certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
     except x509.ExtensionNotFound:  # a CA made by ros2/sros2 has none
@@ -180,7 +180,7 @@ def pem(certificate: x509.Certificate) -> bytes:
 
 
 def load_certificate(data: bytes, name: str) -> x509.Certificate:
-    """The first certificate of a PEM file, read in full; ``name`` stands for it in errors."""
+    """Return the first certificate of a PEM file, read in full; ``name`` is for errors."""
     try:
         return read_in_full(x509.load_pem_x509_certificate(data))
     except UNREADABLE as error:
@@ -204,10 +204,10 @@ def load_certificates(data: bytes, name: str) -> tuple[x509.Certificate, ...]:
 
 
 def read_in_full(certificate: x509.Certificate) -> x509.Certificate:
-    """``certificate``, after every part of it that sros asks for was read once.
+    """Return ``certificate`` after reading once every part of it that sros uses.
 
     `cryptography` reads a certificate's parts when they are asked for, so damage would otherwise
-    come to light anywhere.  Raises one of `UNREADABLE`.
+    show at any later place.  Raises one of `UNREADABLE`.
     """
     for name in (certificate.subject, certificate.issuer):
         name.rfc4514_string()
@@ -240,8 +240,8 @@ def digest(certificate: x509.Certificate) -> str:
 def subject_text(name: x509.Name) -> str:
     """Return a distinguished name as OpenSSL prints it by RFC 2253, and vendors compare it.
 
-    The most general attribute stands last, also of those that share one RDN; non-ASCII characters
-    stand as they are.
+    The most general attribute comes last, also within one RDN; non-ASCII
+    characters are kept.
     """
     return ",".join(
         "+".join(map(_attribute_text, reversed(list(rdn)))) for rdn in reversed(name.rdns)

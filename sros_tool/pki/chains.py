@@ -1,4 +1,4 @@
-"""Chains of certificates, verified as OpenSSL 3 does it for the DDS vendors (x509_vfy.c)."""
+"""Verify chains of certificates as OpenSSL 3 does for the DDS vendors (x509_vfy.c)."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def chain_fault(
 ) -> str:
     """Return why ``start`` has no valid chain to a self-signed one of ``authorities``, or "".
 
-    The chain may lead over ``others``.  ``for_documents`` asks for the purpose of S/MIME,
-    ``strict`` for what RFC 5280 asks of chains (OpenSSL's ``X509_V_FLAG_X509_STRICT``, with
+    ``others`` are possible intermediate certificates.  ``for_documents`` asks for the purpose of
+    S/MIME, ``strict`` for what RFC 5280 asks of chains (OpenSSL's ``X509_V_FLAG_X509_STRICT``, with
     ``X509_V_FLAG_CHECK_SS_SIGNATURE``).
     """
     chain = [start]
@@ -85,7 +85,7 @@ def _extension_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
 
 
 def purpose_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
-    """Why what the first of ``chain`` signs is no S/MIME ("unsuitable certificate purpose")."""
+    """Return why the first of ``chain`` may not sign S/MIME ("unsuitable certificate purpose")."""
     usage = _extension(chain[0], x509.KeyUsage)
     if usage and not (usage.digital_signature or usage.content_commitment):
         yield (

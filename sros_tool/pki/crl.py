@@ -80,7 +80,7 @@ def sign_crl(
 
 
 def load_crl(pem: bytes, name: str) -> RevocationList:
-    """Read the first revocation list of a PEM file; ``name`` stands for it in errors."""
+    """Return the first revocation list of a PEM file; ``name`` names it in errors."""
     try:
         crl = x509.load_pem_x509_crl(pem)
         revoked = tuple(_revoked(entry) for entry in crl)

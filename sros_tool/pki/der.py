@@ -23,9 +23,9 @@ class Value(NamedTuple):
 
 
 def children(data: bytes) -> list[Value]:
-    """Return the values that ``data`` (the content of a constructed value) consists of.
+    """Return the values in ``data`` (the content of a constructed value).
 
-    Raises `PkiError` where a value is cut short, or of a form that DER does not have.
+    Raises `PkiError` where a value is cut short, or not valid DER.
     """
     values = []
     position, end = 0, len(data)

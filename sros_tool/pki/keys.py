@@ -16,14 +16,14 @@ PublicKey = ec.EllipticCurvePublicKey | rsa.RSAPublicKey
 
 
 def generate_key() -> ec.EllipticCurvePrivateKey:
-    """A new key on the curve prime256v1, which every DDS vendor accepts (DDS-Security 9.3.1)."""
+    """Return a new key on prime256v1, which every DDS vendor accepts (DDS-Security 9.3.1)."""
     return ec.generate_private_key(ec.SECP256R1())
 
 
 def key_pem(key: PrivateKey, passphrase: str | None = None) -> bytes:
     """Return the key as PKCS#8 PEM, encrypted where a passphrase is given.
 
-    The keys of enclaves never are: no RMW can give a password.
+    Enclave keys are never encrypted: no RMW can give a password.
     """
     protection: serialization.KeySerializationEncryption = serialization.NoEncryption()
     if passphrase:

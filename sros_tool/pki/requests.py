@@ -1,4 +1,4 @@
-"""Certificate signing requests (PKCS#10, RFC 2986): making them, and reading those of others."""
+"""Certificate signing requests (PKCS#10, RFC 2986): making and reading them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _DIGESTS = (hashes.SHA256, hashes.SHA384, hashes.SHA512)
 
 @dataclass(frozen=True, slots=True)
 class SigningRequest:
-    """A request whose signature was verified: its common name, its key, and itself as PEM."""
+    """A request whose signature was verified: its common name, its key, and the PEM."""
 
     name: str
     public_key: PublicKey
@@ -66,8 +66,9 @@ def load_request(data: bytes, what: str) -> SigningRequest:
         )
     if not isinstance(digest, _DIGESTS) or not _holds(request):
         raise PkiError(
-            f"the signature of the request {what} does not hold",
-            "Whoever sent it has not shown to have the key, or it was changed on its way.",
+            f"the signature of the request {what} is not valid",
+            "The sender did not prove possession of the key, or the request was changed "
+            "in transit.",
             "Have it sent again.",
         )
     if len(list(subject)) != 1 or not common_name_of(subject):

@@ -2,8 +2,8 @@
 
 The form that every DDS vendor reads: CRLF line ends, a first part whose header
 ``Content-Type: text/plain`` is part of what is signed, SHA-256, the signer's certificate embedded
-(DDS-Security 1.1, 9.4.1.1; OpenSSL ``smime -sign -text``).  Opaque messages, which hold what they
-sign, are read as well, for every vendor takes them (``-nodetach``).
+(DDS-Security 1.1, 9.4.1.1; OpenSSL ``smime -sign -text``).  Opaque messages, which contain what
+they sign, are read as well, as every vendor accepts them (``-nodetach``).
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> byt
 
 @dataclass(frozen=True, slots=True)
 class SignedDocument:
-    """A ``.p7s`` taken apart; nothing of it is trusted before `verify`.
+    """A parsed ``.p7s``; nothing in it is trusted before `verify`.
 
     ``content`` is what was signed, with CRLF line ends and its MIME header; ``document`` the same
     without the header; ``certificates`` those embedded in the signature.
@@ -99,7 +99,7 @@ class SignedDocument:
         return self.signer_among(self.certificates)
 
     def signer_among(self, certificates: Iterable[x509.Certificate]) -> x509.Certificate | None:
-        """The one of ``certificates`` that the signature names, by its issuer and serial number."""
+        """Return the certificate that the signature names, by its issuer and serial number."""
         issuer, serial = self._issuer_and_serial
         for certificate in certificates:
             if certificate.serial_number == serial and certificate.issuer.public_bytes() == issuer:
@@ -110,14 +110,14 @@ class SignedDocument:
         """Check that ``authority`` itself signed this document; else raise `PkiError`.
 
         Stricter than Cyclone DDS 0.10.2 and Fast DDS 2.9.1, which accept any signer whose chain
-        ends at the authority (the CVE-2023-24011 class; both ran).
+        leads to the authority (the CVE-2023-24011 class; both ran).
         """
         signer = self.signer()
         if signer is None or signer != authority:
             who = (
                 f"by {signer.subject.rfc4514_string()}"
                 if signer
-                else "by a certificate that it lacks"
+                else "by a certificate that is not embedded"
             )
             raise PkiError(
                 f"it is signed {who}, not by the permissions CA "
@@ -155,7 +155,7 @@ class SignedDocument:
 
 @lru_cache(maxsize=8)  # one document is asked about from several sides, one after the other
 def parse(message: bytes) -> SignedDocument:
-    """Take a ``.p7s`` apart.  Raises `PkiError` if it is no S/MIME signed message."""
+    """Parse a ``.p7s``. Raises `PkiError` if it is not an S/MIME signed message."""
     content, signature = _split(message)
     try:
         return _parse_cms(signature, content)
@@ -216,7 +216,7 @@ def _certificate(data: bytes) -> x509.Certificate:
 
 
 def _parts(value: der.Value, *tags: int) -> list[der.Value]:
-    """Return what a value consists of; the first of its parts must have ``tags``."""
+    """Return the parts of a value; the first ones must have ``tags``."""
     parts = der.children(value.content)
     if [part.tag for part in parts[: len(tags)]] != list(tags):
         raise ValueError("not of the structure of a signature")

@@ -19,7 +19,7 @@ from sros_tool.errors import PkiError, UnavailableError, UsageError
 SCHEME = "pkcs11:"
 _MODULE_VARIABLE = "PKCS11_MODULE_PATH"
 Secrets = Callable[[str], str]
-"""Answers with the secret for what it is told; never asked more than once for one thing."""
+"""Returns the secret for the named thing; asked at most once for each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ def _parse_uri(uri: str) -> TokenUri:
     """Read ``pkcs11:token=NAME;object=LABEL?module-path=FILE``.
 
     Without ``module-path``, $PKCS11_MODULE_PATH names the module.  A ``pin-value`` is refused: a
-    secret does not belong into a file of settings or a command line.
+    secret does not belong in a settings file or on a command line.
     """
     path, _, query = uri.removeprefix(SCHEME).partition("?")
     parts = dict(part.partition("=")[::2] for part in path.split(";") if part)
@@ -45,7 +45,7 @@ def _parse_uri(uri: str) -> TokenUri:
         raise UsageError(
             "a PKCS#11 URI with pin-value is not accepted",
             "The PIN would be written into the keystore's settings.",
-            "Leave it out; SROS_PKCS11_PIN or pin-source=FILE says it.",
+            "Leave it out; Give it by SROS_PKCS11_PIN or pin-source=FILE.",
         )
     module = options.get("module-path", os.environ.get(_MODULE_VARIABLE, ""))
     token, label = unquote(parts.get("token", "")), unquote(parts.get("object", ""))
@@ -74,16 +74,16 @@ class TokenKey(ec.EllipticCurvePrivateKey):
 
     @property
     def curve(self) -> ec.EllipticCurve:
-        """The curve."""
+        """The curve of the key."""
         return self._public.curve
 
     @property
     def key_size(self) -> int:
-        """Its size in bits."""
+        """The size of the key in bits."""
         return self._public.key_size
 
     def sign(self, data: Any, signature_algorithm: ec.EllipticCurveSignatureAlgorithm) -> bytes:
-        """Sign on the token (CKM_ECDSA over a digest that is made here); DER-encoded."""
+        """Return a DER signature made on the token (CKM_ECDSA over a digest made here)."""
         import pkcs11
 
         algorithm = signature_algorithm.algorithm
@@ -100,8 +100,8 @@ class TokenKey(ec.EllipticCurvePrivateKey):
         )
 
     def exchange(self, algorithm: ec.ECDH, peer_public_key: ec.EllipticCurvePublicKey) -> bytes:
-        """Not for a key that signs."""
-        raise PkiError("a key on a token does not agree on secrets")
+        """Raise `PkiError`: this key only signs."""
+        raise PkiError("a key on a token cannot be used for key agreement")
 
     def private_numbers(self) -> ec.EllipticCurvePrivateNumbers:
         """Never leave the token."""
@@ -181,7 +181,7 @@ def _unusable(parsed: TokenUri, error: Exception) -> PkiError:
     return PkiError(
         f"the token {parsed.token!r} cannot be used",
         f"{type(error).__name__}{f': {error}' if str(error) else ''} ({parsed.module}).",
-        "Check that the token is there, the module is right, and so is the PIN.",
+        "Check that the token is present and that the module and the PIN are right.",
     )
 
 

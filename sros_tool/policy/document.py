@@ -1,6 +1,6 @@
 """Policy files (SROS2 policy XML 0.2.0): reading them with their includes, and writing them.
 
-The grammar is that of the schema of ros2/sros2, and beyond it every name is checked: a rule that
+The grammar follows the schema of ros2/sros2; in addition every name is checked: a rule that
 can never match anything is an error, for it is a right or a denial that somebody relies on.
 
 Includes (``xi:include``) never leave the root folder of the policy.  Included documents are read
@@ -73,7 +73,7 @@ class Includer:
         return self._documents[file]
 
     def hold(self, file: Path, content: bytes) -> None:
-        """Take ``content`` for what the file (its real path) holds, wherever it is included."""
+        """Use ``content`` in place of the file (its real path), wherever it is included."""
         self._bytes += len(content)
         if self._bytes > _MAX_BYTES:
             raise PolicyError(
@@ -86,7 +86,7 @@ class Includer:
     def children(
         self, parent: etree._Element, place: IncludedFile
     ) -> Iterator[tuple[etree._Element, IncludedFile]]:
-        """Yield the child elements of ``parent`` with includes replaced by what they stand for."""
+        """Yield the child elements of ``parent`` with includes replaced by their elements."""
         for child in parent:
             if child.tag in _INCLUDES:
                 yield from self._included(child, place)
@@ -220,8 +220,8 @@ class _Reader:
             if enclave.path in enclaves:
                 raise PolicyError(
                     f"{enclave.source}: the enclave {enclave.path} is given twice",
-                    f"It stands at {enclaves[enclave.path].source} already, and it would not be "
-                    "clear which one counts.",
+                    f"It is already defined at {enclaves[enclave.path].source}, so it is "
+                    "unclear which one applies.",
                     "Join the two into one <enclave>.",
                 )
             enclaves[enclave.path] = enclave
@@ -277,7 +277,7 @@ class _Reader:
             raise PolicyError(
                 f"{self._where(element, place)}: {node!r} is not a valid node name",
                 expression_problem(node)
-                or "A node name has no '/' and no '~'; its namespace stands in ns=.",
+                or "A node name has no '/' and no '~'; its namespace goes into ns=.",
             )
         groups = tuple(self._group(child, at, node) for child, at in self._children(element, place))
         return Profile(ns, node, groups, self._source(element, place))

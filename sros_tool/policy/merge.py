@@ -1,7 +1,7 @@
 """Merging policies into a policy file: what it lacks, and the edits that add it in place.
 
-Nothing here weakens: a denial stays whatever asks for more, and a right is added for the one
-direction in which it was asked.  All other text of the file stays byte for byte, comments and line
+A merge never weakens a denial, and adds a right only for the direction
+that was asked for.  All other text of the file stays byte for byte, comments and line
 ends included.
 
 Names go into a group that has exactly their rights, of a profile with their namespace and node, in
@@ -64,7 +64,7 @@ class AddedName:
 
 @dataclass(frozen=True, slots=True)
 class ProfileKey:
-    """A profile: of which enclave, namespace and node."""
+    """A profile, by its enclave, namespace and node."""
 
     enclave: str
     ns: str
@@ -73,7 +73,7 @@ class ProfileKey:
 
 @dataclass(frozen=True, slots=True)
 class MergePlan:
-    """What is to be added where, the same as rights, and what contradicts."""
+    """The names to add by profile, the same as rights, and the contradictions."""
 
     entries: dict[ProfileKey, tuple[AddedName, ...]]
     added: tuple[Right, ...]
@@ -81,9 +81,9 @@ class MergePlan:
 
 
 def plan_merge(before: Policy, additions: Policy) -> MergePlan:
-    """Return what ``before`` lacks of ``additions``.
+    """Return the rights of ``additions`` that ``before`` lacks.
 
-    Not added is what ``before`` says already for that enclave, by whatever profile or wildcard,
+    Left out is what ``before`` already allows in that enclave, by any profile or wildcard,
     and what it denies as a whole.
     """
     return _Planner(before, additions).plan()
@@ -140,7 +140,7 @@ class _Planner:
 
 @dataclass(frozen=True, slots=True)
 class _Name:
-    """A name as it is written first, and the rights on it that are wanted."""
+    """A name as first written, and the rights wanted on it."""
 
     written: str
     rights: dict[tuple[str, Qualifier], None]
@@ -164,13 +164,13 @@ def _entry_order(entry: AddedName) -> tuple[int, GroupRights, str]:
 
 
 def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
-    """Return one remark for each denial that a merge met."""
+    """Return a remark for each denial that limits a merge."""
     by_denial: dict[tuple[Right, bool], list[Right]] = {}
     for each in contradictions:
         by_denial.setdefault((each.denied, each.new), []).append(each.allowed)
     notes = []
     for (denied, new), allowed in by_denial.items():
-        shown = [right.told() for right in dict.fromkeys(sorted(allowed, key=order))]
+        shown = [right.describe() for right in dict.fromkeys(sorted(allowed, key=order))]
         some = ", ".join(shown[:_SHOWN])
         if len(shown) > _SHOWN:
             some += f" and {len(shown) - _SHOWN} more"
@@ -178,7 +178,7 @@ def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
             text = f"{denied} was added. It takes away from what the file allows: {some}."
             notes.append(Note("merge.newly-denied", text))
         else:
-            text = f"{denied} stays, and counts before what was asked for: {some}."
+            text = f"{denied} stays, and takes precedence over what was asked for: {some}."
             notes.append(Note("merge.still-denied", text))
     return tuple(notes)
 
@@ -242,13 +242,13 @@ class EditedText:
 
     def _unsuitable(self, why: str) -> PolicyError:
         return PolicyError(
-            f"{self._name} cannot be added to in place",
+            f"{self._name} cannot be edited in place",
             why,
             "Save it as UTF-8.",
         )
 
     def _elements(self, root: etree._Element) -> PlacedElement:
-        """The tree of places.  lxml knows what the elements are, but not where they stand."""
+        """The tree of places.  lxml knows the elements, but not their positions."""
         nodes = root.iter()
         top: PlacedElement | None = None
         stack: list[PlacedElement] = []
@@ -282,7 +282,7 @@ class EditedText:
         return before
 
     def _unit(self) -> str:
-        """Return what a line is indented by more than that of its parent."""
+        """Return the indentation that a line has in addition to its parent's."""
         stack = [self.root]
         while stack:
             parent = stack.pop()
@@ -304,7 +304,7 @@ class EditedText:
     # ── changing it ────────────────────────────────────────────────────────────────────────
 
     def put(self, place: int, text: str, until: int | None = None) -> None:
-        """Let ``text`` stand at a place, or in place of what goes from there to ``until``."""
+        """Insert ``text`` at a place, or replace what lies between there and ``until``."""
         self._edits.append((place, place if until is None else until, text))
 
     def document(self) -> bytes:
@@ -342,14 +342,14 @@ def merge_into(path: Path, additions: Policy) -> Merged:
     """Return the policy file at ``path`` with the rights of ``additions``; nothing is written.
 
     Raises `PolicyError` (or another `DocumentError`) if the file is no policy, or where a right
-    has no place: its enclave stands in an included file, or a changed part is included elsewhere
+    cannot be added: its enclave stands in an included file, or a changed part is included elsewhere
     and would give more than was asked.
     """
     return merge_all(path, (additions,))
 
 
 def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
-    """As `merge_into`, with one policy after the other."""
+    """Return the policy file with several policies merged one after the other."""
     document = read_bytes(path, "policy file")
     before = read_policy(path, document)
     added: list[Right] = []
@@ -371,7 +371,7 @@ def _proven(path: Path, document: bytes, before: Policy, added: Sequence[Right])
         after = read_policy(path, document)
     except DocumentError as error:
         raise PolicyError(
-            f"'{path}' with what is to be added would be no valid policy: {error.what}",
+            f"'{path}' with what is to be added would not be a valid policy: {error.what}",
             error.why,
             error.remedy,
         ) from error
@@ -445,7 +445,7 @@ class _Editor:
                     f"It is included from {included.source}."
                     if included
                     else "Its <enclaves> are included from another file.",
-                    "Merge into the file in which it stands.",
+                    "Merge into the file that contains it.",
                 )
             profiles = _New("profiles", children=[_profile(*each) for each in places.items()])
             self._append(blocks[0], _New(f'enclave path="{path}"', children=[profiles]))
@@ -485,7 +485,7 @@ class _Editor:
                 self._add_names(group, kind, [entry.name for entry in same])
 
     def _add_names(self, group: PlacedElement, kind: str, names: Sequence[str]) -> None:
-        """Put names where they belong in a sorted group, and at the end of any other."""
+        """Insert names in order into a sorted group, at the end of any other."""
         present = [child.xml.text or "" for child in group.named(kind.removesuffix("s"))]
         is_sorted = len(present) == len(group.children) and present == sorted(present)
         for name in names:
@@ -536,7 +536,7 @@ class _Editor:
         text.put(place, rendered)
 
     def _rendered(self, new: _New, indent: str | None) -> str:
-        """Return the text of an element, on lines of its own if its neighbours stand so."""
+        """Return the text of an element, on its own lines if its neighbours are."""
         tag = new.start.split(" ", 1)[0]
         before = "" if indent is None else self._text.newline + indent
         if not new.children:

@@ -50,7 +50,7 @@ class _WideRule:
 
 @dataclass(frozen=True, slots=True)
 class EnclaveUse:
-    """What an enclave is allowed against what it was observed to do.
+    """The rights of an enclave compared with what it was observed to do.
 
     ``unused`` rules were never observed and go; ``common`` ones were never observed and stay, as
     they belong to what every node needs; ``refused`` was observed, and the policy does not allow
@@ -131,7 +131,7 @@ class _KnownNames:
 
 
 class _Narrowing:
-    """One enclave."""
+    """The narrowing of one enclave."""
 
     def __init__(
         self,
@@ -161,7 +161,7 @@ class _Narrowing:
         return self._rules.cover(part) and not self._rules.cover(part._replace(qualifier=DENY))
 
     def _is_usable(self, part: Right) -> bool:
-        """Return whether it, or for a wildcard some of what it means, is allowed."""
+        """Return whether a right, or a part of a wildcard, is allowed."""
         if self._is_allowed(part):
             return True
         return is_expression(part.name) and bool(self._rules.meeting(part))
@@ -244,7 +244,7 @@ class _Narrowing:
         )
 
     def _prove(self, remaining: Sequence[Right]) -> None:
-        """Nothing more than before, and nothing observed lost."""
+        """Check that nothing was added, and nothing observed was lost."""
         after = Rules(remaining)
         more = [right for right in remaining if not self._rules.cover(right)]
         lost = [p for p in self._in_use if self._is_allowed(p) and not after.cover(p)]
@@ -309,8 +309,8 @@ def _narrowed_enclave(
 ) -> Enclave:
     """``enclave`` with its denials, the ALLOW rights in ``kept``, and names for wildcards.
 
-    The names of a wildcard stand once, where it stood first, and are written as it was: relative,
-    private or absolute.  Profiles stay, even without a rule.
+    The names that replace a wildcard are written once, at its first place, and in its form:
+    relative, private or absolute.  Profiles stay, even without a rule.
     """
     pending = dict(replacements)
     blocks = []
@@ -389,9 +389,9 @@ def propose_wildcards(
     needed: int,
     size: Callable[[Right], int],
 ) -> tuple[WildcardProposal, ...]:
-    """Wildcards by which the document of an enclave becomes ``needed`` bytes smaller, if possible.
+    """Return wildcards that make an enclave's document ``needed`` bytes smaller, if possible.
 
-    ``rights`` are the enclave's, ``known`` those of every enclave, and ``size`` returns the
+    ``rights`` are the enclave's, ``known`` are every enclave's, and ``size`` returns the
     bytes that a right takes.  Those that save most come first; such that grant something known are
     used only if the safe ones do not suffice.
     """
@@ -436,7 +436,7 @@ def _candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
 
 
 def _wider(name: str) -> Iterator[str]:
-    """A folder with all below it, never that of the root; and the name without its numbers."""
+    """Return wider patterns: the folder with ``*`` (not the root); ``*`` for each number."""
     tokens = name.split("/")[1:-1]
     for depth in range(1, len(tokens) + 1):
         yield "/" + "/".join((*tokens[:depth], "*"))

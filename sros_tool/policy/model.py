@@ -1,6 +1,6 @@
 """The policy language of ROS: who may publish, subscribe, request, reply, call and execute.
 
-Names are those of SROS2 policy XML 0.2.0.  All values can be compared; where a thing came from
+Names follow SROS2 policy XML 0.2.0.  All values can be compared; where a thing came from
 (`Source`) does not count in a comparison.
 """
 
@@ -49,8 +49,8 @@ class Group:
     """Names of one kind (topics, services or actions) that share the same rights.
 
     ``rights`` are pairs of a right and its qualifier, in the order of `RIGHTS`; ``names`` are as
-    written: relative, private or absolute, perhaps with wildcards.  ``lines`` are those of the
-    names in the file of ``source``, where they were read from one.
+    written: relative, private or absolute, perhaps with wildcards.  ``lines`` are the lines of
+    the names in the file of ``source``, if read from one.
     """
 
     kind: str
@@ -60,7 +60,7 @@ class Group:
     lines: tuple[int, ...] = field(default=(), compare=False)
 
     def source_of(self, index: int) -> Source:
-        """Return where the name of that index stands."""
+        """Return the file and line of the name at an index."""
         if index < len(self.lines):
             return Source(self.source.file, self.lines[index])
         return self.source

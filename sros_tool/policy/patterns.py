@@ -24,7 +24,7 @@ _PIECE = re.compile(r"\*+|\?|\[(!?)([^\]]+)\]|(.)", re.DOTALL)
 _RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
 _ALPHABET = frozenset(map(chr, range(33, 127)))  # wider than ROS names: DDS topics may be foreign
 _ANY: frozenset[str] = frozenset()
-"""Stands for ``*`` among the pieces of a pattern."""
+"""The piece of a pattern that means ``*``."""
 
 
 @lru_cache(maxsize=_MANY)
@@ -114,7 +114,7 @@ def _overlap(one: str, other: str) -> bool:
 
 
 def _after_stars(reached: set[int], pieces: tuple[frozenset[str], ...]) -> set[int]:
-    """Return the places reached when stars that follow stand for nothing."""
+    """Return the places reached when the following stars match nothing."""
     grown = set(reached)
     for i in sorted(reached):
         while i < len(pieces) and pieces[i] is _ANY:
@@ -161,8 +161,8 @@ def common_name(
     """Return the shortest absolute ROS name that all of ``wanted`` mean and none of ``unwanted``.
 
     Unless ``absolute``, one without its first "/", as DDS topics are.  None if there is no such
-    name.  Where the search grows beyond all bounds (many ``?`` behind ``*``), the exceptions are
-    left out of account: an overlap too many is reported, never one too few.
+    name.  Where the search grows beyond all bounds (many ``?`` behind ``*``), the exceptions
+    are ignored: an overlap too many is reported, never one too few.
     """
     inner, outer = tuple(dict.fromkeys(wanted)), tuple(dict.fromkeys(unwanted))
     for name in inner:
@@ -215,11 +215,11 @@ def _spelt(state: _State, before: dict[_State, tuple[_State, str] | None]) -> st
 
 
 def _representatives(patterns: list[_Pieces]) -> str:
-    """Return one letter of each kind that the patterns, and the grammar of names, tell apart."""
-    told = {piece for pattern in patterns for piece in pattern if piece is not _ANY}
+    """Return one letter of each kind that the patterns, and the grammar of names, distinguish."""
+    special = {piece for pattern in patterns for piece in pattern if piece is not ANY}
     kinds: dict[tuple[object, ...], str] = {}
     for letter in _LETTERS:
-        kind = (letter == "/", letter in digits, *(letter in piece for piece in told))
+        kind = (letter == "/", letter in digits, *(letter in piece for piece in special))
         kinds.setdefault(kind, letter)
     return "".join(kinds.values())
 
@@ -246,7 +246,7 @@ def _step(reached: frozenset[int], letter: str, pattern: _Pieces) -> frozenset[i
 
 
 def _closed(reached: set[int], pattern: _Pieces) -> frozenset[int]:
-    """With the places that are reached when stars stand for nothing."""
+    """Return the places, with those reached when stars match nothing."""
     return frozenset(place for at in reached for place in _onward(at, pattern))
 
 

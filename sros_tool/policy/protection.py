@@ -1,4 +1,4 @@
-"""What a robot's messages are protected by, said in ROS terms: per topic, service and action."""
+"""The protection of a robot's messages in ROS terms: per topic, service and action."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Rights and denials on absolute names: what a policy states, and how two policies differ.
 
 Two documents mean the same if their rights in normal form are equal.  An action is nothing but
-three services and two topics (ROS 2 design "Actions"): `unfolded` says it in those, `folded` puts
-them together again.
+three services and two topics (ROS 2 design "Actions"): `unfolded` splits it into them, `folded`
+joins them again.
 """
 
 from __future__ import annotations
@@ -62,9 +62,9 @@ class Right(NamedTuple):
 
     def __str__(self) -> str:
         """As ``/talker ALLOW publish topic /chatter``."""
-        return f"{self.enclave} {self.qualifier.value} {self.told()}"
+        return f"{self.enclave} {self.qualifier.value} {self.describe()}"
 
-    def told(self) -> str:
+    def describe(self) -> str:
         """As ``publish topic /chatter``."""
         item = "DDS topic" if self.kind == "dds" else self.kind.removesuffix("s")
         return f"{self.right} {item} {self.name}"
@@ -80,7 +80,7 @@ GroupRights = tuple[tuple[str, Qualifier], ...]
 
 
 def groupable(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
-    """What groups are to say for ``rights`` on a name: two where one is allowed and denied."""
+    """Return the groups for ``rights`` on a name: two where one is both allowed and denied."""
     ordered = sorted(rights, key=lambda each: (RIGHT_ORDER[each[0]], each[1]))
     if len({right for right, _ in ordered}) == len(ordered):
         yield tuple(ordered)
@@ -90,7 +90,7 @@ def groupable(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
 
 
 def policy_rights(policy: Policy) -> frozenset[Right]:
-    """The rights that a policy states, as written but for their names, which become absolute."""
+    """Return the rights that a policy states, as written, with absolute names."""
     return frozenset(
         right
         for enclave in policy.enclaves
@@ -128,7 +128,7 @@ def unfolded(rights: Iterable[Right]) -> frozenset[Right]:
 
 
 def folded(rights: Iterable[Right]) -> frozenset[Right]:
-    """The normal form: all parts of an action become the action, and do not count a second time."""
+    """Return the normal form: all parts of an action become the action, and are listed once."""
     remaining = set(unfolded(rights))
     actions = [
         Right(each.enclave, each.qualifier, WHOLE[each.right], each.name.removesuffix(GOAL))
@@ -158,7 +158,7 @@ class Rules:
                 self._wild[place].append(name)
 
     def cover(self, right: Right) -> bool:
-        """Return whether all that ``right`` says (an ALLOW, or a DENY) is said here too."""
+        """Return whether these rights contain all of ``right`` (an ALLOW, or a DENY)."""
         return all(self._covering(part) for part in parts(right))
 
     def covering(self, right: Right) -> tuple[Right, ...]:
@@ -183,7 +183,7 @@ class Rules:
         return tuple(found)
 
     def allow(self, enclave: str, right: str, name: str) -> bool:
-        """Whether ``name`` may be used so: something allows it, and nothing denies any of it."""
+        """Return whether ``name`` may be used: something allows it, and nothing denies any part."""
         wanted = Right(enclave, ALLOW, right, name)
         return self.cover(wanted) and not self.meeting(wanted._replace(qualifier=DENY))
 

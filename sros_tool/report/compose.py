@@ -256,7 +256,8 @@ def _changed(first: frozenset[Right], second: frozenset[Right]) -> tuple[Overlay
             OverlaySide.FIRST if sign == "-" else OverlaySide.SECOND,
             str(right),
             tuple(
-                f"the other has it by {each.told()}" for each in difference.covered.get(right, ())
+                f"the other has it by {each.describe()}"
+                for each in difference.covered.get(right, ())
             ),
         )
         for sign, right in difference.lines()

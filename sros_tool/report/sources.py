@@ -122,7 +122,7 @@ def _observation(path: Path) -> PictureSource:
         observed = from_json(json.loads(read_bytes(path, "file")))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DocumentError(
-            f"'{path}' is no observation",
+            f"'{path}' is not an observation",
             "It is JSON, but not what `sros generate_policy --json` prints.",
         ) from error
     learned = learn(observed)

@@ -105,13 +105,13 @@ _ALL = (
     *_SIGNATURE, *_GRANT, *_DOCUMENT, Fault.GOVERNANCE_DOMAIN, Fault.PERMISSIONS_DOMAIN,
 )  # fmt: skip
 
-_CHECK = "Name the keystore and the enclave, and the true cause is looked for there."
+_CHECK = "Name the keystore and the enclave, and sros looks for the true cause there."
 _FILE = "Where ROS_SECURITY_LOG_FILE is set, give `sros explain --log` that file."
 _CHECK_OR_FILE = f"{_CHECK} {_FILE}"
 _RENEW = "Renew it: `sros renew KEYSTORE ENCLAVE`."
 _SIGN = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
 _SIGN_ONE = (
-    f"Name the keystore and the enclave, and which of the two it is is looked for there. {_SIGN} "
+    f"Name the keystore and the enclave, and sros finds out there which of the two it is. {_SIGN} "
     "A governance has to be restored from a backup: every enclave depends on it."
 )
 _READABLE = (
@@ -161,7 +161,7 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     ),
     _text(
         "files-missing", _ROS, r"couldn't find all security files",
-        "a file of the enclave is missing or a broken link; which one, it does not say",
+        "a file of the enclave is missing or a broken link; the message does not say which",
         "Complete it: `sros create_enclave KEYSTORE ENCLAVE`, or export it again.", _FILES,
         refuses=Refused.PARTICIPANT,
     ),
@@ -182,7 +182,8 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     # ── Cyclone DDS, starting ──────────────────────────────────────────────────────────────
     _text(
         "certificate-expired", _CYCLONE, r"Certificate not valid: error: certificate has expired",
-        "the certificate of the enclave or of its identity CA has expired; which, it does not say",
+        "the certificate of the enclave or of its identity CA has expired; the message "
+        "does not say which",
         _RENEW, (Fault.CERTIFICATE_EXPIRED, Fault.CA_EXPIRED),
     ),
     _text(
@@ -199,7 +200,7 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "revoked", _CYCLONE, r"Certificate not valid: error: certificate revoked",
         "the certificate of the enclave is revoked",
-        "It is meant to be kept out; if it shall run again, make it again with another key: `sros "
+        "It is meant to be kept out; to let it run again, create it again with another key: `sros "
         "create_enclave KEYSTORE ENCLAVE`.",
         (Fault.REVOKED,),
     ),
@@ -216,12 +217,13 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     ),
     _text(
         "key-encrypted", _CYCLONE, r"Failed to parse certificate: .*(?:bad decrypt|empty password)",
-        "it says certificate and means the key: key.pem is encrypted, and no passphrase is asked",
+        "the message says certificate but means the key: key.pem is encrypted, and "
+        "DDS asks for no passphrase",
         "Store key.pem without a passphrase, mode 0600.", (Fault.KEY_ENCRYPTED,),
     ),
     _text(
         "pem-unreadable", _CYCLONE, r"Failed to parse (?:certificate|private key)",
-        "cert.pem or key.pem is no PEM file; it says certificate for both",
+        "cert.pem or key.pem is not a PEM file; the message says certificate for both",
         "Restore the file.", (Fault.CERTIFICATE_MALFORMED, *_KEY, *_FILES),
     ),
     _text(
@@ -299,7 +301,7 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "peer-malformed", _FAST,
         r"Error validating remote permissions for \S+ \(Malformed permissions file",
-        "a PEER was refused: its permissions, although signed, are not such as Fast DDS accepts",
+        "a PEER was refused: its permissions, although signed, are not accepted by Fast DDS",
         "Have sros write the peer's permissions: `sros create_permission KEYSTORE ENCLAVE POLICY`.",
     ),
     _text(
@@ -355,14 +357,14 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "signature", _FAST, r"PKCS7 data verification failed",
         "governance.p7s or permissions.p7s was changed, or signed by another CA than the "
-        "permissions CA next to it; which of the two, it does not say",
+        "permissions CA next to it; the message does not say which",
         _SIGN_ONE, _SIGNATURE,
         refuses=Refused.PARTICIPANT,
     ),
     _text(
         "not-signed", _FAST, r"Input data has not PKCS7 S/MIME format",
-        "governance.p7s or permissions.p7s is not a signed document: plain XML, or damaged; which "
-        "of the two, it does not say", _SIGN_ONE, _SIGNATURE,
+        "governance.p7s or permissions.p7s is not a signed document: plain XML, or damaged; the "
+        "message does not say which", _SIGN_ONE, _SIGNATURE,
         refuses=Refused.PARTICIPANT,
     ),
     _text(
@@ -397,7 +399,7 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "partition", _FAST, r"partition not found in rule",
         "a rule names the topic, but not the partitions of this publisher or subscriber",
-        "Say nothing of partitions in permissions; sros never does.",
+        "Leave partitions out of permissions; sros never writes them.",
         refuses=Refused.TOPIC,
     ),
     # ── what follows on others ─────────────────────────────────────────────────────────────
@@ -472,7 +474,7 @@ UNKNOWN = LogText(
         r"|SECURITY ERROR"
     ),
     "a line of DDS Security that sros does not know",
-    "Read it as it stands; what it is about may matter. If it kept a node from starting, `sros "
+    "Read the line itself: it may matter. If it kept a node from starting, `sros "
     "check KEYSTORE` and `sros explain KEYSTORE ENCLAVE join` look at all that DDS looks at.",
 )
 """For what looks like a message of DDS Security and is none of `LOG_TEXTS`."""

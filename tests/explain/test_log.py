@@ -38,7 +38,7 @@ CAUSES = {
     "permissions of another CA": ("permissions.p7s: it is signed by CN=a foreign CA",),
     "governance unsigned": ("governance.p7s: it is not an S/MIME",),
     "permissions unsigned": ("permissions.p7s: it is not an S/MIME",),
-    "permissions expired": ("ended at",),
+    "permissions expired": ("expired at",),
     "permissions not yet valid": ("begins at",),
     "permissions of another enclave": ("no grant of the permissions names the subject",),
     "domain not in governance": ("the governance does not list domain 0",),

@@ -74,7 +74,7 @@ def test_a_watch_keeps_what_was_gone_and_tells_it_once() -> None:
     passing = graph(node("/p", "publish z", participant="p9"))
     script = Script([(0.1, ONE), (3.0, ONE.union(passing)), (5.0, ONE), (7.0, TWO)])
     told: list[Observation] = []
-    snapshot = watch(script, 10.0, script.clock, stop=lambda: False, tell=told.append)
+    snapshot = watch(script, 10.0, script.clock, stop=lambda: False, report=told.append)
     assert snapshot.observation == TWO.union(passing)
     assert told == [ONE, ONE.union(passing), TWO.union(passing)]
 
@@ -83,7 +83,7 @@ def test_what_is_half_discovered_is_not_told_for_a_moment() -> None:
     half = graph(node("/a"))
     script = Script([(0.1, half), (0.3, ONE)])
     told: list[Observation] = []
-    watch(script, 3.0, script.clock, stop=lambda: False, tell=told.append)
+    watch(script, 3.0, script.clock, stop=lambda: False, report=told.append)
     assert told == [ONE]
 
 
@@ -95,7 +95,7 @@ def test_a_restless_graph_is_told_nevertheless() -> None:
         changes.append((each * 0.3, grown))
     script = Script(changes)
     told: list[Observation] = []
-    watch(script, 12.0, script.clock, stop=lambda: False, tell=told.append)
+    watch(script, 12.0, script.clock, stop=lambda: False, report=told.append)
     assert len(told) >= 4
 
 
@@ -103,7 +103,7 @@ def test_a_watch_ends_when_it_is_told_to() -> None:
     script = Script([(0.1, ONE)])
     told: list[Observation] = []
     stop = lambda: script.now > 101.0  # noqa: E731
-    snapshot = watch(script, None, script.clock, stop=stop, tell=told.append)
+    snapshot = watch(script, None, script.clock, stop=stop, report=told.append)
     assert snapshot.observation == ONE
     assert snapshot.seconds < 1.5
     assert told == [ONE]

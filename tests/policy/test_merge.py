@@ -86,7 +86,7 @@ CASES = {
 
 @pytest.mark.parametrize(("before", "asked", "added"), CASES.values(), ids=CASES)
 def test_what_is_there_is_not_added(before: Policy, asked: Policy, added: list[str]) -> None:
-    assert [right.told() for right in plan_merge(before, asked).added] == added
+    assert [right.describe() for right in plan_merge(before, asked).added] == added
 
 
 DENIED = group("topics", "/cam/*", subscribe="DENY")

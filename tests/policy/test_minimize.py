@@ -142,9 +142,9 @@ def test_what_is_told() -> None:
         group("topics", "/x /y /cam/*", "publish") + group("topics", "/cam/secret", "-publish")
     )
     found = use(given_policy, "publish /x", "publish /cam/a", "publish /cam/secret", "call /f")
-    assert [right.told() for right in found.unused] == ["publish topic /y"]
+    assert [right.describe() for right in found.unused] == ["publish topic /y"]
     assert [(w.rule.name, [r.name for r in w.used]) for w in found.wide] == [("/cam/*", ["/cam/a"])]
-    assert {right.told() for right in found.refused} == {
+    assert {right.describe() for right in found.refused} == {
         "publish topic /cam/secret",
         "call action /f",
     }

@@ -245,7 +245,9 @@ def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -
         return
     difference = compare(wanted[name], grant_rights(name, grant))
     if difference:
-        shown = [f"{sign} {right.qualifier} {right.told()}" for sign, right in difference.lines()]
+        shown = [
+            f"{sign} {right.qualifier} {right.describe()}" for sign, right in difference.lines()
+        ]
         more = f" and {len(shown) - _RIGHTS_SHOWN} more" if len(shown) > _RIGHTS_SHOWN else ""
         text = f"policy (-) and permissions (+) differ: {'; '.join(shown[:_RIGHTS_SHOWN])}{more}"
         yield STALE.found(name, text, enclave.file("permissions.p7s"))

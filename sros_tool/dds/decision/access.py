@@ -1,7 +1,7 @@
 """The access control of one vendor: who may join, publish and subscribe under two documents.
 
 A decision chooses the grant of the subject (`_choose_grant`), takes its rules for the domain
-(`_rules_for`), asks them for a topic (`GrantRules`), and weighs them with what the governance
+(`_rules_for`), asks them for a topic (`GrantRules`), and combines them with what the governance
 controls (`_GovernedDomain`, `_decide_join`, `Access`).
 """
 
@@ -80,7 +80,7 @@ def _state(
         )
     seconds = int(now) if traits.moments is Moments.LOCAL else now
     if seconds > end or (strict and now == end):
-        return Refusal("expired", f"{traits.title}: {name} ended at {grant.not_after}{how}.")
+        return Refusal("expired", f"{traits.title}: {name} expired at {grant.not_after}{how}.")
     return None
 
 
@@ -117,7 +117,7 @@ class RuleVerdict:
 
     @property
     def allowed(self) -> bool:
-        """Whether they say yes."""
+        """Whether the rules allow it."""
         return self.outcome is Outcome.ALLOWED
 
 
@@ -149,7 +149,7 @@ def _rules_for(
     for index, rule in enumerate(grant.rules):
         holds = holds_for(traits.open_range, rule.domains, domain)
         if holds is None:
-            # Cyclone DDS looks for the next rule before it uses one: the last one is never used.
+            # Cyclone DDS looks for the next rule before it uses one, so it never uses the last one.
             return found[:-1], RuleVerdict(Outcome.CRASHES, "open-range", index)
         if holds:
             found.append((index, rule))
@@ -196,7 +196,7 @@ class _GrantRules:
         self._topics = ExpressionIndex(traits.style, texts)
 
     def ask(self, topic: str, partitions: tuple[str, ...]) -> RuleVerdict:
-        """The verdict on an endpoint of ``topic`` in ``partitions`` (none: the default one)."""
+        """Return the verdict on an endpoint of ``topic`` in ``partitions`` (none: default)."""
         wanted = partitions or _DEFAULT_PARTITION
         passed = 0
         for position in self._topics.matching(topic):
@@ -245,7 +245,7 @@ def _trimmed(traits: VendorTraits, text: str) -> str:
 def _partitions(
     traits: VendorTraits, rule: Rule, criteria: tuple[Criteria, ...]
 ) -> tuple[str, ...]:
-    """The partitions that ``criteria`` of ``rule`` name; without any, what the vendor implies."""
+    """Return the partitions that ``criteria`` of ``rule`` name, or the ones a vendor implies."""
     everywhere = not rule.allow and traits.deny_partitions is DenyPartitions.ANY_OR_ALL
     implied = ("*",) if everywhere else _DEFAULT_PARTITION
     if implied is _DEFAULT_PARTITION and not any(each.partitions for each in criteria):
@@ -271,7 +271,7 @@ class _GovernedDomain:
         )
 
     def topic_rule(self, topic: str) -> TopicRule | None:
-        """The first rule whose expression matches; where one is empty, the vendor may crash."""
+        """Return the first rule whose expression matches; an empty one may crash the vendor."""
         position = self._topics.first(topic)
         return None if position is None else self._topic_rules[position]
 
@@ -327,7 +327,7 @@ def _decide_join(
     otherwise: RuleVerdict,
     domain: int,
 ) -> _Joining:
-    """``rules`` are those of the grant for ``domain``, ``otherwise`` the verdict behind them."""
+    """Decide about joining; ``rules`` hold for ``domain``, else ``otherwise`` is the verdict."""
     where = f"domain {domain}"
     if traits.always_needs_allow_rule and not any(rule.allow for rule in grant.rules):
         text = "the grant has no allow rule, so nothing starts"
@@ -407,7 +407,7 @@ class Access:
         at: datetime,
         zone: tzinfo = UTC,
     ) -> Access | Refusal:
-        """The decisions under two documents as ``vendor`` reads them, or why it refuses them."""
+        """Return the access under two documents as ``vendor`` reads them, or its refusal."""
         governance = read_governance_as(vendor, governance_xml)
         if isinstance(governance, Refusal):
             return governance
@@ -459,7 +459,9 @@ class Access:
             return join
         traits = self._traits
         if traits.creates_topics and not _is_topic_name(topic):
-            return self._answer(Outcome.DENIED, "invalid-name", f"{topic!r} is no name for a topic")
+            return self._answer(
+                Outcome.DENIED, "invalid-name", f"{topic!r} is not a valid topic name"
+            )
         decision = self._ruled(verb, topic, partitions)
         longest = traits.longest_topic_name
         if decision.outcome.ok and longest is not None and len(topic.encode()) > longest:
@@ -473,7 +475,7 @@ class Access:
         return decision
 
     def _ruled(self, verb: AccessVerb, topic: str, partitions: tuple[str, ...]) -> Decision:
-        """What the governance and the rules of the grant say, for a participant that starts."""
+        """Return the decision of governance and grant for a participant that starts."""
         join, traits = self._join, self._traits
         rule = self._governed.topic_rule(topic)
         if rule is None:
@@ -557,5 +559,5 @@ class Access:
 
 
 def _is_topic_name(name: str) -> bool:
-    """Whether Cyclone DDS 0.10 takes it: letters, digits, ``_`` and ``/``, no digit first."""
+    """Whether Cyclone DDS 0.10 accepts it: letters, digits, ``_`` and ``/``, no digit first."""
     return bool(_TOPIC_NAME.match(name))

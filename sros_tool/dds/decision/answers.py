@@ -1,4 +1,4 @@
-"""What is asked of the access control of DDS, and what it answers."""
+"""Questions to the access control of DDS (verbs), and its answers (outcomes, decisions)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class AccessVerb(StrEnum):
 
 
 class Outcome(StrEnum):
-    """What becomes of it."""
+    """What happens to a participant or endpoint."""
 
     ALLOWED = "allowed"
     DENIED = "denied"
@@ -65,7 +65,7 @@ _REASONS = {
     "peer-refuses-participant": "peers do not accept the participant on this domain",
     "no-grant": "no grant names the subject",
     "not-yet-valid": "the grant of the subject begins later",
-    "expired": "the grant of the subject has ended",
+    "expired": "the grant of the subject has expired",
     "malformed": "the vendor does not accept a document",
     "unauthenticated-with-rtps-protection": "the governance contradicts itself",
     "long-name": "the name of the topic is too long for peers",

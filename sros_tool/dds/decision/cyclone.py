@@ -44,8 +44,8 @@ _ENTITIES = {"lt": "<", "gt": ">", "amp": "&", "apos": "'", "quot": '"'}
 def read(xml: bytes) -> XmlElement:
     """Return the root of a document; raises `UnreadableError` where Cyclone DDS refuses it.
 
-    A text is without the blanks around it, and decoded as UTF-8, each byte that is none as a
-    surrogate.
+    Texts are stripped of surrounding blanks and decoded as UTF-8, invalid bytes as
+    surrogates.
     """
     return _Reader(xml).root()
 
@@ -59,7 +59,7 @@ class _Reader:
         root = self._element(0)
         self._pass_over()
         if self._index < len(self._text):
-            raise self._error("something stands behind its root")
+            raise self._error("something follows its root")
         return root
 
     def _error(self, why: str) -> UnreadableError:
@@ -89,7 +89,7 @@ class _Reader:
             if self._take(begin):
                 stop = self._text.find(end, self._index)
                 if stop < 0:
-                    raise self._error("a quoted text does not end")
+                    raise self._error("a quoted text is not closed")
                 text = self._text[self._index : stop]
                 self._index = stop + len(end)
                 return self._unescaped(text)
@@ -131,7 +131,7 @@ class _Reader:
             element.children.append(self._element(depth + 1))
 
     def _opens(self) -> bool:
-        """Return whether the next token begins an element; raises where it is none at all."""
+        """Return whether the next token begins an element; raises where it is not a token."""
         self._pass_over()
         text, index = self._text, self._index
         if text[index : index + 1] == "<" and not text.startswith(_CDATA, index):
@@ -183,7 +183,7 @@ class _Reader:
             code = (int(number[1], 16) if number[1] else int(number[2])) % 2**32
             if code <= 0x10FFFF:
                 return chr(code).encode("utf-8", "surrogatepass").decode("latin-1")
-        raise self._error(f"&{word} is no reference to a character")
+        raise self._error(f"&{word} is not a character reference")
 
 
 def _decoded(text: str) -> str:
@@ -193,7 +193,7 @@ def _decoded(text: str) -> str:
 _SCHEMA_ATTRIBUTES = ("xmlns:xsi", "xsi:nonamespaceschemalocation")
 _IGNORED = ("relay", "value", "name", "tag", "data_tags")
 _NOTHING = "["
-"""An expression that nothing matches: a set that does not end."""
+"""An expression that matches nothing: a set that is never closed."""
 _INTEGER = re.compile(r"[+-]?(?:0[xX][0-9a-fA-F]+|0[0-7]*|[1-9]\d*)\Z", re.ASCII)
 
 
@@ -201,7 +201,7 @@ def _names(rule: type[DomainRule | TopicRule]) -> tuple[str, ...]:
     return tuple(each.name for each in attributes(rule))
 
 
-# What may stand in what; without an entry, only text may.
+# The allowed children of each element; an element without an entry holds only text.
 _DOMAINS = {"domains": ("id", "id_range"), "id_range": ("min", "max")}
 _GOVERNANCE = _DOMAINS | {
     "dds": ("domain_access_rules",),
@@ -239,7 +239,7 @@ def read_permissions(xml: bytes) -> Permissions:
     """Return the permissions; raises `UnreadableError`.
 
     A ``<topic>`` without text is "", a rule without domains has a range without ends, and a
-    ``<default>`` may be empty: over each it crashes once it comes to it.
+    ``<default>`` may be empty: Cyclone DDS crashes when it evaluates one of these.
     """
     dds = _Node.root(xml, _PERMISSIONS, _IGNORED)
     parent = dds.last("permissions")
@@ -250,7 +250,7 @@ def read_permissions(xml: bytes) -> Permissions:
 
 
 class _Node:
-    """An element that may stand where it does, with the children that count."""
+    """An element at an allowed place, with the children that count."""
 
     def __init__(
         self,
@@ -312,7 +312,7 @@ def _number(node: _Node) -> int:
     if not node.text:
         return 0
     if not _INTEGER.match(node.text):
-        raise UnreadableError(f"<{node.tag}> holds {node.text!r}, which is no number")
+        raise UnreadableError(f"<{node.tag}> holds {node.text!r}, which is not a number")
     sign, digits = ("-", node.text[1:]) if node.text[0] == "-" else ("", node.text.lstrip("+"))
     octal = len(digits) > 1 and digits[0] == "0" and digits[1] not in "xX"
     number = int(sign + digits, 8 if octal else 0)
@@ -336,7 +336,7 @@ def _value(node: _Node, attribute: Attribute) -> Value:
         return _flag(node)
     if node.text and node.text not in attribute.values:
         raise UnreadableError(
-            f"<{node.tag}> holds {node.text!r}, which is no protection kind there"
+            f"<{node.tag}> holds {node.text!r}, which is not a protection kind there"
         )
     return ProtectionKind(node.text) if node.text else ProtectionKind.NONE
 

@@ -17,7 +17,7 @@ from sros_tool.xml import tag_of
 
 
 class UnreadableError(Exception):
-    """The vendor does not accept the document; ``outcome`` says whether it crashes over it."""
+    """The vendor does not accept the document; ``outcome`` says whether it crashes."""
 
     def __init__(self, text: str, outcome: Outcome = Outcome.REFUSED) -> None:
         super().__init__(text)
@@ -43,7 +43,7 @@ class NodeMark(Enum):
 class XmlElement:
     """An element; ``children`` are its nodes in order, text and CDATA as strings.
 
-    ``name`` and the names of ``attributes`` stand as they are written, with their prefixes.
+    ``name`` and the names of ``attributes`` are kept as written, with their prefixes.
     """
 
     name: str
@@ -68,7 +68,7 @@ _DOMAINS = {
     "id_range": "min,(max,)?|max,",
 }
 _RULE = "domains,(publish,)*(subscribe,)*(relay,)*"
-# The schema lets these stand in any order, each once.
+# The schema allows these in any order, each once.
 _CRITERIA = "(?!.*(?:^|,)(\\w+,).*\\1)(?=.*topics,)(topics,|partitions,|data_tags,)*"
 _PERMISSIONS = _DOMAINS | {
     "dds": "permissions,",
@@ -112,12 +112,12 @@ _EVERYWHERE = "{http://www.w3.org/2001/XMLSchema-instance}"
 
 
 def check_permissions(xml: bytes) -> None:
-    """Raises `UnreadableError` unless ``xml`` is valid permissions."""
+    """Check that ``xml`` is valid permissions; raises `UnreadableError`."""
     _check(_root(xml), "dds", _PERMISSIONS)
 
 
 def check_governance(xml: bytes) -> None:
-    """Raises `UnreadableError` unless ``xml`` is valid governance."""
+    """Check that ``xml`` is valid governance; raises `UnreadableError`."""
     _check(_root(xml), "dds", _GOVERNANCE)
 
 
@@ -140,13 +140,13 @@ def _check(element: etree._Element, name: str, grammar: dict[str, str]) -> None:
     text = "".join([element.text or "", *(child.tail or "" for child in element)])
     attributes = [str(each) for each in element.attrib if not str(each).startswith(_EVERYWHERE)]
     if attributes != (["name"] if name == "grant" else []):
-        raise UnreadableError(f"<{name}> has not the attributes that it should have")
+        raise UnreadableError(f"<{name}> does not have the expected attributes")
     if name not in grammar:
         if children or not re.fullmatch(_TEXTS.get(name, "(?s:.*)"), text, re.ASCII):
-            raise UnreadableError(f"<{name}> does not hold what it should, but {text!r}")
+            raise UnreadableError(f"<{name}> holds an unexpected value, {text!r}")
         return
     names = "".join(f"{tag_of(child)}," for child in children)
     if text.strip() or not re.fullmatch(grammar[name], names):
-        raise UnreadableError(f"<{name}> has not the elements that it should have, in their order")
+        raise UnreadableError(f"<{name}> does not have the expected elements in the expected order")
     for child in children:
         _check(child, tag_of(child), grammar)

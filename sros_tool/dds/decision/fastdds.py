@@ -45,7 +45,7 @@ _REFERENCE = re.compile("&(?:#x?([^;]*)|(quot|amp|apos|lt|gt));")
 def read(xml: bytes) -> XmlElement:
     """Return the first element of a document; raises `UnreadableError` where TinyXML-2 refuses it.
 
-    A text is decoded as UTF-8, each byte that is none as a surrogate.
+    A text is decoded as UTF-8, invalid bytes as surrogates.
     """
     return _Reader(xml).root()
 
@@ -89,7 +89,7 @@ class _Reader:
             closing, name, closed = tag[1], tag[2], tag[6]
             if closing and not closed:
                 if len(stack) == 1:
-                    return  # what stands behind it goes unread
+                    return  # what follows the root is not read
                 if stack.pop().name != _decoded(name):
                     raise self._error(f"</{name}> closes another element")
                 continue
@@ -109,7 +109,7 @@ class _Reader:
             raise self._error("it ends with <")
 
     def _take_special(self, stack: list[XmlElement]) -> None:
-        """A declaration, comment, CDATA or anything else that begins with ``<?`` or ``<!``."""
+        """Read a declaration, comment, CDATA or anything else that begins with ``<?`` or ``<!``."""
         text, children = self._text, stack[-1].children
         begin, end = next(each for each in _SPECIAL if text.startswith(each[0], self._index))
         start = self._index + len(begin)
@@ -119,7 +119,7 @@ class _Reader:
         self._index = stop + len(end)
         if begin == "<?":
             if len(stack) > 1 or any(each is not NodeMark.DECLARATION for each in children):
-                raise self._error("a processing instruction stands behind the prolog")
+                raise self._error("a processing instruction follows the prolog")
             children.append(NodeMark.DECLARATION)
         elif begin == "<![CDATA[":
             children.append(_decoded(_LINE_END.sub("\n", text[start:stop])))
@@ -130,7 +130,7 @@ class _Reader:
         found = {}
         for name, value in _ATTRIBUTES.findall(text):
             if name in found:
-                raise self._error(f"the attribute {name} stands there twice")
+                raise self._error(f"the attribute {name} is given twice")
             found[name] = _plain(value[1:-1])
         return {_decoded(name): value for name, value in found.items()}
 
@@ -198,7 +198,7 @@ def read_governance(xml: bytes) -> Governance:
     parent = _first(root, "domain_access_rules")
     if root.children[-1] is not parent:
         # A comment counts as well.
-        raise UnreadableError("something stands behind <domain_access_rules>")
+        raise UnreadableError("something follows <domain_access_rules>")
     return Governance(tuple(_domain_rule(each) for each in _all(parent, "domain_rule")))
 
 
@@ -230,7 +230,7 @@ def _all(parent: XmlElement, name: str) -> list[XmlElement]:
 
 
 class _Sequence:
-    """The child elements of one, taken in order."""
+    """The child elements of one element, taken in order."""
 
     def __init__(self, element: XmlElement) -> None:
         self._name = element.name
@@ -263,7 +263,7 @@ class _Sequence:
         return found
 
     def end(self) -> None:
-        """Nothing may follow."""
+        """Check that no child follows; raises `UnreadableError`."""
         if self.rest():
             raise UnreadableError(f"<{self._name}> holds too much: <{self.rest()[0].name}>")
 
@@ -272,7 +272,7 @@ class _Sequence:
 
 
 def _text(element: XmlElement) -> str | None:
-    """The text that stands first, comments aside; None if something else does, or nothing."""
+    """Return the first node if it is text, comments aside, else None."""
     for child in element.children:
         if child is not NodeMark.COMMENT:
             return child if isinstance(child, str) else None
@@ -297,7 +297,7 @@ def _first_text(element: XmlElement) -> str:
 def _number(element: XmlElement) -> int:
     found = _INTEGER.match(_first_text(element))
     if not found:
-        raise UnreadableError(f"<{element.name}> holds no number")
+        raise UnreadableError(f"<{element.name}> does not hold a number")
     return (int(found[1], 16) if found[1] else int(found[2])) % 2**32
 
 
@@ -315,7 +315,7 @@ def _value(element: XmlElement, attribute: Attribute) -> Value:
         return _flag(element)
     text = _required(element)
     if text not in list(ProtectionKind):
-        raise UnreadableError(f"<{element.name}> holds {text!r}, which is no protection kind")
+        raise UnreadableError(f"<{element.name}> holds {text!r}, which is not a protection kind")
     if text not in attribute.values:
         raise UnreadableError(f"<{element.name}> holds {text}, which is for metadata only")
     return ProtectionKind(text)
@@ -439,5 +439,5 @@ def _criteria(element: XmlElement) -> Criteria:
 def _partition(element: XmlElement) -> str:
     text = _text(element)
     if text is None and element.children:
-        raise UnreadableError("<partition> holds something else than text")
+        raise UnreadableError("<partition> holds something other than text")
     return text or ""

@@ -68,7 +68,7 @@ def _matcher(style: Style, expression: str) -> _Matcher | None:
 
 
 def _joined(segments: list[str]) -> str:
-    """Return the pattern of what stands between stars.
+    """Return the pattern for the segments between stars.
 
     Each segment matches a fixed number of characters, so the first place where one fits is as good
     as any later one: the atomic group keeps to it, or else many stars take exponential time.
@@ -89,8 +89,8 @@ def matches(style: Style, expression: str, name: str) -> bool:
 class ExpressionIndex:
     """Expressions in their order, asked which of them match a name.
 
-    Plain ones are looked up by the name, those with wildcards by what stands before the first
-    wildcard, so that thousands of them cost little more than one.
+    Plain ones are looked up by the name, wildcards by the text before the first wildcard,
+    so that thousands of them cost little more than one.
     """
 
     def __init__(self, style: Style, texts: Iterable[str], *, both_ways: bool = False) -> None:
@@ -240,7 +240,7 @@ def _whole_attributes(granted: str, certified: str) -> bool:
 
 
 def _stripped(name: str) -> list[str]:
-    # It stops at the first part that is empty: what stands behind two commas does not count.
+    # It stops at the first part that is empty: what follows two commas does not count.
     return [part.strip(" ") for part in takewhile(bool, name.split(","))]
 
 
@@ -276,7 +276,7 @@ def _types_and_values(name: str) -> list[tuple[str, str]]:
 
 
 def _outside_quotes(text: str, wanted: str) -> int:
-    """Return where a character stands first, not escaped and not in quotes; -1 if nowhere."""
+    """Return the index of the first such character outside of escapes and quotes, or -1."""
     index = 0
     while index < len(text):
         found = _UNQUOTED.match(text, index)
@@ -352,7 +352,7 @@ _FARTHEST = timedelta(hours=12)
 def read_moment(rule: Moments, text: str, zone: tzinfo) -> float | None:
     """Return the moment that ``text`` means; None if the vendor calls the document malformed.
 
-    ``zone`` is that of the host.  What Cyclone DDS cannot read is minus infinity: a grant that
+    ``zone`` is the host's time zone.  What Cyclone DDS cannot read is minus infinity: a grant that
     begins then has begun, one that ends then has ended.
     """
     match rule:
@@ -374,7 +374,7 @@ def _local(text: str, zone: tzinfo) -> float | None:
     year, month, day, hour, minute, second = (int(each or -1) for each in found.groups())
     if 0 in (month, day) or month > 12 or day > 31 or hour > 23 or minute > 59 or second > 60:
         return None
-    # A month or a day that is not there stays zero: January, and the last day of the month before.
+    # A month or a day that is missing stays zero: January, and the last day of the month before.
     days = timedelta(days=max(day, 0) - 1)
     time = timedelta(hours=max(hour, 0), minutes=max(minute, 0), seconds=max(second, 0))
     try:

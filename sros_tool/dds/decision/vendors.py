@@ -20,7 +20,7 @@ class Style(Enum):
 
 
 class Subjects(Enum):
-    """How the subject of a grant is compared with that of a certificate."""
+    """How the subject of a grant is compared with a certificate's subject."""
 
     EXACT = auto()
     """The same attributes in the same order; spaces around them do not count."""
@@ -29,7 +29,7 @@ class Subjects(Enum):
     ANY_ORDER = auto()
     """The same attributes in any order (Fast DDS 2.14)."""
     SUBSET = auto()
-    """What lies between ``, / |`` in the certificate's subject occurs in the grant's (Cyclone)."""
+    """Each part of the certificate's subject, split at ``, / |``, is in the grant's (Cyclone)."""
 
 
 class Moments(Enum):
@@ -97,7 +97,7 @@ class DocumentReader(Enum):
     """Which parser reads the documents (`sros_tool.dds.decision.documents`)."""
 
     STANDARD = auto()
-    """That of the schema."""
+    """The schema of the standard."""
     FAST = auto()
     """TinyXML-2 and Fast DDS."""
     CYCLONE = auto()
@@ -108,7 +108,7 @@ class DocumentReader(Enum):
 class VendorTraits:
     """All that is known of one vendor: its names, and its rules where vendors differ.
 
-    The rules are those of the standard unless another one is given.
+    A rule that is not given is the standard's.
     """
 
     title: str

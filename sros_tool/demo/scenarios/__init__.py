@@ -30,7 +30,7 @@ def choose_scenarios(names: Sequence[str]) -> tuple[Scenario, ...]:
     """Return the scenarios of those names or TOML files, in order; without any, the default.
 
     Raises:
-        UsageError: there is none of that name.
+        UsageError: no such name.
         DocumentError: a file is not understood.
     """
     if ALL in names:

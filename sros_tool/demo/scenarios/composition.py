@@ -26,7 +26,7 @@ _ROWS: tuple[Row, ...] = (
     Row(
         "listener of a container hears a talker",
         RowStatus.HEARD,
-        "the enclave of the container may subscribe the topic",
+        "the enclave of the container may subscribe to the topic",
         (_CONTAINER, _TALKER),
         (Claim(Relation.HEARS, "container", "talker"),),
         brief=True,
@@ -66,7 +66,7 @@ _ROWS: tuple[Row, ...] = (
     Row(
         "listener node with the rights of its container publishes",
         RowStatus.HEARD,
-        "DDS cannot tell the nodes of a process apart: they share the sum of their rights",
+        "DDS cannot distinguish the nodes of a process: they share the sum of their rights",
         (
             Party("listener node gone astray", Role.TALKER, Identity(OWN, "container")),
             _LISTENER,

@@ -125,7 +125,7 @@ ROWS: tuple[Row, ...] = (
     Row(
         "unsecured payload on the wire",
         RowStatus.READABLE,
-        "the text lies open in the packets",
+        "the text is readable in the packets",
         (_OPEN_TALKER, _OPEN_LISTENER),
         (Claim(Relation.READABLE, "unsecured talker"),),
         (_hears("unsecured listener", "unsecured talker"),),

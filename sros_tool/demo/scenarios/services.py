@@ -70,7 +70,7 @@ def _rows_of(kind: _Interface, both: str) -> tuple[Row, ...]:
         Row(
             f"unsecured client of a secured {kind.server}",
             RowStatus.NOT_ANSWERED,
-            "who cannot authenticate is not heard, and would get no answer",
+            "a node that cannot authenticate is not heard, and would get no answer",
             (open_client, server, client),
             (_is_answered(open_client, server, holds=False),),
             (_is_answered(client, server),),
@@ -78,7 +78,7 @@ def _rows_of(kind: _Interface, both: str) -> tuple[Row, ...]:
         Row(
             f"unsecured {kind.server} to a secured client",
             RowStatus.NOT_ANSWERED,
-            "a client asks nobody who cannot authenticate",
+            "a client asks no server that cannot authenticate",
             (open_server, client, open_client),
             (_is_answered(client, open_server, holds=False),),
             (_is_answered(open_client, open_server),),
@@ -108,7 +108,7 @@ def _refused(name: str, may: str, may_not: str, intruder: Party, rightful: Party
     return Row(
         name,
         RowStatus.REFUSED,
-        f"its permissions allow to {may}, not to {may_not}",
+        f"its permissions allow it to {may}, not to {may_not}",
         (intruder, rightful),
         (Claim(Relation.IS_REFUSED, intruder.name),),
         (Claim(Relation.STARTS, rightful.name),),
@@ -134,7 +134,7 @@ def _on_the_wire(expected: RowStatus, mechanism: str, *, secured: bool) -> Row:
 
 _SERVICE_ROWS: tuple[Row, ...] = (
     *_rows_of(_SERVICE, "one may send requests and receive replies, the other one the opposite"),
-    _on_the_wire(RowStatus.READABLE, "the text lies open in the packets", secured=False),
+    _on_the_wire(RowStatus.READABLE, "the text is readable in the packets", secured=False),
     _on_the_wire(
         RowStatus.NOT_READABLE, "requests and replies are encrypted like topics", secured=True
     ),

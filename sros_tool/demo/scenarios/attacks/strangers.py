@@ -67,7 +67,7 @@ ROWS: tuple[Row, ...] = (
     Row(
         "packets of a secured talker sent again",
         RowStatus.NOT_HEARD_AGAIN,
-        "each two peers agree on new keys, so that nobody's fit old packets",
+        "each two peers agree on new keys, so that no key fits old packets",
         (
             Party("talker", Role.TALKER, Identity(OWN, "talker")),
             Party("listener", Role.LISTENER, Identity(OWN, "listener")),
@@ -106,7 +106,7 @@ ROWS: tuple[Row, ...] = (
             brief=True,
             attack="what the handshake reveals",
             open_because="DDS Security 1.1 sends certificates and permissions unencrypted",
-            remedy="put no secrets into names, and keep strangers off the network",
+            remedy="do not put secrets into names, and keep strangers off the network",
         )
         for what, wire in (("topic names", Wire.TOPIC), ("certificates", Wire.CERTIFICATE))
     ),
@@ -114,7 +114,7 @@ ROWS: tuple[Row, ...] = (
         "an unsecured node listens",
         UNSECURED,
         RowStatus.NOT_HEARD,
-        "who cannot authenticate gets no keys, and is sent nothing",
+        "a node that cannot authenticate gets no keys, and is sent nothing",
         attack="an unsecured node listens",
     ),
     listening(
@@ -173,6 +173,6 @@ ROWS: tuple[Row, ...] = (
         "endpoints are announced to every authenticated participant",
         attack="an authenticated node looks around",
         open_because="DDS Security 1.1 does not hide endpoints from authenticated participants",
-        remedy="give an identity to nobody who must not know what there is",
+        remedy="give no identity to anybody who must not see what is on the robot",
     ),
 )

@@ -88,7 +88,7 @@ ROWS: tuple[Row, ...] = (
             RowStatus.HEARD,
             mechanism,
             attack="misspelt security variables",
-            open_because="rcl takes every other spelling for no, and a node says nothing about it",
+            open_because="rcl reads every other spelling as no, and a node says nothing about it",
             remedy="start nodes with `sros run`, which sets the variables; `sros doctor` finds"
             " misspelt ones",
         )
