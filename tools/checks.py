@@ -91,7 +91,7 @@ def _conclude(results: Mapping[str, int], counts: Counter[str], started: float) 
 
 
 def count(report: Path) -> Counter[str]:
-    """How many tests passed, failed and were skipped, as pytest's JUnit report tells."""
+    """Return how many tests passed, failed and were skipped, from pytest's JUnit report."""
     try:
         suites = ElementTree.parse(report).getroot().iter("testsuite")  # noqa: S314 - our own
     except (OSError, ElementTree.ParseError):

@@ -73,7 +73,7 @@ def main(arguments: list[str]) -> int:
 
 
 def set_up(needs: Needs, *, afresh: bool = False) -> None:
-    """Bring about what a command needs, where the last setup's record does not say it is there.
+    """Install what a command needs and the record of the last setup does not list.
 
     ``afresh`` asks pip and the system again whatever the record says.
     """

@@ -97,7 +97,7 @@ def holds(record: Record, now: Record, groups: list[str]) -> bool:
 
 
 def difference(record: Record, now: Record) -> str | None:
-    """Why an environment must be made anew; None where it can be built upon."""
+    """Return why an environment must be made again; None where it can be reused."""
     if record.checkout != now.checkout:
         return f"this checkout was moved here from {record.checkout}"
     if (record.base, record.version) != (now.base, now.version):

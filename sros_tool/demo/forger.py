@@ -255,7 +255,7 @@ def governance_of_another_ca(copy: KeystoreCopy) -> None:
 
 
 def weaker_governance(copy: KeystoreCopy) -> None:
-    """Give talker and listener a weak governance, signed by the CA, as it once was."""
+    """Give talker and listener a weak governance, signed earlier by the CA."""
     signed = copy.sign(_weak_governance(copy))
     for part in ("talker", "listener"):
         copy.put(part, GOVERNANCE_FILE, signed)

@@ -122,7 +122,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
 
 
 def _find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend:
-    """Try what is installed, in a keystore that is made for that and removed again."""
+    """Return a backend that works in a temporary keystore."""
     with TemporaryDirectory(dir=folder, prefix="probe-") as probed:
         domains = DomainSet.of((_DEFAULT_DOMAIN, _DEFAULT_DOMAIN))
         spec = KeystoreSpec(topic, domains, load_template(_DEFAULT_TEMPLATE), now)

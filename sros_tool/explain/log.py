@@ -74,7 +74,7 @@ def explain_log(
     context: Callable[[LoadedEnclave], JoinContext],
     root: str = "",
 ) -> tuple[LogFinding, ...]:
-    """Return what a log says of faults, in its order, each fault once; empty if it has none.
+    """Return the faults that a log reports, in its order, each once; empty if there are none.
 
     ``context`` says where and when an enclave joins, ``root`` names its keystore in commands.
     """

@@ -125,7 +125,7 @@ def _after_stars(reached: set[int], pieces: tuple[frozenset[str], ...]) -> set[i
 
 @lru_cache(maxsize=_MANY)
 def _pieces(expression: str) -> tuple[frozenset[str], ...]:
-    """An expression piece by piece: `ANY` for ``*``, else the characters that fit one place."""
+    """An expression piece by piece: `_ANY` for ``*``, else the characters that fit one place."""
     found: list[frozenset[str]] = []
     for piece in _PIECE.finditer(expression):
         negated, members, literal = piece.groups()
@@ -216,7 +216,7 @@ def _spelt(state: _State, before: dict[_State, tuple[_State, str] | None]) -> st
 
 def _representatives(patterns: list[_Pieces]) -> str:
     """Return one letter of each kind that the patterns, and the grammar of names, distinguish."""
-    special = {piece for pattern in patterns for piece in pattern if piece is not ANY}
+    special = {piece for pattern in patterns for piece in pattern if piece is not _ANY}
     kinds: dict[tuple[object, ...], str] = {}
     for letter in _LETTERS:
         kind = (letter == "/", letter in digits, *(letter in piece for piece in special))

@@ -26,7 +26,7 @@ def render_demo_page(result: Json) -> str:
 
 
 def without_folders(value: Any, folders: Sequence[str]) -> Any:
-    """Return a JSON value in whose texts "…" stands for these folders of the machine."""
+    """Return a JSON value with these folders of the machine replaced by "…" in its texts."""
     if isinstance(value, str):
         for folder in sorted(folders, key=len, reverse=True):
             value = value.replace(folder, "…") if len(folder) > 1 else value

@@ -436,7 +436,7 @@ def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
 
 
 def counted(number: int, thing: str) -> str:
-    """Return a number with its thing, as ``1 topic`` and ``2 topics``."""
+    """Return a number with its noun, as ``1 topic`` and ``2 topics``."""
     return f"{number} {thing}{'' if number == 1 else 's'}"
 
 

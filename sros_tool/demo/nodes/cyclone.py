@@ -64,7 +64,7 @@ class _Listener:
         self._heard = 0
 
     def step(self) -> None:
-        """Report what has come."""
+        """Report the received messages."""
         for text in self._reader.take():
             self._heard += 1
             self._events.report(EventKind.HEARD, text, count=self._heard)
