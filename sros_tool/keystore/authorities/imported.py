@@ -134,7 +134,7 @@ def _notes(
             "portable.ca-purpose",
             f"{fault}: Fast DDS 2.9.1 and Cyclone DDS 0.10.2 refuse every document that it signs "
             '("unsuitable certificate purpose"), and only Fast DDS 2.14 takes them. Issue its '
-            "certificate anew with keyUsage digitalSignature and without extendedKeyUsage, unless "
+            "certificate again with keyUsage digitalSignature and without extendedKeyUsage, unless "
             "all robots run Fast DDS 2.14.",
         )
     for each in chain:
