@@ -168,7 +168,7 @@ STOPPED_WHILE_IT_IS_MADE = """
 import sys
 from pathlib import Path
 from sros_tool.demo.nodes.options import NodeOptions
-from sros_tool.demo.nodes.ros import run_role
+from sros_tool.demo.nodes.ros import _run_role
 
 def build(node, options, events):
     import rclpy
@@ -176,7 +176,7 @@ def build(node, options, events):
         rclpy.try_shutdown()  # as the handler of a signal does
     raise RuntimeError("half made")
 
-sys.exit(run_role(build, NodeOptions("talker", report=Path(sys.argv[1])), []))
+sys.exit(_run_role(build, NodeOptions("talker", report=Path(sys.argv[1])), []))
 """
 
 

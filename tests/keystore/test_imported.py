@@ -198,5 +198,5 @@ def test_what_is_no_span(text: str) -> None:
 def test_a_span_that_is_over_makes_no_keystore(tmp_path: Path) -> None:
     ended = sros("create_keystore", tmp_path / "ks", "--validity", "2020-01-01")
     assert ended.status == 2
-    assert "ended at 2020-01-01" in ended.err
+    assert "expired at 2020-01-01" in ended.err
     assert list(tmp_path.iterdir()) == []

@@ -284,7 +284,7 @@ BAD_REQUESTS: dict[str, tuple[Callable[[], bytes], str]] = {
     "nothing": (lambda: b"", "cannot be read"),
     "garbage": (lambda: os.urandom(500), "cannot be read"),
     "too much": (lambda: make_request(generate_key(), NAME) + b"x" * 70000, "cannot be read"),
-    "a key that was not signed with": (with_another_key, "does not hold"),
+    "a key that was not signed with": (with_another_key, "is not valid"),
     "P-384": (
         lambda: request_with(ec.generate_private_key(ec.SECP384R1())),
         "key of EC secp384r1",
