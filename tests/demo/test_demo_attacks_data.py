@@ -91,7 +91,7 @@ def test_every_forgery_is_used_and_has_a_folder_of_its_own() -> None:
     assert len(public_functions("copy")) > 25
     assert names - {"_unchanged"} == public_functions("copy")
     templates = {each.template.__name__ for each in undefended}
-    assert templates == public_functions("template")
+    assert templates - {"_same_template"} == public_functions("template")
     folders = [name_of(each) for each in forged]  # type: ignore[arg-type]
     assert len(folders) == len(set(folders)) == len(forged) > 40
 
