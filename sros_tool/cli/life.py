@@ -446,7 +446,7 @@ def _show_status(status: RotationStatus, as_json: bool) -> None:
                 "authorities": [
                     {
                         "roles": list(each.roles),
-                        "standing": each.standing,
+                        "standing": each.state,
                         "subject": each.subject,
                         "serial": each.serial,
                         "not_before": iso(each.validity.not_before),
@@ -466,7 +466,7 @@ def _show_status(status: RotationStatus, as_json: bool) -> None:
         if each.validity.not_after < now():
             end = f"ENDED {iso(each.validity.not_after)}"
         click.echo(
-            f"  {name:14} {each.standing:7} {each.enclaves} of {status.enclaves} enclaves  {end}"
+            f"  {name:14} {each.state:7} {each.enclaves} of {status.enclaves} enclaves  {end}"
             f"  {each.subject}"
         )
     for remark in status.remarks:

@@ -16,7 +16,7 @@ from sros_tool.pki.keys import PrivateKey, PublicKey
 from sros_tool.validity import Window
 
 _CA_USAGE = x509.KeyUsage(
-    digital_signature=True,  # it signs governance and permissions documents too
+    digital_signature=True,  # it also signs governance and permissions documents
     content_commitment=False,
     key_encipherment=False,
     data_encipherment=False,
@@ -38,7 +38,7 @@ _LEAF_USAGE = x509.KeyUsage(
     decipher_only=False,
 )
 UNREADABLE = (ValueError, UnsupportedAlgorithm, x509.DuplicateExtension, x509.InvalidVersion)
-"""What `cryptography` raises for a certificate that is damaged or of an unknown kind."""
+"""The exceptions of `cryptography` for a certificate that is damaged or of an unknown kind."""
 
 _SHORT_NAMES = {
     oid.dotted_string: name
@@ -90,12 +90,11 @@ def common_name(text: str) -> x509.Name:
 
 
 def enclave_subject(name: str, *, unique: bool) -> x509.Name:
-    """The subject of an enclave's certificate: its name, and optionally a unique part.
+    """Return the subject of an enclave's certificate: its name, and optionally a unique part.
 
-    With the unique part, no other permissions fit: neither of an enclave whose
-    name contains this one's (Cyclone DDS compares parts), nor of an earlier certificate.
-    RFC 4514 text of this order of parts, CN first, is what Fast DDS 2.9.1 and Cyclone DDS 0.10.2
-    both compare with.
+    With the unique part, no other permissions match: neither those of an enclave whose name
+    contains this name (Cyclone DDS compares parts), nor those of an earlier certificate.  The RFC
+    4514 text has the CN first, as Fast DDS 2.9.1 and Cyclone DDS 0.10.2 both compare it.
     """
     if not unique:
         return common_name(name)
@@ -106,8 +105,8 @@ def enclave_subject(name: str, *, unique: bool) -> x509.Name:
 def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certificate:
     """Return a self-signed certificate authority.
 
-    It carries BasicConstraints, KeyUsage and both key identifiers, without which OpenSSL's
-    strict check (``-x509_strict``, used by Fast DDS) refuses chains.
+    It has BasicConstraints, KeyUsage and both key identifiers: without them OpenSSL's strict check
+    (``-x509_strict``, used by Fast DDS) refuses chains.
     """
     public = key.public_key()
     identifier = x509.SubjectKeyIdentifier.from_public_key(public)
@@ -125,7 +124,7 @@ def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certifi
 
 
 class Issuer:
-    """Issues the certificates of enclaves in the name of one identity CA."""
+    """Issuer of enclaves' certificates for one identity CA."""
 
     def __init__(self, certificate: x509.Certificate, key: PrivateKey) -> None:
         self._certificate = certificate
@@ -147,7 +146,7 @@ class Issuer:
 
 
 def authority_identifier(certificate: x509.Certificate) -> x509.AuthorityKeyIdentifier:
-    """Return the AuthorityKeyIdentifier for what ``certificate`` signs."""
+    """Return the AuthorityKeyIdentifier for certificates that ``certificate`` signs."""
     try:
         extension = certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
     except x509.ExtensionNotFound:  # a CA made by ros2/sros2 has none
@@ -192,7 +191,7 @@ def load_certificate(data: bytes, name: str) -> x509.Certificate:
 
 
 def load_certificates(data: bytes, name: str) -> tuple[x509.Certificate, ...]:
-    """Return all certificates of a PEM file, one at least; ``name`` stands for it in errors."""
+    """Return all certificates of a PEM file, at least one; ``name`` stands for it in errors."""
     first = load_certificate(data, name)
     try:
         others = [read_in_full(each) for each in x509.load_pem_x509_certificates(data)[1:]]
@@ -204,10 +203,10 @@ def load_certificates(data: bytes, name: str) -> tuple[x509.Certificate, ...]:
 
 
 def read_in_full(certificate: x509.Certificate) -> x509.Certificate:
-    """Return ``certificate`` after reading once every part of it that sros uses.
+    """Return ``certificate`` after reading every part of it that sros uses.
 
-    `cryptography` reads a certificate's parts when they are asked for, so damage would otherwise
-    show at any later place.  Raises one of `UNREADABLE`.
+    `cryptography` parses a part on first use, so a damaged part would otherwise fail anywhere
+    later.  Raises one of `UNREADABLE`.
     """
     for name in (certificate.subject, certificate.issuer):
         name.rfc4514_string()
@@ -224,7 +223,7 @@ def same_key(certificate: x509.Certificate, key: PrivateKey) -> bool:
 
 
 def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
-    """Whether ``authority`` issued and signed ``certificate`` (names and signature, not time)."""
+    """Return whether ``authority`` issued and signed ``certificate``, at whatever time."""
     try:
         certificate.verify_directly_issued_by(authority)
     except (InvalidSignature, ValueError, TypeError):
@@ -238,7 +237,7 @@ def digest(certificate: x509.Certificate) -> str:
 
 
 def subject_text(name: x509.Name) -> str:
-    """Return a distinguished name as OpenSSL prints it by RFC 2253, and vendors compare it.
+    """Return a distinguished name as OpenSSL prints it by RFC 2253; vendors compare this text.
 
     The most general attribute comes last, also within one RDN; non-ASCII
     characters are kept.
@@ -260,7 +259,7 @@ def _attribute_text(attribute: x509.NameAttribute[str | bytes]) -> str:
 
 
 def subject_of(text: str) -> x509.Name:
-    """Return the distinguished name that `subject_text` prints so.  Raises `ValueError`."""
+    """Return the distinguished name of a text from `subject_text`.  Raises `ValueError`."""
     return x509.Name.from_rfc4514_string(text, _OIDS)
 
 
@@ -271,5 +270,5 @@ def common_name_of(name: x509.Name) -> str:
 
 
 def fingerprints(pem: bytes) -> frozenset[str]:
-    """Return the SHA-256 of every certificate of a CA file: more than one while it is rotated."""
+    """Return the SHA-256 of every certificate of a CA file; during a rotation it has several."""
     return frozenset(map(digest, load_certificates(pem, "the certificate of a CA")))

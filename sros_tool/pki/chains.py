@@ -15,7 +15,7 @@ from sros_tool.validity import iso
 
 Extension = TypeVar("Extension", bound=x509.ExtensionType)
 
-_issued_by = lru_cache(maxsize=256)(issued_by)  # the CAs of a keystore come up again and again
+_issued_by = lru_cache(maxsize=256)(issued_by)  # the same few CAs are asked about repeatedly
 
 
 def chain_fault(
@@ -29,8 +29,8 @@ def chain_fault(
 ) -> str:
     """Return why ``start`` has no valid chain to a self-signed one of ``authorities``, or "".
 
-    ``others`` are possible intermediate certificates.  ``for_documents`` asks for the purpose of
-    S/MIME, ``strict`` for what RFC 5280 asks of chains (OpenSSL's ``X509_V_FLAG_X509_STRICT``, with
+    ``others`` are possible intermediate certificates.  ``for_documents`` checks the purpose S/MIME,
+    ``strict`` the rules of RFC 5280 for chains (OpenSSL's ``X509_V_FLAG_X509_STRICT`` with
     ``X509_V_FLAG_CHECK_SS_SIGNATURE``).
     """
     chain = [start]
@@ -39,7 +39,7 @@ def chain_fault(
         if issuer is None or issuer in chain:
             return f"the issuer {subject_text(chain[-1].issuer)} is not among what is trusted"
         chain.append(issuer)
-    # Of several with the same name and key only the first is looked at.
+    # Of several with the same name and key, OpenSSL tries only the first.
     root = next((each for each in authorities if _issued_by(chain[-1], each)), None)
     if root != chain[-1]:
         return f"the self-signed {subject_text(chain[-1].subject)} is not among what is trusted"

@@ -15,14 +15,14 @@ from sros_tool.pki.certificates import authority_identifier
 from sros_tool.pki.keys import PrivateKey
 
 CRL_MARK = b"-----BEGIN X509 CRL-----"
-"""What a PEM revocation list begins with."""
+"""The first line of a PEM revocation list."""
 REASONS = tuple(
     flag.value
     for flag in x509.ReasonFlags
     # Not reasons of a whole certificate: remove_from_crl belongs to delta lists.
     if flag not in (x509.ReasonFlags.remove_from_crl,)
 )
-"""The reasons that a revocation can have, in the words of RFC 5280."""
+"""The reasons for a revocation, in the words of RFC 5280."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +36,7 @@ class Revoked:
 
 @dataclass(frozen=True, slots=True)
 class RevocationList:
-    """A revocation list as it was read."""
+    """A parsed revocation list."""
 
     number: int
     this_update: datetime
@@ -45,7 +45,7 @@ class RevocationList:
     list: x509.CertificateRevocationList
 
     def names(self, serial: int) -> bool:
-        """Return whether the certificate of that serial number is revoked."""
+        """Return whether the certificate with that serial number is revoked."""
         return any(each.serial == serial for each in self.revoked)
 
 

@@ -1,7 +1,7 @@
-"""Just enough of DER (X.690) to walk through a CMS signature.
+"""A minimal DER (X.690) reader for CMS signatures.
 
-`cryptography` makes CMS signatures but cannot yet verify them; this reader finds the parts that
-its verification primitives are then given.
+`cryptography` makes CMS signatures but cannot yet verify them; this reader finds the parts to pass
+to its verification primitives.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Value(NamedTuple):
 def children(data: bytes) -> list[Value]:
     """Return the values in ``data`` (the content of a constructed value).
 
-    Raises `PkiError` where a value is cut short, or not valid DER.
+    Raises `PkiError` if a value is cut short, or is not valid DER.
     """
     values = []
     position, end = 0, len(data)
@@ -61,7 +61,7 @@ def first(data: bytes) -> Value:
 
 
 def encode_oid(dotted: str) -> bytes:
-    """Return the content of an object identifier, from its dotted form."""
+    """Return the DER content of an object identifier in dotted form."""
     one, two, *rest = map(int, dotted.split("."))
     content = bytearray([40 * one + two])
     for number in rest:

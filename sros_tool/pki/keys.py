@@ -21,9 +21,9 @@ def generate_key() -> ec.EllipticCurvePrivateKey:
 
 
 def key_pem(key: PrivateKey, passphrase: str | None = None) -> bytes:
-    """Return the key as PKCS#8 PEM, encrypted where a passphrase is given.
+    """Return the key as PKCS#8 PEM, encrypted if a passphrase is given.
 
-    Enclave keys are never encrypted: no RMW can give a password.
+    Enclave keys are never encrypted: no RMW can supply a passphrase.
     """
     protection: serialization.KeySerializationEncryption = serialization.NoEncryption()
     if passphrase:
@@ -36,7 +36,7 @@ def key_pem(key: PrivateKey, passphrase: str | None = None) -> bytes:
 def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None) -> PrivateKey:
     """Read a PEM private key; ``name`` stands for it in errors.
 
-    ``passphrase`` is asked where the key is encrypted; without it such a key is refused.
+    ``passphrase`` is called if the key is encrypted; without it an encrypted key is refused.
     """
     try:
         key = serialization.load_pem_private_key(pem, None)

@@ -15,7 +15,7 @@ from sros_tool.pki.certificates import common_name, common_name_of, subject_text
 from sros_tool.pki.keys import PrivateKey, PublicKey, algorithm
 
 _MAX_BYTES = 64 * 1024
-"""Largest request that is read."""
+"""Largest request that is read, in bytes."""
 _DIGESTS = (hashes.SHA256, hashes.SHA384, hashes.SHA512)
 
 
@@ -37,8 +37,8 @@ def make_request(key: PrivateKey, name: str) -> bytes:
 def load_request(data: bytes, what: str) -> SigningRequest:
     """Read a PEM request and verify that its sender has the key; ``what`` stands for it in errors.
 
-    The keys are those that every DDS vendor takes: EC prime256v1 and RSA 2048.  Extensions that a
-    request asks for have no effect: the keystore decides what a certificate says.
+    Only keys that every DDS vendor accepts are allowed: EC prime256v1 and RSA 2048.  Extensions in
+    a request have no effect: the keystore decides the content of a certificate.
     """
     try:
         if len(data) > _MAX_BYTES:

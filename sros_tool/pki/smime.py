@@ -1,9 +1,9 @@
 """Signed documents (``.p7s``): S/MIME multipart/signed with a detached CMS signature.
 
-The form that every DDS vendor reads: CRLF line ends, a first part whose header
-``Content-Type: text/plain`` is part of what is signed, SHA-256, the signer's certificate embedded
-(DDS-Security 1.1, 9.4.1.1; OpenSSL ``smime -sign -text``).  Opaque messages, which contain what
-they sign, are read as well, as every vendor accepts them (``-nodetach``).
+Every DDS vendor reads this form: CRLF line ends, a first part whose header
+``Content-Type: text/plain`` is signed with it, SHA-256, the signer's certificate embedded
+(DDS-Security 1.1, 9.4.1.1; OpenSSL ``smime -sign -text``).  Opaque messages, which hold the content
+inside of the signature, are read as well, as every vendor accepts them (``-nodetach``).
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> byt
 class SignedDocument:
     """A parsed ``.p7s``; nothing in it is trusted before `verify`.
 
-    ``content`` is what was signed, with CRLF line ends and its MIME header; ``document`` the same
-    without the header; ``certificates`` those embedded in the signature.
+    ``content`` are the signed bytes, with CRLF line ends and the MIME header; ``document`` is the
+    same without the header; ``certificates`` are the ones embedded in the signature.
     """
 
     content: bytes
@@ -95,11 +95,11 @@ class SignedDocument:
     _issuer_and_serial: tuple[bytes, int]
 
     def signer(self) -> x509.Certificate | None:
-        """Return the certificate that the signature names, if it is embedded."""
+        """Return the signer's certificate, if it is embedded."""
         return self.signer_among(self.certificates)
 
     def signer_among(self, certificates: Iterable[x509.Certificate]) -> x509.Certificate | None:
-        """Return the certificate that the signature names, by its issuer and serial number."""
+        """Return the signer's certificate, found by its issuer and serial number."""
         issuer, serial = self._issuer_and_serial
         for certificate in certificates:
             if certificate.serial_number == serial and certificate.issuer.public_bytes() == issuer:
@@ -107,7 +107,7 @@ class SignedDocument:
         return None
 
     def verify(self, authority: x509.Certificate) -> None:
-        """Check that ``authority`` itself signed this document; else raise `PkiError`.
+        """Check that ``authority`` itself signed this document; raise `PkiError` if not.
 
         Stricter than Cyclone DDS 0.10.2 and Fast DDS 2.9.1, which accept any signer whose chain
         leads to the authority (the CVE-2023-24011 class; both ran).
@@ -130,7 +130,7 @@ class SignedDocument:
             )
 
     def carries_digest(self) -> bool:
-        """Whether what was signed is this content, by the digest among the signed attributes."""
+        """Return whether the digest in the signed attributes is the digest of this content."""
         digest = hashes.Hash(self._digest_algorithm)
         digest.update(self.content)
         return digest.finalize() == self._message_digest
@@ -153,7 +153,7 @@ class SignedDocument:
         return True
 
 
-@lru_cache(maxsize=8)  # one document is asked about from several sides, one after the other
+@lru_cache(maxsize=8)  # several callers parse the same document, one after the other
 def parse(message: bytes) -> SignedDocument:
     """Parse a ``.p7s``. Raises `PkiError` if it is not an S/MIME signed message."""
     content, signature = _split(message)
@@ -177,7 +177,7 @@ def _document(content: bytes) -> bytes:
 def _split(message: bytes) -> tuple[bytes | None, bytes]:
     """Return the signed part, with CRLF line ends, and the DER of its signature.
 
-    An opaque message has no signed part of its own: it is in its signature.
+    An opaque message holds the signed part inside of the signature.
     """
     head, _, body = message.replace(b"\r\n", b"\n").partition(b"\n\n")
     if _OPAQUE.search(head):
@@ -257,7 +257,7 @@ def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
         raise ValueError("unknown digest, or no signers")
     attributes, message_digest = b"", b""
     if info[3].tag == der.CONTEXT_0:
-        # What is signed is the attributes as a SET, not with the tag that they carry inside.
+        # The signature covers the attributes with the tag SET, not with their tag in SignerInfo.
         attributes = b"\x31" + info[3].whole[1:]
         message_digest = _message_digest(info[3].content)
     signature_algorithm, signature_value = info[4:6] if attributes else info[3:5]

@@ -1,4 +1,4 @@
-"""Keys on PKCS#11 tokens, named by URI (RFC 7512): they sign there and never leave it."""
+"""Keys on PKCS#11 tokens, named by URI (RFC 7512): the token signs, and the key never leaves it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sros_tool.errors import PkiError, UnavailableError, UsageError
 SCHEME = "pkcs11:"
 _MODULE_VARIABLE = "PKCS11_MODULE_PATH"
 Secrets = Callable[[str], str]
-"""Returns the secret for the named thing; asked at most once for each."""
+"""Function that returns the secret for the named thing; called at most once for each."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,15 +100,15 @@ class TokenKey(ec.EllipticCurvePrivateKey):
         )
 
     def exchange(self, algorithm: ec.ECDH, peer_public_key: ec.EllipticCurvePublicKey) -> bytes:
-        """Raise `PkiError`: this key only signs."""
+        """Raise `PkiError`: this key can only sign."""
         raise PkiError("a key on a token cannot be used for key agreement")
 
     def private_numbers(self) -> ec.EllipticCurvePrivateNumbers:
-        """Never leave the token."""
+        """Raise `PkiError`: the key never leaves the token."""
         raise PkiError("a key on a token cannot be read")
 
     def private_bytes(self, *_args: Any, **_options: Any) -> bytes:
-        """Never leave the token."""
+        """Raise `PkiError`: the key never leaves the token."""
         raise PkiError("a key on a token cannot be read")
 
     def __copy__(self) -> TokenKey:
@@ -132,12 +132,12 @@ def holds_token_key(uri: str, secrets: Secrets) -> bool:
 
 
 def open_token_key(uri: str, secrets: Secrets) -> TokenKey:
-    """Return the key that ``uri`` names; `PkiError` if the token has none."""
+    """Return the key that ``uri`` names; raise `PkiError` if the token has none."""
     return _open(uri, secrets, create=False)
 
 
 def create_token_key(uri: str, secrets: Secrets) -> TokenKey:
-    """Return a new key pair on the token; `PkiError` if there is one of that name already."""
+    """Return a new key pair on the token; raise `PkiError` if its name is in use."""
     return _open(uri, secrets, create=True)
 
 
@@ -168,7 +168,7 @@ def _open(uri: str, secrets: Secrets, *, create: bool) -> TokenKey:
 
 
 def _need_package() -> None:
-    """Raise `UnavailableError` where the Python package for tokens is not installed."""
+    """Raise `UnavailableError` if the Python package for tokens is not installed."""
     if importlib.util.find_spec("pkcs11") is None:
         raise UnavailableError(
             "keys on PKCS#11 tokens need the Python package python-pkcs11",
@@ -185,7 +185,7 @@ def _unusable(parsed: TokenUri, error: Exception) -> PkiError:
     )
 
 
-# A process logs into a token once, whichever of its keys are used.
+# A process logs into a token once, for all of its keys.
 _sessions: dict[tuple[str, str], tuple[Any, bool]] = {}
 
 

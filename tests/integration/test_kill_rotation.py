@@ -57,9 +57,7 @@ def see(root: Path) -> State:
         # One that is on its way out may be a broken link for a moment.
         assert not path.exists() or path.stat().st_mode & 0o777 == 0o600, path
     lists = tuple(len(each.revoked) for each in read_lists(root))
-    on = tuple(
-        (each.standing, each.enclaves) for each in rotation_status(root, now=LATER).authorities
-    )
+    on = tuple((each.state, each.enclaves) for each in rotation_status(root, now=LATER).authorities)
     return tuple(names), str(read_rotation(root).stage), on, lists
 
 

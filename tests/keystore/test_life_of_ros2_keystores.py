@@ -102,7 +102,7 @@ def test_rotating_with_a_revocation_in_every_stage(root: Path) -> None:
         sros("revoke", root, f"/new{number}").ok()
         check(root, *names)
     (state,) = rotation_status(root, now=NOW).authorities
-    assert state.standing == "issuing"
+    assert state.state == "issuing"
     assert state.serial != f"{old.serial_number:x}"
     assert len(list((root / "public").glob("*_ca.cert.pem"))) == 2
     assert all(path.is_symlink() for path in (root / "public").glob("*_ca.cert.pem"))

@@ -84,7 +84,7 @@ def openssl(*words: object) -> None:
 
 def states(root: Path) -> list[tuple[str, str, int]]:
     found = rotation_status(root, now=NOW).authorities
-    return [(each.roles[0], each.standing, each.enclaves) for each in found]
+    return [(each.roles[0], each.state, each.enclaves) for each in found]
 
 
 # ── the stages ─────────────────────────────────────────────────────────────────────────────

@@ -1,8 +1,8 @@
 """The access control of one vendor: who may join, publish and subscribe under two documents.
 
 A decision chooses the grant of the subject (`_choose_grant`), takes its rules for the domain
-(`_rules_for`), asks them for a topic (`GrantRules`), and combines them with what the governance
-controls (`_GovernedDomain`, `_decide_join`, `Access`).
+(`_rules_for`), applies them to a topic (`_GrantRules`), and combines the result with the access
+control that the governance asks for (`_GovernedDomain`, `_decide_join`, `Access`).
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def _choose_grant(
 def _state(
     traits: VendorTraits, index: int, grant: Grant, now: float, zone: tzinfo
 ) -> Refusal | None:
-    """Return why the grant does not hold now, if so."""
+    """Return why the grant does not hold now; None if it holds."""
     begin = read_moment(traits.moments, grant.not_before, zone)
     end = read_moment(traits.moments, grant.not_after, zone)
     name = f"grant {grant.name!r}" if grant.name else f"grant {index + 1}"
@@ -108,7 +108,7 @@ NumberedRule = tuple[int, Rule]
 
 @dataclass(frozen=True, slots=True)
 class RuleVerdict:
-    """What the rules say: ALLOWED, DENIED or CRASHES, why, by which rule and expression."""
+    """The verdict of the rules: ALLOWED, DENIED or CRASHES, why, by which rule and expression."""
 
     outcome: Outcome
     reason: str
@@ -123,7 +123,7 @@ class RuleVerdict:
 
 @dataclass(frozen=True, slots=True)
 class _Entry:
-    """One ``<topic>`` of a rule; ``partitions`` are those that the vendor weighs with it."""
+    """One ``<topic>`` of a rule, with the ``partitions`` that the vendor compares for it."""
 
     criteria: int
     rule: int
@@ -144,7 +144,7 @@ class _Entry:
 def _rules_for(
     traits: VendorTraits, grant: Grant, domain: int
 ) -> tuple[list[NumberedRule], RuleVerdict]:
-    """Return the rules of the grant for ``domain``, and the verdict where none of them matches."""
+    """Return the rules of the grant for ``domain``, and the verdict if none of them matches."""
     found: list[NumberedRule] = []
     for index, rule in enumerate(grant.rules):
         holds = holds_for(traits.open_range, rule.domains, domain)
@@ -166,7 +166,7 @@ def _default_verdict(traits: VendorTraits, grant: Grant) -> RuleVerdict:
 
 
 class _GrantRules:
-    """Rules in their order, for one verb, or for both where only the topic is asked for."""
+    """The rules of a grant in their order, for one verb, or for both to ask about a topic only."""
 
     def __init__(
         self,
@@ -175,7 +175,7 @@ class _GrantRules:
         otherwise: RuleVerdict,
         *verbs: str,
     ) -> None:
-        """``otherwise`` is the verdict where no rule matches."""
+        """Prepare the rules for questions; ``otherwise`` is the verdict if no rule matches."""
         self._traits = traits
         self._otherwise = otherwise
         self._entries: list[_Entry] = []
@@ -185,7 +185,7 @@ class _GrantRules:
         ):
             for each in criteria:
                 count += 1
-                # Fast DDS weighs the partitions of all criteria of a verb in a rule together.
+                # Fast DDS joins the partitions of all criteria of a verb in a rule.
                 weighed = _partitions(traits, rule, criteria if traits.topic_decides else (each,))
                 self._entries += [
                     _Entry(count, index, rule.allow, _trimmed(traits, expression), weighed)
@@ -202,7 +202,7 @@ class _GrantRules:
         for position in self._topics.matching(topic):
             entry = self._entries[position]
             if entry.criteria == passed:
-                continue  # the first topic of some criteria that matches is the only one looked at
+                continue  # of some criteria, only the first topic that matches counts
             passed = entry.criteria
             fits = self._fits(entry, wanted)
             if fits or self._traits.topic_decides or not entry.expression:
@@ -210,7 +210,7 @@ class _GrantRules:
         return self._otherwise
 
     def ask_topic(self, topic: str) -> RuleVerdict:
-        """Return the verdict on a topic in itself, whatever the partitions."""
+        """Return the verdict on a topic, whatever the partitions."""
         position = self._topics.first(topic)
         if position is None:
             return self._otherwise
@@ -232,20 +232,20 @@ def _named(style: Style, expressions: tuple[str, ...], partition: str) -> bool:
 
 
 def _usable_expression(traits: VendorTraits, text: str) -> str:
-    """Return an expression that matches every name, for one over which the vendor crashes."""
+    """Replace an expression that crashes the vendor by one that matches every name."""
     text = _trimmed(traits, text)
     return text or "*" if traits.crashes_on_empty_texts else text
 
 
 def _trimmed(traits: VendorTraits, text: str) -> str:
-    """Return the text as the vendor takes it from its element."""
+    """Return the text of an element, stripped if the vendor strips it."""
     return text.strip(" \t\v\r\n") if traits.trims_texts else text
 
 
 def _partitions(
     traits: VendorTraits, rule: Rule, criteria: tuple[Criteria, ...]
 ) -> tuple[str, ...]:
-    """Return the partitions that ``criteria`` of ``rule`` name, or the ones a vendor implies."""
+    """Return the partitions that ``criteria`` name, or the ones that the vendor implies."""
     everywhere = not rule.allow and traits.deny_partitions is DenyPartitions.ANY_OR_ALL
     implied = ("*",) if everywhere else _DEFAULT_PARTITION
     if implied is _DEFAULT_PARTITION and not any(each.partitions for each in criteria):
@@ -255,7 +255,7 @@ def _partitions(
 
 
 class _GovernedDomain:
-    """The first domain rule that lists the domain (``rule``, None without one), and its topics."""
+    """The first domain rule that lists the domain (``rule``, or None), and its topic rules."""
 
     def __init__(self, traits: VendorTraits, governance: Governance, domain: int) -> None:
         self.rule: DomainRule | None = None
@@ -284,9 +284,9 @@ class _GovernedDomain:
 
 
 def _verdict_text(verdict: RuleVerdict, asked: str, domain: int, *, by_peers: bool = False) -> str:
-    """Return what ``verdict`` says about ``asked`` (``publish rt/a``), as a clause.
+    """Return ``verdict`` on ``asked`` (``publish rt/a``) as a clause.
 
-    ``by_peers`` says that the own participant lets it pass and its peers do not.
+    ``by_peers`` means that the own participant allows it and its peers do not.
     """
     rule = "" if verdict.rule is None else f"rule {verdict.rule + 1}"
     peers = f" for domain {domain}, and peers keep to that" if by_peers else ""
@@ -312,7 +312,7 @@ def _verdict_text(verdict: RuleVerdict, asked: str, domain: int, *, by_peers: bo
 
 @dataclass(frozen=True, slots=True)
 class _Joining:
-    """The outcome, why, and a clause that says so."""
+    """The outcome of joining, its reason, and a clause for people."""
 
     outcome: Outcome
     reason: str
@@ -327,7 +327,7 @@ def _decide_join(
     otherwise: RuleVerdict,
     domain: int,
 ) -> _Joining:
-    """Decide about joining; ``rules`` hold for ``domain``, else ``otherwise`` is the verdict."""
+    """Return whether the participant may join; without matching ``rules``, ``otherwise`` counts."""
     where = f"domain {domain}"
     if traits.always_needs_allow_rule and not any(rule.allow for rule in grant.rules):
         text = "the grant has no allow rule, so nothing starts"
@@ -364,9 +364,9 @@ _ENDPOINTS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 
 
 class Access:
-    """The decisions of one vendor; prepared once, asked often.
+    """The access control of one vendor; prepared once, asked often.
 
-    A peer is taken to have the same governance, clock and zone, and every right of its own.
+    A peer is assumed to have the same governance, clock and zone, and every right.
     """
 
     def __init__(
@@ -382,7 +382,7 @@ class Access:
     ) -> None:
         """Prepare the answers for ``subject`` (RFC 4514) on ``domain`` at the aware moment ``at``.
 
-        ``zone`` is the host's time zone.  No error is raised: what is wrong is answered.
+        ``zone`` is the host's time zone.  Nothing is raised: the answers report every fault.
         """
         self._traits = vendor.traits
         self._domain = domain
@@ -407,7 +407,7 @@ class Access:
         at: datetime,
         zone: tzinfo = UTC,
     ) -> Access | Refusal:
-        """Return the access under two documents as ``vendor`` reads them, or its refusal."""
+        """Return the access control by two documents as ``vendor`` reads them, or its refusal."""
         governance = read_governance_as(vendor, governance_xml)
         if isinstance(governance, Refusal):
             return governance
@@ -423,15 +423,15 @@ class Access:
         return self.join() if verb is AccessVerb.JOIN else self._endpoint(verb, topic, partitions)
 
     def join(self) -> Decision:
-        """Return whether the participant starts, and peers talk to it."""
+        """Return the decision whether the participant starts and peers talk to it."""
         return self._join
 
     def publish(self, topic: str, partitions: tuple[str, ...] = ()) -> Decision:
-        """Whether a writer of ``topic`` can be created and heard (no partitions: the default)."""
+        """Return the decision whether a writer of ``topic`` can be created and heard."""
         return self._endpoint(AccessVerb.PUBLISH, topic, partitions)
 
     def subscribe(self, topic: str, partitions: tuple[str, ...] = ()) -> Decision:
-        """Return whether a reader of ``topic`` can be created and hears."""
+        """Return the decision whether a reader of ``topic`` can be created and hears."""
         return self._endpoint(AccessVerb.SUBSCRIBE, topic, partitions)
 
     def _prepare(self, grant: Grant) -> None:
@@ -506,7 +506,7 @@ class Access:
         return self._verdict(verdict, asked, rule)
 
     def _in_the_open(self, rule: TopicRule) -> bool:
-        """Return whether even participants that refuse each other exchange the topic."""
+        """Return whether participants exchange the topic although they refuse each other."""
         domain = self._governed.rule
         return (
             self._traits.shares_open_topics
@@ -559,5 +559,5 @@ class Access:
 
 
 def _is_topic_name(name: str) -> bool:
-    """Whether Cyclone DDS 0.10 accepts it: letters, digits, ``_`` and ``/``, no digit first."""
+    """Return whether Cyclone DDS 0.10 accepts it: letters, digits, ``_``, ``/``; no digit first."""
     return bool(_TOPIC_NAME.match(name))

@@ -9,7 +9,7 @@ from sros_tool.dds.governance import TopicRule
 
 
 class AccessVerb(StrEnum):
-    """What an identity wants to do."""
+    """An action that an identity asks for."""
 
     JOIN = "join"
     PUBLISH = "publish"
@@ -17,7 +17,7 @@ class AccessVerb(StrEnum):
 
 
 class Outcome(StrEnum):
-    """What happens to a participant or endpoint."""
+    """The outcome for a participant or endpoint."""
 
     ALLOWED = "allowed"
     DENIED = "denied"
@@ -40,8 +40,8 @@ class Decision:
     """An outcome and what decided it.
 
     ``reason`` is a stable word for programs (one of `REASONS`), ``text`` a sentence for people.
-    ``grant`` is an index in the permissions, ``rule`` one in the grant, ``expression`` the
-    ``<topic>`` that matched, ``topic_rule`` what the governance says of the topic.
+    ``grant`` is an index in the permissions, ``rule`` an index in the grant, ``expression`` the
+    ``<topic>`` that matched, ``topic_rule`` the rule of the governance for the topic.
     """
 
     outcome: Outcome
@@ -79,7 +79,7 @@ _REASONS = {
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a vendor does not accept a document; ``outcome`` is REFUSED or CRASHES."""
+    """The reason why a vendor does not accept a document; ``outcome`` is REFUSED or CRASHES."""
 
     reason: str
     text: str

@@ -1,11 +1,11 @@
 """Governance and permissions as Cyclone DDS 0.10 reads them, with its own XML parser.
 
-In its XML (ddsrt/src/xmlparser.c) names are of ASCII letters, digits, ``_ - :``; comments,
-processing instructions and ``<!...>`` are passed over between any two tokens; an element holds
-either elements or one text.
+In its XML (ddsrt/src/xmlparser.c) names consist of ASCII letters, digits, ``_ - :``; comments,
+processing instructions and ``<!...>`` are skipped between any two tokens; an element holds either
+elements or one text.
 
-Tags may be written in capitals, come in any order, and the last of several counts; blanks around
-texts do not.  Any element or attribute that it does not know makes the document malformed.
+Capitals in tags, the order of elements, and blanks around texts do not matter; of several equal
+elements the last one counts.  An unknown element or attribute makes the document malformed.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 
 _BLANKS = " \t\v\r\n"
 _CDATA = "<![CDATA["
-_ROOM = len(_CDATA) - 2  # it looks for more text only where so many characters are left
-_DEEPEST = 200  # of elements within each other; any such document is refused for its names
+_ROOM = len(_CDATA) - 2  # it looks for more text only if this many characters are left
+_DEEPEST = 200  # nesting of elements; a deeper document is refused anyway, for its names
 _NAME = re.compile("[A-Za-z][A-Za-z0-9_:-]*")
 _PASSED_OVER = re.compile(
     rf"(?:[{_BLANKS}]++|<!--.*?-->|<\?(?:.*?\?>|.*)|<!(?!--|\[CDATA\[)(?:[^>]*>|.*))*+", re.DOTALL
@@ -238,8 +238,8 @@ def read_governance(xml: bytes) -> Governance:
 def read_permissions(xml: bytes) -> Permissions:
     """Return the permissions; raises `UnreadableError`.
 
-    A ``<topic>`` without text is "", a rule without domains has a range without ends, and a
-    ``<default>`` may be empty: Cyclone DDS crashes when it evaluates one of these.
+    A ``<topic>`` without text is "", a rule without domains has a range that is open at both ends,
+    and a ``<default>`` may be empty: Cyclone DDS crashes when it evaluates one of these.
     """
     dds = _Node.root(xml, _PERMISSIONS, _IGNORED)
     parent = dds.last("permissions")
@@ -250,7 +250,7 @@ def read_permissions(xml: bytes) -> Permissions:
 
 
 class _Node:
-    """An element at an allowed place, with the children that count."""
+    """An element at an allowed place, with its known children."""
 
     def __init__(
         self,
@@ -318,7 +318,7 @@ def _number(node: _Node) -> int:
     number = int(sign + digits, 8 if octal else 0)
     if not -(2**63) <= number < 2**63:
         raise UnreadableError(f"<{node.tag}> holds {number}, which is far too large")
-    number = (number + 2**31) % 2**32 - 2**31  # it keeps 32 bits, and looks at the range then
+    number = (number + 2**31) % 2**32 - 2**31  # it cuts to 32 bits before it checks the range
     if not 0 <= number <= MAX_DOMAIN:
         raise UnreadableError(f"<{node.tag}> holds {number}, which is above {MAX_DOMAIN}")
     return number
@@ -433,7 +433,7 @@ def _criteria(node: _Node) -> Criteria:
     topics, partitions = node.last("topics"), node.last("partitions")
     return Criteria(
         tuple(each.text for each in topics.all("topic")) if topics else (),
-        # A list of no partitions is not the default one: nothing lies in it.
+        # An empty list of partitions does not mean the default partition: it contains none.
         tuple(each.text for each in partitions.all("partition")) or (_NOTHING,)
         if partitions
         else (),

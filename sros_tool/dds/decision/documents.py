@@ -1,4 +1,4 @@
-"""How each vendor reads governance and permissions: what it takes and what it refuses."""
+"""How each vendor reads governance and permissions, and which documents it refuses."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ _READERS = {
 
 
 def read_governance_as(vendor: Vendor, xml: bytes) -> Governance | Refusal:
-    """Return the governance that ``vendor`` finds in ``xml``, or why it refuses it."""
+    """Return the governance as ``vendor`` reads it from ``xml``, or its refusal."""
     return _read(vendor, "governance", _READERS[vendor.traits.reader][0], xml)
 
 
 def read_permissions_as(vendor: Vendor, xml: bytes) -> Permissions | Refusal:
-    """Return the permissions that ``vendor`` finds in ``xml``, or why it refuses them."""
+    """Return the permissions as ``vendor`` reads them from ``xml``, or its refusal."""
     return _read(vendor, "permissions", _READERS[vendor.traits.reader][1], xml)
 
 

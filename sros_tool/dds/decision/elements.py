@@ -17,14 +17,14 @@ from sros_tool.xml import tag_of
 
 
 class UnreadableError(Exception):
-    """The vendor does not accept the document; ``outcome`` says whether it crashes."""
+    """A document that the vendor does not accept; ``outcome`` says whether the vendor crashes."""
 
     def __init__(self, text: str, outcome: Outcome = Outcome.REFUSED) -> None:
         super().__init__(text)
         self.outcome = outcome
 
     def refusal(self, title: str, document: str) -> Refusal:
-        """Return the same as a value; ``title`` names the vendor."""
+        """Return this error as a value; ``title`` names the vendor."""
         how = "crashes over" if self.outcome is Outcome.CRASHES else "refuses"
         return Refusal("malformed", f"{title} {how} the {document}: {self}.", self.outcome)
 

@@ -1,11 +1,11 @@
 """Governance and permissions as Fast DDS reads them, with its parser TinyXML-2 9.
 
-The parser forgives much that XML forbids.  It knows bytes, not encodings, and neither namespaces
-nor entities of a document: ``--`` in a comment, a lone ``&``, control characters, ``]]>`` in a text
-and a second root are all taken.
+The parser accepts much that XML forbids: ``--`` in a comment, a lone ``&``, control characters,
+``]]>`` in a text, a second root.  It reads bytes, without encodings, namespaces or entities of the
+document.
 
-The order of elements is compulsory, texts keep their blanks, and words are written in one way.
-What follows the last element that it looks for goes unread.
+Elements must be in order, texts keep their blanks, and keywords have only one spelling.  Content
+after the last element that it looks for is not read.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 
 _BLANKS = " \t\n\v\f\r"
 _MARK = "\xef\xbb\xbf"
-_DEEPEST = 99  # elements within each other
+_DEEPEST = 99  # nesting of elements
 _NAME = "[A-Za-z_:\x80-\xff][A-Za-z0-9_:.\x80-\xff-]*+"
 _VALUE = "(?:\"[^\"]*\"|'[^']*')"
 _ATTRIBUTE = f"({_NAME})[{_BLANKS}]*=[{_BLANKS}]*({_VALUE})"
@@ -143,8 +143,8 @@ def _plain(text: str) -> str:
     """Return the text with its line ends and references resolved, up to a NUL."""
     if "&" not in text:
         return _decoded(_LINE_END.sub("\n", text) if "\r" in text or "\n" in text else text)
-    # It writes into the text that it reads: of a lone "&" nothing is written, so that the
-    # character stays that stood there before.
+    # It writes into the text that it reads: for a lone "&" it writes nothing, so the
+    # old character stays at that position.
     written = list(text)
     place = index = 0
     while index < len(text):
@@ -170,7 +170,7 @@ def _referred(found: re.Match[str]) -> str | None:
     """Return the bytes of a reference; None where it is malformed."""
     if found[2]:
         return _ENTITIES[found[2]]
-    # It reads the digits from the last one on, back to the mark before them.
+    # It reads the digits backwards, from the last one to the mark before them.
     base, mark = (16, "x") if found[0][2] == "x" else (10, "#")
     digits = found[1].rpartition(mark)[2]
     if not re.fullmatch("[0-9a-fA-F]*" if base == 16 else "[0-9]*", digits):
@@ -222,7 +222,7 @@ def _first(root: XmlElement, name: str) -> XmlElement:
 
 
 def _all(parent: XmlElement, name: str) -> list[XmlElement]:
-    """Return the children, all of one name, at least one."""
+    """Return the children; there must be at least one, all of the same name."""
     children = parent.elements
     if not children or any(child.name != name for child in children):
         raise UnreadableError(f"<{parent.name}> needs <{name}> elements and nothing else")
@@ -272,7 +272,7 @@ class _Sequence:
 
 
 def _text(element: XmlElement) -> str | None:
-    """Return the first node if it is text, comments aside, else None."""
+    """Return the first node that is not a comment, if it is text; else None."""
     for child in element.children:
         if child is not NodeMark.COMMENT:
             return child if isinstance(child, str) else None
@@ -287,7 +287,7 @@ def _required(element: XmlElement) -> str:
 
 
 def _first_text(element: XmlElement) -> str:
-    """Return the text of a number or a flag, before which not even a comment may stand."""
+    """Return the text of a number or a flag; nothing may precede it, not even a comment."""
     first = element.children[0] if element.children else None
     if not isinstance(first, str):
         raise UnreadableError(f"<{element.name}> does not begin with its value")

@@ -1,7 +1,7 @@
 """Comparing expressions with topics, grants with subjects, and dates with moments, by vendor.
 
-Certificates' subjects are the text that OpenSSL and `sros_tool.pki.certificates.subject_text` print
-by RFC 2253, the most specific attribute first.
+A certificate's subject is the RFC 2253 text that OpenSSL and
+`sros_tool.pki.certificates.subject_text` print, with the most specific attribute first.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ _CLASSES = {
 
 @lru_cache(maxsize=65536)
 def _matcher(style: Style, expression: str) -> _Matcher | None:
-    """Return what matches names against ``expression``; None if it matches only itself."""
+    """Return a function that matches names; None if ``expression`` matches only itself."""
     if _SPECIAL.isdisjoint(expression):
         return None
     take_set = _fnmatch_set if style is Style.FNMATCH else _cyclone_set
-    segments = [""]  # what stands between stars
+    segments = [""]  # the text between stars
     index = 0
     while index < len(expression):
         char = expression[index]
@@ -70,8 +70,8 @@ def _matcher(style: Style, expression: str) -> _Matcher | None:
 def _joined(segments: list[str]) -> str:
     """Return the pattern for the segments between stars.
 
-    Each segment matches a fixed number of characters, so the first place where one fits is as good
-    as any later one: the atomic group keeps to it, or else many stars take exponential time.
+    Each segment matches a fixed number of characters, so the first fit is as good as a later one.
+    The atomic group tries only that one; otherwise many stars would take exponential time.
     """
     first, *rest = segments
     if not rest:
@@ -87,7 +87,7 @@ def matches(style: Style, expression: str, name: str) -> bool:
 
 
 class ExpressionIndex:
-    """Expressions in their order, asked which of them match a name.
+    """Ordered expressions, and a fast answer to the question which of them match a name.
 
     Plain ones are looked up by the name, wildcards by the text before the first wildcard,
     so that thousands of them cost little more than one.
@@ -140,10 +140,10 @@ def _set_of(members: list[str], negated: bool) -> str:
 
 
 def _fnmatch_set(text: str, start: int) -> tuple[str, int]:
-    """Return the set that begins behind ``[``, as glibc reads it, and where the expression goes on.
+    """Return the set after ``[`` as glibc reads it, and the index after the set.
 
-    Behind an unknown class or symbol, and behind a range without its end, no further character
-    matches; a set that is never closed is a plain ``[`` otherwise, and if ``[`` was in it before.
+    After an unknown class or symbol, and after a range without its end, no further character
+    matches.  In all other cases, or if ``[`` was in it before, an unclosed set is a plain ``[``.
     """
     index = start
     negated = text[index : index + 1] in ("!", "^")
@@ -176,7 +176,7 @@ def _fnmatch_set(text: str, start: int) -> tuple[str, int]:
 
 
 def _member(text: str, index: int) -> tuple[str | None, int]:
-    """Return one character of a set, also as ``[.a.]``, for a pattern; None where there is none."""
+    """Return one character of a set, also if written ``[.a.]``, for a pattern; None without one."""
     if text[index : index + 2] != "[.":
         return (re.escape(text[index]) if index < len(text) else None), index + 1
     end = text.find(".]", index + 2)
@@ -186,10 +186,10 @@ def _member(text: str, index: int) -> tuple[str | None, int]:
 
 
 def _cyclone_set(text: str, start: int) -> tuple[str, int]:
-    """Return the set that begins behind ``[``, as Cyclone DDS 0.10 reads it, and what follows it.
+    """Return the set after ``[`` as Cyclone DDS 0.10 reads it, and the index after the set.
 
-    Its loop ends only after it took the closing bracket for a member, and looks for a range there
-    as well: ``[ab]`` also matches ``]``, and ``[ab]-x`` is one set with the range ``]`` to ``x``.
+    Its loop takes the closing bracket for a member before it ends, and looks for a range there,
+    too: ``[ab]`` also matches ``]``, and ``[ab]-x`` is one set with the range ``]`` to ``x``.
     """
     index = start
     negated = text[index : index + 1] == "!"
@@ -217,12 +217,12 @@ _MOST_PARTS = 20  # Cyclone DDS 0.10 refuses a grant's subject of more
 
 
 def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
-    """Return whether a grant for ``granted`` is one for the certificate's subject ``certified``."""
+    """Return whether a grant for ``granted`` applies to the certificate subject ``certified``."""
     return _COMPARE[rule](granted, certified)
 
 
 def escaped(certified: str) -> str:
-    """Return the subject of a certificate with every byte beyond ASCII as ``\\C3``."""
+    """Return the subject of a certificate with every non-ASCII byte as ``\\C3``."""
     parts = (
         each if each.isascii() else "".join(f"\\{b:02X}" for b in each.encode())
         for each in certified
@@ -240,11 +240,11 @@ def _whole_attributes(granted: str, certified: str) -> bool:
 
 
 def _stripped(name: str) -> list[str]:
-    # It stops at the first part that is empty: what follows two commas does not count.
+    # It stops at the first empty part: text after two commas does not count.
     return [part.strip(" ") for part in takewhile(bool, name.split(","))]
 
 
-_MOST_ATTRIBUTES = 20  # of which Fast DDS 2.14 takes notice
+_MOST_ATTRIBUTES = 20  # the ones that Fast DDS 2.14 uses
 _UNQUOTED = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*(?:"|\\?\Z)|[^"\\])', re.DOTALL)
 
 
@@ -253,20 +253,20 @@ def _any_order(granted: str, certified: str) -> bool:
     first_values: dict[str, str] = {}
     for kind, value in theirs:
         first_values.setdefault(kind, value)
-    # Only the first value of a kind is ever found, so a repeated kind fits nothing; one that the
-    # certificate lacks is empty there.
+    # Only the first value of a kind is found, so a repeated kind never matches; a kind that the
+    # certificate lacks has an empty value.
     return len(ours) == len(theirs) and all(first_values.get(k, "") == v for k, v in ours)
 
 
 def _types_and_values(name: str) -> list[tuple[str, str]]:
-    """The attributes that DistinguishedName.cpp of Fast DDS 2.14 finds, up to a malformed one."""
+    """Return the attributes before a malformed one, as Fast DDS 2.14 (DistinguishedName.cpp)."""
     found: list[tuple[str, str]] = []
     rest = name.lstrip(" ")
     while rest and len(found) < _MOST_ATTRIBUTES:
         equals = _outside_quotes(rest, "=")
         if equals < 0:
             break
-        # A cut that ends where it begins is one to the end of the text.
+        # An empty cut means: up to the end of the text.
         kind, rest = rest[: equals or None], rest[equals + 1 :]
         comma = _outside_quotes(rest, ",")
         value = rest if comma < 0 else rest[: comma or None]
@@ -276,7 +276,7 @@ def _types_and_values(name: str) -> list[tuple[str, str]]:
 
 
 def _outside_quotes(text: str, wanted: str) -> int:
-    """Return the index of the first such character outside of escapes and quotes, or -1."""
+    """Return the index of the first such character outside of escapes and quotes, else -1."""
     index = 0
     while index < len(text):
         found = _UNQUOTED.match(text, index)
@@ -293,7 +293,7 @@ _EQUALS = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^="\\])*', re.DOTALL)
 
 
 def _attributes(name: str) -> list[tuple[str, str]]:
-    """Kinds and values without quotes, escapes and outer spaces; up to the first malformed one."""
+    """Return kinds and plain values (no quotes, escapes, outer spaces) before a malformed one."""
     found = []
     index = 0
     while index < len(name):
@@ -320,7 +320,7 @@ def _subset(granted: str, certified: str) -> bool:
         kind, _, value = part.partition("=")
         values.setdefault(kind, value)
     wanted = re.split(r"[,/|]", certified)
-    if wanted and not wanted[-1]:  # what ends in a separator has nothing behind it
+    if wanted and not wanted[-1]:  # no empty part after a last separator
         wanted.pop()
     for part in wanted:
         kind, _, value = part.partition("=")
@@ -340,8 +340,8 @@ _COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
 _CYCLONE = re.compile(
     r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d):(\d\d)(\.\d{1,12})?(?:Z|([+-])(\d\d):(\d\d))?\Z", re.ASCII
 )
-# What std::get_time of libstdc++ takes of %Y-%m-%dT%H:%M:%S: the text may end behind the year, the
-# month or the day; one blank may stand before the day; behind the seconds anything may follow.
+# std::get_time of libstdc++ with %Y-%m-%dT%H:%M:%S: the text may end after the year, the month or
+# the day; one blank may precede the day; anything may follow the seconds.
 _LOCAL = re.compile(
     r"\s*(\d{1,4})(?:-(\d\d?)(?:-\s?(\d\d?)(?:[Tt](\d\d?):(\d\d?):(\d\d?))?)?)?", re.ASCII
 )
@@ -352,8 +352,8 @@ _FARTHEST = timedelta(hours=12)
 def read_moment(rule: Moments, text: str, zone: tzinfo) -> float | None:
     """Return the moment that ``text`` means; None if the vendor calls the document malformed.
 
-    ``zone`` is the host's time zone.  What Cyclone DDS cannot read is minus infinity: a grant that
-    begins then has begun, one that ends then has ended.
+    ``zone`` is the host's time zone.  A date that Cyclone DDS cannot read is minus infinity: as a
+    begin or an end it has always passed.
     """
     match rule:
         case Moments.LOCAL:
@@ -374,7 +374,7 @@ def _local(text: str, zone: tzinfo) -> float | None:
     year, month, day, hour, minute, second = (int(each or -1) for each in found.groups())
     if 0 in (month, day) or month > 12 or day > 31 or hour > 23 or minute > 59 or second > 60:
         return None
-    # A month or a day that is missing stays zero: January, and the last day of the month before.
+    # A missing month or day stays zero: January, or the last day of the month before.
     days = timedelta(days=max(day, 0) - 1)
     time = timedelta(hours=max(hour, 0), minutes=max(minute, 0), seconds=max(second, 0))
     try:

@@ -1,7 +1,7 @@
-"""The vendors of DDS Security, and in what their decisions differ, as data.
+"""The vendors of DDS Security, and the differences of their decisions, as data.
 
 Fast DDS 2.9.1 and 2.14.5 and Cyclone DDS 0.10.2 were measured on the real libraries.  Vendors that
-were never measured, as OpenDDS and Connext, decide by the standard, which their manuals follow.
+were never measured, such as OpenDDS and Connext, decide by the standard, as their manuals do.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from enum import Enum, StrEnum, auto
 
 
 class Style(Enum):
-    """How an expression with wildcards is read."""
+    """The rules for expressions with wildcards."""
 
     FNMATCH = auto()
     """POSIX fnmatch of glibc, without escapes, where ``*`` crosses ``/``."""
@@ -20,7 +20,7 @@ class Style(Enum):
 
 
 class Subjects(Enum):
-    """How the subject of a grant is compared with a certificate's subject."""
+    """The comparison of a grant's subject with a certificate's subject."""
 
     EXACT = auto()
     """The same attributes in the same order; spaces around them do not count."""
@@ -33,18 +33,18 @@ class Subjects(Enum):
 
 
 class Moments(Enum):
-    """How a date of a grant is read."""
+    """The reading of dates in a grant."""
 
     STANDARD = auto()
     """With its offset; UTC if it has none."""
     LOCAL = auto()
     """In the standard time of the host's zone, the offset dropped (Fast DDS)."""
     CYCLONE = auto()
-    """With its offset; only whole dates and times of 1970 to 2262, all else is long past."""
+    """With its offset; only complete dates and times from 1970 to 2262, others are long past."""
 
 
 class OpenRange(Enum):
-    """What a range of domains with one end means."""
+    """The meaning of a range of domains with one end."""
 
     OPEN = auto()
     """From N on; up to N."""
@@ -55,25 +55,25 @@ class OpenRange(Enum):
 
 
 class DenyPartitions(Enum):
-    """Which partitions of an endpoint a deny rule must name to hold for it."""
+    """The partitions of an endpoint that a deny rule must name to apply to it."""
 
     ANY_OR_ALL = auto()
-    """One of them; without partitions the rule holds for all."""
+    """One of them; without partitions the rule applies to all."""
     ANY_OR_DEFAULT = auto()
-    """One of them; without partitions the rule holds for the default one only (Cyclone DDS)."""
+    """One of them; without partitions the rule applies to the default one only (Cyclone DDS)."""
     IGNORED = auto()
-    """None: a deny rule holds whatever its partitions (Fast DDS)."""
+    """None: a deny rule applies whatever its partitions (Fast DDS)."""
 
 
 class Signers(Enum):
-    """Who may sign governance and permissions."""
+    """The accepted signers of governance and permissions."""
 
     AUTHORITY = auto()
     """The permissions CA itself, whose certificate is in the message."""
     LISTED = auto()
-    """Whose certificate is in the file of the permissions CA; no chain is verified (2.14)."""
+    """Anyone with a certificate in the file of the permissions CA; no chain is verified (2.14)."""
     CHAIN = auto()
-    """Whose certificate is in the message and has a chain to that CA, for S/MIME."""
+    """Anyone with a certificate in the message that has a chain to that CA, for S/MIME."""
 
 
 class Hashes(Enum):
@@ -94,7 +94,7 @@ class Keys(Enum):
 
 
 class DocumentReader(Enum):
-    """Which parser reads the documents (`sros_tool.dds.decision.documents`)."""
+    """The parser that reads the documents (`sros_tool.dds.decision.documents`)."""
 
     STANDARD = auto()
     """The schema of the standard."""
@@ -106,9 +106,9 @@ class DocumentReader(Enum):
 
 @dataclass(frozen=True, slots=True)
 class VendorTraits:
-    """All that is known of one vendor: its names, and its rules where vendors differ.
+    """The names of one vendor, and its rules where vendors differ.
 
-    A rule that is not given is the standard's.
+    By default a rule is the one of the standard.
     """
 
     title: str
@@ -133,13 +133,13 @@ class VendorTraits:
     filters_own_domain: bool = True
     """Rules for other domains do not count for the own participant (they never do for peers)."""
     relays_count_for_readers: bool = False
-    """Peers weigh ``<relay>`` for a reader, behind the ``<subscribe>`` of the same rule."""
+    """For a reader, peers also check ``<relay>``, after the ``<subscribe>`` of the same rule."""
     topic_decides: bool = False
     """The first rule whose topic matches decides, and then its partitions must fit."""
     deny_partitions: DenyPartitions = DenyPartitions.ANY_OR_ALL
     honours_default: bool = True
     crashes_on_empty_texts: bool = False
-    """An expression or a default without text ends the process once a decision comes to it."""
+    """An expression or a default without text crashes the process when a decision reaches it."""
     longest_topic_name: int | None = None
     """A topic with a longer name, in bytes, is created and never matched."""
     creates_topics: bool = False
@@ -149,12 +149,12 @@ class VendorTraits:
     needs_domain_rule: bool = True
     """On a domain that the governance does not list, the participant does not even start."""
     shares_open_topics: bool = False
-    """Participants that refused each other still exchange what nothing protects (ran)."""
+    """Participants that refused each other still exchange unprotected topics (ran)."""
     refuses_open_rtps: bool = False
     """Unauthenticated participants together with RTPS protection are refused."""
     signers: Signers = Signers.AUTHORITY
     reads_first_authority: bool = False
-    """Of a file with several CAs only the first is trusted."""
+    """Only the first CA of a file is trusted."""
     verifies_authorities: bool = False
     """The first certificate of a CA file is verified, strictly, when it is loaded."""
     hashes: Hashes = Hashes.ANY
@@ -193,9 +193,9 @@ _FAST_2_14 = VendorTraits(
 class Vendor(StrEnum):
     """A DDS implementation, or the specification itself.
 
-    An entry is all that it takes to add a vendor that decides by the standard: options, texts and
-    comparisons follow, and `sros_tool.runtime.rmw` says which RMW uses it.  Of several releases of
-    a product the newest stands first.
+    To add a vendor that decides by the standard, add an entry: options, texts and comparisons
+    follow.  `sros_tool.runtime.rmw` maps RMWs to vendors.  The newest release of a product stands
+    first.
     """
 
     traits: VendorTraits

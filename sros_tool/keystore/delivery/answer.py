@@ -39,7 +39,7 @@ _AGAIN = "Have the request signed again, and the answer sent again."
 SEAL = "answer.p7s"
 """The list of all files of an answer with their digests, signed by the permissions CA.
 
-Without it, one who carries an answer could put an earlier governance or a further CA into it.
+Without it, the carrier of an answer could put an older governance or another CA into it.
 """
 
 
@@ -61,9 +61,9 @@ class RequestAnswer:
 
 @dataclass(frozen=True, slots=True)
 class ImportedEnclave:
-    """The enclave that an answer was imported for; without changes, it was there already.
+    """The result of an import; without changes, the same answer was installed already.
 
-    ``first`` is whether the CAs were unknown in the folder, so that nothing there vouches for them.
+    ``first`` is whether the folder had no CAs before: nothing there vouches for the new ones.
     """
 
     name: str
@@ -92,7 +92,7 @@ def _read_answer(data: bytes) -> RequestAnswer:
     """Return the answer in an archive that ``sign_request`` made; nothing is written.
 
     Raises:
-        DocumentError: it holds anything but the files of one enclave.
+        DocumentError: the archive holds anything else than the files of one enclave.
     """
     try:
         files = unpack(data)
@@ -119,9 +119,9 @@ def _read_answer(data: bytes) -> RequestAnswer:
 def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> OpenedEnclave:
     """Check that DDS would load an answer together with the private half of ``key``.
 
-    Raises `PkiError` with all that is wrong: another key's certificate, another enclave's, a
-    chain or a signature that does not hold, what is not in date, what was revoked, and files that
-    are not those that were sent.
+    Raises:
+        PkiError: it lists everything that is wrong: a certificate for another key or enclave, an
+            invalid chain or signature, an expired or revoked part, a file changed on the way.
     """
     with tempfile.TemporaryDirectory(prefix="sros-") as folder:
         for path, data in answer.files.items():
@@ -143,7 +143,7 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
 
 
 def _broken_seal(answer: RequestAnswer, authorities: Iterable[x509.Certificate]) -> str:
-    """Return why no authority's signature of the files verifies, or "" if one does."""
+    """Return why no CA's signature of the list of files verifies, or "" if one does."""
     try:
         signed = smime.parse(answer.seal)
     except SrosError as error:
@@ -171,8 +171,8 @@ def import_answer(
 ) -> ImportedEnclave:
     """Install an answer next to its key in ``folder``, or change nothing.
 
-    An answer that is older than what is there, or that comes from other CAs, needs ``force``.
-    Where CAs are ``pinned``, by their SHA-256, one of them has to have signed it in any case.
+    An answer that is older than the present files, or that comes from other CAs, needs ``force``.
+    If CAs are ``pinned``, by their SHA-256, one of them must have signed it, also with ``force``.
     """
     answer = _read_answer(data)
     name = answer.name
@@ -224,10 +224,10 @@ def _check_pinned(
     permissions_ca: x509.Certificate,
     pinned: frozenset[str],
 ) -> None:
-    """Check that a CA that a person named has signed the seal, and so the whole answer.
+    """Check that one of the pinned CAs has signed the seal, and so the whole answer.
 
-    The identity CA vouches for the certificate alone, which anybody may put next to permissions and
-    a governance of his own.
+    The identity CA vouches for the certificate only: an attacker could add other permissions and
+    another governance to it.
     """
     if not pinned or digest(permissions_ca) in pinned:
         return
@@ -242,7 +242,7 @@ def _check_pinned(
 
 
 def _check_known(folder: Path, answer: RequestAnswer, known: list[x509.Certificate]) -> None:
-    """Refuse an answer from other CAs than those of the first answer."""
+    """Refuse an answer that the CAs of the first answer did not sign."""
     if known and (problem := _broken_seal(answer, known)):
         raise KeystoreError(
             f"the answer for enclave {answer.name} comes from another keystore",

@@ -19,18 +19,18 @@ SUFFIXES = (".tar.gz", ".tgz")
 MAX_PACKED = 4 * 1024 * 1024
 MAX_UNPACKED = 8 * 1024 * 1024
 MAX_MEMBER = 1024 * 1024
-"""Largest archive that is read, in bytes: packed, unpacked, and each file in it."""
+"""Largest size in bytes of an archive: packed, unpacked, and of each file in it."""
 _MOST_MEMBERS = 200
 _GZIP = 16 + zlib.MAX_WBITS
 
 
 def file_mode(path: str) -> int:
-    """Return the permission bits of a file that is sent: a private key is its owner's alone."""
+    """Return the permission bits of an exported file; only its owner can read a private key."""
     return 0o600 if path.rpartition("/")[2] == "key.pem" else 0o644
 
 
 def pack(files: Mapping[str, bytes]) -> bytes:
-    """Return a gzipped tar that depends on the files alone: no users, groups or times."""
+    """Return a gzipped tar without users, groups and times: the same files give the same bytes."""
     buffer = io.BytesIO()
     with (
         gzip.GzipFile(fileobj=buffer, mode="wb", filename="", mtime=0) as packed,
@@ -59,8 +59,9 @@ def unpack(data: bytes) -> dict[str, bytes]:
     The caller checks the names.
 
     Raises:
-        DocumentError: it holds anything but plain files and folders of bounded size and number:
-            links, devices, sparse files, a name twice, bytes after the end.
+        DocumentError: it holds anything else than plain files and folders (such as links,
+            devices, sparse files, a repeated name, bytes after the end), or too many or too large
+            files.
     """
     try:
         with tarfile.open(fileobj=io.BytesIO(_unzip(data)), mode="r:") as tar:
@@ -107,9 +108,9 @@ def _members(tar: tarfile.TarFile) -> Iterator[tuple[str, bytes]]:
 
 @contextmanager
 def staged_file(target: Path, data: bytes) -> Iterator[Callable[[], None]]:
-    """Write a file next to ``target``; calling what is yielded moves it there, as a whole.
+    """Write a temporary file next to ``target``; yield a function that moves it there atomically.
 
-    It is readable by its owner only, and on the disk before it can be put in place.
+    Only its owner can read it, and it is flushed to the disk before the move.
     """
     spare = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}")
     handle = os.open(spare, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)

@@ -1,4 +1,4 @@
-"""Exporting enclaves for a robot: a keystore of real files, without links and without CA keys."""
+"""Exporting enclaves for a robot: a keystore of plain files, without links and without CA keys."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _ANSWER_AGAIN = (
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """The enclaves that were exported, and where to."""
+    """The exported enclaves, and the target of the export."""
 
     target: Path
     enclaves: tuple[str, ...]
@@ -46,7 +46,7 @@ class Export:
 
 @dataclass(frozen=True, slots=True)
 class ExportSelection:
-    """The enclaves to export, and those that match but whose key is on their robot."""
+    """The enclaves to export, and the matching ones left out: their key is on their robot."""
 
     names: tuple[str, ...]
     left_out: tuple[str, ...]
@@ -57,8 +57,8 @@ def select(
 ) -> ExportSelection:
     """Return the named enclaves and the keystore's enclaves that match a pattern, or ``every`` one.
 
-    In a pattern ``*`` stands for any part of a name, "/" included, as in policies.  Those that are
-    found so are left out if their key is not at home; those that are named are refused later.
+    In a pattern ``*`` stands for any part of a name, "/" included, as in policies.  An enclave
+    whose key is on its robot is left out if a pattern found it, and refused later if it was named.
     """
     existing = list_enclaves(root)
     chosen = list(dict.fromkeys(names))
@@ -95,8 +95,8 @@ def distribute(
 ) -> Export:
     """Export enclaves to ``target``: an archive if it is named ``.tar.gz``, else a folder.
 
-    The same enclaves give the same bytes.  An enclave that cannot run is not exported.  In a
-    folder that already is an export, other enclaves stay; files that would change need ``force``.
+    The same enclaves give the same bytes.  An enclave that cannot run is refused.  In the folder
+    of an earlier export, other enclaves stay, and only ``force`` replaces a file that differs.
     """
     files = _collect(root, names, now)
     if target.name.endswith(_ARCHIVE_SUFFIXES):
@@ -121,7 +121,7 @@ def pack_enclaves(root: Path, names: Sequence[str], *, now: datetime) -> PackedE
 
 
 def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]:
-    """Return the files that are sent, by their paths; raise for an enclave that cannot run."""
+    """Map paths to the exported files; raise for an enclave that cannot run."""
     existing = set(list_enclaves(root))
     files: dict[str, bytes] = {}
     for name in names:
@@ -149,7 +149,7 @@ def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes
 
 
 def _real(path: Path) -> Path:
-    # Unlike Path.resolve, realpath does not fail at links that lead in a circle.
+    # Unlike Path.resolve, realpath does not fail at a circle of links.
     return Path(os.path.realpath(path))
 
 

@@ -19,7 +19,7 @@ from sros_tool.xml import read_bytes
 
 @dataclass(frozen=True, slots=True)
 class Requested:
-    """A request that was made: its file, the SHA-256 of its public key, and the changes."""
+    """A new signing request: its file, the SHA-256 of its public key, and the changes."""
 
     name: str
     file: Path
@@ -30,10 +30,10 @@ class Requested:
 def create_request(
     folder: Path, name: str, *, again: bool = False, dry_run: bool = False
 ) -> Requested:
-    """Make a key, which stays in ``folder``, and the request to have it certified.
+    """Make a key, which stays in ``folder``, and a request to certify it.
 
     ``folder`` becomes a keystore without CAs, in which the enclave waits for the answer.  With
-    ``again`` the request is made for the key that is there; no key is ever replaced.
+    ``again`` the request is made for the existing key; no key is ever replaced.
     """
     check_enclave_name(name)
     if not dry_run and folder.is_dir():
@@ -61,7 +61,9 @@ def create_request(
             key = generate_key()
             transaction.write(f"{place}/key.pem", key_pem(key), private=True)
         request = make_request(key, name)
-        load_request(request, "as it was made")  # so that a key of a wrong kind is reported here
+        load_request(
+            request, "as it was made"
+        )  # reports a key of a wrong kind here, not at the keystore
         transaction.write(f"{place}/{REQUEST}", request)
         transaction.commit()
     digest = key_digest(key.public_key())

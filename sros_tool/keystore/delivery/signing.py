@@ -67,7 +67,7 @@ class Signed:
     """A request that was answered.
 
     ``key`` is the SHA-256 of its public key, ``identity_ca`` the certificate of the CA that the
-    robot is going to trust, ``archive`` the answer for the robot, as ``.tar.gz``.
+    robot will trust, ``archive`` the answer for the robot, as ``.tar.gz``.
     """
 
     name: str
@@ -96,9 +96,9 @@ def sign_request(
 
     ``data`` is the request as PEM.
 
-    The keystore gets everything but the key.  The rights are those that ``policy`` states; else,
-    with ``renew``, those that are signed already; else the default of the keystore's template.
-    ``answer`` is the file that the answer goes to, which appears after the keystore has changed.
+    The keystore gets all files of the enclave except the key.  The rights come from ``policy``;
+    without it, with ``renew``, from the present permissions; otherwise from the keystore's
+    template.  ``answer`` is the file for the answer; it appears after the keystore has changed.
     """
     request = load_request(data, "that was given")
     name = check_enclave_name(request.name)
@@ -186,7 +186,7 @@ def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
 
 
 def _check_key(root: Path, request: SigningRequest) -> None:
-    """Refuse a key that was revoked, and one where the keystore has another key."""
+    """Refuse a revoked key, and a request for an enclave whose key is in the keystore."""
     for path in sorted((root / REVOKED).glob(f"*/{CERTIFICATE_FILE}")):
         certificate = read_certificate(path)
         if certificate.public_key() == request.public_key:
@@ -208,7 +208,7 @@ def _check_key(root: Path, request: SigningRequest) -> None:
 
 
 def _check_result(answer: RequestAnswer, request: SigningRequest, now: datetime) -> None:
-    """Check that the robot will accept the answer, before anybody relies on it."""
+    """Check that the robot will accept the answer."""
     try:
         check_answer(answer, request.public_key, now=now)
     except SrosError as error:
@@ -235,7 +235,7 @@ def _new_key_note(root: Path, request: SigningRequest) -> list[Note]:
 
 
 def _earlier_rights(root: Path, name: str, authority: x509.Certificate) -> EarlierRights:
-    """Return the rights that are signed for an enclave by the permissions CA."""
+    """Return the rights in the permissions that the permissions CA signed for an enclave."""
     subject = text_of(_present_certificate(root, name).subject)
     old = read_granted(enclave_path(root, name) / PERMISSIONS_FILE, subject)
     old.signed.verify(authority)

@@ -17,11 +17,11 @@ from sros_tool.xml import read_bytes
 def read_pin(text: str) -> frozenset[str]:
     """Return the SHA-256 of the pinned CAs, from a fingerprint or a certificate file.
 
-    Colons and capitals in a fingerprint do not matter, so that one may be copied from
-    ``openssl x509 -fingerprint -sha256``.
+    Colons and capitals in a fingerprint do not matter, so that the output of
+    ``openssl x509 -fingerprint -sha256`` can be copied.
 
     Raises:
-        UsageError: ``text`` is neither.
+        UsageError: ``text`` is neither a fingerprint nor a certificate file.
     """
     plain = text.strip().rpartition("=")[2].replace(":", "").lower()
     if re.fullmatch(r"[0-9a-f]{64}", plain):
@@ -37,7 +37,7 @@ def read_pin(text: str) -> frozenset[str]:
 
 
 def trusted_in(folder: Path, file: str) -> list[x509.Certificate]:
-    """Return the CAs that the enclaves of a robot's folder trust, by the name of the CA file."""
+    """Map the names of CA files to the CAs that the enclaves of a robot's folder trust by them."""
     found: dict[str, x509.Certificate] = {}
     for path in sorted((folder / ENCLAVES).rglob(file)):
         if path.exists():
@@ -46,11 +46,11 @@ def trusted_in(folder: Path, file: str) -> list[x509.Certificate]:
 
 
 def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
-    """Refuse to mix the enclaves of two keystores in one folder: they would never talk.
+    """Refuse to mix enclaves of two keystores in one folder: they would never talk.
 
     Args:
         target: the folder of a robot.
-        files: what is to be written below ``target``, by relative paths.
+        files: the new files below ``target``, by relative paths.
 
     Raises:
         KeystoreError: ``target`` holds an enclave that trusts none of the identity CAs in
@@ -73,7 +73,7 @@ def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
 
 
 def refuse_home(folder: Path, remedy: str) -> None:
-    """Raise `KeystoreError` where ``folder`` is the keystore that has the CAs, not a robot's."""
+    """Raise `KeystoreError` if ``folder`` is the keystore with the CAs, not a folder of a robot."""
     if (folder / PRIVATE).exists() or (folder / PUBLIC).exists():
         raise KeystoreError(
             f"'{folder}' is a keystore with CAs",

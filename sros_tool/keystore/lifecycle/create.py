@@ -82,8 +82,8 @@ _NONE_IMPORTED: Mapping[str, bytes] = MappingProxyType({})
 class Creation:
     """What was created, or with ``dry_run`` would be.
 
-    ``created`` are new enclaves, ``changed`` those whose permissions were replaced, ``completed``
-    those that got a file that was missing, ``kept`` those that were left as they are.
+    ``created`` are new enclaves; ``changed`` ones got new permissions, ``completed`` ones a file
+    that was missing; ``kept`` ones were not changed.
     """
 
     root: Path
@@ -110,12 +110,12 @@ def create_keystore(
 ) -> Creation:
     """Create a keystore for ``domains`` (default: 0) by the choices of ``template``.
 
-    ``imported`` are PEM certificates of existing CAs by role ("identity", "permissions"), whose
-    keys the ``keyring`` has.
+    ``imported`` are PEM certificates of existing CAs by role ("identity", "permissions"); the
+    ``keyring`` has their keys.
 
     Raises:
-        KeystoreError: ``root`` is a keystore, or holds any part of one: a CA is never made next to
-            the remains of an older one.
+        KeystoreError: ``root`` holds a keystore or a part of one: a new CA never joins the
+            remains of an older one.
     """
     if not dry_run:
         tidy(root)
@@ -147,9 +147,8 @@ def create_enclaves(
 ) -> Creation:
     """Create enclaves with the default rights of the keystore's template.
 
-    An enclave that exists is left as it is, and completed where a file is missing: neither its
-    key nor its permissions are ever replaced.  ``domain`` is the one that the caller will use
-    (its ROS_DOMAIN_ID); it must be one of the keystore's.
+    An existing enclave keeps its key and its permissions, and gets the files that it lacks.
+    ``domain`` is the caller's ROS_DOMAIN_ID; it must be one of the keystore's domains.
     """
     return generate_artifacts(
         root,
@@ -172,7 +171,7 @@ def create_permission(
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
 ) -> Creation:
-    """Give an existing enclave the permissions that ``policy`` states for it."""
+    """Replace the permissions of an existing enclave by the ones that ``policy`` states for it."""
     check_enclave_name(name)
     if not dry_run:
         tidy(root)
@@ -201,8 +200,8 @@ def generate_artifacts(
 ) -> Creation:
     """Create the named enclaves and the policies' enclaves, with permissions, all or nothing.
 
-    Permissions that a policy states replace those that an enclave had.  Where there is no
-    keystore, one is created by the template ``create``, if that is given.
+    Permissions of a policy replace the enclave's present ones.  If there is no keystore and
+    ``create`` is given, a keystore is created by that template.
     """
     wanted = _wanted(enclaves, policies)
     if not dry_run:
@@ -242,7 +241,7 @@ def _wanted(names: Sequence[str], policies: Sequence[Policy]) -> dict[str, Encla
 
 @dataclass(frozen=True, slots=True)
 class _Keystore:
-    """A keystore that enclaves are added to, its enclaves, and ledger entries where it is new."""
+    """A keystore to add enclaves to, with its enclaves, and ledger entries if it is new."""
 
     authorities: Authorities
     template: Template
@@ -271,9 +270,9 @@ def _write_keystore(
     imported: Mapping[str, bytes],
 ) -> _Keystore:
     """Stage a new keystore: its authorities, its governance and its settings."""
-    _check_free(transaction.root)  # another process may have been faster
+    _check_free(transaction.root)  # another process may have made it meanwhile
     for span in (template.certificate_validity, template.permissions_validity):
-        window(now, span)  # raises where nothing could be issued
+        window(now, span)  # raises if the CAs could not issue anything
     authorities = create_authorities(transaction, template, keyring, now, imported)
     distinct = dict.fromkeys((authorities.identity, authorities.permissions))
     entries = [certificate_entry(now, "ca", each.certificate) for each in distinct]
@@ -294,7 +293,7 @@ def _write_keystore(
 
 
 def _check_free(root: Path) -> None:
-    """Raise `KeystoreError` where something is in the way of a new keystore."""
+    """Raise `KeystoreError` if ``root`` is not free for a new keystore."""
     if is_keystore(root):
         raise _already_exists(root)
     if root.resolve() == Path("/"):
@@ -356,7 +355,7 @@ def _write_enclaves(
     now: datetime,
     progress: Progress | None = None,
 ) -> Creation:
-    """Create or complete each enclave; with a policy, give it those permissions.  Commit."""
+    """Create or complete each enclave, give it the permissions of its policy, and commit."""
     writer = EnclaveWriter(
         transaction,
         keystore.template,
@@ -403,7 +402,7 @@ def _write_enclave(
     policy: Enclave | None,
     now: datetime,
 ) -> tuple[_Outcome, tuple[Note, ...]]:
-    """Stage an enclave's missing files, and the permissions of its policy if there is one."""
+    """Stage the files that an enclave lacks, and permissions if there is a policy for it."""
     present = present_files(transaction.root, name)
     before = len(transaction.changes)
     identity = _identity(transaction.root, keystore, name, present, now)
@@ -425,7 +424,7 @@ def _write_enclave(
 def _identity(
     root: Path, keystore: _Keystore, name: str, present: set[str], now: datetime
 ) -> NewIdentity | x509.Certificate:
-    """Return an enclave's certificate, or the subject and key for a new one; keep its key."""
+    """Return an enclave's certificate; without one, the subject and the key to issue it for."""
     folder = enclave_path(root, name)
     if CERTIFICATE_FILE in present:
         if not present & {KEY_FILE, REQUEST}:
@@ -453,7 +452,7 @@ def _identity(
 def _usable_certificate(
     root: Path, keystore: _Keystore, name: str, now: datetime
 ) -> x509.Certificate:
-    """Return the certificate of an enclave; raise `KeystoreError` where DDS would refuse it."""
+    """Return the certificate of an enclave; raise `KeystoreError` if DDS would refuse it."""
     path = enclave_path(root, name) / CERTIFICATE_FILE
     certificate = read_certificate(path)
     if not issued_by(certificate, keystore.authorities.identity.certificate):
@@ -474,7 +473,7 @@ def _usable_certificate(
 
 
 def _permissions_subjects(path: Path, authority: x509.Certificate) -> Iterator[x509.Name]:
-    """Yield the subjects that permissions are signed for; none where they cannot be used."""
+    """Yield the subjects in signed permissions; none if the permissions cannot be used."""
     try:
         signed = smime.parse(read_bytes(path, "permissions document"))
         signed.verify(authority)

@@ -52,11 +52,11 @@ _REASON = "superseded"
 
 @dataclass(frozen=True, slots=True)
 class Renewal:
-    """What was renewed, or with ``dry_run`` would be.
+    """The result of a renewal, or with ``dry_run`` the result that it would have.
 
-    ``works_until`` is the latest expiry of a certificate that was replaced and not revoked, if one
-    has not expired yet.  ``restart`` are the enclaves whose processes go on trusting the revoked
-    ones until they are restarted.  ``remarks`` are sentences on what is still to be done.
+    ``works_until`` is the latest expiry of the certificates that were replaced and not revoked;
+    None if all of them have expired.  ``restart`` are the enclaves whose processes trust the
+    revoked certificates until they are restarted.  ``remarks`` are sentences about open tasks.
     """
 
     root: Path
@@ -93,10 +93,10 @@ def renew(
 ) -> Renewal:
     """Renew the named enclaves, or all that are due by ``expiring``; all or nothing.
 
-    The new certificate is for the same key, or with ``new_key`` for a new one; the rights stay as
-    they are signed.  Certificate, key and permissions of an enclave change at one moment.  A
-    replaced certificate works until it expires, for anyone who has its files, unless revoked; with
-    ``revoke_old`` all earlier ones of the renewed enclaves are revoked at the same moment.
+    The new certificate is for the same key, or with ``new_key`` for a new one; the signed rights
+    do not change.  Certificate, key and permissions of an enclave change at the same moment.  A
+    replaced certificate works until it expires, for anyone who has its files, unless it is
+    revoked; ``revoke_old`` revokes all earlier certificates of the renewed enclaves.
 
     Raises:
         KeystoreError: an enclave cannot be renewed; one error names every such enclave.
@@ -204,7 +204,7 @@ class _Renewer:
     def renew_if_due(
         self, name: str, threshold: Threshold | None
     ) -> _Replaced | UnreadableEnclave | None:
-        """Renew an enclave; with a ``threshold`` only if it is due, else return None."""
+        """Renew an enclave and return the replaced certificate; None if it is not due."""
         try:
             state = read_credentials(self._root, name)
             if threshold and not state.lifetime().due(threshold, self._now):

@@ -1,9 +1,9 @@
-"""The revocation lists of a keystore: read, carried over, signed, and put where DDS reads them.
+"""The revocation lists of a keystore: signed again, and put where DDS reads them.
 
-The issuing identity CA's list is every enclave's ``crl.pem``.  While CAs are replaced there is a
-second identity CA, whose list travels in the file of the CAs: Fast DDS 2.9.1 trusts both CAs and
-reads lists there, but not a second one in ``crl.pem``; Cyclone DDS 0.10.2 trusts the issuing CA
-alone (all of this ran).
+The list of the issuing identity CA is the ``crl.pem`` of every enclave.  During a rotation there is
+a second identity CA; its list is in the file of the CAs.  Fast DDS 2.9.1 trusts both CAs and reads
+lists in that file, but reads only one list in ``crl.pem``; Cyclone DDS 0.10.2 trusts the issuing
+CA alone (all of this ran).
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def sign_list(
     template: Template,
     now: datetime,
 ) -> SignedList:
-    """Sign a list that expires with its CA at the latest: an expired one locks everybody out."""
+    """Sign a list that expires no later than its CA: an expired list locks everybody out."""
     validity = validity_of(authority.certificate)
     moment = now.replace(microsecond=0)
     begin = max(moment - BACKDATE, validity.not_before)
@@ -80,24 +80,24 @@ def sign_list(
     return SignedList(document, end, entry)
 
 
-def _carried_over(old: RevocationList | None, ends: Mapping[int, str]) -> list[Revoked]:
+def _carried_over(old: RevocationList | None, expiries: Mapping[int, str]) -> list[Revoked]:
     """Return the entries that a new list takes over: all that had not expired at the old list.
 
-    RFC 5280, 3.3: an entry stays until it was on one list that was issued after its certificate
-    expired.  ``ends`` maps serial numbers to the expiry of the certificate (ISO 8601, UTC); an
-    entry that is not in it is kept for ever.
+    RFC 5280, 3.3: an entry stays until one list that was issued after the certificate expired has
+    held it.  ``expiries`` maps serial numbers to the expiry of the certificate (ISO 8601, UTC); an
+    entry without an expiry is kept for ever.
     """
     if old is None:
         return []
-    # The list was issued BACKDATE after it begins, at the latest; so some stay a little longer.
+    # The start of a list is up to BACKDATE before its issue, so some entries stay a little longer.
     issued = iso(old.this_update)
-    return [each for each in old.revoked if ends.get(each.serial, issued) >= issued]
+    return [each for each in old.revoked if expiries.get(each.serial, issued) >= issued]
 
 
 class Lists:
-    """Signs the lists of all identity CAs that are trusted, in a transaction.
+    """Signer of the lists of all trusted identity CAs, within a transaction.
 
-    ``remarks`` are sentences on what could not be signed.
+    ``remarks`` are sentences about lists that could not be signed.
     """
 
     def __init__(
@@ -122,20 +122,20 @@ class Lists:
     def sign(
         self, newly: Sequence[Revoked], names: Sequence[str], *, incomplete: bool
     ) -> tuple[datetime, list[Entry]]:
-        """Stage the lists with what is ``newly`` revoked; return the first expiry and entries.
+        """Stage the lists with the ``newly`` revoked; return their first expiry and ledger entries.
 
-        Each list has all serial numbers: one that another CA has given does no harm, and the ledger
-        does not say which of two CAs gave it.  With ``incomplete``, the key of a CA that is being
-        replaced may be missing.
+        Each list has all serial numbers: the ledger does not say which of two CAs issued one, and a
+        serial number of the other CA does no harm.  With ``incomplete``, the key of the old CA may
+        be missing.
 
         Raises:
-            KeystoreError: that key is missing, and ``incomplete`` is not set.
+            KeystoreError: the key of the old CA is missing, and ``incomplete`` is not set.
         """
-        ends = self._ends()
-        signed = self._sign(self._authority, self.present, newly, ends, 0)
+        expiries = self._expiries()
+        signed = self._sign(self._authority, self.present, newly, expiries, 0)
         self._transaction.write(CRL, signed.document)
         found = [signed]
-        if second := self._sign_second(newly, names, ends, incomplete=incomplete):
+        if second := self._sign_second(newly, names, expiries, incomplete=incomplete):
             found.append(second)
         return min(each.end for each in found), [each.entry for each in found]
 
@@ -144,27 +144,27 @@ class Lists:
         authority: Authority,
         old: RevocationList | None,
         newly: Sequence[Revoked],
-        ends: Mapping[int, str],
+        expiries: Mapping[int, str],
         least: int,
     ) -> SignedList:
-        kept = _carried_over(old, ends)
+        kept = _carried_over(old, expiries)
         listed = {each.serial for each in kept}
         kept += [each for each in newly if each.serial not in listed]
         number = max(old.number + 1 if old else 1, least)
         return sign_list(authority, kept, number=number, template=self._template, now=self._now)
 
-    def _ends(self) -> dict[int, str]:
-        """Map serial numbers to expiry, by the ledger, or else by the files in ``revoked``."""
-        ends = {
+    def _expiries(self) -> dict[int, str]:
+        """Map serial numbers to expiries, from the ledger and the files in ``revoked``."""
+        expiries = {
             int(each.serial, 16): each.not_after
             for each in self._ledger
             if each.what == "certificate"
         }
         for path in (self._root / REVOKED).glob("*/cert.pem"):
-            if int(path.parent.name, 16) not in ends:
+            if int(path.parent.name, 16) not in expiries:
                 found = read_certificate(path)
-                ends.setdefault(found.serial_number, iso(validity_of(found).not_after))
-        return ends
+                expiries.setdefault(found.serial_number, iso(validity_of(found).not_after))
+        return expiries
 
     # ── the other CA, while one replaces the other ─────────────────────────────────────────
 
@@ -172,7 +172,7 @@ class Lists:
         self,
         newly: Sequence[Revoked],
         names: Sequence[str],
-        ends: Mapping[int, str],
+        expiries: Mapping[int, str],
         *,
         incomplete: bool,
     ) -> SignedList | None:
@@ -187,18 +187,18 @@ class Lists:
         wanted = replaced.new if coming else replaced.old
         (other,) = [each for each in certificates if digest(each) == wanted]
         if coming and lists_confusable(certificates[0], other):
-            return None  # who trusts both CAs has to be restarted with all others anyway
+            return None  # all processes are restarted together in this case anyway
         old = carried_crl(self._root, file)
         try:
             authority = self._open(other, replaced, coming=coming)
         except KeystoreError as error:
-            # The CA that comes has issued nothing; the next stage of the rotation sees to it.
+            # The new CA has issued nothing yet; the next stage of the rotation signs its list.
             if not coming:
                 self._without(other, error, newly, old, incomplete=incomplete)
             return None
-        # As the next stage makes its list the first one, its number has to be above that.
+        # The next stage puts this list in place of the present one, so its number must be higher.
         least = (self.present.number if self.present else 0) + 2 if coming else 0
-        signed = self._sign(authority, old, () if coming else newly, ends, least)
+        signed = self._sign(authority, old, () if coming else newly, expiries, least)
         bundle = b"".join(map(pem, certificates)) + signed.document
         write_bundle(self._transaction, file, authority_files(self._root)[file], bundle, names)
         return signed
@@ -207,7 +207,7 @@ class Lists:
         self, certificate: x509.Certificate, replaced: Replacement, *, coming: bool
     ) -> Authority:
         place = replaced.key if coming else replaced.place_of_old(certificate)
-        # What the environment names is the place of the issuing CA's key.
+        # The environment variables name the key of the issuing CA.
         keyring = replace(self._keyring, places={})
         key = keyring.open(self._root, IDENTITY, replace(self._template, identity_key=place))
         if not same_key(certificate, key):
@@ -223,7 +223,7 @@ class Lists:
         *,
         incomplete: bool,
     ) -> None:
-        """Note that the old CA cannot sign its list, or refuse to revoke without it."""
+        """Note that the old CA cannot sign its list; raise if a revocation needs it."""
         name = subject_text(old_ca.subject)
         if newly and not incomplete:
             raise KeystoreError(

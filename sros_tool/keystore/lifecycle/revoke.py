@@ -1,4 +1,4 @@
-"""Revoking enclaves: their certificates go on the list, their files move to ``revoked``."""
+"""Revoking enclaves: the list names their certificates, and their files move to ``revoked``."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ _PRIVATE = "key.pem"
 class Revocation:
     """The revoked certificates, and the expiry of the list.
 
-    ``restart`` are the enclaves whose processes go on trusting the revoked ones until they are
-    started again.  ``remarks`` are sentences on what is still to be done.
+    ``restart`` are the enclaves whose processes trust the revoked certificates until they are
+    restarted.  ``remarks`` are sentences about open tasks.
     """
 
     root: Path
@@ -65,11 +65,11 @@ def revoke(
 ) -> Revocation:
     """Revoke the certificates of enclaves and move their files to ``revoked`` in the keystore.
 
-    Every certificate of an enclave is revoked that the ledger knows and that has not expired: an
-    earlier one would serve whoever has a copy of it, with the key, just as well.
-    Every other enclave gets ``crl.pem``, a link to the one list.  ``reason`` is one of `REASONS`.
-    While the identity CA is being replaced, both CAs revoke; where the key of the old one is not at
-    hand, ``until_retired`` says that its certificates may be accepted until it is retired.
+    All certificates of an enclave that are in the ledger and have not expired are revoked: an
+    attacker with the key could use an earlier one, too.  Every other enclave gets ``crl.pem``, a
+    link to the list.  ``reason`` is one of `REASONS`.  During a rotation of the identity CA both
+    CAs revoke; if the key of the old CA is missing, ``until_retired`` accepts that Fast DDS trusts
+    its certificates until it is retired.
     """
     if reason not in REASONS:
         raise UsageError(f"{reason!r} is not a reason", f"Reasons are {', '.join(REASONS)}.")
@@ -77,7 +77,7 @@ def revoke(
         tidy(root)
     _check_names(root, names)
     with Transaction(root, dry_run=dry_run) as transaction:
-        existing = _check_names(root, names)  # another process may have been faster
+        existing = _check_names(root, names)  # another process may have revoked it meanwhile
         template = load_settings(root)
         authority = load_authority(root, IDENTITY, template, keyring, now)
         issued = read_ledger(root)
@@ -116,7 +116,7 @@ def refresh_crl(
 ) -> Revocation:
     """Sign the revocation list again, so that it is valid for longer.
 
-    Its entries stay, except for certificates that expired and were on a list after that.
+    Its entries stay, except certificates that had expired before the present list was signed.
     """
     if not dry_run:
         tidy(root)
@@ -135,7 +135,7 @@ def refresh_crl(
 
 
 def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
-    """Return all enclaves of the keystore; raise unless the named ones are among them."""
+    """Return all enclaves of the keystore; raise if a named one is not among them."""
     existing = list_enclaves(root)
     for name in names:
         check_enclave_name(name)
@@ -145,7 +145,7 @@ def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def still_valid(issued: Sequence[Entry], name: str, now: datetime) -> dict[int, str]:
-    """Map the serial numbers of an enclave's certificates that have not expired to subjects."""
+    """Map serial numbers to subjects, for an enclave's certificates that have not expired."""
     return {
         int(each.serial, 16): each.subject
         for each in issued
@@ -168,7 +168,7 @@ def _move_away(transaction: Transaction, authority: Authority, name: str) -> tup
     for file in _FILES:
         source = transaction.root / folder / file
         if name == "/" and file == "governance.p7s":
-            continue  # of the enclave / this is the keystore's own
+            continue  # of the enclave / of the keystore itself
         if not source.is_symlink() and not source.exists():
             continue
         if not source.is_symlink():
@@ -184,6 +184,6 @@ def link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
         folder = enclave_folder(name)
         path = transaction.root / folder / "crl.pem"
         target = "../" * folder.count("/") + f"../{CRL}"
-        # A copy, as some ways of copying a keystore make of a link, would grow stale.
+        # Some ways to copy a keystore turn the link into a file, which would never be updated.
         if not path.is_symlink() or str(path.readlink()) != target:
             transaction.link(f"{folder}/crl.pem", target)

@@ -24,9 +24,9 @@ _NOT_SUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
 
 
 def lock_folder(folder: Path, wait: float | None = None) -> int:
-    """Lock a folder for this process; return the descriptor that holds the lock.
+    """Lock a folder for this process; return the file descriptor that holds the lock.
 
-    The lock is on the folder itself, so that no lock file is left behind.  ``wait`` is in seconds
+    The lock is on the folder itself, so that no lock file remains.  ``wait`` is in seconds
     (default: `LOCK_SECONDS`).
 
     Raises:
@@ -64,7 +64,7 @@ def flush_file_system(folder: Path) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Flush the names in a folder to the disk."""
+    """Flush a folder to the disk: the names in it, not the contents of its files."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)
@@ -75,7 +75,7 @@ def flush_folder(folder: Path) -> None:
 def exchange(one: str, other: str) -> bool:
     """Atomically exchange two names (``renameat2``); return whether that was possible.
 
-    It is not, and nothing is changed, where the system, its C library or the file system cannot.
+    Nothing is changed if the kernel, the C library or the file system does not support it.
     """
     try:
         rename = _c_library().renameat2
@@ -97,7 +97,7 @@ def _c_library() -> ctypes.CDLL:
 
 
 def is_folder(path: str | Path) -> bool:
-    """Whether a real folder is at ``path``.
+    """Return whether a real folder is at ``path``.
 
     Raises:
         KeystoreError: something else is there.
@@ -136,7 +136,7 @@ def make_folders(root: Path, folders: Iterable[str]) -> None:
 def move_into_place(source: Path, target: Path) -> None:
     """Move everything below ``source``, if it exists, to the same place below ``target``.
 
-    The enclaves come last: without them, a new keystore that is not complete yet is none.
+    The enclaves come last: a folder without them does not count as a keystore yet.
     """
     if not source.is_dir():
         return
@@ -152,11 +152,11 @@ def move_into_place(source: Path, target: Path) -> None:
 
 
 def remove_empty_folders(root: Path, paths: Iterable[str]) -> None:
-    """Remove the folders of ``paths`` that are empty; never one of the first level."""
+    """Remove the parent folders of ``paths`` that are empty, except at the first level."""
     for path in paths:
         folder = path.rpartition("/")[0]
         with contextlib.suppress(OSError):  # it is not empty
             while "/" in folder:
-                with contextlib.suppress(FileNotFoundError):  # whoever was stopped here removed it
+                with contextlib.suppress(FileNotFoundError):  # removed before an interruption
                     os.rmdir(root / folder)
                 folder = folder.rpartition("/")[0]

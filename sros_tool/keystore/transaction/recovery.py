@@ -1,8 +1,8 @@
-"""Recovery: completes or undoes what a transaction that was stopped left in a keystore.
+"""Recovery: completes or undoes an interrupted transaction of a keystore.
 
-A transaction also finishes with it: after its commit the links into the stage give way to the plain
-files, and new folders move to their places.  Each step may be repeated: it finds what is done
-already, so a recovery that was stopped is recovered, too.
+Every transaction ends with it: after the commit, plain files replace the links into the stage, and
+new folders move to their places.  Each step can be repeated and skips finished work, so an
+interrupted recovery is recovered, too.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def tidy(root: Path) -> None:
 
 
 def recover(root: Path) -> None:
-    """Do the work of `tidy`, for a caller that holds the lock."""
+    """Complete or undo an interrupted transaction, for a caller that holds the lock."""
     stage = root / STAGE
     if not is_folder(stage):
         return
@@ -79,7 +79,7 @@ def recover(root: Path) -> None:
 
 
 def _target(stage: Path) -> str | None:
-    """Return where ``live`` leads to: BEFORE, AFTER, or None where nothing was changed yet.
+    """Return the target of the link ``live``: BEFORE, AFTER, or None if nothing was changed yet.
 
     Raises:
         KeystoreError: the stage is not of this version's format (`stage`); nothing is touched.
@@ -100,7 +100,7 @@ def _target(stage: Path) -> str | None:
 
 
 def _complete(root: Path, stage: Path, moves: Sequence[Move]) -> None:
-    """Replace the links that lead into the stage by the new files and links."""
+    """Replace the links into the stage by the new files and links."""
     make_folders(root, {move.path.rpartition("/")[0] for move in moves})
 
     def complete(part: Sequence[Move]) -> None:
@@ -142,7 +142,7 @@ def _undo(root: Path, stage: Path, moves: Sequence[Move]) -> None:
 
 
 def _symlink(text: str, path: str) -> None:
-    with contextlib.suppress(FileNotFoundError):  # left by whoever was stopped here
+    with contextlib.suppress(FileNotFoundError):  # left by an interruption
         os.unlink(path)
     os.symlink(text, path)
 

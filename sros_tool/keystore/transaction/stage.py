@@ -1,12 +1,12 @@
-"""The stage of a transaction: the folder that holds what is to change, and the list of it.
+"""The stage of a transaction: the folder with the new files, and the list of all changes.
 
 ``.sros-transaction`` in the keystore holds
 
-- ``after``: new files and links for folders that exist, flat, each by the `number` of its path;
-- ``before``: what they replace, by the same numbers, as soon as the change has begun;
-- ``live``: a link to ``before`` or ``after``; pointing it at the other is the commit;
+- ``after``: new files and links for existing folders, flat, each named by the `number` of its path;
+- ``before``: the files that they replace, by the same numbers, from the start of the change;
+- ``live``: a link to ``before`` or ``after``; pointing it at ``after`` is the commit;
 - ``added``: new folders, as they will be in the keystore;
-- ``manifest.json``: the paths of all that is in ``after``, or removed, as `Move`.
+- ``manifest.json``: a `Move` for each path in ``after``, and for each path to remove.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ _VERSION = 2
 
 
 class Move(NamedTuple):
-    """How a path of the keystore changes, where its folder exists.
+    """The change of one path in an existing folder of the keystore.
 
-    ``before`` and ``after`` say what is at the path: None for nothing, "" for a file, and for a
-    symbolic link its text.
+    ``before`` and ``after`` describe the content of the path: None for nothing, "" for a file, and
+    the target text for a symbolic link.
     """
 
     path: str
@@ -48,24 +48,24 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Staged:
-    """What a forked worker staged, for the process that commits."""
+    """The staged changes of a forked worker, for the process that commits."""
 
     changes: tuple[Change, ...]
     moves: tuple[Move, ...]
 
 
 def number(path: str) -> str:
-    """Return the name in the stage for a path; short, so that a link to it fits its inode."""
+    """Return the name of a path in the stage; short, so that a link to it fits into an inode."""
     return hashlib.blake2b(os.fsencode(path), digest_size=8).hexdigest()
 
 
 def bridge_text(path: str) -> str:
-    """Return the text of the link that is at ``path`` while it changes."""
+    """Return the target text of the link that is at ``path`` during the change."""
     return "../" * path.count("/") + f"{STAGE}/{LIVE}/{number(path)}"
 
 
 def seen_from_stage(path: str, text: str) -> str:
-    """Return the text that a link in the stage needs to lead where one at ``path`` would."""
+    """Return the target text of the link at ``path``, rewritten for a link in the stage."""
     return text if text.startswith("/") else f"../../{path.rpartition('/')[0]}/{text}"
 
 
@@ -77,7 +77,7 @@ def point_live(stage: Path, to: str) -> None:
 
 
 def write_manifest(stage: Path, moves: Sequence[Move]) -> None:
-    """Write the list of all moves; it must be on the disk before the first one begins."""
+    """Write the list of all moves; flush it to the disk before the first move."""
     with open(stage / MANIFEST, "x", encoding="utf-8") as file:
         file.write(json.dumps({"version": _VERSION, "moves": moves}))
 

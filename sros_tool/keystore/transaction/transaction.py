@@ -1,14 +1,13 @@
 """Changes many files of a keystore as one: all of them, or none, whenever the machine stops.
 
-New files are written below ``.sros-transaction`` in the keystore (`stage`).  Files that already
-exist change together at a single moment (`Transaction.commit`): each path first becomes a link to
-``.sros-transaction/live/<number>``, which still is its old content, for ``live`` is a link to
-``before``; then ``live`` is pointed at ``after``.  That is the commit.  Afterwards the links give
-way to the plain files, and new folders are moved in (`recovery`).  Whatever the moment at which
-the machine stops, DDS finds either all the old files or all the new ones, and the next transaction
-tidies up.
+New files are written below ``.sros-transaction`` in the keystore (`stage`).  Existing files change
+together at a single moment (`Transaction.commit`): each path first becomes a link to
+``.sros-transaction/live/<number>``; ``live`` is a link to ``before``, so that this is still the
+old content.  Then ``live`` is pointed at ``after``: that is the commit.  Finally plain files
+replace the links, and new folders move to their places (`recovery`).  If the machine stops at any
+moment, DDS finds either all old files or all new ones, and the next transaction tidies up.
 
-A new keystore is made next to its place, and appears by one renaming.
+A new keystore is made in a folder next to its path, and one rename puts it in place.
 """
 
 from __future__ import annotations
@@ -51,11 +50,11 @@ _LOG = logging.getLogger(__name__)
 
 
 class Transaction:
-    """A lock on a keystore and the files that will change in it.
+    """A change of many files of a keystore, with the lock on it.
 
-    Use as a context manager; without `commit` nothing changes.  If ``fresh``, the keystore need not
-    exist yet, and appears as a whole; otherwise it must exist.  With ``dry_run`` nothing is
-    written, and ``changes`` says what would be.
+    Use it as a context manager; without `commit` nothing changes.  With ``fresh``, the keystore may
+    be new, and then appears as a whole; otherwise it must exist.  With ``dry_run`` nothing is
+    written, and ``changes`` lists the files that would be.
     """
 
     def __init__(self, root: Path, *, fresh: bool = False, dry_run: bool = False) -> None:
@@ -73,7 +72,7 @@ class Transaction:
         self._undo: list[Callable[[], None]] = []
 
     def on_failure(self, undo: Callable[[], None]) -> None:
-        """Have ``undo`` called at the end, unless the transaction was committed."""
+        """Call ``undo`` when the transaction ends without a commit."""
         self._undo.append(undo)
 
     # ── begin and end ──────────────────────────────────────────────────────────────────────
@@ -132,7 +131,7 @@ class Transaction:
             missing.append(parent)
             parent = parent.parent
         for each in reversed(missing):
-            with contextlib.suppress(FileExistsError):  # another process was faster
+            with contextlib.suppress(FileExistsError):  # another process made it meanwhile
                 each.mkdir()
                 self._made_parents.insert(0, each)
 
@@ -159,7 +158,7 @@ class Transaction:
     # ── staging ──────────────────────────────────────────────────────────────────
 
     def write(self, path: str, data: bytes, *, private: bool = False) -> None:
-        """Stage a file; a ``private`` one is its owner's alone, from the first byte."""
+        """Stage a file; only its owner can ever read a ``private`` one."""
         staged = self._prepare(path, "")
         if staged is None:
             return
@@ -183,7 +182,7 @@ class Transaction:
             os.symlink(seen_from_stage(path, target) if flat else target, staged)
 
     def remove(self, path: str) -> None:
-        """Stage the removal of a file or link, and of the folders that are empty then."""
+        """Stage the removal of a file or link, and of folders that become empty."""
         there = self._prepare_folder(path.rpartition("/")[0], wanted=False)
         before = self._at(path) if there else None
         if before is None:
@@ -192,7 +191,7 @@ class Transaction:
         self._moves.append(Move(path, before, None))
 
     def _prepare(self, path: str, after: str) -> str | None:
-        """Return the path to write a staged file to; ``after`` has the meaning of `Move.after`."""
+        """Return the path to write a staged file to; ``after`` means the same as in `Move`."""
         exists = self._prepare_folder(path.rpartition("/")[0])
         before = self._at(path) if exists else None
         self._begin_change(path, "create" if before is None else "replace")
@@ -209,7 +208,7 @@ class Transaction:
         self.changes.append(Change(action, path))
 
     def _at(self, path: str) -> str | None:
-        """Return the present state of a path, in the terms of `Move`."""
+        """Return the present state of a path, as in `Move.before`."""
         real = f"{self.root}/{path}"
         try:
             mode = os.lstat(real).st_mode
@@ -246,15 +245,15 @@ class Transaction:
     # ── by forked workers ───────────────────────────────────────────────────────────────
 
     def mark(self) -> tuple[int, int]:
-        """Return a mark of this moment, for `since`."""
+        """Return a mark of what is staged so far, for `since`."""
         return len(self.changes), len(self._moves)
 
     def since(self, mark: tuple[int, int]) -> Staged:
-        """Return what was staged since ``mark``."""
+        """Return the changes that were staged after ``mark``."""
         return Staged(tuple(self.changes[mark[0] :]), tuple(self._moves[mark[1] :]))
 
     def absorb(self, staged: Staged) -> None:
-        """Add what a forked worker staged for this transaction."""
+        """Add the changes that a forked worker staged."""
         self._staged.update(change.path for change in staged.changes)
         self.changes += staged.changes
         self._moves += staged.moves
@@ -262,7 +261,7 @@ class Transaction:
     # ── commit ─────────────────────────────────────────────────────────────────────────────
 
     def commit(self) -> None:
-        """Put everything in place; when this returns, it is on the disk."""
+        """Put all staged changes in place and flush them to the disk."""
         if self.dry_run or not self.changes:
             return
         if self._new_root:
@@ -297,7 +296,7 @@ class Transaction:
             raise
         self._made_parents.clear()
         self._undo.clear()
-        with contextlib.suppress(OSError):  # it is there; the system flushes it in time
+        with contextlib.suppress(OSError):  # it is in place; the system flushes it soon
             filesystem.flush_folder(self.root.parent)
 
 
@@ -305,7 +304,7 @@ class Transaction:
 
 
 def _bridge(root: Path, stage: Path, moves: Sequence[Move]) -> None:
-    """Replace each path by a link through ``live`` to its old content, in ``before``."""
+    """Replace each path by a link through ``live`` to its old content, now in ``before``."""
     if not moves:
         return
     os.mkdir(stage / BEFORE, 0o700)
@@ -321,7 +320,7 @@ def _bridge(root: Path, stage: Path, moves: Sequence[Move]) -> None:
 
 
 def _can_exchange(stage: Path) -> bool:
-    """Try whether the file system can exchange two names."""
+    """Return whether the file system can exchange two names, by a try."""
     spare = f"{stage}/spare"
     os.symlink(BEFORE, spare)  # the same as `live`, so that exchanging them changes nothing
     can = filesystem.exchange(spare, f"{stage}/{LIVE}")
@@ -330,14 +329,14 @@ def _can_exchange(stage: Path) -> bool:
 
 
 class _Bridge:
-    """The two ways to replace paths by links, for slices of the moves."""
+    """Two ways to replace paths by links, each applied to a slice of the moves."""
 
     def __init__(self, root: str, stage: str) -> None:
         self._root = root
         self._stage = stage
 
     def by_exchange(self, moves: Sequence[Move]) -> None:
-        """Exchange each file and a link that was prepared in ``before``."""
+        """Exchange each file with a link that was prepared in ``before``."""
         root, before = self._root, f"{self._stage}/{BEFORE}"
         for move in moves:
             if move.before != "":
@@ -350,7 +349,7 @@ class _Bridge:
                 raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP), f"{root}/{move.path}")
 
     def keep(self, moves: Sequence[Move]) -> bool:
-        """Give the old content a second name in the stage; return whether it had to be copied."""
+        """Hard-link each old file into ``before``; return whether one had to be copied instead."""
         copied = False
         for move in moves:
             if move.before != "":
@@ -365,7 +364,7 @@ class _Bridge:
         return copied
 
     def by_replacement(self, moves: Sequence[Move]) -> None:
-        """Put the link in the place of each file, after `keep`."""
+        """Replace each file by its link, after `keep`."""
         for move in moves:
             self._place(move)
 

@@ -1,7 +1,7 @@
-"""The stages of a CA rotation, and the changes that each makes in a keystore.
+"""The stages of a CA rotation, and how each stage changes a keystore.
 
-distribute: a new CA is trusted next to the old one.  reissue: the new CA issues and signs
-everything again.  retire: the old CA is trusted no longer.  Each is one transaction.
+distribute: enclaves trust a new CA in addition to the old one.  reissue: the new CA issues and
+signs everything again.  retire: enclaves no longer trust the old CA.  Each is one transaction.
 """
 
 from __future__ import annotations
@@ -86,11 +86,11 @@ from sros_tool.xml import read_bytes
 
 @dataclass(frozen=True, slots=True)
 class RotationStep:
-    """What was done, or with ``dry_run`` would be.
+    """The result of a rotation step, or with ``dry_run`` the result that it would have.
 
-    ``stage`` is the stage that is reached, ``files`` are the stems of the CA files of the CAs that
-    are replaced, ``kept_elsewhere`` the places of old keys outside of the keystore, which are left
-    there.
+    ``stage`` is the reached stage.  ``files`` are the stems of the files of the CAs that are
+    replaced.  ``kept_elsewhere`` are the places of old keys outside of the keystore; sros leaves
+    them there.
     """
 
     root: Path
@@ -116,11 +116,11 @@ def rotate_ca(
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> RotationStep:
-    """Go to the stage ``to`` (default: the next one), or through all that remain with ``finish``.
+    """Rotate up to the stage ``to`` (default: the next one), or to the end with ``finish``.
 
-    A stage that was reached already is left as it is, so that ``to`` can be repeated.  ``roles``
-    ("identity", "permissions"; default both) count where a rotation begins.  ``keyring`` reaches
-    the present keys; ``new_keys`` says where new ones are made, where not in the keystore.
+    If the stage ``to`` is reached already, nothing is changed.  ``roles`` ("identity",
+    "permissions"; default both) matter only when a rotation begins.  ``keyring`` opens the present
+    keys; ``new_keys`` names the places of new keys outside of the keystore.
     """
     if not dry_run:
         tidy(root)
@@ -147,7 +147,7 @@ def rotate_ca(
 
 
 def _wanted(root: Path, rotation: Rotation, to: RotationStage | None) -> RotationStage:
-    """Return the stage to go to; NONE where there is nothing to do.
+    """Return the stage to go to; NONE if there is nothing to do.
 
     Raises:
         UsageError: the stage is over, or another one comes before it.
@@ -155,7 +155,7 @@ def _wanted(root: Path, rotation: Rotation, to: RotationStage | None) -> Rotatio
     if to is None:
         return rotation.following()
     if to is RotationStage.RETIRE and rotation.stage is RotationStage.NONE:
-        return RotationStage.NONE  # it is done
+        return RotationStage.NONE  # this stage is done
     order = list(RotationStage)
     ahead = order.index(to) - order.index(rotation.stage)
     if ahead > 1:
@@ -181,11 +181,11 @@ def renew_identity_ca(
     validity: Span | None = None,
     dry_run: bool = False,
 ) -> RotationStep:
-    """Give the identity CA a new certificate of the same name and key, which expires later.
+    """Issue a certificate that expires later to the identity CA, with the same name and key.
 
-    All certificates that it has issued fit both, on Cyclone DDS 0.10.2 and Fast DDS 2.9.1 (ran), so
-    nothing else changes.  A permissions CA cannot be renewed so: what it has signed names the very
-    certificate.
+    Nothing else changes: on Cyclone DDS 0.10.2 and Fast DDS 2.9.1 (ran) all certificates that the
+    CA issued have a valid chain to both its certificates.  A permissions CA cannot be renewed this
+    way: the documents that it signed name one exact certificate.
     """
     if not dry_run:
         tidy(root)
@@ -220,10 +220,10 @@ def renew_identity_ca(
 
 
 class _Rotator:
-    """Stages one step of a rotation.
+    """Writer of one rotation step, within a transaction.
 
-    ``replacements`` are the CAs that it is about, ``kept_elsewhere`` the places of old keys that do
-    not lie in the keystore and are left there, ``notes`` are on what was issued.
+    ``replacements`` are the CAs that it replaces, ``kept_elsewhere`` the places of old keys that
+    stay outside of the keystore, ``notes`` are about the issued documents.
     """
 
     def __init__(
@@ -259,8 +259,8 @@ class _Rotator:
     ) -> RotationStage:
         """Stage all changes up to ``stage``; return the reached stage.
 
-        It is the present one where the new identity CA has no revocation list yet, which has to be
-        distributed first: Fast DDS 2.9.1 refuses every enclave of a CA without one (ran).
+        If the new identity CA has no revocation list yet, it is distributed first, and the stage
+        does not change: Fast DDS 2.9.1 refuses every enclave of a CA without a list (ran).
         """
         if self._rotation.stage is RotationStage.REISSUE:
             self._retire()
@@ -312,19 +312,19 @@ class _Rotator:
         self._write_state(RotationStage.DISTRIBUTE)
 
     def _empty_crl(self, authority: Authority, number: int) -> bytes:
-        """Return a list of the new CA, which has issued nothing yet that could be revoked."""
+        """Return an empty revocation list of a new CA."""
         signed = sign_list(authority, (), number=number, template=self._template, now=self._now)
         self._entries.append(signed.entry)
         return signed.document
 
     def _lacks_crl(self, successors: list[_Successor]) -> bool:
-        """Whether something was revoked since the new identity CA was distributed."""
+        """Return whether a revocation was made after the new identity CA was distributed."""
         return (self._root / CRL).exists() and any(
             self._takes_crl(each) and not carried_crl(self._root, each.file) for each in successors
         )
 
     def _takes_crl(self, each: _Successor) -> bool:
-        """Whether the list of a new CA can be distributed before that CA issues."""
+        """Return whether the list of a new CA can be distributed before that CA issues."""
         return IDENTITY in each.roles and not lists_confusable(each.old[0], each.new.certificate)
 
     def _reissue(
@@ -361,8 +361,8 @@ class _Rotator:
     ) -> None:
         """Stage the certificates, governance and permissions that the new CAs issue.
 
-        Keys, subjects and rights stay.  What a CA that is not replaced has issued is left as it
-        is, so its key is not needed.
+        Keys, subjects and rights stay.  Certificates and documents of a CA that is not replaced do
+        not change, so its key is not needed.
         """
         if permissions:
             self._sign_governance(permissions)
@@ -402,7 +402,7 @@ class _Rotator:
                 continue
             signed = smime.parse(read_bytes(real, "governance document"))
             signed.verify(permissions.old[0])
-            parse_governance(signed.document)  # raises where DDS could not read it
+            parse_governance(signed.document)  # raises if DDS could not read it
             message = permissions.new.sign(signed.document, "the governance document")
             self._transaction.write(path, message)
             self._entries.append(document_entry(self._now, "governance", message))
@@ -429,9 +429,9 @@ class _Rotator:
         self._transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
 
     def _install_key(self, each: _Successor) -> str:
-        """Replace the old key, which moves to ``retired``, by the new one.
+        """Move the old key to ``retired`` and put the new one in its place.
 
-        Return the place of the old key where it is outside of the keystore, else "".
+        Return the place of the old key if it is outside of the keystore, else "".
         """
         transaction, root = self._transaction, self._root
         old_key = ""
@@ -454,7 +454,7 @@ class _Rotator:
         return old_key
 
     def _write_settings(self, successors: list[_Successor]) -> None:
-        """Have the settings name the places of the new keys."""
+        """Write the places of the new keys into the settings."""
         places = {
             role: "" if each.key.startswith(f"{PRIVATE}/") else each.key
             for each in successors
@@ -488,7 +488,7 @@ def _issuance(
     folder = enclave_path(root, name)
     path = folder / CERTIFICATE_FILE
     if not path.exists():
-        return None  # it will be of the new CA
+        return None  # the new CA issues its first certificate
     kept = read_certificate(path)
     certificate: NewIdentity | x509.Certificate = kept
     if identity:
@@ -523,7 +523,7 @@ def _verified_rights(
 
 @dataclass(frozen=True, slots=True)
 class _Successor:
-    """A new CA, and the certificates of the one that it replaces (with the chain above it).
+    """A new CA, and the certificate of the CA that it replaces, with the chain above that.
 
     ``file`` is the stem of the CA file, ``key`` the place of the new key: a URI, or a path in the
     keystore.
@@ -536,7 +536,7 @@ class _Successor:
     key: str
 
     def replacement(self) -> Replacement:
-        """Return its record for the rotation's file."""
+        """Return the entry about it in the rotation's file."""
         return Replacement(self.file, digest(self.old[0]), digest(self.new.certificate), self.key)
 
 
@@ -552,7 +552,7 @@ def _make_successors(
 ) -> list[_Successor]:
     """Make new CAs for ``roles`` (none: for all), and stage their keys.
 
-    In the keystore, they lie ``next_to`` the present keys, or replace them.
+    In the keystore, the new keys lie ``next_to`` the present keys, or replace them.
     """
     root = transaction.root
     files = authority_files(root)
@@ -622,7 +622,7 @@ def _make_successor(
 def _distributed(
     root: Path, rotation: Rotation, keyring: Keyring, template: Template
 ) -> list[_Successor]:
-    """Return the distributed new CAs, with their keys."""
+    """Return the new CAs that were distributed, with their keys."""
     found = []
     files = authority_files(root)
     for each in rotation.replacements:
@@ -643,7 +643,7 @@ def _distributed(
 
 
 def _check_later(old: x509.Certificate, new: x509.Certificate) -> None:
-    """Raise `UsageError` where a new CA would expire before the old one, which nobody asked for."""
+    """Raise `UsageError` if a new CA would expire before the old one and no validity was named."""
     if new.not_valid_after_utc < old.not_valid_after_utc:
         raise UsageError(
             "the new CA would expire before the old one",

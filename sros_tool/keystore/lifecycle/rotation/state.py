@@ -1,6 +1,6 @@
 """The state of a rotation of CAs: its stage, the CAs it replaces, and the enclaves of each CA.
 
-This module only reads; `stages` changes.
+This module only reads; `stages` makes the changes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from sros_tool.values import as_plain
 from sros_tool.xml import read_bytes
 
 _SOON = timedelta(days=90)
-"""How long before its expiry a CA should be replaced."""
+"""The remaining time from which a CA should be replaced."""
 
 
 class RotationStage(StrEnum):
@@ -50,7 +50,7 @@ class RotationStage(StrEnum):
     REISSUE = "reissue"
     """The new CA has issued everything; the old one is still trusted."""
     RETIRE = "retire"
-    """The old CA is trusted no longer; the rotation is complete."""
+    """The old CA is no longer trusted; the rotation is complete."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,8 +58,8 @@ class Replacement:
     """A CA and the one that replaces it.
 
     ``file`` is the stem of its files ("identity_ca", "permissions_ca", or "ca" for both jobs);
-    ``old`` and ``new`` are SHA-256 of the certificates; ``key`` is where the new key is, by URI or
-    path in the keystore; ``old_key`` the same of the old one, where that is not kept in `RETIRED`.
+    ``old`` and ``new`` are the SHA-256 of the certificates; ``key`` is the place of the new key, a
+    URI or a path in the keystore; ``old_key`` is the place of the old key, "" if that is `RETIRED`.
     """
 
     file: str
@@ -75,7 +75,7 @@ class Replacement:
 
 @dataclass(frozen=True, slots=True)
 class Rotation:
-    """The stage that was reached, and the CAs that are replaced."""
+    """A rotation: its last finished stage, and the CAs that it replaces."""
 
     stage: RotationStage = RotationStage.NONE
     replacements: tuple[Replacement, ...] = ()
@@ -88,11 +88,11 @@ class Rotation:
 
 @dataclass(frozen=True, slots=True)
 class AuthorityStatus:
-    """A CA that is trusted: ``standing`` is issuing, next or old; ``enclaves`` are on it."""
+    """A trusted CA: ``state`` is issuing, next or old; ``enclaves`` is how many are on it."""
 
     file: str
     roles: tuple[str, ...]
-    standing: str
+    state: str
     subject: str
     serial: str
     validity: Window
@@ -101,7 +101,7 @@ class AuthorityStatus:
 
 @dataclass(frozen=True, slots=True)
 class RotationStatus:
-    """The stage of a keystore, its CAs, its number of enclaves, and what to do, by vendor."""
+    """The stage of a keystore, its CAs, its number of enclaves, and remarks on what to do."""
 
     root: Path
     rotation: Rotation
@@ -119,7 +119,7 @@ def read_rotation(root: Path) -> Rotation:
     """Return the rotation that is under way, or an empty one.
 
     Raises:
-        KeystoreError: its file does not fit the CAs.
+        KeystoreError: the file of the rotation does not fit the CAs.
     """
     path = root / ROTATION
     if not path.exists():
@@ -162,14 +162,14 @@ def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
         counts = _count(root, names, roles[0], found)
         for index, certificate in enumerate(found):
             replaced = by_file.get(file)
-            standing = "issuing" if index == 0 else "old"
+            state = "issuing" if index == 0 else "old"
             if replaced and index and digest(certificate) == replaced.new:
-                standing = "next"
+                state = "next"
             states.append(
                 AuthorityStatus(
                     file,
                     roles,
-                    standing,
+                    state,
                     subject_text(certificate.subject),
                     f"{certificate.serial_number:x}",
                     validity_of(certificate),
@@ -209,10 +209,10 @@ def _count(
 
 
 def _ending(states: Sequence[AuthorityStatus], now: datetime) -> list[str]:
-    """Return what to do about CAs that expire soon, or have expired."""
+    """Return remarks on CAs that expire soon, or have expired."""
     remarks = []
     for each in states:
-        if each.standing != "issuing" or each.validity.not_after - now > _SOON:
+        if each.state != "issuing" or each.validity.not_after - now > _SOON:
             continue
         name = "CA" if len(each.roles) > 1 else f"{each.roles[0]} CA"
         end = iso(each.validity.not_after)
@@ -236,7 +236,7 @@ def _ending(states: Sequence[AuthorityStatus], now: datetime) -> list[str]:
 
 
 def _remarks(root: Path, rotation: Rotation) -> list[str]:
-    """Return what to restart at this stage, and how, by vendor."""
+    """Return remarks on the processes to restart at this stage, by vendor."""
     files = [each.file for each in rotation.replacements]
     if rotation.stage is RotationStage.DISTRIBUTE:
         return [
@@ -261,10 +261,10 @@ def _remarks(root: Path, rotation: Rotation) -> list[str]:
 
 
 def lists_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
-    """Whether OpenSSL may take a revocation list of one CA for a list of the other.
+    """Return whether OpenSSL may take a revocation list of one CA for a list of the other.
 
-    OpenSSL looks for a list by name and key identifier.  Where the old CA has no identifier and the
-    new one has its name, Fast DDS 2.9.1 finds the wrong list and starts no process at all (ran).
+    OpenSSL looks for a list by name and key identifier.  If both CAs have the same name and the
+    old one has no identifier, Fast DDS 2.9.1 finds the wrong list and starts no process (ran).
     """
     return old.subject == new.subject and not _has_identifier(old)
 
@@ -280,8 +280,8 @@ def _has_identifier(certificate: x509.Certificate) -> bool:
 def _fast_dds_hindrance(root: Path, files: Sequence[str]) -> str:
     """Return why Fast DDS cannot trust the old and the new CA at once, as a sentence, or "".
 
-    Fast DDS 2.9.1 (ran): two CAs of one name are distinguished by their key identifiers, and
-    permissions CAs need to have one name and one algorithm on both sides.
+    Fast DDS 2.9.1 (ran) distinguishes two CAs of the same name by their key identifiers, and needs
+    permissions CAs of the same name and algorithm on both sides.
     """
     for file in files:
         if file == "identity_ca":
