@@ -1,7 +1,7 @@
 """The functions that other programs may call; `import sros_tool` offers them by name.
 
-Thin on purpose: a function here turns what a script has at hand (a path, the name of a template)
-into the values of the package, supplies the present moment, and calls one function of a room below.
+Thin on purpose: a function here turns the arguments of a script (a path, the name of a template)
+into the values of the package, supplies the present moment, and calls one function below.
 Nothing here prints, asks a person, or reads an environment variable.
 """
 
@@ -98,7 +98,7 @@ def create_keystore(
     Raises:
         KeystoreError: Something is in the way, or a key cannot be used.
         DocumentError: There is no such template, or it is not understood.
-        UsageError: ``domains`` are none.
+        UsageError: ``domains`` are not domain ids.
 
     Example:
         >>> keystore = sros_tool.create_keystore("ks", template="production")
@@ -120,7 +120,7 @@ def open_keystore(path: AnyPath) -> Keystore:
     """Return the keystore in the folder ``path``; one that ros2/sros2 created is as good.
 
     Raises:
-        KeystoreError: It is none.
+        KeystoreError: The folder is not a keystore.
 
     Example:
         >>> sros_tool.open_keystore("ks").enclaves
@@ -153,7 +153,7 @@ def read_policy(path: AnyPath) -> Policy:
     """Return the policy in the file ``path``, with everything that it includes.
 
     Raises:
-        PolicyError: It is malformed, contradicts itself, or includes what is not below its folder.
+        PolicyError: It is malformed, contradicts itself, or includes a file outside of its folder.
         DocumentError: It cannot be read.
 
     Example:
@@ -196,7 +196,7 @@ def generate(
     Raises:
         KeystoreError: There is no keystore, it is busy or broken, or is not for that domain.
         PolicyError: Two policies disagree on an enclave, or a policy file is malformed.
-        InvalidNameError: An enclave's name is none.
+        InvalidNameError: An enclave's name is not valid.
         UsageError: Neither a policy nor an enclave is given.
 
     Example:
@@ -280,7 +280,7 @@ def explain_access(
 
     Raises:
         KeystoreError: There is no such keystore or enclave.
-        UsageError: No node can do that, or the name, vendor or domain is none.
+        UsageError: No node can do that, or the name, vendor or domain is not valid.
 
     Example:
         >>> answer = sros_tool.explain_access(keystore, "/talker", "publish", "/chatter")
@@ -339,7 +339,7 @@ def check(
         paths: Keystores, folders of enclaves, policy files, or folders of policy files.
         policies: Policies, or their files, to compare the permissions of keystores with.
         severity: The lowest severity that is returned.
-        strict: Report in full what a keystore's template chose openly, too.
+        strict: Report in full also the weaknesses that a keystore's template accepts.
         domain: The ROS domain that enclaves have to join.
         now: The moment that is asked about; the present one by default.
         zone: The time zone of the robot, in which some vendors read dates.
@@ -349,7 +349,7 @@ def check(
         ``text`` and ``remedy``.
 
     Raises:
-        DocumentError: A path is nothing that can be checked.
+        DocumentError: A path is neither a policy, nor a keystore, nor an enclave.
         UsageError: No path is given, or the severity is unknown.
 
     Example:
@@ -393,7 +393,7 @@ def _keyring(secrets: Secrets | None, *, encrypt: bool = False) -> Keyring:
 
 
 def _several(parameter: str, given: Iterable[Item]) -> Iterable[Item]:
-    """Return ``given``; refuse a single string, which would be read letter by letter."""
+    """Return ``given``; refuse a single string, whose letters would count as items."""
     if isinstance(given, str):
         raise UsageError(f"{parameter} is one string", "", f"Pass a list: [{given!r}].")
     return given

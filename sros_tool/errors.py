@@ -12,7 +12,7 @@ from dataclasses import dataclass
 class SrosError(Exception):
     """Base of every error that sros raises on purpose.
 
-    ``what`` is a clause without a final full stop and without a leading "Unable to ...";
+    ``what`` is a clause without a full stop at its end and without "Unable to ..." at its start;
     ``why`` and ``remedy`` are whole sentences, or empty.
     """
 

@@ -1,8 +1,7 @@
 """The faults of an enclave's files, each with title, reason and remedy.
 
-Keystores are read, checked and explained with these faults, and the messages of DDS vendors stand
-for some of them.  A command in a remedy is one that runs on a keystore with that fault, and mends
-it.
+Reading, checking and explaining keystores uses these faults; messages of DDS vendors are mapped to
+some of them.  A command in a remedy runs on a keystore with that fault, and repairs it.
 """
 
 from __future__ import annotations
@@ -292,7 +291,7 @@ class Fault(Enum):
     )
 
     def __new__(cls, identifier: str, *_: object) -> Fault:
-        """Make the identifier the value."""
+        """Make the member whose value is the identifier."""
         fault = object.__new__(cls)
         fault._value_ = identifier
         return fault
@@ -314,7 +313,7 @@ class Fault(Enum):
         self._remedies = remedies or {}
 
     def remedy_in(self, file: str) -> str:
-        """Return what to do where the fault lies in ``file``, with the fields of ``remedy``."""
+        """Return the remedy for a fault in ``file``, with its fields still to be filled in."""
         return self._remedies.get(file, self.remedy)
 
 
@@ -327,4 +326,4 @@ VENDOR_FAULTS = (
     Fault.KEY_ALGORITHM,
     Fault.DOCUMENT_SIZE,
 )
-"""Those that some vendors only find when they load an enclave."""
+"""The faults that only some vendors find, when they load an enclave."""

@@ -15,11 +15,11 @@ _LOG = logging.getLogger(__name__)
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Replace the content of the file at ``path`` by ``data``, on the disk when this returns.
+    """Atomically replace the content of the file at ``path`` by ``data``, and flush it to the disk.
 
-    Whoever reads meanwhile finds the old content or the new one, never a part.  A file that exists
-    keeps its mode and, where that is allowed, its owner; a symbolic link stays and its target
-    changes.  A device or a pipe (``/dev/null``) is written to, and never replaced.
+    Another process reads either the old content or the new one.  An existing file keeps its mode
+    and, if permitted, its owner; a symbolic link stays and its target changes.  A device or a pipe
+    (``/dev/null``) is written to, and never replaced.
 
     Raises:
         OSError: the folder cannot be written; then nothing changed.
@@ -78,5 +78,7 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise
     except RecursionError as error:
         raise tomllib.TOMLDecodeError("it is nested too deeply") from error
-    except ValueError as error:  # a number of thousands of digits, a date that does not exist
+    except (
+        ValueError
+    ) as error:  # such as a number of thousands of digits, or a date that does not exist
         raise tomllib.TOMLDecodeError(str(error)) from error

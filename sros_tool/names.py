@@ -1,4 +1,4 @@
-"""ROS names: their grammar, how a policy's names expand, and the names that ROS itself gives.
+"""ROS names: their grammar, the expansion of a policy's names, and the names of ROS itself.
 
 Sources: ROS 2 design "Topic and Service Names" and "Actions"; rcl's ``validate_topic_name`` and
 ``rmw_validate_namespace``.
@@ -38,11 +38,11 @@ ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")
 ACTION_TOPICS = ("feedback", "status")
 """The topics that an action consists of; the server publishes them.
 
-`keystore/issuing/proof.py` has a second list of all these parts on purpose: a proof that shared
-this one would prove nothing of it.
+`keystore/issuing/proof.py` has its own list of these parts on purpose: a proof that used this list
+could not find an error in it.
 """
 
-# By far the most names need no closer look: relative, private or absolute, without wildcards.
+# Most names need no further check: relative, private or absolute, without wildcards.
 _PLAIN = re.compile(r"(?:~?/)?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _WILDCARDS = frozenset("*?[")
@@ -94,12 +94,12 @@ def _enclave_problem(name: str) -> str:
 
 
 def is_expression(name: str) -> bool:
-    """Return whether ``name`` holds a wildcard, and so stands for many names."""
+    """Return whether ``name`` holds a wildcard."""
     return not _WILDCARDS.isdisjoint(name)
 
 
 def expression_problem(text: str) -> str:
-    """Why ``text`` cannot be the name of a topic, service or action in a policy; "" if it can.
+    """Return why ``text`` cannot name a topic, service or action in a policy; "" if it can.
 
     Allowed are relative, private (``~``, ``~/x``) and absolute ROS names, with the wildcards
     ``*``, ``?``, ``[abc]``, ``[a-c]`` and ``[!a-c]``, which every DDS vendor reads alike.
@@ -158,6 +158,6 @@ def expand(name: str, ns: str, node: str) -> str:
 
 
 def action_part(name: str) -> tuple[str, str]:
-    """Return the action that a service or topic is part of, and which part; "" for any other."""
+    """Return the action of a service or topic, and the part that it is; "" if it is not a part."""
     action, _, part = name.rpartition(ACTION_INSIDE)
     return (action, part) if part in (*ACTION_SERVICES, *ACTION_TOPICS) else ("", "")

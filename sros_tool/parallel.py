@@ -1,7 +1,7 @@
 """Run a function over slices of a list in forked workers.
 
-Signing is limited by the CPU, and forked processes share everything that was read and checked
-before.  They also share the lock on the keystore: it is held until the last of them has exited.
+Signing is limited by the CPU, and forked processes share all data that was read and checked before.
+They also share the lock on the keystore: it is held until the last one has exited.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ def map_slices(
     """Return each slice of ``items`` with the result of ``work`` on it, in order.
 
     There is one slice for each core; this process does the first, forked workers do the others.
-    A short list, and a program with several threads (a fork could leave their locks held for
-    ever), gets one slice and no worker.  Results and errors of workers are pickled.
+    A short list gets one slice and no worker, and so does a program with several threads: a fork
+    could leave their locks held for ever.  Results and errors of workers are pickled.
 
     Raises:
         SrosError: a worker died.  The first error that ``work`` raises is raised here, too.
@@ -73,7 +73,8 @@ def _fork(
 ) -> None:
     """Start a worker and add it, with the pipe for its result, to ``workers``.
 
-    A signal between these two steps would leave a worker that nobody stops, so it has to wait.
+    Signals are blocked meanwhile: one between these two steps would leave a worker that nobody
+    stops.
     """
     parent = os.getpid()
     reader, writer = os.pipe()
@@ -104,7 +105,7 @@ def _result_or_error(
 
 
 def _die_with(parent: int) -> None:
-    """Have this process killed when its parent dies, so that it writes nothing afterwards."""
+    """Ask the kernel to kill this process when its parent dies, so that it writes no more."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)

@@ -1,4 +1,4 @@
-"""Where the files that ship with sros are: policies and keystore templates.
+"""The places of the files that ship with sros: policies and keystore templates.
 
 In a wheel they lie inside the package; in a checkout they stand at the top of the repository.
 """
@@ -26,5 +26,5 @@ def templates_dir() -> Path:
 
 
 def unpacked_dds_dir() -> Path:
-    """Return the folder of a checkout in which its demo command unpacks a DDS, where apt cannot."""
+    """Return the folder of a checkout for a DDS that its demo command unpacks without apt."""
     return _PACKAGE.parent / ".dds"

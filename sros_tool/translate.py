@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sros_tool.policy.protection import DomainProtection, NamedProtection, TopicProtection
 
 SERVICE_ENDS = {"rq": "Request", "rr": "Reply"}
-"""What the topics of a service begin and end with: its requests, and its replies."""
+"""The prefix and suffix of the topics of a service: its requests, and its replies."""
 
 _TOPIC = ("rt", "")
 _REQUESTS, _REPLIES = SERVICE_ENDS.items()
@@ -33,7 +33,7 @@ _DDS_NAMES: dict[str, tuple[_Ends, _Ends]] = {
     "request": ((_REQUESTS,), (_REPLIES,)),
     "reply": ((_REPLIES,), (_REQUESTS,)),
 }
-"""What stands before and behind a ROS name in the topics that a right writes, and reads."""
+"""The prefix and suffix of a ROS name in the topics that a right writes, and reads."""
 
 _DDS_NAMES |= {
     action: (
@@ -45,7 +45,7 @@ _DDS_NAMES |= {
 
 
 class DdsNames(NamedTuple):
-    """The DDS topics behind one right: what its holder writes and what it reads."""
+    """The DDS topics of one right: the ones that its holder writes, and the ones that it reads."""
 
     publish: tuple[str, ...]
     subscribe: tuple[str, ...]
@@ -89,8 +89,8 @@ def permissions_for(
 ) -> Permissions:
     """Return the permissions document of an enclave: one grant, denials before permissions.
 
-    Beside the policy's rights it holds one more: every ROS 2 participant writes and reads
-    ``ros_discovery_info``, without which none starts.
+    In addition to the policy's rights it has one more: every ROS 2 participant writes and reads
+    ``ros_discovery_info``, and does not start without that right.
     """
     allowed, denied = _Topics(), _Topics()
     for profile in enclave.all_profiles():
@@ -131,10 +131,10 @@ def _criteria(topics: set[str]) -> tuple[Criteria, ...]:
 
 
 def governance_for(protection: DomainProtection, domains: DomainSet) -> Governance:
-    """The governance document of a keystore: one domain rule, the narrowest topic rules first.
+    """Return the governance of a keystore: one domain rule, with the narrowest topic rules first.
 
-    The first topic rule that matches decides, so a rule stands before every rule that covers it;
-    the last one, for ``*``, holds for whatever no other names.
+    The first topic rule that matches decides, so a rule precedes every rule that covers it; the
+    last one, for ``*``, applies to all other topics.
     """
     rules = [
         _topic_rule(expression, named.protection)
@@ -155,7 +155,7 @@ def governance_for(protection: DomainProtection, domains: DomainSet) -> Governan
 
 
 def _expressions(named: NamedProtection) -> list[str]:
-    """Return the DDS topics of a ROS name, whichever side uses it."""
+    """Return all DDS topics of a ROS name, for both sides of a service or action."""
     expressions: dict[str, None] = {}
     for right in RIGHTS[named.kind]:
         names = dds_names(right, expand(named.name, "/", ""))
@@ -170,7 +170,7 @@ def _topic_rule(expression: str, protection: TopicProtection) -> TopicRule:
 def _values(
     protection: DomainProtection | TopicProtection, rule: type[DomainRule | TopicRule]
 ) -> dict[str, Any]:
-    """Return the attributes of a rule, each made from the field of its own ``term``."""
+    """Return the attributes of a rule, each made from the field that its ``term`` names."""
     chosen = {each: getattr(protection, each.term) for each in attributes(rule)}
     return {
         each.name: value if each.is_flag else ProtectionKind(value)
@@ -179,7 +179,7 @@ def _values(
 
 
 def _narrow_first(rules: list[TopicRule]) -> list[TopicRule]:
-    """``rules`` reordered, as little as possible, so that none is hidden by a wider one."""
+    """Return ``rules`` reordered, as little as possible, so that a wider one hides none."""
     ordered: list[TopicRule] = []
     for rule in rules:
         place = next(
@@ -209,9 +209,9 @@ class RosRight:
 
 
 def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
-    """Return what a rule says in ROS terms: actions and services are folded back from their topics.
+    """Return the ROS rights of a rule: actions and services are folded back from their topics.
 
-    Whatever is left over (half a service, a topic without ROS prefix) stays as it is, with
+    Other topics (half a service, a topic without ROS prefix) are returned by their DDS names, with
     ``kind`` "dds".  Partitions and relay criteria are not part of the answer.
     """
     qualifier = ALLOW if rule.allow else DENY
@@ -265,7 +265,7 @@ def _all_topics(criteria: Iterable[Criteria]) -> dict[str, bool]:
 
 
 def _candidates(publish: Iterable[str], subscribe: Iterable[str]) -> Iterable[tuple[str, str, str]]:
-    """Actions, then services, of which a topic that only they have is in the rule.
+    """Yield actions, then services, whose request topic is in the rule.
 
     Services of an action count as the action unless some of its topics are missing.
     """

@@ -14,7 +14,7 @@ from functools import lru_cache
 from sros_tool.errors import UsageError
 
 BACKDATE = timedelta(hours=24)
-"""How far before its creation a window begins.
+"""The time from the start of a window to its creation.
 
 Fast DDS 2.14.5 reads the dates of permissions in the host's local time, so a document must be
 valid at least 14 hours before its creation in UTC to work in every time zone.
@@ -61,7 +61,7 @@ class Lifespan:
 
 
 Span = timedelta | Lifespan
-"""How long something is to be valid: so long from its creation on, or a `Lifespan`."""
+"""A chosen validity: a duration from the creation on, or a `Lifespan`."""
 
 
 def window(now: datetime, span: Span) -> Window:
@@ -103,7 +103,7 @@ def _moment(text: str, whole: str) -> datetime:
 
 
 def span_text(span: Span) -> str:
-    """``span`` as `parse_span` reads it."""
+    """Return ``span`` as text for `parse_span`."""
     if isinstance(span, timedelta):
         return duration_text(span)
     end = iso(span.end) if span.end else duration_text(span.length or timedelta(0))
@@ -126,21 +126,21 @@ def parse_duration(text: str) -> timedelta:
 
 
 def duration_text(duration: timedelta) -> str:
-    """``duration`` as `parse_duration` reads it, in days where they are whole."""
+    """Return ``duration`` as text for `parse_duration`, in days if they are whole."""
     seconds = int(duration.total_seconds())
     return f"{seconds // 86400}d" if seconds % 86400 == 0 else f"{seconds}s"
 
 
-@lru_cache(maxsize=64)  # what is made at once shares its moments
+@lru_cache(maxsize=64)  # things made at once have equal moments
 def iso(moment: datetime) -> str:
-    """``moment`` as CCYY-MM-DDThh:mm:ssZ, in UTC."""
+    """Return ``moment`` as CCYY-MM-DDThh:mm:ssZ, in UTC."""
     return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def parse_iso(text: str) -> datetime:
     """Read an XML dateTime; without a zone it is UTC (DDS-Security 1.1, 9.4.1.3.2.2).
 
-    Raises `ValueError` if it is none.
+    Raises `ValueError` for any other text.
     """
     moment = datetime.fromisoformat(text.strip())
     if moment.tzinfo is None:

@@ -13,11 +13,11 @@ from sros_tool.validity import iso
 
 _Value = TypeVar("_Value")
 _SHOWN: dict[type, tuple[str, ...]] = {}
-"""The attributes that values of a class are shown by."""
+"""The attributes by which the values of a class are shown."""
 
 
 def as_plain(value: object) -> Any:
-    """Return ``value`` as what JSON has: dictionaries, lists, texts, numbers, booleans and None.
+    """Return ``value`` as JSON types: dictionaries, lists, texts, numbers, booleans and None.
 
     A dataclass or a named tuple becomes a dictionary by the names of its public fields, in their
     order, or by the attributes that `shows` names for it.  An enumeration becomes its value, a
@@ -46,7 +46,7 @@ def as_plain(value: object) -> Any:
 
 
 def shows(*names: str) -> Callable[[type[_Value]], type[_Value]]:
-    """Return a class decorator by which `as_plain` shows these attributes, and not the fields."""
+    """Return a class decorator: `as_plain` then shows these attributes instead of the fields."""
 
     def decorate(kind: type[_Value]) -> type[_Value]:
         _SHOWN[kind] = names
@@ -56,7 +56,7 @@ def shows(*names: str) -> Callable[[type[_Value]], type[_Value]]:
 
 
 def _shown(kind: type) -> tuple[str, ...]:
-    """Return the attributes that values of a class are shown by: none if it has no fields."""
+    """Return the attributes by which values of a class are shown; none if it has no fields."""
     if kind not in _SHOWN:
         names: tuple[str, ...] = getattr(kind, "_fields", ())
         if is_dataclass(kind):

@@ -35,7 +35,7 @@ def _parser() -> etree.XMLParser:
 def read_bytes(path: Path, what: str) -> bytes:
     """Return the bytes of a regular file of bounded size; ``what`` names it in errors."""
     try:
-        there = path.stat()  # asked first, for to open a pipe is to wait
+        there = path.stat()  # checked first, because opening a pipe would wait for its writer
         if not stat.S_ISREG(there.st_mode):
             raise DocumentError(f"the {what} '{path}' is not a regular file")
         data = b""
@@ -43,7 +43,7 @@ def read_bytes(path: Path, what: str) -> bytes:
             with path.open("rb", buffering=0) as file:
                 data = file.readall()
     except (OSError, ValueError) as error:
-        number = getattr(error, "errno", errno.ENOENT)  # a name that holds NUL is of no file
+        number = getattr(error, "errno", errno.ENOENT)  # no file name holds a NUL
         if number in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP):
             raise DocumentError(f"the {what} '{path}' does not exist") from error
         raise DocumentError(
@@ -81,12 +81,12 @@ def parse(data: bytes, name: str) -> etree._Element:
 
 
 def _text_of(element: etree._Element) -> str:
-    """Return the character data of an element without child elements, as it stands."""
+    """Return the unchanged character data of an element without child elements."""
     return element.text or ""
 
 
 def serialize(root: etree._Element, *, indent: bool = True) -> bytes:
-    """The document of ``root`` in UTF-8, indented unless it is already, with a declaration."""
+    """Return the document of ``root`` in UTF-8, with a declaration, indented if it was not."""
     if indent:
         etree.indent(root, space="  ")
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8") + b"\n"

@@ -1,4 +1,4 @@
-"""Findings and their kinds: a kind is data, and a finding has a place and a reason."""
+"""Findings and their kinds: a kind is data; a finding adds a place and a reason."""
 
 from __future__ import annotations
 
@@ -83,9 +83,9 @@ class Finding:
     """A problem found at one place.
 
     ``subject`` is the thing concerned (an enclave, a variable, a file); ``file`` is a path, or "";
-    ``line`` counts from 1.  ``text`` says why here, ``own_remedy`` what to do here, if that says
-    more than the kind does.  ``accepted`` names the choice by which its owner took it into
-    account: such a finding counts as a note.
+    ``line`` counts from 1.  ``text`` is the reason here; ``own_remedy`` is the remedy here, if it
+    says more than the kind's.  ``accepted`` names the template or setting that accepts the
+    finding, which then counts as a note.
     """
 
     kind: FindingKind

@@ -204,7 +204,7 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
             continue
         if name not in names[other] and not any(matches(wide, name) for wide in wild[other]):
             if action_part(name)[1]:
-                continue  # it stands as an action there
+                continue  # the rule is about an action there
             yield each.found(NO_COUNTERPART, f"no enclave may {other} {name}")
 
 
@@ -438,7 +438,7 @@ def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
 
 
 def _at_denial(found: Finding, checked: _CheckedPolicy) -> Finding:
-    """``found``, at the first denial of its enclave."""
+    """Return ``found`` at the first denial of its enclave."""
     denials = (s for s in checked.statements if s.right.enclave == found.subject and not s.allows)
     source = next(denials).source
     return replace(found, file=source.file, line=source.line)
@@ -547,7 +547,7 @@ def _redundant(checked: _CheckedPolicy) -> Iterator[Finding]:
         if each.allows and is_expression(each.name):
             wild[id(each.profile), each.right.right].append(each.name)
     for each in checked.statements:
-        # What was included is the same for all; that some node does not need it is no fault.
+        # Included rights are the same for all nodes; a node that does not need them is no fault.
         if not each.allows or each.source.file != each.profile.source.file:
             continue
         for wide in wild.get((id(each.profile), each.right.right), ()):

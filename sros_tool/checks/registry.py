@@ -1,4 +1,4 @@
-"""All kinds of findings, and which of them are wanted."""
+"""All kinds of findings, and the selection of findings to report."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ KINDS: Mapping[str, FindingKind] = by_id(
 class FindingFilter:
     """The selection of findings to report.
 
-    With ``vendor``, findings about other vendors only, and about differences, are left out.
-    ``include`` and ``exclude`` hold ids, ids of groups, or patterns with ``*`` and ``?``; nothing
-    to include means all.  ``severity`` is the least that is shown.  ``strict`` takes back what
-    was accepted: a choice of the keystore's template counts like any other finding.
+    With ``vendor``, findings that concern only other vendors, or differences between vendors, are
+    left out.  ``include`` and ``exclude`` hold ids, ids of groups, or patterns with ``*`` and
+    ``?``; an empty ``include`` means all.  ``severity`` is the lowest severity that is shown.
 
-    What a keystore's own settings chose openly, as one CA for both jobs by the template sros2,
-    is accepted: it counts as a note, and is named in one line where notes are not shown.  A
-    keystore without settings, of ros2/sros2, chose nothing, and gets every finding in full.
+    A weakness that the keystore's own settings chose, such as one CA for both jobs by the template
+    sros2, is accepted: it counts as a note, and is named in one line if notes are not shown.  With
+    ``strict`` it counts like any other finding.  A keystore of ros2/sros2 has no settings, so every
+    finding counts in full.
     """
 
     include: tuple[str, ...] = ()
@@ -70,7 +70,7 @@ class FindingFilter:
         return included and not any(_matches(kind, each) for each in self.exclude)
 
     def choose(self, findings: Iterable[Finding]) -> ChosenFindings:
-        """Those that are shown, the worst first, and those that were accepted and are not."""
+        """Return the shown findings, the worst first, and the accepted ones that are not shown."""
         wanted = [each for each in findings if self.wants(each.kind)]
         if self.strict:
             wanted = [replace(each, accepted="") for each in wanted]
@@ -83,7 +83,7 @@ class FindingFilter:
 
 @dataclass(frozen=True, slots=True)
 class ChosenFindings:
-    """The findings that are shown, those that were accepted, and the number of hidden ones."""
+    """The shown findings, the accepted ones that are not shown, and the number of hidden ones."""
 
     shown: tuple[Finding, ...]
     accepted: tuple[Finding, ...]
@@ -95,7 +95,7 @@ class ChosenFindings:
 
 
 def select_kinds(selection: FindingFilter) -> Sequence[FindingKind]:
-    """Return the kinds that are wanted, in the order in which they are listed."""
+    """Return the selected kinds, in the order of the list."""
     return [kind for kind in KINDS.values() if selection.wants(kind)]
 
 

@@ -66,7 +66,7 @@ class Setting:
 
 
 def running_processes(proc: Path = Path("/proc")) -> Iterator[Process]:
-    """Yield the processes whose environment this user may read, but for this one."""
+    """Yield the processes whose environment this user may read, except this process."""
     ticks = os.sysconf("SC_CLK_TCK")
     begin = _boot_time(proc)
     for folder in sorted(proc.glob("[0-9]*"), key=lambda each: int(each.name)):
@@ -470,7 +470,7 @@ def _enclave(setting: Setting, root: Path, domain: int | None) -> Iterator[Findi
     if governed and domain is not None and domain not in governed:
         text = f"the governance of '{root}' is for domain {governed}, not for {domain}"
         yield DOMAIN_NOT_GOVERNED.found(DOMAIN, text)
-        domain = None  # this is said
+        domain = None  # reported here
     for role in (IDENTITY, PERMISSIONS):
         if (root / ca_key(role)).exists():
             yield CA_KEY_HERE.found(KEYSTORE, f"'{root / ca_key(role)}' is there")

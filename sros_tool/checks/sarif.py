@@ -20,7 +20,7 @@ def sarif(
     """Return a SARIF log of one run, in which ``kinds`` are the rules.
 
     Paths are relative to the folder ``base``; a finding without a line is placed at line 1.
-    Accepted findings are there too, as suppressed.
+    Accepted findings are included, marked as suppressed.
     """
     rules = {kind.id: index for index, kind in enumerate(kinds)}
     driver = {

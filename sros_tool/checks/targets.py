@@ -20,7 +20,7 @@ _OF_AN_ENCLAVE = (*REQUIRED_FILES, "permissions.xml", "crl.pem", "request.pem")
 
 @dataclass(frozen=True, slots=True)
 class Circumstances:
-    """When and where something is checked; see `keystore_findings`."""
+    """The moment, time zone and other conditions of a check; see `keystore_findings`."""
 
     now: datetime
     zone: tzinfo = UTC
@@ -31,7 +31,7 @@ class Circumstances:
 def path_findings(path: Path, at: Circumstances) -> list[Finding]:
     """Return the findings at a path: a policy, a keystore, an enclave, or a folder of policies.
 
-    Raises `DocumentError` for anything else.
+    Raises `DocumentError` for any other path.
     """
     if is_keystore(path):
         return _keystore(path, at, None)
@@ -55,7 +55,7 @@ def path_findings(path: Path, at: Circumstances) -> list[Finding]:
 
 
 def policies_below(folder: Path) -> Iterator[Path]:
-    """The policy files in a folder and those below it, sorted; not the fragments they include."""
+    """Return the policy files in a folder and below it, sorted, without fragments for includes."""
     for path in sorted(folder.rglob("*.xml")):
         try:
             if parse(read_bytes(path, "file"), str(path)).tag == "policy":

@@ -51,8 +51,8 @@ class DomainSet:
     def parse(cls, text: str, source: str = "") -> DomainSet:
         """Read ``0``, ``0,7`` or ``3-5,9``; sorted, and joined where ranges touch.
 
-        ``source`` says in errors where the text came from.  Raises `UsageError` for anything but
-        whole numbers from 0 to 230.
+        ``source`` names the origin of the text in errors.  Raises `UsageError` unless it
+        lists whole numbers from 0 to 230.
         """
         pairs = []
         for part in text.split(","):
@@ -93,8 +93,8 @@ class DomainSet:
     def closed(self) -> DomainSet:
         """Return the set with both ends of every range given, sorted and joined.
 
-        An open range means what Fast DDS and Cyclone make of it: from N on is N alone, up to N
-        begins at 0.
+        An open range is read as by Fast DDS and Cyclone DDS: "from N" is N alone, "up to N" begins
+        at 0.
         """
         pairs = []
         for part in self.ranges:
@@ -122,7 +122,7 @@ def domain_lines(domains: DomainSet) -> list[str]:
 
 
 def read_domains(element: etree._Element) -> DomainSet:
-    """Read a ``<domains>`` element as it stands (neither sorted nor joined)."""
+    """Read a ``<domains>`` element without sorting or joining its ranges."""
     ranges = []
     for child in element:
         if child.tag == "id":

@@ -1,4 +1,4 @@
-"""The governance document of DDS Security: what a domain protects, and its XML.
+"""The governance document of DDS Security: the protection of domains and topics, and its XML.
 
 Names follow the specification (DDS-Security 1.1, 9.4.1.2 and the schema
 omg_shared_ca_governance of 20170901).
@@ -24,7 +24,7 @@ _SCHEMA = "http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_governanc
 
 
 class ProtectionKind(StrEnum):
-    """How messages are protected; the long forms also prove which writer a message came from."""
+    """The protection of messages; the long forms also prove which writer a message came from."""
 
     NONE = "NONE"
     SIGN = "SIGN"
@@ -179,7 +179,7 @@ def render_governance(governance: Governance) -> bytes:
 def _attribute_lines(rule: DomainRule | TopicRule) -> Iterator[str]:
     for each in attributes(type(rule)):
         value = getattr(rule, each.name)
-        # Vendors refuse elements that they do not know: one that may be left out is.
+        # Vendors refuse elements that they do not know, so an optional default is left out.
         if each.default is None or value != each.default:
             text = json.dumps(value) if each.is_flag else str(value)
             yield f"<{each.name}>{text}</{each.name}>"

@@ -44,7 +44,7 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """What one subject may do, and when; the moments are kept as written in the document."""
+    """The rights and the validity of one subject; moments are kept as written in the document."""
 
     name: str
     subject: str
@@ -57,7 +57,7 @@ class Grant:
 
     @property
     def validity(self) -> Window:
-        """The window of the grant, read as the standard says (no zone is UTC)."""
+        """The validity of the grant by the standard: a moment without a zone is in UTC."""
         return Window(parse_iso(self.not_before), parse_iso(self.not_after))
 
 
@@ -68,7 +68,7 @@ class Permissions:
     grants: tuple[Grant, ...]
 
     def grant_of(self, subject: str) -> Grant | None:
-        """Return the first grant for a subject, which is the one that DDS reads, or None."""
+        """Return the first grant for a subject, or None; DDS reads only the first one."""
         return next((each for each in self.grants if each.subject == subject), None)
 
 

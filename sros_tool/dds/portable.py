@@ -37,7 +37,7 @@ _CONSEQUENCES = {
 
 
 def _either_matches(one: str, other: str) -> bool:
-    """Whether one expression means the other; two that only share some names are not seen."""
+    """Return whether one expression matches the other as a text; other overlaps are not found."""
     return fnmatchcase(one, other) or fnmatchcase(other, one)
 
 
@@ -46,9 +46,9 @@ def outside(
     signed_bytes: int,
     share: Callable[[str, str], bool] = _either_matches,
 ) -> Iterator[tuple[str, str]]:
-    """Yield what in a document is outside of the profile: the id of the remark, and a clause.
+    """Yield the parts of a document outside of the profile: the id of a remark, and a clause.
 
-    ``share`` returns whether two expressions mean a name in common.
+    ``share`` returns whether two expressions match a common name.
     """
     if signed_bytes >= MAX_SIGNED_BYTES:
         yield "portable.document-size", f"the signed permissions have {signed_bytes} bytes"
@@ -100,7 +100,7 @@ def _blocked(
 
 
 def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
-    """Yield a remark on enclaves of which Cyclone DDS takes one for the other.
+    """Yield a remark on enclaves that Cyclone DDS mistakes for each other.
 
     ``names`` are all enclaves, ``new`` those just added.
     """
@@ -116,7 +116,7 @@ def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
 
 
 def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
-    """Return the pairs of which Cyclone DDS takes the identity of the first for the second, sorted.
+    """Return the sorted pairs whose first identity Cyclone DDS mistakes for the second.
 
     It compares the parts of two subjects as sets, one way: the identity ``/robot`` fits the
     permissions of ``/robot/admin``.
@@ -137,7 +137,7 @@ def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def some_pairs(pairs: Sequence[tuple[str, str]]) -> str:
-    """Return a few pairs in words: "/robot as /robot/admin and 2 more"."""
+    """Return the first pairs in words: "/robot as /robot/admin and 2 more"."""
     shown = ", ".join(f"{inner} as {outer}" for inner, outer in pairs[:_SHOWN])
     return f"{shown} and {len(pairs) - _SHOWN} more" if len(pairs) > _SHOWN else shown
 

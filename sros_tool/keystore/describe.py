@@ -49,7 +49,7 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
             the one that lies with it.
 
     Raises:
-        DocumentError: ``path`` is none of these.
+        DocumentError: ``path`` is of no such kind.
     """
     if path.is_dir():
         if is_keystore(path):
@@ -174,10 +174,10 @@ def _describe_certificate(certificate: x509.Certificate, now: datetime) -> Descr
 
 
 def _certificates(data: bytes, name: str, now: datetime) -> Description:
-    """Return the first certificate of a file, with what else it holds as "further" and "crl"."""
+    """Return the first certificate of a file; "further" and "crl" are the rest of the file."""
     certificate, *further = load_certificates(data, name)
     described = _describe_certificate(certificate, now)
-    if further:  # the chain of a CA, or the other one while a CA is being replaced
+    if further:  # the chain of a CA, or the other CA during a rotation
         described["further"] = [_describe_certificate(each, now) for each in further]
     if CRL_MARK in data:
         described["crl"] = _list(load_crl(data, name), now)
@@ -185,7 +185,7 @@ def _certificates(data: bytes, name: str, now: datetime) -> Description:
 
 
 def _list(crl: RevocationList, now: datetime) -> Description:
-    """Return a revocation list; an expired one makes DDS refuse all that its CA certified."""
+    """Describe a revocation list; with an expired one DDS refuses all certificates of its CA."""
     return {
         "issuer": subject_text(crl.list.issuer),
         "number": crl.number,

@@ -25,7 +25,7 @@ from sros_tool.validity import BACKDATE, Window, iso, parse_duration
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """When an enclave is due: at a ``remaining`` time, or an ``elapsed`` fraction (0 to 1)."""
+    """The limit of a due enclave: ``remaining`` time, or ``elapsed`` fraction (0 to 1)."""
 
     remaining: timedelta | None = None
     elapsed: float | None = None
@@ -40,11 +40,11 @@ class Lifetime:
     permissions: Window
 
     def ends(self) -> datetime:
-        """Return the expiry of whichever expires first."""
+        """Return the earlier expiry of the two."""
         return min(self.certificate.not_after, self.permissions.not_after)
 
     def due(self, threshold: Threshold, now: datetime) -> bool:
-        """Whether the enclave is to be renewed by ``threshold``."""
+        """Return whether ``threshold`` says that the enclave is due for renewal."""
         if threshold.remaining is not None:
             return self.ends() - now <= threshold.remaining
         assert threshold.elapsed is not None
@@ -102,7 +102,7 @@ def _lifetimes(root: Path) -> tuple[Lifetime, ...]:
 
 
 def survey(root: Path) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, ...]]:
-    """Return the lifetimes of the enclaves that can be read, and the others."""
+    """Return the lifetimes of the readable enclaves, and the unreadable enclaves."""
     found, unreadable = [], []
     for name in list_enclaves(root):
         try:

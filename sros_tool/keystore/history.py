@@ -1,4 +1,4 @@
-"""The state of everything that a keystore ever issued, from its ledger and its files."""
+"""The history of a keystore: everything that it issued, and its present state."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ class HistoryStatus(StrEnum):
     CURRENT = "current"
     """It is in the keystore, and in date."""
     SUPERSEDED = "superseded"
-    """It is no longer in the keystore, but would still be accepted: replaced is not revoked."""
+    """It is no longer in the keystore, but DDS would still accept it: it is not revoked."""
     REVOKED = "revoked"
     RETIRED = "retired"
-    """A CA that was replaced, and is trusted no longer."""
+    """A CA that was replaced, and is no longer trusted."""
     EXPIRED = "expired"
     SENT = "sent"
     """It went to a robot; the keystore keeps no copy."""
@@ -57,7 +57,7 @@ class HistoryItem:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """All entries, oldest first, and the paths of files that none of them explains."""
+    """All entries, oldest first, and the paths of files without an entry."""
 
     items: tuple[HistoryItem, ...]
     unexplained: tuple[str, ...]
@@ -115,7 +115,7 @@ def _retired(root: Path) -> Iterator[str]:
 
 
 def _files(root: Path, paths: Iterator[str]) -> dict[str, list[str]]:
-    """Map the digests of the ledger to the files that have them."""
+    """Map ledger digests to existing files."""
     found: dict[str, list[str]] = {}
     for path in paths:
         if (root / path).is_file() and not (root / path).is_symlink():
@@ -125,7 +125,7 @@ def _files(root: Path, paths: Iterator[str]) -> dict[str, list[str]]:
 
 
 def _digests(path: Path) -> list[str]:
-    """Return the digest of everything in a file: a CA's holds more while it is being replaced."""
+    """Return all digests of a file; a CA file holds several certificates during a rotation."""
     data = read_bytes(path, "file")
     if not path.name.endswith("cert.pem"):
         return [hashlib.sha256(data).hexdigest()]

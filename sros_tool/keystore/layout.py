@@ -1,4 +1,4 @@
-"""Where things lie in a keystore, as ROS 2 and ros2/sros2 expect them, and which enclaves it has.
+"""The layout of a keystore, as ROS 2 and ros2/sros2 expect it, and the list of its enclaves.
 
 Paths are relative to the keystore, with "/" between their parts.
 """
@@ -23,12 +23,12 @@ ROLES = (IDENTITY, PERMISSIONS)
 CRL = f"{PUBLIC}/identity_ca.crl.pem"
 """The revocation list of the identity CA, once something was revoked."""
 REVOKED = "revoked"
-"""Where the files of revoked enclaves go."""
+"""The folder for the files of revoked enclaves."""
 
 ROTATION = "rotation.json"
-"""Which CAs are being replaced; there while a rotation is under way."""
+"""The file that names the replaced CAs; it exists only during a rotation."""
 RETIRED = "retired"
-"""Where certificates and keys of CAs go that issue nothing any more."""
+"""The folder for certificates and keys of replaced CAs."""
 STAGE = ".sros-transaction"
 """The folder of a transaction that is under way, or was interrupted."""
 
@@ -66,7 +66,7 @@ def ca_key(role: str) -> str:
 
 
 def permissions_ca_for(document: Path) -> Path | None:
-    """Return the certificate of the permissions CA that lies with a signed document, or None."""
+    """Return the permissions CA certificate next to a signed document, or None."""
     folder = document.absolute().parent
     places = (folder / PERMISSIONS_CA_FILE, folder.parent / PUBLIC / PERMISSIONS_CA_FILE)
     return next((path for path in places if path.exists()), None)
@@ -83,12 +83,12 @@ def enclave_path(root: Path, name: str) -> Path:
 
 
 def folder_mode(path: str) -> int:
-    """Return the permission bits of a folder: closed wherever keys may lie."""
+    """Return the permission bits of a folder: closed to others if it may hold keys."""
     return 0o755 if path in ("", PUBLIC) else 0o700
 
 
 def is_keystore(root: Path) -> bool:
-    """Whether ``root`` is a keystore: one at home, or one that was deployed without its CAs."""
+    """Return whether ``root`` is a keystore, with its CAs or exported without them."""
     folder = root / ENCLAVES
     return folder.is_dir() and (
         (root / GOVERNANCE_P7S).is_file()
@@ -98,22 +98,22 @@ def is_keystore(root: Path) -> bool:
 
 
 def is_enclave(folder: Path) -> bool:
-    """Whether ``folder`` has a certificate or a key of an enclave."""
+    """Return whether ``folder`` has a certificate or a key of an enclave."""
     return any(os.path.lexists(f"{folder}/{file}") for file in (CERTIFICATE_FILE, KEY_FILE))
 
 
 def has_enclave(root: Path, name: str) -> bool:
-    """Whether the keystore has an enclave of that name, without a look at all the others."""
+    """Return whether the keystore has an enclave of that name, without listing all enclaves."""
     return is_enclave(enclave_path(root, name))
 
 
 def key_on_robot(folder: Path) -> bool:
-    """Whether the key of an enclave was made on its robot, where it stays."""
+    """Return whether the key of an enclave was made on its robot and stays there."""
     return (folder / REQUEST).exists() and not (folder / KEY_FILE).exists()
 
 
 def waits_for_answer(folder: Path) -> bool:
-    """Whether the signing request of an enclave was not answered yet."""
+    """Return whether the signing request of an enclave is not answered yet."""
     return (folder / REQUEST).exists() and not (folder / CERTIFICATE_FILE).exists()
 
 
@@ -149,8 +149,8 @@ def check_keystore(root: Path) -> None:
 
 
 def locate_enclave(folder: Path) -> tuple[Path, str]:
-    """The keystore that an enclave's folder lies in, and the name of the enclave."""
-    whole = Path(os.path.abspath(folder))  # noqa: PTH100 - a link is not followed to elsewhere
+    """Return the keystore that holds an enclave's folder, and the name of the enclave."""
+    whole = Path(os.path.abspath(folder))  # noqa: PTH100 - must not follow links
     for above in (whole, *whole.parents):
         if above.name == ENCLAVES:
             return above.parent, f"/{'/'.join(whole.relative_to(above).parts)}"

@@ -1,7 +1,7 @@
 """The ledger of a keystore: every certificate and signed document that it ever issued.
 
-One JSON object a line, only ever added to; it is part of the transaction that issues, so it knows
-of everything that was put in place and of nothing that was not.
+One JSON object a line; lines are only added.  Entries are part of the transaction that issues, so
+the ledger has exactly the certificates and documents that were put in place.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A line of the ledger: what was issued (or revoked), when, for whom, and how long it is valid.
+    """A line of the ledger: the issued (or revoked) thing, with moment, subject and validity.
 
     ``what`` is ca, certificate, permissions, governance, crl, revocation, or answer (the signed
     list of the files sent to a robot).  ``sha256`` is the hash of a certificate's DER or of a

@@ -1,7 +1,7 @@
 """Reasons for which a DDS vendor refuses to load an enclave or a CA.
 
-Vendors differ by the traits in `sros_tool.dds.decision.vendors`; what all of them check alike, and
-`sros_tool.keystore.reader` says by name, is not checked here again.
+Vendors differ by the traits in `sros_tool.dds.decision.vendors`.  `sros_tool.keystore.reader` finds
+the faults that all vendors refuse; they are not checked here again.
 """
 
 from __future__ import annotations
@@ -56,10 +56,10 @@ def vendor_problems(
 ) -> tuple[Problem, ...]:
     """Return the problems that a vendor has with an enclave when it loads it at ``at``.
 
-    What its documents say is not judged here, beyond what `OpenedEnclave` reports.
+    The content of its documents is not judged here, except by the problems of `OpenedEnclave`.
     """
     kept = [each for each in state.problems if each.fault not in _VENDOR_SPECIFIC]
-    # What is wrong with these for every vendor is not reported twice.
+    # A fault of these for every vendor is not reported twice.
     known = {
         each.file
         for each in kept
@@ -104,7 +104,7 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
 def _signature_fault(
     traits: VendorTraits, message: bytes, signers: Certificates, at: datetime
 ) -> str:
-    # The enclaves of a keystore have their governance in common.
+    # All enclaves of a keystore share one governance.
     try:
         return _signer_fault(traits, smime.parse(message), signers, at)
     except PkiError as error:
@@ -115,7 +115,7 @@ def _signature_fault(
 def _authority_fault(
     traits: VendorTraits, certificates: Certificates, at: datetime
 ) -> tuple[str, Fault] | None:
-    """Return why the vendor refuses a CA file as such, and the fault; None if it takes it.
+    """Return why the vendor refuses a CA file, and the fault; None if it accepts the file.
 
     ``certificates`` are all of the file, in their order.
     """
@@ -131,10 +131,10 @@ def _authority_fault(
 
 
 def authority_refusals(role: str, certificates: Certificates, at: datetime) -> dict[Vendor, str]:
-    """Return the vendors that refuse what a CA issues (identity) or signs (permissions), and why.
+    """Map the vendors that refuse certificates or documents of a CA to the reason.
 
-    ``certificates`` are all of its file, the CA itself first.  Only the vendors that were
-    measured are asked.
+    ``certificates`` are all certificates of its file, the CA itself first.  Only measured vendors
+    are asked.
     """
     refusals = {}
     for vendor in MEASURED:
@@ -153,7 +153,7 @@ def authority_refusals(role: str, certificates: Certificates, at: datetime) -> d
 
 
 def refusals_text(refusals: Mapping[Vendor, str]) -> str:
-    """Return in clauses which of the measured vendors refuse a CA and why, and which take it."""
+    """Return clauses on the measured vendors that refuse a CA, with the reason, and the others."""
     by_text: dict[str, list[str]] = {}
     for vendor, text in refusals.items():
         by_text.setdefault(text, []).append(vendor.title)

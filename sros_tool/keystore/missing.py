@@ -12,9 +12,9 @@ from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.names import check_enclave_name
 
 _SHOWN = 5
-"""How many enclaves are named before the rest is counted."""
+"""The number of enclaves that are named before the rest is only counted."""
 _ALIKE = 0.75
-"""The least similarity (`difflib`) of a typo: one letter of four, or two of eight."""
+"""The lowest similarity (`difflib`) of a typo: one letter of four differs, or two of eight."""
 
 
 def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
@@ -40,7 +40,7 @@ def _revocation(root: Path, name: str) -> Entry | None:
     try:
         entries = read_ledger(root)
     except SrosError:
-        return None  # that the enclave is missing is what counts here
+        return None  # the missing enclave is the error to report here
     of_enclave = [
         e for e in entries if e.enclave == name and e.what in ("certificate", "revocation")
     ]
@@ -62,10 +62,10 @@ def _was_revoked(root: Path, entry: Entry) -> SrosError:
 
 
 def likely_names(name: str, there: Collection[str]) -> tuple[str, ...]:
-    """Return the enclaves that someone who wrote ``name`` may have meant, at most three.
+    """Return at most three enclaves that ``name`` may mean.
 
-    Those that end in it, for its beginning is what people leave out; otherwise those whose last
-    part has a similar spelling.
+    These are the enclaves whose names end in it, because people leave out the beginning; otherwise
+    the ones whose last part has a similar spelling.
     """
     end = "/" + name.strip("/")
     if end == "/":

@@ -1,8 +1,8 @@
-"""The one way to read a keystore and an enclave: its parts, its grant, and what is wrong.
+"""The only reader of keystores and enclaves: their parts, their grants, and their problems.
 
-What DDS checks when a participant is created is checked here by name, after Fast DDS 2.14.5 and
-Cyclone DDS 0.10, which name the cause seldom.  Where vendors differ, see
-`sros_tool.keystore.loading`.
+The checks of DDS at the creation of a participant are repeated here, after Fast DDS 2.14.5 and
+Cyclone DDS 0.10, and name the cause, which the vendors seldom do.  For differences between vendors
+see `sros_tool.keystore.loading`.
 """
 
 from __future__ import annotations
@@ -76,8 +76,7 @@ _Parsed = TypeVar("_Parsed")
 class OpenedKeystore:
     """A keystore opened for reading: each part is read when it is first asked for.
 
-    It may be the part of a keystore that was exported for a robot.  Every part raises `SrosError`
-    where it is there and cannot be read.
+    It may be an export for a robot.  A part that exists and cannot be read raises `SrosError`.
     """
 
     def __init__(self, root: Path) -> None:
@@ -192,7 +191,7 @@ def read_certificate(path: Path, what: str = "certificate") -> x509.Certificate:
     """Return the first certificate of a PEM file; ``what`` names it in errors.
 
     Raises:
-        SrosError: the file is missing, or holds none.
+        SrosError: the file is missing, or holds no certificate.
     """
     return load_certificate(read_bytes(path, what), f"'{path}'")
 
@@ -203,12 +202,12 @@ def load_ca_certificate(root: Path, role: str) -> x509.Certificate:
 
 
 def authority_files(root: Path) -> dict[str, tuple[str, ...]]:
-    """Return the stem of each CA file, with the roles for which it serves."""
+    """Map the stem of each CA file to the roles of its CA."""
     found: dict[str, tuple[str, ...]] = {}
     for role in ROLES:
         path = root / ca_certificate(role)
         file = path
-        # A link into the stage is a file of its own that an interrupted transaction left so.
+        # A link into the stage stands for a file; an interrupted transaction left it.
         if path.is_symlink() and STAGE not in (to := str(path.readlink())):
             file = path.with_name(to)
         if not file.is_file() or file.parent != path.parent:
@@ -273,10 +272,10 @@ class SignedGrant:
 
 
 def read_granted(path: Path, subject: str) -> SignedGrant:
-    """Return what a ``permissions.p7s`` grants to a subject, without verifying its signature.
+    """Return the grant of a ``permissions.p7s`` to a subject, without verifying its signature.
 
     Raises:
-        SrosError: it is no signed permissions document.
+        SrosError: the file is not a signed permissions document.
     """
     message = read_bytes(path, "permissions document")
     signed = smime.parse(message)
@@ -290,7 +289,7 @@ def read_granted(path: Path, subject: str) -> SignedGrant:
 @shows("file", "text", "code")
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A fault that keeps a process from running in an enclave: in which file, and why there."""
+    """A fault that keeps a process from running in an enclave, with its file and the reason."""
 
     file: str
     text: str
@@ -335,7 +334,7 @@ class OpenedEnclave:
 
     @property
     def problems_at_home(self) -> tuple[Problem, ...]:
-        """Its problems, but for the key that is on its robot."""
+        """Its problems, except that its key is on its robot."""
         if not self.key_on_robot:
             return self.problems
         return tuple(
@@ -349,12 +348,12 @@ class OpenedEnclave:
         return self.governance.domains().closed() if self.governance else None
 
     def valid_until(self) -> datetime | None:
-        """Return when it stops being loadable: the first expiry of anything it consists of."""
+        """Return the moment until which it is loadable: the first expiry of its parts."""
         if not (self.certificate and self.permissions):
             return None
         certificates = (self.certificate, self.identity_ca, self.permissions_ca)
         moments = [validity_of(each).not_after for each in certificates if each]
-        with suppress(SrosError):  # a grant that ends before it begins
+        with suppress(SrosError):  # a grant that expires before it begins
             moments += [self.grant.validity.not_after] if self.grant else []
         return min(moments)
 
@@ -374,7 +373,7 @@ _EXPIRY_OF_PERMISSIONS = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_V
 _ENCRYPTED = re.compile(rb"ENCRYPTED")
 _SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
 
-# Enclaves of a keystore share all files except their own: shared files are read once.
+# Enclaves of a keystore share some files, which are read only once.
 _load_certificate = lru_cache(maxsize=8)(load_certificate)
 _parse_governance = lru_cache(maxsize=8)(parse_governance)
 
@@ -397,7 +396,7 @@ def _load_crl(
 
 
 class _EnclaveFiles:
-    """Checks the files of one enclave, and collects its problems."""
+    """Checker of the files of one enclave, which collects its problems."""
 
     def __init__(self, folder: Path, now: datetime) -> None:
         self._folder = folder
@@ -567,7 +566,7 @@ class _EnclaveFiles:
             return
         try:
             self._check_validity(name, grant.validity, _EXPIRY_OF_PERMISSIONS)
-        except SrosError as error:  # it ends before it begins
+        except SrosError as error:  # it expires before it begins
             self._add(name, error.what, Fault.PERMISSIONS_MALFORMED)
         rules = [rule for rule in grant.rules if rule.allow]
         if domain is not None and not any(domain in rule.domains.closed() for rule in rules):

@@ -1,7 +1,7 @@
 """The rights that a policy, a permissions document, an enclave or a keystore gives.
 
-What DDS loads is ``permissions.p7s``, so that counts in enclaves and keystores.  Its signature is
-verified against the permissions CA that lies with it.
+DDS loads ``permissions.p7s``, so that file counts in enclaves and keystores.  Its signature is
+verified against the permissions CA next to it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class RightsSource:
     """The rights that a file or folder gives.
 
     ``kind`` is policy, permissions, enclave or keystore.  ``scope`` are the enclaves that it
-    can give rights to; None for all.  ``sound`` is False where DDS would refuse some of it:
+    can give rights to; None for all.  ``sound`` is False if DDS would refuse a part of it:
     a signature that does not verify, permissions that are missing or cannot be read.
     """
 
@@ -57,7 +57,7 @@ def load_rights(path: Path) -> RightsSource:
     keystore.
 
     Raises:
-        DocumentError: it is anything else.
+        DocumentError: ``path`` is anything else.
     """
     if path.is_dir():
         if is_keystore(path):
@@ -112,7 +112,7 @@ def _keystore(root: Path) -> RightsSource:
 
 @dataclass(slots=True)
 class _Reader:
-    """Reads permissions, and collects notes about them."""
+    """Reader of permissions, which collects notes about them."""
 
     sound: bool = True
     unsure: list[Note] = field(default_factory=list)
@@ -179,7 +179,7 @@ def _enclave_of(grant: Grant) -> str:
 
 
 def _left_out(grants: Iterable[Grant]) -> Iterator[Note]:
-    """Yield notes on what a grant says and rights in ROS terms do not."""
+    """Yield notes on parts of a grant that cannot be said in ROS terms."""
     seen: set[str] = set()
     for grant in grants:
         name = _enclave_of(grant)

@@ -1,7 +1,6 @@
 """Keystore templates: named sets of choices, each one readable TOML file.
 
-A keystore keeps a copy of the choices that it was made with (`sros.toml`), so that what is added
-later follows them.
+A keystore keeps a copy of its choices (`sros.toml`), so that later additions follow them.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ from sros_tool.xml import read_bytes
 
 DEFAULT_TEMPLATE = "development"
 EVERYTHING, NODE_BASICS = "everything", "node_basics"
-_LONGEST_AUTHORITY_NAME = 40  # the role and a number follow it in a common name
+_LONGEST_AUTHORITY_NAME = 40  # characters; the common name adds the role and a number
 _DATA_LEVELS = (Level.NONE, Level.SIGN, Level.ENCRYPT)
 _KINDS: dict[str, str] = {"topic": "topics", "service": "services", "action": "actions"}
 
 
 @dataclass(frozen=True, slots=True)
 class Template:
-    """The choices that a keystore is made by.
+    """The choices for a keystore.
 
-    Durations count from the moment at which something is created.  ``identity_key`` and
-    ``permissions_key`` name the keys of the CAs by URI, where they are not in the keystore.  With
-    ``unique_subject``, the subject of a certificate has a part that no other has.
+    Durations count from the creation of a certificate or document.  ``identity_key`` and
+    ``permissions_key`` are the URIs of CA keys outside of the keystore.  With ``unique_subject``,
+    the subject of every certificate has a unique part.
     """
 
     name: str
@@ -94,7 +93,7 @@ class _TemplateError(ValueError):
 
 
 def parse_template(text: str, name: str) -> Template:
-    """Return the template in a text; an unknown key is an error, for it may be a typo."""
+    """Return the template in a TOML text; an unknown key is an error, because it may be a typo."""
     table = _Table(parse_toml(text), "")
     authorities = table.table("authorities")
     certificates = table.table("certificates")
@@ -175,7 +174,7 @@ def _topic_lines(protection: TopicProtection) -> list[str]:
 def _toml(value: str | bool) -> str:
     if isinstance(value, bool):
         return json.dumps(value)
-    # A JSON string is a TOML basic string, but for a character that TOML wants escaped.
+    # A JSON string is a TOML basic string, except for one character that TOML wants escaped.
     return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
@@ -184,7 +183,7 @@ _OF_DOMAIN: dict[str, Any] = {
     for field in fields(DomainProtection)
     if field.name not in ("default", "named")
 }
-"""What [protection] says of the whole domain, with its usual value."""
+"""The settings of [protection] for the whole domain, with their usual values."""
 
 
 def _protection(table: _Table) -> DomainProtection:
@@ -229,7 +228,7 @@ def _topic_protection(table: _Table, default: TopicProtection) -> TopicProtectio
 
 
 class _Table:
-    """A TOML table whose keys are taken one by one; a key that is left over is an error."""
+    """A TOML table whose keys are taken one by one; an unused key is an error."""
 
     def __init__(self, values: object, path: str) -> None:
         if not isinstance(values, dict):

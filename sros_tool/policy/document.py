@@ -1,11 +1,10 @@
 """Policy files (SROS2 policy XML 0.2.0): reading them with their includes, and writing them.
 
-The grammar follows the schema of ros2/sros2; in addition every name is checked: a rule that
-can never match anything is an error, for it is a right or a denial that somebody relies on.
+The grammar follows the schema of ros2/sros2; in addition every name is checked: a rule that can
+never match anything is an error, because somebody relies on that right or denial.
 
-Includes (``xi:include``) never leave the root folder of the policy.  Included documents are read
-into the model where they lie; their nodes are never moved into another document (a moved node of
-lxml can crash the interpreter).
+Includes (``xi:include``) never leave the root folder of the policy.  Nodes of included documents
+are never moved into another document: a moved node of lxml can crash the interpreter.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class IncludedFile:
 
 @dataclass(slots=True)
 class Includer:
-    """Reads documents below ``root``, each of them once."""
+    """Reader of the documents below ``root``; each one is read once."""
 
     root: Path
     _documents: dict[Path, etree._Element] = field(default_factory=dict)
@@ -73,7 +72,7 @@ class Includer:
         return self._documents[file]
 
     def hold(self, file: Path, content: bytes) -> None:
-        """Use ``content`` in place of the file (its real path), wherever it is included."""
+        """Keep ``content`` to use in place of the file (its real path), wherever it is included."""
         self._bytes += len(content)
         if self._bytes > _MAX_BYTES:
             raise PolicyError(
@@ -122,7 +121,7 @@ class Includer:
         inner = IncludedFile(file, (*place.trail, step))
         found = [target] if not pointer else _point(target, pointer, where)
         for each in found:
-            # What an xpointer selects may itself be an include.
+            # An element that an xpointer selects may be an include itself.
             if each.tag in _INCLUDES:
                 yield from self._included(each, inner)
             else:
@@ -133,7 +132,7 @@ class Includer:
             return place.file
         path = Path(unquote(href))
         try:
-            # Unlike Path.resolve, realpath does not fail at links that lead in a circle.
+            # Unlike Path.resolve, realpath does not fail at a circle of links.
             file = Path(os.path.realpath(place.file.parent / path))
         except (OSError, ValueError) as error:
             raise PolicyError(f"{where}: the include of {href!r} names no file") from error
@@ -174,7 +173,7 @@ _QUALIFIERS = {qualifier.value: qualifier for qualifier in Qualifier}
 def read_policy(path: Path, content: bytes | None = None) -> Policy:
     """Read a policy file and its includes, which must lie in its folder or below.
 
-    With ``content``, read that in place of what the file holds; the file need not exist.
+    With ``content``, that is read in place of the file, which need not exist.
     Raises `PolicyError` (or another `DocumentError`) with file and line for anything that the
     format does not have, for names that ROS does not have, and for an enclave given twice.
     """
@@ -403,7 +402,7 @@ def write_policy(policy: Policy) -> bytes:
             if block.metadata:
                 metadata.append((profiles, block.metadata))
     etree.indent(root, space="  ")
-    for profiles, text in metadata:  # after the indentation, which would change what it holds
+    for profiles, text in metadata:  # after the indentation, which would otherwise change its text
         last, element = profiles[-1], parse(text.encode(), "metadata")
         last.tail, element.tail = profiles.text, last.tail
         profiles.append(element)

@@ -1,12 +1,11 @@
-"""Merging policies into a policy file: what it lacks, and the edits that add it in place.
+"""Merging policies into a policy file: the missing rights, and the edits that add them in place.
 
-A merge never weakens a denial, and adds a right only for the direction
-that was asked for.  All other text of the file stays byte for byte, comments and line
-ends included.
+A merge never weakens a denial, and adds a right only for the requested direction.  All other text
+of the file stays byte for byte, comments and line ends included.
 
-Names go into a group that has exactly their rights, of a profile with their namespace and node, in
-the file itself and never in what it includes; where there is none, it is made.  What comes out is
-read again and proven to hold what was there and what was added, and nothing else.
+A name goes into a group with exactly its rights, in a profile with its namespace and node.  Both
+are added if the file itself lacks them; included files do not change.  The result is read again and
+proven to hold the old rights and the added ones, and nothing else.
 """
 
 from __future__ import annotations
@@ -44,8 +43,8 @@ _SHOWN = 3
 class Contradiction:
     """A right that one side allows and the other denies, wholly or in part.
 
-    The denial always holds.  ``new`` says that the merge brought it, while the file allowed the
-    right; otherwise the denial stood in the file, and the right was asked for.
+    The denial always wins.  With ``new``, the merge added the denial to a file that allowed the
+    right; otherwise the file had the denial, and the merge asked for the right.
     """
 
     denied: Right
@@ -55,7 +54,7 @@ class Contradiction:
 
 @dataclass(frozen=True, slots=True)
 class AddedName:
-    """A name to be added to a profile, as it is to be written, with the rights to be added."""
+    """A name to add to a profile, as written there, and its rights to add."""
 
     kind: str
     name: str
@@ -83,8 +82,8 @@ class MergePlan:
 def plan_merge(before: Policy, additions: Policy) -> MergePlan:
     """Return the rights of ``additions`` that ``before`` lacks.
 
-    Left out is what ``before`` already allows in that enclave, by any profile or wildcard,
-    and what it denies as a whole.
+    Rights that ``before`` already allows in that enclave, by any profile or wildcard, and rights
+    that it completely denies are left out.
     """
     return _Planner(before, additions).plan()
 
@@ -194,7 +193,7 @@ _COMMENTS_OF_THE_LINE = re.compile(r"(?:[ \t]*<!--.*?-->)+(?=[ \t]*(?:\r?\n|\Z))
 
 @dataclass(slots=True)
 class PlacedElement:
-    """An element and its places in the text: characters from the start of the document.
+    """An element and its positions in the text, in characters from the start of the document.
 
     ``inner`` is where its content begins, ``close`` where its end tag does; an element without
     end tag (``<a/>``) has ``inner == close == end``.
@@ -217,7 +216,7 @@ class PlacedElement:
         return self.xml.get(attribute, "")
 
     def named(self, tag: str) -> Iterator[PlacedElement]:
-        """The child elements of that tag which stand here themselves (not through an include)."""
+        """Return the child elements with that tag, without the included ones."""
         return (child for child in self.children if child.tag == tag)
 
 
@@ -248,7 +247,7 @@ class EditedText:
         )
 
     def _elements(self, root: etree._Element) -> PlacedElement:
-        """The tree of places.  lxml knows the elements, but not their positions."""
+        """Return the tree of placed elements: lxml does not know the positions of elements."""
         nodes = root.iter()
         top: PlacedElement | None = None
         stack: list[PlacedElement] = []
@@ -274,7 +273,7 @@ class EditedText:
     # ── how it is laid out ─────────────────────────────────────────────────────────────────
 
     def indent_of(self, element: PlacedElement) -> str | None:
-        """The white space before an element that begins its line; None for one that does not."""
+        """Return the white space before an element that begins its line; None for any other."""
         line = max(self.text.rfind("\n", 0, element.start), self.text.rfind("\r", 0, element.start))
         before = self.text[line + 1 : element.start].removeprefix("\ufeff")
         if before.strip(" \t") or (line < 0 and element is not self.root):
@@ -282,7 +281,7 @@ class EditedText:
         return before
 
     def _unit(self) -> str:
-        """Return the indentation that a line has in addition to its parent's."""
+        """Return the indentation of one level."""
         stack = [self.root]
         while stack:
             parent = stack.pop()
@@ -304,7 +303,7 @@ class EditedText:
     # ── changing it ────────────────────────────────────────────────────────────────────────
 
     def put(self, place: int, text: str, until: int | None = None) -> None:
-        """Insert ``text`` at a place, or replace what lies between there and ``until``."""
+        """Insert ``text`` at a position, or replace the text from there up to ``until``."""
         self._edits.append((place, place if until is None else until, text))
 
     def document(self) -> bytes:
@@ -328,7 +327,7 @@ def _encoding(data: bytes, root: etree._Element) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """A policy file after a merge: its new bytes, what was added, and what contradicted.
+    """A policy file after a merge: its new bytes, the added rights, and the contradictions.
 
     Without additions ``document`` is the file byte for byte.
     """
@@ -366,7 +365,7 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
 
 
 def _proven(path: Path, document: bytes, before: Policy, added: Sequence[Right]) -> Policy:
-    """Return the policy that a document says, if it is ``before`` with ``added``; else an error."""
+    """Return the policy of a document; raise `PolicyError` if not ``before`` and ``added``."""
     try:
         after = read_policy(path, document)
     except DocumentError as error:

@@ -1,11 +1,11 @@
-"""Minimizing a policy to what was observed, and wildcards that make a large one smaller.
+"""Minimizing a policy to the observed rights, and wildcards that make a large policy smaller.
 
-Over-privilege of an enclave is the number of pairs (right, name) that it is allowed, divided by
-the number of those that were observed.  A pair is one of publish, subscribe, request, reply, call,
-execute with one exact name; a wildcard counts as the known names that it matches, which are the
-exact names of that kind (topics, services or actions) in the policy, in the observations of all
-enclaves, and among what every node needs.  Pairs that a DENY takes away do not count.  What was
-observed and is not allowed does not count either: it cannot have worked.
+The over-privilege of an enclave is its number of allowed pairs (right, name), divided by the number
+of observed ones.  A pair is one of publish, subscribe, request, reply, call, execute with one exact
+name.  A wildcard counts as the known names that it matches: the exact names of that kind (topics,
+services or actions) in the policy, in the observations of all enclaves, and among the names that
+every node needs.  Pairs that a DENY takes away do not count, nor do observed pairs that are not
+allowed: they cannot have worked.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ _Pair = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class _WideRule:
-    """A wildcard, the observed rights that rest on it, and what can stand in its place.
+    """A wildcard, the observed rights that it allowed, and the rights that can replace it.
 
-    ``replacement`` leaves out what other rules of the enclave allow by its exact name.
+    ``replacement`` leaves out rights that other rules of the enclave allow by exact name.
     """
 
     rule: Right
@@ -50,11 +50,11 @@ class _WideRule:
 
 @dataclass(frozen=True, slots=True)
 class EnclaveUse:
-    """The rights of an enclave compared with what it was observed to do.
+    """The rights of an enclave compared with its observed rights.
 
-    ``unused`` rules were never observed and go; ``common`` ones were never observed and stay, as
-    they belong to what every node needs; ``refused`` was observed, and the policy does not allow
-    it.  An enclave that was not ``seen`` at all stays as it is.
+    ``unused`` rules were never observed and are removed; ``common`` ones were never observed and
+    stay, because every node needs them; ``refused`` rights were observed, and the policy does not
+    allow them.  An enclave that was never ``seen`` does not change.
     """
 
     enclave: str
@@ -86,8 +86,8 @@ def minimize(
 ) -> MinimizedPolicy:
     """Narrow ``policy`` to the ALLOW rights of ``observed``.
 
-    A DENY always stays.  ``common`` is what every node needs, said for a node: where the policy
-    allows it to a node with a profile, it stays, observed or not.
+    A DENY always stays.  ``common`` are the rights that every node needs: if the policy allows
+    them to a node with a profile, they stay, observed or not.
     """
     seen = folded(right for right in observed if right.qualifier is ALLOW)
     by_enclave: dict[str, set[Right]] = defaultdict(set)
@@ -199,7 +199,7 @@ class _Narrowing:
     # ── what stays, and what takes the place of wildcards ──────────────────────────────────
 
     def _stays(self, rule: Right) -> bool:
-        """Whether a rule stays as it is: a name in use, or a wildcard that was used as such."""
+        """Return whether a rule does not change: a name in use, or a wildcard observed as such."""
         if rule in self._common:
             return True
         if not is_expression(rule.name):
@@ -212,7 +212,7 @@ class _Narrowing:
         )
 
     def _narrowed(self, kept: set[Right]) -> tuple[_WideRule, ...]:
-        """The wildcards that were used, or mean common rights, with what no other rule allows."""
+        """Return the used and common wildcards, each with the rights that no other rule allows."""
         wide = [rule for rule in self._stated if is_expression(rule.name) and rule not in kept]
         owners: dict[Right, list[Right]] = defaultdict(list)
         for rule in wide:
@@ -244,7 +244,7 @@ class _Narrowing:
         )
 
     def _prove(self, remaining: Sequence[Right]) -> None:
-        """Check that nothing was added, and nothing observed was lost."""
+        """Check that no right was added, and no observed right was lost."""
         after = Rules(remaining)
         more = [right for right in remaining if not self._rules.cover(right)]
         lost = [p for p in self._in_use if self._is_allowed(p) and not after.cover(p)]
@@ -307,7 +307,7 @@ def _for_nodes(enclave: Enclave, common: Sequence[Group]) -> Iterator[Right]:
 def _narrowed_enclave(
     enclave: Enclave, kept: Set[Right], replacements: Mapping[Right, Sequence[Right]]
 ) -> Enclave:
-    """``enclave`` with its denials, the ALLOW rights in ``kept``, and names for wildcards.
+    """Return ``enclave`` with its denials, the ALLOW rights in ``kept``, and names for wildcards.
 
     The names that replace a wildcard are written once, at its first place, and in its form:
     relative, private or absolute.  Profiles stay, even without a rule.
@@ -325,7 +325,7 @@ def _narrowed_enclave(
 def _profile(
     path: str, profile: Profile, kept: Set[Right], pending: dict[Right, Sequence[Right]]
 ) -> Profile:
-    """Return the profile; what it takes of ``pending`` is removed there."""
+    """Return the narrowed profile; remove from ``pending`` the names that it takes."""
     said: dict[tuple[str, str], dict[tuple[str, Qualifier], None]] = {}
     for group in profile.groups:
         for name in group.names:
@@ -351,7 +351,7 @@ def _profile(
 
 
 def _written(fqn: str, like: str, profile: Profile) -> str:
-    """An absolute name as the rule that it comes from was written, where that is possible."""
+    """Return an absolute name in the form of its rule (relative, private), if that is possible."""
     if like.startswith("/"):
         return fqn
     prefix = expand("~/" if like.startswith("~") else "", profile.ns, profile.node)
@@ -364,14 +364,14 @@ def _written(fqn: str, like: str, profile: Profile) -> str:
 # ── wildcards in place of names ────────────────────────────────────────────────────────────
 
 _DIGITS = re.compile(r"\d+")
-_FEWEST = 3  # names that are worth a wildcard
+_FEWEST = 3  # the least number of names for a wildcard
 
 
 @dataclass(frozen=True, slots=True)
 class WildcardProposal:
     """A wildcard in place of names: ``saves`` bytes of the signed document.
 
-    ``adds`` are the topics and services known from elsewhere that it would newly allow.  A safe
+    ``adds`` are the known topics and services of other enclaves that it would newly allow.  A safe
     proposal has none; it still allows names that nobody has used so far.
     """
 
@@ -391,9 +391,9 @@ def propose_wildcards(
 ) -> tuple[WildcardProposal, ...]:
     """Return wildcards that make an enclave's document ``needed`` bytes smaller, if possible.
 
-    ``rights`` are the enclave's, ``known`` are every enclave's, and ``size`` returns the
-    bytes that a right takes.  Those that save most come first; such that grant something known are
-    used only if the safe ones do not suffice.
+    ``rights`` are the enclave's, ``known`` are every enclave's, and ``size`` returns the bytes that
+    a right takes.  The largest savings come first; wildcards that newly allow a known name are used
+    only if the safe ones do not suffice.
     """
     own = [right for right in rights if right.enclave == enclave and right.qualifier is ALLOW]
     rules = Rules(own)
@@ -401,7 +401,7 @@ def propose_wildcards(
     candidates: dict[frozenset[Right], WildcardProposal] = {}
     for rule, found in _candidates(own).items():
         other = candidates.get(frozenset(found))
-        # Of wildcards that stand for the same names, the one that says most grants least.
+        # Of wildcards that stand for the same names, the most specific one allows least.
         if other is None or len(rule.name) > len(other.rule.name):
             adds = tuple(sorted(_added(rule, foreign), key=order))
             saves = sum(map(size, found)) - size(rule)
@@ -448,7 +448,7 @@ def _wider(name: str) -> Iterator[str]:
 
 
 def _foreign(enclave: str, own: Rules, known: Iterable[Right]) -> dict[str, list[str]]:
-    """Return the known names by right (in parts of actions) that the enclave is not allowed."""
+    """Map each right to the known names that the enclave is not allowed, in parts of actions."""
     by_service: dict[bool, set[str]] = {True: set(), False: set()}
     for part in unfolded(known):
         if not is_expression(part.name):

@@ -1,7 +1,7 @@
 """The policy language of ROS: who may publish, subscribe, request, reply, call and execute.
 
-Names follow SROS2 policy XML 0.2.0.  All values can be compared; where a thing came from
-(`Source`) does not count in a comparison.
+Names follow SROS2 policy XML 0.2.0.  All values can be compared; their origin (`Source`)
+does not count in a comparison.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ RIGHTS: dict[str, tuple[str, str]] = {
 
 
 class Qualifier(StrEnum):
-    """What a rule says about a right."""
+    """The qualifier of a right in a rule."""
 
     ALLOW = "ALLOW"
     DENY = "DENY"
@@ -60,7 +60,7 @@ class Group:
     lines: tuple[int, ...] = field(default=(), compare=False)
 
     def source_of(self, index: int) -> Source:
-        """Return the file and line of the name at an index."""
+        """Return the file and line of the name at ``index``."""
         if index < len(self.lines):
             return Source(self.source.file, self.lines[index])
         return self.source
@@ -68,7 +68,7 @@ class Group:
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """What one node, in its namespace, may do."""
+    """The rights of one node in its namespace."""
 
     ns: str
     node: str
@@ -87,7 +87,7 @@ class Profiles:
 
 @dataclass(frozen=True, slots=True)
 class Enclave:
-    """What the processes of one enclave may do.
+    """The rights of the processes of one enclave.
 
     ``digest`` is the SHA-256 of the policy file that it was read from, with its includes.
     """

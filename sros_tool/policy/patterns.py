@@ -1,4 +1,4 @@
-"""Names with wildcards: which names they match, cover and have in common.
+"""Names with wildcards: matching names, covering and overlapping other wildcards.
 
 ``*`` stands for any characters, "/" among them, ``?`` for one, ``[abc]``, ``[a-c]`` and ``[!a-c]``
 for one of a set or outside of it: glibc's fnmatch without escapes, as the DDS vendors match.
@@ -44,10 +44,10 @@ def literal_prefix(expression: str) -> str:
 
 
 def covers(wide: str, narrow: str) -> bool:
-    """Return whether everything that ``narrow`` means is also meant by ``wide``.
+    """Return whether ``wide`` matches every name that ``narrow`` matches.
 
-    True is always right.  Exotic patterns such as ``?*`` and ``*?`` mean the same and yet do not
-    cover each other here; whoever relies on that keeps a rule too many, never one too few.
+    True is always right.  False can be wrong for exotic patterns: ``?*`` and ``*?`` match the same
+    names, but do not cover each other here.  A caller then keeps a rule too many, never too few.
     """
     if wide == narrow:
         return True
@@ -76,7 +76,7 @@ def _covers(wide: str, narrow: str) -> bool:
 
 
 def overlap(one: str, other: str) -> bool:
-    """Return whether some name is meant by both."""
+    """Return whether both match a common name."""
     if not is_expression(one):
         return matches(other, one) if is_expression(other) else one == other
     if not is_expression(other):
@@ -125,7 +125,7 @@ def _after_stars(reached: set[int], pieces: tuple[frozenset[str], ...]) -> set[i
 
 @lru_cache(maxsize=_MANY)
 def _pieces(expression: str) -> tuple[frozenset[str], ...]:
-    """An expression piece by piece: `_ANY` for ``*``, else the characters that fit one place."""
+    """Return the pieces of an expression: `_ANY` for ``*``, else the characters of one place."""
     found: list[frozenset[str]] = []
     for piece in _PIECE.finditer(expression):
         negated, members, literal = piece.groups()
@@ -149,7 +149,7 @@ def _members(text: str) -> frozenset[str]:
 _LETTERS = ascii_letters + digits + "_/"
 _MOST_STATES = 5_000
 _START, _SLASH, _TOKEN = range(3)
-"""Where in a ROS name one is: nowhere yet, behind a "/", or within one of its parts."""
+"""Positions in a ROS name: before its start, after a "/", or within one of its parts."""
 
 _Pieces = tuple[frozenset[str], ...]
 _State = tuple[int, tuple[frozenset[int], ...]]
@@ -158,11 +158,11 @@ _State = tuple[int, tuple[frozenset[int], ...]]
 def common_name(
     wanted: Iterable[str], unwanted: Iterable[str] = (), *, absolute: bool = True
 ) -> str | None:
-    """Return the shortest absolute ROS name that all of ``wanted`` mean and none of ``unwanted``.
+    """Return the shortest absolute ROS name that all of ``wanted`` and none of ``unwanted`` match.
 
-    Unless ``absolute``, one without its first "/", as DDS topics are.  None if there is no such
-    name.  Where the search grows beyond all bounds (many ``?`` behind ``*``), the exceptions
-    are ignored: an overlap too many is reported, never one too few.
+    Without ``absolute``, the name has no first "/", like DDS topics.  None if there is no name.
+    If the search gets too large (many ``?`` after ``*``), ``unwanted`` is ignored: an overlap too
+    many is reported, never one too few.
     """
     inner, outer = tuple(dict.fromkeys(wanted)), tuple(dict.fromkeys(unwanted))
     for name in inner:
@@ -225,7 +225,7 @@ def _representatives(patterns: list[_Pieces]) -> str:
 
 
 def _after(place: int, letter: str) -> int | None:
-    """Return where in a name the letter leads, or None where it cannot stand."""
+    """Return the position in a name after the letter; None if the letter is not allowed."""
     if letter == "/":
         return None if place == _SLASH else _SLASH
     if place == _START or (place == _SLASH and letter in digits):

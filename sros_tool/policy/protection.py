@@ -7,7 +7,7 @@ from enum import StrEnum
 
 
 class Level(StrEnum):
-    """How strongly something is protected; the long forms also prove which writer it came from."""
+    """The strength of a protection; the long forms also prove which writer a message came from."""
 
     NONE = "NONE"
     SIGN = "SIGN"

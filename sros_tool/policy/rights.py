@@ -1,6 +1,6 @@
 """Rights and denials on absolute names: what a policy states, and how two policies differ.
 
-Two documents mean the same if their rights in normal form are equal.  An action is nothing but
+Two documents mean the same if their rights in normal form are equal.  An action consists of
 three services and two topics (ROS 2 design "Actions"): `unfolded` splits it into them, `folded`
 joins them again.
 """
@@ -36,18 +36,18 @@ ACTION_PARTS: dict[str, tuple[tuple[str, str], ...]] = {
         ("execute", "reply", "publish"),
     )
 }
-"""What a right to an action consists of: rights, and what follows the name of the action."""
+"""The parts of a right to an action: rights, and the suffix of the action's name."""
 
 GOAL = f"{ACTION_INSIDE}send_goal"
-"""Follows the name of an action in the service by which it is recognised."""
+"""The suffix of the service by which an action is recognised."""
 
 
 @shows("enclave", "qualifier", "kind", "right", "name")
 class Right(NamedTuple):
     """One right or denial of an enclave; ``name`` is absolute, perhaps with wildcards.
 
-    A name without a leading "/" is a DDS topic that ROS has no word for; only permissions that
-    sros did not make hold such.
+    A name without a leading "/" is a DDS topic that ROS has no word for; it occurs only in
+    permissions that sros did not make.
     """
 
     enclave: str
@@ -61,22 +61,22 @@ class Right(NamedTuple):
         return KIND_OF[self.right] if self.name.startswith("/") else "dds"
 
     def __str__(self) -> str:
-        """As ``/talker ALLOW publish topic /chatter``."""
+        """Return text such as ``/talker ALLOW publish topic /chatter``."""
         return f"{self.enclave} {self.qualifier.value} {self.describe()}"
 
     def describe(self) -> str:
-        """As ``publish topic /chatter``."""
+        """Return text such as ``publish topic /chatter``."""
         item = "DDS topic" if self.kind == "dds" else self.kind.removesuffix("s")
         return f"{self.right} {item} {self.name}"
 
 
 def order(right: Right) -> tuple[str, int, str, str]:
-    """Sorts rights as people look for them: by enclave, then kind and right, then name."""
+    """Return the sort key of a right: by enclave, then kind and right, then name."""
     return right.enclave, RIGHT_ORDER[right.right], right.name, right.qualifier
 
 
 GroupRights = tuple[tuple[str, Qualifier], ...]
-"""What a group says of its names: rights with their qualifiers, in the order of `RIGHTS`."""
+"""The rights of a group with their qualifiers, in the order of `RIGHTS`."""
 
 
 def groupable(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
@@ -113,7 +113,7 @@ def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
 
 
 def parts(right: Right) -> tuple[Right, ...]:
-    """The topics and services that a right stands for: itself, or the five parts of an action."""
+    """Return the topics and services of a right: itself, or the five parts of an action."""
     found = ACTION_PARTS.get(right.right)
     if found is None:
         return (right,)
@@ -145,7 +145,7 @@ def folded(rights: Iterable[Right]) -> frozenset[Right]:
 
 
 class Rules:
-    """A set of rights that can be asked; exact names are looked up, only wildcards are matched."""
+    """A set of rights with fast queries: exact names are looked up, only wildcards are matched."""
 
     def __init__(self, rights: Iterable[Right]) -> None:
         self._said = unfolded(rights)
@@ -158,16 +158,16 @@ class Rules:
                 self._wild[place].append(name)
 
     def cover(self, right: Right) -> bool:
-        """Return whether these rights contain all of ``right`` (an ALLOW, or a DENY)."""
+        """Return whether these rights cover all of ``right`` (an ALLOW, or a DENY)."""
         return all(self._covering(part) for part in parts(right))
 
     def covering(self, right: Right) -> tuple[Right, ...]:
-        """Return the rights by which `cover` is true, without repetition; empty where it is not."""
+        """Return the rights by which `cover` is true, without repetition; none if it is false."""
         found = [self._covering(part) for part in parts(right)]
         return tuple(dict.fromkeys(each for each in found if each)) if all(found) else ()
 
     def meeting(self, right: Right) -> tuple[Right, ...]:
-        """Return the rights here that share a name with ``right``."""
+        """Return the rights of this set that share a name with ``right``."""
         found: dict[Right, None] = {}
         for part in parts(right):
             place = part[:3]
@@ -215,7 +215,7 @@ class RightsDifference:
         return bool(self.only_first or self.only_second)
 
     def lines(self) -> list[tuple[str, Right]]:
-        """Every difference with its sign, "-" for the first side, in the order of `order`."""
+        """Return every difference with its sign, "-" for the first side, sorted by `order`."""
         found = [("-", each) for each in self.only_first] + [("+", e) for e in self.only_second]
         return sorted(found, key=lambda line: (*order(line[1]), line[0] == "+"))
 
@@ -225,8 +225,8 @@ def compare(
 ) -> RightsDifference:
     """Return how two sets of rights differ, within the enclaves of ``scope`` (None: all).
 
-    The difference is empty just if both allow and deny the same, with actions taken for the
-    services and topics that they consist of.
+    The difference is empty if and only if both allow and deny the same; an action counts as its
+    services and topics.
     """
     one, other = (
         folded(each for each in side if scope is None or each.enclave in scope)

@@ -19,10 +19,10 @@ from sros_tool.keystore.issuing import enclave as writer_of_enclaves
 from sros_tool.keystore.issuing import proof
 from sros_tool.keystore.issuing.proof import (
     differences,
+    example_topics,
     prove,
     signed_expressions,
     stated_expressions,
-    telling_topics,
 )
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
@@ -71,7 +71,7 @@ def test_what_is_stated_is_what_the_rights_of_the_policy_say(policy: Policy) -> 
     rules = Rules(policy_rights(policy))
     for enclave in policy.enclaves:
         stated = stated_expressions(enclave)
-        for topic in telling_topics(stated.all()):
+        for topic in example_topics(stated.all()):
             if topic.startswith("rt/") and len(topic) > 3:
                 for verb in ("publish", "subscribe"):
                     allowed = rules.allow(enclave.path, verb, topic[2:])
@@ -181,8 +181,8 @@ def test_another_form_that_means_the_same_is_accepted(tmp_path: Path) -> None:
     prove(enclave, changed, DOMAINS)
 
 
-def test_telling_topics() -> None:
-    found = telling_topics(["rt/a", "rt/b/*", "rt/*/c", "rq/*Request"])
+def test_example_topics() -> None:
+    found = example_topics(["rt/a", "rt/b/*", "rt/*/c", "rq/*Request"])
     assert "rt/a" in found
     assert "rt/b/c" in found
     for wanted, others in (
@@ -200,7 +200,7 @@ def test_telling_topics() -> None:
 
 @given(st.lists(st.sampled_from(["rt/a", "rt/*", "rt/a*", "rt/?", "rt/[ab]", "*"]), max_size=4))
 def test_a_wildcard_is_told_apart_from_all_others(expressions: list[str]) -> None:
-    found = telling_topics(expressions)
+    found = example_topics(expressions)
     for one in {each for each in expressions if "*" in each}:
         assert any(matches(one, name) for name in found)
 

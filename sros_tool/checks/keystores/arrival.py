@@ -1,4 +1,4 @@
-"""The state of enclaves on a robot: which can be used, until when, and every problem."""
+"""The state of enclaves on a robot: whether and until when each can be used, and every problem."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ArrivedEnclave:
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """The enclaves of a folder, or a single one, and everything that is wrong with them.
+    """The enclaves of a robot's folder, or a single one, and all findings about them.
 
     ``root`` is the folder that contains the enclaves folder; ``kind`` is keystore or enclave.
     """
@@ -94,7 +94,7 @@ def verify_arrival(
 ) -> Arrival:
     """Return the findings in a robot's folder, or in the folder of one enclave.
 
-    A request without an answer is reported too: on a robot nothing works before.
+    A request without an answer is reported too: the enclave does not work without it.
 
     Args:
         path: a folder with enclaves, or the folder of an enclave.

@@ -258,7 +258,7 @@ def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
 
 
 def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
-    """Keystores of ros2/sros2 have neither settings nor a ledger; keystores of sros have both."""
+    """Yield a finding if only one of settings and ledger is there: ros2/sros2 makes neither."""
     settings, ledger = ((keystore.root / name).exists() for name in (SETTINGS, LEDGER))
     if ledger and not settings:
         yield SETTINGS_MISSING.found("settings", f"there is no {SETTINGS}", str(keystore.root))
@@ -284,7 +284,7 @@ def _authority(
 def _key(keystore: CheckedKeystore, role: str, certificate: x509.Certificate) -> Iterator[Finding]:
     path = keystore.root / ca_key(role)
     if not path.exists():
-        return  # it is kept elsewhere
+        return  # the key is kept elsewhere
     try:
         key = load_key(read_bytes(path, "key"), f"'{path}'", _locked)
     except _LockedError:

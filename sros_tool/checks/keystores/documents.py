@@ -241,7 +241,7 @@ def _times(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding
         for each in (grant.not_before, grant.not_after)
     )
     if begin is None or end is None:
-        return  # which the form of the dates reports
+        return  # the finding about the form of dates reports it
     if not begin <= int(now.timestamp()) <= end:
         here = f"in {enclave.keystore.zone} Fast DDS takes that for {_utc(begin)} to {_utc(end)}"
         yield LOCAL_TIME.found(enclave.name, f"{text}, and {here}", file)
@@ -431,8 +431,8 @@ _NONE = (ProtectionKind.NONE,)
 def check_governance(enclave: CheckedEnclave, *, alone: bool) -> Iterator[Finding]:
     """Yield the findings in the governance that an enclave loads.
 
-    It is reported once for a keystore, by the first enclave; ``alone`` says that this one is not
-    the first, and has a copy of its own that may differ.
+    The shared governance is reported once for a keystore, by the first enclave.  With ``alone``,
+    this enclave is not the first, and has its own copy, which may differ.
     """
     governance = enclave.state.governance
     if governance is None:
@@ -456,7 +456,7 @@ def governance_findings(
     for rule in governance.domain_access_rules:
         subject = f"domain {rule.domains}"
         for kind, text in (*_domain_rule(rule), *_topic_rules(rule)):
-            # A template chooses what is open, but nobody chooses that messages are lost.
+            # A template may choose open topics, but nobody chooses to lose messages.
             chosen = "" if kind is SIGNED_PAYLOAD else accepted
             yield kind.found(subject, text, file, accepted=chosen)
         for problem in _domain_problems(rule.domains):
@@ -573,8 +573,8 @@ _SHOWN = 3
 def check_vendors(enclave: CheckedEnclave, *, outside: bool) -> Iterator[Finding]:
     """Ask every vendor about every topic that the permissions name.
 
-    Documents just as sros writes them are decided alike, unless something ``outside`` of the
-    portable profile was found in them: they are not asked about, for that takes long.
+    Vendors decide alike on a document as sros writes it, without anything ``outside`` of the
+    portable profile.  They are not asked about such a document, because that takes long.
     """
     state = enclave.state
     if not (state.certificate and state.governance and state.permissions_document):

@@ -222,7 +222,7 @@ def _expiry(
 
 
 def _expires_soon(window: Window, now: datetime) -> bool:
-    """Whether it expires within 30 days, or is in the last third of a validity under 90 days."""
+    """Return whether it expires in 30 days, or is in the last third of a validity under 90 days."""
     return window.not_after - now < min(_SOON, (window.not_after - window.not_before) / 3)
 
 
@@ -250,7 +250,7 @@ def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
 
 
 def _is_as_long(chosen: Span, length: timedelta) -> bool:
-    """Whether the keystore's template chose this validity, such as a fixed expiry."""
+    """Return whether the keystore's template chose this validity, such as a fixed expiry."""
     return not isinstance(chosen, timedelta) or length <= chosen + BACKDATE
 
 

@@ -155,7 +155,7 @@ def check_issued(
         yield SERIAL_TWICE.found(", ".join(names), f"the serial number is {serial:x}")
     for _, names in _twice((each.key, each.name) for each in summaries):
         yield KEY_TWICE.found(", ".join(names), "their certificates are for one key")
-    # A part of its own in the subject keeps it from being a part of another.
+    # A unique part in the subject keeps it from matching another one.
     plain = {each.name for each in summaries if not each.unique}
     names = [each.name for each in summaries]
     pairs = [(inner, outer) for inner, outer in mistaken_names(names) if inner in plain]
@@ -179,9 +179,9 @@ def _twice(pairs: Iterable[tuple[_Key, str]]) -> Iterator[tuple[_Key, list[str]]
 
 
 def _trust(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:
-    """Yield enclaves that have no CA in common; during a rotation each trusts the old and the new.
+    """Yield enclaves without a common CA; during a rotation each trusts the old and the new.
 
-    The CAs of the keystore are the right ones; in an export, the CAs of most enclaves.
+    The CAs of the keystore are the right ones; in an export, the CAs of most enclaves are.
     """
     for index, (role, file) in enumerate(zip(ROLES, _AUTHORITY_FILES, strict=True)):
         everyone = [each for each in summaries if each.trusted[index]]
@@ -202,7 +202,7 @@ def _trust(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> It
 def _exported_governance(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
-    """Yield exported enclaves whose copy of the governance is from another time."""
+    """Yield exported enclaves whose copy of the governance differs from the others."""
     copies = [each for each in summaries if each.governance]
     for each in copies[1:]:
         if each.governance != copies[0].governance:
@@ -234,7 +234,7 @@ def _ledger(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> I
 
 
 def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -> Iterator[Finding]:
-    """Yield how the rights of an enclave differ from those that the policies state for it."""
+    """Yield a finding if the rights of an enclave differ from the rights in the policies."""
     if not wanted:
         return
     name, grant = enclave.name, grant_of(enclave)
@@ -254,7 +254,7 @@ def check_policy(enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]]) -
 
 
 def wanted_rights(keystore: CheckedKeystore) -> dict[str, frozenset[Right]]:
-    """Return the rights of every enclave that the policies have."""
+    """Map each enclave of the policies to its rights."""
     found: dict[str, frozenset[Right]] = {}
     for policy in keystore.policies:
         rights = defaultdict(set)

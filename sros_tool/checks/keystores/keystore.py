@@ -57,12 +57,12 @@ def keystore_findings(
 
     Args:
         root: the keystore.
-        now: the moment for which it is checked.
+        now: the moment to check for.
         zone: the time zone of the host on which its enclaves run.
         domain: the ROS domain that its enclaves have to join.
         policies: policies with which its permissions are compared.
         only: the enclaves to look at; None for all, and the keystore itself.
-        on_robot: whether it lies on a robot, where keys of CAs have no place.
+        on_robot: whether it is on a robot, where no CA key may be.
 
     Raises:
         KeystoreError: ``root`` is no keystore.

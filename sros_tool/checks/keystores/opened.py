@@ -43,11 +43,11 @@ class UnreadablePart:
 class CheckedKeystore:
     """A keystore, or the part of one that was exported for a robot, as it is checked.
 
-    ``settings`` are None where ros2/sros2 made it.  ``authorities`` has the certificates of a CA
-    file by role, the issuing one first.  ``governance`` are the bytes of the document that its
-    enclaves share, where there is one.  Without ``is_home`` it lies on a robot, where keys of CAs
-    have no place.  ``policies`` are compared with its permissions; ``zone`` is the time zone of
-    the host on which its enclaves run.
+    ``settings`` are None if ros2/sros2 made it.  ``authorities`` maps a role to the certificates of
+    its CA file, the issuing one first.  ``governance`` are the bytes of the document that its
+    enclaves share, if there is one.  Without ``is_home`` it is on a robot, where no CA key may be.
+    ``policies`` are compared with its permissions; ``zone`` is the time zone of the host on which
+    its enclaves run.
     """
 
     root: Path
@@ -64,9 +64,9 @@ class CheckedKeystore:
     is_home: bool = True
 
     def accepts(self, chosen: Callable[[Template], bool]) -> str:
-        """Return the name of whoever accepted ``chosen``: a template, or the exporting keystore.
+        """Return the name of the template, or exporting keystore, that accepts ``chosen``.
 
-        "" where nobody did, by its settings, or in a keystore of ros2/sros2, which has none.
+        "" if the settings do not accept it, or if there are no settings (ros2/sros2).
         """
         if self.settings:
             return f"template {self.settings.name}" if chosen(self.settings) else ""

@@ -1,7 +1,7 @@
 """The identity CA and the permissions CA of a keystore: making them, and loading them to sign.
 
-A CA file holds the issuing CA first, for Cyclone DDS 0.10.2 reads nothing else of it (ran); Fast
-DDS 2.9.1 trusts all that it holds, and reads a revocation list in it, too (ran).
+A CA file holds the issuing CA first, because Cyclone DDS 0.10.2 reads only that (ran); Fast DDS
+2.9.1 trusts all CAs in the file, and also reads a revocation list in it (ran).
 """
 
 from __future__ import annotations
@@ -102,11 +102,11 @@ def create_authorities(
     now: datetime,
     imported: Mapping[str, bytes],
 ) -> Authorities:
-    """Stage the CAs of a new keystore; a CA whose certificate is ``imported`` exists already."""
+    """Stage the CAs of a new keystore; for an ``imported`` certificate no CA is made."""
     check_places(keyring, template)
     check_keys_of(imported, keyring, template)
     validity = window(now, template.authority_validity)
-    # Every keystore's CA has a name of its own, so that messages and pictures distinguish them.
+    # Each CA gets a unique name, so that messages and pictures distinguish keystores.
     serial = secrets.token_hex(4)
     notes: list[Note] = []
 

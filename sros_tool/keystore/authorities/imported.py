@@ -45,10 +45,10 @@ class ImportedAuthority:
 def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> ImportedAuthority:
     """Return the CA of ``key`` with its chain; ``data`` is PEM, in any order.
 
-    What only some DDS vendors refuse becomes a note.
+    A fault that only some DDS vendors refuse becomes a note.
 
     Raises:
-        PkiError: it cannot serve as the ``role`` CA.
+        PkiError: the CA cannot serve as the ``role`` CA.
     """
     try:
         certificates = [read_in_full(each) for each in x509.load_pem_x509_certificates(data)]

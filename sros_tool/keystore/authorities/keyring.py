@@ -34,9 +34,9 @@ def no_secrets(what: str) -> str:
 class Keyring:
     """The places of the keys of the two authorities, and the secrets that open them.
 
-    ``places`` names the key of a role ("identity", "permissions") by URI, ``file:PATH`` or
-    ``pkcs11:...``, where it is not at the place that the keystore's settings say.  ``secrets``
-    answers with passphrases and PINs.  With ``encrypt``, new keys in files get a passphrase.
+    ``places`` maps a role ("identity", "permissions") to the URI of its key, ``file:PATH`` or
+    ``pkcs11:...``; for other roles the keystore's settings say the place.  ``secrets`` returns
+    passphrases and PINs.  With ``encrypt``, new keys in files get a passphrase.
     """
 
     secrets: Secrets = no_secrets
@@ -52,7 +52,7 @@ class Keyring:
         """Return the key of a role.
 
         Raises:
-            KeystoreError: it is not there, or cannot be used.
+            KeystoreError: the key is missing, or cannot be used.
         """
         place = self.place(role, template)
         try:
@@ -79,9 +79,9 @@ class Keyring:
     def make(
         self, transaction: Transaction, file: str, role: str, template: Template
     ) -> PrivateKey:
-        """Return the key for a new authority: the one at its place, or else a new one there.
+        """Return the key for a new authority: the existing one at its place, or a new one there.
 
-        ``file`` is where in the keystore it goes, unless a place is named.
+        ``file`` is its path in the keystore, unless another place is named.
         """
         place = self.places.get(role) or (
             template.identity_key if role == IDENTITY else template.permissions_key
@@ -119,7 +119,7 @@ IN_KEYSTORE = Keyring()
 
 
 def check_places(keyring: Keyring, template: Template) -> None:
-    """Raise `KeystoreError` where one CA does both jobs and its key is named for one only."""
+    """Raise `KeystoreError` if one CA does both jobs and two places of its key are named."""
     named = {role: keyring.places.get(role) for role in ROLES}
     if not template.separate_authorities and len({place or "" for place in named.values()}) > 1:
         raise KeystoreError(
@@ -130,7 +130,7 @@ def check_places(keyring: Keyring, template: Template) -> None:
 
 
 def check_keys_of(roles: Iterable[str], keyring: Keyring, template: Template) -> None:
-    """Raise `UsageError` where the certificate of a CA is given, but not where its key is."""
+    """Raise `UsageError` if the certificate of a CA is given without the place of its key."""
     for role in roles:
         if keyring.place(role, template) == ca_key(role):
             raise UsageError(

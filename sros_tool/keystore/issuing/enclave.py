@@ -1,8 +1,8 @@
-"""The one writer of an enclave: its certificate and permissions are issued, proven and staged here.
+"""The only writer of enclaves: it issues, proves and stages their certificates and permissions.
 
-Every verb that issues says what is issued as an `Issuance`, and `EnclaveWriter.write` does it: the
-rights become permissions, these are proven, both documents are signed, staged in a transaction, and
-recorded for the ledger.  For many enclaves, several processes do it.
+Every verb that issues passes an `Issuance` to `EnclaveWriter.write`: the rights become permissions,
+these are proven, certificate and permissions are signed, staged in a transaction, and recorded for
+the ledger.  For many enclaves, several processes share the work.
 """
 
 from __future__ import annotations
@@ -83,8 +83,8 @@ class StatedRights:
 class EarlierRights:
     """Rights that were signed before.
 
-    ``policy`` is the SHA-256 of the policy that they were made from, "" where the ledger does not
-    know it.
+    ``policy`` is the SHA-256 of the policy that they were made from, "" if the ledger does not
+    have it.
     """
 
     grant: Grant
@@ -95,8 +95,8 @@ class EarlierRights:
 class Issuance:
     """The certificate and permissions to issue for one enclave.
 
-    ``identity`` is a certificate that the enclave keeps, or what a new one is issued for.  Without
-    ``rights`` the permissions stay as they are.
+    ``identity`` is the certificate that the enclave keeps, or the subject and key of a new one.
+    Without ``rights`` the permissions do not change.
     """
 
     name: str
@@ -108,8 +108,7 @@ class Issuance:
 class Issued:
     """The certificate and the permissions that an enclave has now.
 
-    ``document`` is the signed ``permissions.p7s``; it is empty, and so are the permissions, where
-    none were issued.
+    ``document`` is the signed ``permissions.p7s``; without new permissions, both are empty.
     """
 
     issuance: Issuance
@@ -118,7 +117,7 @@ class Issued:
     document: bytes = b""
 
     def notes(self) -> Iterator[Note]:
-        """Yield notes on the permissions: where they are not portable, or not as in ros2/sros2."""
+        """Yield notes on permissions that are not portable, or differ from ros2/sros2."""
         name, rights = self.issuance.name, self.issuance.rights
         if isinstance(rights, StatedRights) and len(rights.enclave.profiles) > 1:
             yield Note(
@@ -134,9 +133,9 @@ class Issued:
 
 
 class EnclaveWriter:
-    """Issues for enclaves in the name of the authorities that are given, in one transaction.
+    """Writer of enclaves: issues in the name of ``authorities``, within one transaction.
 
-    ``entries`` are for the ledger; ``notes`` say where the authorities expire too early for the
+    ``entries`` are for the ledger; ``notes`` report authorities that expire too early for the
     validity that the template chooses.
     """
 
@@ -179,7 +178,7 @@ class EnclaveWriter:
         certificate and with the permissions CA at the latest.
 
         Raises:
-            KeystoreError: the permissions would not say what the policy says.
+            KeystoreError: the permissions would not decide as the policy does.
         """
         name, identity, rights = issuance.name, issuance.identity, issuance.rights
         certificate = self._issue(name, identity) if isinstance(identity, NewIdentity) else identity
@@ -236,8 +235,8 @@ class EnclaveWriter:
     ) -> dict[str, Result]:
         """Return the result of ``work`` for each enclave, done on all cores.
 
-        What forked workers issue and stage counts as if it had been done here.  The session of a
-        token does not survive a fork, so with a key on a token there is no worker.
+        Everything that forked workers issue and stage is added here.  The session of a token does
+        not survive a fork, so a key on a token is used without workers.
         """
         own_process = os.getpid()
 
@@ -264,7 +263,7 @@ class EnclaveWriter:
 def _permissions(
     rights: StatedRights | EarlierRights, subject: str, validity: Window
 ) -> Permissions:
-    """Return the permissions that give ``rights`` to a subject (RFC 4514 text) for a time."""
+    """Return permissions with ``rights`` for a subject (RFC 4514 text) and a validity."""
     if isinstance(rights, EarlierRights):
         begin, end = iso(validity.not_before), iso(validity.not_after)
         grant = replace(rights.grant, subject=subject, not_before=begin, not_after=end)
@@ -322,7 +321,7 @@ def policies_of(root: Path) -> dict[str, str]:
 
 
 def present_files(root: Path, name: str) -> set[str]:
-    """Return the files of an enclave; a link that leads nowhere is a file that is missing."""
+    """Return the files of an enclave; a broken link counts as missing."""
     folder = enclave_path(root, name)
     try:
         return {file for file in os.listdir(folder) if (folder / file).exists()}
@@ -333,7 +332,7 @@ def present_files(root: Path, name: str) -> set[str]:
 def shared_files(root: Path, name: str) -> dict[str, str]:
     """Map the files of an enclave that it shares with all others to their paths in the keystore."""
     shared = {f"{role}_ca.cert.pem": ca_certificate(role) for role in ROLES}
-    if enclave_folder(name) != ENCLAVES:  # in the folder of the enclave / it lies itself
+    if enclave_folder(name) != ENCLAVES:  # in the folder of the enclave / its target
         shared[GOVERNANCE_FILE] = GOVERNANCE_P7S
     if (root / CRL).exists():
         shared[CRL_FILE] = CRL
@@ -341,7 +340,7 @@ def shared_files(root: Path, name: str) -> dict[str, str]:
 
 
 def link_shared_files(transaction: Transaction, name: str, present: Collection[str]) -> None:
-    """Stage links to the files that all enclaves share, but for those that are ``present``."""
+    """Stage links to the files that all enclaves share, except the ``present`` ones."""
     folder = enclave_folder(name)
     up = "../" * folder.count("/")
     for file, source in shared_files(transaction.root, name).items():

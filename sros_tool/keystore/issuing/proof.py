@@ -9,12 +9,11 @@ Both mean the same, for every name, mentioned or not, if
 - the vendors match each expression with wildcards as a policy means it (one without wildcards
   matches itself for all of them): a comparison of matchers, for names that distinguish them.
 
-Both are made of every document, whatever its size and however many are signed at once.  For a
-document of another form, the decision engine is asked for every name that either of them mentions,
-and for names that none mentions.
+Both comparisons are made for every document, whatever its size.  For a document of another form,
+the decision engine is asked for every name in the policy or the document, and for names in neither.
 
-The DDS names are written down here a second time, from the ROS 2 design "Topic and Service name
-mapping to DDS", so that an error of `sros_tool.translate` does not prove itself.
+The DDS names are defined here a second time, from the ROS 2 design "Topic and Service name mapping
+to DDS", so that the proof finds an error of `sros_tool.translate`.
 """
 
 from __future__ import annotations
@@ -38,10 +37,10 @@ from sros_tool.policy.model import ALLOW, Enclave
 from sros_tool.policy.patterns import common_name, matches, overlap
 
 _ASKED = (Vendor.STANDARD, Vendor.FAST)
-"""The vendors that have to decide as the policy does; Fast DDS 2.9 reads such documents as 2.14.
+"""The vendors that must decide as the policy does; Fast DDS 2.9 reads such documents like 2.14.
 
-Not Cyclone DDS 0.10: it denies a topic in both directions if one is denied, which is noted
-(``portable.deny-blocks-topic``) and cannot be expressed otherwise.
+Not Cyclone DDS 0.10: it denies a topic in both directions if one is denied.  No document can avoid
+that; a note reports it (``portable.deny-blocks-topic``).
 """
 
 _SET = re.compile(r"\[!?[^\]]+\]")
@@ -82,11 +81,11 @@ class ExpressionSets:
 
     @classmethod
     def none(cls) -> ExpressionSets:
-        """No right and no denial."""
+        """Return the empty sets: no right and no denial."""
         return cls({_OUT: set(), _IN: set()}, {_OUT: set(), _IN: set()})
 
     def allow(self, verb: str, topic: str) -> bool:
-        """Whether a policy allows it: one rule allows it, and no rule denies it."""
+        """Return whether a policy allows it: one rule allows it, and no rule denies it."""
         return _meant(self.allowed[verb], topic) and not _meant(self.denied[verb], topic)
 
     def all(self) -> Iterator[str]:
@@ -100,7 +99,7 @@ class ExpressionSets:
 class Disagreement:
     """A DDS topic on which policy and permissions differ.
 
-    ``meant`` is whether the policy allows it, ``outcome`` is what the vendor decides.
+    ``meant`` is whether the policy allows it, ``outcome`` is the decision of the vendor.
     """
 
     verb: str
@@ -110,7 +109,7 @@ class Disagreement:
     outcome: Outcome
 
     def __str__(self) -> str:
-        """As ``publish rt/x is allowed, and Fast DDS 2.14 says denied``."""
+        """Return text such as ``publish rt/x is allowed, and Fast DDS 2.14 says denied``."""
         meant = "allowed" if self.meant else "denied"
         return f"{self.verb} {self.topic} is {meant}, and {self.vendor.title} says {self.outcome}"
 
@@ -133,16 +132,16 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
 
 @lru_cache(maxsize=4096)
 def matched_as_meant(expression: str) -> bool:
-    """Whether the vendors match an expression with the same names as the policy does."""
+    """Return whether the vendors match an expression with the same names as the policy."""
     return all(
         dds_matches(vendor.traits.style, expression, name) == matches(expression, name)
-        for name in telling_topics([expression])
+        for name in example_topics([expression])
         for vendor in _ASKED
     )
 
 
 def stated_expressions(policy: Enclave) -> ExpressionSets:
-    """Return a policy's rights for an enclave in DDS names, including every participant's."""
+    """Return a policy's rights for an enclave, and every participant's rights, in DDS names."""
     found = ExpressionSets.none()
     for verb in (_OUT, _IN):
         found.allowed[verb].add(ROS_DISCOVERY_TOPIC)
@@ -187,13 +186,13 @@ def differences(
 ) -> list[Disagreement]:
     """Return the differences between the vendors' decisions and the policy.
 
-    They are asked for the `telling_topics` of all expressions, and of each one alone.
+    They are asked about the `example_topics` of all expressions, and of each one alone.
     """
     stated = stated_expressions(policy)
     expressions = {*stated.all(), *_topics(permissions)}
-    topics = set(telling_topics(expressions))
+    topics = set(example_topics(expressions))
     for each in filter(is_expression, expressions):
-        topics.update(telling_topics([each]))
+        topics.update(example_topics([each]))
     found = []
     for vendor in vendors:
         for domain in _ends(domains):
@@ -207,12 +206,12 @@ def differences(
     return found
 
 
-def telling_topics(expressions: Iterable[str]) -> tuple[str, ...]:
-    """Return topics that distinguish the expressions, sorted.
+def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
+    """Return sorted example topics that distinguish the expressions.
 
-    Each topic that is mentioned; for each wildcard one that it matches, one that only it matches,
-    and one for each other wildcard that it overlaps; and one that nothing matches, for each prefix
-    of ROS.
+    These are each exact topic; for each wildcard a topic that it matches, one that only it matches,
+    and one for each other wildcard that it overlaps; and for each ROS prefix a topic that no
+    expression matches.
     """
     known = sorted(set(expressions))
     wild = [each for each in known if is_expression(each)]

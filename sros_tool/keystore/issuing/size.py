@@ -18,10 +18,10 @@ _LINE = len("            <topic></topic>\r\n")
 
 
 class SizeEstimator:
-    """Estimates the size of signed permissions by signing them with a temporary key.
+    """Estimator of the size of signed permissions, which signs them with a temporary key.
 
-    A keystore's own CA may have a longer or shorter name, and a signature varies by some bytes: the
-    sizes are right to within 100 bytes.
+    The name of a keystore's CA may be longer or shorter, and a signature varies by some bytes: the
+    error of a size is below 100 bytes.
     """
 
     def __init__(self) -> None:
