@@ -25,6 +25,44 @@ settings.register_profile(
 )
 settings.load_profile("sros")
 
+MEMORY = Path("/dev/shm")
+ROOM = 1 << 30
+"""Bytes that have to be free in memory for the folders of the tests."""
+
+
+def use_memory_for_folders() -> None:
+    """Have pytest make the tests' folders in memory, where there is room and programs may run.
+
+    Thousands of keystores are copied, changed and removed: on a disk, most of the time is waiting.
+    """
+    try:
+        found = os.statvfs(MEMORY)
+    except OSError:
+        return
+    may_run = os.access(MEMORY, os.W_OK | os.X_OK) and not found.f_flag & os.ST_NOEXEC
+    if may_run and found.f_bavail * found.f_frsize > ROOM:
+        os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+
+
+use_memory_for_folders()
+
+SLOWEST = (
+    "test_revoke_in_rotation_on_dds",
+    "test_life_on_dds",
+    "test_rotate_on_dds",
+    "test_generate_policy",
+    "test_demo_attacks",
+    "test_nodes_fit_their_enclaves",
+)
+"""Modules that take minutes, mostly waiting: begun first, so that none is waited for at the end."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the slowest modules."""
+    rank = {name: number for number, name in enumerate(SLOWEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
+
+
 for each in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
     # Whoever starts the tests in the background may have had them ignored, and children inherit it.
     if signal.getsignal(each) is signal.SIG_IGN:

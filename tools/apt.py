@@ -14,21 +14,21 @@ _PATIENT = ["-o", "Acquire::Retries=2", "-o", "DPkg::Lock::Timeout=300"]
 
 
 def available() -> bool:
-    """Whether this system has apt and dpkg at all."""
+    """Return whether this system has apt and dpkg."""
     return all(shutil.which(tool) for tool in ("apt-get", "apt-cache", "dpkg", "dpkg-query"))
 
 
 def install(pattern: str, lock: int | None = None) -> bool:
     """Install, as root, the package whose name matches ``pattern`` wholly.
 
-    The package lists are brought up to date first.  False where nobody is root, where no such
-    package exists, or where apt fails; the log has its words.
+    Updates the package lists first.  Returns False without root, where no such package exists,
+    or where apt fails; the log has its output.
     """
     return install_all([pattern], lock) == []
 
 
 def install_all(patterns: Sequence[str], lock: int | None = None) -> list[str]:
-    """As `install`, of several packages at once; return the patterns that could not be had."""
+    """Install several packages at once; return the patterns that could not be installed."""
     prefix = root_prefix()
     if prefix is None or not available():
         return list(patterns)
@@ -62,11 +62,11 @@ FOR_TESTS: tuple[tuple[str, str, Callable[[], bool]], ...] = (
     ),
     ("chromium", "a browser for the pages", _command("chromium")),
 )
-"""What the tests hold sros against: the package, what it is, and how to see that it is there."""
+"""What the tests compare sros with: the package, what it is, and whether it is installed."""
 
 
 def provide_for_tests(lock: int | None = None) -> None:
-    """Make sure of `FOR_TESTS`; whatever cannot be had, its tests are skipped and say so."""
+    """Install `FOR_TESTS`; where one cannot be installed, its tests are skipped and say so."""
     missing = {package: what for package, what, there in FOR_TESTS if not there()}
     if not missing:
         return
@@ -77,7 +77,7 @@ def provide_for_tests(lock: int | None = None) -> None:
 
 
 def find(pattern: str, options: Sequence[str] = ()) -> str | None:
-    """The first name of an installable package that matches ``pattern`` wholly."""
+    """Return the first installable package whose name matches ``pattern`` wholly."""
     stem = re.match(r"[a-z0-9.+-]*", pattern)
     names = output_of(["apt-cache", *options, "pkgnames", stem.group() if stem else ""]) or ""
     for name in sorted(names.split()):
@@ -89,8 +89,8 @@ def find(pattern: str, options: Sequence[str] = ()) -> str | None:
 def unpack(pattern: str, folder: Path, lock: int | None = None) -> bool:
     """Download the package that matches ``pattern`` and unpack it into ``folder``, without root.
 
-    With it come the packages that it depends on and this machine does not have.  Where the
-    system's package lists know no such package or an outdated one, private lists are fetched.
+    Also unpacks its dependencies that are not installed.  Where the system's package lists have
+    no such package or an outdated one, private lists are fetched.
     """
     if not available():
         return False
@@ -106,10 +106,10 @@ def unpack(pattern: str, folder: Path, lock: int | None = None) -> bool:
 def needed(
     package: str, depends: Callable[[str], str], installed: Callable[[str], bool]
 ) -> list[str]:
-    """``package`` and everything that it needs, directly or not, and that is not installed.
+    """Return ``package`` and all its direct and indirect dependencies that are not installed.
 
-    ``depends`` answers as `apt-cache depends --important` does.  Of alternatives an installed
-    one serves; else the first that is a real package is taken.
+    ``depends`` returns the output of `apt-cache depends --important`.  Of alternatives, an
+    installed one is enough; else the first real package is taken.
     """
     wanted = [package]
     for name in wanted:

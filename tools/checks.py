@@ -21,10 +21,10 @@ _NOTHING_COLLECTED = 5
 _PLUGINS = "xdist.plugin,_hypothesis_pytestplugin"
 
 LONG = "--long"
-"""The argument that brings the long forms of the tests, as the variable SROS_LONG does."""
+"""The argument for the long forms of the tests; the same as the variable SROS_LONG."""
 
 WITH_DDS = ("tests/integration", "tests/explain")
-"""The folders with all tests that start DDS processes; the others need not be imported for them."""
+"""The folders of all tests that start DDS processes; the others are not imported for them."""
 
 RUFF = {
     "ruff check": ["-m", "ruff", "check", "--quiet"],
@@ -34,12 +34,12 @@ MYPY = {"mypy": ["-m", "mypy", "--no-error-summary"]}
 
 
 def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> int:
-    """Run every check whatever the others say; return the worst exit status.
+    """Run every check even after failures; return the worst exit status.
 
-    Without ``arguments`` the tests that start DDS processes run beside the others, and so does
-    mypy: their output follows when the others have ended.  There are more of them at once than
-    there are cores: each is in a network of its own and mostly waits for real time to pass.  With
-    ``arguments`` pytest runs once, with just these.
+    Without ``arguments``, mypy and the tests that start DDS processes run at the same time as the
+    other tests; their output is shown when the others have ended.  More DDS tests run at once than
+    there are cores: each has a network of its own and mostly waits.  With ``arguments``, pytest
+    runs once, with these.
     """
     started = time.monotonic()
     if read_record().ros_around:
@@ -56,7 +56,11 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
     cores = len(os.sched_getaffinity(0))
     parts = {
         "tests": ["-m", "not dds", "-n", str(cores), "--dist", "worksteal"],
-        "tests on a real DDS": ["-m", "dds", "-n", str(2 * cores), "--dist", "loadfile", *WITH_DDS],
+        # One file runs in one process; `tests/conftest.py` puts the slowest files first.
+        "tests on a real DDS": [
+            *("-m", "dds", "-n", str(3 * cores), "--dist", "loadfile", "--no-loadscope-reorder"),
+            *WITH_DDS,
+        ],
     }
     reports = {name: VENV / f"{name.replace(' ', '-')}.xml" for name in parts}
     for report in reports.values():
@@ -123,7 +127,7 @@ class _Step:
         )
 
     def end(self) -> int:
-        """Wait for its end, show what was kept, and return the exit status."""
+        """Wait for the end, show the kept output, and return the exit status."""
         status = self._process.wait()
         if self._output:
             _say(self._name)

@@ -18,7 +18,7 @@ Usage: ./dev COMMAND [ARGUMENTS…]
 
   demo [ARGUMENTS…]   show on a real DDS that secured nodes are closed to all others: sros demo
   test [ARGUMENTS…]   ruff, mypy and pytest; ARGUMENTS go to pytest, but --long: it brings more
-                      of what is drawn or killed at random, and takes much longer
+                      random and exhaustive cases, and takes much longer
   lint                ruff and mypy alone
   bench [ARGUMENTS…]  measure: python -m benchmarks
   sros ARGUMENTS…     run this checkout's sros
@@ -31,7 +31,7 @@ that enforces security. PYTHON names the Python to build upon, otherwise a fitti
 
 @dataclass(frozen=True)
 class Needs:
-    """What has to stand before a command runs."""
+    """What must be installed before a command runs."""
 
     groups: tuple[str, ...] = ("package",)
     dds: bool = False
@@ -94,7 +94,7 @@ def set_up(needs: Needs, *, afresh: bool = False) -> None:
 
 
 def _with_dds(needs: Needs, record: Record, lock: int) -> Record:
-    """See to a DDS that enforces security, and note where it is, so as not to ask again."""
+    """Provide a DDS that enforces security; return the record with its path."""
     if record.ros_around and not needs.for_tests:
         # The demo prefers the DDS of a sourced ROS 2; the tests ask for Cyclone DDS besides.
         if not _stands(record.rmw):
@@ -128,5 +128,5 @@ def _run(command: str, arguments: list[str]) -> int:
 
 
 def _become(program: list[str], env: dict[str, str]) -> NoReturn:
-    """Let the program take this process over: its signals and exit status are its own."""
+    """Replace this process by the program, which then gets its signals and exit status."""
     os.execve(program[0], program, env)

@@ -1,4 +1,4 @@
-"""A DDS that enforces security: find the machine's own, or bring Debian's Cyclone DDS."""
+"""A DDS that enforces security: find the machine's own, or install Debian's Cyclone DDS."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ except UnavailableError:
 
 
 def provide(python: Path, lock: int | None) -> str | None:
-    """Make sure of Cyclone DDS with security plugins; their folder, None without them.
+    """Provide Cyclone DDS with security plugins; return their folder, None without them.
 
-    Nothing here fails: without a DDS the commands still run, and explain what they miss.
+    Never fails: without a DDS the commands still run, and say what is missing.
     """
     plugins = plugins_found_by(python)
     if plugins is None:
@@ -66,7 +66,7 @@ def provide(python: Path, lock: int | None) -> str | None:
 
 
 def enforced_by_ros(python: Path) -> str | None:
-    """The DDS library of the sourced ROS 2, if sros found by trying that it enforces security."""
+    """Return the DDS library of the sourced ROS 2 if `sros doctor` saw it enforce security."""
     try:
         answer = json.loads(output_of([python, "-m", "sros_tool", "doctor", "--json"]) or "{}")
         enforcing = [stack for stack in answer["stacks"] if stack["enforces"]]
@@ -76,14 +76,14 @@ def enforced_by_ros(python: Path) -> str | None:
 
 
 def chosen_by_user() -> bool:
-    """Whether a variable names the DDS to use, so that nothing else is to be brought."""
+    """Return whether a variable names the DDS to use, so that none is installed."""
     return bool(os.environ.get(_VARIABLE))
 
 
 def plugins_found_by(python: Path, folder: Path | None = None) -> str | None:
-    """Where the package finds the security plugins; empty if nowhere, None if it does not start.
+    """Return where sros finds the security plugins; empty if nowhere, None if sros does not start.
 
-    ``folder`` makes it look there and nowhere else.
+    With ``folder``, only that folder is searched.
     """
     env = dict(os.environ)
     if folder is not None:

@@ -1,6 +1,6 @@
-"""The virtual environment of the checkout: made, filled, remembered, remade when it is not whole.
+"""The virtual environment of the checkout: created, filled, and created again when damaged.
 
-A record in it says what a finished setup put there; a mark says that one was interrupted.
+A record in it lists what a finished setup installed; a mark says that one was interrupted.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ _TITLES = {
 
 
 def prepare(groups: list[str], record: Record, lock: int) -> Record:
-    """Make the environment if need be and install ``groups``, each one of `GROUPS`.
+    """Create the environment where needed and install ``groups`` of `GROUPS`; return the record.
 
-    Returns what now stands.  Raises `SetupError`, with the end of the log, where it cannot.
+    Raises `SetupError`, with the end of the log.
     """
     now = current()
     if record.surroundings == now.surroundings and record.base == now.base:
@@ -89,7 +89,7 @@ def prepare(groups: list[str], record: Record, lock: int) -> Record:
 
 
 def _usable(record: Record, now: Record) -> bool:
-    """Whether the environment on disk can be built upon; refuses one that a person made."""
+    """Return whether the environment on disk can be used; refuse one that a person made."""
     if not VENV.exists():
         return False
     if UNFINISHED.exists():
@@ -116,7 +116,7 @@ def _usable(record: Record, now: Record) -> bool:
 
 @contextlib.contextmanager
 def _unfinished() -> Iterator[None]:
-    """Mark the environment while it changes; a kill leaves the mark, an error that pip told not."""
+    """Mark the environment while it changes; a kill leaves the mark, an error of pip does not."""
     UNFINISHED.touch()
     try:
         yield
@@ -168,7 +168,7 @@ def _has_venv() -> bool:
 
 
 def _install(group: str, now: Record, lock: int) -> bool:
-    """Install one group; whether it is settled.  Raises `SetupError` where nothing runs without."""
+    """Install one group; return whether it need not be tried again.  Raises `SetupError`."""
     optional = group in ROS_GROUPS
     if optional and (now.ros_around or not _rclpy_fits(group, now)):
         return True
@@ -183,7 +183,7 @@ def _install(group: str, now: Record, lock: int) -> bool:
 
 
 def _requirements(group: str) -> list[str]:
-    """What pip is asked for; naming the extras' contents spares building the package again."""
+    """Return what pip installs; with the extras by content, the package is not built again."""
     if group == "package":
         return ["--editable", str(CHECKOUT)]
     if group == "ros-test":
@@ -210,7 +210,7 @@ def _quiet_environment() -> dict[str, str]:
 
 
 def _has_rclpy(now: Record) -> bool:
-    """Whether the interpreter, as this shell has set it up, already has an rclpy that works."""
+    """Return whether the interpreter has a working rclpy in this shell's environment."""
     if output_of([now.base, "-c", "import rclpy.node"]) is not None:
         return True
     if output_of([now.base, "-c", "import importlib.util as u; assert u.find_spec('rclpy')"]) == "":

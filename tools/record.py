@@ -1,4 +1,4 @@
-"""What a finished setup left behind: remembered, compared with what is here now."""
+"""The record of a finished setup, and its comparison with what is here now."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LIVE_ROS = ("ros-std-srvs==5.3.6", "ros-test-msgs==2.0.3")
 """Interfaces that only the tests of a live ROS graph use; built for the rclpy wheels."""
 
 UNFINISHED = VENV / "sros-setup.unfinished"
-"""Lies there while an installer works; an environment that is found with it is not trusted."""
+"""Exists while an installer runs; an environment in which it is found is not trusted."""
 
 _RECORD = VENV / "sros-setup.json"
 _SURROUNDINGS = ("PYTHONPATH", "AMENT_PREFIX_PATH", "CONDA_PREFIX")
@@ -47,7 +47,7 @@ class Record:
 
 
 def read_record() -> Record:
-    """What the last setup left, empty where there is none that can be trusted."""
+    """Return the record of the last setup; an empty one where none can be trusted."""
     try:
         found = Record(**json.loads(_RECORD.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
@@ -56,14 +56,14 @@ def read_record() -> Record:
 
 
 def write_record(record: Record) -> None:
-    """Remember a finished setup, whole or not at all."""
+    """Write the record of a finished setup atomically."""
     staged = _RECORD.with_suffix(".new")
     staged.write_text(json.dumps(asdict(record), indent=1), encoding="utf-8")
     staged.replace(_RECORD)
 
 
 def current() -> Record:
-    """This checkout, this interpreter and these surroundings, with nothing installed yet."""
+    """Return the record of this checkout and interpreter, with nothing installed yet."""
     requirements = PYPROJECT.read_bytes() + repr(LIVE_ROS).encode()
     around = repr([os.environ.get(name) for name in _SURROUNDINGS]).encode()
     return Record(
@@ -76,7 +76,7 @@ def current() -> Record:
 
 
 def base_interpreter() -> Path:
-    """The Python behind this process, outside of any virtual environment made by links."""
+    """Return the Python of this process, outside of any virtual environment."""
     real = Path(sys.executable).resolve()
     if real.is_relative_to(VENV):
         return Path(getattr(sys, "_base_executable", sys.executable)).resolve()
@@ -84,7 +84,7 @@ def base_interpreter() -> Path:
 
 
 def holds(record: Record, now: Record, groups: list[str]) -> bool:
-    """Whether a recorded setup still stands and has all ``groups``."""
+    """Return whether a recorded setup is still valid and has all ``groups``."""
     same = replace(
         now,
         ros_around=record.ros_around,
@@ -110,7 +110,7 @@ def difference(record: Record, now: Record) -> str | None:
 
 
 def whole(record: Record) -> bool:
-    """Whether the environment still has all that the setup left in it."""
+    """Return whether the environment still has all that the setup installed."""
     packages = _site_packages(record.version)
     return PYTHON.exists() and all((packages / name).exists() for name in record.distributions)
 
@@ -120,5 +120,5 @@ def _site_packages(version: str) -> Path:
 
 
 def distributions_now() -> list[str]:
-    """The distributions in the environment, by the names of their metadata folders."""
+    """Return the names of the metadata folders of all distributions in the environment."""
     return sorted(path.name for path in VENV.glob("lib/python3.*/site-packages/*.dist-info"))

@@ -24,11 +24,11 @@ _TAIL = 15
 
 
 class SetupError(Exception):
-    """What is missing, why, and how to get it, in one paragraph for a person."""
+    """A setup cannot go on: what is missing, why, and how to get it, in one paragraph."""
 
 
 def say(text: str) -> None:
-    """Tell in one line what is being done, on stderr: stdout belongs to the command's results."""
+    """Print one line about the setup to stderr; stdout is for the results of the command."""
     print(f"dev: {text}", file=sys.stderr, flush=True)
 
 
@@ -39,10 +39,10 @@ def succeeds(
     env: Mapping[str, str] | None = None,
     keep_open: int | None = None,
 ) -> bool:
-    """Run an installer with its output in the log; whether it ended with 0.
+    """Run an installer with its output in the log; return whether its exit status was 0.
 
-    ``keep_open`` is a file descriptor that it inherits: the lock, so that an installer which
-    outlives a killed setup still keeps the next one waiting.
+    The installer inherits the file descriptor ``keep_open``, the lock: if it outlives a killed
+    setup, the next setup still waits for it.
     """
     LOG.parent.mkdir(parents=True, exist_ok=True)
     with LOG.open("ab") as log:
@@ -68,7 +68,7 @@ def succeeds(
 
 
 def output_of(command: Sequence[str | Path], env: Mapping[str, str] | None = None) -> str | None:
-    """What a question to the system answers on stdout; None where it fails or cannot be asked."""
+    """Return a command's stdout; None where it fails or cannot be started."""
     try:
         ended = subprocess.run(
             command,
@@ -87,7 +87,7 @@ def output_of(command: Sequence[str | Path], env: Mapping[str, str] | None = Non
 
 
 def log_tail() -> str:
-    """The last lines of the log, indented, with where to read the rest."""
+    """Return the last lines of the log, indented, with the path of the whole log."""
     try:
         lines = LOG.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -98,7 +98,7 @@ def log_tail() -> str:
 
 @contextlib.contextmanager
 def locked() -> Iterator[int]:
-    """Keep other setups of this checkout out; gives the descriptor that holds the lock.
+    """Lock this checkout against other setups; yield the descriptor that holds the lock.
 
     The lock is on the checkout's folder itself: it leaves nothing behind, and ends with the
     last process that has it open.
@@ -117,7 +117,7 @@ def locked() -> Iterator[int]:
 
 @functools.cache
 def root_prefix() -> list[str] | None:
-    """What to put before a command so that root runs it; None where nobody may without asking."""
+    """Return the words before a command that root runs; None where that needs a password."""
     if os.geteuid() == 0:
         return []
     if shutil.which("sudo") and output_of(["sudo", "-n", "true"]) is not None:

@@ -96,13 +96,13 @@ class Moments:
     """Pauses after which to kill, so that some kills come early, some late, and some too late.
 
     How long the work takes changes with what else the machine does, so it is learned from what
-    comes of each kill: `tell` that for every pause.  There are at least ``number`` of them (ten
+    comes of each kill: `tell` that for every pause.  There are at least ``number`` of them (twenty
     times as many in the long form), and so many more until a quarter of ``number`` was killed
     before its work was done, and the work was done at least once.
     """
 
     def __init__(self, number: int, seed: int, length: float) -> None:
-        self._number = number * (10 if LONG else 1)
+        self._number = number * (20 if LONG else 1)
         self._random = random.Random(seed)
         self._length = length
         self._told = self._early = self._late = 0

@@ -16,7 +16,7 @@ from tests.support.harness import check_whole, policy_text, publish, remains, to
 
 __all__ = ["server"]
 
-KILLS = 60
+KILLS = 30
 
 
 def write_policy(path: Path, version: str, enclaves: list[str]) -> Path:

@@ -29,7 +29,7 @@ __all__ = ["server"]
 NOW = datetime.now(UTC)
 LATER = NOW + timedelta(hours=1)
 NAME, FOLDER = "/arm/camera", "enclaves/arm/camera"
-KILLS = 25
+KILLS = 12
 
 
 @pytest.fixture(params=["the first", "a renewal"])

@@ -28,7 +28,7 @@ __all__ = ["server"]
 
 NOW = datetime.now(UTC)
 LATER = NOW + timedelta(hours=1)
-KILLS = 25
+KILLS = 12
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ __all__ = ["server"]
 
 NOW = datetime.now(UTC)
 LATER = NOW + timedelta(hours=1)
-KILLS = 8
+KILLS = 4
 STAGES = (RotationStage.DISTRIBUTE, RotationStage.REISSUE, RotationStage.RETIRE)
 
 State = tuple[tuple[str, ...], str, tuple[tuple[str, int], ...], tuple[int, ...]]

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,6 +41,7 @@ pytest_plugins = ["tests.report.browsing"]
 
 pytestmark = [pytest.mark.browser, pytest.mark.xdist_group("browser")]
 PRODUCTION = policies_dir().parent / "keystore_templates/production.toml"
+ASKED_FOR_FLOW = ("/cmd_vel", "/scan", "/navigate_to_pose", "/lifecycle_manager/is_active")
 SIZES = {"desk": (1440, 900), "phone": (390, 844)}
 
 
@@ -189,22 +191,15 @@ def distances(network: Network, name: str, upstream: bool) -> dict[str, int]:
 
 
 @pytest.mark.parametrize("open_to_all", ["nothing", "some names", "writing"])
-@pytest.mark.parametrize(
-    "name", ["/cmd_vel", "/scan", "/navigate_to_pose", "/lifecycle_manager/is_active"]
-)
-@pytest.mark.parametrize("upstream", [True, False], ids=["reaches it", "is reached"])
 def test_the_flow_agrees_with_the_one_that_explain_follows(
     browser: Browser,
     robot_page: Path,
     open_keystores: dict[str, Path],
     tmp_path: Path,
     open_to_all: str,
-    name: str,
-    upstream: bool,
 ) -> None:
-    network = Network(policy_rights(read_policy(MOBILE_ROBOT)), without=OF_EVERY_NODE)
-    distance = distances(network, name, upstream)
-    path = robot_page
+    by_permissions = Network(policy_rights(read_policy(MOBILE_ROBOT)), without=OF_EVERY_NODE)
+    network, path = by_permissions, robot_page
     if root := open_keystores.get(open_to_all):
         network = Network(
             load_rights(root).rights,
@@ -212,24 +207,27 @@ def test_the_flow_agrees_with_the_one_that_explain_follows(
             unguarded=unguarded(governance_of(root)),
             everybody=enclave_names(root),
         )
-        by_permissions, distance = distance, distances(network, name, upstream)
-        # By permissions, too, whatever one of these names reaches comes to most enclaves.
-        more = upstream if open_to_all == "writing" else (name, upstream) == ("/scan", False)
-        if more:
-            assert distance != by_permissions
         path = tmp_path / "open.html"
         sros("view", root, "-o", path).ok()
-    assert len(distance) > 1
     with opened(browser, path) as page:
-        page.fill("#search", name)
-        page.keyboard.press("Enter")
-        assert page.inner_text("#details h2") == name
-        page.click("text=What reaches it" if upstream else "text=What it reaches")
-        summary = page.inner_text("#summary")
-        found = re.search(r"(\d+) enclaves? can .* within 2 hops(?:, (\d+) over)?", summary)
-        assert found, summary
-        assert int(found[1]) == sum(hops <= 2 for hops in distance.values())
-        assert int(found[2] or found[1]) == len(distance)
+        for name, upstream in product(ASKED_FOR_FLOW, (True, False)):
+            distance = distances(network, name, upstream)
+            assert len(distance) > 1
+            # By permissions, too, whatever one of these names reaches comes to most enclaves.
+            differs = {"writing": upstream, "some names": (name, upstream) == ("/scan", False)}
+            if differs.get(open_to_all):
+                assert distance != distances(by_permissions, name, upstream)
+            page.fill("#search", name)
+            page.keyboard.press("Enter")
+            assert page.inner_text("#details h2") == name
+            page.click("text=What reaches it" if upstream else "text=What it reaches")
+            summary = page.inner_text("#summary")
+            found = re.search(r"(\d+) enclaves? can .* within 2 hops(?:, (\d+) over)?", summary)
+            assert found, summary
+            asked = (name, upstream, summary)
+            assert int(found[1]) == sum(hops <= 2 for hops in distance.values()), asked
+            assert int(found[2] or found[1]) == len(distance), asked
+            page.click("#back")
 
 
 def test_hops_can_be_added_up_to_all(browser: Browser, robot_page: Path) -> None:

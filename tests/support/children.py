@@ -1,7 +1,7 @@
-"""Processes that tests start: awaited with patience, and heard when they fail.
+"""Run processes in tests, with their output in the failure.
 
-Nothing here depends on how fast a machine is: what is awaited is an event, and `PATIENCE` only
-tells a child that hangs from one that is slow.
+Nothing here depends on the speed of a machine: tests wait for events, and `PATIENCE` is only for
+a child that hangs.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 PATIENCE = 300.0
-"""Seconds after which something awaited is taken for never coming."""
+"""Seconds after which a process is taken to hang."""
 
 LATE = 30.0
-"""Seconds after which one who is expected on a DDS is taken for silent."""
+"""Seconds after which a DDS participant that should be heard is taken to be silent."""
 
 LONG = "SROS_LONG" in os.environ
-"""Whether the long forms are asked for: more of what is drawn or killed at random."""
+"""Whether to run the long forms of the tests, with more random and exhaustive cases."""
 
 Done = subprocess.CompletedProcess[str]
 _Value = TypeVar("_Value")
@@ -39,7 +39,7 @@ def run(
 ) -> Done:
     """Run a program to its end, with ``said`` on its standard input.
 
-    Fails with the program's own words unless it ends with ``status`` (None: any).
+    Fails with the program's output unless its exit status is ``status`` (None: any).
     """
     words = [str(each) for each in command]
     try:
@@ -62,21 +62,21 @@ def run(
 
 
 def python(*words: object, **more: Any) -> Done:
-    """As `run`, with this Python: a script, or ``-c`` and code, or ``-m`` and a module.
+    """Run this Python: with a script, ``-c`` and code, or ``-m`` and a module.
 
-    It finds what this process finds, unless ``env`` says otherwise.
+    It imports what this process imports, unless ``env`` says otherwise.  Fails as `run` does.
     """
     more.setdefault("env", importing())
     return run([sys.executable, *words], **more)
 
 
 def importing(**variables: str) -> dict[str, str]:
-    """This process's environment, and more, for a Python that imports what is imported here."""
+    """Return this process's environment and ``variables``, with the import path of this process."""
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), **variables}
 
 
 def finish(process: subprocess.Popen[str], *, status: int | None = 0) -> Done:
-    """Wait for the end of a program that was started with pipes; fails as `run` does."""
+    """Wait for a program that was started with pipes; fail as `run` does."""
     words = [str(each) for each in process.args]  # type: ignore[union-attr]
     try:
         out, err = process.communicate(timeout=PATIENCE)
@@ -97,10 +97,10 @@ def wait_for(
     *,
     words: Callable[[], object] = str,
 ) -> _Value:
-    """Return what ``look`` gives as soon as it is true.
+    """Return the first true value of ``look()``.
 
-    Fails when it never is, or when ``process``, which has to bring it about, has ended before;
-    what then stands in the assertion is the process's output, and ``words()``.
+    Fails when there is none within `PATIENCE`, or when ``process`` ended before; the assertion
+    then has the process's output and ``words()``.
     """
     end = time.monotonic() + PATIENCE
     while True:

@@ -1,4 +1,4 @@
-"""What the tests of keystores and of the program share: running it, and looking at what it left."""
+"""Run the program in tests, and check the keystores that it writes."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ STAGES = (".sros-transaction", ".sros-")
 
 @dataclass(frozen=True)
 class Ended:
-    """How a run of the program ended, and what it said."""
+    """The exit status and the output of a run of the program."""
 
     status: int
     out: str
     err: str
 
     def ok(self) -> Ended:
-        """Itself, if the program succeeded."""
+        """Return self; fail unless the program succeeded."""
         assert self.status == 0, self
         return self
 
@@ -80,9 +80,9 @@ def forked(
     env: Mapping[str, str] | None = None,
     first: Callable[[], object] | None = None,
 ) -> Ended:
-    """Run the program in a process of its own, which has imported what this one has.
+    """Run the program in a forked process, which calls ``first`` before it.
 
-    It calls ``first`` before the program.
+    Nothing is imported again, so this is faster than a new process.
     """
     out, err = os.pipe(), os.pipe()
     child = os.fork()
@@ -141,7 +141,7 @@ def _refuse_to_execute(*_: object) -> NoReturn:
 
 
 def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
-    """Everything below a folder: kind and mode, and the bytes or the target of a link."""
+    """Map every path below a folder to its mode, and its bytes or the target of the link."""
     found = {}
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
@@ -156,7 +156,7 @@ def snapshot(folder: Path) -> dict[str, tuple[int, bytes]]:
 
 
 def remains(folder: Path) -> list[str]:
-    """Stages of transactions that were left below a folder, or next to a keystore in it."""
+    """Return the stages of transactions that were left below a folder."""
     return [
         os.path.relpath(os.path.join(parent, name), folder)
         for parent, folders, files in os.walk(folder)
@@ -166,7 +166,7 @@ def remains(folder: Path) -> list[str]:
 
 
 def topics_of(enclave: Path) -> frozenset[str]:
-    """The DDS topics of an enclave's signed permissions, as DDS would load them."""
+    """Return the DDS topics of an enclave's signed permissions, as DDS would load them."""
     signed, authority = (enclave / name for name in ("permissions.p7s", "permissions_ca.cert.pem"))
     return _topics(_document(signed.read_bytes(), authority.read_bytes()))
 
@@ -176,7 +176,7 @@ def certificate(path: Path) -> x509.Certificate:
 
 
 def check_whole(keystore: Path) -> None:
-    """Assert what must hold of a keystore at any moment, before anything tidies it up."""
+    """Assert what must hold for a keystore at any moment, before anything is tidied up."""
     for parent, folders, files in os.walk(keystore):
         folders[:] = [name for name in folders if name != STAGES[0]]
         for name in files:
@@ -190,7 +190,7 @@ def check_whole(keystore: Path) -> None:
 
 
 def check_enclave_whole(enclave: Path) -> None:
-    """Assert that every file of an enclave is there and fits the others."""
+    """Assert that every file of an enclave exists and fits the others."""
     check_pair(enclave / "key.pem", enclave / "cert.pem")
     authority = (enclave / "identity_ca.cert.pem").read_bytes()
     _check_issued((enclave / "cert.pem").read_bytes(), authority)
@@ -203,12 +203,12 @@ def check_enclave_whole(enclave: Path) -> None:
 
 
 def check_pair(key: Path, cert: Path) -> None:
-    """Assert that a private key is its owner's alone, and the key of a certificate."""
+    """Assert that only the owner can read a private key, and that it fits the certificate."""
     assert key.stat().st_mode & 0o777 == 0o600, key
     assert _fit(key.read_bytes(), cert.read_bytes()), key
 
 
-# The same files are looked at after every step of a long series: what is in them is asked once.
+# The same files are checked after every step of a long series: each content is checked once.
 
 
 @cache
@@ -242,7 +242,7 @@ def _topics(permissions: bytes) -> frozenset[str]:
 
 
 def policy_text(enclaves: Mapping[str, str]) -> str:
-    """A policy in which each enclave has one node, and the groups that are given as XML."""
+    """Return a policy in which each enclave has one node with the given groups of XML."""
     bodies = "".join(
         f'<enclave path="{path}"><profiles><profile ns="/" node="n">{groups}</profile></profiles>'
         "</enclave>"
@@ -252,11 +252,11 @@ def policy_text(enclaves: Mapping[str, str]) -> str:
 
 
 def publish(*names: str) -> str:
-    """A group of topics to publish, as XML."""
+    """Return a group of topics to publish, as XML."""
     topics = "".join(f"<topic>{name}</topic>" for name in names)
     return f'<topics publish="ALLOW">{topics}</topics>'
 
 
 def with_includes(policy: str) -> str:
-    """A policy's text in which the prefix xi is that of includes."""
+    """Return a policy's text that declares the prefix xi of XInclude."""
     return policy.replace("<policy", '<policy xmlns:xi="http://www.w3.org/2001/XInclude"', 1)
