@@ -58,7 +58,7 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
         "tests": ["-m", "not dds", "-n", str(cores), "--dist", "worksteal"],
         # One file runs in one process; `tests/conftest.py` puts the slowest files first.
         "tests on a real DDS": [
-            *("-m", "dds", "-n", str(3 * cores), "--dist", "loadfile", "--no-loadscope-reorder"),
+            *("-m", "dds", "-n", str(2 * cores), "--dist", "loadfile", "--no-loadscope-reorder"),
             *WITH_DDS,
         ],
     }
