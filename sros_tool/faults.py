@@ -316,6 +316,13 @@ class Fault(Enum):
         """Return the remedy for a fault in ``file``, with its fields still to be filled in."""
         return self._remedies.get(file, self.remedy)
 
+    def remedy_in_export(self, file: str) -> str:
+        """Return what to do where the fault lies in ``file`` of an export, which has no CA keys."""
+        text = self.remedy_in(file)
+        if "`" not in text or text is _CLOCK or self is Fault.GOVERNANCE_DOMAIN:
+            return text
+        return f"In the keystore with the keys of the CAs: {text} Then export the enclave again."
+
 
 FAULTS = {fault.id: fault for fault in Fault}
 """All faults by their ids."""

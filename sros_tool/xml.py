@@ -68,7 +68,8 @@ def parse(data: bytes, name: str) -> etree._Element:
     try:
         root = etree.fromstring(data, _parser())
     except (etree.XMLSyntaxError, ValueError) as error:
-        raise DocumentError(f"{name} is not well-formed XML", f"{error}.".capitalize()) from error
+        why = getattr(error, "msg", "") or str(error)
+        raise DocumentError(f"{name} is not well-formed XML", f"{why}.".capitalize()) from error
     if root is None:
         raise DocumentError(f"{name} has no element", "", "An XML document was expected.")
     if root.getroottree().docinfo.doctype:

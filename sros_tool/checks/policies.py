@@ -592,6 +592,7 @@ REDUNDANT_INCLUDE = FindingKind(
 
 _CHECKS = (_check_rules, _check_nodes, _check_names, _check_counterparts, _check_portability)
 _PLACE = re.compile(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
+_SYNTAX = re.compile(r", line (?P<line>\d+), column \d+")  # as libxml2 says it
 _INCLUDE = re.compile(r"\{http://www\.w3\.org/200[13]/XInclude\}include\Z")
 _MANY = 1000
 
@@ -623,6 +624,8 @@ def _unreadable(path: Path, error: SrosError) -> Iterator[Finding]:
         return
     match = _PLACE.match(error.what)
     file, line, text = (match["file"], int(match["line"]), match["text"]) if match else ("", 0, "")
+    if not match and (syntax := _SYNTAX.search(error.why)):
+        line = int(syntax["line"])
     why = " ".join(part for part in (f"{text or error.what}.", error.why) if part)
     yield MALFORMED.found(str(path), why, file or str(path), line, error.remedy)
 

@@ -122,7 +122,7 @@ def _keystore(d: dict[str, Any]) -> Iterator[str]:
             yield f"  governance: {d['governance']['error']}"
         else:
             yield from _indented(_governance(d["governance"]))
-    yield f"  {len(d['enclaves'])} enclaves"
+    yield f"  {len(d['enclaves'])} enclave{'' if len(d['enclaves']) == 1 else 's'}"
     for enclave in d["enclaves"]:
         until = enclave["valid_until"]
         state = "loadable" if enclave["loadable"] else "NOT LOADABLE"

@@ -312,20 +312,21 @@ def create_keystore(
     if own is not None:
         domains = DomainSet.of((own, own))
     template = _choices(template_name, ca_layout, ca_validity, validity, permissions_validity)
+    imported = _imported({"identity": identity_ca, "permissions": permissions_ca})
     result = create(
         root,
         template=template,
         domains=domains,
         now=now(),
         keyring=keyring(identity_key, permissions_key, encrypt=encrypt_ca_keys),
-        imported=_imported({"identity": identity_ca, "permissions": permissions_ca}),
+        imported=imported,
         dry_run=dry_run,
     )
     print_notes(result.notes)
     if dry_run:
         print_plan(root, result.changes)
         return
-    _say_new_keystore(root, template, result.domains)
+    _say_new_keystore(root, template, result.domains, frozenset(imported))
     _say_what_is_open(template)
 
 
@@ -367,12 +368,14 @@ def _imported(files: dict[str, Path | None]) -> dict[str, bytes]:
     }
 
 
-def _say_new_keystore(root: Path, template: Template, domains: DomainSet) -> None:
+def _say_new_keystore(
+    root: Path, template: Template, domains: DomainSet, imported: frozenset[str] = frozenset()
+) -> None:
     """Say what was made, and by which choices."""
     from sros_tool.keystore.layout import ROLES
     from sros_tool.keystore.reader import load_ca_certificate
-    from sros_tool.pki.certificates import digest
-    from sros_tool.validity import span_text
+    from sros_tool.pki.certificates import digest, validity_of
+    from sros_tool.validity import iso, span_text
 
     layout = (
         "identity CA and permissions CA: separate"
@@ -381,15 +384,22 @@ def _say_new_keystore(root: Path, template: Template, domains: DomainSet) -> Non
     )
     click.echo(f"created keystore '{root}' for domain {domains}")
     click.echo(f"  template {template.name}: {template.description}")
+    roles = ROLES if template.separate_authorities else ROLES[:1]
+    if not imported.issuperset(roles):
+        new = "a new one " if imported else ""
+        layout += f", {new}valid for {span_text(template.authority_validity)}"
     click.echo(
-        f"  {layout}, valid for {span_text(template.authority_validity)}; certificates "
+        f"  {layout}; certificates "
         f"{span_text(template.certificate_validity)}, permissions "
         f"{span_text(template.permissions_validity)}"
     )
     # By these, those who get something from here know whose it is.
-    for role in ROLES if template.separate_authorities else ROLES[:1]:
+    for role in roles:
         name = f"{role} CA" if template.separate_authorities else "CA"
-        click.echo(f"  {name} SHA-256 {digest(load_ca_certificate(root, role))}")
+        certificate = load_ca_certificate(root, role)
+        click.echo(f"  {name} SHA-256 {digest(certificate)}")
+        if role in imported:
+            click.echo(f"    given, and valid until {iso(validity_of(certificate).not_after)}")
 
 
 def _say_what_is_open(template: Template) -> None:

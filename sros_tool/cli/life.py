@@ -279,9 +279,8 @@ def _say_restart(names: tuple[str, ...]) -> None:
     if not names:
         return
     shown = ", ".join(names[:_MANY]) + (", ..." if len(names) > _MANY else "")
-    click.echo(
-        f"restart the processes of {len(names)} enclaves for it to take effect: {shown}", err=True
-    )
+    number = "1 enclave" if len(names) == 1 else f"{len(names)} enclaves"
+    click.echo(f"restart the processes of {number} for it to take effect: {shown}", err=True)
 
 
 if TYPE_CHECKING:

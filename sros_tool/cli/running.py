@@ -111,7 +111,11 @@ def run(ctx: click.Context, words: tuple[str, ...], domain: str | None, no_ros_a
     variables = loadable_environment(root, name, domain)
     program = shutil.which(command[0])
     if program is None:
-        raise UsageError(f"the command '{command[0]}' is not found")
+        raise UsageError(
+            f"the command '{command[0]}' is not found",
+            "",
+            "Name its path, or set up its environment first (ROS: `. /opt/ros/jazzy/setup.sh`).",
+        )
     given = tuple(command)
     if not no_ros_args and (command := list(with_enclave(given, name))) != list(given):
         added = " ".join(command[len(given) :])

@@ -152,6 +152,16 @@ def test_includes(tmp_path: Path) -> None:
     assert missing == {"policy.malformed"}
 
 
+def test_a_broken_tag_is_found_at_its_line(tmp_path: Path) -> None:
+    text = policy(enclave(topics("publish", "x"))).replace("</profile>", "</profil>")
+    (found,) = findings(tmp_path, text)
+    assert (found.id, found.line) == (
+        "policy.malformed",
+        1 + text[: text.index("</profil>")].count("\n"),
+    )
+    assert "<string>" not in found.text
+
+
 @pytest.mark.parametrize(
     "path",
     [

@@ -271,6 +271,9 @@ def test_verify_says_what_is_wrong_and_answers_by_its_status(
     assert ended.status == 1
     assert "/b  NOT LOADABLE\n" in ended.out
     assert f"{out}/enclaves/b/cert.pem: error: a file that an enclave needs is miss" in ended.out
+    # No command that needs the keys of the CAs is proposed for the robot's folder.
+    assert "In the keystore with the keys of the CAs: Create the missing file: `sros " in ended.out
+    assert "`sros create_enclave KEYSTORE /b`. Then export the enclave again." in ended.out
     assert f"{out}/enclaves/a/key.pem: error: a private key that others can read" in ended.out
     assert f"chmod 600 '{out}/enclaves/a/key.pem'" in ended.out
     said = json.loads(sros("verify", out, "--json", "--at", "2026-12-24", "--domain", "7").out)

@@ -56,11 +56,13 @@ def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_both_authorities_can_be_imported(pki: Path, tmp_path: Path) -> None:
     root = tmp_path / "ks"
-    sros(
+    made = sros(
         "create_keystore", root, "--template", "production",
         "--identity-ca", pki / "root.pem", "--identity-key", pki / "root.key",
         "--permissions-ca", pki / "permissions.pem", "--permissions-key", pki / "permissions.key",
     ).ok()  # fmt: skip
+    assert "separate; certificates 365d" in made.out  # and no validity of a CA that is not made
+    assert made.out.count("    given, and valid until ") == 2
     assert not (root / "private").exists()
     sros("create_enclave", root, "/a").ok()
     folder = root / "enclaves/a"
@@ -77,6 +79,8 @@ def test_an_intermediate_comes_with_its_chain(pki: Path, tmp_path: Path) -> None
         pki / "sub.key",
     ).ok()  # fmt: skip
     assert "portable.intermediate" in made.err
+    assert "separate, a new one valid for 3650d; " in made.out
+    assert made.out.count("    given, and valid until ") == 1
     sros("create_enclave", root, "/a").ok()
     openssl(
         tmp_path, "verify", "-x509_strict", "-CAfile", str(pki / "chain.pem"),

@@ -314,6 +314,9 @@ def test_the_program(tmp_path: Path) -> None:
     assert sros("revoke", root, "/b", "--reason", "boredom").status == 2
     assert sros("revoke", root, "/a").status == 1
     assert sros("revoke", root).status == 2
+    done = sros("revoke", root, "/b").ok()
+    assert "restart the processes of 1 enclave for it to take effect: /c" in done.err
+    assert "\n  1 enclave\n" in sros("inspect", root).ok().out
 
 
 def test_a_list_that_ends_soon_is_an_alarm(tmp_path: Path) -> None:

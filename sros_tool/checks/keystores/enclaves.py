@@ -50,8 +50,13 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
         kind = _LOADING_KINDS[f"enclave.{problem.fault.id}"]
         text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
         file = enclave.file(problem.file)
-        remedy = problem.fault.remedy_in(problem.file)
-        remedy = remedy.format(root="ROOT", enclave="NAME", path=quote(file))
+        if enclave.keystore.is_home:
+            remedy, root, path = problem.fault.remedy_in(problem.file), "ROOT", quote(file)
+        else:
+            remedy, root = problem.fault.remedy_in_export(problem.file), "KEYSTORE"
+            there = f"KEYSTORE/enclaves{quote(enclave.name)}/{problem.file}"
+            path = there if "`" in remedy else quote(file)
+        remedy = remedy.format(root=root, enclave="NAME", path=path)
         yield kind.found(enclave.name, text, file, remedy=remedy)
 
 
