@@ -1,4 +1,4 @@
-"""The backend: rclpy nodes where its RMW enforces security, else nodes on Cyclone DDS."""
+"""Choose the backend: rclpy nodes if an RMW enforces security, else nodes on Cyclone DDS."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ _NO_RCLPY = (
     " `--backend cyclone`."
 )
 _ON_THE_WIRE = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
-"""Without it, Fast DDS hands messages to a neighbour through shared memory, past the wire."""
+"""The variable that keeps Fast DDS from sending messages through shared memory."""
 
 
 @dataclass(frozen=True)
 class Backend:
-    """What the nodes run on; ``why`` says in one line how it was chosen.
+    """The library that the demo's nodes use; ``why`` is the reason of the choice, in one line.
 
-    With ``ros_observer``, an unsecured observer of Cyclone nodes is a node of rclpy; ``rmw`` is
-    what rclpy runs on.
+    With ``ros_observer``, an unsecured observer of Cyclone nodes is an rclpy node; ``rmw`` is the
+    RMW of rclpy.
     """
 
     name: str
@@ -58,12 +58,12 @@ class Backend:
 
     @property
     def rows_at_once(self) -> int:
-        """How many rows run at the same time: an rclpy node costs some 0.6 s of CPU to start."""
+        """The number of rows to run in parallel; an rclpy node needs some 0.6 s of CPU to start."""
         return 4 if self.name == RCLPY else 16
 
     @property
     def vendor(self) -> Condition | None:
-        """The vendor, as far as the expected status of a row depends on it."""
+        """The vendor as a condition for expected statuses, or None."""
         if self.dds.startswith("Cyclone DDS"):
             return Condition.CYCLONE
         return Condition.FAST if self.dds.startswith("Fast DDS") else None
@@ -79,7 +79,7 @@ class Backend:
     ) -> list[str]:
         """Return the command line of a process of that role.
 
-        ``names`` are the absolute ones of its ROS nodes, as `node_names` has them.
+        ``names`` are the absolute names of its ROS nodes, from `node_names`.
         """
         if self.library(role, secured=secured) == RCLPY:
             program = [sys.executable, "-m", "sros_tool.demo.nodes.ros", role.value]
@@ -89,9 +89,9 @@ class Backend:
     def environment(
         self, role: Role, *, wire: bool = False, denied: bool = False, secured: bool = False
     ) -> Mapping[str, str]:
-        """Return the variables that a node needs in addition to those of its security.
+        """Return the variables that a node needs in addition to its security variables.
 
-        ``wire`` keeps its messages off shared memory; ``denied`` makes it say why.
+        ``wire`` keeps its messages out of shared memory; ``denied`` makes it log why it is denied.
         """
         on_ros = self.library(role, secured=secured) == RCLPY
         variables = {RMW: self.rmw} if on_ros and self.rmw else {}
@@ -105,7 +105,7 @@ class Backend:
 
 
 def choose_backend(wish: str, probe: ProbeEnclave) -> Backend:
-    """Find a backend that enforces security, by trying.
+    """Return a backend that was tried and enforces security.
 
     ``wish`` is `AUTO`, `RCLPY` or `CYCLONE`.
 
@@ -155,14 +155,14 @@ def _why_not(stacks: Sequence[Stack]) -> str:
 
 
 _SIGNERS_CHECKED = ((2, 1, 4), (2, 6, 5), (2, 8, 2), (2, 9, 2))
-"""The first release of each older line of Fast DDS that takes no signer but those in the file of
-the permissions CA (CVE-2023-24010); all do from 2.10 on.  From the tags of its repository."""
+"""The first release of each older branch of Fast DDS that accepts only signers in the file of the
+permissions CA (CVE-2023-24010); all releases since 2.10 do.  Source: the tags of its repository."""
 
 _ENCRYPTING = (ProtectionKind.ENCRYPT, ProtectionKind.ENCRYPT_WITH_ORIGIN_AUTHENTICATION)
 
 
 def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Condition]:
-    """Return what holds on ``backend`` in a keystore made by ``template``, for a DDS topic."""
+    """Return the conditions that hold for a DDS topic, by backend and keystore template."""
     (domain,) = governance_for(template.protection, DomainSet.of((0, 0))).domain_access_rules
     rule = next(each for each in domain.topic_access_rules if matches(each.topic_expression, topic))
     kinds = (
@@ -189,9 +189,9 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
 
 
 def _checks_signers(dds: str) -> bool:
-    """Return whether that Fast DDS, as in ``Fast DDS 2.14.5``, knows its signers exactly.
+    """Return whether a Fast DDS (``Fast DDS 2.14.5``) accepts only the permissions CA as signer.
 
-    One whose version is not known is taken for a recent one.
+    An unknown version counts as a recent one.
     """
     version = tuple(int(part) for part in dds.rpartition(" ")[2].split(".") if part.isdigit())
     if len(version) < 3 or version >= (2, 10):

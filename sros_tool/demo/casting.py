@@ -1,9 +1,8 @@
-"""Casting: which enclave of a keystore plays which part, and under which node names.
+"""Casting: choose enclaves of a keystore for the parts of a scenario, and their node names.
 
-Both go by the signed permissions.  A ROS node offers services under its own name (its parameters,
-its types), and an enclave that was made from a policy allows them to the nodes of that policy
-alone: a node of another name fails at start.  So a node that plays a part in an enclave takes one
-of the names that the enclave allows.
+Both depend on the signed permissions.  A ROS node offers services under its own name (parameters,
+types), and an enclave made from a policy allows these only for the nodes in that policy: a node
+with another name fails at start.  So a node gets one of the names that its enclave allows.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ _WILD = set("*?[")
 
 @dataclass(frozen=True)
 class CastMember:
-    """An enclave that plays a part in a keystore of the user's, and its ROS nodes on rclpy."""
+    """An enclave of the user's keystore with its part, and the names of its ROS nodes on rclpy."""
 
     part: str
     enclave: str
@@ -51,10 +50,10 @@ class CastMember:
 
 @dataclass(frozen=True)
 class UserKeystore:
-    """A keystore of the user's that is to be attacked: its template, its domains, and its cast.
+    """A keystore of the user to attack, with its template, domains, and cast.
 
-    ``topic`` is the ROS topic that is attacked, ``service`` the ROS service, "" without one.
-    ``guessed`` says that the cast was chosen by the rights of its enclaves, not by their names.
+    ``topic`` is the attacked ROS topic, ``service`` the attacked ROS service ("": none).
+    ``guessed`` says that the cast was chosen by the rights of the enclaves, not by their names.
     """
 
     root: Path
@@ -71,7 +70,7 @@ class UserKeystore:
         shutil.copytree(self.root, target, symlinks=True, ignore=_all_but(self.root, folders))
 
     def keyring(self) -> Keyring:
-        """Return where the CA keys are: in the keystore, or where its settings say."""
+        """Return the keyring of the CA keys: in the keystore, or as its settings say."""
         inside = {role: self.root.absolute() / ca_key(role) for role in ROLES}
         places = {role: f"file:{path}" for role, path in inside.items() if path.exists()}
         return Keyring(places=places)
@@ -81,13 +80,13 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario) -> UserKeysto
     """Read a keystore and cast its enclaves for the ROS topic ``topic`` ("": one that fits).
 
     Raises:
-        KeystoreError: it is no keystore, or no two enclaves may talk to each other.
+        KeystoreError: it is not a keystore, or no two enclaves may talk to each other.
     """
     names = list_enclaves(root)
     domains = governance_of(root).domains()
     rights = {name: grants for name in names if (grants := enclave_grant(root, name))}
     template = load_settings(root)
-    # Whatever is made next to it has keys of its own.
+    # Keystores made from this template get their own keys.
     template = replace(template, identity_key="", permissions_key="")
     wanted = f"rt{topic}" if topic else ""
     guessed = not set(scenario.cast.values()) <= set(names)
@@ -99,8 +98,8 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario) -> UserKeysto
     if not chosen:
         raise KeystoreError(
             f"no two enclaves of keystore '{root}' talk on {topic or 'a topic'}",
-            "An attack on it needs one enclave that may publish a topic and another one that may"
-            " subscribe to it, by a name without wildcards.",
+            "An attack needs an enclave that may publish a topic, by a name without wildcards, and"
+            " another enclave that may subscribe to it.",
             "Name the topic with --topic, or attack a keystore made by the demo.",
         )
     service = _service(rights, cast) if "server" in cast else ""
@@ -109,9 +108,9 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario) -> UserKeysto
 
 
 def _best_cast(rights: Mapping[str, Grant], wanted: str) -> tuple[dict[str, str], str]:
-    """Return a talker, a listener and a guest, and the DDS topic they can show most on.
+    """Return the most useful cast (talker, listener, guest) and its DDS topic.
 
-    An enclave that may only publish, or only subscribe, shows more than one that may do both.
+    An enclave that may only publish, or only subscribe, is more useful than one that may do both.
     """
     best: tuple[int, dict[str, str], str] = (-1, {}, "")
     for topic in [wanted] if wanted else sorted(each for each in _topics(rights) if "rt/" in each):
@@ -150,12 +149,12 @@ def _best_cast(rights: Mapping[str, Grant], wanted: str) -> tuple[dict[str, str]
 def _single_purpose_first(
     rights: Mapping[str, Grant], chosen: set[str], others: set[str]
 ) -> list[str]:
-    """Return ``chosen`` in the order of ``rights``, but enclaves that are in ``others`` last."""
+    """Return ``chosen`` in the order of ``rights``, with those also in ``others`` at the end."""
     return sorted((name for name in rights if name in chosen), key=lambda name: name in others)
 
 
 def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
-    """Return a server and a client of one service, if any; best a client that may not serve."""
+    """Return server and client of one service, if any; preferably a client that may not serve."""
     found: dict[str, str] = {}
     for server, client in permutations(rights, 2):
         for topic in _topics_of_its_own(rights[server], "publish"):
@@ -189,7 +188,7 @@ def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
 
 
 def _within(short: str, long: str) -> bool:
-    """Return whether all parts of an enclave's name, and more, are in another's."""
+    """Return whether the other enclave name has all parts of this one, and more."""
     return set(short.strip("/").split("/")) < set(long.strip("/").split("/"))
 
 
@@ -198,7 +197,7 @@ def _topics(rights: Mapping[str, Grant]) -> set[str]:
 
 
 def _all_but(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[str]]:
-    """Return what `shutil.copytree` leaves out: keys of CAs, and enclaves that play no part."""
+    """Return what `shutil.copytree` ignores: keys of CAs, and enclaves without a part."""
     wanted = {root / folder for folder in folders}
     kept = {parent for folder in wanted for parent in folder.parents} | wanted
 
@@ -215,7 +214,7 @@ def _all_but(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[st
 
 
 def enclave_grant(root: Path, enclave: str) -> Grant | None:
-    """Return the first grant of an enclave, or None where its permissions cannot be read."""
+    """Return the first grant of an enclave, or None if its permissions cannot be read."""
     try:
         signed = (enclave_path(root, enclave) / "permissions.p7s").read_bytes()
         grants = parse_permissions(smime.parse(signed).document).grants
@@ -236,7 +235,7 @@ def may(grant: Grant, verb: str, topic: str) -> bool:
 
 
 def _topics_of_its_own(grant: Grant, verb: str) -> Iterator[str]:
-    """Yield the DDS topics without wildcards that a grant allows, except those of every node."""
+    """Yield the DDS topics (no wildcards) that a grant allows, except the topics of every node."""
     for topic in _allowed(grant, verb):
         private = topic.startswith("rt/_") or ACTION_INSIDE in topic
         if topic not in _TOPICS_OF_EVERY_NODE and not private:
@@ -244,7 +243,7 @@ def _topics_of_its_own(grant: Grant, verb: str) -> Iterator[str]:
 
 
 def is_node_allowed(grant: Grant, node: str) -> bool:
-    """Return whether a grant allows every service that the node of that absolute name offers."""
+    """Return whether a grant allows all standard services of the node of that absolute name."""
     names = (dds_names("reply", f"{node}/{service}") for service in NODE_SERVICES)
     return all(
         all(may(grant, "publish", topic) for topic in each.publish)
@@ -285,14 +284,14 @@ OWN_NAMES: Mapping[Role, tuple[str, ...]] = {
     Role.ACTION_CLIENT: ("action_client",),
     Role.COMPOSED: ("talker", "listener", "server"),
 }
-"""The names that the nodes of a process have by default, in the namespace /."""
+"""The default names of the nodes of each role, in the namespace /."""
 
 
 def node_names(role: Role, grant: Grant | None) -> tuple[str, ...]:
     """Return the absolute names of a role's nodes under a grant (None: without security).
 
-    A node keeps its own name where the grant allows it.  Otherwise it gets the name of a node
-    that the grant names, the most similar one first, and its own one where there is none.
+    A node keeps its default name if the grant allows it.  Otherwise it gets the most similar node
+    name in the grant; without any, it keeps its default name.
     """
     wanted = [f"/{name}" for name in OWN_NAMES[role]]
     if grant is None:
@@ -310,7 +309,7 @@ def _names(
         if name in kept or not named:
             yield name
             continue
-        # More nodes than names: DDS does not mind two nodes of one name in a process.
+        # With more nodes than names, two nodes share a name: DDS allows that in a process.
         alike = [each for each in free if name[1:] in each.lower()]
         chosen = (alike or free or named)[0]
         if chosen in free:
@@ -319,13 +318,13 @@ def _names(
 
 
 def naming_arguments(role: Role, names: Sequence[str]) -> list[str]:
-    """Return the ``--ros-args`` by which the nodes of a role take these absolute names."""
+    """Return the ``--ros-args`` that give these absolute names to the nodes of a role."""
     rules: list[str] = []
     for own, name in zip(OWN_NAMES[role], names, strict=True):
         namespace, _, node = name.rpartition("/")
         if node != own:
             rules += ["-r", f"{own}:__node:={node}"]
         if namespace:
-            # rcl looks for the namespace of a node under the name that the node has by then.
+            # rcl looks up the namespace under the new name of the node.
             rules += ["-r", f"{node}:__ns:={namespace}"]
     return ["--ros-args", *rules, "--"] if rules else []

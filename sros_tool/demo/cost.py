@@ -1,7 +1,7 @@
-"""What security costs: time to the first message, latency and throughput, by protection kind.
+"""Measure the cost of security by protection kind: first message, latency, throughput.
 
-Two processes talk in a network of their own, one pair after the other; each pair measures by the
-same program, so that only the protection differs.
+Pairs of processes, one pair after the other, talk in their own network.  All pairs run the same
+program, so only the protection differs.
 
 `CostResult.as_json` gives ``kinds`` (the protection kinds, unsecured first), ``payloads`` (bytes),
 ``note`` (what the numbers contain), ``first_message`` (a list of ``{"kind", "seconds", "ratio"}``)
@@ -32,10 +32,10 @@ from sros_tool.errors import SrosError
 _UNSECURED = "unsecured"
 _PAYLOADS = (64, 1024, 16 * 1024, 256 * 1024, 1024 * 1024)
 NOTE = (
-    "medians; latency is half a round trip, throughput is measured in bursts that are waited"
-    " for; both ends are Python, whose overhead is in all numbers alike and makes the ratios"
-    " smaller than with nodes in C++; messages go over UDP, not through shared memory; the numbers"
-    " of payloads that do not fit into the buffer of a socket scatter"
+    "medians; latency is half a round trip, throughput is measured in bursts, each of which is"
+    " confirmed; both ends are Python, whose overhead is the same in all numbers and makes the"
+    " ratios smaller than with nodes in C++; messages go over UDP, not through shared memory; the"
+    " numbers of payloads that do not fit into the buffer of a socket vary"
 )
 _LONGEST_START = 60.0
 _TICK = 0.02
@@ -43,7 +43,7 @@ _TICK = 0.02
 
 @dataclass(frozen=True)
 class Effort:
-    """How much to measure: payloads in bytes, seconds for each, and rounds of all of it."""
+    """The amount of measuring: payloads in bytes, seconds for each, and rounds."""
 
     payloads: tuple[int, ...] = _PAYLOADS
     seconds: float = 0.2
@@ -73,12 +73,12 @@ class CostResult:
         """Return one measurement.
 
         Raises:
-            KeyError: there is none.
+            KeyError: it was not measured.
         """
         return {(each.kind, each.payload): each for each in self.measurements}[kind, payload]
 
     def as_json(self) -> dict[str, Any]:
-        """Return the result as the head of this module describes it."""
+        """Return the result as JSON, described at the top of this module."""
         return {
             "kinds": list(self.kinds),
             "payloads": list(self.payloads),
@@ -114,17 +114,17 @@ def measure_cost(
     effort: Effort,
     progress: Progress,
 ) -> CostResult:
-    """Measure two unsecured ends, and then two ends in each of the keystores ``measured``.
+    """Measure an unsecured pair, and a pair in each of the keystores ``measured``.
 
     Raises:
-        SrosError: two ends did not find each other.
+        SrosError: the two processes of a pair did not find each other.
     """
     kinds = {_UNSECURED: (Identity(), Identity())}
     for kind, keystore in measured.items():
         kinds[kind] = (Identity(keystore, "pong"), Identity(keystore, "ping"))
     folder.mkdir(parents=True, exist_ok=True)
     found: dict[str, list[dict[str, Any]]] = {kind: [] for kind in kinds}
-    # In turns, so that what else the machine does falls on all kinds alike.
+    # In turns, so that other load of the machine affects all kinds equally.
     for turn in range(effort.rounds):
         for kind, ends in kinds.items():
             found[kind].append(_run_pair(ends, plan, folder, effort))
@@ -146,7 +146,7 @@ def measure_cost(
 def _run_pair(
     ends: tuple[Identity, Identity], plan: RunPlan, folder: Path, effort: Effort
 ) -> dict[str, Any]:
-    """Let one pair measure, and return what its ping reported."""
+    """Run one pair, and return the measurements of its ping."""
     answer = folder / "answer.json"
     answer.unlink(missing_ok=True)
     command = [sys.executable, "-m", "sros_tool.demo.nodes.ping_pong", plan.backend.name]

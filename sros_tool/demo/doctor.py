@@ -24,7 +24,7 @@ _TEMPLATE = "production"
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The stacks of this machine, and what to do where none enforces security."""
+    """The stacks of this machine, and advice if none enforces security."""
 
     stacks: tuple[Stack, ...]
 
@@ -35,7 +35,7 @@ class Diagnosis:
 
     @property
     def advice(self) -> str:
-        """What to install where nothing enforces, else ""."""
+        """The packages to install if no stack enforces security, else ""."""
         return "" if self.enforces else f"{INSTALL_ADVICE} {ROS_ADVICE}"
 
     def as_json(self) -> dict[str, Any]:
@@ -48,7 +48,7 @@ class Diagnosis:
 
 
 def examine(now: datetime) -> Diagnosis:
-    """Try every stack in an enclave of a temporary keystore."""
+    """Return the diagnosis of this machine: try every stack in a temporary keystore."""
     with TemporaryDirectory(prefix="sros-doctor-") as folder:
         domains = DomainSet.of((_PROBE_DOMAIN, _PROBE_DOMAIN))
         template = load_template(_TEMPLATE)

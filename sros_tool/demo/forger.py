@@ -1,8 +1,8 @@
-"""The forger: turns a keystore into what an attacker would use, or takes a defence away from it.
+"""The forger: change a keystore as an attacker would, or remove a defence from it.
 
-Rows refer to its functions.  A function alone works on a copy of the keystore, with all its
-defences; inside of `Undefended` it works on a keystore that was made again without one of them,
-and shows that the attack works there.
+Rows refer to its functions.  A function alone works on a copy of the keystore, with all defences;
+in `Undefended` it works on a new keystore without one of them, and shows that the attack works
+there.
 """
 
 from __future__ import annotations
@@ -62,15 +62,15 @@ _DAY, _MINUTE = timedelta(days=1), timedelta(minutes=1)
 _NOBODY = 65534
 
 STOLEN = "/stolen"
-"""The enclave that holds a copy of another one from before its revocation."""
+"""The enclave with a copy of another one, made before its revocation."""
 
 
 @dataclass(frozen=True)
 class KeystoreCopy:
-    """A keystore that is worked on; ``foreign`` is another one with the same enclaves.
+    """A keystore to forge; ``foreign`` is another keystore with the same enclaves.
 
-    ``cast`` has the enclave of each part; ``topic`` is the ROS topic that attackers are after,
-    ``domain`` one of the keystore's; ``keyring`` says where the keys of the copy's CAs are.
+    ``cast`` has the enclave of each part; ``topic`` is the attacked ROS topic, ``domain`` a domain
+    of the keystore; ``keyring`` says where the keys of its CAs are.
     """
 
     root: Path
@@ -83,7 +83,7 @@ class KeystoreCopy:
 
     @property
     def dds_topic(self) -> str:
-        """The DDS name of the topic that attackers are after."""
+        """The DDS name of the attacked topic."""
         return f"rt{self.topic}"
 
     def enclave(self, part: str) -> str:
@@ -141,7 +141,7 @@ class KeystoreCopy:
     def widened(
         self, part: str, publish: Sequence[str] = (), subscribe: Sequence[str] = ()
     ) -> bytes:
-        """Return an enclave's permissions with more DDS topics in the first allow rule, as XML."""
+        """Return an enclave's permissions as XML, with more DDS topics in the first allow rule."""
         permissions = self.permissions(part)
         grant = permissions.grants[0]
         place = next(place for place, rule in enumerate(grant.rules) if rule.allow)
@@ -171,7 +171,7 @@ class KeystoreCopy:
 
 
 Forge = Callable[[KeystoreCopy], None]
-"""Turns a keystore into what an attacker would use."""
+"""A function that changes a keystore as an attacker would."""
 
 
 def _unchanged(_copy: KeystoreCopy) -> None:
@@ -185,14 +185,14 @@ def _same_template(template: Template) -> Template:
 
 @dataclass(frozen=True)
 class Undefended:
-    """A keystore made again without a defence: from a changed template, then forged in."""
+    """A new keystore without a defence: made from a changed template, and then forged."""
 
     forge: Forge = _unchanged
     template: Callable[[Template], Template] = _same_template
 
 
 def name_of(forgery: Forge | Undefended) -> str:
-    """Return a name for the folder of a forged keystore, another one for each forgery."""
+    """Return the folder name of a forged keystore, unique for each forgery."""
     if isinstance(forgery, Undefended):
         return f"undefended_{forgery.template.__name__}_{forgery.forge.__name__}"
     return forgery.__name__
@@ -236,10 +236,10 @@ def _weak_governance(copy: KeystoreCopy) -> bytes:
 
 
 def edited_governance(copy: KeystoreCopy) -> None:
-    """Write a weak governance over the XML inside of the listener's signed document."""
+    """Replace the XML inside the listener's signed governance by a weak governance."""
     signed = copy.read("listener", GOVERNANCE_FILE)
     kept = copy.governance().replace(b"\r\n", b"\n")
-    # The comment makes a difference where the governance was as weak already.
+    # The comment ensures a difference, even if the governance was already as weak.
     weak = _weak_governance(copy) + b"<!-- edited -->\n"
     edited = signed.replace(kept.replace(b"\n", b"\r\n"), weak.replace(b"\n", b"\r\n"))
     if edited == signed:
@@ -255,7 +255,7 @@ def governance_of_another_ca(copy: KeystoreCopy) -> None:
 
 
 def weaker_governance(copy: KeystoreCopy) -> None:
-    """Give talker and listener a weak governance, signed earlier by the CA."""
+    """Give talker and listener a weak governance that the CA signed earlier."""
     signed = copy.sign(_weak_governance(copy))
     for part in ("talker", "listener"):
         copy.put(part, GOVERNANCE_FILE, signed)
@@ -294,12 +294,12 @@ def permissions_of_another_ca(copy: KeystoreCopy) -> None:
 
 
 def own_permissions_ca(copy: KeystoreCopy) -> None:
-    """Sign all documents of the guest by another permissions CA, which its own DDS trusts."""
+    """Sign the guest's documents by another permissions CA, which only the guest's DDS trusts."""
     _trust_another_permissions_ca(copy, "guest")
 
 
 def another_permissions_ca_trusted(copy: KeystoreCopy) -> None:
-    """Do the same with the listener, which then trusts that permissions CA as well."""
+    """Make both guest and listener trust another permissions CA, which signs their documents."""
     for part in ("guest", "listener"):
         _trust_another_permissions_ca(copy, part)
 
@@ -321,10 +321,10 @@ def permissions_signed_by_itself(copy: KeystoreCopy) -> None:
 
 
 def permissions_and_governance_signed_by_itself(copy: KeystoreCopy) -> None:
-    """Do the same with the governance, so that its own DDS has nothing against the guest.
+    """Sign the guest's permissions and governance with its own key, so that its own DDS accepts.
 
-    The file of the permissions CA has the identity CA, for vendors that follow a chain, and the
-    guest's certificate, for those that ask for the signer alone.
+    The file of the permissions CA gets the identity CA, for vendors that check a chain, and the
+    guest's certificate, for vendors that check only the signer.
     """
     certificate, key = copy.certificate("guest"), copy.key("guest")
     governance = copy.governance()
@@ -334,7 +334,7 @@ def permissions_and_governance_signed_by_itself(copy: KeystoreCopy) -> None:
 
 
 def enclave_among_the_signers(copy: KeystoreCopy) -> None:
-    """Do the same, and put its certificate among the signers of guest and listener."""
+    """Sign the guest's permissions with its own key, which guest and listener then trust."""
     permissions_signed_by_itself(copy)
     trusted = copy.read("guest", PERMISSIONS_CA_FILE) + pem(copy.certificate("guest"))
     for part in ("guest", "listener"):
@@ -347,19 +347,19 @@ def borrowed_permissions(copy: KeystoreCopy) -> None:
 
 
 def borrowed_permissions_and_subject(copy: KeystoreCopy) -> None:
-    """Do the same, and issue the guest a certificate with the subject of that enclave."""
+    """Give the guest the permissions and, in a new certificate, the subject of the admin."""
     borrowed_permissions(copy)
     validity = Window(copy.now - _DAY, copy.now + _DAY)
     copy.reissue("guest", validity, subject_of="admin")
 
 
 def permissions_signed_by_the_ca(copy: KeystoreCopy) -> None:
-    """Give the guest permissions with one more topic, signed by the CA, as they once were."""
+    """Give the guest earlier permissions, with one more topic, signed by the CA."""
     copy.put("guest", PERMISSIONS_FILE, copy.sign(_wider_permissions(copy)))
 
 
 def old_permissions_after_renewal(copy: KeystoreCopy) -> None:
-    """Renew the guest, and put its permissions from before back."""
+    """Renew the guest, then restore its earlier permissions."""
     old = copy.sign(_wider_permissions(copy))
     renew(copy.root, [copy.enclave("guest")], now=copy.now, keyring=copy.keyring)
     copy.put("guest", PERMISSIONS_FILE, old)
@@ -405,7 +405,7 @@ def client_may_do_everything(copy: KeystoreCopy) -> None:
 
 
 def _allow_everything(copy: KeystoreCopy, part: str) -> None:
-    """Sign what ros2/sros2 gives to an enclave without a policy."""
+    """Give an enclave the permissions that ros2/sros2 gives without a policy."""
     wide = copy.widened(part, publish=["*"], subscribe=["*"])
     copy.put(part, PERMISSIONS_FILE, copy.sign(wide))
 
@@ -416,7 +416,7 @@ def identity_in_date(copy: KeystoreCopy) -> None:
 
 
 def expired_identity(copy: KeystoreCopy) -> None:
-    """Issue the talker's certificate for the first minute of its CA, which issues none before."""
+    """Issue the talker's certificate for the first minute of its CA's validity only."""
     start = validity_of(copy.authorities().identity.certificate).not_before
     copy.reissue("talker", Window(start, start + _MINUTE))
 
@@ -432,7 +432,7 @@ def key_of_another_enclave(copy: KeystoreCopy) -> None:
 
 
 def _revoke(copy: KeystoreCopy, part: str) -> None:
-    """Revoke an enclave, and issue it again for the same subject, as its owner would go on."""
+    """Revoke an enclave, and issue it again for the same subject, as its owner would."""
     folder = copy.folder(part)
     before = {name: copy.read(part, name) for name in REQUIRED_FILES}
     revoke(copy.root, [copy.enclave(part)], now=copy.now, keyring=copy.keyring)
@@ -454,12 +454,12 @@ def guest_revoked(copy: KeystoreCopy) -> None:
 
 
 def talker_revocation_not_delivered(copy: KeystoreCopy) -> None:
-    """Revoke the talker, keep a copy of it, and take the revocation list from the listener."""
+    """Revoke the talker, keep a copy of it, and remove the listener's revocation list."""
     _revocation_not_delivered(copy, "talker")
 
 
 def guest_revocation_not_delivered(copy: KeystoreCopy) -> None:
-    """Do the same with the guest; the copy has permissions from before rights were removed."""
+    """Revoke the guest, keep a copy with earlier permissions, and remove the listener's list."""
     now = copy.read("guest", PERMISSIONS_FILE)
     permissions_signed_by_the_ca(copy)
     before = copy.read("guest", PERMISSIONS_FILE)
@@ -480,9 +480,9 @@ def _revocation_not_delivered(copy: KeystoreCopy, part: str) -> None:
 
 
 def identity_copied_by_another_user(copy: KeystoreCopy) -> None:
-    """Leave of the talker only those files that another user of the machine can read."""
+    """Remove the talker's files that another user of the machine cannot read."""
     if os.geteuid() != 0:
-        raise UnavailableError("only root can try it as another user of this machine")
+        raise UnavailableError("only root can try this as another user of the machine")
     folder = copy.folder("talker")
     inside = str(folder.relative_to(copy.root))
     names = [file.name for file in folder.iterdir()]
@@ -495,7 +495,7 @@ def identity_copied_by_another_user(copy: KeystoreCopy) -> None:
 
 
 def _read_as_nobody(root: Path, files: list[str]) -> list[bytes | None]:
-    """Return what a user without any rights can read below a folder, by the modes below it."""
+    """Return the content of files as a user without rights can read it, None if unreadable."""
     kept: list[bytes | None] = []
     place = os.open(root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -525,7 +525,7 @@ def _read_as_nobody(root: Path, files: list[str]) -> list[bytes | None]:
 
 
 def files_readable_for_all(copy: KeystoreCopy) -> None:
-    """Open the modes, as a careless copy or ros2/sros2 leaves them; then copy the talker."""
+    """Make all files readable, like a careless copy or ros2/sros2, then copy the talker."""
     for path in [copy.root, *copy.root.rglob("*")]:
         if not path.is_symlink():
             path.chmod(0o755 if path.is_dir() else 0o644)
@@ -538,7 +538,7 @@ def one_ca(template: Template) -> Template:
 
 
 def shared_subjects(template: Template) -> Template:
-    """Return the template with subjects that have no part of their own."""
+    """Return the template without unique subjects."""
     return replace(template, unique_subject=False)
 
 
@@ -548,25 +548,25 @@ def open_default(template: Template) -> Template:
 
 
 def unprotected(template: Template) -> Template:
-    """Return the template with access control, and messages that travel as they are."""
+    """Return the template with access control and unprotected messages."""
     return _protected(template, Level.NONE)
 
 
 def signed(template: Template) -> Template:
-    """Return the template with access control, and messages that are signed and in clear."""
+    """Return the template with access control and signed, unencrypted messages."""
     return _protected(template, Level.SIGN)
 
 
 def encrypted(template: Template) -> Template:
-    """Return the template with access control, and messages that are encrypted."""
+    """Return the template with access control and encrypted messages."""
     return _protected(template, Level.ENCRYPT)
 
 
 def _protected(template: Template, level: Level) -> Template:
-    """Protect every topic by one level.
+    """Return the template with the same protection level for every topic.
 
-    A payload is signed with the submessage that it is in: Fast DDS loses payloads that are signed
-    by themselves (`governance.signed-payload`).
+    A payload is signed together with its submessage: Fast DDS loses payloads that are signed
+    separately (`governance.signed-payload`).
     """
     discovered = level is not Level.NONE
     payload = level if level is Level.ENCRYPT else Level.NONE

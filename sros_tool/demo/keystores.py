@@ -1,7 +1,7 @@
-"""The keystores that a scenario plays in: its own, one of another CA, and forged ones.
+"""The keystores of a scenario: its own, one of another CA, and forged ones.
 
-The user's keystore, if there is one, is only read.  The keys of its CAs are not copied; forgeries
-that need a signature of the CA ask for it where the key is, and are left out where it is not.
+The user's keystore, if given, is only read.  The keys of its CAs are not copied; forgeries that
+need a signature of a CA use its key in place, and are skipped if there is none.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _RIGHTS = {
 
 @dataclass(frozen=True)
 class KeystoreSpec:
-    """What keystores are made for: an absolute ROS topic, domains, a template, and the time."""
+    """The input for making keystores: an absolute ROS topic, domains, a template, the time."""
 
     topic: str
     domains: DomainSet
@@ -59,9 +59,9 @@ class KeystoreSpec:
 class KeystoreSet:
     """The keystores of a scenario, sound and forged, and the enclave of each part.
 
-    ``missing`` has the reason for which a keystore could not be made.  The scenario's own keystore
-    is a copy of the ``user``'s, if any: this copy and the forgeries made from it have the user's
-    cast, the other keystores ``cast``.
+    ``missing`` has the reasons why keystores could not be made.  The scenario's own keystore is a
+    copy of the ``user`` keystore, if given: that copy and its forgeries have the cast of ``user``,
+    the other keystores have ``cast``.
     """
 
     keystores: Mapping[KeystoreChoice, Path]
@@ -70,7 +70,7 @@ class KeystoreSet:
     user: UserKeystore | None = None
 
     def topic(self, party: Party, topic: str) -> str:
-        """Return the ROS name that a party speaks on, where the topic of the demo is ``topic``."""
+        """Return the ROS name that a party uses; ``topic`` is the topic of the demo."""
         name = party.topic or topic
         user = self._user_of(party.identity)
         if name == SERVICE and user is not None:
@@ -95,11 +95,11 @@ class KeystoreSet:
         return secured | dict(identity.variables)
 
     def node_names(self, party: Party) -> tuple[str, ...]:
-        """Return the absolute names of a party's ROS nodes: those that its enclave allows."""
+        """Return the absolute names of a party's ROS nodes, which its enclave allows."""
         return node_names(party.role, self._grant(party.identity))
 
     def members(self, rows: Iterable[Row], *, on_ros: bool) -> tuple[CastMember, ...]:
-        """Return who plays in its own keystore in these rows, in the order of the cast."""
+        """Return the cast members of the own keystore that these rows use, in the cast's order."""
         cast = self._cast(Identity(OWN))
         nodes: dict[str, set[str]] = {}
         for row in rows:
@@ -114,12 +114,12 @@ class KeystoreSet:
         )
 
     def probe(self, topic: str, domain: int) -> ProbeEnclave:
-        """Return what to ask a DDS to find out whether it enforces security."""
+        """Return the probe that shows whether a DDS enforces security."""
         environment = self.environment(Identity(OWN, "talker"), domain)
         return ProbeEnclave(environment, topic, DENIED_TOPIC)
 
     def problem(self, row: Row, topic: str) -> str:
-        """Return why a row cannot be played on the ROS topic ``topic``, or ""."""
+        """Return why a row cannot be run on the ROS topic ``topic``, or ""."""
         for party in row.parties:
             identity = party.identity
             part = identity.enclave
@@ -138,7 +138,7 @@ class KeystoreSet:
         return ""
 
     def _why_not_denied(self, party: Party, topic: str) -> str:
-        """Return that a party has the very right that its row wants to be denied, or ""."""
+        """Return a text if a party has the right that its row expects to be denied, or ""."""
         right = _RIGHTS[party.role]
         name = self.topic(party, topic)
         grant = self._grant(party.identity)
@@ -161,7 +161,7 @@ class KeystoreSet:
         return enclave_grant(self.keystores[identity.keystore], self.enclave(identity))
 
     def _user_of(self, identity: Identity) -> UserKeystore | None:
-        """Return the user's keystore if the one of the identity was made from it."""
+        """Return the user's keystore if the identity's keystore was made from it."""
         made_again = isinstance(identity.keystore, Undefended)
         if identity.keystore in (None, FOREIGN) or made_again:
             return None
@@ -177,11 +177,11 @@ def create_keystores(
 ) -> KeystoreSet:
     """Create the keystores of a scenario in ``folder``: its own, a foreign one, and forged ones.
 
-    Its own is a copy of the ``user``'s, if any.  A forgery that cannot be made only leaves out the
-    rows in which it is used.
+    Its own is a copy of the ``user`` keystore, if given.  If a forgery cannot be made, only the
+    rows that use it are skipped.
 
     Raises:
-        KeystoreError, OSError: and whatever else making a keystore raises.
+        KeystoreError, OSError: a keystore could not be made.
     """
     keystores: dict[KeystoreChoice, Path] = {
         OWN: folder / "keystore",
@@ -212,7 +212,7 @@ def create_scenario_keystore(root: Path, scenario: Scenario, spec: KeystoreSpec)
 
 
 def _forgeries_of(scenario: Scenario) -> list[Forge | Undefended]:
-    """Return the forgeries that the rows and the measurement of a scenario ask for, once each."""
+    """Return each forgery that the rows and the measurement of a scenario use, once."""
     asked: list[KeystoreChoice | None] = [
         party.identity.keystore for row in scenario.rows for party in row.parties
     ]

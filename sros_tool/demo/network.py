@@ -1,8 +1,8 @@
-"""Networks of their own: for the demo in a child process, and in it for each row.
+"""Network namespaces for the demo (in a child process) and for each of its rows.
 
-A row's network is a namespace that lives as long as what was started in it.  It needs a process
-that is already in a network of its own and has one thread (`run_isolated`): to enter a namespace
-and to come back changes the calling thread alone (setns(2)).
+A row's network is a namespace that exists as long as the processes and sockets in it.  It needs a
+process that is already in its own network and has only one thread (`run_isolated`): setns(2)
+changes only the calling thread.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _HERE = "/proc/thread-self/ns/net"
 
 
 class RowNetwork:
-    """The network of a row's processes and capture; the machine's own where not ``own``."""
+    """The network of a row's processes and capture; without ``own``, the machine's network."""
 
     def __init__(self, *, own: bool) -> None:
         self.own = own
@@ -41,7 +41,7 @@ class RowNetwork:
 
     @contextmanager
     def entered(self) -> Iterator[None]:
-        """Start and open things in the network of the row while in this context."""
+        """Enter the network of the row for the time of the context."""
         if not self.own:
             yield
             return
@@ -69,7 +69,7 @@ def _enter(descriptor: int) -> None:
 _Value = TypeVar("_Value")
 
 Progress = Callable[[str], None]
-"""Takes a line about what has been done."""
+"""A function that receives lines about the progress."""
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -77,7 +77,7 @@ _SECONDS_TO_END = 8.0
 
 
 def end_with_starter() -> Callable[[], None]:
-    """Return what a child of this process has to call first so that it does not outlive it."""
+    """Return the function that a child must call first, so that it ends with this process."""
     starter = os.getpid()
 
     def follow() -> None:
@@ -97,7 +97,7 @@ def run_isolated(
     network of its own if ``isolation`` says so, and does not outlive this process.
 
     Raises:
-        SrosError: the one that ``work`` raised, or one that says how it ended.
+        SrosError: ``work`` raised it, or the child ended without a result.
     """
     context = multiprocessing.get_context("fork")
     ours, theirs = context.Pipe(duplex=False)
@@ -139,8 +139,8 @@ def _main(
     follow_starter: Callable[[], None],
 ) -> None:
     follow_starter()
-    # Not the handlers of the parent: one that raises can do so in the middle of a fork, where
-    # Python drops the exception.  Work that has something to clean up sets its own.
+    # Without the parent's handlers: an exception from a handler during a fork is lost in Python.
+    # Work that has to clean up sets its own handlers.
     for number in ENDING_SIGNALS:
         signal.signal(number, signal.SIG_DFL)
     try:

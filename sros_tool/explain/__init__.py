@@ -1,1 +1,1 @@
-"""What DDS will decide and why, whom an enclave can influence, and what a vendor's log means."""
+"""Explanations: of DDS decisions, of the reach of an enclave, and of vendors' logs."""

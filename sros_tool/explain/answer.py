@@ -31,18 +31,18 @@ class Provenance(StrEnum):
     SAME = "same"
     """They were made from the file as it is now."""
     CHANGED = "changed"
-    """They were made from another file, or the file has changed since."""
+    """They were made from another file, or the file has changed since then."""
     UNKNOWN = "unknown"
-    """The ledger does not know what they were made from."""
+    """The ledger does not have the file that they were made from."""
     PLANNED = "planned"
-    """The policy itself was asked; nothing is signed."""
+    """The answer is about the policy; nothing is signed yet."""
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyLine:
-    """A name in a policy that stands for a rule: where it is written, how, and what it says.
+    """A name in a policy that became part of a rule, with its position and its right.
 
-    ``group`` and ``profile`` are those that it stands in; ``right`` is the policy's word.
+    ``group`` and ``profile`` contain the name; ``right`` is the word of the policy language.
     """
 
     source: Source
@@ -53,26 +53,25 @@ class PolicyLine:
     profile: Profile
 
     def __str__(self) -> str:
-        """As ``robot.xml:12: ALLOW publish chatter``."""
+        """Return text like ``robot.xml:12: ALLOW publish chatter``."""
         return f"{self.source}: {self.qualifier.value} {self.right} {self.name}"
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """What one vendor makes of a question, and, where it was asked to explain, why.
+    """The answer of one vendor to a question, with an explanation on request.
 
-    ``decision`` is the one that the outcome comes from, and ``part`` the endpoint that it is about,
-    None where it is about joining.  ``parts`` are all endpoints of the question with the decisions
-    on them.  ``problems`` are the faults of files that keep the vendor from loading the enclave.
-    ``grant`` and ``domain_rule`` are the parts of the documents that hold.  ``until`` is when the
-    first of the files expires, ``until_file``; None where nothing is signed.
+    ``decision`` determines the outcome; ``part`` is the endpoint that it is about, None if it is
+    about joining.  ``parts`` are all endpoints of the question with the decisions on them.
+    ``problems`` are the faults of files that keep the vendor from loading the enclave.  ``grant``
+    and ``domain_rule`` are the parts of the documents that apply.  ``until`` is the time when
+    ``until_file``, the first of the files, expires; None if nothing is signed.
 
-    The other fields are filled in by `Evaluator.explain`.  ``lines`` are those of the policy file
-    that the deciding rule comes from, and ``provenance`` says whether the permissions were made
-    from that file; ``policy_sha256`` is the digest of the file that they were made from, "" where
-    it is not known.  Of a denial, ``change`` is what a policy would have to say, ``remedy`` what to
-    do where the policy cannot help, and ``sign`` says that the policy file, as it is now, would
-    allow it once signed.
+    `Evaluator.explain` fills in the other fields.  ``lines`` are the lines of the policy file that
+    the deciding rule comes from, and ``provenance`` says whether the permissions were made from
+    that file; ``policy_sha256`` is the digest of the file that they were made from, "" if it is not
+    known.  For a denial, ``change`` is the necessary change of the policy, ``remedy`` is what to do
+    if no policy can help, and ``sign`` says that the present policy file, once signed, allows it.
     """
 
     vendor: Vendor
@@ -100,18 +99,18 @@ class Answer:
 
     @property
     def as_documented(self) -> bool:
-        """Whether it rests on what the vendor documents: faults of files are seen here."""
+        """Whether the answer relies on the vendor's documentation alone, not on tests."""
         return self.vendor.documented_only and not self.problems
 
     @property
     def wildcard(self) -> str:
-        """The expression of the deciding rule where that is a wildcard, or ""."""
+        """The expression of the deciding rule if it is a wildcard, or ""."""
         expression = self.decision.expression or ""
         return expression if is_expression(expression) else ""
 
     @property
     def denied_by(self) -> str:
-        """Who denies it, and what then does not run or is not created; "" where it is allowed."""
+        """The process that denies it, with the consequence; "" if it is allowed."""
         match self.outcome:
             case Outcome.ALLOWED:
                 return ""
@@ -143,7 +142,7 @@ _CREATED = {
 def recorded_policy(root: Path, signed: bytes) -> str:
     """Return the SHA-256 of the policy that signed permissions were made from, or "".
 
-    It is what the ledger of the keystore at ``root`` says; "" also where there is no ledger.
+    It comes from the ledger of the keystore at ``root``; it is "" if there is no ledger or entry.
     """
     from sros_tool.keystore.ledger import read_ledger
 
@@ -153,7 +152,7 @@ def recorded_policy(root: Path, signed: bytes) -> str:
 
 
 def deciding_lines(policy: Enclave, answer: Answer) -> tuple[PolicyLine, ...]:
-    """Return the names of an enclave's policy that the deciding rule of an answer comes from.
+    """Return the names in an enclave's policy that the deciding rule of an answer comes from.
 
     Several nodes of an enclave may have the same right, so there may be several.
     """
@@ -162,7 +161,7 @@ def deciding_lines(policy: Enclave, answer: Answer) -> tuple[PolicyLine, ...]:
         return ()
     rule = answer.grant.rules[answer.decision.rule or 0]
     qualifier = ALLOW if rule.allow else DENY
-    # Cyclone DDS denies a topic as a whole, also by a rule of the other direction.
+    # Cyclone DDS denies a whole topic, also because of a rule for the other direction.
     other = AccessVerb.SUBSCRIBE if part.verb is AccessVerb.PUBLISH else AccessVerb.PUBLISH
     for verb in (part.verb, other):
         found = tuple(
@@ -176,7 +175,7 @@ def deciding_lines(policy: Enclave, answer: Answer) -> tuple[PolicyLine, ...]:
 
 
 def lines_of_right(policy: Enclave, right: Right) -> tuple[PolicyLine, ...]:
-    """Return the names of an enclave's policy that state a right or denial."""
+    """Return the names in an enclave's policy that state a right or denial."""
     return tuple(
         each
         for each in _lines(policy)

@@ -1,7 +1,7 @@
-"""The smallest change of a policy after which a vendor allows what it denies.
+"""Find the smallest change of a policy that makes a vendor allow a denied question.
 
-A right is added only if none covers the question, and a denial is lifted only if it stands in the
-way; the result is tried out on the decision engine before it is proposed.
+A right is added only if no right covers the question, and a denial is removed only if it prevents
+the answer "allowed"; the decision engine checks the result before it is proposed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _NO_RULE = frozenset({"no-rule", "default"})
 
 @dataclass(frozen=True, slots=True)
 class GroupEdit:
-    """A group of a policy file that is to be replaced; ``xml`` is "" where nothing is left."""
+    """A replacement for a group of a policy file; ``xml`` is "" if nothing is left of the group."""
 
     source: Source
     xml: str
@@ -34,10 +34,10 @@ class GroupEdit:
 
 @dataclass(frozen=True, slots=True)
 class PolicyChange:
-    """Rights to add and denials to lift; both are empty where the policy needs no change.
+    """Rights to add and denials to remove (``lift``); both are empty if no change is needed.
 
-    ``document`` is a policy of the additions alone, for ``sros merge_policy``; ``edits`` are how
-    the groups that deny have to read, where the policy file is known.
+    ``document`` is a policy with only the additions, for ``sros merge_policy``; ``edits`` are new
+    versions of the groups with denials, if the policy file is known.
     """
 
     add: tuple[Right, ...]
@@ -49,8 +49,8 @@ class PolicyChange:
 def smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | None:
     """Return the change that makes the evaluator's vendor allow a denied question.
 
-    It starts from the policy of the enclave, or where that is not known from the rights of its
-    permissions.  Returns None if no policy could allow it.
+    It starts from the policy of the enclave or, if that is not known, from the rights in its
+    permissions.  Returns None if no policy could allow the question.
     """
     enclave, question = evaluator.enclave, answer.question
     if not question.right:
@@ -87,7 +87,7 @@ def smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | None
 
 
 def policy_of(name: str, rights: Iterable[Right]) -> Enclave:
-    """Return the policy of an enclave with one nameless node that has these rights."""
+    """Return the policy of an enclave with a single nameless node that has these rights."""
     groups = tuple(
         Group(right.kind, ((right.right, right.qualifier),), (right.name,))
         for right in sorted(rights)
@@ -96,7 +96,7 @@ def policy_of(name: str, rights: Iterable[Right]) -> Enclave:
 
 
 def _present_rights(policy: Enclave | None, name: str, answer: Answer) -> set[Right]:
-    """Return the rights that an enclave has now, but for those that no policy can state."""
+    """Return the present rights of an enclave, except those that no policy can state."""
     found: Iterable[Right] = ()
     if policy:
         found = (r for each in policy.all_profiles() for r in profile_rights(name, each))
@@ -108,8 +108,8 @@ def _present_rights(policy: Enclave | None, name: str, answer: Answer) -> set[Ri
 def _blocking(rights: Iterable[Right], answer: Answer) -> list[Right]:
     """Return the denials that the deciding expression of an answer comes from.
 
-    Those of the other direction only if there is no other: Cyclone DDS denies a topic as a whole
-    by a denial of either direction.
+    Denials of the other direction count only if there is no other: Cyclone DDS denies a whole topic
+    because of a denial in either direction.
     """
     expression = answer.decision.expression or ""
     publishes = answer.part is not None and answer.part.verb is AccessVerb.PUBLISH
@@ -126,7 +126,7 @@ def _blocking(rights: Iterable[Right], answer: Answer) -> list[Right]:
 
 
 def _addition(right: Right, policy: Enclave | None) -> str:
-    """Return a policy of one right, in the node that it belongs to."""
+    """Return a policy with one right, in the profile of the node that it belongs to."""
     ns, node = _node_for(right, policy)
     group = Group(right.kind, ((right.right, right.qualifier),), (right.name,))
     enclave = Enclave(right.enclave, (Profiles((Profile(ns, node, (group,)),)),))
@@ -134,7 +134,7 @@ def _addition(right: Right, policy: Enclave | None) -> str:
 
 
 def _node_for(right: Right, policy: Enclave | None) -> tuple[str, str]:
-    """Return namespace and name of the innermost node whose namespace the right's name lies in."""
+    """Return namespace and name of the node with the longest namespace around the right's name."""
     profiles = policy.all_profiles() if policy else ()
     fitting = [
         each for each in profiles if right.name.startswith(each.ns.rstrip("/") + "/")
@@ -146,7 +146,7 @@ def _node_for(right: Right, policy: Enclave | None) -> tuple[str, str]:
 
 
 def _edits(lift: list[Right], policy: Enclave) -> Iterator[GroupEdit]:
-    """Yield how each group that denies has to read without these denials."""
+    """Yield the new version, without these denials, of each group that has one."""
     groups: dict[Source, Group] = {}
     lifted: dict[Source, set[tuple[str, str]]] = {}
     for right in lift:

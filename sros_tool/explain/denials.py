@@ -1,9 +1,9 @@
-"""Read the denied topics from the logs of secured nodes, and propose the rules that were missing.
+"""Read denied topics from the logs of secured nodes, and propose the missing rules.
 
-The texts are in `sros_tool.runtime.vendor_log`.  Fast DDS names the topic, and near it whether it
-was a writer or a reader.  Cyclone DDS first asks whether a topic may be used at all; that denial
-has no direction but by what rcl says next.  It says nothing where the governance protects the
-discovery of the topic.
+The texts are in `sros_tool.runtime.vendor_log`.  Fast DDS names the topic and, in a line nearby,
+whether it was a writer or a reader.  Cyclone DDS first checks whether a topic may be used at all;
+the direction of such a denial is only in the next message of rcl.  Cyclone DDS logs nothing if the
+governance protects the discovery of the topic.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from sros_tool.runtime.vendor_log import (
 from sros_tool.translate import service_of
 
 _NEAR_LINES = 3
-"""How many lines after a denial are still about it."""
+"""The number of lines after a denial that still belong to it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Denial:
-    """One refusal: a raw DDS topic, "publish", "subscribe" or "" where the log does not say.
+    """A denied DDS topic (raw name); ``direction`` is "publish", "subscribe", or "" if unknown.
 
-    ``by_rule`` says that a rule denies it, so that allowing it would not help; ``remote`` that it
-    is about the permissions of a peer.  ``enclave`` is "" where the log does not name it.
+    ``by_rule`` says that a rule denies it, so that a rule to allow it would not help; ``remote``
+    says that a peer's permissions deny it.  ``enclave`` is "" if the log does not name it.
     """
 
     topic: str
@@ -60,10 +60,10 @@ class Denial:
 
 @dataclass(frozen=True, slots=True)
 class MissingRights:
-    """The rights that denials ask for, by enclave ("" where the log does not name it).
+    """The rights that denials show to be missing, by enclave ("" if the log does not name it).
 
-    Left to the user are the denials without a direction (``unclear``), by a deny rule
-    (``by_rule``), of peers (``remote``), and of topics without a ROS name (``foreign``).
+    The user has to handle denials without a direction (``unclear``), by a deny rule (``by_rule``),
+    by a peer's permissions (``remote``), and of topics without a ROS name (``foreign``).
     """
 
     rights: dict[str, frozenset[NodeRight]]
@@ -74,10 +74,10 @@ class MissingRights:
 
 
 def read_denials(text: str) -> tuple[Denial, ...]:
-    """Return every denied topic in a log without colours, once, in the order of the log.
+    """Return each denied topic in a log without colours once, in the order of the log.
 
-    Processes that write into one log are told apart by what ros2 launch, journald or Docker
-    Compose puts before their lines; an enclave that one of them names is not another one's.
+    The labels that ros2 launch, journald or Docker Compose put before lines distinguish the
+    processes in a log; the enclave named by one process is not used for another one.
     """
     processes: dict[str, list[str]] = {}
     for line in text.splitlines():
@@ -103,7 +103,7 @@ def _denials_of(lines: list[str]) -> Iterator[Denial]:
 
 
 def _direction(lines: list[str], topic: str) -> tuple[bool, str]:
-    """Return whether a denial is about a peer, and its direction, from its line and the next."""
+    """Return whether a peer is denied, and the direction, from a denial and the next lines."""
     for line in lines:
         other = denied_topic(line)
         if other and other[1]["topic"] != topic:
@@ -122,10 +122,10 @@ def _direction(lines: list[str], topic: str) -> tuple[bool, str]:
 
 
 def propose(denials: Iterable[Denial]) -> MissingRights:
-    """Return the rights that would have allowed what was denied, as far as the log says.
+    """Return the rights that would have prevented the denials, as far as the log shows them.
 
-    A node stops at its first refusal, so one denied half of a service asks for the service, and
-    one denied service of an action for the action.
+    A node stops at its first refusal.  So one denied topic of a service leads to a right to the
+    service, and one denied service of an action to a right to the action.
     """
     rights: dict[str, set[NodeRight]] = {}
     rest: dict[str, list[Denial]] = {"unclear": [], "by_rule": [], "remote": [], "foreign": []}
@@ -151,7 +151,7 @@ _OWN_SERVICE = re.compile(rf"(?P<node>/.+)/(?:{'|'.join(NODE_SERVICES)})\Z")
 
 
 def serving_node(denial: Denial) -> str:
-    """Return the full name of the node that was denied one of every node's own services, or ""."""
+    """Return the full name of a node that was denied one of its standard services, or ""."""
     service, begin = service_of(denial.topic)
     if denial.remote or not service:
         return ""
@@ -161,14 +161,14 @@ def serving_node(denial: Denial) -> str:
 
 
 def nodes_served(rights: Iterable[tuple[str, str]]) -> tuple[str, ...]:
-    """Return the full names of the nodes whose own services these rights (right, name) allow."""
+    """Return the full names of the nodes whose standard services these (right, name) allow."""
     found = (_OWN_SERVICE.match(name) for right, name in rights if right == "reply")
     return tuple(sorted({own["node"] for own in found if own}))
 
 
 def _is_ros(topic: str) -> bool:
     if is_expression(topic) or expression_problem(topic[2:]):
-        return False  # a topic that is named like a wildcard must not become one
+        return False  # a topic name that looks like a wildcard must not become one
     return topic.startswith("rt/") or bool(service_of(topic)[0])
 
 
@@ -184,7 +184,7 @@ def _right(denial: Denial) -> NodeRight:
 
 
 def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:
-    """Return the rights without the topics that an action among them stands for."""
+    """Return the rights without the topics that belong to an action among them."""
     parts = {
         NodeRight(way, f"{each.name}{ACTION_INSIDE}{topic}")
         for each in rights
@@ -196,7 +196,7 @@ def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:
 
 
 _ANY_NODE = ("/", "*")
-"""The namespace and node of a profile that is not about a particular node."""
+"""The namespace and name of a profile for any node."""
 
 _OTHER = (
     "not proposed, as these nodes are not in the policy under that name; start them as it says "
@@ -204,8 +204,8 @@ _OTHER = (
     "with --node /NAMESPACE/NAME: {}"
 )
 _WHOLE = (
-    "what every node needs is proposed as a whole, rather than one right after each restart, as "
-    "the profile has nothing of it: {}"
+    "all the rights that every node needs are proposed together, instead of one after each "
+    "restart, as the profile has none of them: {}"
 )
 _SEVERAL = Note(
     "log.several-enclaves",
@@ -214,8 +214,7 @@ _SEVERAL = Note(
 )
 
 _NODE_PARTS = ("common/node.xml", "common/node/parameters.xml")
-"""The parts that a node most likely lacks as a whole if it is denied anything of them; the widest
-first."""
+"""The parts of which a node probably lacks all rights if it lacks one; the widest part first."""
 
 
 def as_learned(
@@ -227,11 +226,11 @@ def as_learned(
 ) -> Learned:
     """Return the proposed rights as profiles.
 
-    ``enclave`` is for denials of which the log does not name it.  ``node`` (namespace and name)
-    names the profile; without it, it is the profile of the node whose own services were denied, or
-    else the only profile of that enclave in ``policy``, or one for any node: DDS asks for the
-    enclave alone.  A node that the policy does not have under that name gets nothing, and a note.
-    With ``common``, a node that has nothing of what every node needs gets all of it.
+    ``enclave`` is used for denials whose enclave the log does not name.  ``node`` (namespace and
+    name) names the profile.  Without it, the rights go to the node whose standard services were
+    denied, else to the only profile of the enclave in ``policy``, else to a profile for any node:
+    DDS checks only the enclave.  A node that is not in the policy gets a note instead of rights.
+    With ``common``, a node that has none of the rights that every node needs gets all of them.
 
     Raises:
         UsageError: The log does not name the enclave of a denial, and ``enclave`` is "".
@@ -263,13 +262,13 @@ def as_learned(
 
 
 def _by_enclave(missing: MissingRights, enclave: str) -> dict[str, frozenset[NodeRight]]:
-    """Return the rights by enclave: the log may name an enclave that is also an argument."""
+    """Return the rights by enclave, with ``enclave`` for denials that name none."""
     found: dict[str, frozenset[NodeRight]] = {}
     for named, rights in missing.rights.items():
         if not (named or enclave):
             raise UsageError(
                 "the log does not say in which enclave the node ran",
-                "It would, with the line 'Found security directory' of rcl.",
+                "rcl's line 'Found security directory', which names it, is missing.",
                 "Name it with --enclave.",
             )
         path = check_enclave_name(named or enclave)
@@ -282,7 +281,7 @@ def _by_place(
     node: tuple[str, str] | None,
     present: Mapping[tuple[str, str], frozenset[NodeRight]],
 ) -> dict[tuple[str, str], frozenset[NodeRight]]:
-    """Return the rights by the namespace and name of the profile that they belong to."""
+    """Return the rights by namespace and name of their profile."""
     if node is not None:
         return {node: rights}
     own = nodes_served((each.right, each.name) for each in rights)
@@ -297,7 +296,7 @@ def _by_place(
 
 
 def _place(fqn: str, present: Iterable[tuple[str, str]]) -> tuple[str, str]:
-    """Return namespace and name of the profile for a node, which may have a wildcard."""
+    """Return namespace and name of the profile for a node; they may have wildcards."""
     ns, _, name = fqn.rpartition("/")
     return next((each for each in present if covers(_fqn(each), fqn)), (ns or "/", name))
 
@@ -312,7 +311,7 @@ def _whole_parts(
     has: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
-    """Return the part of which something was denied to a node that has nothing of it, if any."""
+    """Return the part of which the node has no right and was denied one, if any."""
     if is_expression(place[1]):
         return ()
     for part in _NODE_PARTS:
@@ -324,7 +323,7 @@ def _whole_parts(
 
 
 def _profiles(policy: Policy | None, path: str) -> dict[tuple[str, str], frozenset[NodeRight]]:
-    """Return the rights of each profile of an enclave, by its namespace and node."""
+    """Return the rights of each profile of an enclave, by namespace and node name."""
     enclave = policy.enclave(path) if policy else None
     found: dict[tuple[str, str], frozenset[NodeRight]] = {}
     for each in enclave.all_profiles() if enclave else ():
@@ -351,7 +350,7 @@ def _notes(missing: MissingRights) -> tuple[Note, ...]:
         ),
         "log.no-ros-name": (
             missing.foreign,
-            "not proposed, as a policy has no words for these topics: {}",
+            "not proposed, as a policy cannot name these topics: {}",
         ),
     }
     several = len(missing.rights) > 1

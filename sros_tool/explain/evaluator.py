@@ -1,4 +1,4 @@
-"""The evaluator: what DDS loads for an enclave, and what one vendor decides with it."""
+"""Load an enclave as DDS does, and evaluate what one vendor decides with it."""
 
 from __future__ import annotations
 
@@ -56,23 +56,23 @@ _LEFT_TO_THE_VENDOR = frozenset(
         Fault.PERMISSIONS_SUBJECT,
     }
 )
-"""Faults of documents that every vendor judges by rules of its own."""
+"""Faults of documents that each vendor judges by its own rules."""
 _NO_KEY = (Fault.FILE_MISSING, KEY_FILE)
 
 _PLANNED = timedelta(days=365)
-"""How long the permissions of a policy that is not signed yet are taken to be valid."""
+"""The assumed validity of permissions for a policy that is not signed yet."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoadedEnclave:
-    """An enclave as DDS gets it.
+    """An enclave as DDS loads it.
 
-    ``governance`` and ``permissions`` are the XML within the signed documents; ``signed`` is the
-    signed permissions, b"" if they are not signed yet.  ``expiries`` are files with the moment when
-    they expire.  ``state`` is what the files were found to be at the moment ``at``; None where they
-    are not made yet.  ``key_elsewhere`` says that its key is on the robot on which it was made.
+    ``governance`` and ``permissions`` are the XML in the signed documents; ``signed`` is the
+    signed permissions, b"" if they are not signed yet.  ``expiries`` are files with their expiry
+    times.  ``state`` is the state of the files at the time ``at``; None if they do not exist yet.
+    ``key_elsewhere`` says that the key is on the robot that generated it.
 
-    ``root`` is its keystore and ``policy`` its part of the policy file, where these are known.
+    ``root`` is its keystore and ``policy`` its part of the policy file, if known.
     """
 
     name: str
@@ -89,7 +89,7 @@ class LoadedEnclave:
     policy: Enclave | None = None
 
     def problems(self, traits: VendorTraits) -> tuple[Problem, ...]:
-        """Return what keeps a vendor's process from running, whatever the documents say."""
+        """Return the faults, except those of documents, that keep a vendor's process out."""
         if self.state is None or self.at is None:
             return ()
         return tuple(
@@ -101,7 +101,7 @@ class LoadedEnclave:
 
 
 def load_enclave(name: str, folder: Path, *, at: datetime) -> LoadedEnclave:
-    """Return what DDS would load from the folder of an enclave at the moment ``at``."""
+    """Return the enclave that DDS would load from a folder at the time ``at``."""
     state = open_enclave(folder, now=at)
     governance, permissions = (
         _document(state.files.get(file, b"")) for file in ("governance.p7s", "permissions.p7s")
@@ -121,7 +121,7 @@ def load_enclave(name: str, folder: Path, *, at: datetime) -> LoadedEnclave:
 
 
 def plan_enclave(policy: Enclave, governance: Governance, *, at: datetime) -> LoadedEnclave:
-    """Return what DDS would load for an enclave if its policy were signed at the moment ``at``."""
+    """Return the enclave that DDS would load if the policy were signed at ``at``."""
     from sros_tool.translate import permissions_for
     from sros_tool.validity import window
 
@@ -183,7 +183,7 @@ _ONLY_PEERS_NOTICE = {
     (Vendor.FAST_2_9, Fault.KEY_ALGORITHM),
     (Vendor.FAST_2_9, Fault.DOCUMENT_SIZE),
 }
-"""What a vendor does not notice itself, but every peer does."""
+"""Faults that a vendor does not notice in its own process, but all peers do."""
 
 # All enclaves of a keystore have the same governance.
 _governance_as = lru_cache(maxsize=16)(read_governance_as)
@@ -191,7 +191,7 @@ _governance_as = lru_cache(maxsize=16)(read_governance_as)
 
 @dataclass(frozen=True, slots=True)
 class JoinContext:
-    """Where and when a process joins; ``zone`` is the time zone of the host."""
+    """The domain and time of joining; ``zone`` is the time zone of the host."""
 
     domain: int
     at: datetime
@@ -199,7 +199,7 @@ class JoinContext:
 
 
 class Evaluator:
-    """One vendor's answers about one enclave; prepared once, asked often."""
+    """An evaluator of questions to one vendor about one enclave; reusable for many questions."""
 
     def __init__(self, vendor: Vendor, enclave: LoadedEnclave, context: JoinContext) -> None:
         self.vendor = vendor
@@ -212,7 +212,7 @@ class Evaluator:
         self._until_file, self._until = self._first_expiry()
 
     def answer(self, question: Question) -> Answer:
-        """Return the answer to a question, without the policy and the remedy behind it."""
+        """Return the answer to a question, without policy lines, change and remedy."""
         if isinstance(self._access, Decision):
             return self._made(question, [(None, self._access)])
         access = self._access
@@ -223,7 +223,7 @@ class Evaluator:
         return self._made(question, own, asked)
 
     def explain(self, question: Question) -> Answer:
-        """Return the answer to a question with the policy behind it, and what would change it."""
+        """Return the answer with its policy lines and, for a denial, a change or remedy."""
         answer = self.answer(question)
         _LOG.info(
             "asked %s: %s of enclave %s: %s",
@@ -245,7 +245,7 @@ class Evaluator:
         return replace(answer, remedy=self._remedy(answer))
 
     def _load(self) -> Access | Decision:
-        """Return the access that the vendor's process has, or why it does not run."""
+        """Return the access of the vendor's process, or the decision that keeps it from running."""
         enclave, context = self.enclave, self.context
         if self._problems:
             first = self._problems[0]
@@ -278,10 +278,10 @@ class Evaluator:
         own: Sequence[tuple[Part | None, Decision]],
         asked: Sequence[tuple[Part, Decision]] = (),
     ) -> Answer:
-        """Return the answer that follows from the decisions on the process and its endpoints."""
+        """Return the answer that results from the decisions on the process and its endpoints."""
         found = [*own, *asked]
         outcome = min((decision.outcome for _, decision in found), key=_WORST_FIRST.index)
-        # An allowed question is answered by its own topics, any other by what comes first.
+        # The question's own topics explain an allowed outcome; the first such decision any other.
         deciding = [each for each in found if each[1].outcome is outcome]
         part, decision = asked[0] if asked and outcome.ok else deciding[0]
         grant = None
@@ -319,7 +319,7 @@ class Evaluator:
     # ── why, and what would change it ──────────────────────────────────────────────────────
 
     def _provenance(self, recorded: str) -> Provenance | None:
-        """Return whether the permissions were made from the policy, by the recorded digest."""
+        """Return whether the permissions were made from the policy, according to the ledger."""
         if self.enclave.policy is None:
             return None
         if not self.enclave.signed:
@@ -340,7 +340,7 @@ class Evaluator:
             return None
         if change.add or change.lift:
             return replace(answer, change=change)
-        # The policy, as it is, allows it.
+        # The present policy allows it.
         return replace(answer, sign=True) if answer.provenance is Provenance.CHANGED else None
 
     def _remedy(self, answer: Answer) -> str:

@@ -1,7 +1,7 @@
-"""Explain the security messages of a log: cause and remedy, with the enclave examined.
+"""Explain the security messages of a log by cause and remedy, and examine the enclave.
 
-The lines of several processes may be mixed, with the labels of ros2 launch, journald or Docker
-Compose before them, with colours, and with tracebacks between them.
+The log may mix lines of several processes, with labels of ros2 launch, journald or Docker Compose,
+and may contain colours and tracebacks.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ from sros_tool.runtime.vendor_log import (
 from sros_tool.translate import SERVICE_ENDS, grant_rights
 
 _WORDS = (re.compile(r"[\w/]+"), re.compile(r"[^\s(]+"), re.compile(r"\S+"))
-"""The forms of a topic in a line: between punctuation, or with it where it has some itself."""
+"""The forms of a topic in a line: without punctuation, or with punctuation of its name."""
 _NUMBERS = re.compile(r"\b[0-9a-f]{2}(?:\.[0-9a-f]{2}){5,}\S*|\d+")
 _LONGEST = 8000
-"""How many characters of a line can be a message: a log may be one line of many megabytes."""
+"""The number of characters of a line that are read: a line may have many megabytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class LogFinding:
-    """A message, its cause and remedy, and what was found in the enclave.
+    """A message with its cause and remedy, and the causes found in the enclave.
 
-    ``line`` is the number, from 1, of the first of ``count`` messages; ``vendor`` is None for
-    messages of rcl.  ``enclave`` is "" where the log does not name it.  ``found`` are the true
-    causes, where an enclave was examined; ``checked`` says whether one was.
+    ``line`` is the line number (from 1) of the first of ``count`` messages; ``vendor`` is None for
+    messages of rcl.  ``enclave`` is "" if the log does not name it.  ``checked`` says whether an
+    enclave was examined, and ``found`` are the true causes found in it.
     """
 
     id: str
@@ -65,7 +65,7 @@ class LogFinding:
 
 
 FindEnclave = Callable[[str], LoadedEnclave | None]
-"""Returns an enclave of the keystore by its name ("": the one that was named), or None."""
+"""A function from an enclave's name ("": the one that the user named) to the enclave, or None."""
 
 
 def explain_log(
@@ -74,9 +74,9 @@ def explain_log(
     context: Callable[[LoadedEnclave], JoinContext],
     root: str = "",
 ) -> tuple[LogFinding, ...]:
-    """Return the faults that a log reports, in its order, each once; empty if there are none.
+    """Return the faults that a log reports, each once, in the order of the log.
 
-    ``context`` says where and when an enclave joins, ``root`` names its keystore in commands.
+    ``context`` gives domain and time for an enclave, ``root`` names its keystore in commands.
     """
     plain = plain_text(text)
     examiner = _Examiner(find, context, root)
@@ -96,7 +96,7 @@ def explain_log(
 
 @dataclass(frozen=True, slots=True)
 class _Hit:
-    """A line that the table of texts knows; ``fields`` are the groups of the text's pattern."""
+    """A line that matches the table of texts; ``fields`` are the groups of the text's pattern."""
 
     line: int
     text: str
@@ -111,19 +111,19 @@ class _Hit:
 
     @property
     def quoted(self) -> Mapping[str, str]:
-        """The fields as words of a command: whoever wrote the log chose them."""
+        """The fields, quoted for a shell command: the author of the log chose them."""
         return {name: quote(text) for name, text in self.fields.items()}
 
     @property
     def kind(self) -> str:
-        """What lines have in common that are reported as one."""
+        """The key by which lines are grouped into one finding."""
         if self.meaning is not UNKNOWN:
             return f"{self.meaning.id} {self.cause}"
         return _NUMBERS.sub("", plain_refusal(self.text))
 
 
 def _joined(lines: list[str]) -> Iterator[tuple[int, str]]:
-    """Yield the lines with their numbers; OpenSSL's error stack is one with what it explains."""
+    """Yield the lines with their numbers; an error stack of OpenSSL joins the line before it."""
     number, current = 0, ""
     for index, line in enumerate(lines, 1):
         if current and CONTINUED.match(line):
@@ -154,7 +154,7 @@ def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
 
 
 def _meaning_of(line: str, text: str) -> tuple[LogText, re.Match[str] | None]:
-    """Return what a line means, which is ``text`` without its label, and the match, if any."""
+    """Return the meaning of a line (``text`` without its label), and the match, if any."""
     if found := log_text(line):
         return found
     return UNKNOWN, None if denied_topic(line) else UNKNOWN.pattern.search(text)
@@ -171,9 +171,9 @@ def _without_label(line: str) -> str:
 
 
 def _strongest(hits: Iterable[_Hit], reported: set[str]) -> Iterator[_Hit]:
-    """Yield the hits but for those that only follow on stronger ones of the same process.
+    """Yield the hits, except weaker ones if the same process has stronger ones.
 
-    ``reported`` are the processes whose denied topics are reported on their own.
+    ``reported`` are the processes whose denied topics are reported separately.
     """
     found = list(hits)
     least = dict.fromkeys(reported, 0)
@@ -191,7 +191,7 @@ def _grouped(hits: Iterable[_Hit]) -> Iterator[list[_Hit]]:
 
 
 def _lines_naming(lines: list[str], topics: set[str]) -> dict[str, list[tuple[int, str]]]:
-    """Return the lines that name each topic, with their numbers, in one pass over the log."""
+    """Return, for each topic, the lines that name it, with line numbers."""
     found: dict[str, list[tuple[int, str]]] = {topic: [] for topic in topics}
     for number, line in enumerate(lines, 1):
         words = (word for pattern in _WORDS for word in pattern.findall(line))
@@ -204,7 +204,7 @@ def _lines_naming(lines: list[str], topics: set[str]) -> dict[str, list[tuple[in
 
 
 class _Examiner:
-    """Examines enclaves for the causes of messages."""
+    """An examiner that searches enclaves for the causes of messages."""
 
     def __init__(
         self, find: FindEnclave, context: Callable[[LoadedEnclave], JoinContext], root: str
@@ -214,7 +214,7 @@ class _Examiner:
         self._root = root
 
     def message(self, hits: list[_Hit]) -> LogFinding:
-        """Return the finding of one message, however often it came."""
+        """Return the finding for one group of equal messages."""
         first = hits[0]
         meaning = first.meaning
         plain = LogFinding(
@@ -247,13 +247,13 @@ class _Examiner:
         )
 
     def denial(self, denial: Denial, named: list[tuple[int, str]]) -> LogFinding:
-        """Return the finding of a topic that was denied; ``named`` are the lines that name it."""
+        """Return the finding for a denied topic; ``named`` are the lines that name it."""
         line, text = named[0][0], _without_label(named[0][1])
         right, name = _in_ros_terms(denial)
         who = "a peer" if denial.remote else denial.enclave or "the process"
         by = "a rule of the policy denies it" if denial.by_rule else "no rule allows it"
         if node := serving_node(denial):
-            by += f"; every node has such a service, and this one is the node {node}"
+            by += f"; every node has such a service, and this is the one of node {node}"
         finding = LogFinding(
             "topic-denied",
             denial.vendor,
@@ -263,15 +263,15 @@ class _Examiner:
             denial.enclave,
             f"{who} may not {right} {name}: {by}",
             f"`sros explain {self._root or 'KEYSTORE'} {denial.enclave or 'ENCLAVE'} {right} "
-            f"{name}` says what the policy lacks.",
+            f"{name}` shows what is missing in the policy.",
         )
         enclave = None if denial.remote else self._find(denial.enclave)
         if enclave is None or not denial.direction:
             return finding
         answer = self._answer(enclave, denial.vendor, _question(denial))
         if answer.allowed:
-            found = ["the permissions that are there now allow it"]
-            remedy = "Restart the process: it loaded the permissions that were there before."
+            found = ["the present permissions allow it"]
+            remedy = "Restart the process: it loaded earlier permissions."
         else:
             other, better = _other_node(denial, answer)
             found = [answer.decision.text, *other]
@@ -287,7 +287,7 @@ class _Examiner:
     def _causes(
         self, enclave: LoadedEnclave, answer: Answer, faults: tuple[Fault, ...]
     ) -> Iterator[tuple[str, str]]:
-        """Yield the faults of an enclave and their remedies, only fitting ones if there are any."""
+        """Yield the faults of an enclave with remedies; only those in ``faults``, if it has any."""
         fitting = [each for each in answer.problems if each.fault in faults]
         for each in fitting or answer.problems:
             yield str(each), remedy(each.fault, self._root, enclave.name, each.file)
@@ -298,7 +298,7 @@ class _Examiner:
     def _wrong_domain(
         self, enclave: LoadedEnclave, answer: Answer, hit: _Hit
     ) -> Iterator[tuple[str, str]]:
-        """Yield that a process was in a domain its documents are not for, if nothing else fits."""
+        """Yield the cause and remedy if a process was in a domain that its documents exclude."""
         topic, domain = hit.fields.get("topic", ""), hit.fields.get("domain", "")
         if hit.meaning.id == "domain" and topic:
             asked = _question(Denial(topic, PUBLISH))
@@ -322,16 +322,16 @@ class _Examiner:
 
 
 _ABOUT_DOMAINS = ("domain", "domain-of-permissions")
-_EVERY_NODE = "what every node has: parameter services, /rosout, /parameter_events"
+_EVERY_NODE = "the rights that every node needs: parameter services, /rosout, /parameter_events"
 _TOPICS_OF_EVERY_NODE = ("rt/rosout", "rt/parameter_events")
 
 
 def _nodes(answer: Answer) -> tuple[str, ...]:
-    """Return for which nodes the permissions of an enclave are, as far as they say."""
+    """Return a text that names the nodes in the permissions of an enclave."""
     nodes = _served(answer)
     if nodes:
         return (f"its permissions are for {_listed(nodes)}",)
-    return (f"its permissions have nothing of {_EVERY_NODE}",)
+    return (f"its permissions lack {_EVERY_NODE}",)
 
 
 def _served(answer: Answer) -> tuple[str, ...]:
@@ -340,7 +340,7 @@ def _served(answer: Answer) -> tuple[str, ...]:
 
 
 def _other_node(denial: Denial, answer: Answer) -> tuple[list[str], str]:
-    """Return what was found, and the remedy, where a node is not the permissions' node."""
+    """Return causes and a remedy if the permissions are for a node with another name."""
     node, nodes = serving_node(denial), _served(answer)
     if node and nodes and not any(covers(each, node) for each in nodes):
         ns, _, name = nodes[0].rpartition("/")
@@ -349,7 +349,7 @@ def _other_node(denial: Denial, answer: Answer) -> tuple[list[str], str]:
             f"if {node} is right, give it a profile in the policy of ENCLAVE, with common/node.xml."
         )
     if not nodes and (node or denial.topic in _TOPICS_OF_EVERY_NODE):
-        return [f"the permissions have nothing of {_EVERY_NODE}"], (
+        return [f"the permissions lack {_EVERY_NODE}"], (
             'Put <xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> into the '
             "node's profile: `sros generate_policy POLICY --enclave ENCLAVE --from-log LOG` does."
         )
@@ -362,8 +362,8 @@ def _listed(nodes: Sequence[str]) -> str:
 
 def _nothing_found(enclave: LoadedEnclave) -> str:
     return (
-        f"Enclave {enclave.name}, as it is there now, has no fault that would explain it: "
-        "look at the files on the robot itself, its clock and its time zone."
+        f"Enclave {enclave.name} now has no fault that would explain it: "
+        "check the files on the robot itself, its clock and its time zone."
     )
 
 
@@ -376,7 +376,7 @@ _HALVES = {
 
 
 def _in_ros_terms(denial: Denial) -> tuple[str, str]:
-    """Return what was tried, in the words of `question.WORDS`, and the name."""
+    """Return the denied action, as a word of `question.WORDS`, and its ROS name."""
     prefix, topic = denial.topic[:2], denial.topic[2:]
     if (prefix, denial.direction) in _HALVES:
         word, end = _HALVES[prefix, denial.direction]
@@ -388,6 +388,6 @@ def _in_ros_terms(denial: Denial) -> tuple[str, str]:
 
 
 def _question(denial: Denial) -> Question:
-    """Return the question about that one topic."""
+    """Return a question about the denied topic alone."""
     part = Part(AccessVerb(denial.direction), denial.topic)
     return Question(denial.direction, "topic", denial.direction, denial.topic, (part,))

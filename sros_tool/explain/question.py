@@ -1,4 +1,4 @@
-"""A question in ROS terms, and the DDS topics on which its answer rests.
+"""A question in ROS terms, and the DDS topics that its answer depends on.
 
 Nodes speak of calling and serving; a policy says request and reply for services, and call and
 execute for actions.  Mapping of names: ROS 2 design "Topic and Service name mapping to DDS".
@@ -28,7 +28,7 @@ _RIGHTS = {
     ("reply", "service"): "reply",
 }
 WORDS = (*dict.fromkeys(word for word, _ in _RIGHTS), _JOIN)
-"""What can be asked for; request and reply are the policy's words for call and serve."""
+"""The words of questions; request and reply are the policy's words for call and serve."""
 
 _ROLES = {"rq": "requests", "rr": "replies"}
 
@@ -42,7 +42,7 @@ class Part:
     role: str = ""
 
     def __str__(self) -> str:
-        """As ``publish its requests (rq/addRequest)``."""
+        """Return text like ``publish its requests (rq/addRequest)``."""
         return f"{self.verb.value} its {self.role} ({self.topic})" if self.role else self.topic
 
 
@@ -50,15 +50,15 @@ OWN_PARTS = (
     Part(AccessVerb.PUBLISH, ROS_DISCOVERY_TOPIC, "node names"),
     Part(AccessVerb.SUBSCRIBE, ROS_DISCOVERY_TOPIC, "node names"),
 )
-"""What every ROS 2 process needs before anything else."""
+"""The endpoints that every ROS 2 process needs to start."""
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """May an enclave do ``word`` with ``name``?  ``right`` is what a policy says of it.
+    """A question whether an enclave may do ``word`` with ``name``.
 
-    ``name`` is an absolute ROS name; of the question whether it may join at all, both it and
-    ``right`` are "".  ``only`` are endpoints to ask about in place of those that the right needs.
+    ``right`` is the policy's word for it, and ``name`` an absolute ROS name; both are "" in the
+    question whether the enclave may join.  ``only`` replaces the endpoints that the right needs.
     """
 
     word: str
@@ -69,7 +69,7 @@ class Question:
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """The endpoints that it needs; none for joining."""
+        """The endpoints that the right needs; none for joining."""
         if self.only or not self.right:
             return self.only
         names = dds_names(self.right, self.name)
@@ -82,24 +82,24 @@ class Question:
         return (*published, *read)
 
     def allowed(self, enclave: str) -> Right:
-        """Return the right that a policy would have to state."""
+        """Return the right that a policy must have to allow it."""
         return Right(enclave, ALLOW, self.right, self.name)
 
     def __str__(self) -> str:
-        """As ``call service /add``."""
+        """Return text like ``call service /add``."""
         return f"{self.word} {self.type} {self.name}" if self.right else "join the domain"
 
 
 def ask(word: str, name: str = "", kind: str | None = None) -> Question:
-    """Return the question of the command line, as of ``call /add``.
+    """Return the question for words of the command line such as ``call /add``.
 
     Args:
         word: One of `WORDS`.
         name: An absolute ROS name; "" for joining.
-        kind: What the name is: topic, service or action. Without it, call means a service.
+        kind: The type of the name: topic, service or action. By default, call means a service.
 
     Raises:
-        UsageError: No node can do that, or the name is none that a node could use.
+        UsageError: No node can do that, or no node could use the name.
     """
     if word not in WORDS:
         raise UsageError(
@@ -124,7 +124,7 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
 
 
 def _checked(name: str, word: str, kind: str) -> str:
-    """Return the name, if a node can use it."""
+    """Return the name after checking that a node can use it."""
     if not name:
         raise UsageError(f"{word} needs the name of {_a(kind)}", "", f"Write `{word} /NAME`.")
     problem = expression_problem(name)
@@ -148,7 +148,7 @@ def _a(kind: str) -> str:
 
 
 def _role(topic: str, kind: str) -> str:
-    """Return what a DDS topic is for in a service or action, as ``send_goal requests``."""
+    """Return the role of a DDS topic in a service or action, such as ``send_goal requests``."""
     if kind == "topic":
         return ""
     service, begin = service_of(topic)

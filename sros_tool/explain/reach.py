@@ -1,12 +1,12 @@
-"""The reach of an enclave: whom it can influence and learn from, over any number of hops.
+"""The reach of an enclave: the enclaves it can influence and learn from, over several hops.
 
-Whoever publishes a topic influences all who may subscribe to it.  A service carries information in
-both directions: the request to the server, the reply to the client; an action is its services and
-topics.  All of them are DDS topics, and are followed as such.  Where both sides are wildcards,
-there is a hop if they have a name in common that neither side is denied.  Topics that the
-governance leaves open can be written or read by every enclave, whatever its rights.
+An enclave that publishes a topic influences all that may subscribe to it.  A service carries
+information in both directions: the request to the server, the reply to the client; an action
+consists of services and topics.  All of them are DDS topics, and are treated as such.  If both
+sides have wildcards, there is a hop if they share a name that neither side is denied.  Every
+enclave, with any rights, can write or read the topics that the governance leaves open.
 
-Nothing here reads files.
+This module reads no files.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from sros_tool.translate import SERVICE_ENDS, dds_names
 class Unguarded:
     """DDS topics without access control in one direction (publish or subscribe).
 
-    ``topic`` is an expression; ``without`` are the expressions of earlier rules that guard a part
-    of it.
+    ``topic`` is an expression; ``without`` are the expressions of earlier rules that protect a
+    part of it.
     """
 
     direction: str
@@ -40,7 +40,7 @@ class Unguarded:
 
 
 def unguarded(governance: Governance) -> Iterator[Unguarded]:
-    """Yield what anybody may do in any of the domains; the first topic rule that matches holds.
+    """Yield the topics without access control in any domain; the first matching rule applies.
 
     DDS-Security 1.1, 9.4.1.2.6 (topic rules, and enable_read/write_access_control).
     """
@@ -58,7 +58,7 @@ def unguarded(governance: Governance) -> Iterator[Unguarded]:
 
 
 OF_EVERY_NODE = ("/parameter_events",)
-"""Topics that every node publishes and reads: with them, everybody influences everybody."""
+"""Topics of every node: if they counted, every enclave would influence every other one."""
 
 _WRITER_RIGHTS = {
     "rt": ("topics", "publish", ""),
@@ -70,11 +70,11 @@ _WRITER_RIGHTS = {
 
 @dataclass(frozen=True, slots=True)
 class Hop:
-    """Information goes from ``source`` to ``target``, which are enclaves, by one ROS name.
+    """A flow of information from enclave ``source`` to enclave ``target`` by one ROS name.
 
-    ``right`` is what the source does (publish, request, reply; call or execute where the name is
-    of an action), ``kind`` topics, services, actions or dds.  ``name`` is a name that both may use;
-    ``said`` and ``heard`` are the names or wildcards in the rights of source and target.
+    ``right`` is the right of the source (publish, request, reply; call or execute for an action),
+    ``kind`` is topics, services, actions or dds.  ``name`` is a name that both may use; ``said``
+    and ``heard`` are the names or wildcards in the rights of source and target.
     """
 
     source: str
@@ -86,20 +86,20 @@ class Hop:
     heard: str
 
     def __str__(self) -> str:
-        """Return text as ``/a -publish /x-> /b``."""
+        """Return text like ``/a -publish /x-> /b``."""
         return f"{self.source} {self.arrow()}"
 
     def arrow(self) -> str:
-        """Return text as ``-publish /x-> /b``."""
+        """Return text like ``-publish /x-> /b``."""
         return f"-{self.right} {self.name}-> {self.target}"
 
 
 HopPath = tuple[Hop, ...]
-"""Hops, each of which starts at the target of the one before it."""
+"""A chain of hops: each one starts at the target of the previous one."""
 
 
 def path_text(path: HopPath) -> str:
-    """Return text as ``/a -publish /x-> /b -publish /y-> /c``."""
+    """Return text like ``/a -publish /x-> /b -publish /y-> /c``."""
     return " ".join((path[0].source, *(hop.arrow() for hop in path)))
 
 
@@ -117,7 +117,7 @@ class Reach:
 
 @dataclass(frozen=True, slots=True)
 class _Access:
-    """The right of an enclave to DDS topics, without what denials and exceptions take from it."""
+    """The right of an enclave to DDS topics; ``without`` are denied or ignored expressions."""
 
     enclave: str
     topic: str
@@ -125,9 +125,9 @@ class _Access:
 
 
 class _Direction:
-    """The accesses of all enclaves in one direction: all that write, or all that read.
+    """The accesses of all enclaves in one direction: either all writers or all readers.
 
-    They are found by their exact topics, and by the text before their first wildcard.
+    They are indexed by exact topic, or by the text before the first wildcard.
     """
 
     def __init__(self, ends: Iterable[_Access]) -> None:
@@ -144,7 +144,7 @@ class _Direction:
         self._prefixes = sorted(self._wild)
 
     def meeting(self, topic: str) -> Iterator[_Access]:
-        """Yield the accesses that might have a name in common with a topic or wildcard."""
+        """Yield the accesses that may share a name with a topic or wildcard."""
         prefix = literal_prefix(topic)
         if prefix == topic:
             yield from self._exact.get(topic, ())
@@ -169,10 +169,10 @@ _Used = set[tuple[str, tuple[str, ...]]]
 
 
 class Network:
-    """All enclaves of a system, connected by what they may write and read.
+    """All enclaves of a system, connected by the topics that they may write and read.
 
-    ``without`` are topics (ROS names) that do not count.  All enclaves in ``everybody`` may do
-    what is ``unguarded``, whatever the rights say.
+    ``without`` are topics (ROS names) to ignore.  All enclaves in ``everybody`` may use the
+    ``unguarded`` topics, independently of their rights.
     """
 
     def __init__(
@@ -210,11 +210,11 @@ class Network:
         return tuple(sorted({name for side in self._sides.values() for name in side.of}))
 
     def hops(self, enclave: str) -> Iterator[Hop]:
-        """Yield every hop by which information leaves an enclave for another one."""
+        """Yield every hop from an enclave to another one."""
         return self._steps(enclave, True, set(), {enclave})
 
     def reach(self, enclave: str) -> Reach:
-        """Return whom an enclave can influence and learn from over any number of hops."""
+        """Return the enclaves that an enclave can influence and learn from, over several hops."""
         return Reach(enclave, self._search(enclave, True), self._search(enclave, False))
 
     def _search(self, start: str, forward: bool) -> dict[str, HopPath]:
@@ -234,9 +234,9 @@ class Network:
     def _steps(
         self, enclave: str, forward: bool, used: _Used, known: Container[str]
     ) -> Iterator[Hop]:
-        """Yield the hops out of an enclave, or into it, from or to others than the ``known``.
+        """Yield the hops from (``forward``) or to an enclave, except those with ``known`` enclaves.
 
-        Accesses to topics that were ``used`` already lead nowhere new, and are left out.
+        Topics that were ``used`` before cannot reach other enclaves, and are left out.
         """
         directions = ("publish", "subscribe") if forward else ("subscribe", "publish")
         own, others = (self._sides[direction] for direction in directions)
@@ -251,7 +251,7 @@ class Network:
 
 
 def _topics(right: Right) -> Iterator[tuple[str, str]]:
-    """Yield the DDS topics behind a right, each with its direction."""
+    """Yield direction and DDS topic for each topic that a right needs."""
     if right.kind == "dds":
         yield right.right, right.name
         return
@@ -261,7 +261,7 @@ def _topics(right: Right) -> Iterator[tuple[str, str]]:
 
 
 def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
-    """Sort topics of the robot before services, and every node's log last."""
+    """Return a sort key: topics before services, and /rosout last."""
     kind = topic[:3]
     return (
         topic == "rt/rosout",
@@ -273,7 +273,7 @@ def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
 
 
 def _shared(one: _Access, other: _Access) -> str:
-    """Return a DDS topic that both may use, or ""."""
+    """Return a DDS topic that both accesses allow, or ""."""
     if not overlap(one.topic, other.topic):
         return ""
     exact = next((end.topic for end in (one, other) if not is_expression(end.topic)), "")
@@ -286,7 +286,7 @@ def _shared(one: _Access, other: _Access) -> str:
 @lru_cache(maxsize=4096)
 def _shared_by_wildcards(one: str, other: str, outside: tuple[str, ...]) -> str:
     for prefix, (_, _, end) in _WRITER_RIGHTS.items():
-        # In ROS terms first, so that the name is one that a node could have.
+        # In ROS terms first, so that the result is a valid ROS name.
         inner = [_ros_part(each, prefix, end) for each in (one, other)]
         outer = [_ros_part(each, prefix, end) for each in outside]
         name = common_name(inner, filter(None, outer)) if all(inner) else ""
@@ -297,7 +297,7 @@ def _shared_by_wildcards(one: str, other: str, outside: tuple[str, ...]) -> str:
 
 
 def _ros_part(topic: str, prefix: str, end: str) -> str:
-    """Return the ROS name or wildcard within a DDS expression of one kind, or "" without one."""
+    """Return the ROS name or wildcard in a DDS expression with this prefix and suffix, or ""."""
     if topic == "*":
         return "*"
     if topic.startswith(prefix + "/") and topic.endswith(end):
@@ -306,7 +306,7 @@ def _ros_part(topic: str, prefix: str, end: str) -> str:
 
 
 def _in_ros_terms(topic: str) -> tuple[str, str, str]:
-    """Return the kind, the right of the writer and the ROS name of a DDS topic or expression."""
+    """Return kind, right of the writer, and ROS name for a DDS topic or expression."""
     kind, right, end = _WRITER_RIGHTS.get(topic[:2], ("", "", ""))
     name = _ros_part(topic, topic[:2], end) if kind else ""
     if not name.startswith("/"):

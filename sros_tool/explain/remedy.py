@@ -1,6 +1,6 @@
-"""What to do where it is not the policy that keeps an enclave out, by its fault.
+"""Remedies for faults of an enclave, where the cause is not the policy.
 
-A command in a remedy is one that runs on a keystore with that fault, and mends it.
+A command in a remedy works on a keystore with that fault, and repairs it.
 """
 
 from __future__ import annotations
@@ -45,27 +45,27 @@ _BY_REASON: dict[str, str | Fault] = {
     "invalid-name": "Use a name of letters, digits, '_' and '/'.",
     "partition": "Leave partitions out of permissions; sros never writes them.",
 }
-"""The reasons of decisions that are no right of the policy: the fault they come from, or a text."""
+"""Faults or texts, by the reasons of decisions that do not come from rights of the policy."""
 
 _SHARED = {
     GOVERNANCE_FILE: GOVERNANCE_P7S,
     IDENTITY_CA_FILE: ca_certificate(IDENTITY),
     PERMISSIONS_CA_FILE: ca_certificate(PERMISSIONS),
 }
-"""Files of an enclave that are links to those of the keystore, unless somebody replaced them."""
+"""Files of an enclave that are normally links to files of the keystore."""
 _NOT_IN_THE_FILE = (Fault.CA_NOT_YET_VALID, Fault.FILE_UNREADABLE)
 _OF_GOVERNANCE = (Fault.GOVERNANCE_MALFORMED, Fault.GOVERNANCE_DOMAIN)
 
 
 def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
-    """Return what to do about ``cause``, or "" where only the policy can help.
+    """Return the remedy for ``cause``, or "" if only a change of the policy can help.
 
     Args:
         cause: a fault of the enclave's files, its id, or the reason of a decision.
-        root: the keystore, or "". One without the keys of the CAs, on a robot, can only be mended
-            where they are.
+        root: the keystore, or "". An exported keystore, without the keys of the CAs, can only be
+            repaired in the keystore that has them.
         enclave: the name of the enclave.
-        file: the enclave's file that has the fault, where known.
+        file: the enclave's file that has the fault, if known.
     """
     found = cause if isinstance(cause, Fault) else FAULTS.get(cause, _BY_REASON.get(cause, ""))
     fault, text = (found, "") if isinstance(found, Fault) else (None, found)
@@ -91,12 +91,12 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
 
 def _filled(text: str, root: str, enclave: str, file: str) -> str:
     path = enclave_path(Path(root), enclave) / (file or "cert.pem")
-    # What is copied into a shell must not become another command there.
+    # Quoted, so that text copied into a shell cannot become another command.
     return text.format(root=quote(root), enclave=quote(enclave), path=quote(str(path)))
 
 
 def _is_own_copy(keystore: Path, enclave: str, file: str) -> bool:
-    """Whether an enclave has a file of its own where a link to the keystore's should be."""
+    """Return whether an enclave has a copy of a file instead of a link to the keystore's."""
     own, common = enclave_path(keystore, enclave) / file, keystore / _SHARED.get(file, "")
     return file in _SHARED and own.is_file() and common.is_file() and not own.samefile(common)
 
@@ -109,10 +109,10 @@ def _is_rotating(keystore: Path) -> bool:
 
 
 def _has_authorities(keystore: Path) -> bool:
-    """Whether it is the keystore at home, and no export, nor the folder of an enclave."""
+    """Return whether it is the original keystore, not an export or the folder of an enclave."""
     return (keystore / PRIVATE).is_dir() or (keystore / LEDGER).is_file()
 
 
 def _known_causes() -> frozenset[str]:
-    """Return the ids of the faults and the reasons of decisions for which there is a remedy."""
+    """Return the fault ids and decision reasons that have a remedy."""
     return frozenset((*FAULTS, *_BY_REASON))

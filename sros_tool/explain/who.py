@@ -1,4 +1,4 @@
-"""The question the other way round: which enclaves of a keystore may do something with a name."""
+"""Find the enclaves of a keystore that may do something with a ROS name."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from sros_tool.parallel import map_slices
 
 @dataclass(frozen=True, slots=True)
 class EnclaveOutcome:
-    """What one enclave may do: the outcome, why, and by which expression of its permissions."""
+    """The outcome for one enclave, with the reason and the expression of its permissions."""
 
     enclave: str
     outcome: Outcome
@@ -43,8 +43,8 @@ def who(
 ) -> tuple[EnclaveOutcome, ...]:
     """Return the outcome of a question for every enclave of a keystore, sorted by name.
 
-    ``context`` gives where the question is asked of an enclave that is made for these domains;
-    ``at`` is the moment at which the files are checked.
+    ``context`` gives domain and time for an enclave by its domains; ``at`` is the time at which
+    the files are checked.
     """
 
     def work(names: Sequence[str]) -> list[EnclaveOutcome]:

@@ -1,1 +1,1 @@
-"""The live ROS graph: observe it, and learn from it the policy under which the robot works."""
+"""The live ROS graph: observe it, and learn the policy that the robot needs."""

@@ -1,6 +1,6 @@
 """Write a learned policy: as a new file, or as additions to an existing one.
 
-Names need no escaping: what is learned are plain ROS names, of which nothing is markup.
+Names need no escaping: only plain ROS names are learned, and those contain no markup.
 """
 
 from __future__ import annotations
@@ -33,10 +33,11 @@ _HEADER = """\
 
 @dataclass(frozen=True, slots=True)
 class Draft:
-    """A change before it is written: the policy ``path``, and ``copies`` next to it.
+    """A change of the policy at ``path`` that is not written yet.
 
-    ``before`` is the present content of the policy, or None; ``copies`` are paths relative to the
-    folder of the policy.  The rights of ``document`` lie between ``least`` and ``most``.
+    ``before`` is the present content of the policy, None if there is no file; ``document`` is the
+    new content.  ``copies`` are files to create, by their paths relative to the policy's folder.
+    ``document`` must have all rights in ``least`` and none outside of ``most``.
     """
 
     path: Path
@@ -50,15 +51,15 @@ class Draft:
 
     @property
     def changes(self) -> bool:
-        """Whether anything would change."""
+        """Whether writing the draft would change the policy."""
         return self.document != self.before
 
 
 def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
     """Return how ``learned`` changes the policy file at ``path``; nothing is written.
 
-    ``common`` are the parts with which it was learned (None: one file without includes).  Raises
-    `PolicyError` (or another `DocumentError`) where the file is no policy, or nothing can be
+    ``common`` are the parts that ``learned`` may include (None: one file without includes).  Raises
+    `PolicyError` (or another `DocumentError`) if the file is not a policy, or if nothing can be
     added to it.
     """
     additions = learned.policy()
@@ -90,9 +91,9 @@ def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
 def _parted(
     path: Path, before: bytes, merged: bytes, learned: Learned, common: CommonParts
 ) -> tuple[Learned, list[LearnedProfile]]:
-    """Return what is written name by name, and the profiles that get includes.
+    """Return the rights to write name by name, and the profiles that get includes.
 
-    An existing profile gets an include only if it has, and is denied, none of its rights.
+    An existing profile gets an include only if it neither has nor denies any right of the include.
     """
     known = _profiles_of(path, before)
     rules = Rules(policy_rights(read_policy(path, merged)))
@@ -121,7 +122,7 @@ def _parted(
 def write(plan: Draft) -> None:
     """Write a draft; a failure leaves every file as it was.
 
-    Raises `PolicyError` if the result, read again, would not say what it should.
+    Raises `PolicyError` if the new policy, read again, would not have the expected rights.
     """
     if not plan.changes:
         return
@@ -152,7 +153,7 @@ def _check(plan: Draft) -> None:
 
 
 def _put_new(path: Path, data: bytes) -> list[Path]:
-    """Create a file with its missing folders; return all that was made, the folders first."""
+    """Create a file with its missing folders; return the created paths, folders first."""
     made = [each for each in reversed(path.parents) if not each.exists()]
     path.parent.mkdir(parents=True, exist_ok=True)
     replace_file(path, data)
@@ -163,7 +164,7 @@ def _put_new(path: Path, data: bytes) -> list[Path]:
 
 
 def render(profiles: Iterable[LearnedProfile]) -> bytes:
-    """Return a policy file with these sorted profiles; the same for the same profiles."""
+    """Return a policy file with these sorted profiles; the same profiles give the same bytes."""
     profiles = tuple(profiles)
     declared = f' xmlns:xi="{_XINCLUDE}"' if any(each.includes for each in profiles) else ""
     lines = [f'<policy version="{VERSION}"{declared}>', "  <enclaves>"]
@@ -179,7 +180,7 @@ def render(profiles: Iterable[LearnedProfile]) -> bytes:
 
 
 def _content(profile: LearnedProfile, include: str, unit: str) -> Iterator[str]:
-    """Yield the lines in a profile; ``include`` is the tag of an include."""
+    """Yield the lines inside a profile; ``include`` is the tag name of an include element."""
     yield from _includes(profile, include)
     for group in profile.groups:
         item = group.kind.removesuffix("s")
@@ -197,10 +198,10 @@ def _includes(profile: LearnedProfile, include: str) -> Iterator[str]:
 def _with_includes(
     path: Path, before: bytes, merged: bytes, profiles: Iterable[LearnedProfile]
 ) -> tuple[bytes, tuple[str, ...]]:
-    """Return ``merged`` (the file ``before`` with learned rights) with includes, and those parts.
+    """Return ``merged`` (``before`` with the learned rights) with includes, and the included parts.
 
-    A new profile of which the policy denies something stays as the merge left it; one that
-    ``before`` had gets its includes in front of its content.
+    A profile that ``before`` already had gets its includes in front of its content.  A new profile
+    gets none if the policy denies one of its rights.
     """
     name = f"the policy file '{path}'"
     known = _profiles(EditedText(before, name))
@@ -235,12 +236,12 @@ def _profiles(text: EditedText) -> dict[tuple[str, str, str], PlacedElement]:
 
 
 def _profiles_of(path: Path, document: bytes) -> frozenset[tuple[str, str, str]]:
-    """Return the enclave, namespace and node of each profile in the file itself."""
+    """Return enclave, namespace and node of each profile in the file, without its includes."""
     return frozenset(_profiles(EditedText(document, f"the policy file '{path}'")))
 
 
 def _in_front(profile: LearnedProfile, element: PlacedElement, text: EditedText) -> str:
-    """Return the includes of a profile as text, to put before its content."""
+    """Return the includes of a profile as text to insert before its content."""
     include = f"{_prefix(text) or 'xi'}:include"
     outer = text.indent_of(element)
     lead = "" if outer is None else text.newline + outer + text.unit
@@ -258,5 +259,5 @@ def _inside(profile: LearnedProfile, element: PlacedElement, text: EditedText) -
 
 
 def _prefix(text: EditedText) -> str | None:
-    """Return the prefix of the namespace of includes; None if there is none, and xi is free."""
+    """Return the prefix of the XInclude namespace; None if the document declares none."""
     return next((p for p, uri in text.root.xml.nsmap.items() if p and uri == _XINCLUDE), None)

@@ -1,10 +1,10 @@
 """Learn a policy from an observation of the ROS graph.
 
-Names come over the network, and on an unsecured robot from anybody: whatever is no plain ROS name
-is left out, above all a topic that is *named* like a wildcard.  The policy writes names relative
-where that is shorter, with ``*`` for the part of a node's name that changes with every start.  A
-common part is included only where the node has every right in it, so that an include grants
-nothing that was not seen.
+Names come over the network; on an unsecured robot, anybody can send them.  So every name that is
+not a plain ROS name is left out, above all a topic that is *named* like a wildcard.  The policy
+uses relative names where they are shorter, and ``*`` for the part of a node's name that changes
+with every start.  A common part is included only if the node has every right in it, so that an
+include never grants more than was seen.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class NodeRight:
 
 @dataclass(frozen=True, slots=True)
 class LearnedProfile:
-    """A node's rights: by includes, and the rest in groups; ``rights`` are all, absolute."""
+    """The rights of a node: ``rights`` (all, absolute) as includes and, for the rest, groups."""
 
     enclave: str
     ns: str
@@ -61,11 +61,11 @@ class Learned:
 
     @property
     def includes(self) -> tuple[str, ...]:
-        """Return every part that is included, sorted."""
+        """The common parts that the profiles include, sorted."""
         return tuple(sorted({each for profile in self.profiles for each in profile.includes}))
 
     def flat(self) -> Learned:
-        """Return the same without includes."""
+        """Return the same rights without includes."""
         profiles = (
             replace(each, includes=(), groups=groups_of(each.rights, each.ns, each.node))
             for each in self.profiles
@@ -73,7 +73,7 @@ class Learned:
         return replace(self, profiles=tuple(profiles))
 
     def policy(self) -> Policy:
-        """Return everything as a policy without includes."""
+        """Return the learned rights as a policy without includes."""
         enclaves: dict[str, list[Profile]] = {}
         for each in self.profiles:
             groups = groups_of(each.rights, each.ns, each.node)
@@ -87,9 +87,9 @@ _Place = tuple[str, str, str]
 
 
 def learn(observation: Observation, common: CommonParts | None = None) -> Learned:
-    """Return the least policy for an observation; ``common`` are the parts that it may include.
+    """Return the smallest policy for an observation; ``common`` are the parts it may include.
 
-    A node that can be in one of several enclaves gets its rights in each of them, and a note.
+    If the enclave of a node is ambiguous, every possible enclave gets its rights, with a note.
     """
     notes = _Notes()
     seen: dict[_Place, set[NodeRight]] = {}
@@ -120,7 +120,7 @@ def learn(observation: Observation, common: CommonParts | None = None) -> Learne
 
 
 def _rights_of(node: ObservedNode, notes: _Notes) -> list[tuple[_Place, frozenset[NodeRight]]]:
-    """Return the rights of a node, for each enclave that it can be in."""
+    """Return the rights of a node, once for each enclave that it may run in."""
     if not node.enclaves:
         notes.add("unknown-enclave", node.fqn)
         return []
@@ -184,8 +184,8 @@ def _is_place(ns: str, name: str) -> bool:
 class Folded:
     """The rights behind a set of endpoints.
 
-    ``halves`` are endpoints of services whose other half is missing; ``foreign`` are topics that
-    have no ROS name.  A policy can express neither.
+    ``halves`` are service endpoints without the matching request or reply endpoint; ``foreign``
+    are topics that have no ROS name.  A policy can express neither.
     """
 
     rights: frozenset[NodeRight]
@@ -197,7 +197,7 @@ _ANY_DOMAIN = DomainSet.of((0, 0))
 
 
 def fold(endpoints: Iterable[Endpoint]) -> Folded:
-    """Return the rights behind endpoints: actions and services where all their topics are there."""
+    """Return the rights behind endpoints; complete sets of topics become services or actions."""
     endpoints = tuple(endpoints)
     rule = Rule(True, _ANY_DOMAIN, _criteria(endpoints, PUBLISH), _criteria(endpoints, SUBSCRIBE))
     rights, halves, foreign = set(), set(), set()
@@ -217,7 +217,7 @@ def _criteria(endpoints: Iterable[Endpoint], direction: str) -> tuple[Criteria, 
 
 
 def groups_of(rights: Iterable[NodeRight], ns: str, node: str) -> tuple[Group, ...]:
-    """Return groups of one right each, in the order of the policy language, with sorted names."""
+    """Return one group per right, in the order of the policy language, with sorted names."""
     rights = tuple(rights)
     groups = []
     for kind, both in RIGHTS.items():
@@ -232,7 +232,7 @@ def groups_of(rights: Iterable[NodeRight], ns: str, node: str) -> tuple[Group, .
 
 
 _CHANGING = (
-    # tf2_ros names the node of a listener by its address; the others by their process.
+    # tf2_ros puts a memory address into the name of a listener's node; the others a process id.
     (re.compile(r"(transform_listener_impl_)[0-9a-f]+\Z"), r"\1*"),
     (re.compile(r"(launch_ros_)[0-9]+\Z"), r"\1*"),
     (re.compile(r"(rqt_gui_(?:py|cpp)_node_)[0-9]+\Z"), r"\1*"),
@@ -241,16 +241,16 @@ _TOOLS = re.compile(r"_ros2cli(_.*)?\Z|_sros_observer\Z")
 _ABSOLUTE = frozenset(
     ("/bond", "/clock", "/diagnostics", "/parameter_events", "/rosout", "/tf", "/tf_static")
 )
-"""Names that packages write with a leading slash, so that a namespace does not change them."""
+"""Names that packages use with a leading slash, so that they stay the same in any namespace."""
 
 
 def is_tool(name: str) -> bool:
-    """Return whether a node belongs to a tool that looks at the robot, and is no part of it."""
+    """Return whether a node belongs to a tool that observes the robot."""
     return _TOOLS.match(name) is not None
 
 
 def stable_name(name: str) -> str:
-    """Return the name of a node, with ``*`` for the part that changes each time it starts."""
+    """Return a node's name with ``*`` for the part that changes with every start."""
     for pattern, stable in _CHANGING:
         if pattern.match(name):
             return pattern.sub(stable, name)
@@ -258,10 +258,11 @@ def stable_name(name: str) -> str:
 
 
 def written(fqn: str, ns: str, node: str) -> str:
-    """Return an absolute name as the profile of ``node`` in ``ns`` writes it; undone by `expand`.
+    """Return an absolute name in the form for the profile of ``node`` in ``ns``.
 
-    ``~/x`` for the node's own names, ``x`` for names in its namespace, ``/x`` for the rest.  In
-    the root namespace only names directly in it are relative, as deeper ones belong to others.
+    ``~/x`` for the node's private names, ``x`` for names in its namespace, ``/x`` for the rest.  In
+    the root namespace only names without a further slash become relative: deeper ones belong to
+    other namespaces.  The inverse is `expand`.
     """
     own = expand("~/", ns, node)
     if fqn.startswith(own):
@@ -297,8 +298,8 @@ PARTS = (
 class CommonParts:
     """The parts that a policy can include.
 
-    ``rights`` are the rights of each part, with names as it writes them; ``missing`` are the files
-    to copy for a part: their paths relative to the folder of the policy, and their content.
+    ``rights`` are the rights of each part, with names as written there; ``missing`` are the files
+    to copy for each part: their content by path, relative to the folder of the policy.
     """
 
     rights: Mapping[str, frozenset[NodeRight]] = field(default_factory=dict)
@@ -307,7 +308,7 @@ class CommonParts:
     def choose(
         self, rights: frozenset[NodeRight], ns: str, node: str
     ) -> tuple[tuple[str, ...], frozenset[NodeRight]]:
-        """Return the parts for a node with these absolute rights, and the remaining rights."""
+        """Return the parts to include for these absolute rights, and the rights that remain."""
         chosen, rest = [], rights
         for part, names in self.rights.items():
             given = _expanded(names, ns, node)
@@ -317,18 +318,19 @@ class CommonParts:
         return tuple(chosen), rest
 
     def given(self, parts: Iterable[str], ns: str, node: str) -> frozenset[NodeRight]:
-        """Return the rights that these parts give to a node, by absolute names."""
+        """Return the rights that these parts give to a node, with absolute names."""
         return frozenset().union(*(_expanded(self.rights[part], ns, node) for part in parts))
 
     def to_copy(self, parts: Iterable[str]) -> dict[str, bytes]:
-        """Return the files that these parts need and that the folder of the policy lacks."""
+        """Return the files that these parts need and that are missing next to the policy."""
         return {path: data for part in parts for path, data in self.missing[part].items()}
 
 
 def common_parts(folder: Path, shipped: Path) -> CommonParts:
     """Return the parts that a policy in ``folder`` can include, from there or from ``shipped``.
 
-    A file of the user is used as it is; a shipped part that would silently mix with it is left out.
+    A file in ``folder`` has priority; a shipped part that needs a different version of it is left
+    out, so that the two never mix silently.
     """
     rights, missing = {}, {}
     for part in PARTS:
@@ -358,7 +360,7 @@ def _differs(folder: Path, path: str, needed: Mapping[str, bytes]) -> bool:
 
 
 def _part_rights(root: Path, part: str) -> frozenset[NodeRight] | None:
-    """Return the rights in a part; None if it cannot be read, or denies something."""
+    """Return the rights in a part, or None if it cannot be read or denies something."""
     includer = Includer(root.resolve())
     file = (root / part).resolve()
     rights = set()
@@ -374,7 +376,7 @@ def _part_rights(root: Path, part: str) -> frozenset[NodeRight] | None:
 
 
 def _needed_files(root: Path, part: str) -> dict[str, bytes]:
-    """Return a shipped part and everything that it includes: path below ``root``, content."""
+    """Return the content of a part and of all its includes, by path relative to ``root``."""
     found: dict[str, bytes] = {}
     waiting = [(root / part).resolve()]
     includer = Includer(root.resolve())
@@ -400,34 +402,33 @@ _TEXTS = {
     "ambiguous": "the graph does not show in which enclave each of these nodes of the same name "
     "runs, so all of these enclaves get their rights; start them one at a time under --watch to "
     "distinguish them: {}",
-    "changing-name": "nodes that get another name each time they start have a profile with a "
-    "wildcard: {}",
+    "changing-name": "nodes whose name changes with every start have a profile with a wildcard: {}",
     "half-service": "left out, as only one half of a service was seen (look again with a longer "
     "--spin-time): {}",
-    "no-ros-name": "left out, as a policy has no words for topics outside of ROS's naming: {}",
-    "odd-name": "left out, as these are not names that ROS gives; somebody may be trying to get a "
+    "no-ros-name": "left out, as a policy cannot name topics that have no ROS name: {}",
+    "odd-name": "left out, as these are not valid ROS names; somebody may be trying to get a "
     "wildcard into your policy: {}",
     "odd-node": "left out, as no policy can name these nodes or their enclaves: {}",
     "partial-action": "only parts of an action are used, so they are listed as "
     "topics and services: {}",
     "root-enclave": "all {} nodes run in the enclave /, and share all rights; start each process "
     "with `--ros-args --enclave /its/name` and learn again to distinguish them",
-    "service-event": "service introspection is on: what these services are asked is readable by "
-    "every subscriber; take the topics out if that is for debugging only: {}",
+    "service-event": "service introspection is on: every subscriber of these topics can read the "
+    "requests; remove the topics from the policy if that is for debugging only: {}",
     "sets-clock": "may set the clock of every node that uses simulated time; meant for a simulator "
     "or a player: {}",
     "silent": "left out, as they were announced but had no endpoint: {}",
     "stray": "left out, as the writers or readers of these topics belong to no ROS node: {}",
     "unknown-enclave": "left out, as the graph does not show in which enclaves these nodes run: "
-    "theirs was set by ROS_SECURITY_ENCLAVE_OVERRIDE, and the observer's keystore has no "
-    "certificate of theirs; observe with the keystore that has their enclaves (--keystore), or "
+    "it was set by ROS_SECURITY_ENCLAVE_OVERRIDE, and the observer's keystore has no "
+    "certificate for it; observe with the keystore that has their enclaves (--keystore), or "
     "start them with `--ros-args --enclave /its/name`: {}",
-    "tool": "left out, as they are tools that look at the robot: {}",
+    "tool": "left out, as they are tools that observe the robot: {}",
 }
 
 
 class _Notes:
-    """The subjects of each kind of note, for one note of each kind."""
+    """A collector of subjects (nodes, topics), which makes one note of each kind."""
 
     def __init__(self) -> None:
         self._found: dict[str, set[str]] = {}
@@ -453,7 +454,7 @@ _EVERY_NODE = "common/node.xml"
 
 
 class News:
-    """The nodes and rights reported so far; rights that every node needs are not reported."""
+    """The nodes and rights reported so far, without the rights that every node needs."""
 
     def __init__(self, common: CommonParts) -> None:
         self._ordinary = common.rights.get(_EVERY_NODE, frozenset[NodeRight]())

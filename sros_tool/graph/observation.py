@@ -1,7 +1,7 @@
-"""What was seen of a ROS graph: nodes with their DDS endpoints, and the union of several looks.
+"""Observations of a ROS graph: nodes with their DDS endpoints, and the union of observations.
 
-Topics stand here by their raw DDS names (``rt/chatter``, ``rq/addRequest``), for only those tell
-everything apart; `sros_tool.graph.learn` says them in ROS terms.
+Topics have their raw DDS names here (``rt/chatter``, ``rq/addRequest``), because only those are
+unambiguous; `sros_tool.graph.learn` translates them to ROS names.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ class Endpoint:
 class ObservedNode:
     """A node of one process.
 
-    ``enclaves`` is the enclave of that process; several, sorted, where the graph does not tell
+    ``enclaves`` holds the enclave of that process; several, sorted, if the graph does not show
     which of them it is.  ``participant`` is the first 12 bytes of its endpoints' identifiers, in
-    hex (RTPS 2.3, 8.2.4.1): the same for all nodes of a process, and of no other process.
+    hex (RTPS 2.3, 8.2.4.1): the same for all nodes of a process, different for each process.
     """
 
     enclaves: tuple[str, ...]
@@ -44,11 +44,11 @@ class ObservedNode:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """The nodes of a graph, sorted, and what belongs to none of them.
+    """The nodes of a graph, sorted, and the endpoints that belong to none of them.
 
-    ``silent`` are nodes (enclave, namespace, name) that were announced and had no endpoint.
-    ``strays`` are endpoints of a participant that no node claims: of programs without ROS, or of
-    a node that was only half discovered.
+    ``silent`` are nodes (enclave, namespace, name) that were announced but had no endpoint.
+    ``strays`` are endpoints without a node: of a program that does not use ROS, or of a node
+    that was not discovered completely.
     """
 
     nodes: tuple[ObservedNode, ...] = ()
@@ -57,14 +57,14 @@ class Observation:
 
     @property
     def endpoint_count(self) -> int:
-        """How many endpoints all nodes have together."""
+        """The number of endpoints of all nodes together."""
         return sum(len(node.endpoints) for node in self.nodes)
 
     def union(self, other: Observation) -> Observation:
-        """Everything that either of the two has seen.
+        """Return everything that is in either of the two observations.
 
-        What one look left open, another may tell: a process stays in one enclave, so only the
-        enclaves that both looks allow remain for it.
+        A process never changes its enclave, so only the enclaves remain that are possible in both
+        observations.
         """
         enclaves: dict[str, tuple[str, ...]] = {}
         endpoints: dict[tuple[str, str, str], frozenset[Endpoint]] = {}
@@ -92,12 +92,12 @@ def make_observation(
     silent: Iterable[tuple[str, str, str]] = (),
     strays: Iterable[tuple[str, Endpoint]] = (),
 ) -> Observation:
-    """An observation of these nodes, sorted."""
+    """Return an observation of these nodes, sorted."""
     return Observation(tuple(sorted(nodes)), frozenset(silent), frozenset(strays))
 
 
 def to_json(observation: Observation) -> dict[str, Any]:
-    """The nodes as JSON; `from_json` gives them back."""
+    """Return the nodes of an observation as JSON, for `from_json`."""
     return {
         "nodes": [
             {
@@ -114,7 +114,7 @@ def to_json(observation: Observation) -> dict[str, Any]:
 
 
 def from_json(value: Mapping[str, Any]) -> Observation:
-    """The observation that `to_json` has written."""
+    """Return the observation in JSON that `to_json` has made."""
     return make_observation(
         ObservedNode(
             tuple(node["enclaves"]),

@@ -1,15 +1,16 @@
 """Observe the live ROS graph: through rclpy, for how long, and in which enclave each node runs.
 
-`RosGraph` looks by rclpy in a process of its own (`sros_tool.graph.observer`); `settle`, `look_for`
-and `watch` decide for how long.  Times are in seconds; clock and source are passed in.
+`RosGraph` runs rclpy in a separate process (`sros_tool.graph.observer`); `settle`, `look_for` and
+`watch` decide for how long.  Times are in seconds; clock and source are passed in.
 
-rclpy lists nodes with their enclaves, but without their processes; and endpoints with the names
-of their nodes and with their participants (processes), but without enclaves.  Where nodes of the
-same name run in several enclaves, `resolve` brings the two lists together.
+rclpy lists nodes with their enclaves, but without their processes; it lists endpoints with the
+names of their nodes and with their participants (processes), but without enclaves.  `resolve`
+combines the two lists, also if nodes of the same name run in several enclaves.
 
-The graph shows the enclave of ``--ros-args --enclave``, and "/" for a process that has it from
-ROS_SECURITY_ENCLAVE_OVERRIDE.  But a secured participant's identifier begins with a digest of the
-subject of its certificate (DDS-Security 1.1, 9.3.3), which its peers check; `identified` uses it.
+The graph shows the enclave of ``--ros-args --enclave``, but "/" for a process whose enclave comes
+from ROS_SECURITY_ENCLAVE_OVERRIDE.  The identifier of a secured participant, however, begins with
+a digest of its certificate's subject (DDS-Security 1.1, 9.3.3), which its peers check;
+`identified` uses that digest.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, mak
 
 _LOG = logging.getLogger(__name__)
 _PERIOD_SECONDS = 0.1
-"""How often the graph is looked at; a node that lives for a second is seen several times."""
+"""Time between two looks at the graph; a node that lives for a second is seen several times."""
 _START_SECONDS = 30.0
 _END_SECONDS = 3.0
 
@@ -49,7 +50,7 @@ class GraphSource(Protocol):
 
 
 class ObserverError(UnavailableError):
-    """The observer could not look: ``reason`` and ``output`` say what rclpy and the DDS said."""
+    """A failure of the observer: ``reason`` is from rclpy, ``output`` is what the DDS printed."""
 
     def __init__(self, what: str, reason: str, output: str) -> None:
         super().__init__(what, reason)
@@ -58,11 +59,11 @@ class ObserverError(UnavailableError):
 
 
 class RosGraph:
-    """The ROS graph as it is from now on; use as a context manager.
+    """The live ROS graph, observed by a child process; use it as a context manager.
 
-    ``environment`` is added to that of this process: the domain, and the enclave if the observer
-    is to be secured.  Raises `UnavailableError` without rclpy, and `ObserverError` where rclpy
-    cannot start a node.
+    ``environment`` are additional variables for that process: the domain, and the enclave if the
+    observer shall be secured.  Raises `UnavailableError` without rclpy, and `ObserverError` if
+    rclpy cannot start a node.
     """
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
@@ -75,7 +76,7 @@ class RosGraph:
         self._output = tempfile.TemporaryFile()
         try:
             self._process = subprocess.Popen(
-                # -P: what lies in the present folder is not what shall be imported.
+                # -P: never import modules from the current folder.
                 [
                     *(sys.executable, "-P", "-m", "sros_tool.graph.observer"),
                     *(str(write_end), str(_PERIOD_SECONDS)),
@@ -85,7 +86,7 @@ class RosGraph:
                 stderr=subprocess.STDOUT,
                 pass_fds=[write_end],
                 env=self._environment,
-                process_group=0,  # Ctrl-C is for this process, which then ends the other one
+                process_group=0,  # Ctrl-C reaches this process only, which then ends the observer
             )
         except BaseException:
             os.close(read_end)
@@ -126,7 +127,7 @@ class RosGraph:
         return resolve(Sighting(_parse_listed(line["listed"]), endpoints, line["ordered"]))
 
     def close(self) -> None:
-        """End the observer, politely first, so that the graph forgets it at once."""
+        """End the observer; first by closing its input, so that it leaves the graph properly."""
         if self._process.stdin:
             self._process.stdin.close()
         try:
@@ -138,7 +139,7 @@ class RosGraph:
         self._output.close()
 
     def _line(self, seconds: float) -> dict[str, Any] | None:
-        """Return the next line of the observer, or None after ``seconds``."""
+        """Return the next line of the observer, or None if none comes within ``seconds``."""
         deadline = time.monotonic() + seconds
         with selectors.DefaultSelector() as selector:
             selector.register(self._report, selectors.EVENT_READ)
@@ -199,10 +200,12 @@ _TICK = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Settling:
-    """When a graph counts as complete: after ``least``, unchanged for ``still``, or after ``most``.
+    """The rule when a graph counts as complete.
 
-    Fast DDS announces its participants every 3 s after a first burst, some of which gets lost when
-    there are many: half a robot was seen to stand still from 0.4 to 3.4 s.
+    It does after ``least`` seconds, once it has not changed for ``still`` seconds, but at the
+    latest after ``most`` seconds.  Fast DDS announces its participants in a first burst, and then
+    every 3 s.  With many participants, parts of the burst get lost: a graph of half a robot was
+    seen not to change from 0.4 to 3.4 s.
     """
 
     least: float = 4.0
@@ -216,7 +219,7 @@ SECURED = Settling(least=6.0, still=5.0, most=45.0)
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """The graph at the end of a look, the seconds it took, and whether it had stopped changing."""
+    """A graph, the seconds it took to observe, and whether the graph had stopped changing."""
 
     observation: Observation
     seconds: float
@@ -239,7 +242,7 @@ def settle(source: GraphSource, settling: Settling, clock: Clock) -> Snapshot:
 
 
 def look_for(source: GraphSource, seconds: float, clock: Clock) -> Snapshot:
-    """Return the graph as it is after exactly so many seconds."""
+    """Return the graph after exactly ``seconds`` seconds."""
     begin = clock()
     seen = Observation()
     while (left := begin + seconds - clock()) > 0:
@@ -257,10 +260,10 @@ def watch(
     still: float = 0.5,
     patience: float = 2.0,
 ) -> Snapshot:
-    """Return the union of everything seen in so many seconds (None: forever), or until ``stop()``.
+    """Return the union of everything seen in ``seconds`` (None: no limit), or until ``stop()``.
 
-    ``report`` gets the union whenever it has grown and then not changed for ``still`` seconds, so
-    that a half discovered node is not reported; it waits no longer than ``patience``.
+    ``report`` gets the union each time it has grown and then not changed for ``still`` seconds, so
+    that no incompletely discovered node is reported; but at most ``patience`` seconds later.
     """
     begin = clock()
     union = reported = Observation()
@@ -286,7 +289,7 @@ def watch(
 
 
 Listed = tuple[str, str, str]
-"""A node as it is announced: enclave, namespace, name."""
+"""An announced node: enclave, namespace, name."""
 _Name = tuple[str, str]
 # What rmw reports for an endpoint that no announced node claims (rmw_dds_common, graph_cache).
 NOBODY = "_NODE_NAME_UNKNOWN_"
@@ -307,7 +310,7 @@ class Sighting:
 
 
 def resolve(sighting: Sighting) -> Observation:
-    """Return the nodes of a sighting, each with its process and the enclaves that it can be in."""
+    """Return the nodes of a sighting, each with its process and its possible enclaves."""
     found: dict[str, dict[_Name, set[Endpoint]]] = {}
     strays = set()
     for participant, ns, name, endpoint in sighting.endpoints:
@@ -321,7 +324,7 @@ def resolve(sighting: Sighting) -> Observation:
     heard = set()
     for participant, nodes in found.items():
         enclaves = tuple(sorted(candidates[participant]))
-        if not enclaves:  # its announcement is still to come, or was just withdrawn
+        if not enclaves:  # not announced yet, or no longer
             strays |= {(participant, each) for every in nodes.values() for each in every}
             continue
         for (ns, name), endpoints in nodes.items():
@@ -333,7 +336,7 @@ def resolve(sighting: Sighting) -> Observation:
 def _enclaves(
     sighting: Sighting, processes: dict[str, frozenset[_Name]]
 ) -> dict[str, frozenset[str]]:
-    """Return the enclaves that each process can be in, as few as the sighting allows."""
+    """Return the possible enclaves of each process, as few as the sighting allows."""
     free: dict[str, Counter[_Name]] = {}
     for enclave, ns, name in sighting.listed:
         free.setdefault(enclave, Counter())[(ns, name)] += 1
@@ -348,7 +351,7 @@ def _enclaves(
         news = [each for each, left in candidates.items() if len(left) == 1 and each not in settled]
         if not news:
             return candidates
-        # A node that is taken is not there for another process; that may settle further ones.
+        # A listed node that belongs to one process cannot belong to another: that may decide more.
         for each in news:
             settled.add(each)
             (enclave,) = candidates[each]
@@ -366,10 +369,10 @@ def _by_order(
     processes: dict[str, frozenset[_Name]],
     candidates: dict[str, frozenset[str]],
 ) -> dict[str, frozenset[str]]:
-    """Return the candidates narrowed by the order of the list; unchanged if that is in doubt.
+    """Return the candidates narrowed by the order of the list; unchanged if the order is wrong.
 
-    The nth node of a name belongs to the nth participant that has this name, if there are as
-    many nodes as participants of it.
+    The nth listed node of a name belongs to the nth participant with a node of that name, if both
+    are equally many.
     """
     enclaves: dict[_Name, list[str]] = {}
     for enclave, ns, name in listed:
@@ -381,7 +384,7 @@ def _by_order(
             for owner, enclave in zip(owners, places, strict=True):
                 by_owner.setdefault(owner, set()).add(enclave)
     if any(len(each) > 1 or not each <= candidates[owner] for owner, each in by_owner.items()):
-        return candidates  # not the order that was promised
+        return candidates  # the list is not in the documented order
     return {each: frozenset(by_owner.get(each, left)) for each, left in candidates.items()}
 
 
@@ -391,21 +394,21 @@ def _by_order(
 _DIGITS = 12
 _FIRST_BIT = 1 << (4 * _DIGITS - 1)
 _SECURED = tuple("89abcdef")
-"""How identifiers of secured participants begin, in hex: with the first bit set."""
+"""The first hex digits that identifiers of secured participants have: the first bit is set."""
 _DEFAULT_ENCLAVE = ("/",)
 
 
 def identity_of(subject: bytes) -> str:
-    """Return how participants with this certificate subject (DER) begin: 6 bytes, in hex."""
+    """Return the first 6 bytes, in hex, of a participant with this certificate subject (DER)."""
     digest = int(sha256(subject).hexdigest()[:_DIGITS], 16)
     return f"{_FIRST_BIT | digest >> 1:x}"
 
 
 def identified(observation: Observation, enclaves: Mapping[str, str]) -> Observation:
-    """Return the observation with the enclaves by the certificates of its participants.
+    """Return the observation with the enclaves that its participants' certificates show.
 
-    ``enclaves`` are by `identity_of`.  A secured node has none where neither they nor the graph
-    say its enclave.
+    ``enclaves`` maps the result of `identity_of` to an enclave.  A secured node gets no enclave if
+    neither this map nor the graph shows it.
     """
     nodes = []
     for node in observation.nodes:

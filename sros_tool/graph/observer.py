@@ -1,9 +1,9 @@
 """The process that looks at the ROS graph: ``python -P -m sros_tool.graph.observer FD PERIOD``.
 
-It is a process of its own so that the DDS may log to standard output, refuse, or crash, without
-harm to its parent.  Writes JSON, one object a line, to the file descriptor FD: first
-``{"ready": RMW}`` or ``{"failed": STAGE, "reason": TEXT}``, then the graph every time that it has
-changed, looking every PERIOD seconds.  Ends when its standard input does.
+It runs separately, so that the DDS can log to standard output, refuse, or crash without harm to
+its parent.  It writes JSON, one object per line, to the file descriptor FD: first
+``{"ready": RMW}`` or ``{"failed": STAGE, "reason": TEXT}``, then the graph after each change.  It
+looks every PERIOD seconds, and exits when its standard input is closed.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ from typing import Any
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 
 NODE_NAME = "_sros_observer"
-"""The node by which sros looks at a graph; it is hidden, and never part of what was seen."""
+"""The name of the node with which sros observes a graph; it is left out of observations."""
 
 _PREFIX_BYTES = 12  # of an endpoint's identifier: its participant (RTPS 2.3, 9.3.1)
 _DISCOVERY = "ros_discovery_info"
 # These keep their participants sorted by identifier, and list nodes in that order.
 _ORDERED = ("rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp", "rmw_cyclonedds_cpp", "rmw_connextdds")
 _LOG_FLUSH_SECONDS = 0.3
-"""Fast DDS logs from a thread of its own: a process that ends at once loses the reason."""
+"""Time for the logging thread of Fast DDS: a process that exits at once loses the reason."""
 _ATTEMPTS = 5
 
 
 def main() -> int:
-    """Look until standard input ends; return the exit status."""
+    """Report the graph until standard input is closed; return the exit status."""
     report, period = os.fdopen(int(sys.argv[1]), "w", buffering=1), float(sys.argv[2])
     stage = "import"
     try:
@@ -42,7 +42,7 @@ def main() -> int:
         context = rclpy.Context()
         rclpy.init(args=[], context=context, signal_handler_options=SignalHandlerOptions.NO)
         stage = "node"
-        # As few endpoints as a node of rclpy can have: an observer needs few permissions.
+        # With as few endpoints as rclpy allows, so that an observer needs few permissions.
         node = rclpy.create_node(
             NODE_NAME,
             context=context,
@@ -77,7 +77,7 @@ def _look(node: Any, report: Any, period: float, ordered: bool) -> None:
 
 
 def _sight(node: Any) -> tuple[list[Any], list[Any]] | None:
-    """One look, during which no node came or went; None if the graph never held still."""
+    """Return nodes and endpoints that belong together; None if nodes came or went all the time."""
     for _ in range(_ATTEMPTS):
         listed = _listed(node)
         endpoints = _endpoints(node)
@@ -87,13 +87,13 @@ def _sight(node: Any) -> tuple[list[Any], list[Any]] | None:
 
 
 def _listed(node: Any) -> list[tuple[str, str, str]]:
-    """Every node but the observers: enclave, namespace, name; in the order of the middleware."""
+    """Return enclave, namespace and name of each node but observers, in the RMW's order."""
     found = node.get_node_names_and_namespaces_with_enclaves()
     return [(enclave, ns, name) for name, ns, enclave in found if name != NODE_NAME]
 
 
 def _endpoints(node: Any) -> list[tuple[str, str, str, str, str]]:
-    """Every endpoint: participant, namespace and name of its node, DDS topic, direction; sorted."""
+    """Return the sorted endpoints: participant, node namespace and name, topic, direction."""
     found = set()
     for topic, _ in node.get_topic_names_and_types(no_demangle=True):
         if topic == _DISCOVERY:  # every participant has it, and no policy mentions it

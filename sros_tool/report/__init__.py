@@ -1,1 +1,1 @@
-"""Pictures of who may do what: from rights to values, and from values to SVG, DOT, a page."""
+"""Pictures of the rights of enclaves, as SVG, DOT, Mermaid, JSON, or an HTML page."""

@@ -1,8 +1,8 @@
-"""Compose the picture of one source, or of two over each other, from rights and governance.
+"""Compose the picture of one source, or an overlay of two, from rights and governance.
 
-Wildcards become the known names that they match, and denials win over permissions.  Known are the
-exact names that any right of any source has.  An action is shown as one name; a right to some of
-its parts only, such as that of a recorder that subscribes to ``/*``, leads to the action too.
+Wildcards become the known names that they match, and denials override permissions.  Known names
+are the exact names in the rights of all sources.  An action is shown as one name, also for a right
+to only some of its parts, such as the right of a recorder that subscribes to ``/*``.
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ _OVERLAYS = {
     "change": Overlay("change", "removed", "added"),
     "drift": Overlay("drift", "only in the policy", "only in what was signed"),
 }
-"""The meaning of two sources over each other, by the kind of overlay."""
+"""The meaning of each kind of overlay."""
 
 
 @dataclass(frozen=True, slots=True)
 class PictureSource:
-    """What was read of one source.
+    """The content of one source of a picture.
 
-    ``nodes`` are the nodes of each enclave, ``enclaves`` what is known of their certificates;
-    ``scope`` are the enclaves of which the source can speak, None for all.
+    ``nodes`` are the nodes of each enclave, ``enclaves`` describes the enclaves' certificates;
+    ``scope`` are the enclaves that the source can describe, None for all.
     """
 
     origin: SourceTitle
@@ -72,10 +72,10 @@ class PictureSource:
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What is known in addition to the sources.
+    """Information in addition to the sources.
 
-    ``common`` are the rights that every node needs; ``hosts`` says which host an enclave runs on,
-    by the enclave or by the namespace that it is in.
+    ``common`` are the rights that every node needs; ``hosts`` maps an enclave, or the namespace
+    that contains it, to the host that it runs on.
     """
 
     common: Sequence[Right] = ()
@@ -93,7 +93,7 @@ def compose(first: PictureSource, context: Context = Context()) -> Picture:
 def overlay(
     first: PictureSource, second: PictureSource, kind: str, context: Context = Context()
 ) -> Picture:
-    """Return the picture of two sources over each other; ``kind`` is a key of `_OVERLAYS`."""
+    """Return the overlay of two sources; ``kind`` is "use", "change" or "drift"."""
     scope = first.scope if second.scope is None else second.scope
     rights = [
         frozenset(each for each in side.rights if scope is None or each.enclave in scope)
@@ -202,7 +202,7 @@ def _enclaves(
 
 
 def group_of(enclave: str, hosts: Mapping[str, str]) -> str:
-    """Return the host of an enclave if it is known, else the namespace of the enclave."""
+    """Return the host of an enclave, or its namespace if the host is not known."""
     place = enclave
     while place:
         if place in hosts:
@@ -222,8 +222,8 @@ def _namespace_of(name: str) -> str:
 def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) -> list[Edge]:
     """Return the edges of both sides, each marked with its side.
 
-    An edge that both have is by a wildcard only if it is on both sides; with ``allowed_by``, if it
-    is on the first: an observed right always has its exact name.
+    An edge on both sides counts as a wildcard edge only if it is one on both sides.  With
+    ``allowed_by``, the first side alone decides: an observed right always has an exact name.
     """
     sides = [{_identity(edge): edge for edge in side} for side in (first, second)]
     found = []
@@ -240,7 +240,7 @@ def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) 
 
 
 def _neutral(edge: Edge, unseen: frozenset[str]) -> Edge:
-    """Return ``edge`` marked as of both sides if it is a denial or of an ``unseen`` enclave."""
+    """Return ``edge``, marked as on both sides if it is a denial or of an ``unseen`` enclave."""
     neutral = edge.qualifier is not ALLOW or edge.enclave in unseen
     return replace(edge, mark=OverlaySide.BOTH) if neutral else edge
 
@@ -265,9 +265,10 @@ def _changed(first: frozenset[Right], second: frozenset[Right]) -> tuple[Overlay
 
 
 def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
-    """Return what was allowed and never observed (without what every node needs), and vice versa.
+    """Return the rights that were allowed but never observed, and the other way round.
 
-    Names that wildcards reach are counted: a recorder of everything would fill pages.
+    Rights that every node needs are left out.  The names that a wildcard matches are only counted:
+    the list for a recorder of all topics would fill pages.
     """
     found: dict[tuple[OverlaySide, Right], tuple[str, ...]] = {}
     reached: dict[Right, list[bool]] = defaultdict(list)
@@ -292,7 +293,7 @@ def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
 
 
 class Known:
-    """The exact names in rights: of topics and services, and which of them are actions."""
+    """The exact names in rights: topics, services, and actions."""
 
     def __init__(self, rights: Iterable[Right]) -> None:
         rights = frozenset(rights)
@@ -313,7 +314,7 @@ class Known:
                 self._open[part.kind].append(part.name)
 
     def reached(self, kind: str, name: str) -> tuple[str, ...]:
-        """Return the known names that a wildcard matches; an exact name is returned itself."""
+        """Return the known names that a wildcard matches; for an exact name, only that name."""
         if not is_expression(name):
             return (name,)
         key = (kind, name)
@@ -322,10 +323,10 @@ class Known:
         return self._matched[key]
 
     def drawn(self, right: Right) -> tuple[str, ...]:
-        """Return the names to which a right leads: known ones, and wildcards that match none.
+        """Return the names to draw for a right: known names, and wildcards that match none.
 
-        An ALLOW leads to such a wildcard where they have names in common, a DENY where nothing
-        of it is left.
+        Such a wildcard is drawn for an ALLOW that shares names with it, and for a DENY that covers
+        it completely.
         """
         if not is_expression(right.name):
             return (right.name,)
@@ -358,16 +359,16 @@ _Found = dict[Qualifier, set[str]]
 
 
 def _edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = ()) -> list[Edge]:
-    """Return every right and denial as edges to the names that it reaches; unsorted.
+    """Return unsorted edges from every right and denial to the names that it matches.
 
-    A wildcard that reaches no known name leads to a name of its own.  ``common`` are the rights
-    that every node needs, of whatever enclave.
+    A wildcard that matches no known name is drawn as a name itself.  ``common`` are the rights
+    that every node needs, of any enclave.
     """
     topics: dict[tuple[str, str, str, str], _Found] = defaultdict(lambda: defaultdict(set))
     for each in unfolded(rights):
         by = each.name if is_expression(each.name) else ""
         for reached in known.drawn(each):
-            # A wildcard that is drawn itself is said by its own name.
+            # A wildcard that is drawn as a name counts as an exact name.
             said = "" if reached == by else by
             topics[each.enclave, each.kind, each.right, reached][each.qualifier].add(said)
     whole: dict[tuple[str, str, Qualifier], dict[tuple[str, str], set[str]]] = defaultdict(dict)
@@ -400,7 +401,7 @@ def _action_edges(
     qualifier: Qualifier,
     members: dict[tuple[str, str], set[str]],
 ) -> Iterable[Edge]:
-    """Yield one edge for all parts of an action, and one for each right to some of them."""
+    """Yield one edge for a whole action, or one for each right to only some of its parts."""
     remaining = dict(members)
     for right, needed in _WHOLE.items():
         if needed <= members.keys():
@@ -417,7 +418,7 @@ def _action_edges(
 
 
 def _by(names: set[str], *, action: bool = False) -> tuple[str, ...]:
-    """Return the expressions among ``names``, or none if the exact name is among them."""
+    """Return the expressions in ``names``, or () if it has the exact name (an empty text)."""
     if "" in names:
         return ()
     return tuple(
@@ -438,9 +439,9 @@ def _is_common(right: str, name: str, common: Sequence[Right]) -> bool:
 def protection_of(governance: Governance | None, kind: str, name: str) -> Protection:
     """Return the weakest protection of the DDS topics of a name, by the first domain rule.
 
-    Whatever protects whole RTPS messages protects every topic in them.  A topic that no rule
-    names is not protected: vendors refuse it.  Access is controlled where it is for each of the
-    topics in every domain, as in `sros_tool.explain.reach`.
+    The protection of whole RTPS messages protects every topic in them.  A topic without a rule
+    counts as not protected: vendors refuse it.  Access counts as controlled if it is for all of
+    the topics in all domains, as in `sros_tool.explain.reach`.
     """
     if governance is None or not governance.domain_access_rules:
         return UNKNOWN
@@ -474,7 +475,7 @@ def _topics(kind: str, name: str) -> tuple[str, ...]:
 
 
 def _rules_of(domain: DomainRule, topic: str) -> Iterator[TopicRule]:
-    """Yield the rule of a topic; for a wildcard, every rule that may apply to a topic of it."""
+    """Yield the rule of a topic; for a wildcard, every rule that may apply to a matching topic."""
     for rule in domain.topic_access_rules:
         if overlap(rule.topic_expression, topic):
             yield rule

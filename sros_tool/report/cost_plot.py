@@ -1,7 +1,7 @@
-"""The plots of what security costs: latency and throughput over the payload, for file and page.
+"""Plots of the cost of security: latency and throughput over the payload size.
 
-Both axes are logarithmic.  Kinds of protection differ in the shape and the colour of their points.
-It takes the JSON that `sros_tool.demo.cost` describes.
+Both axes are logarithmic.  Each kind of protection has its own shape and colour of points.  The
+input is the JSON that `sros_tool.demo.cost` describes.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ _SHAPES = (
     "M0 -5L4.6 3.8H-4.6z",
     "M0 5L4.6 -3.8H-4.6z",
 )
-"""The points of the kinds in turn: a circle, a square, a rhombus, two triangles."""
+"""The shapes of points, by kind: a circle, a square, a rhombus, two triangles."""
 
 _PLOTS = (
     ("Latency in µs, over the payload", "latency_us"),
     ("Throughput in MB/s, over the payload", "megabytes_per_s"),
 )
 _COLOURS = ("#1b1b1b", "#0072b2", "#b8860b", "#00795a", "#a3497e")
-"""After Okabe and Ito: distinct for people who do not see all colours."""
+"""The colours, after Okabe and Ito: distinguishable for people with colour blindness."""
 
 _STYLE = (
     ".grid{stroke:#ddd;fill:none}"
@@ -40,7 +40,7 @@ _STYLE = (
 
 
 def cost_section(cost: Json) -> str:
-    """Return the plots and the table, as markup for a page."""
+    """Return the plots and the table as HTML markup."""
     kinds = cost["kinds"]
     legend = "".join(
         f'<li><svg class="icon" width="14" height="14" aria-hidden="true"><path class="k{n}" '
@@ -93,7 +93,7 @@ def _shape(number: int) -> str:
 
 
 def payload_text(size: int) -> str:
-    """Return a payload in bytes as ``64 B``, ``16 KiB``, ``1 MiB``."""
+    """Return a payload size in bytes as text like ``64 B``, ``16 KiB``, ``1 MiB``."""
     for unit, step in (("MiB", 1 << 20), ("KiB", 1 << 10)):
         if size >= step:
             return f"{size / step:g} {unit}"

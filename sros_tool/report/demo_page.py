@@ -1,7 +1,7 @@
-"""The page of a demo: what was tried, expected and seen, what decides it, and what it costs.
+"""Render the result of a demo as an HTML page: its rows, and the cost of security.
 
-It takes the JSON of ``sros demo --json`` (`sros_tool.demo.result`) as a value.  The page has no
-script; it opens from disk, and can be printed.
+The input is the JSON value of ``sros demo --json`` (`sros_tool.demo.result`).  The page has no
+script; it can be opened from disk, and printed.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def render_demo_page(result: Json) -> str:
 
 
 def without_folders(value: Any, folders: Sequence[str]) -> Any:
-    """Return a JSON value with these folders of the machine replaced by "…" in its texts."""
+    """Return a JSON value in which these folder paths are replaced by "…" in all texts."""
     if isinstance(value, str):
         for folder in sorted(folders, key=len, reverse=True):
             value = value.replace(folder, "…") if len(folder) > 1 else value

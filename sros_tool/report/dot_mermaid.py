@@ -1,4 +1,4 @@
-"""Render a scene as DOT for Graphviz or as Mermaid for Markdown; both place cards themselves."""
+"""Render a scene as DOT for Graphviz or as Mermaid for Markdown; both do their own layout."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
 
 
 def graphviz_svg(dot: str) -> str:
-    """Return the SVG that Graphviz draws of DOT text; raises `UnavailableError` without it."""
+    """Return the SVG that Graphviz makes from DOT text.  Raises `UnavailableError` without it."""
     try:
         done = subprocess.run(
             ["dot", "-Tsvg"], input=dot, capture_output=True, text=True, timeout=_WAIT, check=True
@@ -86,11 +86,11 @@ def graphviz_svg(dot: str) -> str:
     return done.stdout
 
 
-# ── what both share ────────────────────────────────────────────────────────────────────────
+# ── common to both ─────────────────────────────────────────────────────────────────────────
 
 
 def _once(scene: Scene) -> Mapping[str, Card]:
-    """Return the nodes: the two cards of an enclave on both sides of a scene are one node here."""
+    """Return one card for each node: the two cards of an enclave in a scene are one node here."""
     found: dict[str, Card] = {}
     for card in sorted(scene.cards, key=lambda each: (each.role, each.members, each.column)):
         found.setdefault(_key(card.id), card)
@@ -98,7 +98,7 @@ def _once(scene: Scene) -> Mapping[str, Card]:
 
 
 def _clusters(cards: Mapping[str, Card]) -> dict[str, list[str]]:
-    """Return the enclaves by their groups; none if there is only one group."""
+    """Return the enclaves by group; empty if there is only one group."""
     found: dict[str, list[str]] = defaultdict(list)
     for key, card in cards.items():
         if card.role == "enclave":
@@ -107,7 +107,7 @@ def _clusters(cards: Mapping[str, Card]) -> dict[str, list[str]]:
 
 
 def _key(card: str) -> str:
-    """Return the id of the node of a card: e and the enclave, or n and the number of the names."""
+    """Return the node id for a card id: "e" and the enclave, or "n" and the number of the card."""
     return card if card[0] == "n" else f"e{card[1:]}"
 
 
@@ -188,7 +188,7 @@ def _id(key: str) -> str:
 
 
 def _entities(text: str) -> str:
-    """Return ``text`` with everything that could be markup as Mermaid's numbered entities."""
+    """Return ``text`` with all possible markup escaped as Mermaid's numbered entities."""
     return re.sub(r"[^A-Za-z0-9 /_.,:+-]", lambda found: f"#{ord(found[0])};", text)
 
 

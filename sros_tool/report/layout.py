@@ -1,12 +1,11 @@
 """Lay out a picture in three columns: senders left, names in the middle, listeners right.
 
-A scene is the same for SVG and the page; Graphviz and Mermaid take the cards and place them
-themselves.  Lengths are in pixels at the size at which the text is read; x grows to the right and
-y downwards.
+SVG and the page use the same scene; Graphviz and Mermaid use its cards, but place them themselves.
+Lengths are in pixels at normal text size; x grows to the right and y downwards.
 
-A layered layout of three layers, after Sugiyama: the order of each column follows the barycentre
-of its neighbours, and each card stands as near to its neighbours as the others leave room (found
-by pooling adjacent violators).  It depends on nothing but its input.
+It is a layered layout with three layers, after Sugiyama: each column is ordered by the barycentres
+of the neighbours, and each card is placed as near to its neighbours as the other cards allow (with
+the pool-adjacent-violators algorithm).  The same input always gives the same layout.
 """
 
 from __future__ import annotations
@@ -30,14 +29,14 @@ from sros_tool.report.picture import (
 
 _SIDE_WIDTH, _NAMES_WIDTH, _GUTTER = 184, 330, 110
 LINE, PAD, SMALL = 16, 7, 14
-"""The heights of a line of text, of the room around it, and of a line of a note."""
+"""The height of a line of text, the padding of a card, and the height of a line of a note."""
 _GAP, _LEAD, _TOP, _MARGIN = 9.0, 24.0, 34.0, 14
-_SIDE_LETTERS, _NAMES_LETTERS = 20, 35  # letters of a line on a card
-_ONLOOKER_LINES, _ONLOOKER_SHARE = 8, 0.3  # an onlooker reaches more bundles, and more of them all
+_SIDE_LETTERS, _NAMES_LETTERS = 20, 35  # letters per line on a card
+_ONLOOKER_LINES, _ONLOOKER_SHARE = 8, 0.3  # an onlooker has more bundles, and a larger share
 _MOST_ONLOOKERS = 26  # as there are letters
-_FEW_BUNDLES, _MOST_BUNDLES = 24, 80  # above these, own names are counted, and bundles joined
-_MOST_ENCLAVES = 40  # more are drawn by groups
-_MOST_NAMES, _SHOWN_NAMES = 8, 4  # all names are on a card up to 8, and 4 of them if more
+_FEW_BUNDLES, _MOST_BUNDLES = 24, 80  # more: private names are only counted; bundles are joined
+_MOST_ENCLAVES = 40  # more are drawn as groups
+_MOST_NAMES, _SHOWN_NAMES = 8, 4  # up to 8 names are all on the card, else the first 4
 _SWEEPS = 24
 
 KIND_NAMES = {"topics": "topic", "services": "service", "actions": "action", "dds": "DDS topic"}
@@ -69,7 +68,7 @@ _COMMON = {
     "actions": "used by every node",
     "dds": "used by every node",
 }
-"""The note on a card whose names every node may use, where those rights are not drawn."""
+"""The note on a card whose names every node may use, if those rights are not drawn."""
 OWN = "own:"
 SENDERS, LISTENERS = "may send", "may receive"
 
@@ -78,8 +77,8 @@ SENDERS, LISTENERS = "may send", "may receive"
 class Scene:
     """Cards and the links between them.
 
-    ``shown`` names are drawn or counted in the enclave that alone may use them; ``hidden`` ones
-    are not, as only what every node needs is said of them.
+    ``shown`` is the number of names that are drawn, or counted on the card of their only enclave;
+    ``hidden`` is the number of names left out because only rights that every node needs use them.
     """
 
     id: str
@@ -96,12 +95,12 @@ class Scene:
 
 @dataclass(frozen=True, slots=True)
 class Card:
-    """A rectangle with text: an enclave, a group of enclaves, or names that are alike.
+    """A rectangle with text: an enclave, a group of enclaves, or a bundle of names.
 
-    ``column`` is 0, 1 or 2; an enclave that sends and listens has a card on either side.
-    ``lines`` are its text, ``notes`` smaller text below.  ``members`` are all the enclaves or
-    names that it stands for; ``kind`` and ``level`` are those of names, else "" and unknown.
-    ``group`` is that of an enclave; ``tags`` are the letters of the onlookers of these names.
+    ``column`` is 0, 1 or 2; an enclave that sends and listens has a card on both sides.  ``lines``
+    are its text, ``notes`` are smaller text below.  ``members`` are all its enclaves or names.
+    Cards of names have ``kind``, ``level`` and ``tags`` (letters of onlookers), cards of enclaves
+    have ``group``.
     """
 
     id: str
@@ -122,9 +121,9 @@ class Card:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A line from the right edge of a card to the left edge of another one; the arrow is there.
+    """An arrow from the right edge of one card to the left edge of another one.
 
-    ``rights`` are what it says, such as publish; ``wildcard`` if only wildcards say so.
+    ``rights`` is its label, such as publish; ``wildcard`` says that only wildcards give the right.
     """
 
     source: str
@@ -140,7 +139,7 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class Onlooker:
-    """Who reaches so much that lines would hide all others; its letter is on what it reaches."""
+    """An enclave with so many names that a letter (``tag``) on their cards replaces the lines."""
 
     tag: str
     enclave: str
@@ -149,7 +148,7 @@ class Onlooker:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """The title of a group of enclaves that stand together, and the room that they take."""
+    """The title and the area of a group of enclaves."""
 
     title: str
     x: int
@@ -159,11 +158,12 @@ class Frame:
 
 
 def scenes_of(picture: Picture, *, placed: bool = True) -> tuple[Scene, ...]:
-    """Return the scenes of a picture, the one to begin with first.
+    """Return the scenes of a picture, starting with the overview.
 
-    Of a robot with few enclaves: all but what every node needs, and then everything.  Of many:
-    groups with what passes between them, and then each group with its neighbours.  Without
-    ``placed``, every y and the frames are left out, for formats that place cards themselves.
+    With few enclaves, the first scene leaves out the rights that every node needs, and the second
+    one has everything.  With many enclaves, the first scene has the groups and the links between
+    them, and then each group has a scene with its neighbours.  Without ``placed``, scenes have no y
+    and no frames, for formats that place cards themselves.
     """
     groups = {each.path: each.group for each in picture.enclaves}
     titles = sorted(set(groups.values()))
@@ -174,7 +174,7 @@ def scenes_of(picture: Picture, *, placed: bool = True) -> tuple[Scene, ...]:
             title = "With what every node needs"
             scenes.append(_scene(picture, "all", title, picture.edges, str, placed=placed))
         return tuple(scenes)
-    # The mark of a group is a letter that no enclave begins with.
+    # Groups begin with a colon, as no enclave does.
     outside = {path: f":{group}" for path, group in groups.items()}
     overview = outside.__getitem__
     scenes = [_scene(picture, "essential", "Overview", essential, overview, placed=placed)]
@@ -211,10 +211,10 @@ def _scene(
 
 
 class _Draft:
-    """A scene in the making: its cards and the ties between them, and then their places.
+    """A builder of a scene: first the cards and ties, then their positions.
 
-    ``members`` are the enclaves behind each node of the scene, ``everybody`` the nodes that have
-    any right to a name, drawn or not.
+    ``members`` are the enclaves of each node of the scene, ``everybody`` the nodes that have any
+    right to a name, drawn or not.
     """
 
     def __init__(
@@ -251,12 +251,12 @@ class _Draft:
                     self._ties[(*ends, tie.qualifier, bool(tie.by), tie.mark)].add(tie.right)
 
     def _looks(self, tie: Tie) -> bool:
-        """Whether the tie is shown by a letter, and not by a line."""
+        """Return whether the tie is shown as a letter instead of a line."""
         plain = tie.qualifier is ALLOW and tie.mark is OverlaySide.BOTH
         return plain and (tie.node, tie.right) in self._looking
 
     def _alone(self, bundle: Bundle) -> str:
-        """Return the only node with ties to these names, onlookers aside; "" if there are more."""
+        """Return the only node with ties to these names, except onlookers; "" if there are more."""
         looking = {tie.node for tie in bundle.ties if self._looks(tie)}
         drawn = {tie.node for tie in bundle.ties if not self._looks(tie)}
         if any(
@@ -268,7 +268,7 @@ class _Draft:
         return nodes.pop() if len(nodes) == 1 else ""
 
     def scene(self, name: str, title: str) -> Scene:
-        """Return the scene with every y at 0, without frames and without its count of names."""
+        """Return the scene without positions (every y is 0), frames and number of names."""
         cards = {card.id: card for card in self._cards()}
         return Scene(
             id=name,
@@ -284,7 +284,7 @@ class _Draft:
         )
 
     def placed(self, name: str, title: str) -> Scene:
-        """Return the scene with all cards, links and frames in their places."""
+        """Return the scene with the positions of all cards, links and frames."""
         scene = self.scene(name, title)
         cards = {card.id: card for card in scene.cards}
         columns: list[list[ColumnItem]] = [[], [], []]
@@ -308,7 +308,7 @@ class _Draft:
     def _cards(self) -> Iterable[Card]:
         sides = {end for key in self._ties for end in key[:2] if end[0] in "sl"}
         sides |= {f"{'s' if SENDS[right] else 'l'}{node}" for node, right in self._looking}
-        # Of a group, all enclaves are shown; of its surroundings, only who has to do with it.
+        # In the scene of a group: all its enclaves, but only those neighbours that have links.
         inner = {node for node in self._members if not node.startswith(":")}
         idle = (inner or set(self._members)) - {side[1:] for side in sides}
         sides |= {f"s{node}" for node in idle}
@@ -319,7 +319,7 @@ class _Draft:
             yield self._names_card(number, bundle)
 
     def _side_card(self, side: str, *, first: bool) -> Card:
-        """Return the card of an enclave or group on one side; the ``first`` notes its own names."""
+        """Return the card of an enclave or group; the ``first`` one counts private names."""
         node, sends = side[1:], side[0] == "s"
         members = tuple(self._members[node])
         is_group = node.startswith(":")
@@ -381,7 +381,7 @@ class _Draft:
     # ── links ──────────────────────────────────────────────────────────────────────────────
 
     def _links(self, cards: dict[str, Card]) -> tuple[Link, ...]:
-        """Return the links, with their ends spread over the edges of the cards."""
+        """Return the links, with their ends distributed over the edges of the cards."""
         keys = sorted(self._ties)
         ports: dict[tuple[str, bool], list[tuple[float, int]]] = defaultdict(list)
         for number, (source, target, *_) in enumerate(keys):
@@ -412,9 +412,10 @@ class _Draft:
 
 
 def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
-    """Return who reaches so much by wildcards that its lines would hide all others: how many names.
+    """Return the number of names of each onlooker, by node and right.
 
-    By node and right, such as ("/recorder", "subscribe").
+    An onlooker, such as ("/recorder", "subscribe"), has wildcards that match so many names that its
+    lines would hide all others.
     """
     reached: dict[tuple[str, str], list[Bundle]] = defaultdict(list)
     wild: dict[tuple[str, str], int] = defaultdict(int)
@@ -436,19 +437,19 @@ def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
 
 
 def counted(number: int, thing: str) -> str:
-    """Return a number with its noun, as ``1 topic`` and ``2 topics``."""
+    """Return a number with its noun, like ``1 topic`` or ``2 topics``."""
     return f"{number} {thing}{'' if number == 1 else 's'}"
 
 
 def _own_text(own: Mapping[str, int]) -> list[str]:
-    """Return what only this enclave may use, as ``own: 3 topics, 2 services``, in short lines."""
+    """Return short lines like ``own: 3 topics, 2 services`` for names of one enclave only."""
     found = [counted(number, KIND_NAMES[kind]) for kind, number in own.items() if number]
     lines = [f"{OWN} {', '.join(found[:2])}"]
     return [*lines, ", ".join(found[2:])] if found[2:] else lines
 
 
 def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the text of the card of a bundle: names or the wildcards for them, and notes."""
+    """Return the text (names, or wildcards for them) and the notes of a bundle's card."""
     kind, names = KIND_NAMES[bundle.kind], bundle.names
     if bundle.partial:
         return (f"{_common_namespace(names)}/…",), (
@@ -463,7 +464,7 @@ def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
 
 
 def _common_namespace(names: Sequence[str]) -> str:
-    """Return the namespace that all names are in, "" for the root."""
+    """Return the innermost namespace that contains all names, "" for the root."""
     found = []
     for parts in zip(*(name.split("/")[:-1] for name in names), strict=False):
         if len(set(parts)) > 1:
@@ -473,7 +474,7 @@ def _common_namespace(names: Sequence[str]) -> str:
 
 
 def _wrapped(text: str, letters: int) -> tuple[str, ...]:
-    """Return ``text`` in lines of so many letters, cut at a slash or underscore if one is near."""
+    """Return ``text`` in lines of at most ``letters``, split at a slash or underscore."""
     lines = []
     while len(text) > letters:
         cut = max(
@@ -487,13 +488,13 @@ def _wrapped(text: str, letters: int) -> tuple[str, ...]:
     return (*lines, text)
 
 
-# ── places ─────────────────────────────────────────────────────────────────────────────
+# ── positions ──────────────────────────────────────────────────────────────────────────
 
 
 def _tops(
     columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]
 ) -> dict[str, float]:
-    """Return the y of all cards: the tallest column is packed, the others are aligned with it."""
+    """Return the y of all cards; the tallest column is packed, the others are aligned to it."""
     extent = [_extent(column) for column in columns]
     tallest = max(range(3), key=lambda number: (extent[number], number == 1))
     tops = place_column(columns[tallest], {}, _GAP, _TOP, _LEAD if tallest != 1 else 0)
@@ -528,7 +529,7 @@ def _frames(columns: Sequence[Sequence[ColumnItem]], cards: dict[str, Card]) -> 
 
 @dataclass(frozen=True, slots=True)
 class ColumnItem:
-    """Something of a ``height`` that stands in a column; items of one ``group`` stand together."""
+    """An item of a column, with a height; the items of a ``group`` stay together."""
 
     id: str
     height: float
@@ -543,7 +544,8 @@ def order_columns(
 ) -> tuple[list[ColumnItem], list[ColumnItem], list[ColumnItem]]:
     """Return the items of the three columns in an order with few crossings of lines.
 
-    ``lines`` are pairs of ids, each of neighbouring columns.  Of all sweeps the best is kept.
+    ``lines`` are pairs of ids of items in neighbouring columns.  The result is the best order of
+    all sweeps.
     """
     near: dict[str, list[str]] = {item.id: [] for item in (*left, *middle, *right)}
     for one, other in lines:
@@ -592,7 +594,7 @@ def _by_barycentre(
 
 
 def _crossings(columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]) -> int:
-    """Count how often lines cross between neighbouring columns."""
+    """Return the number of crossings of lines between neighbouring columns."""
     side = {item.id: number for number, column in enumerate(columns) for item in column}
     place = {item.id: n for column in columns for n, item in enumerate(column)}
     total = 0
@@ -608,7 +610,7 @@ def _crossings(columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[st
 
 
 def _inversions(ends: Sequence[int], size: int) -> int:
-    """Count the pairs in the wrong order, with a Fenwick tree."""
+    """Return the number of pairs in the wrong order, with a Fenwick tree."""
     tree = [0] * (size + 1)
     found = 0
     for seen, end in enumerate(ends):
@@ -631,10 +633,10 @@ def place_column(
     top: float,
     lead: float = 0,
 ) -> dict[str, float]:
-    """Return the y of each item: near the y ``wanted`` for its centre, and without overlap.
+    """Return the y of each item, without overlap, and near the ``wanted`` y of its centre.
 
-    Items keep their order and stand ``gap`` apart, none above ``top``; the first of each group
-    has ``lead`` more room above it.
+    Items keep their order, with ``gap`` between them, and are not above ``top``; there is ``lead``
+    more space above the first item of each group.
     """
     offsets, at, group = [], 0.0, None
     for item in column:
@@ -642,7 +644,7 @@ def place_column(
         group = item.group
         offsets.append(at)
         at += item.height + gap
-    # Without the offsets it is least squares under "each not above the one before".
+    # Without the offsets, it is isotonic regression: least squares with increasing values.
     blocks: list[list[float]] = []
     for item, offset in zip(column, offsets, strict=True):
         target = wanted.get(item.id, 0.0) - item.height / 2 - offset

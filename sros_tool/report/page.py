@@ -1,8 +1,8 @@
-"""Writes the page: one HTML file with its script, its style and its data, that needs no network.
+"""Render a picture as one HTML file with its script, style and data; it needs no network.
 
-The content security policy lets nothing run or load but the script and style that are in it, by
-their digests.  The data is JSON in which no letter can end the element that it stands in, and
-the script sets it as text only.
+The content security policy allows only the script and style in the file, by their digests, and
+nothing else.  The data is JSON in which every character that could end its element is escaped, and
+the script inserts it only as text.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 
 def render_page(picture: Picture, scenes: tuple[Scene, ...], now: datetime) -> str:
-    """Return the page of a picture with its scenes; ``now`` is the time of its findings."""
+    """Return the page of a picture with its scenes; ``now`` is the date of its findings."""
     script, style = asset("view.js"), asset("view.css")
     origins = ", ".join(f"{each.kind} {each.title}" for each in picture.origins)
     made = f"{origins}. Findings are as of {iso(now)[:10]}."
@@ -42,7 +42,7 @@ def render_page(picture: Picture, scenes: tuple[Scene, ...], now: datetime) -> s
 
 
 def asset(name: str) -> str:
-    """Return a file that was built for pages (from web/, see its package.json)."""
+    """Return the content of a file that was built for pages (from web/, see package.json there)."""
     return (_ASSETS / name).read_text("utf-8")
 
 
@@ -86,7 +86,7 @@ def _digest(text: str) -> str:
 
 
 def _data(picture: Picture, scenes: tuple[Scene, ...]) -> dict[str, Any]:
-    """Return the data for the script: names by bundles, which is much shorter than edges."""
+    """Return the data for the script: names in bundles, which are much shorter than edges."""
     return {
         "overlay": as_plain(picture.overlay),
         "enclaves": [_enclave(each) for each in picture.enclaves],
@@ -99,7 +99,7 @@ def _data(picture: Picture, scenes: tuple[Scene, ...]) -> dict[str, Any]:
 
 
 def _enclave(enclave: PicturedEnclave) -> dict[str, Any]:
-    """Return an enclave; of its rights as written only the wildcards, as the others are names."""
+    """Return an enclave as JSON, with only those statements that have wildcards."""
     wild = [_with_deny(as_plain(each)) for each in enclave.statements if is_expression(each.name)]
     return {**as_plain(enclave), "statements": wild}
 
@@ -129,7 +129,7 @@ def _scene(scene: Scene) -> dict[str, Any]:
 
 
 def _table(rows: list[dict[str, Any]]) -> list[list[Any]]:
-    """Rows with the same keys: first the keys, then the values of each row."""
+    """Return rows with the same keys as lists: first the keys, then the values of each row."""
     if not rows:
         return []
     keys = list(rows[0])

@@ -1,6 +1,6 @@
-"""The picture of a robot's rights as plain values, whatever is drawn from it.
+"""The picture of a robot's rights as plain values, the input of every output format.
 
-Everything is sorted, holds no path of the machine and no moment of its making, so the same
+Everything is sorted, and contains no paths of the machine and no time of creation, so the same
 sources give the same picture.
 """
 
@@ -19,14 +19,14 @@ from sros_tool.values import as_plain, shows
 SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
     ("subscribe", "reply", "execute"), False
 )
-"""Whether the arrow of a right leads to the name: the enclave sends first."""
+"""Whether the arrow of a right leads to the name, because the enclave sends first."""
 
 _KINDS = (*RIGHTS, "dds")
-"""The kinds of names in the order they are shown; dds is a topic without a ROS name."""
+"""The kinds of names in display order; dds is a topic without a ROS name."""
 
 
 class OverlaySide(StrEnum):
-    """On which side of an overlay something stands; always BOTH where nothing is laid over."""
+    """The side of an overlay that has something; always BOTH without an overlay."""
 
     BOTH = "both"
     FIRST = "first"
@@ -34,7 +34,7 @@ class OverlaySide(StrEnum):
 
 
 class WireLevel(StrEnum):
-    """How strongly messages are protected on the wire, at least; from the weakest on."""
+    """The minimum protection of messages on the wire, from the weakest to the strongest."""
 
     UNKNOWN = "unknown"
     NONE = "none"
@@ -44,11 +44,11 @@ class WireLevel(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Protection:
-    """What governance says of a name: the weakest of the DDS topics that it consists of.
+    """The protection of a name by governance: the weakest of all its DDS topics.
 
-    ``data``, ``metadata`` and ``rtps`` are protection kinds of DDS-Security 1.1; without
-    ``read_control`` anybody with an identity may read, whatever permissions say, and without
-    ``write_control`` anybody may write.
+    ``data``, ``metadata`` and ``rtps`` are protection kinds of DDS-Security 1.1.  Without
+    ``read_control``, everybody with an identity may read, independently of permissions; without
+    ``write_control``, everybody may write.
     """
 
     level: WireLevel
@@ -60,7 +60,7 @@ class Protection:
 
 
 UNKNOWN = Protection(WireLevel.UNKNOWN)
-"""The protection where no governance is known, as in a policy alone."""
+"""The protection if no governance is known, as for a policy alone."""
 
 
 @shows(
@@ -69,11 +69,11 @@ UNKNOWN = Protection(WireLevel.UNKNOWN)
 )
 @dataclass(frozen=True, slots=True, order=True)
 class Edge:
-    """What one enclave may, or may not, do with one name.
+    """A right or denial of one enclave for one name.
 
-    ``by`` are the expressions that reach the name, empty where it is said by its own name.
-    ``parts`` are the parts of an action, such as feedback, where the right is not to all of it.
-    ``common`` is what every node needs to start.
+    ``by`` are the expressions that match the name, empty if the right has the exact name.
+    ``parts`` are the parts of an action, such as feedback, if the right is not for the whole
+    action.  ``common`` marks rights that every node needs to start.
     """
 
     enclave: str
@@ -99,7 +99,7 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Name:
-    """A topic, service or action; a ``wildcard`` is drawn itself where it reaches no known name."""
+    """A topic, service or action, or a ``wildcard`` that matches no known name."""
 
     kind: str
     name: str
@@ -110,7 +110,7 @@ class Name:
 
 @dataclass(frozen=True, slots=True)
 class Statement:
-    """A right as it is written, and how many known names it reaches."""
+    """A right as written in the source, and the number of known names that it matches."""
 
     qualifier: Qualifier
     right: str
@@ -122,11 +122,11 @@ class Statement:
 
 @dataclass(frozen=True, slots=True)
 class PicturedEnclave:
-    """An enclave with what is known of it; ``group`` is its host or its namespace.
+    """An enclave in a picture; ``group`` is its host or its namespace.
 
     ``subject``, ``issuer``, ``serial`` and ``key`` describe its certificate, "" without one.
-    ``problems`` keep a process from running in it.  Where use is laid over what is allowed, one
-    that was not ``observed`` at all is neither used nor unused.
+    ``problems`` keep a process from running in it.  In an overlay of use, an enclave that was not
+    ``observed`` counts as neither used nor unused.
     """
 
     path: str
@@ -143,7 +143,7 @@ class PicturedEnclave:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Validity:
-    """When something expires: a certificate, an authority, a permissions document, a CRL.
+    """The validity of a certificate, a CA, a permissions document, or a CRL.
 
     ``not_before`` and ``not_after`` are CCYY-MM-DDThh:mm:ssZ in UTC.
     """
@@ -157,7 +157,7 @@ class Validity:
 
 @dataclass(frozen=True, slots=True)
 class PicturedFinding:
-    """Something that is wrong or weak; ``severity`` is error, warning or note."""
+    """A fault or weakness; ``severity`` is error, warning or note."""
 
     id: str
     severity: str
@@ -176,10 +176,10 @@ class SourceTitle:
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """Two sources over each other.
+    """The kind of an overlay of two sources.
 
     ``kind`` is use (allowed and observed), change (before and after) or drift (policy and
-    keystore); ``first`` and ``second`` say what it means that only one side has a right.
+    keystore); ``first`` and ``second`` are the meanings of a right that only that side has.
     """
 
     kind: str
@@ -189,10 +189,10 @@ class Overlay:
 
 @dataclass(frozen=True, slots=True)
 class OverlayDifference:
-    """A right that only one side has; ``notes`` say more of it.
+    """A right that only one side has, with ``notes``.
 
-    Of a change, the wildcards by which the other side has it all the same; of use, how many of the
-    names that a wildcard reaches were never observed.
+    For a change, the notes are the wildcards by which the other side has the right nevertheless;
+    for use, the number of names that a wildcard matches and that were never observed.
     """
 
     mark: OverlaySide
@@ -202,7 +202,7 @@ class OverlayDifference:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """Who may do what, how it is protected, how long it holds, and what is wrong with it."""
+    """The rights in a system, with their protection, validity and findings."""
 
     title: str
     origins: tuple[SourceTitle, ...]
@@ -217,7 +217,7 @@ class Picture:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Tie:
-    """What one enclave, or one group of them, may do with all names of a bundle."""
+    """A right or denial of one enclave, or one group of enclaves, for all names of a bundle."""
 
     node: str
     right: str
@@ -235,9 +235,9 @@ class Tie:
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """Names of one kind and protection, sorted, and the ties that each of them has.
+    """Sorted names of one kind and protection, which all have the same ties.
 
-    Of a ``partial`` bundle, each tie is to some of the names only.
+    In a ``partial`` bundle, each tie is for only some of the names.
     """
 
     kind: str
@@ -252,7 +252,7 @@ def fold(
 ) -> tuple[Bundle, ...]:
     """Return the names that have an edge, in bundles, sorted by kind and first name.
 
-    ``owner`` says what stands for an enclave: itself, or a group that it is folded into.
+    ``owner`` maps an enclave to the node that represents it: itself, or its group.
     """
     ties: dict[tuple[str, str], set[Tie]] = defaultdict(set)
     for edge in edges:
@@ -279,9 +279,9 @@ def fold(
 
 
 def coarsened(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
-    """Return bundles joined where the same nodes send; which node hears which name is lost.
+    """Return bundles joined if the same nodes send; they no longer show who receives which name.
 
-    Denials and differences stay separate: they are what people look for.
+    Denials and differences stay separate, because users look for them.
     """
     found: dict[tuple[object, ...], list[Bundle]] = defaultdict(list)
     for bundle in bundles:
@@ -305,5 +305,5 @@ def _order(tie: Tie) -> tuple[int, str, str, tuple[str, ...], tuple[str, ...], s
 
 
 def render_json(picture: Picture) -> str:
-    """Return the whole picture as JSON by the names of `Picture`'s fields."""
+    """Return the picture as JSON with the field names of `Picture`."""
     return json.dumps(as_plain(picture), indent=1, ensure_ascii=False) + "\n"

@@ -1,7 +1,7 @@
 """Read the sources of pictures: policies, permissions, keystores and observations.
 
-Every source is shown by its base name, as its path on this machine is private.  Of private keys
-nothing is read but whether they exist.
+Every source is shown by its base name, because its path on this machine is private.  Private keys
+are never read; only their existence is checked.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ _AUTHORITY_FILES = "*_ca.cert.pem"
 def read_source(path: Path, *, now: datetime) -> PictureSource:
     """Return the source at ``path``: a policy, permissions, an enclave, a keystore, an observation.
 
-    An observation is a policy that was learned, or what ``sros generate_policy --json`` prints.
-    Raises `DocumentError` for anything else.  Of a keystore, what is broken becomes a finding.
+    An observation is a learned policy, or the output of ``sros generate_policy --json``.  Faults of
+    a keystore become findings.  Raises `DocumentError` for anything else.
     """
     if path.is_file() and read_bytes(path, "file").lstrip()[:1] == b"{":
         return _observation(path)
@@ -78,9 +78,9 @@ def read_source(path: Path, *, now: datetime) -> PictureSource:
 def with_findings(
     source: PictureSource, path: Path, findings: Iterable[PicturedFinding]
 ) -> PictureSource:
-    """``source``, which lies at ``path``, with more findings, which then name no other place.
+    """Return ``source``, read from ``path``, with more findings, whose texts get no other path.
 
-    A finding is of an enclave only if the source has one of that name.
+    A finding keeps its enclave only if the source has an enclave of that name.
     """
     known = {each.path for each in source.enclaves} | {each.enclave for each in source.rights}
     found = tuple(_without_paths(_placed(each, known), path) for each in findings)
@@ -88,7 +88,7 @@ def with_findings(
 
 
 def _base_name(path: Path) -> str:
-    """How a source is called in a picture, in characters that every format can hold."""
+    """Return the name of a source in a picture, in characters that every format supports."""
     name = path.absolute().name or "/"
     return "".join(
         letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in name
@@ -96,13 +96,13 @@ def _base_name(path: Path) -> str:
 
 
 def common_rights() -> tuple[Right, ...]:
-    """Return the rights that every node needs, by the shipped policy."""
+    """Return the rights that every node needs, from the shipped policy."""
     policy = read_policy(policies_dir() / "defaults" / "node_basics.xml")
     return tuple(sorted(policy_rights(policy)))
 
 
 def template_governance(choice: str) -> Governance:
-    """Return the governance that a keystore by this template would have."""
+    """Return the governance of a keystore made from this template."""
     from sros_tool.dds.domains import DomainSet
 
     return governance_for(load_template(choice).protection, DomainSet.of((0, 0)))
@@ -123,7 +123,7 @@ def _observation(path: Path) -> PictureSource:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DocumentError(
             f"'{path}' is not an observation",
-            "It is JSON, but not what `sros generate_policy --json` prints.",
+            "It is JSON, but not the output of `sros generate_policy --json`.",
         ) from error
     learned = learn(observed)
     policy = learned.policy()
@@ -225,7 +225,7 @@ def _authorities(root: Path) -> Iterator[Validity]:
         yield Validity(iso(crl.next_update), iso(crl.this_update), "revocation list", title)
 
 
-# ── nothing of the machine ─────────────────────────────────────────────────────────────────
+# ── removing paths of this machine ─────────────────────────────────────────────────────────
 
 
 def _placed(finding: PicturedFinding, known: Set[str]) -> PicturedFinding:
@@ -240,7 +240,7 @@ def _without_paths(finding: PicturedFinding, path: Path) -> PicturedFinding:
 
 
 def _without_path(text: str, path: Path) -> str:
-    """``text`` with the source called by its base name, however its path was written."""
+    """Return ``text`` with every form of the source's path replaced by its base name."""
     places = {str(path), str(path.absolute()), str(path.resolve())}
     for place in sorted(places, key=len, reverse=True):
         if "/" in place and place != "/":

@@ -1,4 +1,4 @@
-"""Draw a scene as SVG: one file that needs nothing else, for light and dark backgrounds."""
+"""Render a scene as a self-contained SVG file, for light and dark backgrounds."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ letter-spacing:.06em}
 .lock-none{stroke:var(--open)}
 .tag{font:700 11px system-ui,"Segoe UI",Roboto,"DejaVu Sans",sans-serif;fill:var(--soft)}
 """
-_USE = "svg{--second:var(--deny)}\n"  # what is used and not allowed is no good news
+_USE = "svg{--second:var(--deny)}\n"  # use without permission is drawn like a denial
 _MARKERS = """\
 <marker id="to" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="8" markerHeight="8" \
 markerUnits="userSpaceOnUse" orient="auto"><path class="tip" d="M0 0.5L8 4L0 7.5z"/></marker>
@@ -70,13 +70,13 @@ _GLYPHS = {
     "actions": "M6.5 1a5.5 5.5 0 1 0 .01 0zM6.5 4.5a2 2 0 1 0 .01 0z",
     "dds": "M6.5 1L12 6.5L6.5 12L1 6.5z",
 }
-"""The symbol of each kind of names, 13 by 13: lines, two arrows, a target, a rhombus."""
+"""The symbol of each kind of name, 13 by 13 pixels: lines, two arrows, a target, a rhombus."""
 _LOCKS = {
     WireLevel.ENCRYPT: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 5 0V6M6.5 8.3v2",
     WireLevel.SIGN: "M1.5 12h10M2.5 9.5l1-2.6L9.3 1.2l1.8 1.8L5.2 8.7z",
     WireLevel.NONE: "M2 6h9v6.5H2zM4 6V3.8a2.5 2.5 0 0 1 4.8-1",
 }
-"""The symbol of each level of protection, 13 by 13: a lock, a pen, an open lock."""
+"""The symbol of each level of protection, 13 by 13 pixels: a lock, a pen, an open lock."""
 
 
 def render_svg(picture: Picture, scene: Scene) -> str:
@@ -104,7 +104,7 @@ def render_svg(picture: Picture, scene: Scene) -> str:
             f'height="{frame.height}" rx="8"/>'
             f'<text class="small" x="{frame.x + 8}" y="{frame.y + 16}">{escape(frame.title)}</text>'
         )
-    # What must not be overlooked is drawn last.
+    # The most important links are drawn last, on top.
     rank = {OverlaySide.BOTH: 0, OverlaySide.FIRST: 1, OverlaySide.SECOND: 2}
     for link in sorted(
         scene.links, key=lambda each: (each.qualifier is not ALLOW, rank[each.mark])
@@ -195,7 +195,7 @@ def _card(card: Card) -> Iterable[str]:
 
 
 def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
-    """Yield one line of the legend for each kind of thing in this scene."""
+    """Yield the lines of the legend for the symbols in this scene."""
     kinds = sorted({card.kind for card in scene.cards if card.kind}, key=list(_GLYPHS).index)
     yield _row(
         (

@@ -1,1 +1,1 @@
-"""Which DDS stacks are here, what they enforce, and the environment of a secured process."""
+"""The installed DDS stacks, what they enforce, and the environment of a secured process."""

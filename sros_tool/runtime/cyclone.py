@@ -1,12 +1,11 @@
 """Cyclone DDS 0.10 from Python: participants, writers and readers of strings, with DDS Security.
 
 A refusal by DDS Security is a `SecurityRefusedError`; everything else that fails is a `DdsError`,
-so that a crash is not taken for a refusal.  One process must not hold two participants with
-different enclaves in one domain: Cyclone 0.10 lets the second use the first one's permissions.
+so that a crash is never mistaken for a refusal.  One process must not have two participants with
+different enclaves in one domain: in Cyclone 0.10 the second one gets the permissions of the first.
 
-libddsc is not loaded at import: `load_cyclone` finds and loads it on the first call.  The part of
-its C interface that sros calls is declared here after ``dds/dds.h`` and ``dds/ddsrt/log.h`` of
-Cyclone DDS 0.10.
+libddsc is not loaded at import: `load_cyclone` finds and loads it on the first call.  The functions
+that sros calls are declared here as in ``dds/dds.h`` and ``dds/ddsrt/log.h`` of Cyclone DDS 0.10.
 """
 
 from __future__ import annotations
@@ -29,15 +28,15 @@ from sros_tool.resources import unpacked_dds_dir
 _Value = TypeVar("_Value")
 
 FOLDER_VARIABLE = "SROS_CYCLONEDDS_DIR"
-"""The variable that names a folder with libddsc, or one in which Debian's packages were unpacked;
-no other is tried then."""
+"""The variable that names the only folder to search: one with libddsc, or one into which Debian's
+packages were unpacked."""
 
 _SYSTEM_NAMES = ("libddsc.so.0debian", "libddsc.so.0t64", "libddsc.so.0")
 """The shared object names of Debian 12, of Debian 13, and of an installation from source or ROS."""
 
 INSTALL_ADVICE = (
     "Install Cyclone DDS with `apt-get install libddsc0debian` (Debian 12; newer releases call it"
-    " libddsc0t64), or unpack the package and those that it depends on into a folder and name that"
+    " libddsc0t64), or unpack the package and its dependencies into a folder and name the folder"
     f" in {FOLDER_VARIABLE}."
 )
 
@@ -65,7 +64,7 @@ _FILE_PROPERTIES = {
 """The properties of a participant that name the files of its enclave."""
 ENCLAVE_FILES = tuple(_FILE_PROPERTIES.values())
 """The files that an enclave must have."""
-_PLUGINS = {  # by the part of their properties: the library, and its functions' name
+_PLUGINS = {  # by part of the property name: the library, and the name in its functions
     "auth": ("dds_security_auth", "authentication"),
     "access": ("dds_security_ac", "access_control"),
     "crypto": ("dds_security_crypto", "crypto"),
@@ -86,7 +85,7 @@ class SecurityRefusedError(DdsError):
 
 @dataclass(frozen=True, order=True)
 class Publication:
-    """A writer that discovery has found: its DDS topic name and DDS type name."""
+    """A discovered writer: its DDS topic name and DDS type name."""
 
     topic: str
     type_name: str
@@ -95,7 +94,7 @@ class Publication:
 class Participant:
     """A DDS participant in ``domain`` (0 to 230), secured by the files of ``enclave`` if given.
 
-    Raises `SecurityRefusedError`, `DdsError`, and `UnavailableError` where Cyclone DDS or its
+    Raises `SecurityRefusedError`, `DdsError`, and `UnavailableError` if Cyclone DDS or its
     security plugins are missing.
     """
 
@@ -121,7 +120,7 @@ class Participant:
         return Reader(self._library, self._endpoint("reader", topic), self.handle)
 
     def publications(self) -> tuple[Publication, ...]:
-        """Return the writers that this participant knows of, with its own, sorted."""
+        """Return the writers that this participant has discovered, and its own, sorted."""
         api = self._library.api
         reader = api.dds_create_reader(self.handle, _BUILTIN_PUBLICATIONS, None, None)
         if reader < 0:
@@ -191,7 +190,7 @@ class Participant:
 
 
 class Writer:
-    """Writes strings; made by `Participant.writer`."""
+    """A writer of strings, created by `Participant.writer`."""
 
     def __init__(self, library: CycloneLibrary, handle: int) -> None:
         self._library = library
@@ -205,12 +204,12 @@ class Writer:
             raise DdsError("cannot write", _describe_return(self._library, code))
 
     def matched(self) -> int:
-        """Return how many readers this writer sends to."""
+        """Return the number of readers that this writer sends to."""
         return max(0, int(self._library.api.dds_get_matched_subscriptions(self.handle, None, 0)))
 
 
 class Reader:
-    """Reads strings; made by `Participant.reader`."""
+    """A reader of strings, created by `Participant.reader`."""
 
     def __init__(self, library: CycloneLibrary, handle: int, participant: int) -> None:
         self._library = library
@@ -219,7 +218,7 @@ class Reader:
         self.handle = handle
 
     def wait(self, seconds: float) -> bool:
-        """Wait until there is something to take, at most ``seconds``; return whether there is."""
+        """Wait for a message, at most ``seconds``; return whether there is one."""
         api = self._library.api
         if not self._waitset:
             condition = api.dds_create_readcondition(self.handle, _ANY_STATE)
@@ -233,19 +232,19 @@ class Reader:
         return bool(api.dds_waitset_wait(self._waitset, None, 0, int(seconds * 1e9)) > 0)
 
     def take(self) -> tuple[str, ...]:
-        """Return the messages that have come since the last call, oldest first."""
+        """Return the messages received since the last call, oldest first."""
         return tuple(_take(self._library, self.handle, 64, _string_of))
 
     def matched(self) -> int:
-        """Return how many writers this reader receives from."""
+        """Return the number of writers that this reader receives from."""
         return max(0, int(self._library.api.dds_get_matched_publications(self.handle, None, 0)))
 
 
 def security_properties(enclave: Path, plugins: Path | None) -> dict[str, str]:
-    """Return the properties by which Cyclone DDS loads ``enclave``, as rmw_cyclonedds sets them.
+    """Return the properties that make Cyclone DDS load ``enclave``, as rmw_cyclonedds sets them.
 
-    ``plugins`` is the folder of libdds_security_*.so; without one the dynamic loader looks for
-    them.  Raises `DdsError` where the enclave lacks a file.
+    ``plugins`` is the folder of libdds_security_*.so; without it, the dynamic loader searches for
+    them.  Raises `DdsError` if a file of the enclave is missing.
     """
     folder = enclave.absolute()
     for name in ENCLAVE_FILES:
@@ -288,7 +287,7 @@ def _qos(library: CycloneLibrary) -> Iterator[Any]:
 def _take(
     library: CycloneLibrary, handle: int, limit: int, copy: Callable[[int], _Value]
 ) -> list[_Value]:
-    """Take up to ``limit`` samples; ``copy`` makes a value of each while it is on loan."""
+    """Take up to ``limit`` samples; ``copy`` converts each one before it is given back to DDS."""
     samples = (ctypes.c_void_p * limit)()
     infos = (SampleInfo * limit)()
     count = library.api.dds_take(handle, samples, infos, limit, limit)
@@ -323,10 +322,10 @@ def _text(raw: bytes | None) -> str:
 
 @dataclass(frozen=True)
 class CycloneLibrary:
-    """A loaded libddsc: its functions, its file, and what it has logged.
+    """A loaded libddsc: its functions, its file, and its log.
 
     ``version`` is as in its file name ("0.10.2"); ``plugins`` is the folder of its security
-    plugins, None where they are missing.  ``log`` keeps the newest warnings and errors of all
+    plugins, None if they are missing.  ``log`` keeps the newest warnings and errors of all
     participants of this process, oldest first.
     """
 
@@ -339,7 +338,7 @@ class CycloneLibrary:
 
 
 def _describe_return(library: CycloneLibrary, code: int) -> str:
-    """Return the library's own name of a (negative) return code."""
+    """Return the name that the library gives to a (negative) return code."""
     return str(library.api.dds_strretcode(code).decode("ascii", "replace"))
 
 
@@ -347,7 +346,7 @@ def _describe_return(library: CycloneLibrary, code: int) -> str:
 def load_cyclone() -> CycloneLibrary:
     """Load libddsc 0.10.x once per process.
 
-    Raises `UnavailableError` where there is none, or one whose C interface is another.
+    Raises `UnavailableError` if there is none, or only a version with another C interface.
     """
     api, path = _load_first()
     version = version_of(path)
@@ -424,10 +423,10 @@ def _library_files(folder: Path) -> list[Path]:
 
 
 def _load_all(files: Iterable[Path]) -> None:
-    """Load libraries that need each other, in whatever order works; ignore what never loads.
+    """Load libraries that depend on each other; ignore those that cannot be loaded.
 
-    With them in memory under their own names, libddsc finds them without LD_LIBRARY_PATH.  Those
-    that others need come first, or the loader might take the system's copy as well as ours.
+    Once they are loaded, libddsc finds them by name, without LD_LIBRARY_PATH.  Libraries that
+    others depend on are loaded first; else the loader might add the system's copies of them.
     """
     waiting = sorted(files, key=_load_order)
     while waiting:
@@ -448,7 +447,7 @@ def _load_order(file: Path) -> tuple[int, str]:
 
 
 def loaded_libraries(prefix: str) -> tuple[Path, ...]:
-    """Return the files of this process's shared libraries whose names start with ``prefix``."""
+    """Return the shared libraries loaded in this process whose names start with ``prefix``."""
     maps = Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace")
     files = {Path("/" + line.partition("/")[2]) for line in maps.splitlines() if "/" in line}
     return tuple(sorted(file.resolve() for file in files if file.name.startswith(prefix)))
@@ -457,7 +456,7 @@ def loaded_libraries(prefix: str) -> tuple[Path, ...]:
 def version_of(path: Path) -> str:
     """Return the version in the name of a shared library: "0.10.2" of libddsc.so.0.10.2.
 
-    Wheels hold copies in place of links, so that the loaded one may have the shortest name.
+    Wheels contain copies instead of links, so the loaded file may have the shortest name.
     """
     copies = [copy for copy in path.parent.glob(f"{path.name}.*") if _same_size(copy, path)]
     name = max([path.name, *(copy.name for copy in copies)], key=len)
@@ -528,7 +527,7 @@ class StringSample(ctypes.Structure):
 
 
 class _EndpointSample(ctypes.Structure):
-    """``dds_builtintopic_endpoint_t``: a writer or reader that discovery has found."""
+    """``dds_builtintopic_endpoint_t``: a discovered writer or reader."""
 
     _fields_ = [
         ("key", ctypes.c_uint8 * 16),

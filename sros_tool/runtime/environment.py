@@ -1,4 +1,4 @@
-"""The environment and the arguments with which a process runs secured: what rcl and the RMWs read.
+"""The environment variables and arguments that make a process run secured, as rcl reads them.
 
 ROS_SECURITY_ENCLAVE_OVERRIDE secures a process, and the ROS graph does not show it; the graph shows
 the enclave of ``--ros-args --enclave``.
@@ -28,10 +28,10 @@ _DOMAIN_ID = re.compile(r"(?:0|[1-9]\d*)\Z", re.ASCII)
 
 
 def domain_from(environment: Mapping[str, str]) -> int | None:
-    """Return ROS_DOMAIN_ID as a number, or None where it is unset or empty.
+    """Return ROS_DOMAIN_ID as a number, or None if it is unset or empty.
 
     Raises:
-        UsageError: It is not a domain id; rcl then refuses to start, too.
+        UsageError: It is not a domain id; rcl refuses to start then, too.
     """
     text = environment.get(DOMAIN, "")
     if not text:
@@ -48,13 +48,13 @@ def domain_from(environment: Mapping[str, str]) -> int | None:
 
 
 def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
-    """Return the domain for a process of the keystore at ``root``, which is made for ``domains``.
+    """Return the domain for a process of the keystore at ``root``, which is for ``domains``.
 
-    It is the one that is ``wanted`` (by an option or ROS_DOMAIN_ID); else 0, as ROS does, where
-    the keystore has it; else the keystore's first one.
+    It is ``wanted`` (from an option or ROS_DOMAIN_ID), if given.  Otherwise it is 0, the default of
+    ROS, if the keystore is for it, and else the first domain of the keystore.
 
     Raises:
-        KeystoreError: The keystore is not for the domain that is wanted.
+        KeystoreError: The keystore is not for the ``wanted`` domain.
     """
     if wanted is not None:
         if wanted not in domains:
@@ -69,7 +69,7 @@ def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
 
 
 def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
-    """Return the variables with which a process runs in enclave ``name``, or does not start."""
+    """Return the variables that make a process run in enclave ``name``, or not start at all."""
     return {
         KEYSTORE: str(root.absolute()),
         ENABLE: "true",
@@ -80,7 +80,7 @@ def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
 
 
 def render_environment(variables: Mapping[str, str], form: str) -> str:
-    """Return the variables as text in one of `FORMS`.
+    """Return the variables as text in a form: sh, fish, json, systemd or docker.
 
     ``docker`` is an env-file, ``systemd`` the lines of a unit; neither can hold a line break.
 
@@ -124,10 +124,10 @@ _PYTHON = re.compile(r"python[\d.]*\Z")
 
 
 def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
-    """Return the command with ``--ros-args --enclave``, if it is known to start a ROS node.
+    """Return the command with ``--ros-args --enclave`` added, if it certainly starts a ROS node.
 
-    Known are ``ros2 run``, an executable of a ROS package (``lib/PACKAGE/NAME``), also of Python,
-    and whatever has ``--ros-args`` already.  A command that names an enclave keeps it.
+    Such commands are ``ros2 run``, an executable or Python script of a ROS package
+    (``lib/PACKAGE/NAME``), and all with ``--ros-args``.  A command that names an enclave keeps it.
     """
     command = tuple(command)
     if Path(command[0]).name == "ros2" and not _is_ros2_run(command):
@@ -141,7 +141,7 @@ def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
 
 
 def _is_ros2_run(command: Sequence[str]) -> bool:
-    """Whether it is ``ros2 run [--prefix PREFIX] PACKAGE EXECUTABLE ...``."""
+    """Return whether it is ``ros2 run [--prefix PREFIX] PACKAGE EXECUTABLE ...``."""
     if Path(command[0]).name != "ros2" or tuple(command[1:2]) != ("run",):
         return False
     words = list(command[2:])
@@ -153,7 +153,7 @@ def _is_ros2_run(command: Sequence[str]) -> bool:
 
 
 def _is_of_package(command: Sequence[str]) -> bool:
-    """Whether the program, or the script that Python runs, is installed by a ROS package."""
+    """Return whether a ROS package installed the program, or the script that Python runs."""
     script = command[1] if _PYTHON.match(Path(command[0]).name) and len(command) > 1 else ""
     path = Path(script or shutil.which(command[0]) or command[0])
     if path.parent.parent.name != "lib" or not path.is_file():

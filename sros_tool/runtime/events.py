@@ -1,8 +1,8 @@
-"""What a watched process reports while it runs: one JSON object per line, appended to a file.
+"""The reports of a running process: one JSON object per line, appended to a file.
 
 Times are seconds of CLOCK_MONOTONIC, which all processes of a machine share.  A line is written
-with one system call, so that a reader never mixes two; an unfinished last line is left for the
-next read.
+with one system call, so that lines never get mixed; an unfinished last line is left for the next
+read.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from sros_tool.errors import DocumentError
 
 
 class EventKind(StrEnum):
-    """What happened."""
+    """The kind of an event."""
 
     READY = "ready"
     REFUSED = "refused"
@@ -32,7 +32,7 @@ class EventKind(StrEnum):
 
 
 class ProcessStage(StrEnum):
-    """How far a process had come when it was refused or failed."""
+    """The stage at which a process was refused or failed."""
 
     IMPORT = "import"
     PARTICIPANT = "participant"
@@ -42,10 +42,10 @@ class ProcessStage(StrEnum):
 
 @dataclass(frozen=True)
 class Event:
-    """One report.
+    """One event that a process reported.
 
-    ``text`` is the message sent or heard, or the reason of a refusal or failure; ``count`` is how
-    many messages there were so far; ``publishers`` says how many an observer counts per topic.
+    ``text`` is the message sent or heard, or the reason of a refusal or failure; ``count`` is the
+    number of messages so far; ``publishers`` is the number that an observer counts, by topic.
     """
 
     kind: EventKind
@@ -57,7 +57,7 @@ class Event:
 
 
 class EventWriter:
-    """Appends events to a file, or drops them where there is none."""
+    """A writer that appends events to a file, or drops them if ``path`` is None."""
 
     def __init__(self, path: Path | None) -> None:
         self._file = None
@@ -96,14 +96,14 @@ class EventWriter:
 
 
 class EventReader:
-    """Reads what has been appended since the last read; a file not there yet is empty."""
+    """A reader of the events appended since its last read; a missing file counts as empty."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._position = 0
 
     def new_events(self) -> list[Event]:
-        """Return the events of the whole lines that have come since the last call.
+        """Return the events of the complete lines appended since the last call.
 
         Raises:
             DocumentError: A line is not an event.

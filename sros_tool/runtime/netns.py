@@ -1,8 +1,8 @@
-"""Give the calling process a network of its own, so that a demo and the host do not interfere.
+"""Move the calling process into its own network, so that a demo and the host do not interfere.
 
-The network namespace holds nothing but a loopback interface, and vanishes with the last process
-in it.  Root needs CAP_SYS_ADMIN; everybody else a user namespace, which also grants the right to
-capture packets inside (capabilities(7), user_namespaces(7)).
+The network namespace has only a loopback interface, and disappears with the last process in it.
+Root needs CAP_SYS_ADMIN; other users need a user namespace, which also grants the right to capture
+packets inside (capabilities(7), user_namespaces(7)).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ _RTF_UP = 0x1
 
 _LOCAL_PORTS = Path("/proc/sys/net/ipv4/ip_local_port_range")
 _BELOW_DDS = "1024 7399"
-"""Where no domain's ports are: those begin at 7400 (RTPS 2.5 §9.6.2.3)."""
+"""A port range that no domain uses: their ports begin at 7400 (RTPS 2.5 §9.6.2.3)."""
 
 _ALONE = 0
 _TRIAL_SECONDS = 60
@@ -58,14 +58,14 @@ class _RouteEntry(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Isolation:
-    """Whether a process can get a network of its own, and the reason where it cannot."""
+    """The ability of a process to get its own network, with the reason if it cannot."""
 
     isolated: bool
     reason: str = ""
 
 
 def try_isolation() -> Isolation:
-    """Try in a child process whether `enter_isolation` would work; the caller stays as it is."""
+    """Return whether `enter_isolation` would work, by trying it in a child process."""
     read_end, write_end = os.pipe()
     child = os.fork()
     if child == 0:
@@ -91,11 +91,11 @@ def try_isolation() -> Isolation:
 
 
 def enter_isolation() -> None:
-    """Move this process, with one thread only, into a network namespace of its own.
+    """Move this process, which must have only one thread, into its own network namespace.
 
     Raises:
-        OSError: The kernel does not allow it. The process may then be half way (in a user namespace
-            without rights), so call `try_isolation` first.
+        OSError: The kernel does not allow it. The process may then be in a user namespace without
+            rights, so call `try_isolation` first.
     """
     user, group = os.getuid(), os.getgid()
     try:
@@ -125,7 +125,7 @@ def _unshare(flags: int) -> None:
 
 
 def _bring_up_loopback() -> None:
-    """``ip link set lo up multicast on; ip route add 224.0.0.0/4 dev lo``, without iproute2."""
+    """Do ``ip link set lo up multicast on; ip route add 224.0.0.0/4 dev lo`` without iproute2."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker:
         request = struct.pack("16sH14x", b"lo", 0)
         answer = fcntl.ioctl(asker, _SIOCGIFFLAGS, request)
@@ -148,15 +148,15 @@ def _add_multicast_route(asker: socket.socket) -> None:
 
 
 def _keep_off_ports_of_dds() -> None:
-    """Let the kernel give sockets that ask for any port none that a DDS domain needs.
+    """Keep the kernel from assigning ports of DDS domains to sockets that ask for any port.
 
-    From domain 102 on, the well-known ports lie where Linux takes such ports from: now and then a
-    participant could not join because another one's socket had been given that very port.
+    From domain 102 on, the well-known ports are in the range from which Linux assigns them.
+    Sometimes a participant could not join because its port was assigned to another socket.
     """
-    with contextlib.suppress(OSError):  # a container may not let anybody write there
+    with contextlib.suppress(OSError):  # a container may forbid it
         _LOCAL_PORTS.write_text(_BELOW_DDS, encoding="ascii")
 
 
 def _internet_address(text: str) -> bytes:
-    """``struct sockaddr_in`` with port 0."""
+    """Return the address as a ``struct sockaddr_in`` with port 0."""
     return struct.pack("=HH4s8x", socket.AF_INET, 0, socket.inet_aton(text))

@@ -1,8 +1,8 @@
-"""The process in which one DDS is tried; started by `sros_tool.runtime.stacks` only.
+"""The process that tries one DDS; only `sros_tool.runtime.stacks` starts it.
 
-It joins in the enclave that the environment names, then asks for endpoints that the enclave's
-permissions allow and for some that they do not, and reports each answer.  Nothing is judged here:
-a crash of this process must not be taken for an answer.
+It joins with the enclave that the environment names, then creates endpoints that the enclave's
+permissions allow and some that they deny, and reports each result.  The parent judges the results:
+a crash of this process must not count as one.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from sros_tool.runtime.rmw import MIDDLEWARE
 _LOG_FLUSH_SECONDS = 0.3
 
 Ask = Callable[[str, str], None]
-"""Creates an endpoint of a kind ("writer" or "reader") on a ROS topic ("/chatter")."""
+"""A function that creates an endpoint ("writer" or "reader") on a ROS topic ("/chatter")."""
 
 Close = Callable[[], None]
-"""Leaves the domain, so that nothing stays behind."""
+"""A function that leaves the domain."""
 
 
 def _join_rclpy() -> tuple[Ask, Close]:
@@ -59,7 +59,7 @@ def _join_rclpy() -> tuple[Ask, Close]:
 
 
 def _join_cyclone() -> tuple[Ask, Close]:
-    """Join as a participant of the Cyclone DDS that sros itself uses."""
+    """Join as a participant of the libddsc that sros uses."""
     participant = Participant(domain_of(os.environ), choose_enclave(os.environ).enclave)
 
     def ask(kind: str, topic: str) -> None:
@@ -72,7 +72,7 @@ def _join_cyclone() -> tuple[Ask, Close]:
 
 
 def _join_cyclonedds_package() -> tuple[Ask, Close]:
-    """Join as a participant of the Python package ``cyclonedds``, with the libddsc it brings."""
+    """Join as a participant of the Python package ``cyclonedds``, with its own libddsc."""
     core, domain, idl, pub, sub, topics = (
         importlib.import_module(f"cyclonedds.{name}")
         for name in ("core", "domain", "idl", "pub", "sub", "topic")
@@ -98,7 +98,7 @@ _JOINS: dict[str, Callable[[], tuple[Ask, Close]]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Join, then ask for endpoints on two topics; arguments are ``KIND REPORT ALLOWED DENIED``."""
+    """Join, then create endpoints on two topics; arguments are ``KIND REPORT ALLOWED DENIED``."""
     kind, report, allowed, denied = sys.argv[1:] if arguments is None else arguments
     if try_isolation().isolated:
         enter_isolation()
@@ -129,7 +129,7 @@ def _report_failure(events: EventWriter, error: Exception, stage: ProcessStage, 
     refused = isinstance(error, SecurityRefusedError)
     reason = f"{type(error).__name__}: {error}"
     if isinstance(error, SrosError):
-        # Not the remedy: what to do depends on all that was found.
+        # Without the remedy: that depends on all findings.
         reason = str(SrosError(error.what, error.why)).rstrip(".")
     if stage is not ProcessStage.ENDPOINT:
         time.sleep(_LOG_FLUSH_SECONDS)
@@ -138,7 +138,7 @@ def _report_failure(events: EventWriter, error: Exception, stage: ProcessStage, 
 
 
 def _dds_in_memory() -> str:
-    """Return name, version and file of the DDS that is loaded here, one per line; or ""."""
+    """Return name, version and file of the DDS loaded in this process, one per line; or ""."""
     for each in MIDDLEWARE:
         for prefix in each.libraries:
             for file in loaded_libraries(prefix):

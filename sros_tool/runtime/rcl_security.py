@@ -1,7 +1,7 @@
-"""Which enclave a process would load, by exactly the rules of ROS 2's rcl (rcl/src/rcl/security.c).
+"""The enclave that a process would load, by the exact rules of rcl (rcl/src/rcl/security.c).
 
-Anything but ``true`` switches security off, and with anything but ``Enforce`` a process without an
-enclave runs unsecured.
+Any other ROS_SECURITY_ENABLE than ``true`` switches security off.  With any other
+ROS_SECURITY_STRATEGY than ``Enforce``, a process without an enclave runs unsecured.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from sros_tool.runtime.environment import ENABLE, ENCLAVE, KEYSTORE, STRATEGY, d
 
 @dataclass(frozen=True)
 class SecurityChoice:
-    """The enclave's directory that rcl chooses, or None for no security, and why."""
+    """The enclave directory that rcl chooses (None: no security), and the reason."""
 
     enclave: Path | None
     note: str
@@ -27,7 +27,7 @@ def choose_enclave(environment: Mapping[str, str], enclave: str = "/") -> Securi
     """Return rcl's choice for a process started with ``--ros-args --enclave`` ENCLAVE.
 
     Raises:
-        SrosError: rcl would not start the process: Enforce, and no such enclave.
+        SrosError: rcl would not start the process: with Enforce, the enclave must exist.
     """
     if environment.get(ENABLE) != "true":
         return SecurityChoice(None, f"security is off: {ENABLE} is not exactly 'true'")
@@ -47,12 +47,12 @@ def choose_enclave(environment: Mapping[str, str], enclave: str = "/") -> Securi
 
 
 def choose_loadable(environment: Mapping[str, str], enclave: str = "/") -> SecurityChoice:
-    """Return the choice of `choose_enclave`, or none where the enclave lacks a file.
+    """Return the choice of `choose_enclave`; no security if a file of the enclave is missing.
 
-    Source: rmw_dds_common ``security.cpp``, which does not say which file it is.
+    Source: rmw_dds_common ``security.cpp``, whose message does not name the file.
 
     Raises:
-        SrosError: The process would not start (Enforce); with the words of the RMWs.
+        SrosError: The process would not start (Enforce); has the message of the RMWs.
     """
     choice = choose_enclave(environment, enclave)
     folder = choice.enclave
@@ -66,7 +66,7 @@ def choose_loadable(environment: Mapping[str, str], enclave: str = "/") -> Secur
 
 
 def domain_of(environment: Mapping[str, str]) -> int:
-    """Return the domain that ROS_DOMAIN_ID names, 0 where it is not set.
+    """Return the domain that ROS_DOMAIN_ID names, or 0 if it is not set.
 
     Raises:
         UsageError: It is not a domain id.

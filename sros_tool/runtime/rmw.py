@@ -1,4 +1,4 @@
-"""The RMWs of ROS 2: the middleware below each, how it is recognised, and which are installed.
+"""The RMWs of ROS 2: the middleware of each, how to recognise it, and which are installed.
 
 A vendor is added to sros by its rules in `sros_tool.dds.decision.vendors`, its row in `MIDDLEWARE`
 here, and its texts in `sros_tool.runtime.vendor_log`.
@@ -17,22 +17,22 @@ from sros_tool.dds.decision.vendors import Vendor
 RMW = "RMW_IMPLEMENTATION"
 """The variable that names the RMW of a process."""
 DEFAULT_RMW = "rmw_fastrtps_cpp"
-"""The RMW of ROS 2 Jazzy where the variable is not set."""
+"""The RMW that ROS 2 Jazzy uses if the variable is not set."""
 
 CYCLONE_EXPLAINS = {
     "CYCLONEDDS_URI": "<CycloneDDS><Domain><Tracing><Category>fatal,error,warning,trace</Category>"
     "<OutputFile>stderr</OutputFile></Tracing></Domain></CycloneDDS>"
 }
-"""Variables that make Cyclone DDS say why it denies a topic, which only its trace does."""
+"""Variables that make Cyclone DDS log, in its trace, why it denies a topic."""
 
 
 @dataclass(frozen=True, slots=True)
 class Middleware:
-    """What ROS 2 runs on, and how it is recognised.
+    """A middleware that ROS 2 can use, and how to recognise it.
 
-    ``rmw`` occurs in the names of its RMWs, and the names of its shared libraries start with one
-    of ``libraries``.  ``vendor`` is the one whose decisions it makes, None where it is not DDS;
-    ``explains`` are the variables that make it log why it denies a topic.
+    ``rmw`` is part of the names of its RMWs, and the names of its shared libraries start with one
+    of ``libraries``.  ``vendor`` is its DDS vendor, None if it is not DDS; ``explains`` are
+    variables that make it log why it denies a topic.
     """
 
     name: str
@@ -55,21 +55,20 @@ _NOT_AN_RMW = "rmw_implementation"
 
 
 def middleware_of(rmw: str) -> Middleware | None:
-    """Return what an RMW runs on, or None where sros does not know the RMW."""
+    """Return the middleware of an RMW, or None if sros does not know the RMW."""
     return next((each for each in MIDDLEWARE if each.rmw in rmw), None)
 
 
 def vendor_of(rmw: str) -> Vendor | None:
-    """Return the DDS vendor below an RMW, or None where there is none or sros does not know it."""
+    """Return the DDS vendor of an RMW, or None if it is unknown or does not use DDS."""
     found = middleware_of(rmw)
     return found.vendor if found else None
 
 
 def rmw_implementations(environment: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the RMWs in the ament index, the one that rclpy would take first.
+    """Return the RMWs in the ament index, starting with the one that rclpy would use.
 
-    Read from the prefixes in AMENT_PREFIX_PATH, and from the prefix of this Python, in which the
-    wheels install theirs.
+    The prefixes are those in AMENT_PREFIX_PATH, and the prefix of this Python, which wheels use.
     """
     prefixes = [*environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
     found = {
@@ -84,9 +83,9 @@ def rmw_implementations(environment: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def vendor_here(environment: Mapping[str, str]) -> tuple[Vendor, str]:
-    """Return the vendor of this machine, and in a few words why it is that one.
+    """Return the DDS vendor of this machine, and the reason as a short text.
 
-    It is the vendor of $RMW_IMPLEMENTATION, else of the RMW that is installed, else Fast DDS.
+    It is the vendor of $RMW_IMPLEMENTATION, else of an installed RMW, else Fast DDS.
     """
     named = environment.get(RMW, "")
     if vendor := vendor_of(named):

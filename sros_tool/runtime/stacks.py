@@ -1,9 +1,8 @@
-"""Which of the DDS stacks here enforce security: each is tried in an enclave made by sros.
+"""Find out which installed DDS stacks enforce security, by trying each in an enclave of sros.
 
-A name or a version says nothing about how a library was built, so each stack is tried in a process
-of its own.  Only two answers are a no: it says that security is not built in, or it lets an
-endpoint pass that the permissions do not allow.  Whatever else goes wrong is "could not be tried",
-never a no.
+A name or a version does not show how a library was built, so each stack is tried, in a separate
+process.  Only two results mean "does not enforce": it reports that security is not built in, or it
+creates an endpoint that the permissions deny.  Any other failure means "could not be tried".
 """
 
 from __future__ import annotations
@@ -46,7 +45,7 @@ _EXIT_SECONDS = 5.0
 
 @dataclass(frozen=True)
 class ProbeEnclave:
-    """The secured environment to probe in, and what its permissions say about two ROS topics.
+    """The secured environment of a probe, with one allowed and one denied ROS topic.
 
     ``environment`` holds the ROS_SECURITY_* variables and ROS_DOMAIN_ID of an enclave that may
     publish ``allowed`` and neither publish nor subscribe ``denied``.
@@ -59,10 +58,10 @@ class ProbeEnclave:
 
 @dataclass(frozen=True)
 class Stack:
-    """One DDS or RMW, and whether it enforces security (None: it could not be tried).
+    """One DDS or RMW; ``enforces`` says whether it enforces security (None: could not be tried).
 
-    ``kind`` is "cyclone" (the libddsc that sros uses), "rmw" (under rclpy) or "cyclonedds"
-    (the Python package).  ``evidence`` says what was tried and seen.
+    ``kind`` is "cyclone" (the libddsc that sros uses), "rmw" (used by rclpy) or "cyclonedds"
+    (the Python package).  ``evidence`` says what was tried and observed.
     """
 
     name: str
@@ -81,12 +80,12 @@ class Stack:
 
 
 def survey(probe: ProbeEnclave) -> tuple[Stack, ...]:
-    """Return every stack that sros can look for, also those that are not here."""
+    """Return every stack that sros knows, also those that are not installed."""
     return (*rclpy_stacks(probe), cyclone_stack(probe), _cyclonedds_package_stack(probe))
 
 
 def rclpy_stacks(probe: ProbeEnclave) -> Iterator[Stack]:
-    """Yield one stack per installed RMW, rclpy's choice first; each is tried when asked for."""
+    """Yield one stack per installed RMW, rclpy's default first; each is tried when requested."""
     if importlib.util.find_spec("rclpy") is None:
         yield _without_rclpy()
         return
@@ -95,7 +94,7 @@ def rclpy_stacks(probe: ProbeEnclave) -> Iterator[Stack]:
 
 
 def cyclone_stack(probe: ProbeEnclave) -> Stack:
-    """Return the Cyclone DDS that sros itself uses (`sros_tool.runtime.cyclone`)."""
+    """Return the stack of the libddsc that sros uses (`sros_tool.runtime.cyclone`)."""
     run = _run_probe("cyclone", probe, {})
     verdict = judge(run, probe.allowed, probe.denied)
     dds, version, where = _identity(run)
@@ -116,7 +115,7 @@ def cyclone_stack(probe: ProbeEnclave) -> Stack:
 
 
 def _cyclonedds_package_stack(probe: ProbeEnclave) -> Stack:
-    """Return the Python package ``cyclonedds``, which brings a libddsc of its own."""
+    """Return the stack of the Python package ``cyclonedds``, which contains its own libddsc."""
     spec = importlib.util.find_spec("cyclonedds")
     if spec is None:
         return _absent("cyclonedds (Python package)", "cyclonedds", "Cyclone DDS")
@@ -126,7 +125,7 @@ def _cyclonedds_package_stack(probe: ProbeEnclave) -> Stack:
     if verdict.enforces is None and where and not _has_plugins(Path(where)):
         verdict = ProbeVerdict(
             False,
-            "a secured participant fails, and no libdds_security_*.so comes with it."
+            "a secured participant fails, and the package has no libdds_security_*.so."
             f" {verdict.evidence.partition(': ')[2]}",
         )
     return Stack(
@@ -138,7 +137,7 @@ def _cyclonedds_package_stack(probe: ProbeEnclave) -> Stack:
         True,
         verdict.enforces,
         verdict.evidence,
-        "" if verdict.enforces else "sros does not need it: it speaks with libddsc itself.",
+        "" if verdict.enforces else "sros does not need this package: it uses libddsc directly.",
     )
 
 
@@ -201,9 +200,9 @@ def _package_version(name: str) -> str:
 
 @dataclass(frozen=True)
 class ProbeRun:
-    """What one probe process left: its reports, its output, and how it ended.
+    """The reports, the output and the exit status of one probe process.
 
-    ``status`` is its exit status, negative for a signal, None where it had to be stopped.
+    ``status`` is negative for a signal, and None if the process had to be stopped.
     """
 
     events: tuple[Event, ...]
@@ -254,15 +253,14 @@ def _wait(process: subprocess.Popen[bytes]) -> int | None:
 
 @dataclass(frozen=True)
 class ProbeVerdict:
-    """Whether a DDS enforces security, None where it could not be tried, and what was seen."""
+    """The answer whether a DDS enforces security (None: could not be tried), with the evidence."""
 
     enforces: bool | None
     evidence: str
 
 
 def judge(run: ProbeRun, allowed: str, denied: str) -> ProbeVerdict:
-    """Return the verdict on a run that asked for a writer on ``allowed`` and for endpoints on
-    ``denied``."""
+    """Return the verdict on a run with a writer on ``allowed`` and endpoints on ``denied``."""
     text = "\n".join([run.output, *(event.text for event in run.events)])
     if lacking := missing_security(text):
         return ProbeVerdict(False, f"a secured participant fails: {lacking}")

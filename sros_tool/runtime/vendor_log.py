@@ -1,13 +1,13 @@
-"""The table of what DDS vendors, rcl and the RMWs log about security, and what each text means.
+"""The table of the security messages that DDS vendors, rcl and the RMWs log, and their meanings.
 
 Fast DDS writes coloured text to standard output, Cyclone DDS to its log sink or standard error.
-With ROS_SECURITY_LOG_FILE the reasons of Fast DDS stand in that file, in another form, instead.
+With ROS_SECURITY_LOG_FILE, Fast DDS writes its reasons to that file instead, in another form.
 Each text was seen in a real log of Fast DDS 2.9.1 or 2.14.5 (Permissions.cpp, SecurityManager.cpp,
 PKIDH.cpp), Cyclone DDS 0.10.2 (access_control.c, authentication.c, q_omg_security.c), or rcl of
 Jazzy.
 
-A vendor is added by its rows in `LOG_TEXTS`, by what it puts around a reason (`_FRAME`), and by
-its words for writers and readers (`DIRECTIONS`).
+To add a vendor, add its rows to `_LOG_TEXTS`, the text that it puts around a reason to `_FRAME`,
+and its words for writers and readers to `DIRECTIONS`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from sros_tool.faults import Fault
 
 
 class Refused(Enum):
-    """What a text says is refused."""
+    """The thing that a message says is refused."""
 
     ALL_SECURITY = auto()
     """DDS Security as such: it is not built in."""
@@ -35,7 +35,7 @@ class Refused(Enum):
 
 
 _ROS = None
-"""The vendor of texts that rcl or an RMW prints, whatever DDS lies below."""
+"""The vendor of texts that rcl or an RMW prints with every DDS."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,14 +43,14 @@ class LogText:
     """A text of a log and its meaning.
 
     ``pattern`` is searched in a line without colours; its groups are fields such as ``path``,
-    ``domain`` and ``topic``.  ``cause`` and ``remedy`` may use them in braces; ``cause`` is ""
-    where the text alone does not give one.  Many texts stand for several causes: ``faults`` are the
-    faults of an enclave among which the true one is found by looking at the
-    enclave, and ``unseen`` is what to do where the enclave has none of them.
+    ``domain`` and ``topic``.  ``cause`` and ``remedy`` may use these fields in braces; ``cause`` is
+    "" if the text alone does not give one.  Many texts have several possible causes: ``faults`` are
+    faults of an enclave that can cause the text, to be searched in the enclave, and ``unseen`` is
+    the remedy if the enclave has none of them.
 
-    ``weak`` is 0 for a text that names a cause, and higher the less it says: of the texts of one
-    process the least weak ones count.  ``refuses`` is None where a text alone does not prove that
-    DDS Security refused something.
+    ``weak`` is 0 for a text that names a cause, and higher the less it says: of all texts of a
+    process, only those with the lowest value count.  ``refuses`` is None if the text alone does not
+    prove that DDS Security refused something.
     """
 
     id: str
@@ -115,8 +115,8 @@ _SIGN_ONE = (
     "A governance has to be restored from a backup: every enclave depends on it."
 )
 _READABLE = (
-    "Let the user that runs the node read it, and enter the folders above it: `ls -lL {path}` run "
-    "as that user shows whether it may."
+    "Allow the user that runs the node to read it, and to enter the folders above it: `ls -lL "
+    "{path}`, run as that user, shows whether this works."
 )
 _SET_DOMAIN = (
     "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env KEYSTORE ENCLAVE --domain ID` prints "
@@ -402,7 +402,7 @@ _LOG_TEXTS: tuple[LogText, ...] = (
         "Leave partitions out of permissions; sros never writes them.",
         refuses=Refused.TOPIC,
     ),
-    # ── what follows on others ─────────────────────────────────────────────────────────────
+    # ── messages that follow others ────────────────────────────────────────────────────────
     _text(
         "participant", _FAST, r"Error while configuring security plugin"
         r"|Participant is not allowed with its own permissions file",
@@ -437,10 +437,9 @@ _LOG_TEXTS: tuple[LogText, ...] = (
         r"|create_(?:publisher|subscription)\(\) could not create",
         _DENIED_ENDPOINT, _ASK_FOR_TOPIC, weak=3,
     ),
-    # ── a topic that is denied: its right and its node are found from the lines nearby ─────
+    # ── denied topics: their right and node are found in the lines nearby ──────────────────
     _text(
-        # Tried only where a word begins: in a line of one long word it would else be tried
-        # everywhere.
+        # Matched only at the start of a word, for speed: a line may be one very long word.
         "topic-denied", _FAST, r"(?<![^\s(])(?P<topic>[^\s(]+) topic "
         r"(?P<how>not found in allow|denied by deny) rule",
         refuses=Refused.TOPIC,
@@ -461,7 +460,7 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     _text("refusal", _CYCLONE, r"denied by default rule|found in deny_rule",
           refuses=Refused.TOPIC),
 )  # fmt: skip
-"""In the order in which they are tried: the first that matches a line counts."""
+"""In the order of matching: the first text that matches a line counts."""
 
 UNKNOWN = LogText(
     "not-understood",
@@ -475,32 +474,32 @@ UNKNOWN = LogText(
     ),
     "a line of DDS Security that sros does not know",
     "Read the line itself: it may matter. If it kept a node from starting, `sros "
-    "check KEYSTORE` and `sros explain KEYSTORE ENCLAVE join` look at all that DDS looks at.",
+    "check KEYSTORE` and `sros explain KEYSTORE ENCLAVE join` check all that DDS checks.",
 )
-"""For what looks like a message of DDS Security and is none of `LOG_TEXTS`."""
+"""The meaning of a line that looks like a DDS Security message but is not in `_LOG_TEXTS`."""
 
 # ── the lines around a text ────────────────────────────────────────────────────────────────
 
 SECURITY_DIRECTORY = re.compile(
     r"Found security directory: \S*?/enclaves(?P<enclave>/\S*)?(?:\s|\Z)"
 )
-"""The line in which rcl says, in the group ``enclave``, which enclave a process runs in."""
+"""The line in which rcl names the enclave of a process (group ``enclave``)."""
 
 PROCESS_LABEL = re.compile(
     r"\[[\w.-]+-\d+\] "  # ros2 launch: [talker-1]
     r"|(?:\S+ +){3,4}[\w.@-]+\[\d+\]: "  # journald: Nov 21 06:00:00 robot talker[12]:
     r"|[\w.-]+ +\| "  # Docker Compose: talker-1  |
 )
-"""The start of a line by which the processes are told apart that write into one log."""
+"""The label at the start of a line that distinguishes the processes in one log."""
 
 DOMAIN_OF_LINE = re.compile(r"\] \S+\|\S+ (\d{1,9}) \w+::\w+ :")
-"""The domain, in a line of ROS_SECURITY_LOG_FILE: behind the participant's identifier."""
+"""The domain in a line of ROS_SECURITY_LOG_FILE, after the participant's identifier."""
 
 CONTINUED = re.compile(r"^(?:[0-9A-F]{8,}:error:|\(code: )")
-"""A line that belongs to the one before it: OpenSSL's error stack."""
+"""The start of a line that continues the line before it: OpenSSL's error stack."""
 
 PEER = re.compile(r"check_remote_data|remote (?:writer|reader)")
-"""In a line about a denied topic: the permissions of a peer deny it, not those of the process."""
+"""The words that show that a peer's permissions deny a topic, not those of the process."""
 
 DIRECTIONS: Mapping[str, re.Pattern[str]] = {
     "writer": re.compile(
@@ -514,23 +513,23 @@ DIRECTIONS: Mapping[str, re.Pattern[str]] = {
     "client": re.compile(r"create(?:_c| c|C)lient"),
     "server": re.compile(r"create(?:_s| s|S)ervice"),
 }
-"""The words, in lines near a denied topic, for the kind of endpoint that was to be created."""
+"""The words, in lines near a denied topic, for the kind of endpoint that was denied."""
 
 # ── reading ────────────────────────────────────────────────────────────────────────────────
 
 
 def missing_security(text: str) -> str:
-    """Return the words in which a DDS says that it was built without DDS Security, or ""."""
+    """Return the message of a DDS that it was built without DDS Security, or ""."""
     return _first_refusal(Refused.ALL_SECURITY, text)
 
 
 def participant_refusal(text: str) -> str:
-    """Return the words in which DDS Security refuses a participant's files or domain, or ""."""
+    """Return the message that refuses a participant's files or domain, or ""."""
     return _first_refusal(Refused.PARTICIPANT, text)
 
 
 def endpoint_refusal(text: str) -> str:
-    """Return the words in which DDS Security denies a topic, a writer or a reader, or ""."""
+    """Return the message that denies a topic, a writer or a reader, or ""."""
     return _first_refusal(Refused.TOPIC, text)
 
 
@@ -543,7 +542,7 @@ def _first_refusal(refused: Refused, text: str) -> str:
 
 
 def denied_topic(line: str) -> tuple[Vendor, re.Match[str]] | None:
-    """Return the vendor that denies a topic in a line, with the groups ``topic`` and ``how``."""
+    """Return the vendor that denies a topic, and the match with groups ``topic`` and ``how``."""
     for vendor, pattern in _TOPIC_DENIED:
         if match := pattern.search(line):
             return vendor, match
@@ -556,7 +555,7 @@ _TOPIC_DENIED = [
 
 
 def log_text(line: str) -> tuple[LogText, re.Match[str]] | None:
-    """Return the row that gives the cause of a line, or None; denied topics have none."""
+    """Return the row that explains a line, or None; denied topics have no such row."""
     for text in _LOG_TEXTS:
         if text.cause and (match := text.pattern.search(line)):
             return text, match
@@ -564,14 +563,14 @@ def log_text(line: str) -> tuple[LogText, re.Match[str]] | None:
 
 
 def plain_text(output: str) -> str:
-    """Return what a process printed, without colours."""
+    """Return the output of a process without colours."""
     return _COLOUR.sub("", output)
 
 
 def plain_refusal(line: str) -> str:
-    """Return the words of a line of a DDS log, without time, severity and places in its sources.
+    """Return the message in a line of a DDS log, without time, severity and source positions.
 
-    Never empty where the line is not: of a refusal without a reason it says what was refused.
+    It is empty only if the line is: without a message, the name of the failed function is used.
     """
     line = " ".join(plain_text(line).split())
     if words := " ".join(_FRAME.sub("", line).split()):
@@ -583,18 +582,18 @@ def plain_refusal(line: str) -> str:
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 
 _FRAME = re.compile(
-    # Fast DDS: when, `[SECURITY Error]`, the place in its sources, and the function.
+    # Fast DDS: time, `[SECURITY Error]`, source position, and function.
     r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d[.\d]* (?=\[)|\[SECURITY\w* (?:Error|Warning)\]\s*"
     r"|\s*\([^()\s]+\.(?:cpp|h|hpp|ipp):\d+\)|\s*-> Function \w+\Z|, at \S+\.(?:cpp|c):\d+"
-    # The file of ROS_SECURITY_LOG_FILE: when, severity, participant, domain, and the function.
+    # The file of ROS_SECURITY_LOG_FILE: time, severity, participant, domain, and function.
     r"|^\S+ \[[A-Z]+\] \S+ \d+ \w+::\w+ :\s*"
-    # Cyclone DDS and OpenSSL: when and by which thread, numbers, and places in their sources.
+    # Cyclone DDS and OpenSSL: time and thread, numbers, and source positions.
     r"|^\d+\.\d+ \[\d*\]\s+\S+: |(?:candidate|adjusted)_guid: \S+ "
     r"|Remote secure participant \S+ not allowed\. ?|[0-9A-F]{16}:error:[0-9A-F]+:[\w ]+:"
     r"|:\.\./\S+\.c:\d+|\[\w+\] failed: |validate_local_identity: |Error\. (?=Error|validate)"
 )
-"""What vendors put around the reason of a refusal, which says nothing to a person."""
+"""The text that vendors put around the reason of a refusal, of no use to a user."""
 
 _NO_REASON = "{}, and Fast DDS gives no reason"
 _FUNCTION = re.compile(r"(?:-> Function |::)(\w+)(?: :)?\s*\Z")
-"""The function that failed, in a line of Fast DDS that has no text of its own."""
+"""The failed function, in a line of Fast DDS without a message."""

@@ -372,7 +372,7 @@ def test_a_node_of_another_name_is_told(keystore: Path, log: str, node: str) -> 
     found = sros("explain", keystore, ENCLAVE, "--log", path).out
     assert f"the permissions are for the node /talker, and this is the node {node}" in found
     assert "`--ros-args -r __node:=talker -r __ns:=/`" in found
-    assert f"this one is the node {node}" in sros("explain", "--log", path).out
+    assert f"this is the one of node {node}" in sros("explain", "--log", path).out
 
 
 def test_rcl_alone_makes_one_look_at_the_name(keystore: Path, tmp_path: Path) -> None:
@@ -389,7 +389,7 @@ def test_a_missing_common_part_is_told(keystore: Path, tmp_path: Path) -> None:
     sros("create_permission", keystore, ENCLAVE, bare).ok()
     log = LOGS / f"{FAST_14}.common_part_missing.log"
     found = sros("explain", keystore, ENCLAVE, "--log", log).out
-    assert "the permissions have nothing of what every node has" in found
+    assert "the permissions lack the rights that every node needs" in found
     assert 'href="common/node.xml"' in found
 
 
@@ -404,7 +404,7 @@ def test_a_denied_topic_is_compared_with_what_is_signed(keystore: Path, tmp_path
     )
     found = sros("explain", keystore, ENCLAVE, "--log", log)
     assert found.status == 1
-    assert "the permissions that are there now allow it" in found.out
+    assert "the present permissions allow it" in found.out
     assert "Restart the process" in found.out
     assert "no rule allows publish rt/other" in found.out
     assert f"sros explain {keystore} {ENCLAVE} publish /other" in found.out

@@ -152,7 +152,7 @@ def test_a_missing_common_part_is_included_in_one_round(tmp_path: Path) -> None:
     text = path.read_text()
     assert text.count("<xi:include") == 1 and "<topic>chatter</topic>" in text
     assert (tmp_path / "common/node/parameters.xml").exists()
-    assert "added 11 rights" in ended.out and "proposed as a whole" in ended.err
+    assert "added 11 rights" in ended.out and "proposed together" in ended.err
     rights = {(each.right, each.name) for each in policy_rights(read_policy(path))}
     assert {("publish", "/rosout"), ("reply", "/talker/set_parameters")} < rights
     again = sros("generate_policy", path, "--from-log", log).ok()
