@@ -1,4 +1,4 @@
-"""The whole demo: check the options, make keystores, choose a backend, run scenarios."""
+"""Run the whole demo: check options, make keystores, choose a backend, run scenarios."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ from sros_tool.runtime.netns import Isolation, try_isolation
 from sros_tool.translate import dds_names
 
 _DEFAULT_DOMAIN = 80
-"""The rows take this domain and those after it: below 102, where Linux hands out no port."""
+"""The first domain of the rows: below 102, where Linux assigns no ports by itself."""
 
 _DEFAULT_TEMPLATE = "production"
 
 _HOST = "host"
-"""The choice to stay in the network of the machine."""
+"""The choice of the machine's network."""
 
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """What to run; ``keep`` is the folder to leave everything in, if any.
+    """The options of a demo; ``keep`` is the folder to keep all files in, if any.
 
-    ``keystore`` is one of the user's, to be attacked in a copy.  Without a ``template`` it is the
-    one of that keystore, or production; without a ``topic``, one that fits.  ``only`` leaves those
-    rows whose names contain one of its words.
+    ``keystore`` is a keystore of the user; a copy of it is attacked.  The default ``template`` is
+    the template of that keystore, or production; the default ``topic`` is a suitable one.  ``only``
+    selects the rows whose names contain one of its words.
     """
 
     template: Template | None = None
@@ -63,10 +63,10 @@ class DemoOptions:
 
 
 def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoResult:
-    """Run the demo; ``progress`` gets lines while it runs.
+    """Run the demo and return its result; ``progress`` gets lines while it runs.
 
     Raises:
-        UsageError: before anything is made.
+        UsageError: an option is wrong; nothing has been created then.
         UnavailableError: no DDS enforces security here.
         SrosError: a keystore could not be made.
     """
@@ -131,10 +131,10 @@ def _find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend
 
 
 def _user_keystore(options: DemoOptions) -> UserKeystore | None:
-    """Open the user's keystore, if one is given.
+    """Return the user's keystore, if one is given.
 
     Raises:
-        UsageError: a scenario needs a keystore of its own.
+        UsageError: a scenario cannot use the user's keystore.
     """
     if options.keystore is None:
         return None
@@ -172,7 +172,7 @@ def _with_chosen_rows(options: DemoOptions) -> tuple[Scenario, ...]:
 
 
 def _dds_topic(row: Row, topic: str) -> str:
-    """Return the DDS topic whose protection decides a row; of a service, its request topic."""
+    """Return the DDS topic whose protection decides a row; for a service, the request topic."""
     return dds_names("request", row.ros_name).publish[0] if row.ros_name else f"rt{topic}"
 
 
@@ -183,7 +183,7 @@ def _asked_for(row: Row, options: DemoOptions) -> bool:
 def _domains(
     scenario: Scenario, options: DemoOptions, user: UserKeystore | None, isolation: Isolation
 ) -> tuple[int, ...]:
-    """Return a domain for each row; with the user's keystore, networks part the rows instead."""
+    """Return a domain for each row; with the user's keystore, always the same one."""
     if user is not None:
         if not isolation.isolated:
             raise UnavailableError(
@@ -223,14 +223,14 @@ def _folder(keep: Path | None) -> Iterator[Path]:
     try:
         yield keep.absolute()
     except BaseException:
-        # A demo without a result is not worth keeping, and it holds private keys.
+        # Without a result, delete the folder: it contains private keys.
         shutil.rmtree(keep, ignore_errors=True)
         raise
 
 
 @contextmanager
 def _ended_by_signals() -> Iterator[None]:
-    """Clean up on SIGTERM and SIGHUP as on Ctrl-C: the folder holds private keys."""
+    """Clean up on SIGTERM and SIGHUP as on Ctrl-C: the folder contains private keys."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -89,7 +89,7 @@ class DemoResult:
         return all(scenario.as_expected for scenario in self.scenarios)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the result as the head of this module describes it."""
+        """Return the result as JSON, described at the top of this module."""
         scenarios = [scenario.as_json() for scenario in self.scenarios]
         return {
             "backend": self.backend.name,

@@ -1,8 +1,8 @@
-"""The runner: starts the processes of each row, watches them, and ends them.
+"""Run rows: start the processes of each row, watch them, and end them.
 
-A row's window starts when all its processes are ready, so a busy machine is waited for.  It is as
-long for silence as for sound; only a brief row in which nobody has to be silent ends early.  None
-of the processes outlives its starter.
+A row's window starts when all its processes are ready, also on a busy machine.  It has the same
+length for expected silence and expected messages; only a brief row that expects no silence ends
+early.  No process outlives the process that started it.
 """
 
 from __future__ import annotations
@@ -55,10 +55,10 @@ _SECONDS_TO_END = 2.0
 
 @dataclass(frozen=True)
 class Limits:
-    """Seconds: to start in, the shortest and longest window, and for all rows together.
+    """Time limits in seconds: for the start, for the window of a row, and for all rows.
 
-    ``wave`` is for as many rows as run at once: many rows get more than ``total``.  All but the
-    shortest window only tell a slow machine from a process that hangs.
+    ``wave`` is for one group of parallel rows, so that many rows get more time than ``total``.  All
+    limits except ``window`` only exist to detect hanging processes on slow machines.
     """
 
     start: float = 60.0
@@ -70,10 +70,10 @@ class Limits:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """The rows to run, and everything that this needs.
+    """The rows to run, with everything that is necessary for it.
 
     ``domains`` has one domain per row; ``topic`` is absolute; ``period`` is in seconds.  With
-    ``own_networks``, each row gets a network namespace of its own.
+    ``own_networks``, each row gets its own network namespace.
     """
 
     rows: tuple[Row, ...]
@@ -93,7 +93,7 @@ def run_rows(plan: RunPlan, progress: Progress) -> list[RowResult]:
 
 
 class _Runner:
-    """Runs the rows of a plan, as many at once as the backend bears."""
+    """A runner of the rows of a plan, as many in parallel as the backend allows."""
 
     def __init__(self, plan: RunPlan, progress: Progress) -> None:
         self._plan = plan
@@ -114,7 +114,7 @@ class _Runner:
         return await asyncio.gather(*map(self._run_row, range(len(self._plan.rows))))
 
     def _text(self, index: int, party: Party) -> str:
-        """Return what a talker says; it occurs nowhere else, not in another row either."""
+        """Return the text of a talker, which is unique among all rows."""
         return f"Hello World from the {party.name} {self._mark}-{index}"
 
     async def _run_row(self, index: int) -> RowResult:
@@ -258,7 +258,7 @@ class _Runner:
         return start, now
 
     def _is_met(self, claim: Claim, processes: Mapping[str, _PartyProcess]) -> bool:
-        """Return whether a claim that something happens has been seen to hold, several times."""
+        """Return whether a claim that something happens was observed often enough."""
         events = processes[claim.subject].look()
         if claim.relation in (Relation.HEARS, Relation.IS_ANSWERED):
             mark = f"{processes[claim.talker].text}: "
@@ -284,7 +284,7 @@ def _is_decided_by_start(row: Row) -> bool:
 
 
 async def _end_softly(processes: Collection[_PartyProcess]) -> None:
-    """Ask processes to end, and wait a while; they log and report until then."""
+    """Ask processes to end, and wait for a short time, in which they still log and report."""
     for process in processes:
         process.ask_to_end()
     latest = time.monotonic() + _SECONDS_TO_END
@@ -300,12 +300,12 @@ _AFTER_FORGERY = 1.0
 
 
 async def _replay_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
-    """End a talker, then send its packets again at the pace of the original."""
+    """End a talker, then send its packets again with the original timing; return their number."""
     packets = tap.packets(talker.ports())
     await _end_softly([talker])
     await asyncio.sleep(_GRACE)
     started = time.monotonic()
-    # Twice, since the listener may take from the first round only who there is to hear.
+    # Twice, since the listener may only discover the talker in the first round.
     for _ in range(_REPLAY_ROUNDS):
         for before, each in zip([*packets[:1], *packets], packets, strict=False):
             await asyncio.sleep(min(each.time - before.time, _LONGEST_PAUSE))
@@ -315,7 +315,7 @@ async def _replay_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
 
 
 async def _forge_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
-    """Suspend a talker, and go on in its name with packets that say something else."""
+    """Suspend a talker, and send changed packets in its name; return their number."""
     talker.hold()
     await asyncio.sleep(_GRACE)
     words, others = talker.text, forged_text(talker.text)
@@ -407,7 +407,7 @@ class _PartyProcess:
 
     @property
     def settled(self) -> bool:
-        """Whether the process is ready, or will never be."""
+        """Whether the process is ready, was refused, or has failed or ended."""
         events = self.look()
         return self._own_status is not None or any(
             event.kind in (EventKind.READY, EventKind.REFUSED, EventKind.FAILED) for event in events
@@ -415,7 +415,7 @@ class _PartyProcess:
 
     @property
     def running(self) -> bool:
-        """Whether the process is ready and still there."""
+        """Whether the process was ready and has not ended by itself."""
         events = self.look()
         return self._own_status is None and any(event.kind is EventKind.READY for event in events)
 
@@ -431,7 +431,7 @@ class _PartyProcess:
         return self._ports
 
     def ask_to_end(self) -> None:
-        """Send SIGTERM; from now on an end is not the process's own."""
+        """Send SIGTERM; later, the process no longer counts as ended by itself."""
         self.look()
         self._asked = True
         with suppress(ProcessLookupError):
@@ -455,8 +455,8 @@ class _PartyProcess:
         self._process.wait()
 
     def record(self) -> PartyRecord:
-        """Return what the process left behind; to be called after `end`."""
-        # A node that is asked to end may report a failure; that is none.
+        """Return the record of the process; call it after `end`."""
+        # A node that was asked to end may report a failure, which does not count.
         late = [event for event in self._reader.new_events() if event.kind is not EventKind.FAILED]
         return PartyRecord(
             text=self.text,

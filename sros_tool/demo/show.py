@@ -37,7 +37,7 @@ def demo_table(result: DemoResult) -> str:
 
 
 def _cast_lines(members: Sequence[CastMember]) -> list[str]:
-    """Say which enclave plays which part, in a keystore that was not made for the demo."""
+    """Return lines with the enclave of each part, for a keystore of the user."""
     width = max((len(member.part) for member in members), default=0)
     lines = [
         f"{_INDENT}{member.part:<{width}}  {member.enclave}"
@@ -192,7 +192,7 @@ def _cells(row: RowResult) -> str:
 
 
 def payload_text(size: int) -> str:
-    """Return a payload in bytes for people: "64 B", "16 KiB", "1 MiB"."""
+    """Return a payload size in bytes as text: "64 B", "16 KiB", "1 MiB"."""
     for unit, name in ((1024 * 1024, "MiB"), (1024, "KiB")):
         if size >= unit:
             return f"{size / unit:g} {name}"

@@ -1,7 +1,7 @@
-"""The verdict: what was observed in a row, by the reports of its processes.
+"""Judge what was observed in a row, from the reports of its processes.
 
-A crash is not a refusal.  Silence counts only where both sides were ready, the talker really sent,
-and the controls held; a refusal only where DDS Security said so itself, about this topic.
+A crash is not a refusal.  Silence counts only if both sides were ready, the talker really sent, and
+the controls held; a refusal counts only if DDS Security itself reported it, for this topic.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from sros_tool.runtime.vendor_log import (
 
 @dataclass(frozen=True)
 class PartyRecord:
-    """What one process left behind.
+    """The record of one process after its end.
 
     ``text`` marks the messages of a talker; ``topic`` is its ROS topic; ``through`` names the
     library it used; ``output`` is what it printed; ``status`` is its exit status (negative for a
@@ -51,9 +51,9 @@ class PartyRecord:
 
 @dataclass(frozen=True)
 class RowRecord:
-    """What a row left behind.
+    """The record of a row after its end.
 
-    ``window`` is the time (CLOCK_MONOTONIC) that counts; None where not all parties became ready.
+    ``window`` is the time (CLOCK_MONOTONIC) that counts; None if not all parties became ready.
     ``injected`` is what an onlooker sent; ``skipped`` is why the row was not run, or "".
     """
 
@@ -68,7 +68,7 @@ class RowRecord:
 
 @dataclass(frozen=True)
 class RowResult:
-    """A line of the table: ``as_expected`` is also true of a row skipped with its reason."""
+    """A line of the table; ``as_expected`` is also true if the row was skipped."""
 
     name: str
     expected: RowStatus
@@ -84,12 +84,12 @@ class RowResult:
 
     @property
     def as_expected(self) -> bool:
-        """Whether this row lets the demo succeed."""
+        """Whether the row was observed as expected, or skipped."""
         return self.observed in (self.expected, RowStatus.SKIPPED)
 
     @property
     def known_open(self) -> bool:
-        """Whether it shows a way in that is known to be open, and why."""
+        """Whether the row shows an attack that is known to succeed."""
         return bool(self.open_because) and self.observed is self.expected
 
     def as_json(self) -> dict[str, Any]:
@@ -112,14 +112,14 @@ class RowResult:
 
 @dataclass(frozen=True)
 class _Finding:
-    """What was observed about one claim, with the evidence in a clause."""
+    """The observed status of one claim, with the evidence."""
 
     status: RowStatus
     detail: str
 
 
 def judge_row(record: RowRecord) -> RowResult:
-    """Return what was observed in a row."""
+    """Return the result of a row from its record."""
     finding = _observe(record)
     row = record.row
     seconds = record.window[1] - record.window[0] if record.window else 0.0
@@ -166,7 +166,7 @@ def _observe(record: RowRecord) -> _Finding:
 
 
 def _lost_import(party: Party, record: PartyRecord) -> str:
-    """Return why a node lacks what not every machine has (rclpy, an interface), or ""."""
+    """Return why a node could not import rclpy or an interface, or ""."""
     if party.role in (Role.TALKER, Role.LISTENER):
         return ""
     failed = (
@@ -329,7 +329,7 @@ def _failure(name: str, record: PartyRecord, event: Event) -> _Finding:
     if event.stage is ProcessStage.ENDPOINT and (refusal := _own_denial(record, event.text)):
         return _refused(name, ProcessStage.ENDPOINT, refusal)
     if event.stage in (ProcessStage.PARTICIPANT, ProcessStage.ENDPOINT):
-        # A ROS node has topics and services of its own: denied one of them, it does not start.
+        # A ROS node has standard topics and services: if one is denied, it does not start.
         refusal = participant_refusal(reported) or endpoint_refusal(reported)
         if refusal:
             return _refused(name, ProcessStage.PARTICIPANT, refusal)
@@ -337,7 +337,7 @@ def _failure(name: str, record: PartyRecord, event: Event) -> _Finding:
 
 
 def _own_denial(record: PartyRecord, reported: str) -> str:
-    """Return the line in which DDS Security denies this very topic, or ""."""
+    """Return the message in which DDS Security denies the party's own topic, or ""."""
     lines = f"{record.output}\n{reported}".splitlines()
     return endpoint_refusal("\n".join(line for line in lines if _is_about(line, record.topic)))
 

@@ -1,7 +1,7 @@
-"""The wire: count what packets show, and send captured or changed packets again.
+"""Capture packets, count readable and protected ones, and send packets again or changed.
 
-It uses packet sockets in plain Python, which need CAP_NET_RAW in their network: root has it, and so
-has a process in a network namespace that it made itself (`sros_tool.runtime.netns`).
+It uses packet sockets in plain Python, which need CAP_NET_RAW in their network: root has it, and
+also a process in a network namespace that it created (`sros_tool.runtime.netns`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class _CapturedPacket(NamedTuple):
 
 
 class PacketCounter:
-    """Counts IPv4 packets in which one of ``marks`` is readable, and those that are protected.
+    """A counter of IPv4 packets that show one of ``marks``, and of protected packets.
 
     ``plain`` counts by mark, ``protected`` by UDP port, for both ports of a packet.  With
     ``keep``, the RTPS packets themselves are in ``kept``, in order.
@@ -49,7 +49,7 @@ class PacketCounter:
         self.kept: list[_CapturedPacket] = []
 
     def count(self, packet: bytes) -> None:
-        """Count one packet; what is not UDP is left out."""
+        """Count one packet; ignore it if it is not UDP."""
         start = (packet[0] & 0x0F) * 4 if packet else 0
         if len(packet) < max(20, start) + 8 or packet[9] != _UDP:
             return
@@ -66,7 +66,7 @@ class PacketCounter:
 
 
 class Capture(PacketCounter):
-    """Captures on every interface and counts; only with ``keep``, packets are stored (in memory).
+    """A capture on all interfaces that counts packets, and with ``keep`` stores them in memory.
 
     Raises:
         PermissionError: capturing is not permitted.
@@ -144,9 +144,9 @@ _SEQUENCE_NUMBER = 20
 
 
 class _Injector:
-    """Sends whole IPv4 packets with their original source address.
+    """A sender of whole IPv4 packets with their original source address.
 
-    A packet socket would not do: the kernel drops loopback addresses that come in by one.
+    A packet socket does not work here: the kernel drops its packets with loopback addresses.
 
     Raises:
         PermissionError: it needs CAP_NET_RAW.
@@ -156,7 +156,7 @@ class _Injector:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
 
     def send(self, packet: bytes) -> None:
-        """Send one packet as it is, except for the checksum, which the loopback never filled in."""
+        """Send one packet without its checksum, which loopback packets do not fill in."""
         self._socket.sendto(without_checksum(packet), (socket.inet_ntoa(packet[16:20]), 0))
 
     def close(self) -> None:
@@ -170,7 +170,7 @@ def packets_of(kept: Sequence[_CapturedPacket], ports: Collection[int]) -> list[
 
 
 def with_other_words(packet: bytes, words: str, others: str, step: int) -> bytes | None:
-    """Return an RTPS packet with ``others`` for ``words`` (of the same length), a later message.
+    """Return an RTPS packet with ``others`` instead of ``words`` (same length), as a later message.
 
     The sequence number of the DATA submessage that holds ``words`` is raised by ``step``, so that
     a reader takes it for the writer's next one (RTPS 2.3 §9.4.5.3).  None where the words are not
@@ -205,10 +205,10 @@ _CERTIFICATE = "-----BEGIN CERTIFICATE-----"
 
 
 class Wiretap:
-    """Captures as soon as it is created; ``problem`` says why that is not permitted, or "".
+    """A capture that starts when created; ``problem`` says why it is not permitted, or "".
 
-    ``texts`` has the text of each party, by its name; ``topic`` is a DDS topic name.  Create it in
-    the network of the row, and in the loop of asyncio.
+    ``texts`` has the text of each party, by name; ``topic`` is a DDS topic name.  Create it in the
+    network of the row, and inside a running asyncio loop.
     """
 
     def __init__(self, texts: Mapping[str, str], topic: str, *, replayed: bool) -> None:
@@ -227,7 +227,7 @@ class Wiretap:
         asyncio.get_running_loop().add_reader(self._capture.fileno(), self._capture.drain)
 
     def count(self, ports: Collection[int]) -> dict[str, WireCount]:
-        """Return what was readable so far, by party; protected packets are those of ``ports``."""
+        """Return the counts so far, by party; only protected packets of ``ports`` count."""
         if self._capture is None:
             return {}
         self._capture.drain()
@@ -283,5 +283,5 @@ class Injection:
 
 
 def forged_text(text: str) -> str:
-    """Return what is said in the name of a talker that says ``text``; of the same length."""
+    """Return the forged form of a talker's ``text``, of the same length."""
     return text.swapcase()

@@ -1,10 +1,10 @@
 """The nodes of the demo on Cyclone DDS: ``python -m sros_tool.demo.nodes.cyclone ROLE``.
 
-They read the environment of a ROS 2 node and speak on the same DDS topics with the same type, so
-that rclpy nodes hear them, and a launcher need not know which kind it starts.
+They read the environment of a ROS 2 node and use the same DDS topics and types, so that rclpy
+nodes receive their messages, and a launcher can start both kinds in the same way.
 
-Services and actions speak on the DDS topics that rmw_cyclonedds would use (rq/...Request,
-rr/...Reply, rt/..._action/...), in strings: names and rights are those of ROS 2, the type is not.
+Services and actions use the DDS topics of rmw_cyclonedds (rq/...Request, rr/...Reply,
+rt/..._action/...), but with strings: names and rights are as in ROS 2, the type is not.
 A request is "CLIENT NUMBER ARGUMENTS"; its reply begins with the same two words.
 """
 
@@ -36,7 +36,7 @@ _POLL_SECONDS = 0.02
 
 
 class _Talker:
-    """Says its text and a number, again and again."""
+    """A talker that publishes its text and a number periodically."""
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
         self._writer = participant.writer(_dds_topic(options.topic))
@@ -45,7 +45,7 @@ class _Talker:
         self._due = time.monotonic() + options.period
 
     def step(self) -> None:
-        """Speak if it is time."""
+        """Publish a message if one is due."""
         if time.monotonic() < self._due:
             return
         self._due += self._options.period
@@ -56,7 +56,7 @@ class _Talker:
 
 
 class _Listener:
-    """Reports what it hears."""
+    """A listener that reports each message."""
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
         self._reader = participant.reader(_dds_topic(options.topic))
@@ -71,7 +71,7 @@ class _Listener:
 
 
 class _Observer:
-    """Counts the publishers of topics."""
+    """An observer that counts the publishers of topics."""
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
         self._participant, self._options, self._events = participant, options, events
@@ -79,7 +79,7 @@ class _Observer:
         self._due = time.monotonic()
 
     def step(self) -> None:
-        """Look if it is time."""
+        """Count the publishers if it is time."""
         if time.monotonic() < self._due:
             return
         self._due += self._options.period
@@ -89,7 +89,7 @@ class _Observer:
 
 
 class _Service:
-    """One side of a service: what it sends on one topic, and takes from another."""
+    """One side of a service: a writer on one topic and a reader on the other."""
 
     def __init__(self, participant: Participant, name: str, *, server: bool) -> None:
         (request,), (reply,) = dds_names("request", name)
@@ -97,7 +97,7 @@ class _Service:
         self._writer: Writer = participant.writer(reply if server else request)
 
     def take(self) -> list[list[str]]:
-        """The requests or replies that have come, each as its client, its number, and the rest."""
+        """Return the received requests or replies, each as client, number, and arguments."""
         return [text.split(" ", 2) for text in self._reader.take()]
 
     def send(self, client: str, number: str, text: str) -> None:
@@ -106,7 +106,7 @@ class _Service:
 
 
 class _Server:
-    """Adds two numbers for whoever asks."""
+    """A server that adds two numbers."""
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
         self._service = _Service(participant, options.service, server=True)
@@ -114,7 +114,7 @@ class _Server:
         self._answered = 0
 
     def step(self) -> None:
-        """Answer what was asked."""
+        """Answer the received requests."""
         for client, number, question in self._service.take():
             first, second = map(int, question.split(" + "))
             self._answered += 1
@@ -124,7 +124,7 @@ class _Server:
 
 
 class _Client:
-    """Asks for sums, again and again, and reports the right answers."""
+    """A client that asks for sums periodically, and reports the right answers."""
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
         self._service = _Service(participant, options.service, server=False)
@@ -134,7 +134,7 @@ class _Client:
         self._due = time.monotonic() + options.period
 
     def step(self) -> None:
-        """Ask if it is time, and check what was answered."""
+        """Send a request if one is due, and check the answers."""
         if time.monotonic() >= self._due:
             self._due += self._options.period
             self._asked += 1
@@ -149,7 +149,7 @@ class _Client:
 
 
 class _ActionServer:
-    """Computes Fibonacci numbers, reports its progress, and sends the result to whoever asks.
+    """An action server that computes Fibonacci numbers, with feedback and results.
 
     A goal is "CLIENT NUMBER ORDER"; feedback and status are "CLIENT NUMBER WHAT".
     """
@@ -166,7 +166,7 @@ class _ActionServer:
         self._done = 0
 
     def step(self) -> None:
-        """Accept goals, work on them, and hand out results."""
+        """Accept goals, compute them, and send requested results."""
         for client, number, order in self._goals.take():
             self._orders[client, number] = int(order)
             self._goals.send(client, number, "accepted")
@@ -183,7 +183,7 @@ class _ActionServer:
 
 
 class _ActionClient:
-    """Sends goals, again and again; reports a result that is right and whose feedback came."""
+    """An action client that sends goals periodically, and reports right results with feedback."""
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
         action = f"{options.topic}/_action"
@@ -200,7 +200,7 @@ class _ActionClient:
         self._due = time.monotonic() + options.period
 
     def step(self) -> None:
-        """Send a goal if it is time, fetch the results of those that were accepted."""
+        """Send a goal if one is due, and fetch the results of accepted goals."""
         if time.monotonic() >= self._due:
             self._due += self._options.period
             self._sent += 1
@@ -237,7 +237,7 @@ class _Composed:
         self._nodes = [kind(participant, options, events) for kind in kinds]
 
     def step(self) -> None:
-        """Let each of them act."""
+        """Do a step of each node."""
         for node in self._nodes:
             node.step()
 
@@ -269,7 +269,7 @@ def _operands(number: int) -> tuple[int, int]:
 
 
 class _Stopped(Exception):  # noqa: N818 - not an error
-    """Ctrl-C or SIGTERM."""
+    """A request to stop, by Ctrl-C or SIGTERM."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -16,11 +16,11 @@ FIBONACCI_ORDER = 5
 
 @dataclass(frozen=True)
 class NodeOptions:
-    """What a node is asked to do.
+    """The options of a node.
 
-    ``topic`` is the ROS name of a topic, or of the service or action that the role speaks on.
-    ``period`` is in seconds.  ``server`` is the text of the only action server that there is ("":
-    not known); an observer looks at the topics ``also`` as well.
+    ``topic`` is the ROS name of the role's topic, service or action.  ``period`` is in seconds.
+    ``server`` is the text of the only action server ("": not known); ``also`` are further topics
+    for an observer.
     """
 
     role: str
@@ -33,7 +33,7 @@ class NodeOptions:
 
     @property
     def service(self) -> str:
-        """The ROS service of the role; a container serves one that is not its topic."""
+        """The ROS service of the role; for a container, a fixed name."""
         return self.topic if self.role in ("server", "client") else _COMPOSED_SERVICE
 
 
@@ -78,7 +78,7 @@ def parse_options(module: str, roles: Collection[str], arguments: Sequence[str])
 
 
 def split_ros_args(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Part the arguments into a node's own and those between ``--ros-args`` and ``--``."""
+    """Return a node's own arguments, and those between ``--ros-args`` and ``--``."""
     own: list[str] = []
     ros: list[str] = []
     target = own

@@ -1,10 +1,10 @@
 """One end of a measurement: ``python -m sros_tool.demo.nodes.ping_pong cyclone|rclpy ping|pong``.
 
 ``ping`` measures, and writes the numbers as JSON; ``pong`` answers.  The first letter of a message
-says what it is: "h" (hello) asks when the other end began to join, "e" (echo) is sent back whole,
-"b" belongs to a burst, and "l" (last) ends one and is answered by a short receipt.  Both read the
-environment of a ROS 2 node; their overhead in Python is the same with and without security, and is
-in all numbers.
+is its kind: "h" (hello) asks when the other end began to join, "e" (echo) is sent back completely,
+"b" is part of a burst, and "l" (last) ends a burst and gets a short reply.  Both read the
+environment of a ROS 2 node; all numbers include the overhead of Python, which is the same with and
+without security.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ from sros_tool.errors import SrosError, UnavailableError
 
 _PING, _PONG = "/cost_ping", "/cost_pong"
 _DEPTH = 10
-_BURST = 8  # below the depth of the history, so that nothing is overwritten before it is sent
-_BURST_BYTES = 128 * 1024  # and below what a socket holds by default, where a payload allows it
+_BURST = 8  # less than the history depth, so that no message is overwritten
+_BURST_BYTES = 128 * 1024  # less than the default buffer of a socket, if possible
 _ASK_AGAIN = 0.005
 _LOST = 2.0
 
 
 @dataclass(frozen=True)
 class _Channel:
-    """The connection of one end to the other one.
+    """The connection from one end to the other one.
 
-    ``wait`` sleeps until there is something to take, but no longer than so many seconds; ``take``
-    returns the messages that have come since its last call, oldest first.
+    ``wait`` waits for a message, at most the given seconds; ``take`` returns the messages received
+    since its last call, oldest first.
     """
 
     write: Callable[[str], None]
@@ -172,7 +172,7 @@ def _await(channel: _Channel) -> None:
     """Wait for an answer.
 
     Raises:
-        SrosError: it did not come, although messages are reliable.
+        SrosError: no answer came, although messages are reliable.
     """
     if not channel.wait(_LOST):
         raise SrosError("an answer was lost", f"It did not come within {_LOST} s.")

@@ -17,13 +17,13 @@ from sros_tool.demo.nodes.options import FIBONACCI_ORDER, NodeOptions, fibonacci
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 
 _LOG_FLUSH_SECONDS = 0.3
-"""Fast DDS logs from a thread of its own: a process that ends at once loses the reason."""
+"""Time for the logging thread of Fast DDS: a process that exits at once loses the reason."""
 
 _QUEUE_DEPTH = 10
 _FIBONACCI_PACKAGES = ("example_interfaces", "test_msgs", "action_tutorials_interfaces")
 
 _Build = Callable[[Any, NodeOptions, EventWriter], Sequence[Any] | None]
-"""Adds the endpoints and timers of a role to a node; returns further nodes of the process."""
+"""A function that adds the endpoints of a role to a node, and returns additional nodes."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -62,11 +62,11 @@ def _run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> 
     except ImportError as error:
         return _fail(name, error, ProcessStage.IMPORT, events)
     except Exception as error:
-        # A signal ends the context, and whatever is being created fails because of it.
+        # A signal shuts the context down; then errors are expected.
         if rclpy.ok() or not joined:
             return _fail(name, error, stage, events)
     finally:
-        # Leaves the domain, and nothing in shared memory; a half-made node may well complain.
+        # Leave the domain and free shared memory; an incomplete node may raise here.
         with suppress(Exception):
             for node in nodes:
                 node.destroy_node()
@@ -87,7 +87,7 @@ def _spin(nodes: Sequence[Any]) -> None:
     except ExternalShutdownException:
         pass
     except Exception:
-        # A signal may end the context in the middle of a callback; that is no failure.
+        # A signal may shut the context down during a callback; that is not a failure.
         if rclpy.ok():
             raise
 
@@ -105,7 +105,7 @@ def _fail(name: str, error: Exception, stage: ProcessStage, events: EventWriter)
 
 
 def _talker(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Publish the text and a number, again and again."""
+    """Publish the text and a number periodically."""
     from std_msgs.msg import String
 
     publisher = node.create_publisher(String, options.topic, _QUEUE_DEPTH)
@@ -123,7 +123,7 @@ def _talker(node: Any, options: NodeOptions, events: EventWriter) -> None:
 
 
 def _listener(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Log what is heard."""
+    """Log and report each message."""
     from std_msgs.msg import String
 
     heard = 0
@@ -143,8 +143,8 @@ def _observer(node: Any, options: NodeOptions, events: EventWriter) -> None:
 
     def look() -> None:
         counts = {topic: node.count_publishers(topic) for topic in (options.topic, *options.also)}
-        # The listed names are worth a line, but a node lists its own topics too: only the count
-        # of publishers says whether a talker is visible.
+        # The list of names is only logged, since a node lists its own topics too: only the count
+        # of publishers shows whether a talker is visible.
         listed = " ".join(sorted(name for name, _ in node.get_topic_names_and_types()))
         node.get_logger().info(f"Publishers: {counts}; topics: {listed}")
         events.report(EventKind.SEEN, listed, publishers=counts)
@@ -158,8 +158,8 @@ def _observer(node: Any, options: NodeOptions, events: EventWriter) -> None:
 def _server(node: Any, options: NodeOptions, events: EventWriter) -> None:
     """Negate the truth value of each request.
 
-    Every ROS 2 installation has the type std_srvs/SetBool, and DDS Security goes by the name of a
-    service, not by its type.
+    Every ROS 2 installation has the type std_srvs/SetBool, and DDS Security checks only the name of
+    a service.
     """
     from std_srvs.srv import SetBool
 
@@ -178,7 +178,7 @@ def _server(node: Any, options: NodeOptions, events: EventWriter) -> None:
 
 
 def _client(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Send requests again and again, and report the right answers."""
+    """Send requests periodically, and report the right answers."""
     from std_srvs.srv import SetBool
 
     client = node.create_client(SetBool, options.service)
@@ -231,7 +231,7 @@ def _action_server(node: Any, options: NodeOptions, events: EventWriter) -> None
 
 
 def _action_client(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Send goals again and again, and report the right results whose feedback was complete.
+    """Send goals periodically, and report right results with complete feedback.
 
     A result does not say which server it is from: ``options.server`` names the only one.
     """
@@ -272,7 +272,7 @@ def _action_client(node: Any, options: NodeOptions, events: EventWriter) -> None
 
 
 def _fibonacci_action() -> Any:
-    """Return the class ``Fibonacci`` of whichever ROS 2 package is installed.
+    """Return the class ``Fibonacci`` of the first installed ROS 2 package that has it.
 
     Raises:
         ImportError: no package has it.
@@ -298,7 +298,7 @@ def _composed(node: Any, options: NodeOptions, events: EventWriter) -> list[Any]
     """Talk, listen and serve with three nodes in one process and one enclave."""
     import rclpy
 
-    # Each node gets its endpoint before the next one is made: the first denial is reported.
+    # Each node gets its endpoint before the next node is created, to report the first denial.
     _talker(node, options, events)
     listener = rclpy.create_node("listener")
     _listener(listener, options, events)

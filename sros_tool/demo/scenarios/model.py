@@ -15,7 +15,7 @@ from sros_tool.policy.model import Policy
 
 
 class Role(StrEnum):
-    """What a process does."""
+    """The role of a process."""
 
     TALKER = "talker"
     LISTENER = "listener"
@@ -29,7 +29,7 @@ class Role(StrEnum):
 
 
 SPEAKING = frozenset({Role.TALKER, Role.SERVER, Role.ACTION_SERVER, Role.COMPOSED})
-"""The roles that send a text by which they are recognised."""
+"""The roles that send a text that identifies them."""
 
 
 class RowStatus(StrEnum):
@@ -59,7 +59,7 @@ class RowStatus(StrEnum):
 
 
 DENIALS = (RowStatus.REFUSED, RowStatus.NOT_LET_IN)
-"""Security says no to a topic, or already to the whole process."""
+"""The statuses of a denial: of a topic, or of the whole process."""
 
 
 class Relation(StrEnum):
@@ -108,7 +108,7 @@ class SoundKeystore(StrEnum):
 
     OWN = "own"
     FOREIGN = "foreign"
-    """One of another CA, with the same enclaves."""
+    """A keystore of another CA, with the same enclaves."""
 
 
 OWN, FOREIGN = SoundKeystore.OWN, SoundKeystore.FOREIGN
@@ -155,9 +155,9 @@ class Party:
 
 @dataclass(frozen=True)
 class Claim:
-    """``subject`` hears, sees ... ``talker``, or, where not ``holds``, does not.
+    """A claim that ``subject`` hears, sees ... ``talker``, or (``holds`` is false) does not.
 
-    ``denied`` is the status of `DENIALS` by which that must be prevented, if any.
+    ``denied`` is the status in `DENIALS` that must be the reason, if any.
     """
 
     relation: Relation
@@ -206,9 +206,9 @@ class Condition(StrEnum):
 class Variant:
     """The expected status of a row where all ``conditions`` hold.
 
-    ``open_because`` says why that lets an attack through ("": it does not), ``remedy`` what a user
-    can do then.  ``instead`` is another row that is played in place of it, for defences that a
-    vendor has in another form.
+    ``open_because`` is the reason why an attack succeeds then ("": it does not), ``remedy`` what a
+    user can do.  ``instead`` is a row to run instead, for a vendor with another form of the
+    defence.
     """
 
     conditions: tuple[Condition, ...]
@@ -267,7 +267,7 @@ class Row:
         return self.party(self.claims[0].subject).topic
 
     def under(self, conditions: frozenset[Condition]) -> Row:
-        """Return the row with the status that is expected where those conditions hold."""
+        """Return the row with the status that is expected under these conditions."""
         for variant in self.variants:
             if conditions.issuperset(variant.conditions):
                 if variant.instead is not None:

@@ -120,7 +120,7 @@ def measured_policy(topic: str) -> Policy:
 
 
 def _with_topic(enclave: Enclave, topic: str | None) -> Enclave:
-    """Return the enclave with ``topic`` instead of the shipped policy's, or with neither."""
+    """Return the enclave with ``topic`` instead of the shipped topic (None: without both)."""
 
     def of_group(group: Group) -> Group | None:
         if group.kind != "topics" or _POLICY_TOPIC not in group.names:

@@ -95,7 +95,7 @@ def _rows_of(kind: _Interface, both: str) -> tuple[Row, ...]:
 
 
 def _is_answered(client: Party, server: Party, *, holds: bool = True) -> Claim:
-    """Claim that a client gets answers of a server, or does not."""
+    """Return the claim that a client gets answers of a server, or does not."""
     return Claim(Relation.IS_ANSWERED, client.name, server.name, holds=holds)
 
 

@@ -34,7 +34,7 @@ _UNCONTROLLED = (
 
 
 def open_to(success: RowStatus, expected: RowStatus) -> tuple[Variant, ...]:
-    """Return the variants in which a template leaves open what is expected to be closed."""
+    """Return the variants for templates that leave open what the row expects to be closed."""
     if expected is RowStatus.REFUSED:
         return (Variant((Condition.UNCONTROLLED,), success, *_UNCONTROLLED),)
     if expected is success or expected is RowStatus.NOT_LET_IN:
@@ -59,8 +59,8 @@ def injection(
 ) -> Row:
     """Return a row that shows whether the attacker is heard on the topic.
 
-    With ``tampered``, it is the listener whose files were changed: it may be kept from starting,
-    and the control is another listener with its files as they should be.
+    With ``tampered``, the files of the listener were changed: it may fail to start, and the control
+    is another listener with unchanged files.
     """
     listener = Party("listener", Role.LISTENER, Identity(victims, "listener"), intruder=tampered)
     parties = [Party(_ATTACKER, Role.TALKER, attacker, intruder=True), listener]
