@@ -248,5 +248,5 @@ def _ended_by_signals() -> Iterator[None]:
 
 def _isolation(network: str) -> Isolation:
     if network == _HOST:
-        return Isolation(False, "the network of this machine was asked for")
+        return Isolation(False, "the option to use the network of this machine was given")
     return try_isolation()

@@ -88,7 +88,7 @@ class RunPlan:
 
 
 def run_rows(plan: RunPlan, progress: Progress) -> list[RowResult]:
-    """Run all rows and judge them; ``progress`` gets a line for each row that ends."""
+    """Return the results of all rows; ``progress`` gets a line for each finished row."""
     return asyncio.run(_Runner(plan, progress).run())
 
 

@@ -80,7 +80,7 @@ class DdsError(SrosError):
 
 
 class SecurityRefusedError(DdsError):
-    """DDS Security refused a participant, a topic, a writer or a reader."""
+    """A refusal by DDS Security of a participant, a topic, a writer or a reader."""
 
 
 @dataclass(frozen=True, order=True)

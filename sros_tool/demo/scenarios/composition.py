@@ -1,4 +1,4 @@
-"""Composition: several nodes in one process share one enclave, and so the sum of their rights."""
+"""Composition: several nodes in one process share one enclave and the sum of their rights."""
 
 from __future__ import annotations
 

@@ -18,14 +18,14 @@
 
     [[row]]
     name = "a spy does not see the camera"
-    because = "..."                       # what brings it about, for the table
+    because = "..."                       # the mechanism, for the table
 
     [[row.claim]]
     listener = "spy"
     talker = "camera"
     expected = "not heard"
 
-    [[row.control]]                       # what makes the silence believable
+    [[row.control]]                       # proves that the silence is not a crash
     listener = "viewer"
     talker = "camera"
     expected = "heard"

@@ -1,7 +1,7 @@
 """Isolation: nobody hears secured nodes, or gets in, without permission.
 
-Every row that expects silence carries a control: another listener that must hear the very same
-messages, or the same program in an enclave that is permitted.
+Every row that expects silence has a control: another listener that must hear the same messages, or
+the same program in an enclave with permission.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The data model of scenarios: parties, claims about them, rows.
 
-A row is one line of the table: processes that start together, what is claimed of them, and the
-controls that make a silence believable.
+A row is one line of the table: processes that start together, claims about them, and controls,
+which prove that a silence is not a crash.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ def injection(
 def succeeds(
     name: str, attacker: Identity, *, attack: str, removed: str, victims: KeystoreChoice
 ) -> Row:
-    """Return a row in which the same attacker, with nothing wrong about it, is heard."""
+    """Return a row in which the same attacker, but with valid files, is heard."""
     mechanism = "with nothing wrong about it, it is heard"
     return injection(
         name, attacker, RowStatus.HEARD, mechanism, attack=attack, removed=removed, victims=victims
