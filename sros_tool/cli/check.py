@@ -304,7 +304,7 @@ def _print_text(chosen: ChosenFindings, _selection: FindingFilter) -> None:
 
 
 def finding_lines(finding: Finding) -> list[str]:
-    """Return a finding as lines: where and what, why here, and what to do."""
+    """Return a finding as lines: its place and title, its reason, and its remedy."""
     head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"
     subject = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
     by = f" (chosen by the {finding.accepted})" if finding.accepted else ""

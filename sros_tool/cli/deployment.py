@@ -154,7 +154,7 @@ Example:
 @click.option("--at", metavar="MOMENT", help="Check as of then: 2027-06-01, or 90d from now.")
 @json_option
 def verify(folder: Path | None, domain: str | None, at: str | None, as_json: bool) -> int:
-    """On a robot: say whether the enclaves in DIR, or the enclave DIR, can be used as they are.
+    """On a robot: report whether the enclaves in DIR, or the enclave DIR, can be used.
 
     It is `sros check` of what was exported: enclaves that are complete, consistent, in date and
     loadable; keys that nobody else can read; no key of a CA; and CAs that all enclaves trust.  The
@@ -262,7 +262,7 @@ def sign_request(
     """At the keystore: certify the key in REQUEST (or -), and sign the enclave's permissions.
 
     The answer is one .tar.gz for `sros import` on the robot.  It holds no secret: certificate,
-    permissions, governance, the certificates of the CAs, and what was revoked.  The keystore knows
+    permissions, governance, the certificates of the CAs, and revocation lists.  The keystore knows
     the enclave from then on, without its key.  Compare the key's SHA-256 with the one that the
     robot printed.
     """

@@ -138,7 +138,7 @@ Example:
 @click.option(
     "--vendor",
     type=click.Choice([each.value for each in Vendor]),
-    help="Whose decision counts. [default: the vendor of this machine's RMW]",
+    help="The vendor whose decision counts. [default: the vendor of this machine's RMW]",
 )
 @click.option("--all-vendors", is_flag=True, help="Compare what the vendors decide.")
 @click.option(

@@ -1,7 +1,7 @@
 """Reasons for which a DDS vendor refuses to load an enclave or a CA.
 
 Vendors differ by the traits in `sros_tool.dds.decision.vendors`.  `sros_tool.keystore.reader` finds
-the faults that all vendors refuse; they are not checked here again.
+the faults that matter to all vendors; they are not checked here again.
 """
 
 from __future__ import annotations

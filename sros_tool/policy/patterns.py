@@ -246,7 +246,7 @@ def _step(reached: frozenset[int], letter: str, pattern: _Pieces) -> frozenset[i
 
 
 def _closed(reached: set[int], pattern: _Pieces) -> frozenset[int]:
-    """Return the places, with those reached when stars match nothing."""
+    """Return the ``reached`` places and the places after stars that match nothing."""
     return frozenset(place for at in reached for place in _onward(at, pattern))
 
 

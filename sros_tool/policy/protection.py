@@ -39,7 +39,7 @@ class NamedProtection:
 
 @dataclass(frozen=True, slots=True)
 class DomainProtection:
-    """The protection of a whole domain, and of its names; ``default`` holds for the others."""
+    """The protection of a domain and of single names in it; ``default`` applies to other names."""
 
     rtps: Level = Level.SIGN
     discovery: Level = Level.ENCRYPT

@@ -253,7 +253,7 @@ class Vendor(StrEnum):
 
     @property
     def documented_only(self) -> bool:
-        """Whether the standard answers for a vendor that was never measured."""
+        """Whether it was never measured, so that it decides by the standard."""
         return not self.traits.measured and self is not Vendor.STANDARD
 
 

@@ -26,7 +26,7 @@ Secrets = Callable[[str], str]
 
 
 def no_secrets(what: str) -> str:
-    """Raise `PkiError`: the secrets handler when no secret is available."""
+    """Raise `PkiError`; use it as the secrets handler if nobody can give a secret."""
     raise PkiError(f"{what} is needed, and nobody is there to give it")
 
 
