@@ -188,7 +188,7 @@ def _domains(
         if not isolation.isolated:
             raise UnavailableError(
                 "cannot attack a keystore here",
-                f"Its rows need network namespaces of their own, and there is {isolation.reason}.",
+                f"Its rows need their own network namespaces ({isolation.reason}).",
                 "Run it as root, or where unprivileged user namespaces are allowed.",
             )
         return (next(iter(user.domains)),) * len(scenario.rows)
