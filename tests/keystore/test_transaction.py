@@ -32,7 +32,6 @@ from sros_tool.keystore.transaction import stage as stage_of
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
-from tests.support.children import LONG
 from tests.support.harness import check_whole, policy_text, publish, remains, snapshot, topics_of
 
 NOW = datetime.now(UTC)
@@ -377,16 +376,13 @@ def test_death_while_recovering_from_death(name: str, stage: Stage) -> None:
 
 @pytest.mark.parametrize("name", SCENARIOS)
 def test_no_space_at_every_step(name: str, stage: Stage) -> None:
-    """An error leaves everything as it was, byte by byte; or else the verb succeeds.
-
-    Every second step is tried, in the long form each.
-    """
+    """An error leaves everything as it was, byte by byte; or else the verb succeeds."""
     scenario = SCENARIOS[name]
     before = snapshot(stage.prepared)
     w = stage.fresh()
     _, steps = in_child(lambda: scenario.verb(w))
     refused = 0
-    for step in steps if LONG else steps[::2]:
+    for step in steps:
         w = stage.fresh()
         status, _ = in_child(lambda w=w: scenario.verb(w), step, run_out_of_space)  # type: ignore[misc]
         assert status in (0, REFUSED), step
