@@ -284,6 +284,16 @@ def test_verify_says_what_is_wrong_and_answers_by_its_status(
     assert sros("verify", out / "enclaves/a", "--at", "2099-01-01").status == 1
 
 
+def test_a_finding_outside_of_its_enclave_names_its_file_from_the_root(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    sros("create_keystore", tmp_path / "ks").ok()
+    sros("create_enclave", tmp_path / "ks", "/listener", "/talker/listener").ok()
+    sros("distribute_key", tmp_path / "ks", "/listener", "/talker/listener", out).ok()
+    findings = json.loads(sros("verify", out, "--json").out)["findings"]
+    assert "/listener" in {each["enclave"] for each in findings}
+    assert not [each for each in findings if ".." in each["file"]]
+
+
 # ── with what else happens to a keystore ───────────────────────────────────────────────────
 
 

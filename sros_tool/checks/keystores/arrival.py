@@ -86,7 +86,9 @@ class Arrival:
     def file_of(self, finding: Finding) -> str:
         """Return the file of a finding, relative to its enclave's folder or to the root."""
         name = self.enclave_of(finding)
-        return os.path.relpath(finding.file, enclave_path(self.root, name) if name else self.root)
+        folder = enclave_path(self.root, name) if name else self.root
+        inside = Path(finding.file).is_relative_to(folder)
+        return os.path.relpath(finding.file, folder if inside else self.root)
 
 
 def verify_arrival(
