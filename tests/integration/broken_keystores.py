@@ -433,7 +433,7 @@ MORE = (
     ),
     Breakage(
         "a folder in place of the key", as_folder, REFUSED, REFUSED, "enclave.file-unreadable",
-        "Error obtaining private key", "read from failed",
+        "Error obtaining private key", "failed(code: 200)",  # to seek or to read, by file system
     ),
     Breakage(
         "an empty certificate", lambda b: b.path(f"{BASE}/cert.pem").write_bytes(b""), REFUSED,
