@@ -13,7 +13,7 @@ from pathlib import Path
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import Decision, Outcome, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
-from sros_tool.dds.decision.matching import read_moment
+from sros_tool.dds.decision.moments import read_moment
 from sros_tool.dds.decision.vendors import Vendor, VendorTraits
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import (

@@ -14,13 +14,9 @@ from datetime import UTC, datetime, tzinfo
 
 from sros_tool.dds.decision.answers import AccessVerb, Decision, Outcome, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
-from sros_tool.dds.decision.matching import (
-    ExpressionIndex,
-    escaped,
-    matches,
-    read_moment,
-    same_subject,
-)
+from sros_tool.dds.decision.matching import ExpressionIndex, matches
+from sros_tool.dds.decision.moments import read_moment
+from sros_tool.dds.decision.subjects import escaped, same_subject
 from sros_tool.dds.decision.vendors import (
     DenyPartitions,
     Moments,

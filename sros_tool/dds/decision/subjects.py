@@ -1,0 +1,136 @@
+"""Whether a grant's subject name and a certificate's subject are equal, by vendor.
+
+A certificate's subject is the RFC 2253 text that OpenSSL and
+`sros_tool.pki.certificates.subject_text` print, with the most specific attribute first.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from itertools import takewhile
+
+from sros_tool.dds.decision.vendors import Subjects
+
+_MOST_PARTS = 20  # Cyclone DDS 0.10 refuses a grant's subject of more
+
+
+def same_subject(rule: Subjects, granted: str, certified: str) -> bool:
+    """Return whether a grant for ``granted`` applies to the certificate subject ``certified``."""
+    return _COMPARE[rule](granted, certified)
+
+
+def escaped(certified: str) -> str:
+    """Return the subject of a certificate with every non-ASCII byte as ``\\C3``."""
+    parts = (
+        each if each.isascii() else "".join(f"\\{b:02X}" for b in each.encode())
+        for each in certified
+    )
+    return "".join(parts)
+
+
+def _exact(granted: str, certified: str) -> bool:
+    return _attributes(granted) == _attributes(certified)
+
+
+def _whole_attributes(granted: str, certified: str) -> bool:
+    # Fast DDS 2.9 splits at every comma, also at an escaped one.
+    return _stripped(granted) == _stripped(certified)
+
+
+def _stripped(name: str) -> list[str]:
+    # It stops at the first empty part: text after two commas does not count.
+    return [part.strip(" ") for part in takewhile(bool, name.split(","))]
+
+
+_MOST_ATTRIBUTES = 20  # the ones that Fast DDS 2.14 uses
+_UNQUOTED = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*(?:"|\\?\Z)|[^"\\])', re.DOTALL)
+
+
+def _any_order(granted: str, certified: str) -> bool:
+    ours, theirs = _types_and_values(granted), _types_and_values(certified)
+    first_values: dict[str, str] = {}
+    for kind, value in theirs:
+        first_values.setdefault(kind, value)
+    # Only the first value of a kind is found, so a repeated kind never matches; a kind that the
+    # certificate lacks has an empty value.
+    return len(ours) == len(theirs) and all(first_values.get(k, "") == v for k, v in ours)
+
+
+def _types_and_values(name: str) -> list[tuple[str, str]]:
+    """Return the attributes before a malformed one, as Fast DDS 2.14 (DistinguishedName.cpp)."""
+    found: list[tuple[str, str]] = []
+    rest = name.lstrip(" ")
+    while rest and len(found) < _MOST_ATTRIBUTES:
+        equals = _outside_quotes(rest, "=")
+        if equals < 0:
+            break
+        # An empty cut means: up to the end of the text.
+        kind, rest = rest[: equals or None], rest[equals + 1 :]
+        comma = _outside_quotes(rest, ",")
+        value = rest if comma < 0 else rest[: comma or None]
+        found.append((_plain(kind), _plain(value)))
+        rest = "" if comma < 0 else rest[comma + 1 :].lstrip(" ")
+    return found
+
+
+def _outside_quotes(text: str, wanted: str) -> int:
+    """Return the index of the first such character outside of escapes and quotes, else -1."""
+    index = 0
+    while index < len(text):
+        found = _UNQUOTED.match(text, index)
+        if not found:
+            break
+        if found[0] == wanted:
+            return index
+        index = found.end()
+    return -1
+
+
+_PART = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^,"\\])*', re.DOTALL)
+_EQUALS = re.compile(r'(?:\\.|"(?:\\.|[^"\\])*"|[^="\\])*', re.DOTALL)
+
+
+def _attributes(name: str) -> list[tuple[str, str]]:
+    """Return kinds and plain values (no quotes, escapes, outer spaces) before a malformed one."""
+    found = []
+    index = 0
+    while index < len(name):
+        part = _PART.match(name, index)
+        text = part[0].strip(" ") if part else ""
+        kind = _EQUALS.match(text)
+        if not text or not kind or kind.end() >= len(text):
+            break
+        found.append((_plain(kind[0]), _plain(text[kind.end() + 1 :])))
+        index += len(part[0]) + 1 if part else 1
+    return found
+
+
+def _plain(text: str) -> str:
+    return text.strip(" ").replace("\\", "").replace('"', "")
+
+
+def _subset(granted: str, certified: str) -> bool:
+    parts = [part for part in re.split(r"[,/|]", granted) if part]
+    if len(parts) > _MOST_PARTS:
+        return False
+    values: dict[str, str] = {}
+    for part in parts:
+        kind, _, value = part.partition("=")
+        values.setdefault(kind, value)
+    wanted = re.split(r"[,/|]", certified)
+    if wanted and not wanted[-1]:  # no empty part after a last separator
+        wanted.pop()
+    for part in wanted:
+        kind, _, value = part.partition("=")
+        if not part or values.get(kind) != value:
+            return False
+    return True
+
+
+_COMPARE: dict[Subjects, Callable[[str, str], bool]] = {
+    Subjects.EXACT: _exact,
+    Subjects.WHOLE_ATTRIBUTES: _whole_attributes,
+    Subjects.ANY_ORDER: _any_order,
+    Subjects.SUBSET: _subset,
+}
