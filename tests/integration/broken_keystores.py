@@ -43,7 +43,7 @@ class Breakage:
     cyclone: str
     finding: str
     fast_says: str = ""
-    cyclone_says: str = ""
+    cyclone_says: str | tuple[str, ...] = ""  # a tuple: one of them
     race: str = ""
     """What Fast DDS does at other times."""
     zone: str = "UTC"
@@ -433,7 +433,8 @@ MORE = (
     ),
     Breakage(
         "a folder in place of the key", as_folder, REFUSED, REFUSED, "enclave.file-unreadable",
-        "Error obtaining private key", "failed(code: 200)",  # to seek or to read, by file system
+        "Error obtaining private key",
+        ("read from failed", "seek to end failed"),  # the latter where the folder is in memory
     ),
     Breakage(
         "an empty certificate", lambda b: b.path(f"{BASE}/cert.pem").write_bytes(b""), REFUSED,
