@@ -1,8 +1,8 @@
 """sros: the security toolkit for ROS 2 robots.
 
-What is named in ``__all__`` is for other programs: it is documented in docs/python.md, and changes
-only with a new minor version and an entry in CHANGELOG.md.  Everything else in this package may
-move at any time.
+The names in ``__all__`` are the public API: they are documented in docs/python.md, and change only
+with a new minor version and an entry in CHANGELOG.md.  Everything else in this package may change
+at any time.
 
 Example:
     >>> import sros_tool
@@ -15,10 +15,10 @@ Example:
     >>> sros_tool.check(keystore)
     ()
 
-Importing this module imports nothing else: a name is loaded when it is first used.
+Importing this module imports no other module: a name is loaded when it is first used.
 """
 
-TYPE_CHECKING = False  # type checkers read it as True; to import typing takes longer than all else
+TYPE_CHECKING = False  # type checkers read it as True; importing typing would take too long here
 
 if TYPE_CHECKING:
     from sros_tool.api import (
@@ -76,10 +76,10 @@ _ELSEWHERE = {
     "Template": "sros_tool.keystore.template",
     **dict.fromkeys((name for name in __all__ if name.endswith("Error")), "sros_tool.errors"),
 }
-"""The modules of the names that are not in `sros_tool.api`."""
+"""The modules of the public names that `sros_tool.api` does not define."""
 
 
-if not TYPE_CHECKING:  # so that type checkers find names that do not exist
+if not TYPE_CHECKING:  # with `__getattr__`, type checkers would accept names that do not exist
 
     def __getattr__(name: str) -> object:
         if name not in __all__:

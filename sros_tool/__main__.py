@@ -1,4 +1,4 @@
-"""``python -m sros_tool`` is ``sros``."""
+"""Entry point of ``python -m sros_tool``, which is the same as ``sros``."""
 
 from sros_tool.cli import main
 

@@ -1,8 +1,9 @@
-"""The functions that other programs may call; `import sros_tool` offers them by name.
+"""The public functions and classes of the Python API, which ``import sros_tool`` exports.
 
-Thin on purpose: a function here turns the arguments of a script (a path, the name of a template)
-into the values of the package, supplies the present moment, and calls one function below.
-Nothing here prints, asks a person, or reads an environment variable.
+Each function converts its arguments (a path, the name of a template) to the types of the package,
+supplies the current time, and calls the function that does the work.  Nothing here prints,
+prompts, or reads environment variables; ``PKCS11_MODULE_PATH`` of a key on a token is the only
+exception.
 """
 
 from __future__ import annotations
@@ -26,14 +27,15 @@ if TYPE_CHECKING:
 AnyPath = str | PathLike[str]
 Item = TypeVar("Item")
 Secrets = Callable[[str], str]
-"""Answers with the passphrase or PIN that its argument asks for, in words for a person."""
+"""Function that returns the passphrase or PIN that its argument names in words."""
 
 
 @dataclass(frozen=True, slots=True)
 class Keystore:
-    """The folder of a keystore; it can be passed wherever a path is expected.
+    """A keystore folder, accepted wherever a path is expected.
 
-    ``notes`` are remarks on what was created, such as names on which DDS vendors differ.
+    ``notes`` are remarks from the creation of the keystore, such as names on which DDS vendors
+    differ.
     """
 
     path: Path
@@ -41,7 +43,7 @@ class Keystore:
 
     @property
     def enclaves(self) -> tuple[str, ...]:
-        """The names of the enclaves that it has at this moment, sorted."""
+        """The sorted names of the enclaves, read from the folder at each access."""
         from sros_tool.keystore.layout import list_enclaves
 
         return list_enclaves(self.path)
@@ -52,14 +54,14 @@ class Keystore:
 
 @dataclass(frozen=True, slots=True)
 class AccessAnswer:
-    """One vendor's decision on an access, and the reason.
+    """One DDS vendor's decision on an access, and the reason.
 
-    ``outcome`` is "allowed", "denied" (the endpoint is not created), "peer-denies" (it is created,
-    and no peer talks to it), "refused" (no node of the enclave starts) or "crashes".  ``reason`` is
-    a clause for people; ``expression`` is the DDS topic expression of the rule that decided, or
-    "".  ``policy_lines`` are the places ``FILE:LINE`` in the policy that the rule comes from, where
-    a policy was given.  ``until`` is when the first of the enclave's files expires, in UTC.
-    ``remedy`` says what to do about a denial that no policy change would lift.
+    ``outcome`` is "allowed", "denied" (the endpoint is not created), "peer-denies" (the endpoint is
+    created, and no peer matches it), "refused" (no node of the enclave starts) or "crashes".
+    ``reason`` is a clause for people.  ``expression`` is the DDS topic expression of the deciding
+    rule, or "".  ``policy_lines`` are the places ``FILE:LINE`` in the given policy that the rule
+    comes from.  ``until`` is the first expiry among the enclave's files, in UTC.  ``remedy`` says
+    what to do if the cause of a denial is not the policy.
     """
 
     allowed: bool
@@ -87,17 +89,17 @@ def create_keystore(
     """Create a keystore in the folder ``path``, with its CAs and its governance.
 
     Args:
-        path: The folder; it must not hold a keystore, nor any part of one.
-        template: The choices to create it by: "development", "production", "sros2", the path of
-            a TOML file, or what `load_template` returned.
-        domains: The ROS domains that it is for: 0, or "0,7", or "10-19".
-        encrypt_ca_keys: Encrypt the keys of the CAs with the passphrase that ``secrets`` answers.
+        path: The folder; it must not hold a keystore or a part of one.
+        template: The keystore template: "development", "production", "sros2", the path of a TOML
+            file, or a `Template` from `load_template`.
+        domains: The ROS domain ids of the keystore, such as 0, "0,7" or "10-19".
+        encrypt_ca_keys: Encrypt the CA keys with the passphrase that ``secrets`` returns.
         secrets: Called for the passphrase of a CA key, or the PIN of a token.
-        now: The moment from which validities count; the present one by default.
+        now: The time from which validities count; the current time by default.
 
     Raises:
-        KeystoreError: Something is in the way, or a key cannot be used.
-        DocumentError: There is no such template, or it is not understood.
+        KeystoreError: The folder holds a keystore or a part of one, or a CA key cannot be used.
+        DocumentError: The template does not exist, or is malformed.
         UsageError: ``domains`` are not domain ids.
 
     Example:
@@ -117,7 +119,7 @@ def create_keystore(
 
 
 def open_keystore(path: AnyPath) -> Keystore:
-    """Return the keystore in the folder ``path``; one that ros2/sros2 created is as good.
+    """Return the keystore in the folder ``path``, whether sros or ros2/sros2 created it.
 
     Raises:
         KeystoreError: The folder is not a keystore.
@@ -133,12 +135,12 @@ def open_keystore(path: AnyPath) -> Keystore:
 
 
 def load_template(choice: AnyPath) -> Template:
-    """Return the keystore template of that name ("production"), or in the TOML file of that path.
+    """Return the keystore template named ``choice`` ("production"), or in the TOML file ``choice``.
 
-    Change one of its choices with `dataclasses.replace`.
+    Change a setting of the template with `dataclasses.replace`.
 
     Raises:
-        DocumentError: There is none, or it holds something that is not understood.
+        DocumentError: The template does not exist, or is malformed.
 
     Example:
         >>> template = sros_tool.load_template("production")
@@ -150,11 +152,12 @@ def load_template(choice: AnyPath) -> Template:
 
 
 def read_policy(path: AnyPath) -> Policy:
-    """Return the policy in the file ``path``, with everything that it includes.
+    """Return the policy in the file ``path``, with the files that it includes.
 
     Raises:
-        PolicyError: It is malformed, contradicts itself, or includes a file outside of its folder.
-        DocumentError: It cannot be read.
+        PolicyError: The policy is malformed, contradicts itself, or includes a file outside of its
+            folder.
+        DocumentError: The file cannot be read.
 
     Example:
         >>> policy = sros_tool.read_policy("policies/talker_listener.xml")
@@ -175,29 +178,29 @@ def generate(
     now: datetime | None = None,
     dry_run: bool = False,
 ) -> Creation:
-    """Create the enclaves of policies, and sign the permissions that the policies state for them.
+    """Create the enclaves that policies name, and sign their permissions.
 
-    All or nothing: after an error the keystore is as it was.  An enclave that exists keeps its key,
-    and gets new permissions if a policy names it.
+    All or nothing: an error leaves the keystore unchanged.  An existing enclave keeps its key, and
+    gets new permissions if a policy names it.
 
     Args:
         keystore: An existing keystore, or its path.
         policies: Policies, or the paths of policy files.
-        enclaves: Names of further enclaves, whose permissions are the template's default.
-        domain: The ROS domain that the enclaves will be used in; it must be one of the keystore's.
+        enclaves: Names of more enclaves, which get the default permissions of the template.
+        domain: The ROS domain id that the enclaves will be used in; the governance must name it.
         secrets: Called for the passphrase of an encrypted CA key, or the PIN of a token.
-        now: The moment from which validities count; the present one by default.
-        dry_run: Report what would be done, and change nothing.
+        now: The time from which validities count; the current time by default.
+        dry_run: Report the changes without making them.
 
     Returns:
         The names of the enclaves that were ``created``, ``changed`` (given new permissions),
         ``completed`` (a missing file added) and ``kept`` (left as they were), and ``notes``.
 
     Raises:
-        KeystoreError: There is no keystore, it is busy or broken, or is not for that domain.
-        PolicyError: Two policies disagree on an enclave, or a policy file is malformed.
+        KeystoreError: The keystore does not exist, is busy or broken, or is not for ``domain``.
+        PolicyError: Two policies differ on an enclave, or a policy file is malformed.
         InvalidNameError: An enclave's name is not valid.
-        UsageError: Neither a policy nor an enclave is given.
+        UsageError: No policy and no enclave is given.
 
     Example:
         >>> sros_tool.generate(keystore, "policies/talker_listener.xml").created
@@ -207,7 +210,7 @@ def generate(
 
     names = tuple(_several("enclaves", enclaves))
     if not (policies or names):
-        raise UsageError("neither a policy nor an enclave is given to generate for")
+        raise UsageError("no policy and no enclave is given", "", "Pass at least one of them.")
     return create.generate_artifacts(
         Path(keystore),
         enclaves=names,
@@ -227,17 +230,18 @@ def export_enclaves(
     force: bool = False,
     now: datetime | None = None,
 ) -> Path:
-    """Export enclaves for their robot to ``target`` and return it; no CA key is exported.
+    """Export enclaves to ``target`` for use on a robot, without CA keys; return ``target``.
 
     Args:
         keystore: The keystore, or its path.
         enclaves: The names of the enclaves.
-        target: A file name that ends in ``.tar.gz``, or a folder, which is created.
-        force: Replace files of another version in ``target``.
-        now: The moment at which the enclaves have to be valid; the present one by default.
+        target: The path of a ``.tar.gz`` file, or of a folder, which is created.
+        force: Replace files in ``target`` that differ.
+        now: The time at which the enclaves have to be valid; the current time by default.
 
     Raises:
-        KeystoreError: An enclave does not exist or could not run, or ``target`` holds other files.
+        KeystoreError: An enclave does not exist or is not usable, or ``target`` holds other files.
+        UsageError: No enclave is given.
 
     Example:
         >>> sros_tool.export_enclaves(keystore, ["/talker_listener/talker"], "robot.tar.gz")
@@ -247,7 +251,7 @@ def export_enclaves(
 
     names = tuple(_several("enclaves", enclaves))
     if not names:
-        raise UsageError("no enclave is given to export")
+        raise UsageError("no enclave is given to export", "", "Pass at least one enclave name.")
     return distribute(Path(keystore), names, Path(target), now=_moment(now), force=force).target
 
 
@@ -264,23 +268,24 @@ def explain_access(
     now: datetime | None = None,
     zone: tzinfo = UTC,
 ) -> AccessAnswer:
-    """Return whether DDS will allow an access, as the vendor decides by the signed documents.
+    """Return how a DDS vendor decides on an access, by the signed documents of the enclave.
 
     Args:
         keystore: The keystore, or its path.
         enclave: The name of the enclave, such as "/talker".
         action: "publish", "subscribe", "call", "serve", "execute" or "join".
-        name: The absolute ROS name of the topic, service or action; none for "join".
-        kind: What ``name`` is; "call" alone means a service.
+        name: The absolute ROS name of the topic, service or action; "" for "join".
+        kind: The kind of ``name``; without it, "call" means a service.
         vendor: "fastdds" (2.14), "fastdds-2.9", "cyclonedds", "standard", "opendds" or "connext".
-        policy: The policy, or its file, to find the lines in that the deciding rule comes from.
-        domain: The ROS domain; by default 0, or the first that the keystore is for.
-        now: The moment that is asked about; the present one by default.
+        policy: The policy of the enclave, or its file, in which to find the ``policy_lines``.
+        domain: The ROS domain id; by default 0, or the first domain of the governance.
+        now: The time of the access; the current time by default.
         zone: The time zone of the robot, in which some vendors read dates.
 
     Raises:
-        KeystoreError: There is no such keystore or enclave.
-        UsageError: No node can do that, or the name, vendor or domain is not valid.
+        KeystoreError: The keystore or the enclave does not exist.
+        UsageError: The action is unknown or does not fit ``kind``, or the name, vendor or domain is
+            not valid.
 
     Example:
         >>> answer = sros_tool.explain_access(keystore, "/talker", "publish", "/chatter")
@@ -333,15 +338,15 @@ def check(
     now: datetime | None = None,
     zone: tzinfo = UTC,
 ) -> tuple[Finding, ...]:
-    """Return what is wrong or weak in keystores, enclaves and policies, the worst first.
+    """Return findings on errors and weaknesses in keystores, enclaves and policies, worst first.
 
     Args:
-        paths: Keystores, folders of enclaves, policy files, or folders of policy files.
+        paths: Keystores, enclave folders, policy files, or folders of policy files.
         policies: Policies, or their files, to compare the permissions of keystores with.
         severity: The lowest severity that is returned.
-        strict: Report in full also the weaknesses that a keystore's template accepts.
-        domain: The ROS domain that enclaves have to join.
-        now: The moment that is asked about; the present one by default.
+        strict: Include the weaknesses that a keystore's template accepts.
+        domain: The ROS domain id that the enclaves have to join.
+        now: The time at which validities are checked; the current time by default.
         zone: The time zone of the robot, in which some vendors read dates.
 
     Returns:
@@ -362,7 +367,7 @@ def check(
 
     levels = {each.word: each for each in Severity}
     if not paths:
-        raise UsageError("no path is given to check")
+        raise UsageError("no path is given to check", "", "Pass at least one path.")
     if severity not in levels:
         raise UsageError(f"unknown severity {severity!r}", "", f"Choose {', '.join(levels)}.")
     read = tuple(_policy(each) for each in _several("policies", policies))
@@ -372,7 +377,7 @@ def check(
 
 
 def _moment(now: datetime | None) -> datetime:
-    """Return ``now``, which must have a time zone, or the present moment if it is None."""
+    """Return ``now``, which must have a time zone, or the current time if it is None."""
     if now is None:
         return datetime.now(UTC)
     if now.tzinfo is None:
@@ -393,7 +398,7 @@ def _keyring(secrets: Secrets | None, *, encrypt: bool = False) -> Keyring:
 
 
 def _several(parameter: str, given: Iterable[Item]) -> Iterable[Item]:
-    """Return ``given``; refuse a single string, whose letters would count as items."""
+    """Return ``given``; refuse a single string, which would be iterated letter by letter."""
     if isinstance(given, str):
         raise UsageError(f"{parameter} is one string", "", f"Pass a list: [{given!r}].")
     return given

@@ -1,7 +1,7 @@
-"""The errors of sros: each says what happened, why, and what to do.
+"""The exceptions of sros: each says what happened, why, and what to do.
 
-The library raises; only the command line prints.  ``exit_status`` is what the command line
-returns for an uncaught error: 1 for "no or failed", 2 for wrong usage.
+Only the command line prints them.  ``exit_status`` is the exit status of the command line for an
+uncaught error: 1 for a negative result or a failure, 2 for wrong usage.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""The faults of an enclave's files, each with title, reason and remedy.
+"""The faults that the files of an enclave can have, each with title, effect and remedy.
 
-Reading, checking and explaining keystores uses these faults; messages of DDS vendors are mapped to
-some of them.  A command in a remedy runs on a keystore with that fault, and repairs it.
+Reading, checking and explaining a keystore reports these faults; messages of DDS vendors are mapped
+to some of them.  A command in a remedy works on a keystore with that fault, and repairs it.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ _CLOCK = "Set the clock of this host; if it is right, sign again: `sros renew {r
 _SIGN = "Sign the permissions again: `sros create_permission {root} {enclave} POLICY`."
 _COMPLETE = "Create the missing file: `sros create_enclave {root} {enclave}`."
 REPLACE = (
-    "Replace it with a good one: `rm {path} && sros create_enclave {root} {enclave}` takes "
-    "the keystore's, or issues it again."
+    "Replace the file: `rm {path} && sros create_enclave {root} {enclave}` links the keystore's "
+    "file, or issues the file again."
 )
 _RESTORE = "Restore {path} from a backup."
 _GOVERNANCE = (
-    "Every enclave depends on it: restore {root}/enclaves/governance.p7s from a backup, or, once "
-    "you have read {root}/enclaves/governance.xml, sign that again: `openssl smime -sign -text -in "
+    "Every enclave depends on it: restore {root}/enclaves/governance.p7s from a backup, or read "
+    "{root}/enclaves/governance.xml and sign it again: `openssl smime -sign -text -in "
     "{root}/enclaves/governance.xml -out {root}/enclaves/governance.p7s -signer "
     "{root}/public/permissions_ca.cert.pem -inkey {root}/private/permissions_ca.key.pem`."
 )
 _AUTHORITY = (
-    "Replace the CA and what expired with it: `sros rotate_ca {root} --finish && sros renew {root} "
-    "--all-expiring 30d`; then restart all processes together."
+    "Replace the CA and the files that expired: `sros rotate_ca {root} --finish && sros renew "
+    "{root} --all-expiring 30d`; then restart all processes together."
 )
 _CRL = "Sign the list again: `sros crl {root} --refresh`, and export it to the robots again."
 _AUTHORITY_FILES = ("identity_ca.cert.pem", "permissions_ca.cert.pem")
@@ -39,16 +39,17 @@ _AUTHORITY_FILES = ("identity_ca.cert.pem", "permissions_ca.cert.pem")
 class Fault(Enum):
     """A fault of an enclave's files that keeps a process from running in it.
 
-    ``id`` is stable, for programs.  ``title`` is a clause; ``why``, ``source`` and ``remedy`` are
-    sentences: how DDS reacts, where that is specified or was measured, and what to do, with
-    ``{root}``, ``{enclave}`` and ``{path}`` for the keystore, the enclave and the file.
+    ``id`` is stable, for programs.  ``title`` is a clause.  ``why`` (how DDS reacts), ``source``
+    (where the reaction is specified or was measured) and ``remedy`` (what to do) are sentences.
+    ``{root}``, ``{enclave}`` and ``{path}`` in a remedy stand for the keystore, the enclave and the
+    file.
     """
 
     FILE_MISSING = (
         "file-missing",
         "a file that an enclave needs is missing",
         "The node fails, or without Enforce runs unsecured; Fast DDS says \"couldn't find all "
-        'security files!" and never which.',
+        'security files!" and never names the file.',
         _RCL,
         _COMPLETE,
         {"permissions.p7s": _SIGN},
@@ -56,8 +57,8 @@ class Fault(Enum):
     LINK_DANGLING = (
         "link-dangling",
         "a file of an enclave is a broken link",
-        "It counts as missing. It happens where an enclave is copied without what it links to; "
-        "`sros distribute_key` exports files in place of links.",
+        "It counts as missing. It happens when an enclave is copied without the files that it "
+        "links to; `sros distribute_key` exports files in place of links.",
         _RCL,
         _COMPLETE,
         {"permissions.p7s": _SIGN},
@@ -67,12 +68,12 @@ class Fault(Enum):
         "a file of an enclave cannot be read",
         "DDS cannot read it either.",
         _RCL,
-        "Let the user that runs the node read the file.",
+        "Give the user that runs the node permission to read the file.",
     )
     FILE_EMPTY = (
         "file-empty",
         "a file of an enclave is empty",
-        "Its content was lost, perhaps because the disk was full.",
+        "The content was lost, perhaps because the disk was full.",
         _RCL,
         REPLACE,
         {
@@ -107,7 +108,7 @@ class Fault(Enum):
     CERTIFICATE_ISSUER = (
         "certificate-issuer",
         "a certificate that another CA issued",
-        "Its own node refuses it; Fast DDS with an empty reason.",
+        "The node itself refuses it; Fast DDS with an empty reason.",
         "DDS-Security 1.1, 9.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
         REPLACE,
     )
@@ -136,11 +137,11 @@ class Fault(Enum):
     KEY_ENCRYPTED = (
         "key-encrypted",
         "a private key that is protected by a passphrase",
-        'No RMW can supply a passphrase, so no node can use it (Fast DDS: "Error obtaining private '
-        'key").',
+        "No RMW can supply a passphrase, so no node can use the key (Fast DDS: "
+        '"Error obtaining private key").',
         "rmw_fastrtps 8.4 and rmw_cyclonedds 2.2 (they set no password property).",
-        f"{_NEW_KEY} Or keep it without a passphrase, which DDS never asks for: `openssl pkey -in "
-        "{path} -out FILE`, and protect it by mode 0600.",
+        f"{_NEW_KEY} Or remove the passphrase: `openssl pkey -in "
+        "{path} -out FILE`, and protect the file with mode 0600.",
     )
     KEY_MISMATCH = (
         "key-mismatch",
@@ -152,39 +153,38 @@ class Fault(Enum):
     CRL_MALFORMED = (
         "crl-malformed",
         "a revocation list that cannot be read",
-        "Fast DDS refuses itself and everybody, with an empty reason.",
+        "Fast DDS refuses every participant, also its own, with an empty reason.",
         "Fast DDS 2.14.5 (PKIDH.cpp); measured.",
         _CRL,
     )
     CRL_ISSUER = (
         "crl-issuer",
         "a revocation list of another CA",
-        "No certificate can be verified with it, so everybody is refused.",
+        "No certificate can be verified with it, so every participant is refused.",
         "RFC 5280, 6.3.3; Fast DDS 2.14.5; measured.",
         _CRL,
     )
     CRL_NOT_YET_VALID = (
         "crl-not-yet-valid",
         "a revocation list that is not valid yet",
-        f"Everybody is refused. {_CLOCK_BEHIND}",
+        f"Every participant is refused. {_CLOCK_BEHIND}",
         "RFC 5280, 5.1.2.4; Fast DDS 2.14.5.",
         _CLOCK,
     )
     CRL_EXPIRED = (
         "crl-expired",
         "a revocation list that has expired",
-        "Everybody is refused, and Fast DDS does not report it.",
+        "Every participant is refused, and Fast DDS does not report it.",
         "RFC 5280, 5.1.2.5; Fast DDS 2.14.5; measured.",
         _CRL,
     )
     REVOKED = (
         "revoked",
         "an enclave whose certificate is revoked",
-        "Everybody who reads crl.pem drops it, Fast DDS in silence.",
+        "Every participant with this crl.pem refuses it; Fast DDS does not report it.",
         "RFC 5280, 5; Fast DDS 2.14.5; measured.",
-        "This is intended after a revocation. If not, give it a new key and certificate: `sros "
-        "renew {root} "
-        "{enclave} --new-key`.",
+        "This is intended after a revocation. If not, give the enclave a new key and certificate: "
+        "`sros renew {root} {enclave} --new-key`.",
     )
     NOT_SIGNED = (
         "not-signed",
@@ -197,9 +197,9 @@ class Fault(Enum):
     SIGNATURE = (
         "signature",
         "a document whose signature does not verify",
-        "It was changed, or another CA signed it: find out who did. The node fails (Fast DDS: "
-        "PKCS7 data verification failed). With one CA for both jobs it may be an enclave that "
-        "signed for itself, which DDS accepts.",
+        "The document was changed, or another CA signed it: find out who did. The node fails (Fast "
+        "DDS: PKCS7 data verification failed). With a single CA, an enclave may have signed its "
+        "own permissions, which DDS accepts.",
         "DDS-Security 1.1, 9.4.1.1; Fast DDS 2.14.5; CVE-2023-24011 for Cyclone DDS 0.10.2.",
         _SIGN,
         {"governance.p7s": _GOVERNANCE},
@@ -246,7 +246,7 @@ class Fault(Enum):
     PERMISSIONS_SUBJECT = (
         "permissions-subject",
         "permissions for another subject",
-        "No grant fits the certificate. It happens where permissions of an earlier certificate, "
+        "No grant fits the certificate. It happens when permissions of an earlier certificate, "
         "or of another enclave, were put in place.",
         'DDS-Security 1.1, 9.4.1.3; Fast DDS ("Not found the identity subject name"), Cyclone '
         "DDS code 146.",
@@ -255,14 +255,15 @@ class Fault(Enum):
     PERMISSIONS_DOMAIN = (
         "permissions-domain",
         "permissions that allow nothing in the domain",
-        "The node starts on Fast DDS, and every peer refuses it; Cyclone DDS refuses it itself.",
+        "With Fast DDS the node starts, and every peer refuses it; with Cyclone DDS it does not "
+        "start.",
         "DDS-Security 1.1, 9.4.1.3; measured.",
-        f"Set ROS_DOMAIN_ID to a domain that they name, or sign them for this one. {_SIGN}",
+        f"Set ROS_DOMAIN_ID to a domain that the permissions name, or add this domain. {_SIGN}",
     )
     CA_CHAIN = (
         "ca-chain",
         "a CA certificate that a vendor refuses",
-        "Fast DDS 2.14 verifies the CA itself, strictly.",
+        "Fast DDS 2.14 also verifies the CA certificate, by the strict rules of OpenSSL.",
         "RFC 5280, 6.1; Fast DDS 2.14.5 (FileProvider.cpp); measured.",
         "Use a self-signed CA with keyCertSign, first in its file.",
     )
@@ -271,27 +272,26 @@ class Fault(Enum):
         "a certificate that is not signed with SHA-256",
         "Fast DDS refuses other digests in a CA and in an enclave's certificate.",
         "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp); measured.",
-        "Issue the certificate again with SHA-256, which every vendor takes.",
+        "Issue the certificate again with SHA-256, which every vendor accepts.",
     )
     KEY_ALGORITHM = (
         "key-algorithm",
         "a key that not every vendor accepts",
-        "Cyclone DDS accepts only EC prime256v1 and RSA of exactly 2048 bits; Fast DDS fails in "
-        "its "
-        "handshake with Ed25519.",
+        "Cyclone DDS accepts only EC prime256v1 and RSA of exactly 2048 bits; with Ed25519, the "
+        "handshake of Fast DDS fails.",
         "DDS-Security 1.1, 9.3.1; Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5; measured.",
-        "Use keys of EC prime256v1, which every vendor takes.",
+        "Use EC prime256v1 keys, which every vendor accepts.",
     )
     DOCUMENT_SIZE = (
         "document-size",
         "permissions that are too large for a handshake",
-        "The node starts, and its handshake with peers never finishes.",
+        "The node starts, and the handshake with its peers never finishes.",
         "Fast DDS 2.9.1; measured.",
         "Make the permissions smaller, with wildcards, or split the enclave.",
     )
 
     def __new__(cls, identifier: str, *_: object) -> Fault:
-        """Make the member whose value is the identifier."""
+        """Create the member whose value is ``identifier``."""
         fault = object.__new__(cls)
         fault._value_ = identifier
         return fault
@@ -313,19 +313,19 @@ class Fault(Enum):
         self._remedies = remedies or {}
 
     def remedy_in(self, file: str) -> str:
-        """Return the remedy for a fault in ``file``, with its fields still to be filled in."""
+        """Return the remedy for this fault in ``file``, with its ``{fields}`` not filled in."""
         return self._remedies.get(file, self.remedy)
 
     def remedy_in_export(self, file: str) -> str:
-        """Return what to do where the fault lies in ``file`` of an export, which has no CA keys."""
+        """Return the remedy for this fault in ``file`` of an export, which has no CA keys."""
         text = self.remedy_in(file)
         if "`" not in text or text is _CLOCK or self is Fault.GOVERNANCE_DOMAIN:
             return text
-        return f"In the keystore with the keys of the CAs: {text} Then export the enclave again."
+        return f"In the keystore that has the CA keys: {text} Then export the enclave again."
 
 
 FAULTS = {fault.id: fault for fault in Fault}
-"""All faults by their ids."""
+"""All faults, by id."""
 
 VENDOR_FAULTS = (
     Fault.CA_CHAIN,
@@ -333,4 +333,4 @@ VENDOR_FAULTS = (
     Fault.KEY_ALGORITHM,
     Fault.DOCUMENT_SIZE,
 )
-"""The faults that only some vendors find, when they load an enclave."""
+"""The faults for which only some vendors refuse an enclave."""

@@ -160,7 +160,7 @@ def test_an_encrypted_key_is_asked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("call", "error", "text"),
     [
-        (lambda ks: sros_tool.generate(ks), UsageError, "neither"),
+        (lambda ks: sros_tool.generate(ks), UsageError, "no policy and no enclave"),
         (lambda ks: sros_tool.generate(ks, enclaves="/spare"), UsageError, "one string"),
         (lambda ks: sros_tool.generate(ks, POLICY, domain=9), KeystoreError, "domain"),
         (lambda ks: sros_tool.export_enclaves(ks, [], "robot.tar.gz"), UsageError, "no enclave"),

@@ -77,7 +77,7 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
         if "`" not in text or fault is Fault.GOVERNANCE_DOMAIN:
             return _filled(text, root, enclave, file)
         mended = _filled(text, "KEYSTORE", enclave, file)
-        return f"In the keystore with the keys of the CAs: {mended} Then export the enclave again."
+        return f"In the keystore that has the CA keys: {mended} Then export the enclave again."
     if keystore and fault:
         wrong_issuer = fault is Fault.CERTIFICATE_ISSUER
         if wrong_issuer and _is_own_copy(keystore, enclave, IDENTITY_CA_FILE):

@@ -272,7 +272,7 @@ def test_verify_says_what_is_wrong_and_answers_by_its_status(
     assert "/b  NOT LOADABLE\n" in ended.out
     assert f"{out}/enclaves/b/cert.pem: error: a file that an enclave needs is miss" in ended.out
     # No command that needs the keys of the CAs is proposed for the robot's folder.
-    assert "In the keystore with the keys of the CAs: Create the missing file: `sros " in ended.out
+    assert "In the keystore that has the CA keys: Create the missing file: `sros " in ended.out
     assert "`sros create_enclave KEYSTORE /b`. Then export the enclave again." in ended.out
     assert f"{out}/enclaves/a/key.pem: error: a private key that others can read" in ended.out
     assert f"chmod 600 '{out}/enclaves/a/key.pem'" in ended.out

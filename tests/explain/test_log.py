@@ -190,8 +190,7 @@ def test_a_remedy_on_a_robot_is_for_the_keystore_at_home(keystore: Path) -> None
     log = log_of(FAST_14, "permissions expired")
     found = sros("explain", keystore, ENCLAVE, "--log", log).out
     assert (
-        f"In the keystore with the keys of the CAs: Renew it: `sros renew KEYSTORE {ENCLAVE}`"
-        in found
+        f"In the keystore that has the CA keys: Renew it: `sros renew KEYSTORE {ENCLAVE}`" in found
     )
 
 
