@@ -39,7 +39,7 @@ def _complete_scenario(
     epilog="""\b
 Example:
   $ sros demo --topic /camera/image
-  Cyclone DDS 0.10.2, topic /camera/image, in a network namespace of its own
+  Cyclone DDS 0.10.2, topic /camera/image, in a separate network namespace
         what was tried                        expected      observed
   ok    secured talker to secured listener    heard         heard
         secured listener heard 49 of 50 messages of the secured talker ...

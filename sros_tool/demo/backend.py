@@ -33,7 +33,7 @@ from sros_tool.translate import governance_for
 
 AUTO, RCLPY, CYCLONE = "auto", "rclpy", "cyclone"
 
-_ASKED = "as asked for"
+_ASKED = "chosen with --backend"
 _NO_RCLPY = (
     "Source a ROS 2 installation from packages (its Fast DDS has DDS Security built in), or use"
     " `--backend cyclone`."
@@ -44,7 +44,7 @@ _ON_THE_WIRE = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}
 
 @dataclass(frozen=True)
 class Backend:
-    """The library that the demo's nodes use; ``why`` is the reason of the choice, in one line.
+    """The library that the demo's nodes use; ``why`` is the reason for the choice, in one line.
 
     With ``ros_observer``, an unsecured observer of Cyclone nodes is an rclpy node; ``rmw`` is the
     RMW of rclpy.
@@ -63,7 +63,7 @@ class Backend:
 
     @property
     def vendor(self) -> Condition | None:
-        """The vendor as a condition for expected statuses, or None."""
+        """The DDS vendor as a condition for expected statuses, or None for another vendor."""
         if self.dds.startswith("Cyclone DDS"):
             return Condition.CYCLONE
         return Condition.FAST if self.dds.startswith("Fast DDS") else None
@@ -79,7 +79,7 @@ class Backend:
     ) -> list[str]:
         """Return the command line of a process of that role.
 
-        ``names`` are the absolute names of its ROS nodes, from `node_names`.
+        ``names`` are the absolute names of the role's ROS nodes, from `node_names`.
         """
         if self.library(role, secured=secured) == RCLPY:
             program = [sys.executable, "-m", "sros_tool.demo.nodes.ros", role.value]
@@ -105,12 +105,12 @@ class Backend:
 
 
 def choose_backend(wish: str, probe: ProbeEnclave) -> Backend:
-    """Return a backend that was tried and enforces security.
+    """Try the backends that ``wish`` allows, and return the first that enforces security.
 
     ``wish`` is `AUTO`, `RCLPY` or `CYCLONE`.
 
     Raises:
-        UnavailableError: there is none.
+        UnavailableError: no such backend enforces security here.
     """
     if wish == CYCLONE:
         return _cyclone(cyclone_stack(probe), _ASKED)
@@ -149,7 +149,7 @@ def _observing_rmw() -> str | None:
 
 def _why_not(stacks: Sequence[Stack]) -> str:
     if not any(stack.present for stack in stacks):
-        return "rclpy is not here"
+        return "rclpy is not installed here"
     seen = "; ".join(f"{stack.rmw or 'its RMW'}: {stack.evidence}" for stack in stacks)
     return f"rclpy does not enforce security here ({seen})"
 
@@ -162,7 +162,7 @@ _ENCRYPTING = (ProtectionKind.ENCRYPT, ProtectionKind.ENCRYPT_WITH_ORIGIN_AUTHEN
 
 
 def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Condition]:
-    """Return the conditions that hold for a DDS topic, by backend and keystore template."""
+    """Return the conditions that hold for a DDS topic with this backend and template."""
     (domain,) = governance_for(template.protection, DomainSet.of((0, 0))).domain_access_rules
     rule = next(each for each in domain.topic_access_rules if matches(each.topic_expression, topic))
     kinds = (
@@ -189,9 +189,9 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
 
 
 def _checks_signers(dds: str) -> bool:
-    """Return whether a Fast DDS (``Fast DDS 2.14.5``) accepts only the permissions CA as signer.
+    """Return whether this Fast DDS accepts only the permissions CA as signer of permissions.
 
-    An unknown version counts as a recent one.
+    ``dds`` is its name and version ("Fast DDS 2.14.5"); an unknown version counts as recent.
     """
     version = tuple(int(part) for part in dds.rpartition(" ")[2].split(".") if part.isdigit())
     if len(version) < 3 or version >= (2, 10):

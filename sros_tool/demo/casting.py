@@ -50,7 +50,7 @@ class CastMember:
 
 @dataclass(frozen=True)
 class UserKeystore:
-    """A keystore of the user to attack, with its template, domains, and cast.
+    """A user's keystore to attack, with its template, domains, and cast.
 
     ``topic`` is the attacked ROS topic, ``service`` the attacked ROS service ("": none).
     ``guessed`` says that the cast was chosen by the rights of the enclaves, not by their names.
@@ -65,22 +65,22 @@ class UserKeystore:
     guessed: bool
 
     def copy(self, target: Path) -> None:
-        """Copy the enclaves of the cast, with their modes and links, but no key of a CA."""
+        """Copy the keystore with modes and links, but only the cast's enclaves and no CA keys."""
         folders = {f"{ENCLAVES}{name}" for name in self.cast.values()}
         shutil.copytree(self.root, target, symlinks=True, ignore=_all_but(self.root, folders))
 
     def keyring(self) -> Keyring:
-        """Return the keyring of the CA keys: in the keystore, or as its settings say."""
+        """Return the keyring of the CA keys: in the keystore if there, else as its settings say."""
         inside = {role: self.root.absolute() / ca_key(role) for role in ROLES}
         places = {role: f"file:{path}" for role, path in inside.items() if path.exists()}
         return Keyring(places=places)
 
 
 def open_user_keystore(root: Path, topic: str, scenario: Scenario) -> UserKeystore:
-    """Read a keystore and cast its enclaves for the ROS topic ``topic`` ("": one that fits).
+    """Read a keystore and cast its enclaves for the ROS topic ``topic`` ("": any).
 
     Raises:
-        KeystoreError: it is not a keystore, or no two enclaves may talk to each other.
+        KeystoreError: ``root`` is not a keystore, or no two enclaves may talk to each other.
     """
     names = list_enclaves(root)
     domains = governance_of(root).domains()
@@ -97,8 +97,8 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario) -> UserKeysto
         cast, chosen = _best_cast(rights, wanted)
     if not chosen:
         raise KeystoreError(
-            f"no two enclaves of keystore '{root}' talk on {topic or 'a topic'}",
-            "An attack needs an enclave that may publish a topic, by a name without wildcards, and"
+            f"no two enclaves of keystore '{root}' may talk on {topic or 'a topic'}",
+            "An attack needs an enclave that may publish a topic (named without wildcards), and"
             " another enclave that may subscribe to it.",
             "Name the topic with --topic, or attack a keystore made by the demo.",
         )
@@ -154,10 +154,10 @@ def _single_purpose_first(
 
 
 def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
-    """Return server and client of one service, if any; preferably a client that may not serve."""
+    """Return server and client of one service, if any; prefer a client that may not serve."""
     found: dict[str, str] = {}
     for server, client in permutations(rights, 2):
-        for topic in _topics_of_its_own(rights[server], "publish"):
+        for topic in _application_topics(rights[server], "publish"):
             service, begin = service_of(topic)
             if begin == "rr" and ACTION_INSIDE not in service:
                 request = dds_names("request", service).publish[0]
@@ -170,7 +170,7 @@ def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
 
 def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     """Return the service that the server of a cast offers and its client calls."""
-    for topic in _topics_of_its_own(rights[cast["server"]], "publish"):
+    for topic in _application_topics(rights[cast["server"]], "publish"):
         name, begin = service_of(topic)
         requests = dds_names("request", name).publish[0]
         if begin == "rr" and may(rights[cast["client"]], "publish", requests):
@@ -181,23 +181,23 @@ def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
 def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     own = [
         topic
-        for topic in _topics_of_its_own(rights[cast["talker"]], "publish")
+        for topic in _application_topics(rights[cast["talker"]], "publish")
         if topic[:3] == "rt/"
     ]
     return next((t for t in own if may(rights[cast["listener"]], "subscribe", t)), "")
 
 
 def _within(short: str, long: str) -> bool:
-    """Return whether the other enclave name has all parts of this one, and more."""
+    """Return whether ``long`` has all path components of ``short``, and more."""
     return set(short.strip("/").split("/")) < set(long.strip("/").split("/"))
 
 
 def _topics(rights: Mapping[str, Grant]) -> set[str]:
-    return {topic for grant in rights.values() for topic in _topics_of_its_own(grant, "publish")}
+    return {topic for grant in rights.values() for topic in _application_topics(grant, "publish")}
 
 
 def _all_but(root: Path, folders: set[str]) -> Callable[[str, list[str]], set[str]]:
-    """Return what `shutil.copytree` ignores: keys of CAs, and enclaves without a part."""
+    """Return the ``ignore`` of `shutil.copytree` that skips CA keys and other enclaves."""
     wanted = {root / folder for folder in folders}
     kept = {parent for folder in wanted for parent in folder.parents} | wanted
 
@@ -224,9 +224,9 @@ def enclave_grant(root: Path, enclave: str) -> Grant | None:
 
 
 def may(grant: Grant, verb: str, topic: str) -> bool:
-    """Return whether the first rule that names a DDS topic allows it, as the vendors decide.
+    """Return whether a grant allows ``verb`` (publish or subscribe) on a DDS topic.
 
-    ``verb`` is publish or subscribe.
+    As in all vendors, the first rule that names the topic decides.
     """
     for rule in grant.rules:
         if any(matches(expression, topic) for expression in _expressions(rule, verb)):
@@ -234,8 +234,11 @@ def may(grant: Grant, verb: str, topic: str) -> bool:
     return False
 
 
-def _topics_of_its_own(grant: Grant, verb: str) -> Iterator[str]:
-    """Yield the DDS topics (no wildcards) that a grant allows, except the topics of every node."""
+def _application_topics(grant: Grant, verb: str) -> Iterator[str]:
+    """Yield the application's DDS topics that a grant allows by a name without wildcards.
+
+    Topics of every node, hidden topics and topics of actions are left out.
+    """
     for topic in _allowed(grant, verb):
         private = topic.startswith("rt/_") or ACTION_INSIDE in topic
         if topic not in _TOPICS_OF_EVERY_NODE and not private:
@@ -243,7 +246,7 @@ def _topics_of_its_own(grant: Grant, verb: str) -> Iterator[str]:
 
 
 def is_node_allowed(grant: Grant, node: str) -> bool:
-    """Return whether a grant allows all standard services of the node of that absolute name."""
+    """Return whether a grant allows all standard services of the node ``node`` (absolute)."""
     names = (dds_names("reply", f"{node}/{service}") for service in NODE_SERVICES)
     return all(
         all(may(grant, "publish", topic) for topic in each.publish)
@@ -253,7 +256,7 @@ def is_node_allowed(grant: Grant, node: str) -> bool:
 
 
 def nodes_named(grant: Grant) -> Iterator[str]:
-    """Yield the absolute names of the nodes that a grant names and allows."""
+    """Yield the absolute names of the nodes whose standard services a grant names and allows."""
     kind, service = _NODE_MARK
     for topic in _allowed(grant, "publish"):
         if topic.startswith(kind) and topic.endswith(service):
@@ -274,7 +277,7 @@ def _expressions(rule: Rule, verb: str) -> Iterator[str]:
         yield from criteria.topics
 
 
-OWN_NAMES: Mapping[Role, tuple[str, ...]] = {
+DEFAULT_NODE_NAMES: Mapping[Role, tuple[str, ...]] = {
     Role.TALKER: ("talker",),
     Role.LISTENER: ("listener",),
     Role.OBSERVER: ("observer",),
@@ -293,7 +296,7 @@ def node_names(role: Role, grant: Grant | None) -> tuple[str, ...]:
     A node keeps its default name if the grant allows it.  Otherwise it gets the most similar node
     name in the grant; without any, it keeps its default name.
     """
-    wanted = [f"/{name}" for name in OWN_NAMES[role]]
+    wanted = [f"/{name}" for name in DEFAULT_NODE_NAMES[role]]
     if grant is None:
         return tuple(wanted)
     kept = {name for name in wanted if is_node_allowed(grant, name)}
@@ -318,12 +321,12 @@ def _names(
 
 
 def naming_arguments(role: Role, names: Sequence[str]) -> list[str]:
-    """Return the ``--ros-args`` that give these absolute names to the nodes of a role."""
+    """Return the ``--ros-args`` that give the nodes of a role these absolute names."""
     rules: list[str] = []
-    for own, name in zip(OWN_NAMES[role], names, strict=True):
+    for default, name in zip(DEFAULT_NODE_NAMES[role], names, strict=True):
         namespace, _, node = name.rpartition("/")
-        if node != own:
-            rules += ["-r", f"{own}:__node:={node}"]
+        if node != default:
+            rules += ["-r", f"{default}:__node:={node}"]
         if namespace:
             # rcl looks up the namespace under the new name of the node.
             rules += ["-r", f"{node}:__ns:={namespace}"]

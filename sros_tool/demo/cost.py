@@ -1,13 +1,13 @@
 """Measure the cost of security by protection kind: first message, latency, throughput.
 
-Pairs of processes, one pair after the other, talk in their own network.  All pairs run the same
-program, so only the protection differs.
+Pairs of processes exchange messages, one pair after the other, each in a separate network.  All
+pairs run the same program, so only the protection differs.
 
 `CostResult.as_json` gives ``kinds`` (the protection kinds, unsecured first), ``payloads`` (bytes),
 ``note`` (what the numbers contain), ``first_message`` (a list of ``{"kind", "seconds", "ratio"}``)
 and ``measurements`` (a list of ``{"kind", "payload", "latency_us", "messages_per_s",
-"megabytes_per_s", "latency_ratio", "throughput_ratio"}``).  Every ratio is secured over unsecured
-in the same run: of latency above 1 is slower, of throughput below 1 is slower.
+"megabytes_per_s", "latency_ratio", "throughput_ratio"}``).  Every ratio is secured divided
+by unsecured in the same run: slower is a latency ratio above 1 and a throughput ratio below 1.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ from sros_tool.errors import SrosError
 _UNSECURED = "unsecured"
 _PAYLOADS = (64, 1024, 16 * 1024, 256 * 1024, 1024 * 1024)
 NOTE = (
-    "medians; latency is half a round trip, throughput is measured in bursts, each of which is"
-    " confirmed; both ends are Python, whose overhead is the same in all numbers and makes the"
-    " ratios smaller than with nodes in C++; messages go over UDP, not through shared memory; the"
-    " numbers of payloads that do not fit into the buffer of a socket vary"
+    "medians; latency is half a round trip; throughput is measured in bursts, and the receiver"
+    " confirms each burst; both ends are Python, whose overhead is the same in all numbers and"
+    " brings the ratios closer to 1 than with nodes in C++; messages go over UDP, not through"
+    " shared memory; the numbers vary for payloads that do not fit into a socket's buffer"
 )
 _LONGEST_START = 60.0
 _TICK = 0.02
@@ -43,7 +43,7 @@ _TICK = 0.02
 
 @dataclass(frozen=True)
 class Effort:
-    """The amount of measuring: payloads in bytes, seconds for each, and rounds."""
+    """The extent of a measurement: payloads in bytes, seconds per number, and rounds."""
 
     payloads: tuple[int, ...] = _PAYLOADS
     seconds: float = 0.2
@@ -70,10 +70,10 @@ class CostResult:
     measurements: tuple[Measurement, ...]
 
     def of(self, kind: str, payload: int) -> Measurement:
-        """Return one measurement.
+        """Return the measurement of a protection kind and payload.
 
         Raises:
-            KeyError: it was not measured.
+            KeyError: this kind or payload was not measured.
         """
         return {(each.kind, each.payload): each for each in self.measurements}[kind, payload]
 
@@ -114,7 +114,7 @@ def measure_cost(
     effort: Effort,
     progress: Progress,
 ) -> CostResult:
-    """Measure an unsecured pair, and a pair in each of the keystores ``measured``.
+    """Measure an unsecured pair, and a pair in each keystore of ``measured`` (by kind).
 
     Raises:
         SrosError: the two processes of a pair did not find each other.
@@ -146,7 +146,7 @@ def measure_cost(
 def _run_pair(
     ends: tuple[Identity, Identity], plan: RunPlan, folder: Path, effort: Effort
 ) -> dict[str, Any]:
-    """Run one pair, and return the measurements of its ping."""
+    """Run one pair of processes, and return the JSON that its ping wrote."""
     answer = folder / "answer.json"
     answer.unlink(missing_ok=True)
     command = [sys.executable, "-m", "sros_tool.demo.nodes.ping_pong", plan.backend.name]

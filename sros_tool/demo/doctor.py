@@ -1,4 +1,4 @@
-"""The examination behind `sros doctor`: which DDS stacks are here, and which enforce security."""
+"""The diagnosis of `sros doctor`: the DDS stacks of this machine, and which enforce security."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Diagnosis:
 
 
 def examine(now: datetime) -> Diagnosis:
-    """Return the diagnosis of this machine: try every stack in a temporary keystore."""
+    """Try every DDS stack with a temporary keystore, and return the diagnosis."""
     with TemporaryDirectory(prefix="sros-doctor-") as folder:
         domains = DomainSet.of((_PROBE_DOMAIN, _PROBE_DOMAIN))
         template = load_template(_TEMPLATE)
@@ -77,7 +77,7 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
 
 def _answer(stack: Stack) -> str:
     if not stack.present:
-        return "not here"
+        return "not installed"
     if stack.enforces is None:
         return "could not be tried"
     return "enforces security" if stack.enforces else "does not enforce"

@@ -1,8 +1,8 @@
-"""The forger: change a keystore as an attacker would, or remove a defence from it.
+"""Forgeries: functions that change a keystore as an attacker would, or remove a defence.
 
-Rows refer to its functions.  A function alone works on a copy of the keystore, with all defences;
-in `Undefended` it works on a new keystore without one of them, and shows that the attack works
-there.
+Rows of scenarios refer to these functions.  A function alone changes a copy of the keystore, with
+all defences in place.  In `Undefended`, it changes a new keystore without one of the defences, to
+show that the attack works there.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _DAY, _MINUTE = timedelta(days=1), timedelta(minutes=1)
 _NOBODY = 65534
 
 STOLEN = "/stolen"
-"""The enclave with a copy of another one, made before its revocation."""
+"""The enclave with a copy of a revoked enclave, made before the revocation."""
 
 
 @dataclass(frozen=True)
@@ -90,10 +90,10 @@ class KeystoreCopy:
         """Return the name of the enclave that plays a part.
 
         Raises:
-            KeystoreError: no enclave does.
+            KeystoreError: no enclave plays the part.
         """
         if part not in self.cast:
-            raise KeystoreError(f"the keystore has no enclave for the part of the {part}")
+            raise KeystoreError(f"the keystore has no enclave that can be the {part}")
         return self.cast[part]
 
     def folder(self, part: str) -> Path:
@@ -104,7 +104,7 @@ class KeystoreCopy:
         """Return the CAs, with their keys, of the copy or of another keystore.
 
         Raises:
-            SrosError: the keys are not there.
+            SrosError: a key of a CA cannot be loaded.
         """
         keyring = IN_KEYSTORE if root else self.keyring
         root = root or self.root
@@ -175,11 +175,11 @@ Forge = Callable[[KeystoreCopy], None]
 
 
 def _unchanged(_copy: KeystoreCopy) -> None:
-    """Leave the keystore as it is."""
+    """Leave the keystore unchanged."""
 
 
 def _same_template(template: Template) -> Template:
-    """Return the template as it is."""
+    """Return the template unchanged."""
     return template
 
 
@@ -192,7 +192,7 @@ class Undefended:
 
 
 def name_of(forgery: Forge | Undefended) -> str:
-    """Return the folder name of a forged keystore, unique for each forgery."""
+    """Return the folder name for the keystore of a forgery, unique for each forgery."""
     if isinstance(forgery, Undefended):
         return f"undefended_{forgery.template.__name__}_{forgery.forge.__name__}"
     return forgery.__name__
@@ -216,7 +216,7 @@ def _widened(criteria: tuple[Criteria, ...], topics: Sequence[str]) -> tuple[Cri
 
 
 def _weak_governance(copy: KeystoreCopy) -> bytes:
-    """Return a governance that lets everybody in and protects nothing, as XML."""
+    """Return the governance as XML, changed to admit everybody and protect nothing."""
     governance = parse_governance(copy.governance())
     return render_governance(
         Governance(
@@ -255,7 +255,7 @@ def governance_of_another_ca(copy: KeystoreCopy) -> None:
 
 
 def weaker_governance(copy: KeystoreCopy) -> None:
-    """Give talker and listener a weak governance that the CA signed earlier."""
+    """Give talker and listener a weak governance signed by the CA, as if from an earlier time."""
     signed = copy.sign(_weak_governance(copy))
     for part in ("talker", "listener"):
         copy.put(part, GOVERNANCE_FILE, signed)
@@ -294,7 +294,7 @@ def permissions_of_another_ca(copy: KeystoreCopy) -> None:
 
 
 def own_permissions_ca(copy: KeystoreCopy) -> None:
-    """Sign the guest's documents by another permissions CA, which only the guest's DDS trusts."""
+    """Sign the guest's documents with another permissions CA, which only the guest trusts."""
     _trust_another_permissions_ca(copy, "guest")
 
 
@@ -321,9 +321,9 @@ def permissions_signed_by_itself(copy: KeystoreCopy) -> None:
 
 
 def permissions_and_governance_signed_by_itself(copy: KeystoreCopy) -> None:
-    """Sign the guest's permissions and governance with its own key, so that its own DDS accepts.
+    """Sign the guest's permissions and governance with its own key, so that its DDS accepts them.
 
-    The file of the permissions CA gets the identity CA, for vendors that check a chain, and the
+    The guest's permissions CA file gets the identity CA, for vendors that check a chain, and the
     guest's certificate, for vendors that check only the signer.
     """
     certificate, key = copy.certificate("guest"), copy.key("guest")
@@ -334,7 +334,7 @@ def permissions_and_governance_signed_by_itself(copy: KeystoreCopy) -> None:
 
 
 def enclave_among_the_signers(copy: KeystoreCopy) -> None:
-    """Sign the guest's permissions with its own key, which guest and listener then trust."""
+    """Sign the guest's permissions with its own key; guest and listener trust its certificate."""
     permissions_signed_by_itself(copy)
     trusted = copy.read("guest", PERMISSIONS_CA_FILE) + pem(copy.certificate("guest"))
     for part in ("guest", "listener"):
@@ -342,7 +342,7 @@ def enclave_among_the_signers(copy: KeystoreCopy) -> None:
 
 
 def borrowed_permissions(copy: KeystoreCopy) -> None:
-    """Give the guest the permissions of an enclave whose name contains its own."""
+    """Give the guest the admin's permissions; the admin's name contains the guest's."""
     copy.put("guest", PERMISSIONS_FILE, copy.read("admin", PERMISSIONS_FILE))
 
 
@@ -354,7 +354,7 @@ def borrowed_permissions_and_subject(copy: KeystoreCopy) -> None:
 
 
 def permissions_signed_by_the_ca(copy: KeystoreCopy) -> None:
-    """Give the guest earlier permissions, with one more topic, signed by the CA."""
+    """Give the guest permissions with one more topic, signed by the CA as if earlier."""
     copy.put("guest", PERMISSIONS_FILE, copy.sign(_wider_permissions(copy)))
 
 
@@ -432,7 +432,7 @@ def key_of_another_enclave(copy: KeystoreCopy) -> None:
 
 
 def _revoke(copy: KeystoreCopy, part: str) -> None:
-    """Revoke an enclave, and issue it again for the same subject, as its owner would."""
+    """Revoke an enclave, then give it a new key and certificate for the same subject."""
     folder = copy.folder(part)
     before = {name: copy.read(part, name) for name in REQUIRED_FILES}
     revoke(copy.root, [copy.enclave(part)], now=copy.now, keyring=copy.keyring)
@@ -444,22 +444,22 @@ def _revoke(copy: KeystoreCopy, part: str) -> None:
 
 
 def talker_revoked(copy: KeystoreCopy) -> None:
-    """Revoke the talker, and issue it again."""
+    """Revoke the talker, then give it a new key and certificate."""
     _revoke(copy, "talker")
 
 
 def guest_revoked(copy: KeystoreCopy) -> None:
-    """Revoke the guest, and issue it again."""
+    """Revoke the guest, then give it a new key and certificate."""
     _revoke(copy, "guest")
 
 
 def talker_revocation_not_delivered(copy: KeystoreCopy) -> None:
-    """Revoke the talker, keep a copy of it, and remove the listener's revocation list."""
+    """Revoke the talker, keep a copy of it in `STOLEN`, and remove the listener's CRL."""
     _revocation_not_delivered(copy, "talker")
 
 
 def guest_revocation_not_delivered(copy: KeystoreCopy) -> None:
-    """Revoke the guest, keep a copy with earlier permissions, and remove the listener's list."""
+    """Revoke the guest, keep a copy with wider permissions, and remove the listener's CRL."""
     now = copy.read("guest", PERMISSIONS_FILE)
     permissions_signed_by_the_ca(copy)
     before = copy.read("guest", PERMISSIONS_FILE)
@@ -482,7 +482,7 @@ def _revocation_not_delivered(copy: KeystoreCopy, part: str) -> None:
 def identity_copied_by_another_user(copy: KeystoreCopy) -> None:
     """Remove the talker's files that another user of the machine cannot read."""
     if os.geteuid() != 0:
-        raise UnavailableError("only root can try this as another user of the machine")
+        raise UnavailableError("only root can try to read the files as another user of the machine")
     folder = copy.folder("talker")
     inside = str(folder.relative_to(copy.root))
     names = [file.name for file in folder.iterdir()]
@@ -495,7 +495,7 @@ def identity_copied_by_another_user(copy: KeystoreCopy) -> None:
 
 
 def _read_as_nobody(root: Path, files: list[str]) -> list[bytes | None]:
-    """Return the content of files as a user without rights can read it, None if unreadable."""
+    """Return the content of files as the user nobody reads them; None if unreadable."""
     kept: list[bytes | None] = []
     place = os.open(root, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -525,7 +525,7 @@ def _read_as_nobody(root: Path, files: list[str]) -> list[bytes | None]:
 
 
 def files_readable_for_all(copy: KeystoreCopy) -> None:
-    """Make all files readable, like a careless copy or ros2/sros2, then copy the talker."""
+    """Make all files world-readable, then copy the talker as another user."""
     for path in [copy.root, *copy.root.rglob("*")]:
         if not path.is_symlink():
             path.chmod(0o755 if path.is_dir() else 0o644)
@@ -543,7 +543,7 @@ def shared_subjects(template: Template) -> Template:
 
 
 def open_default(template: Template) -> Template:
-    """Return the template that lets an enclave without a policy do everything."""
+    """Return the template with all permissions for an enclave without a policy."""
     return replace(template, default_permissions=EVERYTHING)
 
 
@@ -565,8 +565,8 @@ def encrypted(template: Template) -> Template:
 def _protected(template: Template, level: Level) -> Template:
     """Return the template with the same protection level for every topic.
 
-    A payload is signed together with its submessage: Fast DDS loses payloads that are signed
-    separately (`governance.signed-payload`).
+    A payload is signed as part of its submessage: Fast DDS loses messages with a signed payload
+    (`governance.signed-payload`).
     """
     discovered = level is not Level.NONE
     payload = level if level is Level.ENCRYPT else Level.NONE

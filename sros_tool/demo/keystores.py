@@ -1,7 +1,7 @@
-"""The keystores of a scenario: its own, one of another CA, and forged ones.
+"""The keystores of a scenario: the scenario's own, a foreign one with another CA, and forged ones.
 
-The user's keystore, if given, is only read.  The keys of its CAs are not copied; forgeries that
-need a signature of a CA use its key in place, and are skipped if there is none.
+A keystore of the user is only read.  The keys of its CAs are not copied: a forgery that needs a
+signature of a CA uses the key in place, and is skipped if the key cannot be loaded.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _RIGHTS = {
 
 @dataclass(frozen=True)
 class KeystoreSpec:
-    """The input for making keystores: an absolute ROS topic, domains, a template, the time."""
+    """The input for creating keystores: an absolute ROS topic, domains, a template, the time."""
 
     topic: str
     domains: DomainSet
@@ -59,9 +59,9 @@ class KeystoreSpec:
 class KeystoreSet:
     """The keystores of a scenario, sound and forged, and the enclave of each part.
 
-    ``missing`` has the reasons why keystores could not be made.  The scenario's own keystore is a
-    copy of the ``user`` keystore, if given: that copy and its forgeries have the cast of ``user``,
-    the other keystores have ``cast``.
+    ``missing`` has the reason for each keystore that could not be made.  The scenario's own
+    keystore is a copy of the ``user`` keystore, if given: that copy and its forgeries have the
+    cast of ``user``, the other keystores have ``cast``.
     """
 
     keystores: Mapping[KeystoreChoice, Path]
@@ -70,7 +70,7 @@ class KeystoreSet:
     user: UserKeystore | None = None
 
     def topic(self, party: Party, topic: str) -> str:
-        """Return the ROS name that a party uses; ``topic`` is the topic of the demo."""
+        """Return the ROS topic, service or action of a party; ``topic`` is the demo's topic."""
         name = party.topic or topic
         user = self._user_of(party.identity)
         if name == SERVICE and user is not None:
@@ -81,13 +81,13 @@ class KeystoreSet:
         """Return the enclave of an identity.
 
         Raises:
-            KeyError: no enclave plays its part.
+            KeyError: no enclave is cast for the identity's part.
         """
         part = identity.enclave
         return part if part.startswith("/") else self._cast(identity)[part]
 
     def environment(self, identity: Identity, domain: int) -> Mapping[str, str]:
-        """Return the ROS_SECURITY_* variables and ROS_DOMAIN_ID of a process."""
+        """Return the ROS_SECURITY_* variables and ROS_DOMAIN_ID for a process of an identity."""
         if identity.keystore is None:
             return {DOMAIN: str(domain)}
         root = self.keystores[identity.keystore]
@@ -95,11 +95,11 @@ class KeystoreSet:
         return secured | dict(identity.variables)
 
     def node_names(self, party: Party) -> tuple[str, ...]:
-        """Return the absolute names of a party's ROS nodes, which its enclave allows."""
+        """Return absolute names for a party's ROS nodes, chosen so that its enclave allows them."""
         return node_names(party.role, self._grant(party.identity))
 
     def members(self, rows: Iterable[Row], *, on_ros: bool) -> tuple[CastMember, ...]:
-        """Return the cast members of the own keystore that these rows use, in the cast's order."""
+        """Return the cast members that these rows use from the own keystore, in cast order."""
         cast = self._cast(Identity(OWN))
         nodes: dict[str, set[str]] = {}
         for row in rows:
@@ -119,7 +119,7 @@ class KeystoreSet:
         return ProbeEnclave(environment, topic, DENIED_TOPIC)
 
     def problem(self, row: Row, topic: str) -> str:
-        """Return why a row cannot be run on the ROS topic ``topic``, or ""."""
+        """Return why a row cannot run on the ROS topic ``topic``, or ""."""
         for party in row.parties:
             identity = party.identity
             part = identity.enclave
@@ -128,7 +128,7 @@ class KeystoreSet:
                 and not part.startswith("/")
                 and part not in self._cast(identity)
             ):
-                return f"the keystore has no enclave for the part of the {part}"
+                return f"the keystore has no enclave that can be the {part}"
             if identity.keystore is not None and identity.keystore in self.missing:
                 return self.missing[identity.keystore]
         if self.user is not None and self.user.guessed and row.expected is RowStatus.REFUSED:
@@ -138,7 +138,7 @@ class KeystoreSet:
         return ""
 
     def _why_not_denied(self, party: Party, topic: str) -> str:
-        """Return a text if a party has the right that its row expects to be denied, or ""."""
+        """Return why a row cannot show a denial (the party has the right), or ""."""
         right = _RIGHTS[party.role]
         name = self.topic(party, topic)
         grant = self._grant(party.identity)
@@ -151,8 +151,8 @@ class KeystoreSet:
             return ""
         enclave, part = self.enclave(party.identity), party.identity.enclave
         return (
-            f"no enclave fits the part of the {part} better than {enclave}, and its permissions"
-            f" allow to {right} {name}"
+            f"the best enclave for the {part} is {enclave}, but its permissions allow it to {right}"
+            f" {name}: it would not be refused"
         )
 
     def _grant(self, identity: Identity) -> Grant | None:
@@ -161,9 +161,9 @@ class KeystoreSet:
         return enclave_grant(self.keystores[identity.keystore], self.enclave(identity))
 
     def _user_of(self, identity: Identity) -> UserKeystore | None:
-        """Return the user's keystore if the identity's keystore was made from it."""
-        made_again = isinstance(identity.keystore, Undefended)
-        if identity.keystore in (None, FOREIGN) or made_again:
+        """Return the user's keystore if the identity's keystore is a copy of it."""
+        created_new = isinstance(identity.keystore, Undefended)
+        if identity.keystore in (None, FOREIGN) or created_new:
             return None
         return self.user
 
@@ -175,10 +175,10 @@ class KeystoreSet:
 def create_keystores(
     folder: Path, scenario: Scenario, spec: KeystoreSpec, user: UserKeystore | None = None
 ) -> KeystoreSet:
-    """Create the keystores of a scenario in ``folder``: its own, a foreign one, and forged ones.
+    """Create the own, foreign and forged keystores of a scenario in ``folder``.
 
-    Its own is a copy of the ``user`` keystore, if given.  If a forgery cannot be made, only the
-    rows that use it are skipped.
+    The own keystore is a copy of the ``user`` keystore, if given.  If a forgery cannot be made,
+    only the rows that use it are skipped.
 
     Raises:
         KeystoreError, OSError: a keystore could not be made.
@@ -212,11 +212,11 @@ def create_scenario_keystore(root: Path, scenario: Scenario, spec: KeystoreSpec)
 
 
 def _forgeries_of(scenario: Scenario) -> list[Forge | Undefended]:
-    """Return each forgery that the rows and the measurement of a scenario use, once."""
-    asked: list[KeystoreChoice | None] = [
+    """Return the distinct forgeries that the rows and the measurement of a scenario use."""
+    used: list[KeystoreChoice | None] = [
         party.identity.keystore for row in scenario.rows for party in row.parties
     ]
-    chosen = dict.fromkeys([*asked, *scenario.measured.values()])
+    chosen = dict.fromkeys([*used, *scenario.measured.values()])
     return [each for each in chosen if each is not None and not isinstance(each, SoundKeystore)]
 
 

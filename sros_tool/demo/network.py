@@ -1,7 +1,7 @@
 """Network namespaces for the demo (in a child process) and for each of its rows.
 
-A row's network is a namespace that exists as long as the processes and sockets in it.  It needs a
-process that is already in its own network and has only one thread (`run_isolated`): setns(2)
+A row's network is a namespace that exists as long as the processes and sockets in it.  To create
+one, a process must be in a separate network and have only one thread (`run_isolated`): setns(2)
 changes only the calling thread.
 """
 
@@ -25,7 +25,7 @@ _HERE = "/proc/thread-self/ns/net"
 
 
 class RowNetwork:
-    """The network of a row's processes and capture; without ``own``, the machine's network."""
+    """The network of a row's processes and capture; the machine's network if ``own`` is false."""
 
     def __init__(self, *, own: bool) -> None:
         self.own = own
@@ -41,7 +41,7 @@ class RowNetwork:
 
     @contextmanager
     def entered(self) -> Iterator[None]:
-        """Enter the network of the row for the time of the context."""
+        """Enter the network of the row, and leave it at the end of the context."""
         if not self.own:
             yield
             return
@@ -69,7 +69,7 @@ def _enter(descriptor: int) -> None:
 _Value = TypeVar("_Value")
 
 Progress = Callable[[str], None]
-"""A function that receives lines about the progress."""
+"""A function that is called with each line about the progress."""
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -77,7 +77,7 @@ _SECONDS_TO_END = 8.0
 
 
 def end_with_starter() -> Callable[[], None]:
-    """Return the function that a child must call first, so that it ends with this process."""
+    """Return a function for a child to call first: the kernel then kills it with this process."""
     starter = os.getpid()
 
     def follow() -> None:
@@ -93,8 +93,8 @@ def run_isolated(
 ) -> _Value:
     """Run ``work`` in a child process and return its result.
 
-    ``progress`` gets the lines that ``work`` passes to its own while it runs.  The child enters a
-    network of its own if ``isolation`` says so, and does not outlive this process.
+    ``progress`` gets each line that ``work`` passes to its argument.  The child enters a separate
+    network if ``isolation`` says so, and does not outlive this process.
 
     Raises:
         SrosError: ``work`` raised it, or the child ended without a result.
@@ -139,8 +139,8 @@ def _main(
     follow_starter: Callable[[], None],
 ) -> None:
     follow_starter()
-    # Without the parent's handlers: an exception from a handler during a fork is lost in Python.
-    # Work that has to clean up sets its own handlers.
+    # Drop the parent's handlers: Python loses an exception that a handler raises during a fork.
+    # Work that must clean up sets handlers again.
     for number in ENDING_SIGNALS:
         signal.signal(number, signal.SIG_DFL)
     try:

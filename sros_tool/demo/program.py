@@ -37,16 +37,16 @@ _DEFAULT_DOMAIN = 80
 _DEFAULT_TEMPLATE = "production"
 
 _HOST = "host"
-"""The choice of the machine's network."""
+"""The value of --network for the network of this machine."""
 
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """The options of a demo; ``keep`` is the folder to keep all files in, if any.
+    """The options of a demo; ``keep`` is the folder for all files, None to delete them.
 
-    ``keystore`` is a keystore of the user; a copy of it is attacked.  The default ``template`` is
-    the template of that keystore, or production; the default ``topic`` is a suitable one.  ``only``
-    selects the rows whose names contain one of its words.
+    ``keystore`` is a keystore of the user, a copy of which is attacked.  The default ``template``
+    is the template of that keystore, or production; the default ``topic`` is one that the cast may
+    use.  ``only`` selects the rows whose names contain one of its words.
     """
 
     template: Template | None = None
@@ -66,7 +66,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
     """Run the demo and return its result; ``progress`` gets lines while it runs.
 
     Raises:
-        UsageError: an option is wrong; nothing has been created then.
+        UsageError: an option is wrong; nothing was created.
         UnavailableError: no DDS enforces security here.
         SrosError: a keystore could not be made.
     """
@@ -81,10 +81,12 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
     with _ended_by_signals(), _folder(options.keep) as folder:
         progress("looking for a DDS that enforces security")
         backend = _find_backend(options.backend, folder, topic, now)
-        for scenario, of_rows in zip(scenarios, domains, strict=True):
+        for scenario, row_domains in zip(scenarios, domains, strict=True):
             under = folder if len(scenarios) == 1 else folder / scenario.name
-            spanned = user.domains if user else DomainSet.of((of_rows[0], of_rows[-1]))
-            spec = KeystoreSpec(topic, spanned, template, now)
+            keystore_domains = (
+                user.domains if user else DomainSet.of((row_domains[0], row_domains[-1]))
+            )
+            spec = KeystoreSpec(topic, keystore_domains, template, now)
             rows = tuple(
                 row.under(conditions(backend, template, _dds_topic(row, topic)))
                 for row in scenario.rows
@@ -97,7 +99,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             )
             plan = RunPlan(
                 rows=scenario.rows,
-                domains=of_rows,
+                domains=row_domains,
                 backend=backend,
                 keystores=keystores,
                 topic=topic,
@@ -122,7 +124,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
 
 
 def _find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend:
-    """Return a backend that works in a temporary keystore."""
+    """Return a backend that enforces security, tried with a temporary keystore."""
     with TemporaryDirectory(dir=folder, prefix="probe-") as probed:
         domains = DomainSet.of((_DEFAULT_DOMAIN, _DEFAULT_DOMAIN))
         spec = KeystoreSpec(topic, domains, load_template(_DEFAULT_TEMPLATE), now)
@@ -141,8 +143,8 @@ def _user_keystore(options: DemoOptions) -> UserKeystore | None:
     for scenario in options.scenarios:
         if not scenario.any_keystore:
             raise UsageError(
-                f"the scenario {scenario.name} cannot be played in a keystore of yours",
-                "It needs enclaves with rights of its own.",
+                f"the scenario {scenario.name} cannot run in a keystore of yours",
+                "It needs enclaves with the rights of the scenario's policy.",
                 "Use --keystore with --scenario attacks alone.",
             )
     topic = "" if options.topic is None else check_topic(options.topic)
@@ -150,33 +152,33 @@ def _user_keystore(options: DemoOptions) -> UserKeystore | None:
 
 
 def _with_chosen_rows(options: DemoOptions) -> tuple[Scenario, ...]:
-    """Return the scenarios with the rows that were asked for.
+    """Return the scenarios with only the rows that --only selects.
 
     Raises:
-        UsageError: no row is left.
+        UsageError: --only selects no row.
     """
     if not options.only:
         return options.scenarios
     chosen = tuple(
         replace(scenario, rows=rows)
         for scenario in options.scenarios
-        if (rows := tuple(row for row in scenario.rows if _asked_for(row, options)))
+        if (rows := tuple(row for row in scenario.rows if _is_selected(row, options)))
     )
     if not chosen:
         raise UsageError(
             f"no row has {' or '.join(map(repr, options.only))} in its name",
             f"The scenarios are {', '.join(each.name for each in options.scenarios)}.",
-            "See the names without --only.",
+            "Run without --only to see the names of the rows.",
         )
     return chosen
 
 
 def _dds_topic(row: Row, topic: str) -> str:
-    """Return the DDS topic whose protection decides a row; for a service, the request topic."""
+    """Return the DDS topic whose protection matters for a row; of a service, the request topic."""
     return dds_names("request", row.ros_name).publish[0] if row.ros_name else f"rt{topic}"
 
 
-def _asked_for(row: Row, options: DemoOptions) -> bool:
+def _is_selected(row: Row, options: DemoOptions) -> bool:
     return any(word.lower() in f"{row.attack} {row.name}".lower() for word in options.only)
 
 
@@ -188,7 +190,7 @@ def _domains(
         if not isolation.isolated:
             raise UnavailableError(
                 "cannot attack a keystore here",
-                f"Its rows need their own network namespaces ({isolation.reason}).",
+                f"Each row needs a separate network namespace ({isolation.reason}).",
                 "Run it as root, or where unprivileged user namespaces are allowed.",
             )
         return (next(iter(user.domains)),) * len(scenario.rows)
@@ -211,14 +213,16 @@ def _folder(keep: Path | None) -> Iterator[Path]:
     try:
         if keep.exists() and (not keep.is_dir() or any(keep.iterdir())):
             raise UsageError(
-                f"cannot keep the demo in '{keep}'",
-                "It exists, and is not an empty folder.",
+                f"cannot keep the files of the demo in '{keep}'",
+                "It exists and is not an empty folder.",
                 "Name a folder that does not exist yet.",
             )
         keep.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(
-            f"cannot keep the demo in '{keep}'", f"{error.strerror}.", "Name another folder."
+            f"cannot keep the files of the demo in '{keep}'",
+            f"{error.strerror}.",
+            "Name another folder.",
         ) from error
     try:
         yield keep.absolute()
@@ -248,5 +252,5 @@ def _ended_by_signals() -> Iterator[None]:
 
 def _isolation(network: str) -> Isolation:
     if network == _HOST:
-        return Isolation(False, "the option to use the network of this machine was given")
+        return Isolation(False, "--network host was given")
     return try_isolation()

@@ -2,23 +2,24 @@
 
 `DemoResult.as_json` is what ``sros demo --json`` prints and ``--keep`` leaves as ``result.json``:
 
-- ``backend``, ``dds``, ``why``: what the nodes ran on, its version, how it was chosen;
-- ``template``: the keystore template, whose expectations hold; ``topic``: the topic of the demo;
+- ``backend``, ``dds``, ``why``: the backend, its DDS and version, the reason for the choice;
+- ``template``: the keystore template on which the expected statuses depend;
+- ``topic``: the topic of the demo;
 - ``own_network``, ``network_reason``: whether it ran in a network namespace, and if not, why;
 - ``as_expected``: whether the exit status is 0;
 - ``scenarios``: a list of ``{"name", "title", "as_expected", "cast", "rows", "cost"}``;
 - ``rows``: the rows of all scenarios, in order, each with its ``scenario``.
 
 A row has ``name``, ``expected`` and ``observed`` (values of `RowStatus`), ``as_expected``,
-``mechanism`` (what brings the expected status about), ``detail`` (what was seen, counted),
-``domain``, ``seconds`` (how long the window was), and for attacks ``attack`` (which one; ""
-elsewhere), ``defence_removed`` ("" for the attack itself; otherwise the row shows that the attack
-works without the defence named here), ``open_because`` ("" for a closed door; otherwise why it is
-known to be open) and ``remedy``.
+``mechanism`` (the reason for the expected status), ``detail`` (the observation, with counts),
+``domain``, ``seconds`` (the length of the window), ``attack`` (the name of the attack; "" if the
+row is not an attack), ``defence_removed`` ("" for the attack itself; otherwise the row shows that
+the attack works without the named defence), ``open_because`` (why an attack is known to succeed,
+or "") and ``remedy``.
 
-``cast`` says who plays which part in a keystore of the user's (empty without ``--keystore``): a
-list of ``{"part", "enclave", "nodes"}``; ``nodes`` are the absolute names of the ROS nodes that
-ran in the enclave, empty where none did.
+``cast`` has the enclave of each part in a user's keystore (empty without ``--keystore``): a list
+of ``{"part", "enclave", "nodes"}``; ``nodes`` are the absolute names of the ROS nodes that ran in
+the enclave.
 
 ``cost`` is null, or what `sros_tool.demo.cost.CostResult.as_json` describes.
 """
@@ -80,7 +81,7 @@ class DemoResult:
 
     @property
     def cost(self) -> CostResult | None:
-        """The cost of security, where it was measured."""
+        """The cost of security in the first scenario that measured it, or None."""
         return next((each.cost for each in self.scenarios if each.cost is not None), None)
 
     @property

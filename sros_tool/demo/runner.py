@@ -35,14 +35,14 @@ from sros_tool.demo.scenarios.model import (
     Wire,
 )
 from sros_tool.demo.verdict import PartyRecord, RowRecord, RowResult, judge_row
-from sros_tool.demo.wire import Injection, Wiretap, forged_text, udp_ports, with_other_words
+from sros_tool.demo.wire import Injection, Wiretap, forged_text, udp_ports, with_replaced_text
 from sros_tool.runtime.events import Event, EventKind, EventReader
 from sros_tool.runtime.vendor_log import plain_text
 
 _LOG = logging.getLogger(__name__)
 
 _TICK = 0.05
-"""Seconds between two looks at what the processes reported."""
+"""Seconds between two reads of the reports of the processes."""
 
 _GRACE = 0.3
 """Seconds for messages that are on their way when a window closes."""
@@ -58,7 +58,7 @@ class Limits:
     """Time limits in seconds: for the start, for the window of a row, and for all rows.
 
     ``wave`` is for one group of parallel rows, so that many rows get more time than ``total``.  All
-    limits except ``window`` only exist to detect hanging processes on slow machines.
+    limits except ``window`` exist only to detect hanging processes, also on slow machines.
     """
 
     start: float = 60.0
@@ -70,10 +70,10 @@ class Limits:
 
 @dataclass(frozen=True)
 class RunPlan:
-    """The rows to run, with everything that is necessary for it.
+    """The rows to run, and all that is needed to run them.
 
     ``domains`` has one domain per row; ``topic`` is absolute; ``period`` is in seconds.  With
-    ``own_networks``, each row gets its own network namespace.
+    ``own_networks``, each row gets a separate network namespace.
     """
 
     rows: tuple[Row, ...]
@@ -135,7 +135,7 @@ class _Runner:
     def _why_skipped(self, row: Row) -> str:
         handshake = any(claim.wire is not Wire.TEXT for claim in row.claims)
         if (handshake or row.replay or row.impersonate) and not self._plan.own_networks:
-            return "it needs a network namespace of its own"
+            return "the row needs a separate network namespace"
         return self._plan.keystores.problem(row, self._plan.topic)
 
     async def _play(self, index: int) -> RowRecord:
@@ -271,7 +271,7 @@ class _Runner:
 
 
 def _awaits_silence(claim: Claim, row: Row, processes: Mapping[str, _PartyProcess]) -> bool:
-    """Return whether a claim needs time: nothing must happen, and something still could."""
+    """Return whether a claim needs the whole window: it expects silence that could still end."""
     if claim.holds or claim.relation in (Relation.HEARS_AGAIN, Relation.BELIEVES):
         return False
     names = [name for name in (claim.subject, claim.talker) if name and row.party(name).intruder]
@@ -284,7 +284,7 @@ def _is_decided_by_start(row: Row) -> bool:
 
 
 async def _end_softly(processes: Collection[_PartyProcess]) -> None:
-    """Ask processes to end, and wait for a short time, in which they still log and report."""
+    """Send SIGTERM, and wait for at most `_SECONDS_TO_END` while the processes log and report."""
     for process in processes:
         process.ask_to_end()
     latest = time.monotonic() + _SECONDS_TO_END
@@ -300,12 +300,12 @@ _AFTER_FORGERY = 1.0
 
 
 async def _replay_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
-    """End a talker, then send its packets again with the original timing; return their number."""
+    """End a talker, then send its captured packets again with their timing (pauses shortened)."""
     packets = tap.packets(talker.ports())
     await _end_softly([talker])
     await asyncio.sleep(_GRACE)
     started = time.monotonic()
-    # Twice, since the listener may only discover the talker in the first round.
+    # Twice, since the listener may use the first round only to discover the talker.
     for _ in range(_REPLAY_ROUNDS):
         for before, each in zip([*packets[:1], *packets], packets, strict=False):
             await asyncio.sleep(min(each.time - before.time, _LONGEST_PAUSE))
@@ -315,15 +315,15 @@ async def _replay_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
 
 
 async def _forge_packets(talker: _PartyProcess, tap: Wiretap) -> Injection:
-    """Suspend a talker, and send changed packets in its name; return their number."""
+    """Suspend a talker, then send changed copies of its last readable packet."""
     talker.hold()
     await asyncio.sleep(_GRACE)
-    words, others = talker.text, forged_text(talker.text)
+    text, forged = talker.text, forged_text(talker.text)
     packets = [each.packet for each in reversed(tap.packets(talker.ports()))]
-    last = next((each for each in packets if with_other_words(each, words, others, 1)), b"")
+    last = next((each for each in packets if with_replaced_text(each, text, forged, 1)), b"")
     started = time.monotonic()
     steps = range(1, _FORGED_PACKETS + 1) if last else ()
-    sent = [each for step in steps if (each := with_other_words(last, words, others, step))]
+    sent = [each for step in steps if (each := with_replaced_text(last, text, forged, step))]
     for packet in sent:
         tap.send(packet)
     await asyncio.sleep(_AFTER_FORGERY)
@@ -426,12 +426,12 @@ class _PartyProcess:
         return self._own_status is not None
 
     def ports(self) -> frozenset[int]:
-        """Return the UDP ports that the process holds, or held when it was last asked."""
+        """Return the UDP ports that the process has bound, or had bound at the last call."""
         self._ports = udp_ports(self._process.pid) or self._ports
         return self._ports
 
     def ask_to_end(self) -> None:
-        """Send SIGTERM; later, the process no longer counts as ended by itself."""
+        """Send SIGTERM; if the process ends after that, it does not count as ended by itself."""
         self.look()
         self._asked = True
         with suppress(ProcessLookupError):

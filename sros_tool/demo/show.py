@@ -1,4 +1,4 @@
-"""Show the result of the demo as text: a table for a terminal, a page in Markdown."""
+"""The result of the demo as text: a table for a terminal, and a summary in Markdown."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _INDENT = " " * 6
 
 
 def demo_table(result: DemoResult) -> str:
-    """Return the table, with the backend above it and the verdict below."""
+    """Return the result as a table, with the backend above and a summary line below."""
     network = (
-        "a network namespace of its own"
+        "a separate network namespace"
         if result.isolation.isolated
         else f"the network of this machine ({result.isolation.reason})"
     )
@@ -37,14 +37,14 @@ def demo_table(result: DemoResult) -> str:
 
 
 def _cast_lines(members: Sequence[CastMember]) -> list[str]:
-    """Return lines with the enclave of each part, for a keystore of the user."""
+    """Return lines with the enclave of each part of a user's keystore."""
     width = max((len(member.part) for member in members), default=0)
     lines = [
         f"{_INDENT}{member.part:<{width}}  {member.enclave}"
         + (f" as node {', '.join(member.nodes)}" if member.nodes else "")
         for member in members
     ]
-    return ["cast by the rights in the keystore:", *lines, ""] if lines else []
+    return ["enclave for each part:", *lines, ""] if lines else []
 
 
 def _scenario(scenario: ScenarioResult) -> list[str]:
@@ -97,15 +97,15 @@ def _summary(rows: Sequence[RowResult]) -> str:
 
 
 def summary_page(result: DemoResult, now: datetime) -> str:
-    """Return the page for a reviewer, in Markdown; ``now`` is the time of the demo."""
+    """Return a summary for a reviewer, in Markdown; ``now`` is the time of the demo."""
     attacks = [row for row in result.rows if row.attack and not row.removed]
     others = [row for row in result.rows if not row.attack]
     wrong = [row for row in result.rows if not row.as_expected]
     lines = [
-        "# What was tried on this robot's security",
+        "# Security demo: expected and observed",
         "",
-        f"Seen {iso(now)} with `sros demo` on {result.backend.dds}, expectations of the keystore"
-        f" template `{result.template}`: **{_verdict(result, wrong)}**",
+        f"Run {iso(now)} with `sros demo` on {result.backend.dds}; expected statuses are those of"
+        f" the keystore template `{result.template}`: **{_verdict(result, wrong)}**",
         "",
     ]
     for scenario in result.scenarios:
@@ -120,17 +120,22 @@ def summary_page(result: DemoResult, now: datetime) -> str:
     if attacks:
         lines += _attacks(attacks, [row for row in result.rows if row.removed])
     if others:
-        lines += ["## What else was shown", "", *_table(others)]
+        lines += ["## Other rows", "", *_table(others)]
     for scenario in result.scenarios:
         if scenario.cost is not None:
-            lines += ["## What security costs", "", *_cost_markdown(scenario.cost.as_json()), ""]
+            lines += ["## Cost of security", "", *_cost_markdown(scenario.cost.as_json()), ""]
     return "\n".join(lines).rstrip() + "\n"
 
 
 def _summary_cast(members: Sequence[CastMember]) -> list[str]:
     if not members:
         return []
-    lines = ["## Who plays which part", "", "| part | enclave | ROS nodes |", "| --- | --- | --- |"]
+    lines = [
+        "## Enclave for each part",
+        "",
+        "| part | enclave | ROS nodes |",
+        "| --- | --- | --- |",
+    ]
     lines += [f"| {each.part} | {each.enclave} | {', '.join(each.nodes)} |" for each in members]
     return [*lines, ""]
 
@@ -140,7 +145,7 @@ def _verdict(result: DemoResult, wrong: Sequence[RowResult]) -> str:
     skipped = sum(1 for row in result.rows if row.observed is RowStatus.SKIPPED)
     parts = [f"{len(wrong)} of {len(result.rows)} rows not as expected" if wrong else "as expected"]
     if known:
-        parts.append(f"{known} ways in that are known to be open")
+        parts.append(f"{known} attacks that are known to succeed")
     if skipped:
         parts.append(f"{skipped} rows could not be tried")
     return ", ".join(parts) + "."
@@ -152,17 +157,17 @@ def _attacks(attacks: Sequence[RowResult], removed: Sequence[RowResult]) -> list
     lines = [
         "## Attacks",
         "",
-        "An attack that fails proves something only if it works elsewhere: the last column says how"
-        " the same attack ended without the defence.",
+        "A failed attack proves something only if the same attack succeeds without the defence: the"
+        " last column shows that result.",
         "",
-        "| attack | expected | observed | what decides | without the defence |",
+        "| attack | expected | observed | mechanism | without the defence |",
         "| --- | --- | --- | --- | --- |",
     ]
     for row in closed:
         twins = "; ".join(_unique(_twin(each) for each in removed if each.attack == row.attack))
         lines.append(f"| {_cells(row)} | {row.mechanism} | {twins} |")
     if open_:
-        lines += ["", "## Known to be open, and what to do", ""]
+        lines += ["", "## Attacks known to succeed, and remedies", ""]
         lines += [
             "| attack | expected | observed | why | remedy |",
             "| --- | --- | --- | --- | --- |",
@@ -180,7 +185,7 @@ def _unique(texts: Iterable[str]) -> list[str]:
 
 
 def _table(rows: Sequence[RowResult]) -> list[str]:
-    lines = ["| row | expected | observed | what decides |", "| --- | --- | --- | --- |"]
+    lines = ["| row | expected | observed | mechanism |", "| --- | --- | --- | --- |"]
     return [*lines, *(f"| {_cells(row)} | {row.mechanism} |" for row in rows), ""]
 
 
@@ -202,7 +207,7 @@ def payload_text(size: int) -> str:
 def cost_table(cost: CostResult) -> list[str]:
     """Return the cost of security as lines for a terminal."""
     shown = cost.as_json()
-    lines = ["what security costs: latency and throughput, and their ratio to unsecured", ""]
+    lines = ["cost of security: latency and throughput, with the ratio to unsecured", ""]
     lines.append(f"{'protection':<12}{'first message':>15}{'ratio':>8}")
     lines += [
         f"{each['kind']:<12}{each['seconds']:>13.3f} s{each['ratio']:>8.2f}"

@@ -1,7 +1,7 @@
 """Judge what was observed in a row, from the reports of its processes.
 
-A crash is not a refusal.  Silence counts only if both sides were ready, the talker really sent, and
-the controls held; a refusal counts only if DDS Security itself reported it, for this topic.
+A crash is not a refusal.  Silence counts only if both sides were ready, the talker sent messages,
+and the controls held; a refusal counts only if DDS Security reported it, for this topic.
 """
 
 from __future__ import annotations
@@ -53,8 +53,9 @@ class PartyRecord:
 class RowRecord:
     """The record of a row after its end.
 
-    ``window`` is the time (CLOCK_MONOTONIC) that counts; None if not all parties became ready.
-    ``injected`` is what an onlooker sent; ``skipped`` is why the row was not run, or "".
+    ``window`` has start and end of the observation (CLOCK_MONOTONIC), or None if a party was not
+    ready in time.  ``injected`` counts the packets that were sent again or changed; ``skipped`` is
+    why the row was not run, or "".
     """
 
     row: Row
@@ -68,7 +69,7 @@ class RowRecord:
 
 @dataclass(frozen=True)
 class RowResult:
-    """A line of the table; ``as_expected`` is also true if the row was skipped."""
+    """The result of a row: one line of the table."""
 
     name: str
     expected: RowStatus
@@ -84,7 +85,7 @@ class RowResult:
 
     @property
     def as_expected(self) -> bool:
-        """Whether the row was observed as expected, or skipped."""
+        """Whether the observed status is the expected one, or the row was skipped."""
         return self.observed in (self.expected, RowStatus.SKIPPED)
 
     @property
@@ -200,7 +201,7 @@ def _judge_claim(claim: Claim, record: RowRecord) -> _Finding:
         return _judge_answers(claim, record, subject, talker)
     sent = {e.text for e in talker.events if e.kind is EventKind.SENT and _in_window(e, record)}
     if not sent:
-        return _Finding(RowStatus.UNDECIDED, f"{claim.talker} sent nothing in that time")
+        return _Finding(RowStatus.UNDECIDED, f"{claim.talker} sent nothing in the window")
     if claim.relation is Relation.SEES:
         return _judge_view(claim, record, subject, talker)
     mark = f"{talker.text}: "
@@ -217,11 +218,11 @@ def _judge_answers(
 ) -> _Finding:
     asked = [e for e in client.events if e.kind is EventKind.SENT and _in_window(e, record)]
     if not asked:
-        return _Finding(RowStatus.UNDECIDED, f"{claim.subject} asked nothing in that time")
+        return _Finding(RowStatus.UNDECIDED, f"{claim.subject} sent no request in the window")
     answers = [e for e in client.events if e.kind is EventKind.HEARD and _is_of(e, server)]
     status = STATUS_OF[Relation.IS_ANSWERED, bool(answers)]
     within = sum(1 for event in answers if _in_window(event, record))
-    counted = f"{min(within, len(asked))} right answers of the {claim.talker}"
+    counted = f"{min(within, len(asked))} right answers from the {claim.talker}"
     return _Finding(status, f"{claim.subject} asked {len(asked)} times and got {counted}")
 
 
@@ -230,7 +231,7 @@ def _judge_replay(
 ) -> _Finding:
     injected = record.injected
     if injected is None or not injected.packets:
-        return _Finding(RowStatus.UNDECIDED, "no packets were captured that could be sent again")
+        return _Finding(RowStatus.UNDECIDED, "no packets of the talker were captured to send again")
     heard = [e for e in listener.events if e.kind is EventKind.HEARD and _is_of(e, talker)]
     again = sum(1 for event in heard if event.time >= injected.time)
     status = STATUS_OF[Relation.HEARS_AGAIN, again > 0]
@@ -265,7 +266,7 @@ def _is_of(event: Event, speaker: PartyRecord) -> bool:
 def _judge_refusal(name: str, record: PartyRecord) -> _Finding:
     problem = _why_not_running(name, record)
     if problem is None:
-        return _Finding(RowStatus.STARTED, f"{name} was let in")
+        return _Finding(RowStatus.STARTED, f"{name} was not refused")
     return problem
 
 
@@ -307,7 +308,7 @@ def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> _Findin
 
 
 def _why_not_running(name: str, record: PartyRecord) -> _Finding | None:
-    """Return why a party did not run through the row, or None if it did."""
+    """Return why a party did not run until the end of the row, or None if it did."""
     ready = any(event.kind is EventKind.READY for event in record.events)
     for event in record.events:
         if event.kind is EventKind.REFUSED:
@@ -343,7 +344,7 @@ def _own_denial(record: PartyRecord, reported: str) -> str:
 
 
 def _is_about(line: str, topic: str) -> bool:
-    """Return whether a line is about that topic, or a service or action of that name."""
+    """Return whether a log line names that topic, or a service or action of that name."""
     name = rf"r[tqr]{re.escape(topic)}(?:/_action/\w+)?(?:Request|Reply)?(?!\w|/)"
     return bool(re.search(name, line)) or "not allowed by security" in line.lower()
 
@@ -352,9 +353,7 @@ def _refused(name: str, stage: ProcessStage | None, reason: str) -> _Finding:
     reason = plain_refusal(reason)
     if stage is ProcessStage.ENDPOINT:
         return _Finding(RowStatus.REFUSED, f"{name}: {reason}")
-    return _Finding(
-        RowStatus.NOT_LET_IN, f"{name} was refused before it came to the topic: {reason}"
-    )
+    return _Finding(RowStatus.NOT_LET_IN, f"{name} was refused before it used the topic: {reason}")
 
 
 def _end_of(record: PartyRecord) -> str:

@@ -1,7 +1,7 @@
 """Capture packets, count readable and protected ones, and send packets again or changed.
 
-It uses packet sockets in plain Python, which need CAP_NET_RAW in their network: root has it, and
-also a process in a network namespace that it created (`sros_tool.runtime.netns`).
+The packet and raw sockets need CAP_NET_RAW in their network: root has it, and also a process in a
+network namespace that it created (`sros_tool.runtime.netns`).
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Capture(PacketCounter):
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
 
     def fileno(self) -> int:
-        """Return the descriptor to wait on."""
+        """Return the file descriptor of the socket, to wait for packets."""
         return self._socket.fileno()
 
     def drain(self) -> None:
@@ -118,7 +118,7 @@ def _is_protected(payload: bytes) -> bool:
 
 
 def udp_ports(process: int) -> frozenset[int]:
-    """Return the UDP ports that a process has bound, by its open files; none if it has ended."""
+    """Return the UDP ports that a process has bound (from /proc); none if it has ended."""
     folder = Path(f"/proc/{process}")
     try:
         links = list((folder / "fd").iterdir())
@@ -140,7 +140,7 @@ def _socket_inode(link: Path) -> str:
 
 _DATA = 0x15
 _SEQUENCE_NUMBER = 20
-"""Bytes from the head of a DATA submessage to the low half of its sequence number."""
+"""Bytes from the start of a DATA submessage to the low half of its sequence number."""
 
 
 class _Injector:
@@ -156,7 +156,7 @@ class _Injector:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_RAW, socket.IPPROTO_RAW)
 
     def send(self, packet: bytes) -> None:
-        """Send one packet without its checksum, which loopback packets do not fill in."""
+        """Send one packet without UDP checksum: the kernel fills in none for loopback packets."""
         self._socket.sendto(without_checksum(packet), (socket.inet_ntoa(packet[16:20]), 0))
 
     def close(self) -> None:
@@ -169,12 +169,12 @@ def packets_of(kept: Sequence[_CapturedPacket], ports: Collection[int]) -> list[
     return [each for each in kept if each.source in ports]
 
 
-def with_other_words(packet: bytes, words: str, others: str, step: int) -> bytes | None:
-    """Return an RTPS packet with ``others`` instead of ``words`` (same length), as a later message.
+def with_replaced_text(packet: bytes, text: str, forged: str, step: int) -> bytes | None:
+    """Return an RTPS packet with ``text`` replaced by ``forged`` (of the same length).
 
-    The sequence number of the DATA submessage that holds ``words`` is raised by ``step``, so that
-    a reader takes it for the writer's next one (RTPS 2.3 §9.4.5.3).  None where the words are not
-    readable.
+    The sequence number of the DATA submessage with ``text`` is raised by ``step``, so that a
+    DataReader takes it for a later message of the writer (RTPS 2.3 §9.4.5.3).  Returns None if
+    ``text`` is not readable in the packet.
     """
     start = (packet[0] & 0x0F) * 4 + 8
     position = start + _RTPS_HEADER
@@ -184,19 +184,19 @@ def with_other_words(packet: bytes, words: str, others: str, step: int) -> bytes
         order: Literal["little", "big"] = "little" if flags & 1 else "big"
         length = int.from_bytes(packet[position + 2 : position + 4], order)
         end = position + 4 + length if length else len(packet)
-        place = packet.find(words.encode(), position, end)
+        place = packet.find(text.encode(), position, end)
         if kind == _DATA and place >= 0:
             number = slice(position + _SEQUENCE_NUMBER, position + _SEQUENCE_NUMBER + 4)
             raised = int.from_bytes(packet[number], order) + step
             changed[number] = raised.to_bytes(4, order)
-            changed[place : place + len(others.encode())] = others.encode()
+            changed[place : place + len(forged.encode())] = forged.encode()
             return bytes(changed)
         position = end
     return None
 
 
 def without_checksum(packet: bytes) -> bytes:
-    """Return a UDP packet with the checksum that means none (RFC 768: zero)."""
+    """Return a UDP packet with checksum 0, which means none (RFC 768)."""
     start = (packet[0] & 0x0F) * 4 + 6
     return packet[:start] + b"\0\0" + packet[start + 2 :]
 
@@ -205,10 +205,10 @@ _CERTIFICATE = "-----BEGIN CERTIFICATE-----"
 
 
 class Wiretap:
-    """A capture that starts when created; ``problem`` says why it is not permitted, or "".
+    """A capture of a row's packets; ``problem`` says why capturing is not permitted, or "".
 
-    ``texts`` has the text of each party, by name; ``topic`` is a DDS topic name.  Create it in the
-    network of the row, and inside a running asyncio loop.
+    ``texts`` has the text of each party, by name; ``topic`` is a DDS topic name.  The capture
+    starts at once: create it in the network of the row, and inside a running asyncio loop.
     """
 
     def __init__(self, texts: Mapping[str, str], topic: str, *, replayed: bool) -> None:
@@ -262,10 +262,10 @@ class Wiretap:
 
 @dataclass(frozen=True)
 class WireCount:
-    """How many packets showed a talker's text, and how many of its row were protected.
+    """The numbers of packets that show a talker's text, and of protected packets of its row.
 
-    ``topics`` and ``certificates`` count the packets of the row that show the name of its topic,
-    and a certificate.
+    ``topics`` and ``certificates`` count the packets of the row that show the topic name, and a
+    certificate.
     """
 
     plain: int
@@ -276,7 +276,7 @@ class WireCount:
 
 @dataclass(frozen=True)
 class Injection:
-    """How many captured packets were sent again or changed, and when (CLOCK_MONOTONIC)."""
+    """The number of packets sent again or changed, and the start of sending (CLOCK_MONOTONIC)."""
 
     packets: int
     time: float

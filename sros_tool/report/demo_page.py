@@ -47,7 +47,11 @@ def _head(result: Json) -> str:
     good = sum(bool(row["as_expected"]) for row in rows)
     skipped = sum(row["observed"] == _SKIPPED for row in rows)
     opened = sum(bool(row.get("open_because")) for row in rows)
-    where = "in a network of its own" if result["own_network"] else "in the network of the machine"
+    where = (
+        "in a separate network namespace"
+        if result["own_network"]
+        else "in the network of the machine"
+    )
     facts = [
         f"{escape(result['dds'])}, nodes by {escape(result['backend'])}",
         f"topic <code>{escape(result['topic'])}</code>",

@@ -10,7 +10,7 @@ from sros_tool.demo.wire import (
     PacketCounter,
     forged_text,
     packets_of,
-    with_other_words,
+    with_replaced_text,
     without_checksum,
 )
 from tests.demo.test_demo_capture import packet
@@ -39,7 +39,7 @@ def test_other_words_under_a_later_number(order: str) -> None:
     others = forged_text(WORDS)
     assert len(others) == len(WORDS)
     assert others != WORDS
-    changed = with_other_words(packet(data(f"{WORDS}: 1", 7, order)), WORDS, others, 3)
+    changed = with_replaced_text(packet(data(f"{WORDS}: 1", 7, order)), WORDS, others, 3)
     assert changed == packet(data(f"{others}: 1", 10, order))
 
 
@@ -47,7 +47,7 @@ def test_other_words_under_a_later_number(order: str) -> None:
     "payload", [data("nothing of it", 7), b"RTPS" + bytes(16), b"", data(WORDS, 7)[:40]]
 )
 def test_packets_that_do_not_say_it(payload: bytes) -> None:
-    assert with_other_words(packet(payload), WORDS, forged_text(WORDS), 1) is None
+    assert with_replaced_text(packet(payload), WORDS, forged_text(WORDS), 1) is None
 
 
 def test_packets_are_kept_in_order_and_found_by_port() -> None:

@@ -124,7 +124,7 @@ CRASHES = {
             events=(Event(EventKind.REFUSED, 99, "bad file", stage=ProcessStage.PARTICIPANT),)
         ),
         RowStatus.NOT_LET_IN,
-        "before it came to the topic",
+        "before it used the topic",
     ),
     "denied a topic that every node has": (
         PartyRecord(
@@ -133,7 +133,7 @@ CRASHES = {
             events=(Event(EventKind.FAILED, 99, "RCLError: x", stage=ProcessStage.ENDPOINT),),
         ),
         RowStatus.NOT_LET_IN,
-        "before it came to the topic",
+        "before it used the topic",
     ),
     "a denial in the log, then a crash": (
         PartyRecord(topic="/chatter", output=FAST_DDS_DENIAL, status=-6),

@@ -96,8 +96,8 @@ def test_a_row_that_nobody_in_the_keystore_can_show_is_skipped(tmp_path: Path) -
     closed, opened = json.loads(ended.out)["rows"]
     assert closed["observed"] == "skipped"
     assert closed["detail"] == (
-        "no enclave fits the part of the talker better than /a, and its permissions allow to"
-        " subscribe /image"
+        "the best enclave for the talker is /a, but its permissions allow it to subscribe"
+        " /image: it would not be refused"
     )
     assert opened["observed"] == "heard"
 

@@ -24,7 +24,7 @@ from sros_tool.dds.decision.answers import AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.demo.backend import RCLPY, Backend, conditions
-from sros_tool.demo.casting import OWN_NAMES
+from sros_tool.demo.casting import DEFAULT_NODE_NAMES
 from sros_tool.demo.keystores import KeystoreSet, KeystoreSpec, create_keystores
 from sros_tool.demo.scenarios import SCENARIOS
 from sros_tool.demo.scenarios.model import DENIALS, Party, Relation, Role, Row, RowStatus, Scenario
@@ -257,7 +257,7 @@ def test_demo_nodes_do_what_their_enclave_allows_and_are_denied_what_the_row_wan
 def test_it_would_see_a_node_under_another_name(cast: list[Casting]) -> None:
     """The names that the demo's nodes have by themselves are not those of the shipped policies."""
     client = next(each for each in cast if each.party.role is Role.CLIENT)
-    (own,), (name,) = OWN_NAMES[Role.CLIENT], client.key[1]
+    (own,), (name,) = DEFAULT_NODE_NAMES[Role.CLIENT], client.key[1]
     assert name == "/add_two_ints_client" != f"/{own}"
     identity = client.party.identity
     assert identity.keystore is not None

@@ -1,11 +1,11 @@
 """The nodes of the demo on Cyclone DDS: ``python -m sros_tool.demo.nodes.cyclone ROLE``.
 
-They read the environment of a ROS 2 node and use the same DDS topics and types, so that rclpy
-nodes receive their messages, and a launcher can start both kinds in the same way.
+They read the environment of a ROS 2 node and use the DDS topics and types of its messages, so that
+rclpy nodes receive them, and a launcher can start both kinds of nodes in the same way.
 
 Services and actions use the DDS topics of rmw_cyclonedds (rq/...Request, rr/...Reply,
-rt/..._action/...), but with strings: names and rights are as in ROS 2, the type is not.
-A request is "CLIENT NUMBER ARGUMENTS"; its reply begins with the same two words.
+rt/..._action/...), but send strings: names and rights are as in ROS 2, types are not.
+A request is "CLIENT NUMBER ARGUMENTS"; its reply begins with the same CLIENT and NUMBER.
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class _Server:
 
 
 class _Client:
-    """A client that asks for sums periodically, and reports the right answers."""
+    """A client that requests sums periodically, and reports the right answers."""
 
     def __init__(self, participant: Participant, options: NodeOptions, events: EventWriter) -> None:
         self._service = _Service(participant, options.service, server=False)
@@ -264,7 +264,7 @@ def _dds_topic(topic: str) -> str:
 
 
 def _operands(number: int) -> tuple[int, int]:
-    """Return the two numbers that a request asks about; each request has its own sum."""
+    """Return the two numbers to add in a request; each request has a different sum."""
     return number, 3 * number + 1
 
 
@@ -273,7 +273,7 @@ class _Stopped(Exception):  # noqa: N818 - not an error
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Play a role until stopped; return the exit status."""
+    """Run a role until stopped; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = parse_options("sros_tool.demo.nodes.cyclone", _ROLES, arguments)
     _stop_on_signals()

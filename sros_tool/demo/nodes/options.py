@@ -11,7 +11,7 @@ from pathlib import Path
 _COMPOSED_SERVICE = "/add_two_ints"
 
 FIBONACCI_ORDER = 5
-"""The order that every goal of an action client asks for."""
+"""The order of the sequence that an action client requests in each goal."""
 
 
 @dataclass(frozen=True)
@@ -19,8 +19,8 @@ class NodeOptions:
     """The options of a node.
 
     ``topic`` is the ROS name of the role's topic, service or action.  ``period`` is in seconds.
-    ``server`` is the text of the only action server ("": not known); ``also`` are further topics
-    for an observer.
+    ``server`` is the text of the only action server ("": unknown), for an action client; ``also``
+    are further topics for an observer.
     """
 
     role: str
@@ -43,7 +43,7 @@ def parse_options(module: str, roles: Collection[str], arguments: Sequence[str])
     Exits with status 2 on an error.
     """
     parser = argparse.ArgumentParser(
-        prog=f"python -m {module}", description="Play one role of the demo until stopped."
+        prog=f"python -m {module}", description="Run a node in one role of the demo until stopped."
     )
     parser.add_argument("role", choices=tuple(roles))
     parser.add_argument(
@@ -56,21 +56,24 @@ def parse_options(module: str, roles: Collection[str], arguments: Sequence[str])
         type=_positive,
         default=NodeOptions.period,
         metavar="SECONDS",
-        help="time between two messages, requests, goals or looks (default: %(default)s)",
+        help="time between two messages, requests, goals or counts (default: %(default)s)",
     )
     parser.add_argument(
         "--text",
         default=NodeOptions.text,
-        help="what a talker or server says before the number (default: %(default)s)",
+        help="text of a talker or server, sent before a number (default: %(default)s)",
     )
     parser.add_argument(
-        "--server", default="", help="what the only server of an action client says"
+        "--server", default="", help="text of the only action server, for an action client"
     )
     parser.add_argument(
-        "--also", action="append", default=[], help="one more topic that an observer looks at"
+        "--also",
+        action="append",
+        default=[],
+        help="another topic whose publishers an observer counts",
     )
     parser.add_argument(
-        "--report", type=Path, metavar="FILE", help="append what happens to FILE as JSON lines"
+        "--report", type=Path, metavar="FILE", help="append the events to FILE as JSON lines"
     )
     own, _ = split_ros_args(arguments)
     parsed = vars(parser.parse_args(own))
@@ -78,7 +81,7 @@ def parse_options(module: str, roles: Collection[str], arguments: Sequence[str])
 
 
 def split_ros_args(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return a node's own arguments, and those between ``--ros-args`` and ``--``."""
+    """Return the arguments outside and inside ``--ros-args ... --``."""
     own: list[str] = []
     ros: list[str] = []
     target = own
@@ -100,7 +103,7 @@ def _positive(text: str) -> float:
 
 
 def fibonacci(order: int) -> list[int]:
-    """Return the Fibonacci numbers up to that order, from 0 and 1."""
+    """Return the Fibonacci sequence from 0 and 1 up to index ``order``."""
     sequence = [0, 1]
     while len(sequence) <= order:
         sequence.append(sequence[-1] + sequence[-2])

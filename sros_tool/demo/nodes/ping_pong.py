@@ -1,7 +1,7 @@
 """One end of a measurement: ``python -m sros_tool.demo.nodes.ping_pong cyclone|rclpy ping|pong``.
 
 ``ping`` measures, and writes the numbers as JSON; ``pong`` answers.  The first letter of a message
-is its kind: "h" (hello) asks when the other end began to join, "e" (echo) is sent back completely,
+is its kind: "h" (hello) asks when the other end began to join, "e" (echo) is sent back unchanged,
 "b" is part of a burst, and "l" (last) ends a burst and gets a short reply.  Both read the
 environment of a ROS 2 node; all numbers include the overhead of Python, which is the same with and
 without security.
@@ -94,8 +94,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("library", choices=_CHANNELS)
     parser.add_argument("role", choices=("ping", "pong"))
     parser.add_argument("--sizes", type=int, nargs="*", default=[], help="payloads in bytes")
-    parser.add_argument("--seconds", type=float, default=0.5, help="for each measurement")
-    parser.add_argument("--answer", type=Path, help="where ping writes its JSON")
+    parser.add_argument("--seconds", type=float, default=0.5, help="duration of each measurement")
+    parser.add_argument("--answer", type=Path, help="file to which ping writes its JSON")
     options = parser.parse_args(arguments)
     begin = time.monotonic()
     try:
@@ -155,7 +155,7 @@ def _latency(channel: _Channel, size: int, seconds: float) -> float:
 
 
 def _throughput(channel: _Channel, size: int, seconds: float) -> float:
-    """Return the messages per second in the median burst; each burst is waited for."""
+    """Return the messages per second in the median burst; a burst ends with an answer."""
     burst = max(1, min(_BURST, _BURST_BYTES // size))
     texts = [*["b".ljust(size, "x")] * (burst - 1), "l".ljust(size, "x")]
     times: list[float] = []
@@ -172,7 +172,7 @@ def _await(channel: _Channel) -> None:
     """Wait for an answer.
 
     Raises:
-        SrosError: no answer came, although messages are reliable.
+        SrosError: no answer came within `_LOST` seconds, although messages are reliable.
     """
     if not channel.wait(_LOST):
         raise SrosError("an answer was lost", f"It did not come within {_LOST} s.")

@@ -17,7 +17,7 @@ from sros_tool.demo.nodes.options import FIBONACCI_ORDER, NodeOptions, fibonacci
 from sros_tool.runtime.events import EventKind, EventWriter, ProcessStage
 
 _LOG_FLUSH_SECONDS = 0.3
-"""Time for the logging thread of Fast DDS: a process that exits at once loses the reason."""
+"""Time for the logging thread of Fast DDS: if a process exits at once, its log line is lost."""
 
 _QUEUE_DEPTH = 10
 _FIBONACCI_PACKAGES = ("example_interfaces", "test_msgs", "action_tutorials_interfaces")
@@ -27,16 +27,16 @@ _Build = Callable[[Any, NodeOptions, EventWriter], Sequence[Any] | None]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Play a role until stopped; return the exit status."""
+    """Run a node in a role until stopped; return the exit status."""
     arguments = sys.argv[1:] if arguments is None else arguments
     options = parse_options("sros_tool.demo.nodes.ros", _ROLES, arguments)
     return _run_role(_ROLES[options.role], options, [sys.argv[0], *arguments])
 
 
 def _run_role(build: _Build, options: NodeOptions, arguments: Sequence[str]) -> int:
-    """Create a node, let ``build`` add its endpoints, and spin until stopped.
+    """Create a node, add its endpoints with ``build``, and spin until stopped.
 
-    ``arguments`` is the whole command line, from which rclpy takes its ``--ros-args``.  Returns
+    ``arguments`` is the whole command line; rclpy reads the ``--ros-args`` in it.  Returns
     the exit status.
     """
     name = "talker" if options.role == "composed" else options.role
@@ -156,7 +156,7 @@ def _observer(node: Any, options: NodeOptions, events: EventWriter) -> None:
 
 
 def _server(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Negate the truth value of each request.
+    """Answer each request with the negated truth value.
 
     Every ROS 2 installation has the type std_srvs/SetBool, and DDS Security checks only the name of
     a service.
@@ -206,7 +206,7 @@ def _client(node: Any, options: NodeOptions, events: EventWriter) -> None:
 
 
 def _action_server(node: Any, options: NodeOptions, events: EventWriter) -> None:
-    """Compute the Fibonacci numbers that each goal asks for."""
+    """Compute the Fibonacci sequence for each goal, with feedback."""
     from rclpy.action import ActionServer
 
     action = _fibonacci_action()
@@ -233,7 +233,7 @@ def _action_server(node: Any, options: NodeOptions, events: EventWriter) -> None
 def _action_client(node: Any, options: NodeOptions, events: EventWriter) -> None:
     """Send goals periodically, and report right results with complete feedback.
 
-    A result does not say which server it is from: ``options.server`` names the only one.
+    A result does not name its server, so ``options.server`` names the only one.
     """
     from rclpy.action import ActionClient
 
@@ -295,7 +295,7 @@ def _sequence_of(message: Any) -> list[int]:
 
 
 def _composed(node: Any, options: NodeOptions, events: EventWriter) -> list[Any]:
-    """Talk, listen and serve with three nodes in one process and one enclave."""
+    """Run a talker, a listener and a server as three nodes in one process and one enclave."""
     import rclpy
 
     # Each node gets its endpoint before the next node is created, to report the first denial.
