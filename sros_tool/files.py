@@ -1,4 +1,4 @@
-"""Replacing a file as a whole, and reading TOML within bounds."""
+"""Atomic replacement of a file, and a TOML parser with limits."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ _LOG = logging.getLogger(__name__)
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Atomically replace the content of the file at ``path`` by ``data``, and flush it to the disk.
+    """Atomically replace the content of the file at ``path`` with ``data``, and flush it to disk.
 
-    Another process reads either the old content or the new one.  An existing file keeps its mode
-    and, if permitted, its owner; a symbolic link stays and its target changes.  A device or a pipe
-    (``/dev/null``) is written to, and never replaced.
+    Other processes read either the old content or the new one.  An existing file keeps its mode
+    and, if permitted, its owner.  If ``path`` is a symbolic link, its target is replaced.  A device
+    or a pipe (``/dev/null``) is written to, not replaced.
 
     Raises:
-        OSError: the folder cannot be written; then nothing changed.
+        OSError: the file cannot be written; the old content stays.
     """
     target = Path(os.path.realpath(path))
     spare = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
@@ -55,7 +55,7 @@ def replace_file(path: Path, data: bytes) -> None:
     _LOG.info("%s '%s', %d bytes", "replaced" if present else "wrote", target, len(data))
 
 
-_LONGEST_LINE = 4000  # characters: the parser takes quadratic time for a key of many dots
+_LONGEST_LINE = 4000  # characters: the parser takes quadratic time for a key with many dots
 _LONGEST_DOCUMENT = 256 * 1024  # characters
 
 
@@ -78,7 +78,5 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise
     except RecursionError as error:
         raise tomllib.TOMLDecodeError("it is nested too deeply") from error
-    except (
-        ValueError
-    ) as error:  # such as a number of thousands of digits, or a date that does not exist
+    except ValueError as error:  # a number of thousands of digits, or a date that does not exist
         raise tomllib.TOMLDecodeError(str(error)) from error

@@ -1,4 +1,4 @@
-"""ROS names: their grammar, the expansion of a policy's names, and the names of ROS itself.
+"""ROS names: their grammar, the expansion of names in a policy, and names that ROS 2 defines.
 
 Sources: ROS 2 design "Topic and Service Names" and "Actions"; rcl's ``validate_topic_name`` and
 ``rmw_validate_namespace``.
@@ -33,13 +33,13 @@ ACTION_INSIDE = "/_action/"
 """Separates the name of an action from the names of its services and topics."""
 
 ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")
-"""The services that an action consists of (ROS 2 design "Actions")."""
+"""The services of an action (ROS 2 design "Actions")."""
 
 ACTION_TOPICS = ("feedback", "status")
-"""The topics that an action consists of; the server publishes them.
+"""The topics of an action; the server publishes them.
 
-`keystore/issuing/proof.py` has its own list of these parts on purpose: a proof that used this list
-could not find an error in it.
+`keystore/issuing/proof.py` repeats these names on purpose: a proof that used this list could not
+find an error in it.
 """
 
 # Most names need no further check: relative, private or absolute, without wildcards.
@@ -57,7 +57,7 @@ def check_enclave_name(name: str) -> str:
     """Return ``name`` if it is a valid enclave name, else raise `InvalidNameError`.
 
     An enclave name is absolute, has the grammar of a ROS namespace, and fits into the common
-    name of a certificate.
+    name of an X.509 certificate.
     """
     problem = _enclave_problem(name)
     if problem:
@@ -77,7 +77,7 @@ def _enclave_problem(name: str) -> str:
     if len(name) > MAX_COMMON_NAME:
         return (
             f"It has {len(name)} characters, and the common name of an X.509 certificate holds "
-            f"{MAX_COMMON_NAME}."
+            f"at most {MAX_COMMON_NAME}."
         )
     if name == "/":
         return ""
@@ -89,33 +89,33 @@ def _enclave_problem(name: str) -> str:
         if not _TOKEN.match(token):
             if token[0].isdigit() and token.isalnum():
                 return f"Its part {token!r} starts with a digit."
-            return f"Its part {token!r} is not made of letters, digits and underscores."
+            return f"Its part {token!r} has a character other than letters, digits and underscores."
     return ""
 
 
 def is_expression(name: str) -> bool:
-    """Return whether ``name`` holds a wildcard."""
+    """Return whether ``name`` contains a wildcard: ``*``, ``?`` or ``[``."""
     return not _WILDCARDS.isdisjoint(name)
 
 
 def expression_problem(text: str) -> str:
-    """Return why ``text`` cannot name a topic, service or action in a policy; "" if it can.
+    """Return why ``text`` is not a valid name in a policy, as a sentence; "" if it is valid.
 
-    Allowed are relative, private (``~``, ``~/x``) and absolute ROS names, with the wildcards
-    ``*``, ``?``, ``[abc]``, ``[a-c]`` and ``[!a-c]``, which every DDS vendor reads alike.
+    Relative, private (``~``, ``~/x``) and absolute ROS names are valid, with the wildcards ``*``,
+    ``?``, ``[abc]``, ``[a-c]`` and ``[!a-c]``, which all DDS vendors interpret alike.
     """
     if _PLAIN.match(text):
         return ""
     if not text:
         return "It is empty."
     if text != text.strip() or any(c.isspace() for c in text):
-        return "It contains white space, which no ROS name has."
+        return "It contains white space, which is not allowed in ROS names."
     if text[0] == "~" and len(text) > 1 and text[1] != "/":
         return "After '~' there must be a '/', as in ~/get_parameters."
     if "[^" in text or "[:" in text:
-        return "DDS vendors disagree about [^...] and [:class:]; [!...] and plain sets work alike."
+        return "DDS vendors interpret [^...] and [:class:] differently; write [!...] or [abc]."
     if not _EXPRESSION.match(text):
-        return "It contains a character that no ROS name has."
+        return "It contains a character that is not allowed in ROS names."
     if any(first > last for first, last in _RANGE.findall(text)):
         return "It contains a range of characters that runs backwards."
     if "//" in text:
@@ -129,9 +129,9 @@ def expression_problem(text: str) -> str:
 
 
 def check_namespace(ns: str) -> str:
-    """Return the namespace of a profile, normalised, else raise `InvalidNameError`.
+    """Return the normalised namespace of a profile; raise `InvalidNameError` if it is not valid.
 
-    "" stands for "/", one trailing slash is dropped; wildcards are allowed.
+    "" becomes "/", and one trailing slash is dropped.  Wildcards are allowed.
     """
     text = ns if ns == "/" else ns.removesuffix("/")
     if not text:
@@ -145,9 +145,10 @@ def check_namespace(ns: str) -> str:
 
 
 def expand(name: str, ns: str, node: str) -> str:
-    """Return the absolute name of ``name`` used by ``node`` in ``ns``.
+    """Return the absolute form of ``name`` as used by ``node`` in the namespace ``ns``.
 
-    ``/x`` stays; ``~`` and ``~/x`` become ns/node and ns/node/x; anything else ns/name.
+    ``/x`` is unchanged, ``~`` becomes ``ns/node``, ``~/x`` becomes ``ns/node/x``, and ``x`` becomes
+    ``ns/x``.
     """
     if name.startswith("/"):
         return name
@@ -158,6 +159,9 @@ def expand(name: str, ns: str, node: str) -> str:
 
 
 def action_part(name: str) -> tuple[str, str]:
-    """Return the action of a service or topic, and the part that it is; "" if it is not a part."""
+    """Return the action that a service or topic belongs to, and its part, such as ``send_goal``.
+
+    Both are "" if ``name`` does not belong to an action.
+    """
     action, _, part = name.rpartition(ACTION_INSIDE)
     return (action, part) if part in (*ACTION_SERVICES, *ACTION_TOPICS) else ("", "")

@@ -1,7 +1,7 @@
 """Run a function over slices of a list in forked workers.
 
-Signing is limited by the CPU, and forked processes share all data that was read and checked before.
-They also share the lock on the keystore: it is held until the last one has exited.
+Signing is limited by the CPU, and forked workers share all data that the parent read and checked.
+They also share its lock on the keystore: the lock is held until the last worker has exited.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 Progress = Callable[[str], None]
-"""Called with the name of each enclave when it is done."""
+"""Callback that gets the name of each enclave when the work on that enclave is done."""
 
 _SMALLEST_SLICE = 100
 _MOST_PROCESSES = 8
@@ -33,11 +33,12 @@ _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 def map_slices(
     items: Sequence[Item], work: Callable[[Sequence[Item]], Result]
 ) -> list[tuple[Sequence[Item], Result]]:
-    """Return each slice of ``items`` with the result of ``work`` on it, in order.
+    """Split ``items`` into slices; return each slice with the result of ``work`` on it, in order.
 
-    There is one slice for each core; this process does the first, forked workers do the others.
-    A short list gets one slice and no worker, and so does a program with several threads: a fork
-    could leave their locks held for ever.  Results and errors of workers are pickled.
+    There is at most one slice for each core; this process handles the first slice, forked workers
+    the others.  A short list becomes one slice without a worker, as does any list in a program
+    with several threads: a fork could leave the locks of other threads held for ever.  Results and
+    errors of workers are pickled.
 
     Raises:
         SrosError: a worker died.  The first error that ``work`` raises is raised here, too.
@@ -71,10 +72,10 @@ def _fork(
     work: Callable[[Sequence[Item]], Result],
     workers: list[tuple[int, int]],
 ) -> None:
-    """Start a worker and add it, with the pipe for its result, to ``workers``.
+    """Fork a worker, and add its process id and the pipe for its result to ``workers``.
 
-    Signals are blocked meanwhile: one between these two steps would leave a worker that nobody
-    stops.
+    Signals are blocked meanwhile: a signal between the two steps would leave a worker running that
+    ``workers`` does not list.
     """
     parent = os.getpid()
     reader, writer = os.pipe()
@@ -105,23 +106,25 @@ def _result_or_error(
 
 
 def _die_with(parent: int) -> None:
-    """Ask the kernel to kill this process when its parent dies, so that it writes no more."""
+    """Have the kernel kill this process when its parent dies, so that it stops writing."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
         os._exit(1)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it, too, and kills its workers
+    signal.signal(
+        signal.SIGINT, signal.SIG_IGN
+    )  # the parent also gets SIGINT and kills its workers
 
 
 def _collect(worker: int, pipe: int) -> Result:  # type: ignore[type-var]
-    """Wait for a worker; return its result or raise its error."""
+    """Wait for a worker, and return its result or raise its error."""
     with open(pipe, "rb") as stream:
         message = stream.read()
     _, status = os.waitpid(worker, 0)
     if not message:
         raise SrosError(
-            "a process that shared the work died",
-            f"Its exit status is {status}; perhaps there was too little memory.",
+            "a worker process died",
+            f"Its wait status is {status}; perhaps there was too little memory.",
             "Try again.",
         )
     result = pickle.loads(message)  # noqa: S301 - from our own child, through a pipe

@@ -1,6 +1,6 @@
-"""The places of the files that ship with sros: policies and keystore templates.
+"""The folders of the files that ship with sros: policies and keystore templates.
 
-In a wheel they lie inside the package; in a checkout they stand at the top of the repository.
+In a wheel they are inside the package; in a checkout they are at the top of the repository.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ def _shipped(name: str) -> Path:
 
 
 def policies_dir() -> Path:
-    """Return the folder of the example policies and of the common parts that they include."""
+    """Return the folder of the example policies and the common files that they include."""
     return _shipped("policies")
 
 
@@ -26,5 +26,5 @@ def templates_dir() -> Path:
 
 
 def unpacked_dds_dir() -> Path:
-    """Return the folder of a checkout for a DDS that its demo command unpacks without apt."""
+    """Return the folder of a checkout in which ``./dev demo`` unpacks DDS packages without apt."""
     return _PACKAGE.parent / ".dds"

@@ -1,6 +1,6 @@
-"""The translation between the languages of ROS and of DDS Security, both ways.
+"""Translation between ROS policies and DDS Security documents, in both directions.
 
-Names are mapped as in ros2/sros2, so that a policy gives the same rights with both.
+Names are mapped as in ros2/sros2, so that both tools give the same rights for a policy.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sros_tool.policy.protection import DomainProtection, NamedProtection, TopicProtection
 
 SERVICE_ENDS = {"rq": "Request", "rr": "Reply"}
-"""The prefix and suffix of the topics of a service: its requests, and its replies."""
+"""Prefix and suffix of the DDS topics of a service: requests and replies."""
 
 _TOPIC = ("rt", "")
 _REQUESTS, _REPLIES = SERVICE_ENDS.items()
@@ -33,7 +33,7 @@ _DDS_NAMES: dict[str, tuple[_Ends, _Ends]] = {
     "request": ((_REQUESTS,), (_REPLIES,)),
     "reply": ((_REPLIES,), (_REQUESTS,)),
 }
-"""The prefix and suffix of a ROS name in the topics that a right writes, and reads."""
+"""Prefix and suffix of the DDS topics of a right: the written topics, and the read topics."""
 
 _DDS_NAMES |= {
     action: (
@@ -45,14 +45,14 @@ _DDS_NAMES |= {
 
 
 class DdsNames(NamedTuple):
-    """The DDS topics of one right: the ones that its holder writes, and the ones that it reads."""
+    """The DDS topics of one right: the topics to publish, and the topics to subscribe."""
 
     publish: tuple[str, ...]
     subscribe: tuple[str, ...]
 
 
 def dds_names(right: str, fqn: str) -> DdsNames:
-    """Return the DDS topics that ``right`` on the absolute ROS name ``fqn`` stands for.
+    """Return the DDS topics that ``right`` on the absolute ROS name ``fqn`` needs.
 
     ``right`` is publish or subscribe (topics), request or reply (services), call or execute
     (actions).  Source: ROS 2 design "Topic and Service name mapping to DDS".
@@ -65,7 +65,7 @@ def dds_names(right: str, fqn: str) -> DdsNames:
 
 
 def service_of(topic: str) -> tuple[str, str]:
-    """Return the service of a DDS topic, and ``rq`` for its requests or ``rr`` for its replies.
+    """Return the service of a DDS topic, and ``rq`` for a request or ``rr`` for a reply topic.
 
     Both are "" if the topic does not belong to a service.
     """
@@ -87,10 +87,10 @@ def service_of(topic: str) -> tuple[str, str]:
 def permissions_for(
     enclave: Enclave, *, subject: str, validity: Window, domains: DomainSet
 ) -> Permissions:
-    """Return the permissions document of an enclave: one grant, denials before permissions.
+    """Return the permissions of an enclave: one grant, with the deny rule before the allow rule.
 
-    In addition to the policy's rights it has one more: every ROS 2 participant writes and reads
-    ``ros_discovery_info``, and does not start without that right.
+    The allow rule also has ``ros_discovery_info``, which every ROS 2 participant publishes and
+    subscribes: no participant starts without that right.
     """
     allowed, denied = _Topics(), _Topics()
     for profile in enclave.all_profiles():
@@ -108,7 +108,7 @@ def permissions_for(
 
 
 class _Topics:
-    """The DDS topics of one rule while it is put together."""
+    """The DDS topics collected for one rule of a grant."""
 
     def __init__(self) -> None:
         self.publish: set[str] = set()
@@ -131,10 +131,10 @@ def _criteria(topics: set[str]) -> tuple[Criteria, ...]:
 
 
 def governance_for(protection: DomainProtection, domains: DomainSet) -> Governance:
-    """Return the governance of a keystore: one domain rule, with the narrowest topic rules first.
+    """Return the governance of a keystore: one domain rule, narrow topic rules before wide ones.
 
-    The first topic rule that matches decides, so a rule precedes every rule that covers it; the
-    last one, for ``*``, applies to all other topics.
+    The first topic rule that matches a topic decides, so each rule comes before the rules that
+    cover it.  The last rule, ``*``, applies to all other topics.
     """
     rules = [
         _topic_rule(expression, named.protection)
@@ -155,7 +155,7 @@ def governance_for(protection: DomainProtection, domains: DomainSet) -> Governan
 
 
 def _expressions(named: NamedProtection) -> list[str]:
-    """Return all DDS topics of a ROS name, for both sides of a service or action."""
+    """Return the DDS topics of a ROS name, for both sides of a service or action."""
     expressions: dict[str, None] = {}
     for right in RIGHTS[named.kind]:
         names = dds_names(right, expand(named.name, "/", ""))
@@ -170,7 +170,7 @@ def _topic_rule(expression: str, protection: TopicProtection) -> TopicRule:
 def _values(
     protection: DomainProtection | TopicProtection, rule: type[DomainRule | TopicRule]
 ) -> dict[str, Any]:
-    """Return the attributes of a rule, each made from the field that its ``term`` names."""
+    """Map each attribute of a rule to the value of the ``protection`` field named by ``term``."""
     chosen = {each: getattr(protection, each.term) for each in attributes(rule)}
     return {
         each.name: value if each.is_flag else ProtectionKind(value)
@@ -179,7 +179,7 @@ def _values(
 
 
 def _narrow_first(rules: list[TopicRule]) -> list[TopicRule]:
-    """Return ``rules`` reordered, as little as possible, so that a wider one hides none."""
+    """Return ``rules``, reordered as little as needed so that no rule follows a wider one."""
     ordered: list[TopicRule] = []
     for rule in rules:
         place = next(
@@ -200,7 +200,10 @@ def _narrow_first(rules: list[TopicRule]) -> list[TopicRule]:
 
 @dataclass(frozen=True, slots=True)
 class RosRight:
-    """One right or denial in ROS terms; ``kind`` "dds" is a topic that ROS has no word for."""
+    """One right or denial in ROS terms.
+
+    ``kind`` is "topics", "services", "actions", or "dds" for a DDS topic without a ROS name.
+    """
 
     qualifier: Qualifier
     right: str
@@ -209,10 +212,10 @@ class RosRight:
 
 
 def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
-    """Return the ROS rights of a rule: actions and services are folded back from their topics.
+    """Return the ROS rights of a rule, with the topics of services and actions combined again.
 
-    Other topics (half a service, a topic without ROS prefix) are returned by their DDS names, with
-    ``kind`` "dds".  Partitions and relay criteria are not part of the answer.
+    Other topics (half a service, a topic without ROS prefix) keep their DDS names, with ``kind``
+    "dds".  Partitions and relay criteria are ignored.
     """
     qualifier = ALLOW if rule.allow else DENY
     publish = _all_topics(rule.publish)
@@ -223,7 +226,7 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
         uses = [publish.get(topic) for topic in names.publish]
         uses += [subscribe.get(topic) for topic in names.subscribe]
         if all(uses):
-            continue  # as part of an action
+            continue  # all topics already belong to an action
         if all(topic in publish for topic in names.publish) and all(
             topic in subscribe for topic in names.subscribe
         ):
@@ -246,10 +249,10 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
 
 
 def grant_rights(enclave: str, grant: Grant) -> frozenset[Right]:
-    """Return the rights of an ``enclave``'s grant, without the rights of every participant.
+    """Return the rights that a grant gives ``enclave``, without ``ros_discovery_info``.
 
-    Domains, partitions, relay criteria and the default of the grant are not part of the answer,
-    nor is the order of its rules.
+    Domains, partitions, relay criteria, the default of the grant and the order of its rules are
+    ignored.
     """
     return frozenset(
         Right(enclave, each.qualifier, each.right, each.name)
@@ -260,14 +263,14 @@ def grant_rights(enclave: str, grant: Grant) -> frozenset[Right]:
 
 
 def _all_topics(criteria: Iterable[Criteria]) -> dict[str, bool]:
-    """Return the topics, each with whether it was listed as part of a service or action."""
+    """Map each topic to False; `ros_rights` sets True for the topics of a service or action."""
     return dict.fromkeys((topic for each in criteria for topic in each.topics), False)
 
 
 def _candidates(publish: Iterable[str], subscribe: Iterable[str]) -> Iterable[tuple[str, str, str]]:
-    """Yield actions, then services, whose request topic is in the rule.
+    """Yield kind, right and name of the actions, then the services, that have a request topic here.
 
-    Services of an action count as the action unless some of its topics are missing.
+    The caller checks that the other topics of the action or service are in the rule, too.
     """
     requests_out = [name for name, begin in map(service_of, publish) if begin == "rq"]
     requests_in = [name for name, begin in map(service_of, subscribe) if begin == "rq"]

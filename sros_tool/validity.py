@@ -1,7 +1,7 @@
-"""A window of time in which a certificate or a document is valid.
+"""Validity of certificates and documents: windows of time, durations, and their text forms.
 
-Moments are timezone-aware and in UTC, with a resolution of one second.  Nothing here asks for
-the present moment: it is passed in.
+Times are timezone-aware, in UTC, with a resolution of one second.  Nothing here reads the clock:
+callers pass the current time.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from functools import lru_cache
 from sros_tool.errors import UsageError
 
 BACKDATE = timedelta(hours=24)
-"""The time from the start of a window to its creation.
+"""How long before its creation a certificate or document becomes valid.
 
 Fast DDS 2.14.5 reads the dates of permissions in the host's local time, so a document must be
 valid at least 14 hours before its creation in UTC to work in every time zone.
@@ -27,7 +27,7 @@ _LONGEST = 100 * _SECONDS["y"]
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """From ``not_before`` to ``not_after``, both included and both in UTC."""
+    """A validity from ``not_before`` to ``not_after``, both included and both in UTC."""
 
     not_before: datetime
     not_after: datetime
@@ -50,9 +50,10 @@ class Window:
 
 @dataclass(frozen=True, slots=True)
 class Lifespan:
-    """A validity with a fixed start, a fixed end, or both; ``length`` counts from the start.
+    """A chosen validity with a fixed start, a fixed end, or both.
 
-    Without ``start`` it begins when something is made.  Exactly one of the others is given.
+    Without ``start`` it begins at the creation.  Exactly one of ``end`` and ``length`` is given;
+    ``length`` counts from the start.
     """
 
     start: datetime | None = None
@@ -61,11 +62,17 @@ class Lifespan:
 
 
 Span = timedelta | Lifespan
-"""A chosen validity: a duration from the creation on, or a `Lifespan`."""
+"""A chosen validity: a duration that counts from the creation, or a `Lifespan`."""
 
 
 def window(now: datetime, span: Span) -> Window:
-    """Return the window of something made ``now``; back-dated unless its start is fixed."""
+    """Return the validity of a certificate or document created ``now``.
+
+    Without a fixed start it begins `BACKDATE` before ``now``.
+
+    Raises:
+        UsageError: the validity has expired already.
+    """
     moment = now.astimezone(UTC).replace(microsecond=0)
     if isinstance(span, timedelta):
         return Window(moment - BACKDATE, moment + span)
@@ -77,10 +84,10 @@ def window(now: datetime, span: Span) -> Window:
 
 
 def parse_span(text: str) -> Span:
-    """Read a duration (``90d``), an end (``2027-06-01``), or both ends of an interval.
+    """Parse a duration (``90d``), an expiry (``2027-06-01``), or an interval.
 
     Intervals are written as in ISO 8601, ``2026-12-01/2027-06-01`` or ``2026-12-01/90d``; dates
-    without a zone are in UTC.
+    without a zone are in UTC.  Raises `UsageError` for any other text.
     """
     first, slash, last = text.strip().partition("/")
     start = _moment(first, text) if slash else None
@@ -103,7 +110,7 @@ def _moment(text: str, whole: str) -> datetime:
 
 
 def span_text(span: Span) -> str:
-    """Return ``span`` as text for `parse_span`."""
+    """Return ``span`` as text that `parse_span` reads."""
     if isinstance(span, timedelta):
         return duration_text(span)
     end = iso(span.end) if span.end else duration_text(span.length or timedelta(0))
@@ -111,7 +118,10 @@ def span_text(span: Span) -> str:
 
 
 def parse_duration(text: str) -> timedelta:
-    """Read ``90d``, ``72h``, ``10y`` …: a whole number and one of s m h d w y (365 days)."""
+    """Parse a duration such as ``90d``: a whole number and one of s, m, h, d, w, y (365 days).
+
+    Raises `UsageError` for any other text, for 0, and for more than 100 years.
+    """
     match = _DURATION.match(text.strip())
     if match:
         seconds = int(match[1]) * _SECONDS[match[2]]
@@ -126,19 +136,19 @@ def parse_duration(text: str) -> timedelta:
 
 
 def duration_text(duration: timedelta) -> str:
-    """Return ``duration`` as text for `parse_duration`, in days if they are whole."""
+    """Return ``duration`` as text that `parse_duration` reads, in whole days or else in seconds."""
     seconds = int(duration.total_seconds())
     return f"{seconds // 86400}d" if seconds % 86400 == 0 else f"{seconds}s"
 
 
-@lru_cache(maxsize=64)  # things made at once have equal moments
+@lru_cache(maxsize=64)  # files that are created together have equal times
 def iso(moment: datetime) -> str:
     """Return ``moment`` as CCYY-MM-DDThh:mm:ssZ, in UTC."""
     return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
 def parse_iso(text: str) -> datetime:
-    """Read an XML dateTime; without a zone it is UTC (DDS-Security 1.1, 9.4.1.3.2.2).
+    """Parse an XML dateTime; without a zone it is UTC (DDS-Security 1.1, 9.4.1.3.2.2).
 
     Raises `ValueError` for any other text.
     """
@@ -147,5 +157,5 @@ def parse_iso(text: str) -> datetime:
         moment = moment.replace(tzinfo=UTC)
     try:
         return moment.astimezone(UTC)
-    except OverflowError as error:  # an offset at the very end of the calendar
-        raise ValueError(f"{text!r} lies outside of the calendar") from error
+    except OverflowError as error:  # its zone moves the time out of the years 1 to 9999
+        raise ValueError(f"{text!r} is outside of the years 1 to 9999") from error

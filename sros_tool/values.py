@@ -1,4 +1,4 @@
-"""The one way from frozen values to JSON: dataclasses and named tuples as plain dictionaries."""
+"""Conversion of dataclasses and other values to JSON types, for all JSON output."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from sros_tool.validity import iso
 
 _Value = TypeVar("_Value")
 _SHOWN: dict[type, tuple[str, ...]] = {}
-"""The attributes by which the values of a class are shown."""
+"""The attributes of each class that its JSON object has."""
 
 
 def as_plain(value: object) -> Any:
-    """Return ``value`` as JSON types: dictionaries, lists, texts, numbers, booleans and None.
+    """Return ``value`` as JSON types: dictionaries, lists, strings, numbers, booleans and None.
 
-    A dataclass or a named tuple becomes a dictionary by the names of its public fields, in their
-    order, or by the attributes that `shows` names for it.  An enumeration becomes its value, a
-    moment CCYY-MM-DDThh:mm:ssZ in UTC, a path its text, a tuple a list, and a set a sorted list.
+    A dataclass or a named tuple becomes a dictionary of its public fields, in their order, or of
+    the attributes that `shows` names.  An enumeration becomes its value, a datetime
+    CCYY-MM-DDThh:mm:ssZ in UTC, a path its text, a tuple a list, and a set a sorted list.
 
     Raises:
-        TypeError: for anything else, such as bytes.
+        TypeError: ``value`` is of another type, such as bytes.
     """
     if value is None or type(value) in (str, int, float, bool):
         return value
@@ -46,7 +46,7 @@ def as_plain(value: object) -> Any:
 
 
 def shows(*names: str) -> Callable[[type[_Value]], type[_Value]]:
-    """Return a class decorator: `as_plain` then shows these attributes instead of the fields."""
+    """Return a class decorator that makes `as_plain` use these attributes instead of the fields."""
 
     def decorate(kind: type[_Value]) -> type[_Value]:
         _SHOWN[kind] = names
@@ -56,7 +56,7 @@ def shows(*names: str) -> Callable[[type[_Value]], type[_Value]]:
 
 
 def _shown(kind: type) -> tuple[str, ...]:
-    """Return the attributes by which values of a class are shown; none if it has no fields."""
+    """Return the attributes that the JSON object of a class has; none if it has no fields."""
     if kind not in _SHOWN:
         names: tuple[str, ...] = getattr(kind, "_fields", ())
         if is_dataclass(kind):

@@ -1,4 +1,4 @@
-"""The one XML reader and writer of sros: no entities, no network, bounded size."""
+"""The only XML reader and writer of sros: no entities, no network access, limited size."""
 
 from __future__ import annotations
 
@@ -33,7 +33,13 @@ def _parser() -> etree.XMLParser:
 
 
 def read_bytes(path: Path, what: str) -> bytes:
-    """Return the bytes of a regular file of bounded size; ``what`` names it in errors."""
+    """Return the content of a regular file of at most 16 MiB.
+
+    ``what`` describes the file in errors, such as "policy".
+
+    Raises:
+        DocumentError: the file does not exist, cannot be read, is too large or not a regular file.
+    """
     try:
         there = path.stat()  # checked first, because opening a pipe would wait for its writer
         if not stat.S_ISREG(there.st_mode):
@@ -43,7 +49,7 @@ def read_bytes(path: Path, what: str) -> bytes:
             with path.open("rb", buffering=0) as file:
                 data = file.readall()
     except (OSError, ValueError) as error:
-        number = getattr(error, "errno", errno.ENOENT)  # no file name holds a NUL
+        number = getattr(error, "errno", errno.ENOENT)  # ValueError: the path contains a NUL
         if number in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP):
             raise DocumentError(f"the {what} '{path}' does not exist") from error
         raise DocumentError(
@@ -51,7 +57,8 @@ def read_bytes(path: Path, what: str) -> bytes:
         ) from error
     if max(there.st_size, len(data)) > _MAX_BYTES:
         raise DocumentError(
-            f"the {what} '{path}' is too large", f"More than {_MAX_BYTES // 1024**2} MiB."
+            f"the {what} '{path}' is too large",
+            f"It has more than {_MAX_BYTES // 1024**2} MiB.",
         )
     _LOG.debug("read the %s '%s', %d bytes", what, path, len(data))
     return data
@@ -60,8 +67,11 @@ def read_bytes(path: Path, what: str) -> bytes:
 def parse(data: bytes, name: str) -> etree._Element:
     """Return the root element of an XML document, without comments and processing instructions.
 
-    ``name`` stands for the document in errors.  Raises `DocumentError` for anything that is not
-    well-formed, and for a document type declaration (entities are a way to read other files).
+    ``name`` names the document in errors.
+
+    Raises:
+        DocumentError: the document is not well-formed, or has a document type declaration
+            (entities could read other files).
     """
     if not data.strip():
         raise DocumentError(f"{name} is empty", "", "An XML document was expected.")
@@ -75,24 +85,27 @@ def parse(data: bytes, name: str) -> etree._Element:
     if root.getroottree().docinfo.doctype:
         raise DocumentError(
             f"{name} has a document type declaration",
-            "Entities could pull other files into a signed document, so none is accepted.",
+            "It is not accepted, because entities could pull other files into a signed document.",
             "Remove the <!DOCTYPE ...> line.",
         )
     return root
 
 
 def _text_of(element: etree._Element) -> str:
-    """Return the unchanged character data of an element without child elements."""
+    """Return the text of an element up to its first child element, unchanged."""
     return element.text or ""
 
 
 def serialize(root: etree._Element, *, indent: bool = True) -> bytes:
-    """Return the document of ``root`` in UTF-8, with a declaration, indented if it was not."""
+    """Return the XML document of ``root`` in UTF-8, with an XML declaration.
+
+    With ``indent``, indent ``root`` in place.
+    """
     if indent:
         etree.indent(root, space="  ")
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8") + b"\n"
 
 
 def tag_of(element: etree._Element) -> str:
-    """Return the tag of an element as text."""
+    """Return the tag of an element as a string."""
     return str(element.tag)
