@@ -278,8 +278,18 @@ TOMLS = {
 }
 
 
+@pytest.fixture
+def recursion_of_a_program() -> Iterator[None]:
+    """The limit that a program starts with; Hypothesis raises that of the tests' process."""
+    limit = sys.getrecursionlimit()
+    sys.setrecursionlimit(1000)
+    yield
+    sys.setrecursionlimit(limit)
+
+
 @pytest.mark.parametrize("verb", ["demo --scenario", "demo --template", "view {} --template"])
 @pytest.mark.parametrize("case", TOMLS)
+@pytest.mark.usefixtures("recursion_of_a_program")
 def test_toml(verb: str, case: str, tmp_path: Path) -> None:
     text, why = TOMLS[case]
     (tmp_path / "hostile.toml").write_text(text)
