@@ -129,7 +129,7 @@ def test_what_vendors_differ_about_is_said(name: str, note: str, pki: Path, tmp_
         ("only certifies", "lacks digitalSignature", {Vendor.FAST}),
         ("for serverAuth", "lacks emailProtection", {Vendor.FAST}),
         ("may sign", "", {Vendor.FAST, Vendor.FAST_2_9, Vendor.CYCLONE}),
-        ("only certifies, sha384", "no DDS takes it", set()),
+        ("only certifies, sha384", "no DDS vendor accepts it", set()),
     ],
 )
 def test_who_refuses_what_a_permissions_ca_signs_is_said(

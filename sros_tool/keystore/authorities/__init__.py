@@ -1,1 +1,1 @@
-"""The CAs of a keystore: making them, opening their keys, taking over CAs that exist."""
+"""The CAs of a keystore: creating them, opening their keys, importing existing CAs."""

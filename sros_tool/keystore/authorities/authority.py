@@ -1,7 +1,7 @@
-"""The identity CA and the permissions CA of a keystore: making them, and loading them to sign.
+"""The identity CA and the permissions CA of a keystore: creating them, and loading them to sign.
 
-A CA file holds the issuing CA first, because Cyclone DDS 0.10.2 reads only that (ran); Fast DDS
-2.9.1 trusts all CAs in the file, and also reads a revocation list in it (ran).
+The issuing CA is the first certificate of a CA file, because Cyclone DDS 0.10.2 reads only the
+first one.  Fast DDS 2.9.1 trusts all CAs in the file, and also reads a revocation list in it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from cryptography import x509
 
 from sros_tool.errors import KeystoreError, Note, PkiError
 from sros_tool.keystore.authorities.imported import check_imported
-from sros_tool.keystore.authorities.keyring import Keyring, check_keys_of, check_places
+from sros_tool.keystore.authorities.keyring import Keyring, check_imported_keys, check_places
 from sros_tool.keystore.layout import (
     IDENTITY,
     PERMISSIONS,
@@ -56,39 +56,39 @@ class Authority:
         return Issuer(self.certificate, self.key)
 
     def sign(self, document: bytes, what: str) -> bytes:
-        """Return the S/MIME message of a document, after verifying it.
+        """Return ``document`` as a signed S/MIME message (``.p7s``).
 
-        The message is parsed again: its digest has to match, and it has to contain ``document``.
-        ``what`` names the document in the error.
+        The message is parsed again, to check its digest and its content.  ``what`` names the
+        document in the error.
 
         Raises:
-            PkiError: the message does not carry the document.
+            PkiError: the message does not contain ``document`` with a correct digest.
         """
         message = smime.sign(document, self.certificate, self.key)
         signed = smime.parse(message)
         check_meaning(
-            (signed.carries_digest(), _lines(signed.document)), (True, _lines(document)), what
+            (signed.carries_digest(), _with_lf(signed.document)), (True, _with_lf(document)), what
         )
         return message
 
 
 def check_meaning(read: object, meant: object, what: str) -> None:
-    """Raise `PkiError` unless the document read back equals the intended one."""
+    """Raise `PkiError` unless ``read``, parsed from the new document, equals ``meant``."""
     if read != meant:
         raise PkiError(
-            f"{what} as signed differs from the intended one",
+            f"{what} would not have the intended content",
             "Nothing was written.",
             "This is a defect of sros: please report it with the policy.",
         )
 
 
-def _lines(document: bytes) -> bytes:
+def _with_lf(document: bytes) -> bytes:
     return document.replace(b"\r\n", b"\n")
 
 
 @dataclass(frozen=True, slots=True)
 class Authorities:
-    """The identity CA and permissions CA of a keystore; both may be the same CA."""
+    """The identity CA and permissions CA of a keystore, which may be the same CA."""
 
     identity: Authority
     permissions: Authority
@@ -102,11 +102,20 @@ def create_authorities(
     now: datetime,
     imported: Mapping[str, bytes],
 ) -> Authorities:
-    """Stage the CAs of a new keystore; for an ``imported`` certificate no CA is made."""
+    """Stage the CAs of a new keystore and return them, ready to sign.
+
+    ``imported`` maps roles ("identity", "permissions") to the PEM of an existing CA, which is then
+    used instead of a new one.
+
+    Raises:
+        KeystoreError: the places of the CA keys do not fit the template.
+        UsageError: an imported CA comes without its key, or does not fit the template.
+        PkiError: an imported CA cannot be used.
+    """
     check_places(keyring, template)
-    check_keys_of(imported, keyring, template)
+    check_imported_keys(imported, keyring, template)
     validity = window(now, template.authority_validity)
-    # Each CA gets a unique name, so that messages and pictures distinguish keystores.
+    # Separate CAs get unique names, so that messages and diagrams distinguish keystores.
     serial = secrets.token_hex(4)
     notes: list[Note] = []
 
@@ -141,7 +150,11 @@ def create_authorities(
 def load_authorities(
     root: Path, template: Template, keyring: Keyring, now: datetime
 ) -> Authorities:
-    """Return both authorities of a keystore, with their keys, checked and ready to sign."""
+    """Return both CAs of a keystore with their keys, ready to sign.
+
+    Raises:
+        KeystoreError: a CA is missing, does not fit its key, or is not valid at ``now``.
+    """
     identity = load_authority(root, IDENTITY, template, keyring, now)
     permissions = load_authority(root, PERMISSIONS, template, keyring, now)
     return Authorities(identity, permissions)
@@ -150,15 +163,15 @@ def load_authorities(
 def load_authority(
     root: Path, role: str, template: Template, keyring: Keyring, now: datetime
 ) -> Authority:
-    """Return the identity or permissions CA, with its key, checked and ready to sign.
+    """Return the identity or permissions CA with its key, ready to sign.
 
     Raises:
-        KeystoreError: it is missing, does not fit its key, or is not valid at ``now``.
+        KeystoreError: the CA is missing, does not fit its key, or is not valid at ``now``.
     """
     if not (root / ca_certificate(role)).exists() and not (root / ca_key(role)).exists():
         raise KeystoreError(
             f"keystore '{root}' has no {role} CA",
-            "It may be a copy that was made for a robot, which can run enclaves but not make them.",
+            "It may be an export for a robot, which holds enclaves but no CA to create new ones.",
             "Use the keystore that it was exported from.",
         )
     certificate = load_ca_certificate(root, role)
@@ -167,15 +180,15 @@ def load_authority(
         raise KeystoreError(
             f"the key and the certificate of the {role} CA do not belong together",
             f"'{keyring.place(role, template)}' is not the key of "
-            f"'{root / ca_certificate(role)}', so nothing that it signs could be verified.",
-            "Restore the pair from a backup.",
+            f"'{root / ca_certificate(role)}', so its signatures could not be verified.",
+            "Restore both from a backup.",
         )
     validity = validity_of(certificate)
     if not validity.contains(now):
         raise KeystoreError(
             f"the {role} CA {subject_text(certificate.subject)} is not valid now",
             f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}, and DDS "
-            "refuses whatever an expired CA has signed.",
+            "refuses the certificates and documents of a CA outside its validity.",
             "Check the clock of this machine; otherwise make a new keystore.",
         )
     return Authority(certificate, key)
@@ -188,14 +201,17 @@ def write_bundle(
     bundle: bytes,
     names: Sequence[str],
 ) -> None:
-    """Stage a CA file, and the copies that enclaves have of it."""
+    """Stage ``bundle`` (PEM) as the CA file named ``file``, and update its copies in enclaves.
+
+    ``roles`` are the roles of the CA, ``names`` the enclaves of the keystore.
+    """
     transaction.write(f"{PUBLIC}/{file}.cert.pem", bundle)
     for role in roles:
         write_copies(transaction, names, f"{role}_ca.cert.pem", bundle)
 
 
 def write_copies(transaction: Transaction, names: Sequence[str], name: str, data: bytes) -> None:
-    """Stage a file in every enclave that has a copy of it, not a link."""
+    """Stage ``data`` as file ``name`` in each enclave that has a regular file there, not a link."""
     for enclave in names:
         path = f"{enclave_folder(enclave)}/{name}"
         if (transaction.root / path).is_file() and not (transaction.root / path).is_symlink():

@@ -1,4 +1,4 @@
-"""Checking a CA that was made elsewhere, before a keystore uses it."""
+"""Checks of an existing CA before a keystore imports it."""
 
 from __future__ import annotations
 
@@ -43,24 +43,33 @@ class ImportedAuthority:
 
 
 def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> ImportedAuthority:
-    """Return the CA of ``key`` with its chain; ``data`` is PEM, in any order.
+    """Return the CA certificate of ``key`` with its chain, after checking them.
 
-    A fault that only some DDS vendors refuse becomes a note.
+    ``data`` holds the certificates of the CA and of its issuers as PEM, in any order.  A fault
+    that only some DDS vendors refuse becomes a note.
 
     Raises:
-        PkiError: the CA cannot serve as the ``role`` CA.
+        PkiError: the CA cannot be the ``role`` CA.
     """
     try:
         certificates = [read_in_full(each) for each in x509.load_pem_x509_certificates(data)]
     except UNREADABLE as error:
         raise PkiError(
-            f"the certificate of the {role} CA cannot be read", "It is not PEM, or it is damaged."
+            f"the certificate of the {role} CA cannot be read",
+            "It is not PEM, or it is damaged.",
+            "Name a PEM file with the certificate of the CA and those of its issuers.",
         ) from error
     own = [each for each in certificates if same_key(each, key)]
-    if not own or len(certificates) > _MOST_CERTIFICATES:
+    if len(certificates) > _MOST_CERTIFICATES:
+        raise PkiError(
+            f"the certificate file of the {role} CA has {len(certificates)} certificates",
+            f"At most {_MOST_CERTIFICATES} are allowed.",
+            "Put only the CA and its issuers up to the root into the file.",
+        )
+    if not own:
         raise PkiError(
             f"the certificate of the {role} CA does not fit its key",
-            f"None of the {len(certificates)} certificates in the file belongs to it.",
+            f"The key belongs to none of the certificates in the file ({len(certificates)}).",
             "Name the certificate and the key of the same CA.",
         )
     chain = list(_chain(own[0], certificates, role))
@@ -69,7 +78,7 @@ def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> Im
     refusals = authority_refusals(role, tuple(chain), now)
     if len(refusals) == len(MEASURED):
         raise PkiError(
-            f"{subject_text(own[0].subject)} cannot be the {role} CA: no DDS takes it",
+            f"{subject_text(own[0].subject)} cannot be the {role} CA: no DDS vendor accepts it",
             f"{refusals_text(refusals)}.",
             "Issue the CA's certificate again, self-signed with SHA-256 and keyUsage keyCertSign "
             "and digitalSignature.",
@@ -82,6 +91,7 @@ def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> Im
 def _chain(
     start: x509.Certificate, certificates: list[x509.Certificate], role: str
 ) -> Iterator[x509.Certificate]:
+    """Yield ``start`` and its issuers, up to the self-signed root."""
     current, left = start, [each for each in certificates if each != start]
     yield current
     while not issued_by(current, current):
@@ -111,7 +121,8 @@ def _check_ca(certificate: x509.Certificate, role: str, now: datetime) -> None:
     if not is_ca or not may_sign:
         raise PkiError(
             f"{name} cannot be the {role} CA",
-            "Its certificate does not say that it may issue others.",
+            "Its certificate does not allow it to issue certificates.",
+            "It needs basicConstraints CA:TRUE, and keyCertSign in keyUsage if it has that.",
         )
     validity = validity_of(certificate)
     if not validity.contains(now):
@@ -127,13 +138,13 @@ def _notes(
     name = subject_text(chain[0].subject)
     if len(chain) > 1:
         yield Note(
-            "portable.intermediate", f"{name} is below another CA. {refusals_text(refusals)}."
+            "portable.intermediate", f"{name} is an intermediate CA. {refusals_text(refusals)}."
         )
     elif role == PERMISSIONS and (fault := next(purpose_faults(chain), "")):
         yield Note(
             "portable.ca-purpose",
             f"{fault}: Fast DDS 2.9.1 and Cyclone DDS 0.10.2 refuse every document that it signs "
-            '("unsuitable certificate purpose"), and only Fast DDS 2.14 takes them. Issue its '
+            '("unsuitable certificate purpose"), and only Fast DDS 2.14 accepts them. Issue its '
             "certificate again with keyUsage digitalSignature and without extendedKeyUsage, unless "
             "all robots run Fast DDS 2.14.",
         )
@@ -145,11 +156,11 @@ def _notes(
         if not fits:
             yield Note(
                 "portable.key-algorithm",
-                f"{name} has a key of {algorithm(key)}; Cyclone DDS takes EC secp256r1 and RSA "
-                "2048 only.",
+                f"{name} has a key of {algorithm(key)}; Cyclone DDS accepts only EC secp256r1 and "
+                "RSA 2048.",
             )
         if not isinstance(each.signature_hash_algorithm, hashes.SHA256):
             yield Note(
                 "portable.signature-hash",
-                f"{name} is not signed with SHA-256, which Fast DDS rejects in a CA.",
+                f"{name} is not signed with SHA-256, so Fast DDS rejects this CA.",
             )

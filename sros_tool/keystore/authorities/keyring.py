@@ -1,6 +1,6 @@
-"""The keys of the CAs: where they are (keystore, another file, token), and how they are opened.
+"""The private keys of the CAs: in the keystore, in another file, or on a PKCS #11 token.
 
-The library never prompts: the caller brings a secrets handler, which may.
+The library never prompts for a secret: it calls the secrets handler of its caller.
 """
 
 from __future__ import annotations
@@ -23,20 +23,21 @@ from sros_tool.xml import read_bytes
 _LOG = logging.getLogger(__name__)
 
 Secrets = Callable[[str], str]
+"""A secrets handler: returns the passphrase or PIN that its argument describes."""
 
 
 def no_secrets(what: str) -> str:
-    """Raise `PkiError`; use it as the secrets handler if nobody can give a secret."""
-    raise PkiError(f"{what} is needed, and nobody is there to give it")
+    """Raise `PkiError`: the secrets handler of callers that have no secrets."""
+    raise PkiError(f"{what} is needed, but there is no way to ask for it")
 
 
 @dataclass(frozen=True, slots=True)
 class Keyring:
-    """The places of the keys of the two authorities, and the secrets that open them.
+    """The places of the CA keys, and the secrets handler that opens them.
 
     ``places`` maps a role ("identity", "permissions") to the URI of its key, ``file:PATH`` or
-    ``pkcs11:...``; for other roles the keystore's settings say the place.  ``secrets`` returns
-    passphrases and PINs.  With ``encrypt``, new keys in files get a passphrase.
+    ``pkcs11:...``.  For a role without an entry, the keystore's settings name the place.
+    ``secrets`` returns passphrases and PINs.  With ``encrypt``, new key files get a passphrase.
     """
 
     secrets: Secrets = no_secrets
@@ -44,15 +45,15 @@ class Keyring:
     encrypt: bool = False
 
     def place(self, role: str, template: Template) -> str:
-        """Return the URI of the key of a role, or the path of its file within the keystore."""
+        """Return the URI of a CA's key, or its path relative to the keystore."""
         role_key = {IDENTITY: template.identity_key}.get(role, template.permissions_key)
         return self.places.get(role) or role_key or ca_key(role)
 
     def open(self, root: Path, role: str, template: Template) -> PrivateKey:
-        """Return the key of a role.
+        """Return the private key of the ``role`` CA.
 
         Raises:
-            KeystoreError: the key is missing, or cannot be used.
+            KeystoreError: the key is missing, or cannot be opened.
         """
         place = self.place(role, template)
         try:
@@ -64,10 +65,9 @@ class Keyring:
             if not path.exists():
                 raise KeystoreError(
                     f"the key of the {role} CA is not at '{path}'",
-                    "Perhaps it is kept elsewhere on purpose.",
-                    "Put it back for this command, or name its place in "
-                    f"SROS_{role.upper()}_KEY. A new CA would lock out every enclave that "
-                    "exists, so none is made.",
+                    "It may be kept elsewhere on purpose.",
+                    f"Put it back for this command, or set SROS_{role.upper()}_KEY to its place. "
+                    "No new CA is created, because it would lock out every existing enclave.",
                 )
             pem = read_bytes(path, f"{role} CA key")
             key = load_key(pem, f"'{path}'", self._passphrase(role))
@@ -79,9 +79,9 @@ class Keyring:
     def make(
         self, transaction: Transaction, file: str, role: str, template: Template
     ) -> PrivateKey:
-        """Return the key for a new authority: the existing one at its place, or a new one there.
+        """Return the key for a new CA: the key already at its place, or a new key created there.
 
-        ``file`` is its path in the keystore, unless another place is named.
+        ``file`` is the path in the keystore for a new key that has no other place.
         """
         place = self.places.get(role) or (
             template.identity_key if role == IDENTITY else template.permissions_key
@@ -102,8 +102,8 @@ class Keyring:
             _write_outside(_path(place, transaction.root), pem, transaction)
         return key
 
-    def remembered(self, template: Template) -> Template:
-        """Return ``template`` with the places of the keys, for the settings of a new keystore."""
+    def settings_with_places(self, template: Template) -> Template:
+        """Return ``template`` with the places of the CA keys, as settings of a new keystore."""
         identity = self.places.get(IDENTITY) or template.identity_key
         permissions = self.places.get(PERMISSIONS) or template.permissions_key
         if not template.separate_authorities:
@@ -115,34 +115,34 @@ class Keyring:
 
 
 IN_KEYSTORE = Keyring()
-"""The keys lie in the keystore, unencrypted."""
+"""The keyring for CA keys in the keystore, unencrypted."""
 
 
 def check_places(keyring: Keyring, template: Template) -> None:
-    """Raise `KeystoreError` if one CA does both jobs and two places of its key are named."""
+    """Raise `KeystoreError` if a single CA is given different places for its key."""
     named = {role: keyring.places.get(role) for role in ROLES}
     if not template.separate_authorities and len({place or "" for place in named.values()}) > 1:
         raise KeystoreError(
-            "with one CA for both jobs, its key has one place",
-            "Two different places are named.",
+            "a keystore with one CA for both roles needs one place for its key",
+            "The identity key and the permissions key are given different places.",
             "Name the same place for both, or use --ca-layout separate.",
         )
 
 
-def check_keys_of(roles: Iterable[str], keyring: Keyring, template: Template) -> None:
-    """Raise `UsageError` if the certificate of a CA is given without the place of its key."""
+def check_imported_keys(roles: Iterable[str], keyring: Keyring, template: Template) -> None:
+    """Raise `UsageError` if an imported CA comes without its key, or does not fit the CA layout."""
     for role in roles:
         if keyring.place(role, template) == ca_key(role):
             raise UsageError(
                 f"the certificate of the {role} CA is given without its key",
-                "A keystore signs with it.",
+                "The keystore needs the key to sign.",
                 f"Add --{role}-key file:PATH or --{role}-key pkcs11:...",
             )
         if not template.separate_authorities and role != IDENTITY:
             raise UsageError(
-                "with one CA for both jobs, its certificate is the identity CA's",
+                "a keystore with one CA for both roles takes no separate permissions CA",
                 "",
-                "Give --identity-ca alone, or --ca-layout separate.",
+                "Give --identity-ca alone, or add --ca-layout separate.",
             )
 
 
@@ -151,7 +151,7 @@ def _path(place: str, root: Path) -> Path:
 
 
 def _write_outside(path: Path, pem: bytes, transaction: Transaction) -> None:
-    """Write a key file outside of the keystore; remove it if the transaction fails."""
+    """Write a key file outside the keystore; remove it if the transaction fails."""
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
 
     def undo() -> None:

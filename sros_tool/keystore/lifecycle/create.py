@@ -287,7 +287,7 @@ def _write_keystore(
     transaction.write(
         SETTINGS,
         b"# The choices by which sros made this keystore; what is added later follows them.\n"
-        + render_template(keyring.remembered(template)).encode(),
+        + render_template(keyring.settings_with_places(template)).encode(),
     )
     return _Keystore(authorities, template, domains, entries=tuple(entries))
 
