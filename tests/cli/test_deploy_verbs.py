@@ -60,7 +60,7 @@ def test_a_host_by_patterns(keystore: Path, tmp_path: Path) -> None:
     assert snapshot(tmp_path / "1") == snapshot(tmp_path / "2")
     assert sros("list_enclaves", tmp_path / "1").ok().out.split() == ["/a", "/r1/x", "/r1/y/z"]
     ended = sros("distribute_key", keystore, "--match", "/r3/*", tmp_path / "3")
-    assert (ended.status, "fits '/r3/*'" in ended.err) == (1, True)
+    assert (ended.status, "matches '/r3/*'" in ended.err) == (1, True)
     assert not (tmp_path / "3").exists()
 
 
@@ -225,7 +225,7 @@ MISUSE: dict[str, tuple[str, int, str]] = {
     "a key that is there": ("create_request /arm/camera robot", 1, "has a key in 'robot'"),
     "a request in a keystore": ("create_request /c ks", 1, "is a keystore with CAs"),
     "an answer that is missing": ("import no.tgz robot", 1, "does not exist"),
-    "an answer that is none": ("import r.pem robot", 1, "no .tar.gz"),
+    "an answer that is none": ("import r.pem robot", 1, "not a .tar.gz"),
     "an export for an answer": ("import export.tgz robot", 1, "key.pem"),
     "an answer in a keystore": ("import good.tgz ks", 1, "with CAs"),
     "an answer elsewhere": ("import good.tgz elsewhere", 1, "no key of enclave"),

@@ -83,7 +83,7 @@ def test_selection(
 
 @pytest.mark.parametrize(
     ("patterns", "why"),
-    [(["/leg/*"], "fits '/leg/*'"), ([BORN], "not in keystore"), ([""], "fits")],
+    [(["/leg/*"], "matches '/leg/*'"), ([BORN], "not in keystore"), ([""], "matches")],
 )
 def test_a_selection_of_nothing_is_refused(patterns: list[str], why: str, made_fleet: Path) -> None:
     with pytest.raises(KeystoreError) as caught:
@@ -287,7 +287,7 @@ def test_an_update_replaces_what_was_sent_before(fleet: Path, tmp_path: Path) ->
     (tmp_path / "p.xml").write_text(policy_text({"/base": publish("new")}))
     generate_artifacts(fleet, policies=[read_policy(tmp_path / "p.xml")], now=NOW)
     renew(fleet, ["/base"], now=NOW)
-    with pytest.raises(SrosError, match="another version"):
+    with pytest.raises(SrosError, match="different versions"):
         distribute(fleet, ["/base", "/armada"], tmp_path / "robot", now=NOW)
     distribute(fleet, ["/base", "/armada"], tmp_path / "robot", now=NOW, force=True)
     assert not verify_arrival(tmp_path / "robot", now=NOW).findings

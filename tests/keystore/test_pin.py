@@ -60,12 +60,12 @@ def test_the_named_ca_is_accepted_and_no_other(home: Path, robot: Path, tmp_path
     evil = made(tmp_path, "evil")
     answers = answer_of(home, robot), answer_of(evil, robot)
     before = snapshot(robot)
-    with pytest.raises(KeystoreError, match="not signed by the CA that is named"):
+    with pytest.raises(KeystoreError, match="not signed by the pinned CA"):
         import_answer(robot, answers[1], now=NOW, pinned=pin(home))
     assert snapshot(robot) == before
     assert import_answer(robot, answers[0], now=NOW, pinned=pin(home)).first
     # Moving to other CAs is no reason to accept anybody.
-    with pytest.raises(KeystoreError, match="not signed by the CA that is named"):
+    with pytest.raises(KeystoreError, match="not signed by the pinned CA"):
         import_answer(robot, answers[1], now=NOW, pinned=pin(home), force=True)
     import_answer(robot, answers[1], now=NOW, pinned=pin(evil), force=True)
 
@@ -113,7 +113,7 @@ def test_after_a_rotation_the_new_ca_is_named(robot: Path, tmp_path: Path) -> No
     for stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE, RotationStage.RETIRE):
         rotate_ca(home, stage, now=NOW)
     archive = answer_of(home, robot)
-    with pytest.raises(KeystoreError, match="not signed by the CA that is named"):
+    with pytest.raises(KeystoreError, match="not signed by the pinned CA"):
         import_answer(robot, archive, now=NOW, pinned=old)
     import_answer(robot, archive, now=NOW, pinned=pin(home))
 

@@ -1,1 +1,1 @@
-"""Bringing enclaves to robots: export, signing request, answer, import."""
+"""Delivery of enclaves to robots: exports, signing requests, and the answers to them."""

@@ -1,4 +1,4 @@
-"""Importing the answer to a signing request on the robot: verified in full, installed at once."""
+"""Answers to signing requests on the robot: verified in full, then installed atomically."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cryptography import x509
 from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
 from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.delivery.archive import unpack
-from sros_tool.keystore.delivery.trust import check_same_authority, refuse_home, trusted_in
+from sros_tool.keystore.delivery.trust import check_same_authority, refuse_ca_keystore, trusted_in
 from sros_tool.keystore.layout import ENCLAVES, OPTIONAL_FILES, REQUIRED_FILES, enclave_folder
 from sros_tool.keystore.reader import OpenedEnclave, open_enclave, read_certificate
 from sros_tool.keystore.transaction.recovery import tidy
@@ -35,11 +35,11 @@ from sros_tool.xml import read_bytes
 
 _KEY = "key.pem"
 _REQUIRED = tuple(file for file in REQUIRED_FILES if file != _KEY)
-_AGAIN = "Have the request signed again, and the answer sent again."
+_AGAIN = "Have the request signed again, and import the new answer."
 SEAL = "answer.p7s"
 """The list of all files of an answer with their digests, signed by the permissions CA.
 
-Without it, the carrier of an answer could put an older governance or another CA into it.
+Without it, whoever transports an answer could put an older governance or another CA into it.
 """
 
 
@@ -47,7 +47,7 @@ Without it, the carrier of an answer could put an older governance or another CA
 class RequestAnswer:
     """The answer to a request: the files of one enclave by their paths, without its key.
 
-    ``seal`` is the signed list of the files.
+    ``seal`` is the signed list of the files (`SEAL`).
     """
 
     name: str
@@ -61,9 +61,10 @@ class RequestAnswer:
 
 @dataclass(frozen=True, slots=True)
 class ImportedEnclave:
-    """The result of an import; without changes, the same answer was installed already.
+    """An enclave that was imported; without ``changes``, the same answer was installed already.
 
-    ``first`` is whether the folder had no CAs before: nothing there vouches for the new ones.
+    ``first`` says whether the folder trusted no CA before, so that nothing vouched for the new
+    ones.  ``until`` is the first expiry of certificate and permissions.
     """
 
     name: str
@@ -76,23 +77,25 @@ class ImportedEnclave:
 
 def seal(files: dict[str, bytes], authority: Authority) -> bytes:
     """Return the signed list of the files of an answer."""
-    return authority.sign(_listed(files), "the list of the files of the answer")
+    return authority.sign(_listed(files), "the file list of the answer")
 
 
 def _listed(files: dict[str, bytes]) -> bytes:
+    """Return the list of files that is signed: one SHA-256 and path per line, sorted."""
     digests = (f"{hashlib.sha256(data).hexdigest()}  {path}" for path, data in files.items())
     return "\n".join(["sros answer 1", *sorted(digests), ""]).encode()
 
 
-def _lines(document: bytes) -> bytes:
+def _with_lf(document: bytes) -> bytes:
     return document.replace(b"\r\n", b"\n")
 
 
 def _read_answer(data: bytes) -> RequestAnswer:
-    """Return the answer in an archive that ``sign_request`` made; nothing is written.
+    """Read an answer from its archive (``.tar.gz``), without verifying it.
 
     Raises:
-        DocumentError: the archive holds anything else than the files of one enclave.
+        DocumentError: the archive is damaged, lacks a file, or holds files of anything but one
+            enclave.
     """
     try:
         files = unpack(data)
@@ -104,11 +107,11 @@ def _read_answer(data: bytes) -> RequestAnswer:
         folder = enclave_folder(name)
         welcome = {f"{folder}/{file}" for file in (*_REQUIRED, *OPTIONAL_FILES)}
         if strange := sorted(files.keys() - welcome):
-            raise DocumentError(f"it holds {strange[0]!r}, which no answer has")
+            raise DocumentError(f"it holds {strange[0]!r}, which does not belong to an answer")
         if missing := [file for file in _REQUIRED if f"{folder}/{file}" not in files]:
-            raise DocumentError(f"{', '.join(missing)} is missing in it")
+            raise DocumentError(f"it lacks {', '.join(missing)}")
         if not signed:
-            raise DocumentError(f"{SEAL} is missing in it")
+            raise DocumentError(f"it lacks {SEAL}")
     except SrosError as error:
         raise DocumentError(
             f"the answer cannot be used: {error.what}", error.why, _AGAIN
@@ -117,11 +120,14 @@ def _read_answer(data: bytes) -> RequestAnswer:
 
 
 def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> OpenedEnclave:
-    """Check that DDS would load an answer together with the private half of ``key``.
+    """Return the enclave of an answer, after checking that DDS would load it with its key.
+
+    ``key`` is the public key of the enclave.
 
     Raises:
-        PkiError: it lists everything that is wrong: a certificate for another key or enclave, an
-            invalid chain or signature, an expired or revoked part, a file changed on the way.
+        PkiError: the answer has problems; the error lists all of them, such as a certificate for
+            another key or enclave, an invalid chain or signature, an expired or revoked
+            certificate, or a file changed in transit.
     """
     with tempfile.TemporaryDirectory(prefix="sros-") as folder:
         for path, data in answer.files.items():
@@ -130,26 +136,26 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
     problems = [str(each) for each in state.problems if each.file != _KEY]
     certificate = state.certificate
     if certificate and certificate.public_key() != key:
-        problems.insert(0, "cert.pem: it is for another key than the one that is here")
+        problems.insert(0, "cert.pem: it does not belong to the enclave's key.pem")
     if state.permissions_ca and (problem := _broken_seal(answer, [state.permissions_ca])):
         problems.append(f"{SEAL}: {problem}")
     if certificate and common_name_of(certificate.subject) != answer.name:
         problems.insert(0, f"cert.pem: it is for {subject_text(certificate.subject)}")
     if problems:
         raise PkiError(
-            f"the answer for enclave {answer.name} does not hold", "; ".join(problems) + ".", _AGAIN
+            f"the answer for enclave {answer.name} is not valid", "; ".join(problems) + ".", _AGAIN
         )
     return state
 
 
 def _broken_seal(answer: RequestAnswer, authorities: Iterable[x509.Certificate]) -> str:
-    """Return why no CA's signature of the list of files verifies, or "" if one does."""
+    """Return why none of the CAs has signed the list of files, or "" if one has."""
     try:
         signed = smime.parse(answer.seal)
     except SrosError as error:
         return str(error)
-    if _lines(signed.document) != _listed(answer.files):
-        return "the files are not those that were sent"
+    if _with_lf(signed.document) != _listed(answer.files):
+        return "the files differ from the signed list"
     problem = ""
     for authority in authorities:
         try:
@@ -169,23 +175,31 @@ def import_answer(
     force: bool = False,
     dry_run: bool = False,
 ) -> ImportedEnclave:
-    """Install an answer next to its key in ``folder``, or change nothing.
+    """Install an answer next to the enclave's key in ``folder``, or change nothing.
 
-    An answer that is older than the present files, or that comes from other CAs, needs ``force``.
-    If CAs are ``pinned``, by their SHA-256, one of them must have signed it, also with ``force``.
+    Args:
+        data: the answer (``.tar.gz``).
+        pinned: SHA-256 of permissions CAs; if any, one of them must have signed the answer, also
+            with ``force``.
+        force: accept an answer that is older than the present files, or comes from other CAs.
+
+    Raises:
+        DocumentError: ``data`` is not an answer.
+        PkiError: the answer is not valid, see `check_answer`.
+        KeystoreError: the key is missing, or the answer is refused without ``force``.
     """
     answer = _read_answer(data)
     name = answer.name
     place = folder / enclave_folder(name)
     if not dry_run and folder.is_dir():
         tidy(folder)
-    refuse_home(folder, "Name the folder in which the request was made.")
+    refuse_ca_keystore(folder, "Name the folder in which the request was made.")
     if not (place / _KEY).is_file():
         raise KeystoreError(
             f"'{folder}' has no key of enclave {name}",
-            "An answer is for the key of its request, which stays where the request was made.",
-            f"Make key and request with `sros create_request {name} {folder}`, and have that "
-            "signed.",
+            "An answer is installed next to the key, in the folder where the request was made.",
+            f"Name that folder, or make a new key and request with `sros create_request {name} "
+            f"{folder}`, and have the request signed.",
         )
     with Transaction(folder, dry_run=dry_run) as transaction:
         key = load_key(read_bytes(place / _KEY, "private key"), f"'{place / _KEY}'")
@@ -224,45 +238,47 @@ def _check_pinned(
     permissions_ca: x509.Certificate,
     pinned: frozenset[str],
 ) -> None:
-    """Check that one of the pinned CAs has signed the seal, and so the whole answer.
+    """Refuse an answer unless a pinned CA is the permissions CA that signed it.
 
-    The identity CA vouches for the certificate only: an attacker could add other permissions and
-    another governance to it.
+    A pinned identity CA is not enough, because it vouches for the certificate only: an attacker
+    could add other permissions and another governance.
     """
     if not pinned or digest(permissions_ca) in pinned:
         return
-    why = f"It comes from {subject_text(permissions_ca.subject)}, SHA-256 {digest(permissions_ca)}."
+    why = (
+        f"It is signed by {subject_text(permissions_ca.subject)}, SHA-256 {digest(permissions_ca)}."
+    )
     remedy = "Ask for the SHA-256 that `sros sign_request` printed. Nothing was changed."
     if digest(identity_ca) in pinned:
-        why = "The named CA is its identity CA, which vouches for the certificate only."
-        remedy = "Name the permissions CA: it signs the whole answer. Nothing was changed."
+        why = "The pinned CA is its identity CA, which vouches for the certificate only."
+        remedy = "Pin the permissions CA, which signs the whole answer. Nothing was changed."
     raise KeystoreError(
-        f"the answer for enclave {answer.name} is not signed by the CA that is named", why, remedy
+        f"the answer for enclave {answer.name} is not signed by the pinned CA", why, remedy
     )
 
 
 def _check_known(folder: Path, answer: RequestAnswer, known: list[x509.Certificate]) -> None:
-    """Refuse an answer that the CAs of the first answer did not sign."""
+    """Refuse an answer that no permissions CA trusted by ``folder`` signed."""
     if known and (problem := _broken_seal(answer, known)):
         raise KeystoreError(
             f"the answer for enclave {answer.name} comes from another keystore",
             f"The permissions CA that '{folder}' trusts has not signed it: {problem.rstrip('.')}.",
-            "Add --force if this robot moves to that keystore.",
+            "Add --force to move this robot to that keystore.",
         )
     check_same_authority(folder, answer.files)
 
 
 def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certificate) -> None:
-    """Refuse an answer that is older than the present state: an attacker may replay it."""
-    remedy = "Have a new answer made, or add --force if going back is meant."
+    """Refuse an answer that is older than the installed files: it may be replayed."""
+    remedy = "Have the request signed again, or add --force to go back to the older answer."
     path = place / "cert.pem"
     if path.exists():
         old = validity_of(read_certificate(path))
         new = validity_of(certificate)
         if new.not_before < old.not_before:
             raise KeystoreError(
-                f"the answer for enclave {answer.name} is older than what is there",
-                f"Its certificate begins at {iso(new.not_before)}, the present one at "
+                f"the answer for enclave {answer.name} is older than the installed one",
+                f"Its certificate is valid from {iso(new.not_before)}, the installed one from "
                 f"{iso(old.not_before)}.",
                 remedy,
             )
@@ -273,7 +289,7 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
         if sent is None or load_crl(sent, "of the answer").number < present:
             raise KeystoreError(
                 f"the answer for enclave {answer.name} has an older revocation list",
-                f"'{path}' has the number {present}; enclaves that were revoked would be trusted "
-                "again.",
+                f"The list '{path}' has the number {present}; with an older list, revoked enclaves "
+                "would be trusted again.",
                 remedy,
             )

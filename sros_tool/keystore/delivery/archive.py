@@ -1,4 +1,4 @@
-"""Archives that are sent to robots: packed reproducibly, unpacked without trusting them."""
+"""Archives (``.tar.gz``) for robots: written reproducibly, read as untrusted input."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SUFFIXES = (".tar.gz", ".tgz")
 MAX_PACKED = 4 * 1024 * 1024
 MAX_UNPACKED = 8 * 1024 * 1024
 MAX_MEMBER = 1024 * 1024
-"""Largest size in bytes of an archive: packed, unpacked, and of each file in it."""
+"""Largest size in bytes: of a packed archive, of its unpacked content, and of a file in it."""
 _MOST_MEMBERS = 200
 _GZIP = 16 + zlib.MAX_WBITS
 
@@ -54,20 +54,19 @@ def pack(files: Mapping[str, bytes]) -> bytes:
 
 
 def unpack(data: bytes) -> dict[str, bytes]:
-    """Return the files of an archive by their paths, in memory; nothing is written.
+    """Map the paths in a ``.tar.gz`` archive to the content of the files; write nothing to disk.
 
-    The caller checks the names.
+    The paths are not checked: that is left to the caller.
 
     Raises:
-        DocumentError: it holds anything else than plain files and folders (such as links,
-            devices, sparse files, a repeated name, bytes after the end), or too many or too large
-            files.
+        DocumentError: the archive is damaged, or too large, has too many entries, a repeated name,
+            data after its end, or anything other than regular files and folders.
     """
     try:
         with tarfile.open(fileobj=io.BytesIO(_unzip(data)), mode="r:") as tar:
             return dict(_members(tar))
     except (tarfile.TarError, zlib.error, EOFError, OSError, ValueError, OverflowError) as error:
-        raise DocumentError("it is no .tar.gz, or it is damaged") from error
+        raise DocumentError("it is not a .tar.gz archive, or it is damaged") from error
 
 
 def _unzip(data: bytes) -> bytes:
@@ -90,7 +89,9 @@ def _members(tar: tarfile.TarFile) -> Iterator[tuple[str, bytes]]:
         name = entry.name
         if name in seen or len(seen) >= _MOST_MEMBERS:
             raise DocumentError(
-                f"it holds {name!r} twice" if name in seen else "it holds too many files"
+                f"it holds {name!r} twice"
+                if name in seen
+                else f"it holds more than {_MOST_MEMBERS} entries"
             )
         seen.add(name)
         if entry.isdir():
@@ -98,7 +99,9 @@ def _members(tar: tarfile.TarFile) -> Iterator[tuple[str, bytes]]:
         if entry.type not in (tarfile.REGTYPE, tarfile.AREGTYPE) or entry.issparse():
             raise DocumentError(f"it holds {name!r}, which is not a regular file")
         if entry.size > MAX_MEMBER:
-            raise DocumentError(f"it holds {name!r}, which has {entry.size} bytes")
+            raise DocumentError(
+                f"it holds {name!r} with {entry.size} bytes; the limit is {MAX_MEMBER} bytes"
+            )
         content = tar.extractfile(entry)
         read = content.read() if content else b""
         if len(read) != entry.size:
@@ -110,7 +113,7 @@ def _members(tar: tarfile.TarFile) -> Iterator[tuple[str, bytes]]:
 def staged_file(target: Path, data: bytes) -> Iterator[Callable[[], None]]:
     """Write a temporary file next to ``target``; yield a function that moves it there atomically.
 
-    Only its owner can read it, and it is flushed to the disk before the move.
+    Only the owner can read the file, and it is flushed to disk before the move.
     """
     spare = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}")
     handle = os.open(spare, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)

@@ -1,4 +1,4 @@
-"""Exporting enclaves for a robot: a keystore of plain files, without links and without CA keys."""
+"""Exports for robots: keystores of regular files, without links and without CA keys."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ from sros_tool.xml import read_bytes
 
 _ARCHIVE_SUFFIXES = SUFFIXES
 _ANSWER_AGAIN = (
-    "Send the robot a new answer, by `sros sign_request --renew` of the request.pem that lies in "
-    "the enclave's folder."
+    "Sign the request.pem in the enclave's folder with `sros sign_request --renew`, and send the "
+    "answer to the robot."
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """The exported enclaves, and the target of the export."""
+    """The result of an export: the enclaves and the changes below ``target``."""
 
     target: Path
     enclaves: tuple[str, ...]
@@ -46,7 +46,10 @@ class Export:
 
 @dataclass(frozen=True, slots=True)
 class ExportSelection:
-    """The enclaves to export, and the matching ones left out: their key is on their robot."""
+    """The names of the enclaves to export.
+
+    ``left_out`` enclaves match a pattern too, but their keys are on their robots.
+    """
 
     names: tuple[str, ...]
     left_out: tuple[str, ...]
@@ -55,10 +58,14 @@ class ExportSelection:
 def select(
     root: Path, names: Sequence[str], patterns: Sequence[str] = (), *, every: bool = False
 ) -> ExportSelection:
-    """Return the named enclaves and the keystore's enclaves that match a pattern, or ``every`` one.
+    """Return the enclaves to export: ``names``, and those that match a pattern, or ``every`` one.
 
     In a pattern ``*`` stands for any part of a name, "/" included, as in policies.  An enclave
-    whose key is on its robot is left out if a pattern found it, and refused later if it was named.
+    whose key is on its robot is left out if it only matches a pattern; a named one is refused by
+    `distribute`.
+
+    Raises:
+        KeystoreError: a pattern matches no enclave, or no enclave is left.
     """
     existing = list_enclaves(root)
     chosen = list(dict.fromkeys(names))
@@ -67,7 +74,7 @@ def select(
         fitting = [name for name in existing if fnmatchcase(name, pattern)]
         if not fitting:
             raise KeystoreError(
-                f"no enclave of keystore '{root}' fits {pattern!r}",
+                f"no enclave of keystore '{root}' matches {pattern!r}",
                 "",
                 f"See `sros list_enclaves {root}`.",
             )
@@ -95,8 +102,12 @@ def distribute(
 ) -> Export:
     """Export enclaves to ``target``: an archive if it is named ``.tar.gz``, else a folder.
 
-    The same enclaves give the same bytes.  An enclave that cannot run is refused.  In the folder
-    of an earlier export, other enclaves stay, and only ``force`` replaces a file that differs.
+    The same enclaves give the same bytes.  In the folder of an earlier export, other enclaves
+    stay.
+
+    Raises:
+        KeystoreError: an enclave does not exist or cannot run, ``target`` cannot be used, or holds
+            other content that only ``force`` replaces.
     """
     files = _collect(root, names, now)
     if target.name.endswith(_ARCHIVE_SUFFIXES):
@@ -108,20 +119,24 @@ def distribute(
 
 @dataclass(frozen=True, slots=True)
 class PackedEnclaves:
-    """An archive, and the paths of the files in it."""
+    """An archive (``.tar.gz``), and the paths of the files in it."""
 
     data: bytes
     paths: tuple[str, ...]
 
 
 def pack_enclaves(root: Path, names: Sequence[str], *, now: datetime) -> PackedEnclaves:
-    """Return enclaves as the bytes of an archive, for a pipe."""
+    """Return enclaves as an archive in memory.
+
+    Raises:
+        KeystoreError: an enclave does not exist, or cannot run.
+    """
     files = _collect(root, names, now)
     return PackedEnclaves(pack(files), tuple(files))
 
 
 def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]:
-    """Map paths to the exported files; raise for an enclave that cannot run."""
+    """Map the paths of the exported files to their content; refuse an enclave that cannot run."""
     existing = set(list_enclaves(root))
     files: dict[str, bytes] = {}
     for name in names:
@@ -131,14 +146,14 @@ def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes
         if key_on_robot(enclave_path(root, name)):
             raise KeystoreError(
                 f"the key of enclave {name} is not in keystore '{root}'",
-                "It was made on its robot and stays there, so there is nothing that could run.",
+                "It was made on its robot and stays there, so an export could not run.",
                 _ANSWER_AGAIN,
             )
         folder = enclave_path(root, name)
         state = open_enclave(folder, now=now)
         if state.problems:
             raise KeystoreError(
-                f"enclave {name} would not run where it is sent",
+                f"enclave {name} would not run on a robot",
                 "; ".join(map(str, state.problems)) + ".",
                 f"See `sros inspect {folder}`.",
             )
@@ -149,7 +164,7 @@ def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes
 
 
 def _real(path: Path) -> Path:
-    # Unlike Path.resolve, realpath does not fail at a circle of links.
+    # Unlike Path.resolve, realpath does not fail at a loop of links.
     return Path(os.path.realpath(path))
 
 
@@ -161,11 +176,13 @@ def _write_folder(
             f"'{target}' is the keystore itself or lies in it", "", "Choose another folder."
         )
     if os.path.lexists(target) and not target.is_dir():
-        raise KeystoreError(f"'{target}' is in the way", "It is not a folder.")
+        raise KeystoreError(
+            f"'{target}' is in the way", "It is not a folder.", "Choose another folder."
+        )
     if (target / PRIVATE).exists():
         raise KeystoreError(
             f"'{target}' holds CA keys",
-            "It is a keystore of its own, not an export.",
+            "It is a keystore with CAs, not an export.",
             "Choose another folder.",
         )
     check_same_authority(target, files)
@@ -177,9 +194,9 @@ def _write_folder(
     replaced = [path for path in different if os.path.lexists(target / path)]
     if replaced and not force:
         raise KeystoreError(
-            f"'{target}' already holds another version of {', '.join(replaced)}",
+            f"'{target}' already holds different versions of {', '.join(replaced)}",
             "Nothing was changed.",
-            "Add --force to replace it, or choose another folder.",
+            "Add --force to replace these files, or choose another folder.",
         )
     with Transaction(target, fresh=True, dry_run=dry_run) as transaction:
         for path, data in different.items():
@@ -194,7 +211,9 @@ def _write_archive(
     data = pack(files)
     if target.exists():
         if not target.is_file():
-            raise KeystoreError(f"'{target}' is in the way", "It is not a regular file.")
+            raise KeystoreError(
+                f"'{target}' is in the way", "It is not a regular file.", "Choose another name."
+            )
         if target.read_bytes() == data:
             return ()
         if not force:

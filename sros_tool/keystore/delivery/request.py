@@ -1,4 +1,4 @@
-"""The signing request of an enclave: made on its robot, with a key that stays there."""
+"""Signing requests: made on the robot, for a key that stays there."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.delivery.trust import refuse_home
+from sros_tool.keystore.delivery.trust import refuse_ca_keystore
 from sros_tool.keystore.layout import REQUEST, enclave_folder
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
@@ -19,7 +19,7 @@ from sros_tool.xml import read_bytes
 
 @dataclass(frozen=True, slots=True)
 class Requested:
-    """A new signing request: its file, the SHA-256 of its public key, and the changes."""
+    """A new signing request for the enclave ``name``; ``key`` is the SHA-256 of its public key."""
 
     name: str
     file: Path
@@ -30,24 +30,27 @@ class Requested:
 def create_request(
     folder: Path, name: str, *, again: bool = False, dry_run: bool = False
 ) -> Requested:
-    """Make a key, which stays in ``folder``, and a request to certify it.
+    """Create an enclave's private key in ``folder``, and a signing request for it.
 
-    ``folder`` becomes a keystore without CAs, in which the enclave waits for the answer.  With
-    ``again`` the request is made for the existing key; no key is ever replaced.
+    ``folder`` becomes a keystore without CAs.  With ``again`` the request is made for the existing
+    key; a key is never replaced.
+
+    Raises:
+        KeystoreError: the enclave has a key already (without ``again``), or a certificate without
+            a key, or ``folder`` is a keystore with CAs.
     """
     check_enclave_name(name)
     if not dry_run and folder.is_dir():
         tidy(folder)
-    refuse_home(folder, f"Make the enclave with `sros create_enclave {folder} {name}`.")
+    refuse_ca_keystore(folder, f"Make the enclave with `sros create_enclave {folder} {name}`.")
     place = enclave_folder(name)
     with Transaction(folder, fresh=True, dry_run=dry_run) as transaction:
         path = folder / place / "key.pem"
         if path.exists() and not again:
             raise KeystoreError(
                 f"enclave {name} has a key in '{folder}' already",
-                "A key is never replaced, for its certificate would be useless without it.",
-                "Add --again to have the request made again for this key, or choose another "
-                "folder.",
+                "A key is never replaced, because its certificate would become useless.",
+                "Add --again to make the request again for this key, or choose another folder.",
             )
         if again:
             key = load_key(read_bytes(path, "private key"), f"'{path}'")
@@ -61,9 +64,8 @@ def create_request(
             key = generate_key()
             transaction.write(f"{place}/key.pem", key_pem(key), private=True)
         request = make_request(key, name)
-        load_request(
-            request, "as it was made"
-        )  # reports a key of a wrong kind here, not at the keystore
+        # Report an unsupported kind of key here, not later at the keystore.
+        load_request(request, f"of enclave {name}")
         transaction.write(f"{place}/{REQUEST}", request)
         transaction.commit()
     digest = key_digest(key.public_key())

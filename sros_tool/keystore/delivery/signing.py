@@ -1,4 +1,4 @@
-"""Answering the signing request of a robot: everything its enclave needs except its key."""
+"""Answers to signing requests: all files that an enclave on a robot needs, except its key."""
 
 from __future__ import annotations
 
@@ -64,10 +64,10 @@ from sros_tool.xml import read_bytes
 
 @dataclass(frozen=True, slots=True)
 class Signed:
-    """A request that was answered.
+    """A signed request.
 
-    ``key`` is the SHA-256 of its public key, ``identity_ca`` the certificate of the CA that the
-    robot will trust, ``archive`` the answer for the robot, as ``.tar.gz``.
+    ``key`` is the SHA-256 of the enclave's public key, ``identity_ca`` the certificate of the CA
+    that the robot will trust, ``archive`` the answer for the robot (``.tar.gz``).
     """
 
     name: str
@@ -94,11 +94,20 @@ def sign_request(
 ) -> Signed:
     """Certify the key of a request, sign the permissions, and make the answer for the robot.
 
-    ``data`` is the request as PEM.
+    The keystore gets all files of the enclave except the key.  The rights come from ``policy``.
+    Without a policy they come from the present permissions if ``renew`` is set, otherwise from the
+    keystore's template.
 
-    The keystore gets all files of the enclave except the key.  The rights come from ``policy``;
-    without it, with ``renew``, from the present permissions; otherwise from the keystore's
-    template.  ``answer`` is the file for the answer; it appears after the keystore has changed.
+    Args:
+        data: the request (PEM).
+        answer: the path for the answer, which is put in place after the keystore has changed.
+        force: replace ``answer`` if it exists.
+        domain: refuse a keystore that is not made for this domain.
+
+    Raises:
+        PkiError: the request is not valid.
+        KeystoreError: the enclave exists (without ``renew``) or does not (with it), its key was
+            revoked, ``answer`` exists, or the keystore cannot issue.
     """
     request = load_request(data, "that was given")
     name = check_enclave_name(request.name)
@@ -161,7 +170,11 @@ def sign_request(
 
 def _check_free(answer: Path, force: bool) -> None:
     if answer.exists() and not answer.is_file():
-        raise KeystoreError(f"'{answer}' is in the way", "It is not a regular file.")
+        raise KeystoreError(
+            f"'{answer}' is in the way",
+            "It is not a regular file.",
+            "Choose another name with -o.",
+        )
     if answer.exists() and not force:
         raise KeystoreError(
             f"'{answer}' already exists",
@@ -175,18 +188,18 @@ def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
         raise KeystoreError(
             f"enclave {name} exists already in keystore '{root}'",
             "Whoever sent the request would get its rights.",
-            "If that is meant, add --renew; otherwise have the request made for another name.",
+            "If that is intended, add --renew; otherwise have the request made for another name.",
         )
     if renew and not exists:
         raise KeystoreError(
             f"enclave {name} does not exist in keystore '{root}'",
-            "There is nothing to renew.",
+            "Only an existing enclave can be renewed.",
             "Leave --renew out.",
         )
 
 
 def _check_key(root: Path, request: SigningRequest) -> None:
-    """Refuse a revoked key, and a request for an enclave whose key is in the keystore."""
+    """Refuse a revoked key, and a key other than the one that the keystore has for the enclave."""
     for path in sorted((root / REVOKED).glob(f"*/{CERTIFICATE_FILE}")):
         certificate = read_certificate(path)
         if certificate.public_key() == request.public_key:
@@ -202,7 +215,7 @@ def _check_key(root: Path, request: SigningRequest) -> None:
         if key.public_key() != request.public_key:
             raise KeystoreError(
                 f"enclave {request.name} has another key in keystore '{root}'",
-                "Its key.pem would be useless with the certificate of the request.",
+                "Its key.pem would not fit the certificate for the key of the request.",
                 f"Revoke the enclave first, with `sros revoke {root} {request.name}`.",
             )
 
@@ -213,14 +226,14 @@ def _check_result(answer: RequestAnswer, request: SigningRequest, now: datetime)
         check_answer(answer, request.public_key, now=now)
     except SrosError as error:
         raise KeystoreError(
-            f"the answer for {answer.name} would be of no use on the robot: {error.what}",
+            f"the robot would reject the answer for {answer.name}: {error.what}",
             error.why,
-            "Nothing was changed; `sros inspect` says more about the keystore.",
+            "Nothing was changed. See `sros inspect` of the keystore.",
         ) from error
 
 
 def _new_key_note(root: Path, request: SigningRequest) -> list[Note]:
-    """Note when an enclave that is renewed has a new key."""
+    """Return a note if the request's key is not the key of the present certificate."""
     old = _present_certificate(root, request.name)
     if old.public_key() == request.public_key:
         return []
@@ -228,14 +241,14 @@ def _new_key_note(root: Path, request: SigningRequest) -> list[Note]:
     return [
         Note(
             "request.new-key",
-            f"{request.name}: the request has a new key. The certificate of the earlier one "
-            f"stays valid until {until}, for whoever has that key.",
+            f"{request.name}: the request has a new key. The certificate of the old key "
+            f"stays valid until {until} for anyone who has that key.",
         )
     ]
 
 
 def _earlier_rights(root: Path, name: str, authority: x509.Certificate) -> EarlierRights:
-    """Return the rights in the permissions that the permissions CA signed for an enclave."""
+    """Return the rights in an enclave's present permissions, after verifying their signature."""
     subject = text_of(_present_certificate(root, name).subject)
     old = read_granted(enclave_path(root, name) / PERMISSIONS_FILE, subject)
     old.signed.verify(authority)

@@ -1,4 +1,4 @@
-"""Checks that all enclaves in a robot's folder trust a common identity CA."""
+"""Checks of the CAs that a robot's folder of enclaves trusts."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from sros_tool.xml import read_bytes
 
 
 def read_pin(text: str) -> frozenset[str]:
-    """Return the SHA-256 of the pinned CAs, from a fingerprint or a certificate file.
+    """Return the SHA-256 of the pinned CAs, in lower-case hexadecimal.
 
-    Colons and capitals in a fingerprint do not matter, so that the output of
-    ``openssl x509 -fingerprint -sha256`` can be copied.
+    ``text`` is a fingerprint or the path of a certificate file.  A fingerprint may be written as by
+    ``openssl x509 -fingerprint -sha256``, with colons and capitals.
 
     Raises:
         UsageError: ``text`` is neither a fingerprint nor a certificate file.
@@ -30,14 +30,14 @@ def read_pin(text: str) -> frozenset[str]:
     if path.is_file():
         return fingerprints(read_bytes(path, "certificate"))
     raise UsageError(
-        f"{text!r} is neither the file of a certificate nor its SHA-256",
+        f"{text!r} is neither a certificate file nor a SHA-256 fingerprint",
         "A fingerprint has 64 hexadecimal digits.",
-        "Copy the one that `sros sign_request` prints, or name a file.",
+        "Copy the fingerprint that `sros sign_request` prints, or name the CA's certificate file.",
     )
 
 
 def trusted_in(folder: Path, file: str) -> list[x509.Certificate]:
-    """Map the names of CA files to the CAs that the enclaves of a robot's folder trust by them."""
+    """Return the distinct CA certificates in the CA file ``file`` of all enclaves of a folder."""
     found: dict[str, x509.Certificate] = {}
     for path in sorted((folder / ENCLAVES).rglob(file)):
         if path.exists():
@@ -46,11 +46,11 @@ def trusted_in(folder: Path, file: str) -> list[x509.Certificate]:
 
 
 def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
-    """Refuse to mix enclaves of two keystores in one folder: they would never talk.
+    """Refuse to mix enclaves of two keystores in one folder: they could not communicate.
 
     Args:
         target: the folder of a robot.
-        files: the new files below ``target``, by relative paths.
+        files: the content of the new files, by their paths relative to ``target``.
 
     Raises:
         KeystoreError: ``target`` holds an enclave that trusts none of the identity CAs in
@@ -67,17 +67,18 @@ def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
         if ours.isdisjoint(map(digest, theirs)):
             raise KeystoreError(
                 f"'{target}' holds enclaves of another keystore",
-                f"Those trust {subject_text(theirs[0].subject)}, and would not talk to these.",
+                f"They trust {subject_text(theirs[0].subject)}, and could not communicate with the "
+                "new enclaves.",
                 "Choose another folder.",
             )
 
 
-def refuse_home(folder: Path, remedy: str) -> None:
-    """Raise `KeystoreError` if ``folder`` is the keystore with the CAs, not a folder of a robot."""
+def refuse_ca_keystore(folder: Path, remedy: str) -> None:
+    """Raise `KeystoreError` if ``folder`` is a keystore with CAs, not a folder of a robot."""
     if (folder / PRIVATE).exists() or (folder / PUBLIC).exists():
         raise KeystoreError(
             f"'{folder}' is a keystore with CAs",
-            "Requests are made, and their answers used, in a folder of the robot.",
+            "Signing requests and their answers belong into a folder on the robot.",
             remedy,
         )
 
