@@ -1,4 +1,4 @@
-"""Describes keystores, enclaves, certificates and signed documents as plain values for JSON."""
+"""Descriptions of keystores, enclaves, certificates and signed documents as JSON values."""
 
 from __future__ import annotations
 
@@ -45,11 +45,11 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
     Args:
         path: a keystore, the folder of an enclave, or a file of one.
         now: the moment for which validity is reported.
-        authority: the permissions CA certificate to verify a signed document against; by default
-            the one that lies with it.
+        authority: the permissions CA certificate that verifies a signed document; by default the
+            one next to it.
 
     Raises:
-        DocumentError: ``path`` is of no such kind.
+        DocumentError: ``path`` is of no such kind, or cannot be read.
     """
     if path.is_dir():
         if is_keystore(path):
@@ -72,6 +72,7 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
 
 
 def _file(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
+    """Describe a file by its content, whatever its name."""
     if b"-----BEGIN CERTIFICATE-----" in data:
         return {"kind": "certificate", **_certificates(data, "in it", now)}
     if CRL_MARK in data:
@@ -127,14 +128,14 @@ def _keystore(root: Path, now: datetime) -> Description:
 
 
 def _enclave(name: str, state: OpenedEnclave) -> Description:
-    """Describe an enclave of a keystore, where a key that stays on its robot is not a problem."""
+    """Describe an enclave of a keystore; a key that stays on its robot is not a problem there."""
     described = _describe_enclave(state)
     described["problems"] = [str(problem) for problem in state.problems_at_home]
     return {"name": name, "key_on_robot": state.key_on_robot, **described}
 
 
 def _describe_enclave(state: OpenedEnclave) -> Description:
-    """Return the state of an enclave: ``loadable`` says whether a process can run in it now."""
+    """Describe an enclave; ``loadable`` says whether a process can run in it now."""
     domains = state.domains()
     return {
         "loadable": not state.problems,
@@ -152,7 +153,7 @@ def _describe_enclave(state: OpenedEnclave) -> Description:
 
 
 def _describe_certificate(certificate: x509.Certificate, now: datetime) -> Description:
-    """Return the parts of a certificate that matter to DDS Security."""
+    """Describe the parts of a certificate that matter to DDS Security."""
     validity = validity_of(certificate)
     try:
         is_ca = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
@@ -174,7 +175,7 @@ def _describe_certificate(certificate: x509.Certificate, now: datetime) -> Descr
 
 
 def _certificates(data: bytes, name: str, now: datetime) -> Description:
-    """Return the first certificate of a file; "further" and "crl" are the rest of the file."""
+    """Describe the first certificate of a PEM file, its "further" certificates, and its "crl"."""
     certificate, *further = load_certificates(data, name)
     described = _describe_certificate(certificate, now)
     if further:  # the chain of a CA, or the other CA during a rotation
@@ -200,7 +201,7 @@ def _signed(path: Path, data: bytes, now: datetime, authority: Path | None) -> D
     signed = smime.parse(data)
     signer = signed.signer()
     found = authority or permissions_ca_for(path)
-    reason = "no permissions CA certificate lies with it; name one with --ca"
+    reason = "no permissions CA certificate is next to it; name one with --ca"
     verified: bool | None = None
     if found:
         certificate = read_certificate(found)
@@ -257,7 +258,7 @@ def _grant(grant: Grant, now: datetime | None) -> Description:
 
 
 def _rights(rights: Iterable[RosRight]) -> Description:
-    """Return ROS names by kind and right, such as ``{"topics": {"publish": ["/chatter"]}}``."""
+    """Map ROS names by kind and right, such as ``{"topics": {"publish": ["/chatter"]}}``."""
     table: Description = {}
     for right in rights:
         table.setdefault(right.kind, {}).setdefault(right.right, []).append(right.name)

@@ -1,4 +1,4 @@
-"""When the enclaves of a keystore expire, and which of them are due for renewal."""
+"""The expiry of a keystore's enclaves, and the threshold for their renewal."""
 
 from __future__ import annotations
 
@@ -25,7 +25,10 @@ from sros_tool.validity import BACKDATE, Window, iso, parse_duration
 
 @dataclass(frozen=True, slots=True)
 class Threshold:
-    """The limit of a due enclave: ``remaining`` time, or ``elapsed`` fraction (0 to 1)."""
+    """The limit from which an enclave is due for renewal.
+
+    Exactly one is set: ``remaining`` time, or ``elapsed`` fraction of the validity (0 to 1).
+    """
 
     remaining: timedelta | None = None
     elapsed: float | None = None
@@ -39,14 +42,14 @@ class Lifetime:
     certificate: Window
     permissions: Window
 
-    def ends(self) -> datetime:
-        """Return the earlier expiry of the two."""
+    def expires(self) -> datetime:
+        """Return the earlier expiry of certificate and permissions."""
         return min(self.certificate.not_after, self.permissions.not_after)
 
     def due(self, threshold: Threshold, now: datetime) -> bool:
-        """Return whether ``threshold`` says that the enclave is due for renewal."""
+        """Return whether the enclave is due for renewal at ``now``."""
         if threshold.remaining is not None:
-            return self.ends() - now <= threshold.remaining
+            return self.expires() - now <= threshold.remaining
         assert threshold.elapsed is not None
         return any(
             _elapsed(each, now) >= threshold.elapsed
@@ -56,9 +59,9 @@ class Lifetime:
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """The certificate of an enclave and the grant that DDS reads, neither verified yet.
+    """The certificate of an enclave and the grant that DDS reads, both not verified yet.
 
-    ``digest`` is the SHA-256 of the signed permissions, in hexadecimal.
+    ``signed`` is the permissions document with the grant, ``digest`` its SHA-256 in hexadecimal.
     """
 
     name: str
@@ -68,7 +71,7 @@ class Credentials:
     grant: Grant
 
     def lifetime(self) -> Lifetime:
-        """Return the validity of both."""
+        """Return the validity of the certificate and of the grant."""
         return Lifetime(self.name, validity_of(self.certificate), self.grant.validity)
 
 
@@ -81,17 +84,21 @@ class UnreadableEnclave:
 
 
 def parse_threshold(text: str) -> Threshold:
-    """Parse a threshold: ``30d`` of remaining time, or ``66%`` of elapsed validity."""
+    """Parse a threshold: ``30d`` of remaining time, or ``66%`` of elapsed validity.
+
+    Raises:
+        UsageError: ``text`` is neither a duration nor a percentage up to 100.
+    """
     match = re.fullmatch(r"(\d{1,3})%", text.strip(), re.ASCII)
     if not match:
         return Threshold(remaining=parse_duration(text))
     if int(match[1]) > 100:
-        raise UsageError(f"{text!r} is more than all of a lifetime")
+        raise UsageError(f"{text!r} is more than 100% of a validity")
     return Threshold(elapsed=int(match[1]) / 100)
 
 
 def _lifetimes(root: Path) -> tuple[Lifetime, ...]:
-    """Return the lifetime of each enclave of a keystore, in the order of names.
+    """Return the lifetimes of a keystore's enclaves, sorted by name.
 
     Raises:
         KeystoreError: some enclaves cannot be read; it names all of them.
@@ -113,7 +120,7 @@ def survey(root: Path) -> tuple[tuple[Lifetime, ...], tuple[UnreadableEnclave, .
 
 
 def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> None:
-    """Raise one `KeystoreError` that names all these enclaves, if there are any."""
+    """Raise an error that names all ``unreadable`` enclaves, if there are any."""
     if len(unreadable) == 1:
         raise unreadable[0].error
     if unreadable:
@@ -122,7 +129,7 @@ def refuse_unreadable(unreadable: tuple[UnreadableEnclave, ...], verb: str) -> N
         raise KeystoreError(
             f"{len(unreadable)} enclaves cannot be {verb}: {names}",
             f"{reasons} Nothing was changed.",
-            "Repair or revoke them, or name the enclaves that you want.",
+            "Repair or revoke them, or name the other enclaves in the command.",
         )
 
 
@@ -130,7 +137,7 @@ def read_credentials(root: Path, name: str) -> Credentials:
     """Return the certificate and the grant of an enclave, without verifying them.
 
     Raises:
-        KeystoreError: one of them cannot be read, or they do not belong together.
+        KeystoreError: a file is missing or cannot be read, or no grant is for the certificate.
     """
     folder = enclave_path(root, name)
     try:
@@ -153,18 +160,18 @@ def read_credentials(root: Path, name: str) -> Credentials:
 
 
 def describe_lifetime(lifetime: Lifetime, now: datetime) -> str:
-    """Return a line that says which part expires first, and when."""
+    """Return a line that says whether certificate or permissions expire first, and when."""
     first = (
         "certificate"
         if lifetime.certificate.not_after <= lifetime.permissions.not_after
         else "permissions"
     )
-    word = "expired" if lifetime.ends() < now else "until"
-    return f"{lifetime.name}  {first} {word} {iso(lifetime.ends())}"
+    word = "expired" if lifetime.expires() < now else "until"
+    return f"{lifetime.name}  {first} {word} {iso(lifetime.expires())}"
 
 
 def _elapsed(validity: Window, now: datetime) -> float:
-    """Return the elapsed fraction of a validity, from 0 to 1, without its back-dating."""
+    """Return the elapsed fraction of a validity, without back-dating; above 1 once it expired."""
     begin = validity.not_before
     if validity.not_after - begin > BACKDATE:
         begin += BACKDATE

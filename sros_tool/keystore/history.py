@@ -1,4 +1,4 @@
-"""The history of a keystore: everything that it issued, and its present state."""
+"""The history of a keystore: all certificates and documents that it issued, and their state."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ class HistoryStatus(StrEnum):
     """The state of an issued certificate or document."""
 
     CURRENT = "current"
-    """It is in the keystore, and in date."""
+    """It is in the keystore, and has not expired."""
     SUPERSEDED = "superseded"
-    """It is no longer in the keystore, but DDS would still accept it: it is not revoked."""
+    """It was replaced in the keystore, but is neither revoked nor expired: DDS still accepts it."""
     REVOKED = "revoked"
     RETIRED = "retired"
     """A CA that was replaced, and is no longer trusted."""
@@ -57,7 +57,7 @@ class HistoryItem:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """All entries, oldest first, and the paths of files without an entry."""
+    """All entries of the ledger, oldest first, and the paths of files without an entry."""
 
     items: tuple[HistoryItem, ...]
     unexplained: tuple[str, ...]
@@ -65,10 +65,11 @@ class History:
 
 def history(root: Path, *, now: datetime) -> History:
     """Return the ledger of a keystore, compared with its certificates and signed documents."""
-    issued, put_away = _files(root, _served(root)), _files(root, _put_away(root))
-    retired = _files(root, _retired(root))
+    issued, revoked_files = _files(root, _active_paths(root)), _files(root, _revoked_paths(root))
+    retired = _files(root, _retired_paths(root))
     entries = read_ledger(root)
-    # The list of a new CA begins empty, and what expired is on none: the ledger still knows it.
+    # A new CA starts with an empty revocation list, and lists drop expired certificates, so the
+    # ledger is asked too.
     revoked = {each.serial for each in entries if each.what == "revocation"}
     revoked |= {f"{each.serial:x}" for crl in read_lists(root) for each in crl.revoked}
     moment = iso(now)
@@ -76,7 +77,7 @@ def history(root: Path, *, now: datetime) -> History:
     def status(entry: Entry) -> HistoryStatus:
         if entry.what == "answer":
             return HistoryStatus.SENT
-        if entry.what == "revocation" or entry.serial in revoked or entry.sha256 in put_away:
+        if entry.what == "revocation" or entry.serial in revoked or entry.sha256 in revoked_files:
             return HistoryStatus.REVOKED
         if entry.sha256 in retired and entry.sha256 not in issued:
             return HistoryStatus.RETIRED
@@ -85,7 +86,7 @@ def history(root: Path, *, now: datetime) -> History:
         return HistoryStatus.CURRENT if entry.sha256 in issued else HistoryStatus.SUPERSEDED
 
     known = {entry.sha256 for entry in entries}
-    found = {**retired, **put_away, **issued}
+    found = {**retired, **revoked_files, **issued}
     return History(
         tuple(
             HistoryItem(entry, status(entry), (found.get(entry.sha256) or [""])[0])
@@ -97,25 +98,25 @@ def history(root: Path, *, now: datetime) -> History:
     )
 
 
-def _served(root: Path) -> Iterator[str]:
-    """Yield the path of every certificate and signed document that DDS may load."""
+def _active_paths(root: Path) -> Iterator[str]:
+    """Yield the paths where DDS loads certificates and signed documents, missing files included."""
     yield from (f"{PUBLIC}/{path.name}" for path in sorted((root / PUBLIC).glob("*.cert.pem")))
     yield from (GOVERNANCE_P7S, CRL)
     for name in list_enclaves(root):
         yield from (f"{enclave_folder(name)}/{file}" for file in _ISSUED)
 
 
-def _put_away(root: Path) -> Iterator[str]:
+def _revoked_paths(root: Path) -> Iterator[str]:
     for folder in sorted((root / REVOKED).glob("*")):
         yield from (f"{REVOKED}/{folder.name}/{file}" for file in _ISSUED)
 
 
-def _retired(root: Path) -> Iterator[str]:
+def _retired_paths(root: Path) -> Iterator[str]:
     yield from (f"{RETIRED}/{path.name}" for path in sorted((root / RETIRED).glob("*.cert.pem")))
 
 
 def _files(root: Path, paths: Iterator[str]) -> dict[str, list[str]]:
-    """Map ledger digests to existing files."""
+    """Map SHA-256 digests, as in the ledger, to the paths of existing files."""
     found: dict[str, list[str]] = {}
     for path in paths:
         if (root / path).is_file() and not (root / path).is_symlink():
@@ -125,7 +126,7 @@ def _files(root: Path, paths: Iterator[str]) -> dict[str, list[str]]:
 
 
 def _digests(path: Path) -> list[str]:
-    """Return all digests of a file; a CA file holds several certificates during a rotation."""
+    """Return the digests of a file's content; a CA file may hold several certificates."""
     data = read_bytes(path, "file")
     if not path.name.endswith("cert.pem"):
         return [hashlib.sha256(data).hexdigest()]

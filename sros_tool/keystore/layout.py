@@ -13,15 +13,15 @@ from sros_tool.errors import DocumentError, KeystoreError
 
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 SETTINGS = "sros.toml"
-"""The choices by which the keystore was made; keystores of ros2/sros2 have none."""
+"""The settings of the keystore; keystores of ros2/sros2 have no such file."""
 LEDGER = "ledger.jsonl"
-"""Every certificate and signed document that was issued; keystores of ros2/sros2 have none."""
+"""The log of issued certificates and documents; keystores of ros2/sros2 have no such file."""
 
 IDENTITY, PERMISSIONS = "identity", "permissions"
 ROLES = (IDENTITY, PERMISSIONS)
 
 CRL = f"{PUBLIC}/identity_ca.crl.pem"
-"""The revocation list of the identity CA, once something was revoked."""
+"""The revocation list of the identity CA; it exists once a certificate was revoked."""
 REVOKED = "revoked"
 """The folder for the files of revoked enclaves."""
 
@@ -30,7 +30,7 @@ ROTATION = "rotation.json"
 RETIRED = "retired"
 """The folder for certificates and keys of replaced CAs."""
 STAGE = ".sros-transaction"
-"""The folder of a transaction that is under way, or was interrupted."""
+"""The folder of a transaction that is in progress, or was interrupted."""
 
 GOVERNANCE_XML = f"{ENCLAVES}/governance.xml"
 GOVERNANCE_P7S = f"{ENCLAVES}/governance.p7s"
@@ -46,7 +46,7 @@ REQUIRED_FILES = (
     GOVERNANCE_FILE,
     PERMISSIONS_FILE,
 )
-"""The files that rcl and the RMWs read from an enclave; one missing keeps a node from starting."""
+"""The files that rcl and the RMWs read from an enclave; without one of them no node starts."""
 
 CRL_FILE = "crl.pem"
 OPTIONAL_FILES = (CRL_FILE,)
@@ -103,7 +103,7 @@ def is_enclave(folder: Path) -> bool:
 
 
 def has_enclave(root: Path, name: str) -> bool:
-    """Return whether the keystore has an enclave of that name, without listing all enclaves."""
+    """Return whether the keystore has the enclave ``name``, without listing all enclaves."""
     return is_enclave(enclave_path(root, name))
 
 
@@ -118,7 +118,7 @@ def waits_for_answer(folder: Path) -> bool:
 
 
 def enclave_names(root: Path) -> Iterator[str]:
-    """Yield the names of the enclaves in the keystore: every folder that holds a key, sorted."""
+    """Yield the names of the enclaves, sorted: every folder that has a certificate or a key."""
     top = os.fspath(root / ENCLAVES)
     found = []
     for folder, folders, files in os.walk(top):
@@ -143,19 +143,25 @@ def check_keystore(root: Path) -> None:
     if not is_keystore(root):
         raise KeystoreError(
             f"'{root}' is not a valid keystore",
-            "It does not exist." if not root.exists() else f"It has no {ENCLAVES} folder in use.",
+            "It does not exist."
+            if not root.exists()
+            else f"It has no {ENCLAVES} folder, or has neither a CA, a governance nor an enclave.",
             f"Make one with `sros create_keystore {root}`.",
         )
 
 
 def locate_enclave(folder: Path) -> tuple[Path, str]:
-    """Return the keystore that holds an enclave's folder, and the name of the enclave."""
+    """Return the keystore that holds an enclave's folder, and the name of the enclave.
+
+    Raises:
+        DocumentError: ``folder`` is not below a folder named ``enclaves``.
+    """
     whole = Path(os.path.abspath(folder))  # noqa: PTH100 - must not follow links
     for above in (whole, *whole.parents):
         if above.name == ENCLAVES:
             return above.parent, f"/{'/'.join(whole.relative_to(above).parts)}"
     raise DocumentError(
-        f"'{folder}' lies in no folder named {ENCLAVES}",
-        "rcl looks for an enclave below that, by its name.",
+        f"'{folder}' is not below a folder named {ENCLAVES}",
+        "rcl finds an enclave by its path below that folder.",
         "Name the keystore, or the enclave's folder in it.",
     )

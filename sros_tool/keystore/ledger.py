@@ -1,7 +1,7 @@
 """The ledger of a keystore: every certificate and signed document that it ever issued.
 
-One JSON object a line; lines are only added.  Entries are part of the transaction that issues, so
-the ledger has exactly the certificates and documents that were put in place.
+The file has one JSON object per line; lines are only added.  Entries are part of the transaction
+that issues, so the ledger has exactly the certificates and documents that were installed.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A line of the ledger: the issued (or revoked) thing, with moment, subject and validity.
+    """A line of the ledger: a certificate or document that was issued, or a revocation.
 
     ``what`` is ca, certificate, permissions, governance, crl, revocation, or answer (the signed
     list of the files sent to a robot).  ``sha256`` is the hash of a certificate's DER or of a
     document's bytes; ``serial`` is hexadecimal; ``policy`` is the SHA-256 of the policy file,
-    with its includes, that permissions were made from.  Moments are ISO 8601 in UTC.
+    with its includes, that permissions were made from.  Times are ISO 8601 in UTC.
     """
 
     time: str
@@ -54,7 +54,7 @@ _FIELDS = tuple(each.name for each in fields(Entry))
 def certificate_entry(
     now: datetime, what: str, certificate: x509.Certificate, enclave: str = ""
 ) -> Entry:
-    """Return the entry of an issued certificate."""
+    """Return the entry of an issued certificate; ``what`` is ca or certificate."""
     validity = validity_of(certificate)
     return Entry(
         time=iso(now),
@@ -95,7 +95,7 @@ def read_ledger(root: Path) -> tuple[Entry, ...]:
     """Return all entries, oldest first; none for a keystore without a ledger (of ros2/sros2).
 
     Raises:
-        KeystoreError: a line is no entry.
+        KeystoreError: a line is not an entry.
     """
     path = root / LEDGER
     if not path.exists():
@@ -114,7 +114,7 @@ def read_ledger(root: Path) -> tuple[Entry, ...]:
 
 
 def append(transaction: Transaction, entries: Iterable[Entry]) -> None:
-    """Stage the ledger with further entries in a transaction."""
+    """Stage the ledger with ``entries`` added at its end."""
     new = b"".join(_line(entry) for entry in entries)
     if not new:
         return

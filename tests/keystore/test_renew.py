@@ -395,7 +395,7 @@ def test_what_is_cut_short_by_its_authority_says_so(day: int, tmp_path: Path) ->
         assert len(said) == len(expected)
         for text, what in zip(said, expected, strict=True):
             assert what in text
-            assert "expires with its CA at 2031-05-31" in text
+            assert "expire with their CA at 2031-05-31" in text
             assert "sros rotate_ca" in text
     assert not create_enclaves(root, ["/b"], now=late).notes, "nothing was issued"
 

@@ -1,1 +1,1 @@
-"""Issuing for enclaves: certificates, permissions, their proof and the ledger."""
+"""Issuing certificates and permissions for enclaves, and proving that permissions fit policies."""

@@ -1,8 +1,9 @@
 """The only writer of enclaves: it issues, proves and stages their certificates and permissions.
 
-Every verb that issues passes an `Issuance` to `EnclaveWriter.write`: the rights become permissions,
-these are proven, certificate and permissions are signed, staged in a transaction, and recorded for
-the ledger.  For many enclaves, several processes share the work.
+Every command that issues passes an `Issuance` to `EnclaveWriter.write`.  It turns the rights into
+permissions and proves that they match the policy, then signs certificate and permissions, stages
+them in a transaction, and records them for the ledger.  For many enclaves, several processes share
+the work.
 """
 
 from __future__ import annotations
@@ -56,14 +57,14 @@ Result = TypeVar("Result")
 _NOTED_LOSS = 0.01
 
 
-# ── what is issued ─────────────────────────────────────────────────────────────────────────
+# ── certificates and permissions to issue ────────────────────────────────────────────────
 
 
 @dataclass(frozen=True, slots=True)
 class NewIdentity:
     """The subject and the key that a certificate is issued for.
 
-    ``new_key`` is the private key where it was just generated: it is staged with the certificate.
+    ``new_key`` is the private key if it was just generated; it is staged with the certificate.
     """
 
     subject: x509.Name
@@ -81,9 +82,9 @@ class StatedRights:
 
 @dataclass(frozen=True, slots=True)
 class EarlierRights:
-    """Rights that were signed before.
+    """The rights in permissions that were signed before.
 
-    ``policy`` is the SHA-256 of the policy that they were made from, "" if the ledger does not
+    ``policy`` is the SHA-256 of the policy that they were made from, or "" if the ledger does not
     have it.
     """
 
@@ -106,9 +107,10 @@ class Issuance:
 
 @dataclass(frozen=True, slots=True)
 class Issued:
-    """The certificate and the permissions that an enclave has now.
+    """The certificate and the new permissions of an enclave.
 
-    ``document`` is the signed ``permissions.p7s``; without new permissions, both are empty.
+    ``document`` is the signed ``permissions.p7s``.  If the permissions do not change,
+    ``permissions`` and ``document`` are empty.
     """
 
     issuance: Issuance
@@ -117,26 +119,26 @@ class Issued:
     document: bytes = b""
 
     def notes(self) -> Iterator[Note]:
-        """Yield notes on permissions that are not portable, or differ from ros2/sros2."""
+        """Yield notes on permissions that are not portable, or differ from those of ros2/sros2."""
         name, rights = self.issuance.name, self.issuance.rights
         if isinstance(rights, StatedRights) and len(rights.enclave.profiles) > 1:
             yield Note(
                 "policy.several-profiles",
                 f"{name}: the rights of its {len(rights.enclave.profiles)} <profiles> are joined. "
-                "ros2/sros2 makes a grant of each, of which DDS reads only the first.",
+                "ros2/sros2 makes one grant per <profiles>, and DDS reads only the first grant.",
             )
         if self.document:
             yield from document_notes(name, self.permissions, len(self.document))
 
 
-# ── issuing it ─────────────────────────────────────────────────────────────────────────────
+# ── issuing ──────────────────────────────────────────────────────────────────────────────
 
 
 class EnclaveWriter:
-    """Writer of enclaves: issues in the name of ``authorities``, within one transaction.
+    """Writer of enclaves: issues certificates and permissions within one transaction.
 
-    ``entries`` are for the ledger; ``notes`` report authorities that expire too early for the
-    validity that the template chooses.
+    ``identity`` signs certificates, ``permissions`` signs permissions.  ``entries`` are for the
+    ledger.  ``notes`` report CAs that expire too early for the validity that the template chooses.
     """
 
     def __init__(
@@ -204,7 +206,7 @@ class EnclaveWriter:
 
     def _issue(self, name: str, identity: NewIdentity) -> x509.Certificate:
         if self._issuer is None:
-            raise KeystoreError("there is no identity CA to issue by")
+            raise KeystoreError("there is no identity CA to issue the certificate")
         folder = enclave_folder(name)
         if identity.new_key:
             pem_of_key = key_pem(identity.new_key)
@@ -218,7 +220,7 @@ class EnclaveWriter:
 
     def _sign(self, name: str, permissions: Permissions) -> bytes:
         if self._signer is None:
-            raise KeystoreError("there is no permissions CA to sign by")
+            raise KeystoreError("there is no permissions CA to sign the permissions")
         folder, what = enclave_folder(name), f"the permissions of {name}"
         document = render_permissions(permissions)
         check_meaning(parse_permissions(document), permissions, what)
@@ -233,10 +235,10 @@ class EnclaveWriter:
         work: Callable[[str], Result],
         progress: Progress | None = None,
     ) -> dict[str, Result]:
-        """Return the result of ``work`` for each enclave, done on all cores.
+        """Run ``work`` for each enclave on all cores, and map the enclaves to the results.
 
-        Everything that forked workers issue and stage is added here.  The session of a token does
-        not survive a fork, so a key on a token is used without workers.
+        Whatever forked workers issue and stage is added to this writer and its transaction.  The
+        session of a token does not survive a fork, so with a key on a token there are no workers.
         """
         own_process = os.getpid()
 
@@ -285,13 +287,12 @@ def _early_expiry(
         return None
     return Note(
         "keystore.ends-with-ca",
-        f"What is issued now expires with its CA at {iso(end)}, {lost.days} days before the "
-        f"validity that is chosen for {what} is over: rotate the CA with "
-        f"`sros rotate_ca {root} --next`.",
+        f"New {what} expire with their CA at {iso(end)}, {lost.days} days earlier than the "
+        f"keystore's settings choose. Rotate the CA with `sros rotate_ca {root} --next`.",
     )
 
 
-# ── what goes with it ──────────────────────────────────────────────────────────────────────
+# ── rights and shared files ──────────────────────────────────────────────────────────────
 
 
 def stated_enclave(policy: Policy, name: str) -> Enclave:
@@ -300,7 +301,8 @@ def stated_enclave(policy: Policy, name: str) -> Enclave:
     if enclave is None:
         present = ", ".join(each.path for each in policy.enclaves)
         raise PolicyError(
-            f"unable to find enclave {name} in the policy '{policy.file}'", f"It has {present}."
+            f"unable to find enclave {name} in the policy '{policy.file}'",
+            f"The policy has {present or 'no enclaves'}.",
         )
     return enclave
 
@@ -311,7 +313,7 @@ def _default_policy(choice: str) -> Enclave:
 
 
 def default_rights(template: Template, name: str) -> Enclave:
-    """Return the rights of an enclave without a policy, by the keystore's template."""
+    """Return the rights that the keystore's template gives to an enclave without a policy."""
     return replace(_default_policy(template.default_permissions), path=name)
 
 
@@ -321,7 +323,7 @@ def policies_of(root: Path) -> dict[str, str]:
 
 
 def present_files(root: Path, name: str) -> set[str]:
-    """Return the files of an enclave; a broken link counts as missing."""
+    """Return the names of the files of an enclave; a broken link counts as missing."""
     folder = enclave_path(root, name)
     try:
         return {file for file in os.listdir(folder) if (folder / file).exists()}
@@ -330,9 +332,9 @@ def present_files(root: Path, name: str) -> set[str]:
 
 
 def shared_files(root: Path, name: str) -> dict[str, str]:
-    """Map the files of an enclave that it shares with all others to their paths in the keystore."""
+    """Map the names of the files that all enclaves share to their paths in the keystore."""
     shared = {f"{role}_ca.cert.pem": ca_certificate(role) for role in ROLES}
-    if enclave_folder(name) != ENCLAVES:  # in the folder of the enclave / its target
+    if enclave_folder(name) != ENCLAVES:  # the folder of enclave / already holds the governance
         shared[GOVERNANCE_FILE] = GOVERNANCE_P7S
     if (root / CRL).exists():
         shared[CRL_FILE] = CRL

@@ -1,16 +1,16 @@
 """Proof that permissions give exactly the rights of the policy they are made from.
 
-A policy allows what something allows and nothing denies; DDS takes the first rule that matches.
-Both mean the same, for every name, mentioned or not, if
+A policy allows a topic if a rule allows it and no rule denies it.  DDS applies the first rule that
+matches.  Both decide the same for every topic name if
 
-- the document has one grant, its denials come first, every rule is for all of its domains and
-  without partitions, nothing else is allowed, and its expressions equal the policy's: a
-  comparison of sets;
-- the vendors match each expression with wildcards as a policy means it (one without wildcards
-  matches itself for all of them): a comparison of matchers, for names that distinguish them.
+- the document has one grant, its deny rules come first, every rule is for all domains of the
+  keystore and without partitions, the default is to deny, and its expressions equal the policy's:
+  a comparison of sets;
+- the vendors match each expression with wildcards as a policy does: a comparison of matchers, for
+  names that distinguish them.  (Without wildcards, an expression matches only itself.)
 
-Both comparisons are made for every document, whatever its size.  For a document of another form,
-the decision engine is asked for every name in the policy or the document, and for names in neither.
+Both comparisons are made for every document.  If one fails, the decision engine is asked about
+example topics: every name in the policy or the document, and names in neither.
 
 The DDS names are defined here a second time, from the ROS 2 design "Topic and Service name mapping
 to DDS", so that the proof finds an error of `sros_tool.translate`.
@@ -37,10 +37,11 @@ from sros_tool.policy.model import ALLOW, Enclave
 from sros_tool.policy.patterns import common_name, matches, overlap
 
 _ASKED = (Vendor.STANDARD, Vendor.FAST)
-"""The vendors that must decide as the policy does; Fast DDS 2.9 reads such documents like 2.14.
+"""The vendors that must decide as the policy does.
 
-Not Cyclone DDS 0.10: it denies a topic in both directions if one is denied.  No document can avoid
-that; a note reports it (``portable.deny-blocks-topic``).
+Fast DDS 2.9 decides on these documents as 2.14 does.  Cyclone DDS 0.10 is left out, because it
+denies a topic in both directions if one is denied.  No document can avoid that; a note reports it
+(``portable.deny-blocks-topic``).
 """
 
 _SET = re.compile(r"\[!?[^\]]+\]")
@@ -51,12 +52,13 @@ _ACTION_TOPICS = ("feedback", "status")
 
 
 def _service(client: bool, part: str = "") -> tuple[tuple[str, str, str], ...]:
-    """Return both topics of a service: direction, and what precedes and follows the name."""
+    """Return the direction, prefix and suffix of both DDS topics of a service."""
     ask, answer = (_OUT, _IN) if client else (_IN, _OUT)
     return (ask, "rq", f"{part}Request"), (answer, "rr", f"{part}Reply")
 
 
 def _action(client: bool) -> tuple[tuple[str, str, str], ...]:
+    """Return the direction, prefix and suffix of all DDS topics of an action."""
     direction = _IN if client else _OUT
     services = (end for p in _ACTION_SERVICES for end in _service(client, f"/_action/{p}"))
     return (*services, *((direction, "rt", f"/_action/{topic}") for topic in _ACTION_TOPICS))
@@ -74,7 +76,7 @@ _ENDPOINTS = {
 
 @dataclass(slots=True)
 class ExpressionSets:
-    """The DDS expressions that are allowed and denied, for writing and for reading."""
+    """The DDS expressions that are allowed and denied, by direction (publish, subscribe)."""
 
     allowed: dict[str, set[str]]
     denied: dict[str, set[str]]
@@ -85,7 +87,7 @@ class ExpressionSets:
         return cls({_OUT: set(), _IN: set()}, {_OUT: set(), _IN: set()})
 
     def allow(self, verb: str, topic: str) -> bool:
-        """Return whether a policy allows it: one rule allows it, and no rule denies it."""
+        """Return whether a policy allows ``topic``: a rule allows it, and no rule denies it."""
         return _meant(self.allowed[verb], topic) and not _meant(self.denied[verb], topic)
 
     def all(self) -> Iterator[str]:
@@ -99,7 +101,7 @@ class ExpressionSets:
 class Disagreement:
     """A DDS topic on which policy and permissions differ.
 
-    ``meant`` is whether the policy allows it, ``outcome`` is the decision of the vendor.
+    ``meant`` is whether the policy allows it, ``outcome`` is the decision of ``vendor``.
     """
 
     verb: str
@@ -109,9 +111,11 @@ class Disagreement:
     outcome: Outcome
 
     def __str__(self) -> str:
-        """Return text such as ``publish rt/x is allowed, and Fast DDS 2.14 says denied``."""
+        """Return text such as ``publish rt/x is allowed, but Fast DDS 2.14 decides: denied``."""
         meant = "allowed" if self.meant else "denied"
-        return f"{self.verb} {self.topic} is {meant}, and {self.vendor.title} says {self.outcome}"
+        return (
+            f"{self.verb} {self.topic} is {meant}, but {self.vendor.title} decides: {self.outcome}"
+        )
 
 
 def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None:
@@ -124,15 +128,15 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
     if found:
         raise KeystoreError(
             f"the permissions of {policy.path} would not match the policy",
-            f"For the policy, {found[0]}"
-            + (f" ({len(found) - 1} differences more)." if len(found) > 1 else "."),
-            "Nothing was written. This is an error of sros: please report it with the policy.",
+            f"By the policy, {found[0]}"
+            + (f" (and {len(found) - 1} more differences)." if len(found) > 1 else "."),
+            "Nothing was written. This is a defect of sros: please report it with the policy.",
         )
 
 
 @lru_cache(maxsize=4096)
 def matched_as_meant(expression: str) -> bool:
-    """Return whether the vendors match an expression with the same names as the policy."""
+    """Return whether vendors and policies match an expression with the same example names."""
     return all(
         dds_matches(vendor.traits.style, expression, name) == matches(expression, name)
         for name in example_topics([expression])
@@ -141,7 +145,7 @@ def matched_as_meant(expression: str) -> bool:
 
 
 def stated_expressions(policy: Enclave) -> ExpressionSets:
-    """Return a policy's rights for an enclave, and every participant's rights, in DDS names."""
+    """Return an enclave's rights in a policy as DDS expressions, with the ROS discovery topic."""
     found = ExpressionSets.none()
     for verb in (_OUT, _IN):
         found.allowed[verb].add(ROS_DISCOVERY_TOPIC)
@@ -157,7 +161,7 @@ def stated_expressions(policy: Enclave) -> ExpressionSets:
 
 
 def signed_expressions(permissions: Permissions, domains: DomainSet) -> ExpressionSets | None:
-    """Return the rights of permissions, or None if the order of their rules could matter."""
+    """Return the expressions of permissions, or None unless they have the simple form above."""
     if len(permissions.grants) != 1 or permissions.grants[0].default_allow:
         return None
     found = ExpressionSets.none()
@@ -175,7 +179,7 @@ def signed_expressions(permissions: Permissions, domains: DomainSet) -> Expressi
     return found
 
 
-# ── by the decision engine ─────────────────────────────────────────────────────────────────
+# ── comparison by the decision engine ────────────────────────────────────────────────────
 
 
 def differences(
@@ -186,7 +190,8 @@ def differences(
 ) -> list[Disagreement]:
     """Return the differences between the vendors' decisions and the policy.
 
-    They are asked about the `example_topics` of all expressions, and of each one alone.
+    They are compared for the `example_topics` of all expressions together, and of each expression
+    with wildcards alone.
     """
     stated = stated_expressions(policy)
     expressions = {*stated.all(), *_topics(permissions)}
@@ -209,9 +214,9 @@ def differences(
 def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
     """Return sorted example topics that distinguish the expressions.
 
-    These are each exact topic; for each wildcard a topic that it matches, one that only it matches,
-    and one for each other wildcard that it overlaps; and for each ROS prefix a topic that no
-    expression matches.
+    They are: each expression without wildcards; for each expression with wildcards a topic that it
+    matches, one that no other expression matches, and one that it shares with each overlapping
+    expression; and for each ROS prefix a topic that no expression matches.
     """
     known = sorted(set(expressions))
     wild = [each for each in known if is_expression(each)]
@@ -228,7 +233,7 @@ def example_topics(expressions: Iterable[str]) -> tuple[str, ...]:
 
 
 def _only(one: str, known: list[str]) -> str | None:
-    """Return a name that only ``one`` matches, if there is a simple one."""
+    """Return a name that only the expression ``one`` matches, or None if no simple name does."""
     for letter in ("never_mentioned", "n", "0", ""):
         name = _SET.sub(_member, one).replace("*", letter).replace("?", "n")
         if matches(one, name) and not any(matches(each, name) for each in known if each != one):
@@ -237,7 +242,7 @@ def _only(one: str, known: list[str]) -> str | None:
 
 
 def _member(found: re.Match[str]) -> str:
-    """Return a character that a set stands for."""
+    """Return a character that a set such as ``[a-c]`` matches."""
     return next((c for c in _CHARACTERS if matches(found[0], c)), "")
 
 
@@ -248,7 +253,7 @@ def _ends(domains: DomainSet) -> tuple[int, ...]:
 
 
 def _access(vendor: Vendor, permissions: Permissions, domain: int) -> Access:
-    """Return the decisions for the document's own subject, in the middle of its validity."""
+    """Return the vendor's decisions for the subject of the first grant, during its validity."""
     grant = permissions.grants[0]
     window = grant.validity
     middle = window.not_before + (window.not_after - window.not_before) / 2

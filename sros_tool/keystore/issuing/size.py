@@ -20,8 +20,7 @@ _LINE = len("            <topic></topic>\r\n")
 class SizeEstimator:
     """Estimator of the size of signed permissions, which signs them with a temporary key.
 
-    The name of a keystore's CA may be longer or shorter, and a signature varies by some bytes: the
-    error of a size is below 100 bytes.
+    The error is below 100 bytes: the name of the CA and the signature vary in length.
     """
 
     def __init__(self) -> None:
@@ -43,6 +42,6 @@ class SizeEstimator:
 
 
 def right_bytes(right: Right) -> int:
-    """Return the bytes that one right takes in a signed document: a line for each DDS topic."""
+    """Return the size in bytes of one right in a permissions document: one line per DDS topic."""
     names = dds_names(right.right, right.name)
     return sum(_LINE + len(name) for name in (*names.publish, *names.subscribe))
