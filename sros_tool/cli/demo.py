@@ -150,7 +150,7 @@ def demo(
 
     Makes keystores, starts nodes with and without them, and compares what was expected with what
     happened. The scenario isolation takes some ten seconds on Cyclone DDS and some twenty on rclpy,
-    attacks half a minute and a minute: every known way in, each tried a second time without the
+    attacks half a minute and a minute: every known attack, each tried a second time without the
     defence that closes it.
     """
     from sros_tool.demo.program import DemoOptions, run_demo

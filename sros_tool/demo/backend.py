@@ -170,7 +170,7 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
         rule.metadata_protection_kind,
         rule.data_protection_kind,
     )
-    strangers = domain.allow_unauthenticated_participants
+    unauthenticated = domain.allow_unauthenticated_participants
     bare = all(kind is ProtectionKind.NONE for kind in kinds)
     uncontrolled = not (rule.enable_read_access_control or rule.enable_write_access_control)
     found = {
@@ -178,8 +178,8 @@ def conditions(backend: Backend, template: Template, topic: str) -> frozenset[Co
         Condition.SHARED_SUBJECTS: not template.unique_subject,
         Condition.OPEN_DEFAULT: template.default_permissions == EVERYTHING,
         Condition.IN_CLEAR: not any(kind in _ENCRYPTING for kind in kinds),
-        Condition.STRANGERS: strangers and bare and uncontrolled,
-        Condition.STRANGERS_SEE: strangers and not rule.enable_discovery_protection,
+        Condition.UNAUTHENTICATED: unauthenticated and bare and uncontrolled,
+        Condition.UNAUTHENTICATED_SEE: unauthenticated and not rule.enable_discovery_protection,
         Condition.UNCONTROLLED: uncontrolled,
         Condition.OPEN_JOIN: not domain.enable_join_access_control,
         Condition.EXACT_SIGNER: backend.vendor is Condition.FAST and _checks_signers(backend.dds),

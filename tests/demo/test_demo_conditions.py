@@ -42,7 +42,7 @@ def protected(**choices: object) -> Template:
         (protected(join_access_control=False), "rt/a", {C.OPEN_JOIN}),
         (protected(rtps=Level.NONE, allow_unauthenticated_participants=True), "rt/a", set()),
         (protected(rtps=Level.NONE, allow_unauthenticated_participants=True, default=BARE),
-         "rt/a", {C.IN_CLEAR, C.UNCONTROLLED, C.STRANGERS, C.STRANGERS_SEE}),
+         "rt/a", {C.IN_CLEAR, C.UNCONTROLLED, C.UNAUTHENTICATED, C.UNAUTHENTICATED_SEE}),
         (protected(rtps=Level.NONE, named=(NamedProtection("topics", "/a", BARE),)), "rt/a",
          {C.IN_CLEAR, C.UNCONTROLLED}),
         (protected(rtps=Level.NONE, named=(NamedProtection("topics", "/a", BARE),)), "rt/b", set()),
@@ -81,13 +81,13 @@ def test_what_differs_between_templates_and_vendors() -> None:
     assert not differing(CYCLONE, "production")
     shared = {
         "an enclave without a policy publishes": RowStatus.HEARD,
-        "permissions borrowed from a longer name": RowStatus.HEARD,
+        "permissions borrowed from a longer enclave name": RowStatus.HEARD,
         "old permissions put back after renewal": RowStatus.HEARD,
     }
     assert differing(CYCLONE, "development") == shared
     assert differing(CYCLONE, "sros2") == shared | {
         "permissions signed by the enclave itself": RowStatus.HEARD,
-        "permissions and governance signed by itself": RowStatus.HEARD,
+        "permissions and governance signed by the enclave": RowStatus.HEARD,
     }
     vendors = {
         "certificate with the key of another enclave": RowStatus.NOT_LET_IN,
@@ -105,13 +105,13 @@ def test_what_differs_between_templates_and_vendors() -> None:
         "an enclave without a policy publishes",
         "old permissions put back after renewal",
         "permissions signed by the enclave itself",
-        "permissions and governance signed by itself",
+        "permissions and governance signed by the enclave",
     }
 
 
 def test_a_defence_that_a_vendor_has_in_another_form_is_removed_in_that_form() -> None:
     holding = conditions(FAST, load_template("production"), "rt/chatter")
     twins = {row.name: row.under(holding) for row in ATTACKS.rows if row.removed}
-    assert twins["permissions borrowed, subjects not unique"].removed == "a subject of its own"
+    assert twins["permissions borrowed, subjects not unique"].removed == "a unique subject name"
     for name, row in twins.items():
         assert row.expected in OPEN, name

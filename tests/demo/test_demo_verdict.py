@@ -234,7 +234,7 @@ def test_view(of_secured: int, of_open: int, observed: RowStatus) -> None:
     result = judge(
         "secured talker in an unsecured node's view",
         secured_talker=talker("S"),
-        unsecured_talker_aside=talker("U", topic="/c_open"),
+        unsecured_talker_on_another_topic=talker("U", topic="/c_open"),
         observer=PartyRecord(events=(READY, Event(EventKind.SEEN, 103, publishers=looks))),
     )
     assert result.observed is observed
@@ -245,7 +245,7 @@ def test_an_observer_without_rclpy_is_skipped_with_the_reason() -> None:
     result = judge(
         "secured talker in an unsecured node's view",
         secured_talker=talker("S"),
-        unsecured_talker_aside=talker("U"),
+        unsecured_talker_on_another_topic=talker("U"),
         observer=PartyRecord(events=(failed,), status=1),
     )
     assert (result.observed, result.as_expected) == (RowStatus.SKIPPED, True)

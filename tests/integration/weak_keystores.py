@@ -49,7 +49,7 @@ WEAKNESSES: Mapping[str, Weakness] = {
         frozenset(
             {
                 "permissions signed by the enclave itself",
-                "permissions and governance signed by itself",
+                "permissions and governance signed by the enclave",
             }
         ),
         lambda template: replace(template, separate_authorities=False),
@@ -58,7 +58,7 @@ WEAKNESSES: Mapping[str, Weakness] = {
     "subjects that others contain": Weakness(
         frozenset(
             {
-                "permissions borrowed from a longer name",
+                "permissions borrowed from a longer enclave name",
                 "old permissions put back after renewal",
             }
         ),

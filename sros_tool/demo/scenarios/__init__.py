@@ -1,4 +1,4 @@
-"""The scenarios that ship with sros, as data; `custom` reads those of users."""
+"""The scenarios that ship with sros, as data; `custom` reads user-defined scenarios."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ ALL = "all"
 
 
 def choose_scenarios(names: Sequence[str]) -> tuple[Scenario, ...]:
-    """Return the scenarios of those names or TOML files, in order; without any, the default.
+    """Return the scenarios with these names or TOML files, in order; without names, the default.
 
     Raises:
-        UsageError: no such name.
-        DocumentError: a file is not understood.
+        UsageError: no scenario has a given name.
+        DocumentError: a file is not a valid scenario.
     """
     if ALL in names:
         return SCENARIOS

@@ -1,4 +1,4 @@
-"""Composition: several nodes in one process share one enclave and the sum of their rights."""
+"""The composition scenario: nodes of one process share one enclave and the sum of their rights."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _ROWS: tuple[Row, ...] = (
     Row(
         "unsecured listener hears a container",
         RowStatus.NOT_HEARD,
-        "one participant, one identity: what protects one node protects all of them",
+        "all nodes of the process share one participant, so all of them are protected",
         (_CONTAINER, _OPEN_LISTENER, _LISTENER),
         (Claim(Relation.HEARS, "unsecured listener", "container", holds=False),),
         (Claim(Relation.HEARS, "listener", "container"),),
@@ -58,7 +58,7 @@ _ROWS: tuple[Row, ...] = (
     Row(
         "container in the enclave of one of its nodes",
         RowStatus.REFUSED,
-        "the process needs the rights of all of its nodes: one of them is denied",
+        "the enclave lacks the rights of the other nodes in the process",
         (Party("container as a listener", Role.COMPOSED, Identity(OWN, "listener")), _LISTENER),
         (Claim(Relation.IS_REFUSED, "container as a listener"),),
         (Claim(Relation.STARTS, "listener"),),
@@ -68,20 +68,19 @@ _ROWS: tuple[Row, ...] = (
         RowStatus.HEARD,
         "DDS cannot distinguish the nodes of a process: they share the sum of their rights",
         (
-            Party("listener node gone astray", Role.TALKER, Identity(OWN, "container")),
+            Party("compromised listener node", Role.TALKER, Identity(OWN, "container")),
             _LISTENER,
         ),
-        (Claim(Relation.HEARS, "listener", "listener node gone astray"),),
+        (Claim(Relation.HEARS, "listener", "compromised listener node"),),
         brief=True,
-        attack="a node uses the rights of its neighbour",
+        attack="a node uses the rights of another node in its process",
         open_because="one process is one participant with one enclave",
-        remedy="run nodes that must not be trusted with each other's rights in processes of their"
-        " own",
+        remedy="run nodes that must not share rights in separate processes and enclaves",
     ),
     Row(
-        "listener node in an enclave of its own publishes",
+        "listener node in a separate enclave publishes",
         RowStatus.REFUSED,
-        "its own enclave has its own rights only",
+        "its enclave has only the rights of the listener",
         (
             Party("listener that talks", Role.TALKER, Identity(OWN, "listener")),
             _TALKER,

@@ -1,4 +1,4 @@
-"""Governance: the same talk without protection, signed, and encrypted; and what that costs."""
+"""The governance scenario: the same messages unprotected, signed and encrypted; and the cost."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ _KINDS = {
 """The keystore of each protection kind."""
 
 _MECHANISMS = {
-    "none": "access is controlled, and messages travel as they are",
-    "sign": "messages carry a code that proves who sent them, and travel in clear",
-    "encrypt": "messages travel encrypted",
+    "none": "access is controlled, but messages are neither signed nor encrypted",
+    "sign": "messages carry a message authentication code, but are not encrypted",
+    "encrypt": "messages are encrypted",
 }
 
 
@@ -64,13 +64,17 @@ def _changed(kind: str, expected: RowStatus, mechanism: str) -> Row:
 
 
 _CHANGES = (
-    _changed("none", RowStatus.DECEIVED, "nothing proves that the packet is the talker's"),
-    _changed("sign", RowStatus.NOT_DECEIVED, "its code does not fit a changed packet"),
+    _changed("none", RowStatus.DECEIVED, "nothing in the packet proves who sent it"),
+    _changed(
+        "sign",
+        RowStatus.NOT_DECEIVED,
+        "the message authentication code of a changed packet is wrong",
+    ),
 )
 
 GOVERNANCE = Scenario(
     "governance",
-    "the same talk without protection, signed and encrypted: on the wire, and its cost",
+    "the same messages unprotected, signed and encrypted: on the wire, and the cost",
     (*(_row(kind) for kind in _KINDS), *_CHANGES),
     {
         "talker": "/talker_listener/talker",

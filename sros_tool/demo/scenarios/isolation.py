@@ -1,7 +1,7 @@
-"""Isolation: nobody hears secured nodes, or gets in, without permission.
+"""The isolation scenario: nobody hears or joins secured nodes without permission.
 
-Every row that expects silence has a control: another listener that must hear the same messages, or
-the same program in an enclave with permission.
+Every row that expects silence or a refusal has a control: another listener that must hear the same
+messages, or the same program in an enclave with permission.
 """
 
 from __future__ import annotations
@@ -44,14 +44,16 @@ _DENIED_LISTENER = Party(
 )
 _FOREIGN_TALKER = Party("foreign talker", Role.TALKER, Identity(FOREIGN, "talker"))
 _FOREIGN_LISTENER = Party("foreign listener", Role.LISTENER, Identity(FOREIGN, "listener"))
-_OPEN_TALKER_ASIDE = Party("unsecured talker aside", Role.TALKER, UNSECURED, other_topic=True)
+_OTHER_OPEN_TALKER = Party(
+    "unsecured talker on another topic", Role.TALKER, UNSECURED, other_topic=True
+)
 _OBSERVER = Party("observer", Role.OBSERVER, UNSECURED)
 
 ROWS: tuple[Row, ...] = (
     Row(
         "secured talker to secured listener",
         RowStatus.HEARD,
-        "each proves its identity by a certificate of the same CA, and has the permission",
+        "both have a certificate of the same CA, and permission for the topic",
         (_SECURED_TALKER, _SECURED_LISTENER),
         (_hears("secured listener", "secured talker"),),
     ),
@@ -65,7 +67,7 @@ ROWS: tuple[Row, ...] = (
     Row(
         "secured talker to unsecured listener",
         RowStatus.NOT_HEARD,
-        "a listener that cannot authenticate gets no keys, and is sent nothing",
+        "a listener that cannot authenticate gets no keys and no messages",
         (_SECURED_TALKER, _OPEN_LISTENER, _SECURED_LISTENER),
         (_hears_not("unsecured listener", "secured talker"),),
         (_hears("secured listener", "secured talker"),),
@@ -81,7 +83,7 @@ ROWS: tuple[Row, ...] = (
     Row(
         "secured listener without permission",
         RowStatus.REFUSED,
-        "its own DDS refuses the reader: the signed permissions do not allow the topic",
+        "its DDS refuses the DataReader: the signed permissions do not allow the topic",
         (_DENIED_LISTENER, _SECURED_LISTENER),
         (Claim(Relation.IS_REFUSED, "listener without permission"),),
         (Claim(Relation.STARTS, "secured listener"),),
@@ -89,7 +91,7 @@ ROWS: tuple[Row, ...] = (
     Row(
         "secured talker without permission",
         RowStatus.REFUSED,
-        "its own DDS refuses the writer: the signed permissions do not allow the topic",
+        "its DDS refuses the DataWriter: the signed permissions do not allow the topic",
         (_DENIED_TALKER, _SECURED_TALKER),
         (Claim(Relation.IS_REFUSED, "talker without permission"),),
         (Claim(Relation.STARTS, "secured talker"),),
@@ -97,7 +99,7 @@ ROWS: tuple[Row, ...] = (
     Row(
         "talker of another keystore to secured listener",
         RowStatus.NOT_HEARD,
-        "a certificate of another CA proves nothing here: no handshake, no keys",
+        "the listener does not trust the other CA: the handshake fails, and no keys are sent",
         (_FOREIGN_TALKER, _SECURED_LISTENER, _FOREIGN_LISTENER),
         (_hears_not("secured listener", "foreign talker"),),
         (_hears("foreign listener", "foreign talker"),),
@@ -105,7 +107,7 @@ ROWS: tuple[Row, ...] = (
     Row(
         "both pairs side by side on one topic",
         RowStatus.UNDISTURBED,
-        "each pair hears its own talker, and nothing of the other one",
+        "each listener hears the talker of its pair, and nothing from the other pair",
         (_SECURED_TALKER, _SECURED_LISTENER, _OPEN_TALKER, _OPEN_LISTENER),
         (
             _hears("secured listener", "secured talker"),
@@ -117,10 +119,10 @@ ROWS: tuple[Row, ...] = (
     Row(
         "secured talker in an unsecured node's view",
         RowStatus.NOT_VISIBLE,
-        "discovery of endpoints is encrypted: it counts no publisher of the secured topic",
-        (_SECURED_TALKER, _OPEN_TALKER_ASIDE, _OBSERVER),
+        "endpoint discovery is encrypted: the node sees no publisher of the secured topic",
+        (_SECURED_TALKER, _OTHER_OPEN_TALKER, _OBSERVER),
         (Claim(Relation.SEES, "observer", "secured talker", holds=False),),
-        (Claim(Relation.SEES, "observer", "unsecured talker aside"),),
+        (Claim(Relation.SEES, "observer", "unsecured talker on another topic"),),
     ),
     Row(
         "unsecured payload on the wire",
@@ -144,7 +146,7 @@ ROWS: tuple[Row, ...] = (
 
 ISOLATION = Scenario(
     "isolation",
-    "nobody hears secured nodes, or gets in, without permission",
+    "nobody hears or joins secured nodes without permission",
     ROWS,
     {
         "talker": "/talker_listener/talker",

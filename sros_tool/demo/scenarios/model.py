@@ -104,7 +104,7 @@ class Wire(StrEnum):
 
 
 class SoundKeystore(StrEnum):
-    """The keystores of a scenario that nobody has forged."""
+    """A keystore of a scenario that is not forged."""
 
     OWN = "own"
     FOREIGN = "foreign"
@@ -114,9 +114,9 @@ class SoundKeystore(StrEnum):
 OWN, FOREIGN = SoundKeystore.OWN, SoundKeystore.FOREIGN
 
 KeystoreChoice = SoundKeystore | Forge | Undefended
-"""One of the sound keystores, or the function of the forger that makes the keystore.
+"""A keystore that is not forged, or the forgery that makes the keystore.
 
-A function works on a copy of the scenario's own keystore, `Undefended` on one made again.
+A `Forge` changes a copy of the scenario's own keystore, `Undefended` changes a new keystore.
 """
 
 
@@ -141,8 +141,8 @@ class Party:
     """One process of a row.
 
     ``topic`` is the ROS name of its topic, service or action ("": the topic of the demo).
-    ``other_topic`` puts a talker on a topic that nobody else uses.  An ``intruder`` may be kept
-    out, and the row goes on.
+    ``other_topic`` puts a talker on a topic that nobody else uses.  If an ``intruder`` is refused,
+    the row goes on.
     """
 
     name: str
@@ -155,9 +155,9 @@ class Party:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim that ``subject`` hears, sees ... ``talker``, or (``holds`` is false) does not.
+    """A claim that ``subject`` hears, sees ... ``talker``, or (if ``holds`` is false) does not.
 
-    ``denied`` is the status in `DENIALS` that must be the reason, if any.
+    ``denied`` is the denial that must be the reason, a status in `DENIALS`; None: any reason.
     """
 
     relation: Relation
@@ -183,32 +183,32 @@ class Claim:
         for holds in (True, False):
             if STATUS_OF[self.relation, holds] is status:
                 return replace(self, holds=holds, denied=None)
-        raise ValueError(f"{self.relation} does not end as {status}")
+        raise ValueError(f"a claim {self.relation.value!r} cannot have status {status.value!r}")
 
 
 class Condition(StrEnum):
-    """A property of a keystore's template or of a vendor on which an expected status depends."""
+    """A property of the keystore template or the vendor on which an expected status depends."""
 
     ONE_CA = "one CA for identity and permissions"
-    SHARED_SUBJECTS = "subjects without a part of their own"
+    SHARED_SUBJECTS = "subject names without a unique part"
     OPEN_DEFAULT = "an enclave without a policy may do everything"
     IN_CLEAR = "payload is not encrypted"
-    STRANGERS = "unauthenticated participants are allowed, and the topic is not protected"
-    STRANGERS_SEE = "unauthenticated participants are allowed, and discovery is not protected"
+    UNAUTHENTICATED = "unauthenticated participants are allowed, and the topic is not protected"
+    UNAUTHENTICATED_SEE = "unauthenticated participants are allowed, and discovery is not protected"
     UNCONTROLLED = "access to the topic is not controlled"
     OPEN_JOIN = "joining the domain is not controlled"
     CYCLONE = "Cyclone DDS 0.10"
     FAST = "Fast DDS"
-    EXACT_SIGNER = "only who is in the file of the permissions CA may sign (Fast DDS since 2.10)"
+    EXACT_SIGNER = "signers must be in the file of the permissions CA (Fast DDS since 2.10)"
 
 
 @dataclass(frozen=True)
 class Variant:
-    """The expected status of a row where all ``conditions`` hold.
+    """The expected status of a row if all ``conditions`` hold.
 
-    ``open_because`` is the reason why an attack succeeds then ("": it does not), ``remedy`` what a
-    user can do.  ``instead`` is a row to run instead, for a vendor with another form of the
-    defence.
+    ``open_because`` is the reason why an attack then succeeds ("": it fails), ``remedy`` what a
+    user can do.  ``instead`` is a row to run instead, for a vendor that implements the defence
+    differently.
     """
 
     conditions: tuple[Condition, ...]
@@ -223,10 +223,10 @@ class Variant:
 class Row:
     """One line of the demo's table.
 
-    ``mechanism`` says in a clause what brings the expected status about; ``wire`` asks for a
-    capture of the packets; ``replay`` names the party whose packets are sent again after it has
-    left, ``impersonate`` the one in whose name changed packets are sent.  A ``brief`` row ends as
-    soon as it is decided.  The first of ``variants`` whose conditions hold replaces the expected
+    ``mechanism`` is the reason for the expected status, as a clause; ``wire`` requests a capture of
+    the packets; ``replay`` names the party whose packets are sent again after it has left,
+    ``impersonate`` the party whose packets are sent again with changed text.  A ``brief`` row ends
+    as soon as it is decided.  The first of ``variants`` whose conditions hold replaces the expected
     status.  ``attack`` names the attack to which the row belongs; with ``removed`` it shows that
     attack without the defence that ``removed`` names.  ``open_because`` and ``remedy`` are as in
     `Variant`.
@@ -250,20 +250,20 @@ class Row:
 
     @property
     def tapped(self) -> bool:
-        """Whether its packets are captured."""
+        """Whether the packets of the row are captured."""
         return bool(self.wire or self.replay or self.impersonate)
 
     def party(self, name: str) -> Party:
         """Return the party of that name.
 
         Raises:
-            KeyError: there is none.
+            KeyError: the row has no such party.
         """
         return {party.name: party for party in self.parties}[name]
 
     @property
     def ros_name(self) -> str:
-        """The ROS name that its first claim is about ("": the topic of the demo)."""
+        """The topic, service or action of the first claim ("": the topic of the demo)."""
         return self.party(self.claims[0].subject).topic
 
     def under(self, conditions: frozenset[Condition]) -> Row:
@@ -292,10 +292,10 @@ class Row:
 class Scenario:
     """Rows that belong together, and the policy of their enclaves.
 
-    ``cast`` gives the enclave of each part.  ``policy`` makes the policy for the topic of the
-    demo; the enclaves ``unpermitted`` have none.  ``measured`` gives the keystore of each
-    protection kind whose cost is measured; one with ``any_keystore`` can be played in a keystore
-    of the user's.
+    ``cast`` has the enclave of each part.  ``policy`` returns the policy for the topic of the demo;
+    the enclaves ``unpermitted`` have no policy.  ``measured`` has the keystore of each protection
+    kind whose cost is measured.  A scenario with ``any_keystore`` can also run in a user's
+    keystore.
     """
 
     name: str

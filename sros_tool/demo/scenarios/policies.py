@@ -1,4 +1,4 @@
-"""The policies of the demo's enclaves: those that ship with sros, on the demo's topic."""
+"""The policies of the demo's enclaves: shipped policies, changed to the demo's topic."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def check_topic(topic: str) -> str:
     if absolute in _TOPICS_OF_EVERY_NODE:
         raise UsageError(
             f"the demo cannot use {absolute}",
-            "It is one of the topics that a ROS 2 node uses by itself.",
+            "Every ROS 2 node, or the demo itself, uses this topic.",
             "Use a name such as /chatter.",
         )
     return absolute
@@ -75,9 +75,10 @@ def talking_policy(topic: str) -> Policy:
 
 
 def attacked_policy(topic: str) -> Policy:
-    """Return a talker and a listener on ``topic``, a service, and a guest who may use neither.
+    """Return a policy for a talker and a listener on ``topic``, a service, a guest and an admin.
 
-    The name of the guest's enclave is contained in that of an enclave which may publish ``topic``.
+    The guest may use neither the topic nor the service.  The admin may publish the topic, and its
+    enclave name contains the guest's.
     """
     talking = talking_policy(topic)
     talker = next(each for each in _shipped_policy(_POLICY_FILE).enclaves if each.path == _TALKER)
@@ -99,7 +100,7 @@ def shipped_action_policy(_topic: str) -> Policy:
 
 
 def composed_policy(topic: str) -> Policy:
-    """Return the shipped policy of a container, and of nodes outside that it talks to."""
+    """Return the shipped policies of a container, and of the nodes outside that it talks to."""
     talking = talking_policy(topic)
     container = (_with_topic(each, topic) for each in _shipped_policy("composition.xml").enclaves)
     service = shipped_service_policy(topic).enclaves
@@ -107,7 +108,7 @@ def composed_policy(topic: str) -> Policy:
 
 
 def measured_policy(topic: str) -> Policy:
-    """Return a talker, a listener, and the two enclaves between which the cost is measured."""
+    """Return a policy for a talker, a listener, and the two ends of the cost measurement."""
     talking = talking_policy(topic)
     basics = read_policy(policies_dir() / "defaults/node_basics.xml").enclaves[0].all_profiles()
     rights = (("publish", ALLOW), ("subscribe", ALLOW))
@@ -120,7 +121,7 @@ def measured_policy(topic: str) -> Policy:
 
 
 def _with_topic(enclave: Enclave, topic: str | None) -> Enclave:
-    """Return the enclave with ``topic`` instead of the shipped topic (None: without both)."""
+    """Return the enclave with ``topic`` instead of the shipped topic (None: with neither)."""
 
     def of_group(group: Group) -> Group | None:
         if group.kind != "topics" or _POLICY_TOPIC not in group.names:

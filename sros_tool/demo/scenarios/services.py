@@ -1,4 +1,4 @@
-"""Services and actions: who may ask, and who may answer; the rows are the same for both."""
+"""The scenarios services and actions: who may call, and who may serve; both have the same rows."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class _Interface:
         return Party(name, role, identity, self.name)
 
     def pair(self, *, secured: bool) -> tuple[Party, Party]:
-        """Return a client and a server, with the rights that they need, or both unsecured."""
+        """Return a client and a server, either with the rights that they need or unsecured."""
         own = (Identity(OWN, "client"), Identity(OWN, "server")) if secured else (UNSECURED,) * 2
         before = "" if secured else "unsecured "
         return (
@@ -54,7 +54,7 @@ class _Interface:
 
 
 def _rows_of(kind: _Interface, both: str) -> tuple[Row, ...]:
-    """Return the rows; ``both`` says why a pair with its rights is answered."""
+    """Return the rows of a service or action; ``both`` is the mechanism of the secured pair."""
     client, server = kind.pair(secured=True)
     open_client, open_server = kind.pair(secured=False)
     posing = kind.party("client as a server", kind.server_role, Identity(OWN, "client"))
@@ -70,7 +70,7 @@ def _rows_of(kind: _Interface, both: str) -> tuple[Row, ...]:
         Row(
             f"unsecured client of a secured {kind.server}",
             RowStatus.NOT_ANSWERED,
-            "a node that cannot authenticate is not heard, and would get no answer",
+            "a server ignores a client that cannot authenticate, and would send it no answer",
             (open_client, server, client),
             (_is_answered(open_client, server, holds=False),),
             (_is_answered(client, server),),
@@ -78,7 +78,7 @@ def _rows_of(kind: _Interface, both: str) -> tuple[Row, ...]:
         Row(
             f"unsecured {kind.server} to a secured client",
             RowStatus.NOT_ANSWERED,
-            "a client asks no server that cannot authenticate",
+            "a client sends no request to a server that cannot authenticate",
             (open_server, client, open_client),
             (_is_answered(client, open_server, holds=False),),
             (_is_answered(open_client, open_server),),
@@ -90,12 +90,18 @@ def _rows_of(kind: _Interface, both: str) -> tuple[Row, ...]:
             posing,
             server,
         ),
-        _refused(f"{kind.server} that asks", kind.answers, kind.asks, calling, client),
+        _refused(
+            f"{kind.server} that poses as the {kind.client}",
+            kind.answers,
+            kind.asks,
+            calling,
+            client,
+        ),
     )
 
 
 def _is_answered(client: Party, server: Party, *, holds: bool = True) -> Claim:
-    """Return the claim that a client gets answers of a server, or does not."""
+    """Return the claim that a client gets answers from a server, or does not."""
     return Claim(Relation.IS_ANSWERED, client.name, server.name, holds=holds)
 
 
@@ -133,7 +139,7 @@ def _on_the_wire(expected: RowStatus, mechanism: str, *, secured: bool) -> Row:
 
 
 _SERVICE_ROWS: tuple[Row, ...] = (
-    *_rows_of(_SERVICE, "one may send requests and receive replies, the other one the opposite"),
+    *_rows_of(_SERVICE, "the client may send requests and receive replies, the server the reverse"),
     _on_the_wire(RowStatus.READABLE, "the text is readable in the packets", secured=False),
     _on_the_wire(
         RowStatus.NOT_READABLE, "requests and replies are encrypted like topics", secured=True
@@ -142,7 +148,7 @@ _SERVICE_ROWS: tuple[Row, ...] = (
 
 SERVICES = Scenario(
     "services",
-    "add_two_ints: who may ask and who may answer",
+    "add_two_ints: who may call and who may serve",
     _SERVICE_ROWS,
     {"server": f"{SERVICE}/server", "client": f"{SERVICE}/client"},
     shipped_service_policy,

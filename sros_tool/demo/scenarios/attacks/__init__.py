@@ -1,8 +1,8 @@
-"""The attacks: every known way in, each with a control, and once without its defence.
+"""The scenario of all known attacks, each with a control, and again without its defence.
 
-An attacker is an intruder in the row.  The control of a row that expects a closed door is the
-rightful talker, whom the same listener hears at the same time.  A row with ``removed`` shows the
-same attack succeed where the defence is gone: an attack that never works would prove nothing.
+The attacker is the intruder of the row.  A row that expects the attack to fail has a control: the
+same listener must hear the rightful talker at the same time.  A row with ``removed`` shows that the
+same attack succeeds without that defence: an attack that never works would prove nothing.
 """
 
 from __future__ import annotations
@@ -10,15 +10,15 @@ from __future__ import annotations
 from sros_tool.demo.scenarios.attacks import (
     documents,
     identities,
+    network,
     rights,
-    strangers,
     variables,
 )
 from sros_tool.demo.scenarios.model import Row, Scenario
 from sros_tool.demo.scenarios.policies import GUEST, SERVICE, attacked_policy
 
 _ROWS: tuple[Row, ...] = (
-    *strangers.ROWS,
+    *network.ROWS,
     *rights.ROWS,
     *identities.ROWS,
     *documents.ROWS,
@@ -27,7 +27,7 @@ _ROWS: tuple[Row, ...] = (
 
 ATTACKS = Scenario(
     "attacks",
-    "every known way in, tried; and each again without the defence that closes it",
+    "every known attack, and each again without the defence that stops it",
     _ROWS,
     {
         "talker": "/talker_listener/talker",

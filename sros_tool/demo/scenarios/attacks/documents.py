@@ -8,34 +8,34 @@ from sros_tool.demo.scenarios.attacks.kinds import injection, succeeds
 from sros_tool.demo.scenarios.model import UNSECURED, Condition, Identity, Row, RowStatus, Variant
 
 _ITSELF = "permissions signed by the enclave itself"
-_BORROWED = "permissions borrowed from a longer name"
+_BORROWED = "permissions borrowed from a longer enclave name"
 
 _TRUSTED_AS_SIGNER = injection(
     "permissions signed by the enclave itself, a trusted signer",
     Identity(Undefended(forger.enclave_among_the_signers), "guest"),
     RowStatus.HEARD,
-    "whoever is in the file of the permissions CA may sign",
+    "every certificate in the file of the permissions CA may sign",
     attack=_ITSELF,
-    removed="a file of the permissions CA that holds the CA alone",
+    removed="a permissions CA file with only the CA in it",
     victims=Undefended(forger.enclave_among_the_signers),
 )
 _SAME_SUBJECT = injection(
     "permissions borrowed, the same subject",
     Identity(Undefended(forger.borrowed_permissions_and_subject), "guest"),
     RowStatus.HEARD,
-    "two certificates of one subject fit the same permissions",
+    "the same permissions are valid for two certificates with one subject name",
     attack=_BORROWED,
-    removed="a subject of its own",
+    removed="a unique subject name",
     victims=Undefended(forger.borrowed_permissions_and_subject),
 )
-_SIGNED_WRONG = "its own DDS verifies the signature of the permissions CA"
+_SIGNED_WRONG = "the attacker's DDS verifies the signature with the permissions CA"
 
 ROWS: tuple[Row, ...] = (
     injection(
         "permissions copied from another enclave",
         Identity(forger.permissions_of_another, "guest"),
         RowStatus.NOT_LET_IN,
-        "the permissions are for another subject than the certificate's",
+        "the permissions are for another subject name than the certificate's",
         attack="forged permissions",
     ),
     injection(
@@ -67,18 +67,18 @@ ROWS: tuple[Row, ...] = (
         victims=Undefended(forger.permissions_signed_by_the_ca),
     ),
     injection(
-        "a permissions CA of its own",
+        "the attacker's own permissions CA",
         Identity(forger.own_permissions_ca, "guest"),
         RowStatus.NOT_HEARD,
-        "its own DDS is satisfied; its peers verify its permissions with the CA that they trust",
-        attack="a permissions CA of its own",
+        "the attacker's DDS accepts this CA; its peers verify with the CA that they trust",
+        attack="the attacker's own permissions CA",
     ),
     injection(
-        "a permissions CA of its own, trusted by the listener",
+        "the attacker's own permissions CA, trusted by the listener",
         Identity(Undefended(forger.another_permissions_ca_trusted), "guest"),
         RowStatus.HEARD,
-        "whoever the trusted permissions CA signs for is let in",
-        attack="a permissions CA of its own",
+        "the listener accepts what the permissions CA that it trusts has signed",
+        attack="the attacker's own permissions CA",
         removed="the listener's permissions CA",
         victims=Undefended(forger.another_permissions_ca_trusted),
         crowd=False,
@@ -95,8 +95,8 @@ ROWS: tuple[Row, ...] = (
                 Variant(
                     (Condition.ONE_CA,),
                     RowStatus.HEARD,
-                    "with one CA for both jobs, this DDS takes any enclave's certificate as a"
-                    " signer of permissions (the class of CVE-2023-24011)",
+                    "with one CA for identity and permissions, this DDS accepts permissions that"
+                    " any enclave has signed (the class of CVE-2023-24011)",
                     "use a keystore with separate CAs (template development or production)",
                 ),
             ),
@@ -106,15 +106,15 @@ ROWS: tuple[Row, ...] = (
                 _ITSELF,
                 forger.permissions_signed_by_itself,
                 RowStatus.NOT_LET_IN,
-                "the permissions CA is on nobody's certificate path: it signs documents only",
-                "Fast DDS takes no signer but the permissions CA itself",
+                "no enclave's certificate comes from the permissions CA: it signs only documents",
+                "Fast DDS accepts only the permissions CA itself as signer",
             ),
             (
-                "permissions and governance signed by itself",
+                "permissions and governance signed by the enclave",
                 forger.permissions_and_governance_signed_by_itself,
                 RowStatus.NOT_HEARD,
-                "its own DDS is made to agree; its peers verify with the permissions CA",
-                "its own DDS is made to agree; its peers take no signer but the permissions CA",
+                "the attacker changes the CA file for its DDS; its peers verify with the real CA",
+                "the attacker changes the CA file for its DDS; its peers accept only the real CA",
             ),
         )
     ),
@@ -124,7 +124,7 @@ ROWS: tuple[Row, ...] = (
         RowStatus.HEARD,
         "Cyclone DDS 0.10 accepts every signer whose certificate comes from the CA",
         attack=_ITSELF,
-        removed="a permissions CA of its own",
+        removed="a separate permissions CA",
         victims=Undefended(forger.permissions_signed_by_itself, forger.one_ca),
         variants=(Variant((Condition.EXACT_SIGNER,), RowStatus.HEARD, instead=_TRUSTED_AS_SIGNER),),
     ),
@@ -132,19 +132,20 @@ ROWS: tuple[Row, ...] = (
         _BORROWED,
         Identity(forger.borrowed_permissions, "guest"),
         RowStatus.NOT_LET_IN,
-        "each subject has a part that no other has",
+        "every subject name has a unique part",
         attack=_BORROWED,
         variants=(
             Variant(
                 (Condition.FAST,),
                 RowStatus.NOT_LET_IN,
-                mechanism="Fast DDS compares whole subjects, and no two of them are the same",
+                mechanism="Fast DDS compares whole subject names, and no two are equal",
             ),
             Variant(
                 (Condition.SHARED_SUBJECTS, Condition.CYCLONE),
                 RowStatus.HEARD,
-                "Cyclone DDS 0.10 takes a subject for its own that contains its parts",
-                "use the template production (unique_subject), or names that do not contain others",
+                "Cyclone DDS 0.10 accepts permissions for a longer subject with the same parts",
+                "use the template production (unique_subject), or enclave names that do not contain"
+                " each other",
             ),
         ),
     ),
@@ -152,7 +153,7 @@ ROWS: tuple[Row, ...] = (
         "permissions borrowed, subjects not unique",
         Identity(Undefended(forger.borrowed_permissions, forger.shared_subjects), "guest"),
         RowStatus.HEARD,
-        "Cyclone DDS compares parts of names, so the permissions of /guest/admin fit /guest",
+        "Cyclone DDS compares parts of subject names: /guest may use what is for /guest/admin",
         attack=_BORROWED,
         removed="unique subjects",
         victims=Undefended(forger.borrowed_permissions, forger.shared_subjects),
@@ -172,13 +173,13 @@ ROWS: tuple[Row, ...] = (
         "old permissions put back after renewal",
         Identity(forger.old_permissions_after_renewal, "guest"),
         RowStatus.NOT_LET_IN,
-        "the renewed certificate has another subject, which the old permissions do not fit",
+        "the renewed certificate has another subject name than the old permissions",
         attack="old permissions put back after renewal",
         variants=(
             Variant(
                 (Condition.SHARED_SUBJECTS,),
                 RowStatus.HEARD,
-                "the renewed certificate has the same subject as the old one",
+                "the renewed certificate has the same subject name as the old one",
                 "use the template production (unique_subject), or `sros revoke` and a new enclave",
             ),
         ),
@@ -187,7 +188,7 @@ ROWS: tuple[Row, ...] = (
         "old permissions put back after renewal, subjects not unique",
         Identity(Undefended(forger.old_permissions_after_renewal, forger.shared_subjects), "guest"),
         RowStatus.HEARD,
-        "the same subject fits old and new permissions",
+        "the old and new permissions are for the same subject name",
         attack="old permissions put back after renewal",
         removed="unique subjects",
         victims=Undefended(forger.old_permissions_after_renewal, forger.shared_subjects),
@@ -196,7 +197,7 @@ ROWS: tuple[Row, ...] = (
         "old permissions put back after revocation",
         Identity(forger.permissions_signed_by_the_ca, "guest"),
         RowStatus.NOT_HEARD,
-        "the listener's crl.pem names the certificate that they were signed for",
+        "the listener's crl.pem lists the certificate for which they were signed",
         attack="old permissions put back after revocation",
         victims=forger.guest_revoked,
     ),
@@ -204,7 +205,7 @@ ROWS: tuple[Row, ...] = (
         "old permissions put back after revocation, list not delivered",
         Identity(Undefended(forger.guest_revocation_not_delivered), forger.STOLEN),
         RowStatus.HEARD,
-        "without crl.pem, DDS knows of no revocation",
+        "without crl.pem, DDS does not check for revocation",
         attack="old permissions put back after revocation",
         removed="the listener's crl.pem",
         victims=Undefended(forger.guest_revocation_not_delivered),
@@ -213,14 +214,14 @@ ROWS: tuple[Row, ...] = (
         "permissions for another domain",
         Identity(forger.permissions_for_another_domain, "guest"),
         RowStatus.NOT_LET_IN,
-        "no rule of the permissions is for this domain",
+        "the permissions have no rule for this domain",
         attack="permissions for another domain",
         variants=(
             Variant(
                 (Condition.OPEN_JOIN, Condition.UNCONTROLLED),
                 RowStatus.HEARD,
                 "the template controls neither who joins nor who uses the topic",
-                "leave join_access_control and the access control of topics on",
+                "keep join_access_control and the access control of topics on",
             ),
             Variant((Condition.OPEN_JOIN,), RowStatus.REFUSED),
             Variant(
@@ -256,7 +257,7 @@ ROWS: tuple[Row, ...] = (
         "an older, weaker governance put back",
         UNSECURED,
         RowStatus.HEARD,
-        "what the CA has signed is valid for ever: governance has no dates",
+        "a governance that the CA has signed never expires: it has no dates",
         attack="weaker governance",
         victims=forger.weaker_governance,
         tampered=True,
@@ -268,7 +269,7 @@ ROWS: tuple[Row, ...] = (
         "weaker governance, signed by the permissions CA",
         UNSECURED,
         RowStatus.HEARD,
-        "the listener lets everybody in",
+        "the governance admits everybody and protects nothing",
         attack="weaker governance",
         removed="the wrong signature",
         victims=Undefended(forger.weaker_governance),

@@ -1,7 +1,8 @@
-"""The kinds of attacks: somebody injects, listens, looks around, asks, or poses as a server.
+"""The kinds of attacks: to publish, subscribe, discover endpoints, call, or pose as a server.
 
-In each, the attacker is the party "attacker".  Its victims and the control have identities of the
-keystore ``victims``; where the defence is gone (``removed``), there is nothing but the victim.
+Each function returns a row with the party "attacker".  The victims, and the controls unless noted,
+have enclaves in the keystore ``victims``.  ``attack`` names the attack, and ``removed`` the defence
+that the row leaves out ("": none).
 """
 
 from __future__ import annotations
@@ -24,22 +25,22 @@ from sros_tool.demo.scenarios.policies import SERVICE
 _ATTACKER = "attacker"
 
 _LET_IN = (
-    "the template lets unauthenticated participants in, and protects nothing",
-    "leave out allow_unauthenticated_participants, and encrypt",
+    "the template admits unauthenticated participants, and does not protect the topic",
+    "remove allow_unauthenticated_participants from the template, and encrypt the topic",
 )
 _UNCONTROLLED = (
     "the template does not control access to this topic",
-    "leave read_access_control and write_access_control on",
+    "keep read_access_control and write_access_control on",
 )
 
 
 def open_to(success: RowStatus, expected: RowStatus) -> tuple[Variant, ...]:
-    """Return the variants for templates that leave open what the row expects to be closed."""
+    """Return variants that expect ``success`` with templates that do not stop the attack."""
     if expected is RowStatus.REFUSED:
         return (Variant((Condition.UNCONTROLLED,), success, *_UNCONTROLLED),)
     if expected is success or expected is RowStatus.NOT_LET_IN:
         return ()
-    return (Variant((Condition.STRANGERS,), success, *_LET_IN),)
+    return (Variant((Condition.UNAUTHENTICATED,), success, *_LET_IN),)
 
 
 def injection(
@@ -60,7 +61,8 @@ def injection(
     """Return a row that shows whether the attacker is heard on the topic.
 
     With ``tampered``, the files of the listener were changed: it may fail to start, and the control
-    is another listener with unchanged files.
+    is another listener with unchanged files.  Otherwise, the control is a rightful talker, except
+    with ``removed`` or without ``crowd``.
     """
     listener = Party("listener", Role.LISTENER, Identity(victims, "listener"), intruder=tampered)
     parties = [Party(_ATTACKER, Role.TALKER, attacker, intruder=True), listener]
@@ -93,8 +95,8 @@ def injection(
 def succeeds(
     name: str, attacker: Identity, *, attack: str, removed: str, victims: KeystoreChoice
 ) -> Row:
-    """Return a row in which the same attacker, but with valid files, is heard."""
-    mechanism = "with nothing wrong about it, it is heard"
+    """Return a row in which the same attacker is heard, because its files are valid."""
+    mechanism = "an attacker with valid files is heard"
     return injection(
         name, attacker, RowStatus.HEARD, mechanism, attack=attack, removed=removed, victims=victims
     )
@@ -143,7 +145,7 @@ def looking(
     open_because: str = "",
     remedy: str = "",
 ) -> Row:
-    """Return a row that shows whether the attacker counts a publisher of the topic."""
+    """Return a row that shows whether the attacker discovers a publisher of the topic."""
     open_talker = Party("unsecured talker", Role.TALKER, other_topic=True)
     unsecured = attacker.keystore is None
     return Row(
@@ -176,7 +178,7 @@ def asking(
     removed: str = "",
     victims: KeystoreChoice = OWN,
 ) -> Row:
-    """Return a row that shows whether the attacker gets answers of a service."""
+    """Return a row that shows whether the attacker gets answers from a service."""
     return Row(
         name,
         expected,
@@ -205,7 +207,7 @@ def posing_as_server(
     removed: str = "",
     victims: KeystoreChoice = OWN,
 ) -> Row:
-    """Return a row that shows whether a client takes answers of an attacker posing as server."""
+    """Return a row that shows whether a client accepts answers from an attacker as server."""
     rightful = Party("server", Role.SERVER, Identity(victims, "server"), SERVICE)
     return Row(
         name,

@@ -44,7 +44,7 @@ ROWS: tuple[Row, ...] = (
         "a listener publishes",
         Identity(OWN, "listener"),
         RowStatus.REFUSED,
-        "its signed permissions allow the topic in the other direction only",
+        "its signed permissions allow the topic only in the other direction",
         attack="a listener publishes",
     ),
     injection(
@@ -60,7 +60,7 @@ ROWS: tuple[Row, ...] = (
         "a talker listens",
         Identity(OWN, "talker"),
         RowStatus.REFUSED,
-        "its signed permissions allow the topic in the other direction only",
+        "its signed permissions allow the topic only in the other direction",
         attack="a talker listens",
     ),
     listening(
@@ -92,7 +92,7 @@ ROWS: tuple[Row, ...] = (
         "a client poses as the server",
         Identity(OWN, "client"),
         RowStatus.REFUSED,
-        "its signed permissions allow it to ask, not to reply",
+        "its signed permissions allow requests, not replies",
         attack="a client poses as the server",
     ),
     posing_as_server(
@@ -108,13 +108,13 @@ ROWS: tuple[Row, ...] = (
         "an enclave without a policy publishes",
         Identity(OWN, "newcomer"),
         RowStatus.REFUSED,
-        "the template gives an enclave without a policy no topic of the robot",
+        "the template denies every topic of the robot to an enclave without a policy",
         attack="an enclave without a policy",
         variants=(
             Variant(
                 (Condition.OPEN_DEFAULT,),
                 RowStatus.HEARD,
-                "the template lets an enclave without a policy do everything",
+                "the template allows everything to an enclave without a policy",
                 "give every enclave a policy, or use the template production",
             ),
         ),
@@ -125,7 +125,7 @@ ROWS: tuple[Row, ...] = (
         RowStatus.HEARD,
         "an enclave without a policy may do everything",
         attack="an enclave without a policy",
-        removed="the template's denial of what no policy allows",
+        removed="the template's denial by default",
         victims=Undefended(template=forger.open_default),
     ),
 )

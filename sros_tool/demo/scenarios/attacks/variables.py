@@ -1,4 +1,4 @@
-"""Attacks on the files and variables that a process is started with."""
+"""Attacks on the files and environment variables with which a process starts."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _ENABLE, _STRATEGY = "ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY"
 _PERMISSIVE = (_STRATEGY, "Permissive")
 
 
-def _misled(
+def _misconfigured(
     name: str,
     identity: Identity,
     expected: RowStatus,
@@ -31,13 +31,13 @@ def _misled(
     open_because: str = "",
     remedy: str = "",
 ) -> Row:
-    """Return a row that shows whether a misled talker is heard by an unsecured listener."""
+    """Return a row that shows whether a misconfigured talker is heard by an unsecured listener."""
     parties = (
-        Party("misled talker", Role.TALKER, identity, intruder=True),
+        Party("misconfigured talker", Role.TALKER, identity, intruder=True),
         Party("unsecured listener", Role.LISTENER),
         Party("unsecured talker", Role.TALKER),
     )
-    claim = Claim(Relation.HEARS, "unsecured listener", "misled talker").expecting(expected)
+    claim = Claim(Relation.HEARS, "unsecured listener", "misconfigured talker").expecting(expected)
     return Row(
         name,
         expected,
@@ -55,30 +55,30 @@ def _misled(
 
 
 ROWS: tuple[Row, ...] = (
-    _misled(
+    _misconfigured(
         "a file of the enclave missing, Enforce",
         Identity(forger.missing_permissions, "talker"),
         RowStatus.NOT_LET_IN,
-        "with Enforce, a node without all of its files does not start",
+        "with Enforce, a node does not start if a file of its enclave is missing",
         attack="a file of the enclave missing",
     ),
-    _misled(
+    _misconfigured(
         "a file of the enclave missing, Permissive",
         Identity(Undefended(forger.missing_permissions), "talker", (_PERMISSIVE,)),
         RowStatus.HEARD,
-        "with Permissive, it runs unsecured, and everybody hears it",
+        "with Permissive, the talker runs unsecured, and everybody hears it",
         attack="a file of the enclave missing",
         removed="ROS_SECURITY_STRATEGY=Enforce",
     ),
-    _misled(
+    _misconfigured(
         "variables spelt right",
         Identity(OWN, "talker"),
         RowStatus.NOT_HEARD,
-        "the talker runs secured, and sends strangers nothing",
+        "the talker runs secured, and sends nothing to unsecured nodes",
         attack="misspelt security variables",
     ),
     *(
-        _misled(
+        _misconfigured(
             f"{variable}={value}{' and a file missing' if variable == _STRATEGY else ''}",
             Identity(
                 forger.missing_permissions if variable == _STRATEGY else OWN,
@@ -88,13 +88,21 @@ ROWS: tuple[Row, ...] = (
             RowStatus.HEARD,
             mechanism,
             attack="misspelt security variables",
-            open_because="rcl reads every other spelling as no, and a node says nothing about it",
+            open_because="rcl ignores every other spelling, and the node does not warn",
             remedy="start nodes with `sros run`, which sets the variables; `sros doctor` finds"
             " misspelt ones",
         )
         for variable, value, mechanism in (
-            (_ENABLE, "True", "anything but 'true' is off: the talker runs unsecured"),
-            (_STRATEGY, "enforce", "anything but 'Enforce' is permissive: it runs unsecured"),
+            (
+                _ENABLE,
+                "True",
+                "every value but 'true' switches security off: the talker runs unsecured",
+            ),
+            (
+                _STRATEGY,
+                "enforce",
+                "every value but 'Enforce' means Permissive: the talker runs unsecured",
+            ),
         )
     ),
 )

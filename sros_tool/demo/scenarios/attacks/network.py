@@ -1,4 +1,4 @@
-"""Attacks by strangers: on the wire, by nodes without an identity; and what enclaves can see."""
+"""Attacks from the network: capture, replay, unsecured nodes; and what enclaves can discover."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from sros_tool.demo.scenarios.model import (
 )
 
 _IN_CLEAR = Undefended(template=forger.unprotected)
-_STRANGERS_ALLOWED = Undefended(forger.weaker_governance)
+_OPEN_GOVERNANCE = Undefended(forger.weaker_governance)
 
 ROWS: tuple[Row, ...] = (
     Row(
@@ -40,7 +40,7 @@ ROWS: tuple[Row, ...] = (
                 (Condition.IN_CLEAR,),
                 RowStatus.READABLE,
                 "the template does not encrypt the payload of this topic",
-                'set data = "ENCRYPT" for it',
+                'set data = "ENCRYPT" for this topic',
             ),
         ),
         attack="eavesdropping on the wire",
@@ -48,7 +48,7 @@ ROWS: tuple[Row, ...] = (
     Row(
         "payload read on the wire, not encrypted",
         RowStatus.READABLE,
-        "with the protection kinds NONE, access is controlled but nothing is hidden",
+        "with the protection kind NONE, access is controlled but nothing is encrypted",
         (
             Party("talker", Role.TALKER, Identity(_IN_CLEAR, "talker")),
             Party(
@@ -67,7 +67,7 @@ ROWS: tuple[Row, ...] = (
     Row(
         "packets of a secured talker sent again",
         RowStatus.NOT_HEARD_AGAIN,
-        "each two peers agree on new keys, so that no key fits old packets",
+        "every two participants agree on new keys, so that old packets are rejected",
         (
             Party("talker", Role.TALKER, Identity(OWN, "talker")),
             Party("listener", Role.LISTENER, Identity(OWN, "listener")),
@@ -82,7 +82,7 @@ ROWS: tuple[Row, ...] = (
     Row(
         "packets of an unsecured talker sent again",
         RowStatus.HEARD_AGAIN,
-        "nothing in a packet proves when it was sent, nor by whom",
+        "nothing in an unsecured packet proves when or by whom it was sent",
         (Party("talker", Role.TALKER), Party("listener", Role.LISTENER)),
         (Claim(Relation.HEARS_AGAIN, "listener", "talker"),),
         (Claim(Relation.HEARS, "listener", "talker"),),
@@ -95,7 +95,7 @@ ROWS: tuple[Row, ...] = (
         Row(
             f"{what} read in the handshake",
             RowStatus.READABLE,
-            "identity and permissions travel in clear before there are keys",
+            "certificates and permissions are sent in clear before keys are agreed",
             (
                 Party("talker", Role.TALKER, Identity(OWN, "talker")),
                 Party("listener", Role.LISTENER, Identity(OWN, "listener")),
@@ -106,7 +106,7 @@ ROWS: tuple[Row, ...] = (
             brief=True,
             attack="what the handshake reveals",
             open_because="DDS Security 1.1 sends certificates and permissions unencrypted",
-            remedy="do not put secrets into names, and keep strangers off the network",
+            remedy="do not put secrets into names, and admit only trusted machines to the network",
         )
         for what, wire in (("topic names", Wire.TOPIC), ("certificates", Wire.CERTIFICATE))
     ),
@@ -114,41 +114,41 @@ ROWS: tuple[Row, ...] = (
         "an unsecured node listens",
         UNSECURED,
         RowStatus.NOT_HEARD,
-        "a node that cannot authenticate gets no keys, and is sent nothing",
+        "a node that cannot authenticate gets no keys and no messages",
         attack="an unsecured node listens",
     ),
     listening(
-        "an unsecured node listens, strangers allowed",
+        "an unsecured node listens, open governance",
         UNSECURED,
         RowStatus.HEARD,
-        "the governance lets everybody in and protects nothing",
+        "the governance admits everybody and protects nothing",
         attack="an unsecured node listens",
-        removed="the governance's refusal of strangers",
-        victims=_STRANGERS_ALLOWED,
+        removed="the refusal of unauthenticated participants",
+        victims=_OPEN_GOVERNANCE,
     ),
     looking(
         "an unsecured node lists topics",
         UNSECURED,
         RowStatus.NOT_VISIBLE,
-        "discovery of endpoints is encrypted: it counts no publisher of the topic",
+        "endpoint discovery is encrypted: the node sees no publisher of the topic",
         attack="an unsecured node lists topics",
         variants=(
             Variant(
-                (Condition.STRANGERS_SEE,),
+                (Condition.UNAUTHENTICATED_SEE,),
                 RowStatus.VISIBLE,
-                "the template lets unauthenticated participants in",
-                "leave out allow_unauthenticated_participants",
+                "the template admits unauthenticated participants",
+                "remove allow_unauthenticated_participants from the template",
             ),
         ),
     ),
     looking(
-        "an unsecured node lists topics, strangers allowed",
+        "an unsecured node lists topics, open governance",
         UNSECURED,
         RowStatus.VISIBLE,
-        "discovery is not protected, and open to everybody",
+        "discovery is not protected, and everybody may join",
         attack="an unsecured node lists topics",
-        removed="the governance's refusal of strangers",
-        victims=_STRANGERS_ALLOWED,
+        removed="the refusal of unauthenticated participants",
+        victims=_OPEN_GOVERNANCE,
     ),
     injection(
         "an unsecured node injects",
@@ -158,13 +158,13 @@ ROWS: tuple[Row, ...] = (
         attack="an unsecured node injects",
     ),
     injection(
-        "an unsecured node injects, strangers allowed",
+        "an unsecured node injects, open governance",
         UNSECURED,
         RowStatus.HEARD,
-        "the governance lets everybody in and protects nothing",
+        "the governance admits everybody and protects nothing",
         attack="an unsecured node injects",
-        removed="the governance's refusal of strangers",
-        victims=_STRANGERS_ALLOWED,
+        removed="the refusal of unauthenticated participants",
+        victims=_OPEN_GOVERNANCE,
     ),
     looking(
         "an enclave without rights lists topics",
@@ -173,6 +173,6 @@ ROWS: tuple[Row, ...] = (
         "endpoints are announced to every authenticated participant",
         attack="an authenticated node looks around",
         open_because="DDS Security 1.1 does not hide endpoints from authenticated participants",
-        remedy="give no identity to anybody who must not see what is on the robot",
+        remedy="give an identity only to those who may see all endpoints of the robot",
     ),
 )
