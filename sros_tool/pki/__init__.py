@@ -1,1 +1,1 @@
-"""Keys, certificates and S/MIME signatures: bytes in, bytes out."""
+"""Keys, certificates, revocation lists and S/MIME signatures, without access to files."""

@@ -1,4 +1,4 @@
-"""X.509 certificates of authorities and enclaves, as DDS Security asks for them."""
+"""X.509 certificates of CAs and enclaves, as DDS Security requires them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from sros_tool.pki.keys import PrivateKey, PublicKey
 from sros_tool.validity import Window
 
 _CA_USAGE = x509.KeyUsage(
-    digital_signature=True,  # it also signs governance and permissions documents
+    digital_signature=True,  # a permissions CA signs governance and permissions documents
     content_commitment=False,
     key_encipherment=False,
     data_encipherment=False,
@@ -38,7 +38,7 @@ _LEAF_USAGE = x509.KeyUsage(
     decipher_only=False,
 )
 UNREADABLE = (ValueError, UnsupportedAlgorithm, x509.DuplicateExtension, x509.InvalidVersion)
-"""The exceptions of `cryptography` for a certificate that is damaged or of an unknown kind."""
+"""The exceptions of `cryptography` for a certificate that is damaged or not supported."""
 
 _SHORT_NAMES = {
     oid.dotted_string: name
@@ -75,7 +75,10 @@ _SHORT_NAMES = {
         "x500UniqueIdentifier": NameOID.X500_UNIQUE_IDENTIFIER,
     }.items()
 }
-"""OpenSSL's short names of attributes; the value of any other is printed as bytes."""
+"""OpenSSL's short names of subject attributes, by OID.
+
+OpenSSL prints the value of any other attribute in hexadecimal.
+"""
 _OIDS = {name: x509.ObjectIdentifier(oid) for oid, name in _SHORT_NAMES.items()}
 _ESCAPED = re.compile(r'[,+"\\<>;]|^[# ]|(?<!^) \Z')
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
@@ -85,16 +88,16 @@ _A_CA = x509.BasicConstraints(ca=True, path_length=1)
 
 
 def common_name(text: str) -> x509.Name:
-    """Return the distinguished name ``CN=text``, the only part of a portable subject."""
+    """Return the distinguished name ``CN=text``."""
     return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, text)])
 
 
 def enclave_subject(name: str, *, unique: bool) -> x509.Name:
-    """Return the subject of an enclave's certificate: its name, and optionally a unique part.
+    """Return the subject of an enclave's certificate: the CN ``name``; if ``unique``, a random OU.
 
-    With the unique part, no other permissions match: neither those of an enclave whose name
-    contains this name (Cyclone DDS compares parts), nor those of an earlier certificate.  The RFC
-    4514 text has the CN first, as Fast DDS 2.9.1 and Cyclone DDS 0.10.2 both compare it.
+    The OU keeps other permissions from matching: the permissions of an enclave whose name contains
+    this name (Cyclone DDS compares parts), and the permissions for an earlier certificate.  The
+    RFC 4514 text has the CN first, as Fast DDS 2.9.1 and Cyclone DDS 0.10.2 compare it.
     """
     if not unique:
         return common_name(name)
@@ -103,10 +106,10 @@ def enclave_subject(name: str, *, unique: bool) -> x509.Name:
 
 
 def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certificate:
-    """Return a self-signed certificate authority.
+    """Return a self-signed CA certificate.
 
-    It has BasicConstraints, KeyUsage and both key identifiers: without them OpenSSL's strict check
-    (``-x509_strict``, used by Fast DDS) refuses chains.
+    It has BasicConstraints, KeyUsage and both key identifiers: without them, OpenSSL's strict check
+    (``-x509_strict``, used by Fast DDS) refuses a chain.
     """
     public = key.public_key()
     identifier = x509.SubjectKeyIdentifier.from_public_key(public)
@@ -124,7 +127,7 @@ def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certifi
 
 
 class Issuer:
-    """Issuer of enclaves' certificates for one identity CA."""
+    """An identity CA that issues certificates to enclaves."""
 
     def __init__(self, certificate: x509.Certificate, key: PrivateKey) -> None:
         self._certificate = certificate
@@ -134,7 +137,7 @@ class Issuer:
         self._authority_id = authority_identifier(certificate)
 
     def issue(self, subject: x509.Name, public: PublicKey, validity: Window) -> x509.Certificate:
-        """Return a leaf certificate; its validity is cut to the CA's."""
+        """Return a certificate that is not a CA; shorten ``validity`` to the validity of the CA."""
         return (
             _builder(subject, self._name, public, validity.within(self._validity))
             .add_extension(_NOT_A_CA, critical=True)
@@ -146,10 +149,10 @@ class Issuer:
 
 
 def authority_identifier(certificate: x509.Certificate) -> x509.AuthorityKeyIdentifier:
-    """Return the AuthorityKeyIdentifier for certificates that ``certificate`` signs."""
+    """Return the AuthorityKeyIdentifier of certificates that the CA ``certificate`` issues."""
     try:
         extension = certificate.extensions.get_extension_for_class(x509.SubjectKeyIdentifier)
-    except x509.ExtensionNotFound:  # a CA made by ros2/sros2 has none
+    except x509.ExtensionNotFound:  # a CA that ros2/sros2 created has none
         public = certificate.public_key()
         return x509.AuthorityKeyIdentifier.from_issuer_public_key(public)  # type: ignore[arg-type]
     return x509.AuthorityKeyIdentifier.from_issuer_subject_key_identifier(extension.value)
@@ -169,7 +172,7 @@ def _builder(
 
 
 def validity_of(certificate: x509.Certificate) -> Window:
-    """Return the validity of a certificate."""
+    """Return the validity of a certificate, in UTC."""
     return Window(certificate.not_valid_before_utc, certificate.not_valid_after_utc)
 
 
@@ -179,33 +182,43 @@ def pem(certificate: x509.Certificate) -> bytes:
 
 
 def load_certificate(data: bytes, name: str) -> x509.Certificate:
-    """Return the first certificate of a PEM file, read in full; ``name`` is for errors."""
+    """Return the first certificate of a PEM file, read in full; ``name`` names the file in errors.
+
+    Raises:
+        PkiError: the certificate cannot be read.
+    """
     try:
         return read_in_full(x509.load_pem_x509_certificate(data))
     except UNREADABLE as error:
         raise PkiError(
             f"the certificate {name} cannot be read",
-            "It is not a PEM certificate, it is damaged, or its key is of an unknown kind.",
+            "It is not a PEM certificate, it is damaged, or its key algorithm is unknown.",
             "Restore it from a backup, or issue it again.",
         ) from error
 
 
 def load_certificates(data: bytes, name: str) -> tuple[x509.Certificate, ...]:
-    """Return all certificates of a PEM file, at least one; ``name`` stands for it in errors."""
+    """Return all certificates of a PEM file, at least one; ``name`` names the file in errors.
+
+    Raises:
+        PkiError: the file has no certificate, or one of them cannot be read.
+    """
     first = load_certificate(data, name)
     try:
         others = [read_in_full(each) for each in x509.load_pem_x509_certificates(data)[1:]]
     except UNREADABLE as error:
         raise PkiError(
-            f"the certificates {name} cannot be read", "One after the first is damaged."
+            f"the certificates {name} cannot be read",
+            "A certificate after the first one is damaged.",
+            "Restore the file from a backup, or remove the damaged certificate.",
         ) from error
     return (first, *others)
 
 
 def read_in_full(certificate: x509.Certificate) -> x509.Certificate:
-    """Return ``certificate`` after reading every part of it that sros uses.
+    """Return ``certificate`` after parsing every part that sros uses.
 
-    `cryptography` parses a part on first use, so a damaged part would otherwise fail anywhere
+    `cryptography` parses a part at its first use, so a damaged part would otherwise raise an error
     later.  Raises one of `UNREADABLE`.
     """
     for name in (certificate.subject, certificate.issuer):
@@ -213,7 +226,7 @@ def read_in_full(certificate: x509.Certificate) -> x509.Certificate:
     certificate.public_key()
     _ = certificate.extensions, certificate.signature_hash_algorithm, certificate.serial_number
     if certificate.not_valid_after_utc <= certificate.not_valid_before_utc:
-        raise ValueError("its validity ends before it begins")
+        raise ValueError("it expires before its validity begins")
     return certificate
 
 
@@ -223,7 +236,7 @@ def same_key(certificate: x509.Certificate, key: PrivateKey) -> bool:
 
 
 def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
-    """Return whether ``authority`` issued and signed ``certificate``, at whatever time."""
+    """Return whether ``authority`` issued and signed ``certificate``; ignore their validity."""
     try:
         certificate.verify_directly_issued_by(authority)
     except (InvalidSignature, ValueError, TypeError):
@@ -232,15 +245,14 @@ def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> boo
 
 
 def digest(certificate: x509.Certificate) -> str:
-    """Return the SHA-256 of a certificate, in hexadecimal: its fingerprint."""
+    """Return the SHA-256 fingerprint of a certificate, in hexadecimal."""
     return certificate.fingerprint(hashes.SHA256()).hex()
 
 
 def subject_text(name: x509.Name) -> str:
-    """Return a distinguished name as OpenSSL prints it by RFC 2253; vendors compare this text.
+    """Return a distinguished name as OpenSSL prints it by RFC 2253: the text that vendors compare.
 
-    The most general attribute comes last, also within one RDN; non-ASCII
-    characters are kept.
+    RDNs, and the attributes within an RDN, are in reverse order; non-ASCII characters are kept.
     """
     return ",".join(
         "+".join(map(_attribute_text, reversed(list(rdn)))) for rdn in reversed(name.rdns)
@@ -259,7 +271,11 @@ def _attribute_text(attribute: x509.NameAttribute[str | bytes]) -> str:
 
 
 def subject_of(text: str) -> x509.Name:
-    """Return the distinguished name of a text from `subject_text`.  Raises `ValueError`."""
+    """Parse the text of a distinguished name, as `subject_text` returns it.
+
+    Raises:
+        ValueError: the text is not a distinguished name.
+    """
     return x509.Name.from_rfc4514_string(text, _OIDS)
 
 
@@ -270,5 +286,5 @@ def common_name_of(name: x509.Name) -> str:
 
 
 def fingerprints(pem: bytes) -> frozenset[str]:
-    """Return the SHA-256 of every certificate of a CA file; during a rotation it has several."""
+    """Return the fingerprints of the certificates in a CA file: several during a rotation."""
     return frozenset(map(digest, load_certificates(pem, "the certificate of a CA")))

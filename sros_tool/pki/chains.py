@@ -1,4 +1,4 @@
-"""Verify chains of certificates as OpenSSL 3 does for the DDS vendors (x509_vfy.c)."""
+"""Verification of certificate chains as OpenSSL 3 does it for the DDS vendors (x509_vfy.c)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sros_tool.validity import iso
 
 Extension = TypeVar("Extension", bound=x509.ExtensionType)
 
-_issued_by = lru_cache(maxsize=256)(issued_by)  # the same few CAs are asked about repeatedly
+_issued_by = lru_cache(maxsize=256)(issued_by)  # the same few certificates are checked repeatedly
 
 
 def chain_fault(
@@ -27,22 +27,22 @@ def chain_fault(
     for_documents: bool = False,
     strict: bool = False,
 ) -> str:
-    """Return why ``start`` has no valid chain to a self-signed one of ``authorities``, or "".
+    """Return why ``start`` has no valid chain to a self-signed CA of ``authorities``, or "".
 
-    ``others`` are possible intermediate certificates.  ``for_documents`` checks the purpose S/MIME,
-    ``strict`` the rules of RFC 5280 for chains (OpenSSL's ``X509_V_FLAG_X509_STRICT`` with
-    ``X509_V_FLAG_CHECK_SS_SIGNATURE``).
+    ``others`` are possible intermediate certificates; validities are checked at the time ``at``.
+    ``for_documents`` also checks the purpose S/MIME, and ``strict`` the rules of RFC 5280 for
+    chains (OpenSSL's ``X509_V_FLAG_X509_STRICT`` with ``X509_V_FLAG_CHECK_SS_SIGNATURE``).
     """
     chain = [start]
     while not _issued_by(chain[-1], chain[-1]):
         issuer = _issuer(chain[-1], [*authorities, *others], at)
         if issuer is None or issuer in chain:
-            return f"the issuer {subject_text(chain[-1].issuer)} is not among what is trusted"
+            return f"the issuer {subject_text(chain[-1].issuer)} is not a trusted certificate"
         chain.append(issuer)
-    # Of several with the same name and key, OpenSSL tries only the first.
+    # Of several CA certificates with the same name and key, OpenSSL tries only the first.
     root = next((each for each in authorities if _issued_by(chain[-1], each)), None)
     if root != chain[-1]:
-        return f"the self-signed {subject_text(chain[-1].subject)} is not among what is trusted"
+        return f"the self-signed {subject_text(chain[-1].subject)} is not a trusted certificate"
     faults = (
         *_extension_faults(chain),
         *(purpose_faults(chain) if for_documents else ()),
@@ -79,24 +79,29 @@ def _extension_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
     for below, each in enumerate(chain[1:]):
         constraints = _extension(each, x509.BasicConstraints)
         if constraints is None or not constraints.ca:
-            yield f"{subject_text(each.subject)} is no CA"
+            yield f"{subject_text(each.subject)} is not a CA"
         elif constraints.path_length is not None and below > constraints.path_length:
-            yield f"{subject_text(each.subject)} allows no chain of this length"
+            yield f"the chain is longer than the pathlen of {subject_text(each.subject)} allows"
 
 
 def purpose_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
-    """Return why the first of ``chain`` may not sign S/MIME ("unsuitable certificate purpose")."""
+    """Yield the reasons why the first certificate of ``chain`` must not sign S/MIME messages.
+
+    OpenSSL reports them as "unsuitable certificate purpose".
+    """
     usage = _extension(chain[0], x509.KeyUsage)
     if usage and not (usage.digital_signature or usage.content_commitment):
         yield (
-            f"the keyUsage of {subject_text(chain[0].subject)} lacks digitalSignature, so it may "
-            "not sign documents"
+            f"the keyUsage of {subject_text(chain[0].subject)} lacks digitalSignature, which "
+            "signed documents need"
         )
     for each in chain:
         purposes = _extension(each, x509.ExtendedKeyUsage)
         if purposes and ExtendedKeyUsageOID.EMAIL_PROTECTION not in purposes:
             name = subject_text(each.subject)
-            yield f"the extendedKeyUsage of {name} lacks emailProtection, for signed documents"
+            yield (
+                f"the extendedKeyUsage of {name} lacks emailProtection, which signed documents need"
+            )
 
 
 def _strict_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
@@ -104,7 +109,7 @@ def _strict_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
         yield f"the keyUsage of {subject_text(chain[-1].subject)} lacks keyCertSign"
     usage = _extension(chain[0], x509.KeyUsage)
     if usage and usage.key_cert_sign and _extension(chain[0], x509.BasicConstraints) is None:
-        yield f"{subject_text(chain[0].subject)} does not say that it is a CA"
+        yield f"{subject_text(chain[0].subject)} has keyCertSign but no basicConstraints"
     if len(chain) == 1:
         return
     for each in chain:

@@ -1,4 +1,4 @@
-"""Certificate revocation lists (RFC 5280, section 5) of an identity CA."""
+"""Certificate revocation lists (CRLs) of an identity CA (RFC 5280, section 5)."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ CRL_MARK = b"-----BEGIN X509 CRL-----"
 REASONS = tuple(
     flag.value
     for flag in x509.ReasonFlags
-    # Not reasons of a whole certificate: remove_from_crl belongs to delta lists.
+    # remove_from_crl only occurs in delta CRLs.
     if flag not in (x509.ReasonFlags.remove_from_crl,)
 )
-"""The reasons for a revocation, in the words of RFC 5280."""
+"""The reasons for a revocation, as RFC 5280 names them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Revoked:
-    """One revoked certificate; ``reason`` is one of `REASONS`."""
+    """An entry of a revocation list; ``reason`` is one of `REASONS`."""
 
     serial: int
     date: datetime
@@ -36,7 +36,7 @@ class Revoked:
 
 @dataclass(frozen=True, slots=True)
 class RevocationList:
-    """A parsed revocation list."""
+    """A parsed revocation list; its signature is not verified yet."""
 
     number: int
     this_update: datetime
@@ -45,7 +45,7 @@ class RevocationList:
     list: x509.CertificateRevocationList
 
     def names(self, serial: int) -> bool:
-        """Return whether the certificate with that serial number is revoked."""
+        """Return whether the list revokes the certificate with the serial number ``serial``."""
         return any(each.serial == serial for each in self.revoked)
 
 
@@ -58,7 +58,7 @@ def sign_crl(
     this_update: datetime,
     next_update: datetime,
 ) -> bytes:
-    """Return a revocation list as PEM, signed by ``key`` of ``issuer``."""
+    """Return a revocation list as PEM, signed with ``key``, the key of the CA ``issuer``."""
     builder = (
         x509.CertificateRevocationListBuilder()
         .issuer_name(issuer.subject)
@@ -71,7 +71,7 @@ def sign_crl(
         entry = (
             x509.RevokedCertificateBuilder().serial_number(each.serial).revocation_date(each.date)
         )
-        if each.reason != "unspecified":  # RFC 5280 5.3.1: then the reason is left out
+        if each.reason != "unspecified":  # RFC 5280, 5.3.1: the extension is left out instead
             entry = entry.add_extension(
                 x509.CRLReason(x509.ReasonFlags(each.reason)), critical=False
             )
@@ -80,7 +80,11 @@ def sign_crl(
 
 
 def load_crl(pem: bytes, name: str) -> RevocationList:
-    """Return the first revocation list of a PEM file; ``name`` names it in errors."""
+    """Return the first revocation list of a PEM file; ``name`` names the file in errors.
+
+    Raises:
+        PkiError: the list cannot be read, or does not say when it expires.
+    """
     try:
         crl = x509.load_pem_x509_crl(pem)
         revoked = tuple(_revoked(entry) for entry in crl)
@@ -91,12 +95,12 @@ def load_crl(pem: bytes, name: str) -> RevocationList:
     except ValueError as error:
         raise PkiError(
             f"the revocation list {name} cannot be read",
-            "It is not a PEM revocation list, or it is damaged; DDS then refuses everybody.",
+            "It is not a PEM revocation list, or it is damaged; DDS refuses every participant.",
         ) from error
 
 
 def signed_by(crl: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:
-    """Return whether ``authority`` issued and signed a list."""
+    """Return whether ``authority`` issued and signed the revocation list."""
     try:
         public = authority.public_key()
         return crl.issuer == authority.subject and crl.is_signature_valid(public)  # type: ignore[arg-type]

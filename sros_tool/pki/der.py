@@ -1,7 +1,7 @@
 """A minimal DER (X.690) reader for CMS signatures.
 
-`cryptography` makes CMS signatures but cannot yet verify them; this reader finds the parts to pass
-to its verification primitives.
+`cryptography` creates CMS signatures but cannot yet verify them; this reader extracts the parts
+that its verification primitives need.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ CONTEXT_0 = 0xA0
 
 
 class Value(NamedTuple):
-    """One tag-length-value: its tag, the bytes of its content, and all its bytes."""
+    """A DER value: its tag, its content, and its whole encoding (tag, length and content)."""
 
     tag: int
     content: bytes
@@ -23,9 +23,10 @@ class Value(NamedTuple):
 
 
 def children(data: bytes) -> list[Value]:
-    """Return the values in ``data`` (the content of a constructed value).
+    """Return the values in ``data``, the content of a constructed value.
 
-    Raises `PkiError` if a value is cut short, or is not valid DER.
+    Raises:
+        PkiError: a value is truncated, or has a form that this reader does not support.
     """
     values = []
     position, end = 0, len(data)
@@ -53,15 +54,15 @@ def children(data: bytes) -> list[Value]:
 
 
 def first(data: bytes) -> Value:
-    """Return the first value in ``data``."""
+    """Return the first value in ``data``; raise `PkiError` if there is none."""
     values = children(data)
     if not values:
-        raise PkiError("a DER value is empty")
+        raise PkiError("a DER value is missing")
     return values[0]
 
 
 def encode_oid(dotted: str) -> bytes:
-    """Return the DER content of an object identifier in dotted form."""
+    """Encode an object identifier, given in dotted form, as the content of a DER value."""
     one, two, *rest = map(int, dotted.split("."))
     content = bytearray([40 * one + two])
     for number in rest:

@@ -1,4 +1,4 @@
-"""Private keys: making, loading, and writing them as PKCS#8 PEM."""
+"""Generation, loading and PEM encoding (PKCS#8) of private keys."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PublicKey = ec.EllipticCurvePublicKey | rsa.RSAPublicKey
 
 
 def generate_key() -> ec.EllipticCurvePrivateKey:
-    """Return a new key on prime256v1, which every DDS vendor accepts (DDS-Security 9.3.1)."""
+    """Generate an EC prime256v1 key, which every DDS vendor accepts (DDS-Security 1.1, 9.3.1)."""
     return ec.generate_private_key(ec.SECP256R1())
 
 
@@ -34,9 +34,13 @@ def key_pem(key: PrivateKey, passphrase: str | None = None) -> bytes:
 
 
 def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None) -> PrivateKey:
-    """Read a PEM private key; ``name`` stands for it in errors.
+    """Return the EC or RSA key of a PEM file; ``name`` names the file in errors.
 
-    ``passphrase`` is called if the key is encrypted; without it an encrypted key is refused.
+    ``passphrase`` is called if the key is encrypted.
+
+    Raises:
+        PkiError: the key cannot be read, is encrypted and ``passphrase`` is None or wrong, or is
+            neither an EC nor an RSA key.
     """
     try:
         key = serialization.load_pem_private_key(pem, None)
@@ -44,8 +48,8 @@ def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None)
         if passphrase is None:
             raise PkiError(
                 f"the private key {name} is protected by a passphrase",
-                "It cannot be used without it.",
-                "Decrypt it for this command with `openssl pkey -in KEY -out KEY.plain`.",
+                "It is encrypted, so it cannot be used without the passphrase.",
+                "Decrypt it with `openssl pkey -in KEY -out KEY.plain`.",
             ) from error
         key = _decrypted(pem, name, passphrase())
     except (ValueError, UnsupportedAlgorithm) as error:
@@ -67,12 +71,14 @@ def _decrypted(pem: bytes, name: str, passphrase: str) -> PrivateKeyTypes:
         return serialization.load_pem_private_key(pem, passphrase.encode())
     except (ValueError, TypeError) as error:
         raise PkiError(
-            f"the private key {name} cannot be decrypted", "The passphrase is wrong."
+            f"the private key {name} cannot be decrypted",
+            "The passphrase is wrong.",
+            "Try again with the right passphrase.",
         ) from error
 
 
 def algorithm(key: object) -> str:
-    """Return the kind of a key in words, such as ``EC secp256r1`` or ``RSA 2048``."""
+    """Return the algorithm of a key as text, such as ``EC secp256r1`` or ``RSA 2048``."""
     if isinstance(key, (ec.EllipticCurvePrivateKey, ec.EllipticCurvePublicKey)):
         return f"EC {key.curve.name}"
     if isinstance(key, (rsa.RSAPrivateKey, rsa.RSAPublicKey)):

@@ -1,4 +1,4 @@
-"""Certificate signing requests (PKCS#10, RFC 2986): making and reading them."""
+"""Creation and verification of certificate signing requests (PKCS#10, RFC 2986)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _DIGESTS = (hashes.SHA256, hashes.SHA384, hashes.SHA512)
 
 @dataclass(frozen=True, slots=True)
 class SigningRequest:
-    """A request whose signature was verified: its common name, its key, and the PEM."""
+    """A verified certificate signing request; ``name`` is the common name of its subject."""
 
     name: str
     public_key: PublicKey
@@ -29,16 +29,20 @@ class SigningRequest:
 
 
 def make_request(key: PrivateKey, name: str) -> bytes:
-    """Return a request, as PEM, for a certificate of ``key`` with the common name ``name``."""
+    """Return a PEM request, signed with ``key``, for a certificate with the CN ``name``."""
     builder = x509.CertificateSigningRequestBuilder().subject_name(common_name(name))
     return builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
 
 
 def load_request(data: bytes, what: str) -> SigningRequest:
-    """Read a PEM request and verify that its sender has the key; ``what`` stands for it in errors.
+    """Read a PEM request and verify its signature; ``what`` names the request in errors.
 
     Only keys that every DDS vendor accepts are allowed: EC prime256v1 and RSA 2048.  Extensions in
-    a request have no effect: the keystore decides the content of a certificate.
+    a request are ignored: the keystore decides the content of a certificate.
+
+    Raises:
+        PkiError: the request cannot be read, its signature does not verify, its key is of another
+            kind, or its subject is not exactly one common name.
     """
     try:
         if len(data) > _MAX_BYTES:
@@ -54,28 +58,29 @@ def load_request(data: bytes, what: str) -> SigningRequest:
         raise PkiError(
             f"the request {what} cannot be read",
             "It is not a PEM certificate request, or it is damaged.",
-            "Make one with `sros create_request` on the robot, and send its request.pem.",
+            "Create it with `sros create_request` on the robot, and send its request.pem.",
         ) from error
     if not (
         isinstance(public, ec.EllipticCurvePublicKey) and public.curve.name == "secp256r1"
     ) and (not (isinstance(public, rsa.RSAPublicKey) and public.key_size == 2048)):
         raise PkiError(
             f"the request {what} is for a key of {algorithm(public)}",
-            "Every DDS vendor takes EC prime256v1 and RSA 2048, and some take nothing else.",
-            "Make the key with `sros create_request`.",
+            "Only EC prime256v1 and RSA 2048 are accepted by every DDS vendor.",
+            "Create the key with `sros create_request`.",
         )
     if not isinstance(digest, _DIGESTS) or not _holds(request):
         raise PkiError(
             f"the signature of the request {what} is not valid",
             "The sender did not prove possession of the key, or the request was changed "
             "in transit.",
-            "Have it sent again.",
+            "Ask the sender to send it again.",
         )
     if len(list(subject)) != 1 or not common_name_of(subject):
         raise PkiError(
             f"the request {what} is for {said or 'an empty subject'}",
-            "A request names the enclave as its common name, and nothing else.",
-            "Make it with `sros create_request`.",
+            "The subject of a request has to be one common name, the name of the enclave, and "
+            "nothing else.",
+            "Create it with `sros create_request`.",
         )
     return SigningRequest(
         common_name_of(subject), public, request.public_bytes(serialization.Encoding.PEM)

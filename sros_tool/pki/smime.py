@@ -1,9 +1,9 @@
 """Signed documents (``.p7s``): S/MIME multipart/signed with a detached CMS signature.
 
-Every DDS vendor reads this form: CRLF line ends, a first part whose header
-``Content-Type: text/plain`` is signed with it, SHA-256, the signer's certificate embedded
-(DDS-Security 1.1, 9.4.1.1; OpenSSL ``smime -sign -text``).  Opaque messages, which hold the content
-inside of the signature, are read as well, as every vendor accepts them (``-nodetach``).
+Every DDS vendor reads this form: CRLF line ends, a first part whose signed bytes begin with the
+header ``Content-Type: text/plain``, SHA-256, and the embedded certificate of the signer
+(DDS-Security 1.1, 9.4.1.1; OpenSSL ``smime -sign -text``).  Opaque messages, which have the content
+inside the signature (``-nodetach``), are read as well, because every vendor accepts them.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
 
 
 def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> bytes:
-    """Return the S/MIME message that carries ``document``, signed by ``key`` of ``certificate``."""
+    """Return the S/MIME message of ``document``, signed with ``key`` of ``certificate``."""
     content = _TEXT_HEADER + document.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n")
     signature = (
         pkcs7.PKCS7SignatureBuilder()
@@ -78,10 +78,11 @@ def sign(document: bytes, certificate: x509.Certificate, key: PrivateKey) -> byt
 
 @dataclass(frozen=True, slots=True)
 class SignedDocument:
-    """A parsed ``.p7s``; nothing in it is trusted before `verify`.
+    """A parsed ``.p7s``; do not trust its content before `verify`.
 
-    ``content`` are the signed bytes, with CRLF line ends and the MIME header; ``document`` is the
-    same without the header; ``certificates`` are the ones embedded in the signature.
+    ``content`` is the signed part, with CRLF line ends and the MIME header; ``document`` is the
+    same without the header.  ``certificates`` are the embedded certificates.  ``digest`` is the
+    name of the hash algorithm.
     """
 
     content: bytes
@@ -95,11 +96,11 @@ class SignedDocument:
     _issuer_and_serial: tuple[bytes, int]
 
     def signer(self) -> x509.Certificate | None:
-        """Return the signer's certificate, if it is embedded."""
+        """Return the signer's certificate, or None if it is not embedded."""
         return self.signer_among(self.certificates)
 
     def signer_among(self, certificates: Iterable[x509.Certificate]) -> x509.Certificate | None:
-        """Return the signer's certificate, found by its issuer and serial number."""
+        """Return the signer's certificate by issuer and serial number, or None."""
         issuer, serial = self._issuer_and_serial
         for certificate in certificates:
             if certificate.serial_number == serial and certificate.issuer.public_bytes() == issuer:
@@ -107,10 +108,13 @@ class SignedDocument:
         return None
 
     def verify(self, authority: x509.Certificate) -> None:
-        """Check that ``authority`` itself signed this document; raise `PkiError` if not.
+        """Verify that ``authority`` itself signed this document.
 
-        Stricter than Cyclone DDS 0.10.2 and Fast DDS 2.9.1, which accept any signer whose chain
-        leads to the authority (the CVE-2023-24011 class; both ran).
+        Stricter than Cyclone DDS 0.10.2 and Fast DDS 2.9.1, which accept any signer with a chain to
+        the authority (the CVE-2023-24011 class; both measured).
+
+        Raises:
+            PkiError: another certificate signed it, or its signature does not match its content.
         """
         signer = self.signer()
         if signer is None or signer != authority:
@@ -130,13 +134,13 @@ class SignedDocument:
             )
 
     def carries_digest(self) -> bool:
-        """Return whether the digest in the signed attributes is the digest of this content."""
+        """Return whether the messageDigest attribute is the digest of the content."""
         digest = hashes.Hash(self._digest_algorithm)
         digest.update(self.content)
         return digest.finalize() == self._message_digest
 
     def is_intact(self, signer: x509.Certificate) -> bool:
-        """Return whether the key of ``signer`` signed this content."""
+        """Return whether the signature verifies with the key of ``signer``."""
         if self._signed_attributes and not self.carries_digest():
             return False
         signed = self._signed_attributes or self.content
@@ -153,31 +157,31 @@ class SignedDocument:
         return True
 
 
-@lru_cache(maxsize=8)  # several callers parse the same document, one after the other
+@lru_cache(maxsize=8)  # several callers parse the same document in a row
 def parse(message: bytes) -> SignedDocument:
-    """Parse a ``.p7s``. Raises `PkiError` if it is not an S/MIME signed message."""
+    """Parse a ``.p7s`` without verifying it; raise `PkiError` if it is not a signed message."""
     content, signature = _split(message)
     try:
         return _parse_cms(signature, content)
     except (IndexError, *UNREADABLE) as error:
-        raise PkiError("its signature is not a CMS signature that can be read") from error
+        raise PkiError("its signature is not a readable CMS signature") from error
 
 
 def _document(content: bytes) -> bytes:
     header, separator, document = content.partition(b"\r\n\r\n")
     if not separator or not _TEXT.match(header):
         raise PkiError(
-            "its signed part has no MIME header of text/plain",
-            "DDS vendors only accept documents signed with a text/plain header "
+            "its signed part has no MIME header text/plain",
+            "DDS vendors accept only documents that are signed with this header "
             "(openssl smime -sign -text).",
         )
     return document
 
 
 def _split(message: bytes) -> tuple[bytes | None, bytes]:
-    """Return the signed part, with CRLF line ends, and the DER of its signature.
+    """Return the signed part, with CRLF line ends, and the signature in DER.
 
-    An opaque message holds the signed part inside of the signature.
+    The signed part is None for an opaque message, which has it inside the signature.
     """
     head, _, body = message.replace(b"\r\n", b"\n").partition(b"\n\n")
     if _OPAQUE.search(head):
@@ -193,7 +197,7 @@ def _split(message: bytes) -> tuple[bytes | None, bytes]:
     mark = b"\n--" + (boundary[2] or boundary[3])
     parts = (b"\n" + body).split(mark)
     if len(parts) != 4 or not parts[3].startswith(b"--"):
-        raise PkiError("it does not consist of one signed part and one signature")
+        raise PkiError("it is not one signed part followed by one signature")
     content = parts[1].removeprefix(b"\n").replace(b"\n", b"\r\n")
     header, _, encoded = parts[2].removeprefix(b"\n").partition(b"\n\n")
     signature = _decoded(encoded)
@@ -216,15 +220,18 @@ def _certificate(data: bytes) -> x509.Certificate:
 
 
 def _parts(value: der.Value, *tags: int) -> list[der.Value]:
-    """Return the parts of a value; the first ones must have ``tags``."""
+    """Return the values in a constructed value; raise `ValueError` if their tags do not fit."""
     parts = der.children(value.content)
     if [part.tag for part in parts[: len(tags)]] != list(tags):
-        raise ValueError("not of the structure of a signature")
+        raise ValueError("not the structure of a CMS signature")
     return parts
 
 
 def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
-    """Read ContentInfo / SignedData / SignerInfo (RFC 5652, sections 3, 5.1 and 5.3)."""
+    """Parse a ContentInfo with SignedData and one SignerInfo (RFC 5652, 3, 5.1 and 5.3).
+
+    Without ``content``, the signed part is taken from the SignedData.
+    """
     message = der.first(signature)
     content_type, wrapped = _parts(message, der.OID, der.CONTEXT_0)[:2]
     (signed_data,) = _parts(wrapped, der.SEQUENCE)

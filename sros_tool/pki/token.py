@@ -1,4 +1,4 @@
-"""Keys on PKCS#11 tokens, named by URI (RFC 7512): the token signs, and the key never leaves it."""
+"""Keys on PKCS#11 tokens, named by URI (RFC 7512); the token signs, and keys never leave it."""
 
 from __future__ import annotations
 
@@ -19,12 +19,16 @@ from sros_tool.errors import PkiError, UnavailableError, UsageError
 SCHEME = "pkcs11:"
 _MODULE_VARIABLE = "PKCS11_MODULE_PATH"
 Secrets = Callable[[str], str]
-"""Function that returns the secret for the named thing; called at most once for each."""
+"""Function that returns the secret that its argument names, such as "the PIN of the token X"."""
 
 
 @dataclass(frozen=True, slots=True)
 class TokenUri:
-    """The parts of a ``pkcs11:`` URI that sros understands."""
+    """The parts of a ``pkcs11:`` URI that sros uses.
+
+    ``object`` is the label of the key, ``module`` the path of the PKCS#11 library, and
+    ``pin_source`` the path of a file with the PIN, or "".
+    """
 
     token: str
     object: str
@@ -33,10 +37,13 @@ class TokenUri:
 
 
 def _parse_uri(uri: str) -> TokenUri:
-    """Read ``pkcs11:token=NAME;object=LABEL?module-path=FILE``.
+    """Parse ``pkcs11:token=NAME;object=LABEL?module-path=FILE``.
 
-    Without ``module-path``, $PKCS11_MODULE_PATH names the module.  A ``pin-value`` is refused: a
-    secret does not belong in a settings file or on a command line.
+    Without ``module-path``, $PKCS11_MODULE_PATH names the module.
+
+    Raises:
+        UsageError: a part is missing, or there is a ``pin-value``: a secret does not belong in a
+            settings file or on a command line.
     """
     path, _, query = uri.removeprefix(SCHEME).partition("?")
     parts = dict(part.partition("=")[::2] for part in path.split(";") if part)
@@ -45,23 +52,23 @@ def _parse_uri(uri: str) -> TokenUri:
         raise UsageError(
             "a PKCS#11 URI with pin-value is not accepted",
             "The PIN would be written into the keystore's settings.",
-            "Leave it out; Give it by SROS_PKCS11_PIN or pin-source=FILE.",
+            "Remove pin-value, and give the PIN by SROS_PKCS11_PIN or pin-source=FILE.",
         )
     module = options.get("module-path", os.environ.get(_MODULE_VARIABLE, ""))
     token, label = unquote(parts.get("token", "")), unquote(parts.get("object", ""))
     if not uri.startswith(SCHEME) or not token or not label or not module:
         raise UsageError(
             f"{uri!r} does not name a key on a token",
-            "It needs a token, an object and a module.",
+            "The URI has to name a token, an object and a module.",
             f"Write pkcs11:token=NAME;object=LABEL?module-path=FILE, or set {_MODULE_VARIABLE}.",
         )
     return TokenUri(token, label, module, options.get("pin-source", "").removeprefix("file:"))
 
 
 class TokenKey(ec.EllipticCurvePrivateKey):
-    """A private key on the curve prime256v1 that lies on a token.
+    """A private key on the curve prime256v1, stored on a token.
 
-    `cryptography` signs certificates, documents and revocation lists with it as with any other.
+    `cryptography` signs certificates, documents and revocation lists with it as with other keys.
     """
 
     def __init__(self, private: Any, public: ec.EllipticCurvePublicKey) -> None:
@@ -83,7 +90,7 @@ class TokenKey(ec.EllipticCurvePrivateKey):
         return self._public.key_size
 
     def sign(self, data: Any, signature_algorithm: ec.EllipticCurveSignatureAlgorithm) -> bytes:
-        """Return a DER signature made on the token (CKM_ECDSA over a digest made here)."""
+        """Return a DER signature by the token (CKM_ECDSA over a digest computed here)."""
         import pkcs11
 
         algorithm = signature_algorithm.algorithm
@@ -119,7 +126,11 @@ class TokenKey(ec.EllipticCurvePrivateKey):
 
 
 def holds_token_key(uri: str, secrets: Secrets) -> bool:
-    """Return whether the token has the key that ``uri`` names."""
+    """Return whether the token has the key that ``uri`` names.
+
+    Raises:
+        PkiError: the token cannot be used.
+    """
     _need_package()
     import pkcs11
 
@@ -132,12 +143,12 @@ def holds_token_key(uri: str, secrets: Secrets) -> bool:
 
 
 def open_token_key(uri: str, secrets: Secrets) -> TokenKey:
-    """Return the key that ``uri`` names; raise `PkiError` if the token has none."""
+    """Return the key that ``uri`` names; raise `PkiError` if the token does not have it."""
     return _open(uri, secrets, create=False)
 
 
 def create_token_key(uri: str, secrets: Secrets) -> TokenKey:
-    """Return a new key pair on the token; raise `PkiError` if its name is in use."""
+    """Generate a key pair on the token; raise `PkiError` if the token has one of this label."""
     return _open(uri, secrets, create=True)
 
 
@@ -161,14 +172,15 @@ def _open(uri: str, secrets: Secrets, *, create: bool) -> TokenKey:
         raise _unusable(parsed, error) from error
     if not isinstance(loaded, ec.EllipticCurvePublicKey) or loaded.curve.name != "secp256r1":
         raise PkiError(
-            f"the key {parsed.object!r} on the token is not on the curve prime256v1",
-            "Other kinds are not accepted by every DDS vendor.",
+            f"the key {parsed.object!r} on the token {parsed.token!r} is not an EC prime256v1 key",
+            "Not every DDS vendor accepts other keys.",
+            "Name another object of the token.",
         )
     return TokenKey(private, loaded)
 
 
 def _need_package() -> None:
-    """Raise `UnavailableError` if the Python package for tokens is not installed."""
+    """Raise `UnavailableError` if the Python package python-pkcs11 is not installed."""
     if importlib.util.find_spec("pkcs11") is None:
         raise UnavailableError(
             "keys on PKCS#11 tokens need the Python package python-pkcs11",
@@ -181,11 +193,11 @@ def _unusable(parsed: TokenUri, error: Exception) -> PkiError:
     return PkiError(
         f"the token {parsed.token!r} cannot be used",
         f"{type(error).__name__}{f': {error}' if str(error) else ''} ({parsed.module}).",
-        "Check that the token is present and that the module and the PIN are right.",
+        "Check that the token is present, and that the module path and the PIN are right.",
     )
 
 
-# A process logs into a token once, for all of its keys.
+# One login per token and process: (module, token) to the session, and whether it can write.
 _sessions: dict[tuple[str, str], tuple[Any, bool]] = {}
 
 
