@@ -261,7 +261,7 @@ def test_a_folder_that_is_gone(line: str, keystore: Path, tmp_path: Path) -> Non
     )
     assert ended.returncode == 1
     assert ended.stderr.count("\n") == 1
-    assert "the folder that this runs in does not exist any more" in ended.stderr
+    assert "the working directory no longer exists" in ended.stderr
 
 
 # ── TOML ───────────────────────────────────────────────────────────────────────────────────

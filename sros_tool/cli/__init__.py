@@ -11,13 +11,13 @@ from types import FrameType
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run ``sros`` and exit: 0 yes or done; 1 no, denied, or failed; 2 wrong usage."""
-    # Turns a polite request to end into an exception, so that nothing half-made is left behind.
+    """Run ``sros`` and exit with 0 (yes or done), 1 (no, denied or failed) or 2 (wrong usage)."""
+    # SIGTERM raises SystemExit, so that clean-up code runs and no partial files remain.
     signal.signal(signal.SIGTERM, _terminate)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="surrogateescape")  # a path need not be valid UTF-8
     if not sys.warnoptions:
-        warnings.simplefilter("ignore")  # remarks of libraries are not for users
+        warnings.simplefilter("ignore")  # warnings of libraries are not for users
     from sros_tool.cli.program import program, report_error
 
     try:
@@ -39,7 +39,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _give_up_stdout() -> None:
-    """Keep the interpreter from failing again, at its end, with what could not be printed."""
+    """Redirect standard output to /dev/null, so that the interpreter's last flush cannot fail."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -1,4 +1,4 @@
-"""The verbs `check` and `doctor`: findings, and which DDS of this machine enforces security."""
+"""The verbs `check` and `doctor`: report findings, and test which DDS here enforces security."""
 
 from __future__ import annotations
 
@@ -55,9 +55,9 @@ Example:
   $ sros check --needs-renewal 30d keystore || \\
         sros renew keystore --all-expiring 30d
 
-What the template of a keystore chose on purpose is accepted: it counts as a note, and is named
-in one line; --strict reports it as a finding. Exit status: 1 if a finding of the severity of
---fail-on or higher is shown.""",
+Findings that the keystore's template accepts on purpose count as notes and share one line;
+--strict reports them like all others. Exit status: 1 if a finding of the --fail-on severity
+or higher is shown, else 0.""",
 )
 @click.argument("targets", metavar="[policy|keystore|runtime] [PATH]...", nargs=-1, type=PATH)
 @click.option("--list", "as_list", is_flag=True, help="List all kinds of findings.")
@@ -109,7 +109,7 @@ in one line; --strict reports it as a finding. Exit status: 1 if a finding of th
     "--domain", metavar="ID", help="The ROS domain that the enclaves must be able to join."
 )
 @click.option(
-    "--at", "moment", metavar="MOMENT", help="Check as of then: 2027-06-01, or 90d from now."
+    "--at", "moment", metavar="MOMENT", help="Check as of 2027-06-01, or as of 90d from now."
 )
 @click.option(
     "--format",
@@ -124,7 +124,7 @@ in one line; --strict reports it as a finding. Exit status: 1 if a finding of th
 @click.option(
     "--needs-renewal",
     metavar="DURATION|PERCENT",
-    help="List only what expires within 30d, or has used 66% of its validity.",
+    help="List only enclaves that expire within 30d, or have used 66% of their validity.",
 )
 def check(
     targets: tuple[Path, ...],
@@ -143,11 +143,11 @@ def check(
     as_sarif: bool,
     needs_renewal: str | None,
 ) -> int:
-    """Find what is wrong or weak before a node starts.
+    """Find errors and weaknesses in policies, keystores and the runtime.
 
-    PATH is a policy, a folder of policies, a keystore, or an enclave; the first word may say which
-    it has to be. Without one: the keystore of $ROS_SECURITY_KEYSTORE, and the runtime, which is
-    the environment and the processes of this machine.
+    PATH is a policy, a folder of policies, a keystore or an enclave. Its type is detected, unless
+    the first word is `policy` or `keystore`. Without PATH, the keystore of $ROS_SECURITY_KEYSTORE
+    and the runtime are checked. The runtime is the environment and the processes of this machine.
     """
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import FindingFilter
@@ -156,11 +156,11 @@ def check(
     form = "json" if as_json else "sarif" if as_sarif else form
     if needs_renewal is not None:
         if family not in ("", "keystore") or len(paths) > 1:
-            raise UsageError("--needs-renewal looks at one keystore")
+            raise UsageError("--needs-renewal takes one keystore")
         root = paths[0] if paths else keystore_from_environment()
         at = _circumstances(domain, moment, ())
         if form == "sarif":
-            raise UsageError("--needs-renewal has no findings for SARIF", "", "Use --json.")
+            raise UsageError("--needs-renewal has no SARIF output", "", "Use --json.")
         return _needs_renewal(root, needs_renewal, at.now, form == "json")
     selection = FindingFilter(include, exclude, Severity[severity.upper()], strict, vendor or "")
     if as_list:
@@ -174,15 +174,15 @@ def check(
 
 
 def _family(targets: tuple[Path, ...]) -> tuple[str, tuple[Path, ...]]:
-    """Return the family that the first word names, or "", and the paths.
+    """Return the family of checks that the first word names, or "", and the paths.
 
-    A single word is a path where there is one of that name: `keystore` is what people call theirs.
+    A single word is a path if that path exists: many keystores are named `keystore`.
     """
     word = str(targets[0]) if targets else ""
     if word in _FAMILIES and not (len(targets) == 1 and targets[0].exists()):
         if word == "runtime" and len(targets) > 1:
             raise UsageError(
-                "the runtime is always the one of this machine", "", "Leave the path out."
+                "`check runtime` takes no path", "It checks this machine.", "Leave the path out."
             )
         return word, targets[1:]
     return "", targets
@@ -244,7 +244,10 @@ def _runtime(at: Circumstances) -> list[Finding]:
 def _findings_here(
     environment: Mapping[str, str], moment: datetime, insecure_rmws: Mapping[str, str]
 ) -> list[Finding]:
-    """Return the findings in an environment of this machine; `insecure_rmws` were tried before."""
+    """Return the runtime findings on this machine, for the environment variables given.
+
+    ``insecure_rmws`` maps RMWs that were found not to enforce security to the evidence.
+    """
     from sros_tool.checks.runtime import Setting, running_processes, runtime_findings
     from sros_tool.cli.common import local_zone
     from sros_tool.runtime.rmw import rmw_implementations
@@ -256,7 +259,7 @@ def _findings_here(
 
 
 def _shown(finding: Finding) -> Finding:
-    """Return ``finding`` with its file relative to this folder if it lies below it."""
+    """Return the finding; its file becomes relative if it is below the working directory."""
     path = Path(finding.file)
     if path.is_absolute() and path.is_relative_to(Path.cwd()):
         return replace(finding, file=str(path.relative_to(Path.cwd())))
@@ -299,15 +302,15 @@ def _print_text(chosen: ChosenFindings, _selection: FindingFilter) -> None:
     for choice in dict.fromkeys(each.accepted for each in chosen.accepted):
         kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
         kinds_text = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
-        click.echo(f"accepted, as the {choice} chose it: {kinds_text}")
+        click.echo(f"accepted by the {choice}: {kinds_text}")
     click.echo(_summary(chosen), err=True)
 
 
 def finding_lines(finding: Finding) -> list[str]:
-    """Return a finding as lines: its place and title, its reason, and its remedy."""
+    """Return a finding as three lines: place and title, reason, and remedy."""
     head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"
     subject = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
-    by = f" (chosen by the {finding.accepted})" if finding.accepted else ""
+    by = f" (accepted by the {finding.accepted})" if finding.accepted else ""
     return [head, f"    {subject}{finding.text}{by}", f"    {finding.remedy}"]
 
 
@@ -361,7 +364,7 @@ _SHOW: Mapping[str, Callable[[ChosenFindings, FindingFilter], None]] = {
     "json": _print_json,
     "sarif": _print_sarif,
 }
-"""How findings are shown, by the value of --format."""
+"""The function that prints findings, for each value of --format."""
 
 
 @click.command(
@@ -383,9 +386,9 @@ Exit status: 1 if nothing here enforces security, or if a finding is an error; e
 def doctor(as_json: bool) -> None:
     """Find out which DDS stacks and RMWs of this machine enforce security.
 
-    Each is tried, in a process of its own and in an enclave made for the purpose; a name or a
-    version says nothing about how it was built. Also shows what `sros check runtime` finds:
-    misspelt ROS_SECURITY_* values, missing files, a clock that is wrong.
+    Each one is tried in a separate process, in a temporary enclave: its name and version do not
+    show whether it was built with security. Also reports the findings of `sros check runtime`,
+    such as misspelt ROS_SECURITY_* values, missing files or a wrong clock.
     """
     from sros_tool.checks.kind import ERROR, WARNING
     from sros_tool.demo.doctor import diagnosis_text, examine

@@ -1,4 +1,4 @@
-"""Shared by the verbs: arguments, safe output, secrets, times and logs."""
+"""What several verbs share: options, safe output, times, secrets and logs."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ KEYSTORE_VARIABLE = "ROS_SECURITY_KEYSTORE"
 
 
 class _NamedPath(click.Path):
-    """A path that must not be empty: "" is an unset variable of a script, not this folder."""
+    """A path type that rejects "": it is an unset shell variable, not the working directory."""
 
     def __init__(self) -> None:
         super().__init__(path_type=Path)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Return the path; refuse the empty one."""
+        """Return the path; fail if it is empty."""
         if value == "":
             self.fail("the path is empty.", param, ctx)
         return super().convert(value, param, ctx)
@@ -94,10 +94,10 @@ class SeveralValues(click.Command):
 
 
 def split_root(words: Sequence[str]) -> tuple[Path, tuple[str, ...]]:
-    """Split the arguments into the keystore (or the environment's) and the rest.
+    """Return the keystore (from the first word or the environment) and the remaining words.
 
     The first word is the keystore, unless it can only be the name of an enclave: it starts with
-    "/", is no folder, and $ROS_SECURITY_KEYSTORE is set.
+    "/", is not a folder, and $ROS_SECURITY_KEYSTORE is set.
     """
     first = words[0] if words else ""
     only_a_name = first.startswith("/") and not Path(first).is_dir()
@@ -112,8 +112,8 @@ def keystore_from_environment() -> Path:
     if not root:
         raise UsageError(
             "no keystore is named",
-            f"Neither is one given, nor is {KEYSTORE_VARIABLE} set.",
-            "Name the folder of the keystore.",
+            f"There is no keystore argument, and {KEYSTORE_VARIABLE} is not set.",
+            f"Name the keystore's folder, or set {KEYSTORE_VARIABLE}.",
         )
     return Path(root)
 
@@ -156,21 +156,21 @@ _IN_JSON = {code: f"\\u{code:04x}" for code in _CONTROLS}
 
 
 def visible(text: str) -> str:
-    """Return ``text`` with its control characters, except newline and tab, as escapes.
+    """Replace the control characters in ``text``, except newline and tab, with visible escapes.
 
-    Names of files, certificates and logs are chosen by others, who could otherwise clear the
-    screen, hide a denial, or let a name read backwards.
+    Names in files, certificates and logs may come from an attacker: their control characters
+    could clear the screen, hide a denial, or reverse the characters of a name.
     """
     return text.translate(_SHOWN)
 
 
 def visible_json(document: str) -> str:
-    """Return a JSON document with its control characters as escapes; its meaning is the same."""
+    """Replace the control characters in a JSON document with JSON escapes of the same value."""
     return document.translate(_IN_JSON)
 
 
 def print_json(value: object) -> None:
-    """Print a value as JSON, on stdout."""
+    """Print a value as JSON on stdout."""
     click.echo(visible_json(json.dumps(value, indent=2, ensure_ascii=False)))
 
 
@@ -190,7 +190,10 @@ def print_plan(root: Path, changes: Sequence[Change]) -> None:
 
 @contextmanager
 def progress_bar(total: int) -> Iterator[Callable[[str], None] | None]:
-    """Show a progress bar on a terminal if there are 50 items or more; yield what advances it."""
+    """Show a progress bar for 50 items or more on a terminal; yield the function to advance it.
+
+    Yields None if no bar is shown.
+    """
     if total < 50 or not sys.stderr.isatty():
         yield None
         return
@@ -199,9 +202,12 @@ def progress_bar(total: int) -> Iterator[Callable[[str], None] | None]:
 
 
 def check_output(output: Path, *, force: bool) -> None:
-    """Refuse an existing file unless ``force``, a folder, and a file in a missing folder.
+    """Check that ``output`` can be written.
 
-    A device or a pipe is written to, and needs no permission to be replaced.
+    Devices and pipes need no ``force``, because writing does not replace them.
+
+    Raises:
+        UsageError: it is a folder, its folder is missing, or the file exists without ``force``.
     """
     if not output.absolute().parent.is_dir():
         raise UsageError(
@@ -214,7 +220,7 @@ def check_output(output: Path, *, force: bool) -> None:
 
 
 def save(output: Path, document: bytes) -> str:
-    """Write a document atomically, and return the message about it."""
+    """Write a document atomically; return a message for the user."""
     from sros_tool.files import replace_file
 
     verb = "replaced" if output.exists() else "wrote"
@@ -226,7 +232,7 @@ def save(output: Path, document: bytes) -> str:
 
 
 def now() -> datetime:
-    """Return the present moment; nothing else in the command line asks the clock."""
+    """Return the current time in UTC; verbs pass it to the functions that they call."""
     return datetime.now(UTC)
 
 
@@ -237,7 +243,7 @@ def moment_of(text: str | None) -> datetime:
     """Return the moment that ``--at`` names: a date, or a duration from now; now by default.
 
     Raises:
-        UsageError: it is neither, or out of range.
+        UsageError: ``text`` is neither, or its year is out of range.
     """
     from sros_tool.validity import parse_duration, parse_iso
 
@@ -252,7 +258,7 @@ def moment_of(text: str | None) -> datetime:
             return now() + parse_duration(text)
     raise UsageError(
         f"--at {text!r} is not a date",
-        f"It is neither a date of {_YEARS[0]} to {_YEARS[1]} nor a duration.",
+        f"It is neither a date from {_YEARS[0]} to {_YEARS[1]} nor a duration.",
         "Write 2027-06-01, 2027-06-01T12:00:00Z, or 90d from now.",
     )
 
@@ -262,7 +268,10 @@ _LOCALTIME = Path("/etc/localtime")
 
 
 def named_zone(name: str) -> tzinfo:
-    """Return the zone of an IANA name (``Asia/Tokyo``) or an offset (``+09:00``)."""
+    """Return the time zone with an IANA name (``Asia/Tokyo``) or offset (``+09:00``).
+
+    Raises `UsageError`.
+    """
     from zoneinfo import ZoneInfo
 
     if match := _OFFSET.match(name):
@@ -278,7 +287,7 @@ def named_zone(name: str) -> tzinfo:
 
 
 def local_zone(environment: Mapping[str, str]) -> tzinfo:
-    """Return the zone of this machine, with daylight saving if its name can be found."""
+    """Return the time zone of $TZ or /etc/localtime, or the current UTC offset as a fixed zone."""
     from zoneinfo import ZoneInfo
 
     name = environment.get("TZ", "").removeprefix(":")
@@ -292,14 +301,17 @@ def local_zone(environment: Mapping[str, str]) -> tzinfo:
 
 
 def ros_domain() -> int | None:
-    """Return the domain of $ROS_DOMAIN_ID, or None if it is not set."""
+    """Return the domain ID in $ROS_DOMAIN_ID, or None if it is not set."""
     from sros_tool.runtime.environment import domain_from
 
     return domain_from(os.environ)
 
 
 def domain_of(text: str | None) -> int | None:
-    """Return the domain that ``--domain`` names, or None without it.  Raises `UsageError`."""
+    """Return the domain ID in ``text``, the value of --domain; None for None.
+
+    Raises `UsageError`.
+    """
     from sros_tool.runtime.environment import DOMAIN, domain_from
 
     if text == "":
@@ -318,13 +330,17 @@ _KEY_PLACES = {"identity": "SROS_IDENTITY_KEY", "permissions": "SROS_PERMISSIONS
 def keyring(
     identity: str | None = None, permissions: str | None = None, *, encrypt: bool = False
 ) -> Keyring:
-    """Return the keyring with the CA keys at these URIs, or at those that the environment names."""
+    """Return a keyring for the CA keys at these URIs.
+
+    The defaults are $SROS_IDENTITY_KEY and $SROS_PERMISSIONS_KEY. ``encrypt`` protects new keys
+    with a passphrase.
+    """
     from sros_tool.keystore.authorities.keyring import Keyring
 
     given = {"identity": identity, "permissions": permissions}
     places = {role: given[role] or os.environ.get(name, "") for role, name in _KEY_PLACES.items()}
     return Keyring(
-        _Answers(encrypt),
+        _Secrets(encrypt),
         {role: _absolute(place) for role, place in places.items() if place},
         encrypt,
     )
@@ -336,8 +352,8 @@ def _absolute(place: str) -> str:
     return f"file:{Path(place.removeprefix('file:')).absolute()}"
 
 
-class _Answers:
-    """A secrets handler that asks each question once: the environment, a file, or a person."""
+class _Secrets:
+    """A secrets handler that asks for each passphrase or PIN once: environment, file, prompt."""
 
     def __init__(self, new: bool) -> None:
         self._new = new
@@ -361,7 +377,9 @@ class _Answers:
             )
         if not value:
             names = _PIN if is_pin else f"{_PASSPHRASE} or {_PASSPHRASE_FILE}"
-            raise PkiError(f"{what} is needed", "There is no terminal to ask at.", f"Set {names}.")
+            raise PkiError(
+                f"{what} is needed", "There is no terminal to prompt on.", f"Set {names}."
+            )
         return value
 
 
@@ -373,10 +391,10 @@ MAX_LOG = 64 * 1024 * 1024
 
 
 def read_log(log: str) -> str:
-    """Return the text of a log: of a file, a pipe (``<(journalctl ...)``), or stdin for "-".
+    """Return the text of a log file, of a pipe (``<(journalctl ...)``), or of stdin for "-".
 
     Raises:
-        DocumentError: it cannot be read, is a device, or is larger than ``MAX_LOG``.
+        DocumentError: the log cannot be read, is a device, or is larger than ``MAX_LOG``.
     """
     try:
         if log == "-":
@@ -391,12 +409,12 @@ def read_log(log: str) -> str:
         raise DocumentError(f"the log '{log}' does not exist") from error
     except OSError as error:
         raise DocumentError(f"the log '{log}' cannot be read", f"{error.strerror}.") from error
-    except ValueError as error:  # a name that holds NUL is of no file
+    except ValueError as error:  # a path with a NUL byte
         raise DocumentError(f"the log '{log}' does not exist") from error
     if len(data) > MAX_LOG:
         raise DocumentError(
             f"the log '{log}' is too large",
-            f"More than {MAX_LOG // 1024**2} MiB.",
-            "Cut it to what is of interest: tail -n 100000 LOG.",
+            f"It has more than {MAX_LOG // 1024**2} MiB.",
+            "Shorten it first, for example: tail -n 100000 LOG.",
         )
     return data.decode("utf-8", "replace")

@@ -1,4 +1,4 @@
-"""The verb `demo`: show on a real DDS what security keeps apart."""
+"""The verb `demo`: show on a real DDS that secured nodes are isolated."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ Example:
   $ sros demo --scenario governance --plot cost.svg
   $ sros demo --scenario all
 
-Exit status: 0 if every row is as expected, including rows known to be open (or skipped with its
-reason), 1 if not.""",
+Exit status: 0 if every row is as expected or was skipped for a stated reason, else 1. Of a
+row that is known to be open, the attack is expected to succeed.""",
 )
 @click.option(
     "--backend",
@@ -74,7 +74,7 @@ reason), 1 if not.""",
     "--only",
     multiple=True,
     metavar="WORD",
-    help="Only rows and attacks with WORD in their name; can be repeated.",
+    help="Run only rows and attacks with WORD in their name; can be repeated.",
 )
 @click.option(
     "--keystore",
@@ -88,7 +88,7 @@ reason), 1 if not.""",
     type=int,
     default=80,
     show_default=True,
-    help="First domain id; each row takes one.",
+    help="Domain id of the first row; each further row uses the next one.",
 )
 @click.option(
     "--template",
@@ -107,25 +107,25 @@ reason), 1 if not.""",
     "--keep",
     type=PATH,
     metavar="DIR",
-    help="Leave keystores, reports and logs in DIR.",
+    help="Keep keystores, reports and logs in DIR.",
 )
 @click.option(
     "--summary",
     type=PATH,
     metavar="FILE.md",
-    help="Write a page for a reviewer, in Markdown.",
+    help="Write a summary for reviewers, in Markdown.",
 )
 @click.option(
     "--plot",
     type=PATH,
     metavar="FILE.svg",
-    help="Draw what security costs (with --scenario governance).",
+    help="Plot the cost of security (with --scenario governance).",
 )
 @click.option(
     "--report",
     type=PATH,
     metavar="FILE.html",
-    help="Write everything as one page, with plots of what security costs.",
+    help="Write all results as one HTML page, with plots of the cost of security.",
 )
 @force_option
 @json_option
@@ -148,10 +148,10 @@ def demo(
 ) -> None:
     """Show on a real DDS that nobody reads from or joins secured nodes without permission.
 
-    Makes keystores, starts nodes with and without them, and compares what was expected with what
-    happened. The scenario isolation takes some ten seconds on Cyclone DDS and some twenty on rclpy,
-    attacks half a minute and a minute: every known attack, each tried a second time without the
-    defence that closes it.
+    Creates keystores, starts nodes with and without them, and compares expected and observed
+    results. The scenario `isolation` takes about 10 s on Cyclone DDS and 20 s on rclpy. The
+    scenario `attacks` tries every known attack, and repeats it without the defence that stops it;
+    it takes about 30 s on Cyclone DDS and 60 s on rclpy.
     """
     from sros_tool.demo.program import DemoOptions, run_demo
     from sros_tool.demo.scenarios import SCENARIOS, choose_scenarios
@@ -174,14 +174,14 @@ def demo(
         keep=keep,
     )
     for path in (summary, plot, report):
-        if path is not None:  # before the demo has run, and not after it
+        if path is not None:  # fail before the demo runs, not after it
             check_output(path, force=force)
     if keep is not None and keep.exists() and not keep.is_dir():
         raise UsageError(f"cannot keep anything in '{keep}'", "It is a file.", "Name a folder.")
     if plot is not None and not any(scenario.measured for scenario in options.scenarios):
         raise UsageError(
             "there is nothing to plot",
-            "None of these scenarios measures what security costs.",
+            "None of the chosen scenarios measures the cost of security.",
             "Add --scenario governance.",
         )
     moment = now()
@@ -214,7 +214,7 @@ def _list(scenarios: Sequence[Scenario], as_json: bool) -> None:
 
 
 def _write_report(report: Path, result: dict[str, Any], keep: Path | None) -> None:
-    """Write the page, without the folders of this machine."""
+    """Write the HTML page, with the paths of folders on this machine removed."""
     from sros_tool.files import replace_file
     from sros_tool.report.demo_page import render_demo_page, without_folders
 

@@ -1,4 +1,4 @@
-"""The verbs that bring enclaves to robots: exporting them, and verifying what arrived."""
+"""The verbs that bring enclaves to robots: export, verify, request, sign and import."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from sros_tool.cli.common import (
 from sros_tool.errors import DocumentError, UsageError
 
 _STREAM = Path("-")
-"""Standard input or output, where a file could be named."""
+"""The file argument that means standard input or output."""
 
 
 @click.command(
@@ -59,14 +59,14 @@ Example:
     metavar="PATTERN",
     help="Export matching enclaves, such as '/arm/*'; * also matches '/'.  Can be repeated.",
 )
-@click.option("--force", is_flag=True, help="Replace files of another version in TARGET.")
+@click.option("--force", is_flag=True, help="Replace files in TARGET that differ.")
 @dry_run_option
 def distribute_key(
     words: tuple[str, ...], every: bool, patterns: tuple[str, ...], force: bool, dry_run: bool
 ) -> None:
     """Export the enclaves NAME... to TARGET: a folder, a .tar.gz, or - for standard output.
 
-    TARGET is a keystore with these enclaves only: real files in place of links, and no CA key.
+    TARGET becomes a keystore with only these enclaves: files instead of links, and no CA key.
     """
     from sros_tool.keystore.delivery.archive import SUFFIXES
     from sros_tool.keystore.delivery.export import distribute, pack_enclaves, select
@@ -96,7 +96,7 @@ def distribute_key(
             print_plan(target.parent if archive else target, export.changes)
         elif not export.changes:
             for name in selection.names:
-                click.echo(f"'{target}' already holds enclave {name} as it is", err=True)
+                click.echo(f"enclave {name} in '{target}' is already up to date", err=True)
         for change in export.changes if done else ():
             if change.action == "replace":
                 click.echo(f"replaced {change.path}", err=True)
@@ -107,7 +107,7 @@ def distribute_key(
 
 
 def _check_target(root: Path, word: str) -> None:
-    """Refuse the name of an enclave as the target: there it was forgotten."""
+    """Raise `UsageError` if the last word is an enclave of the keystore: TARGET is missing."""
     from sros_tool.keystore.layout import enclave_names
 
     if word.startswith("/") and not Path(word).exists() and word in set(enclave_names(root)):
@@ -119,14 +119,14 @@ def _check_target(root: Path, word: str) -> None:
 
 
 def _write_stdout(data: bytes) -> None:
-    """Write binary data on standard output, after what was printed."""
+    """Write binary data to standard output, after all text printed before."""
     sys.stdout.flush()
     sys.stdout.buffer.write(data)
     sys.stdout.buffer.flush()
 
 
 def _refuse_terminal() -> None:
-    """Raise `UsageError` where binary data would land on a terminal."""
+    """Raise `UsageError` if standard output is a terminal: an archive is binary data."""
     if sys.stdout is not None and sys.stdout.isatty():
         raise UsageError(
             "an archive would be written to this terminal",
@@ -150,15 +150,15 @@ Example:
   $ sros verify robot --at 2027-06-01 || echo 'renew before June'""",
 )
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
-@click.option("--domain", metavar="ID", help="Check also whether it may join this ROS domain.")
-@click.option("--at", metavar="MOMENT", help="Check as of then: 2027-06-01, or 90d from now.")
+@click.option("--domain", metavar="ID", help="Also check whether it may join this ROS domain.")
+@click.option("--at", metavar="MOMENT", help="Check as of 2027-06-01, or as of 90d from now.")
 @json_option
 def verify(folder: Path | None, domain: str | None, at: str | None, as_json: bool) -> int:
     """On a robot: report whether the enclaves in DIR, or the enclave DIR, can be used.
 
-    It is `sros check` of what was exported: enclaves that are complete, consistent, in date and
-    loadable; keys that nobody else can read; no key of a CA; and CAs that all enclaves trust.  The
-    exit status is 0 if it finds nothing.
+    Checks that enclaves are complete, consistent, valid and loadable, that only the owner can read
+    their keys, that no CA key was exported, and that all enclaves trust the same CAs. The exit
+    status is 0 if there are no findings.
     """
     from sros_tool.checks.keystores.arrival import verify_arrival
     from sros_tool.cli.check import finding_lines
@@ -192,7 +192,7 @@ Example:
   made the key of enclave /arm/camera, which stays in 'robot'
     its SHA-256 is 6f5bbd292e91c5d0fbf579aa0d036ac044cdd9788c6efdbc730a...
     have 'robot/enclaves/arm/camera/request.pem' signed: sros sign_request
-  $ ssh robot cat robot/enclaves/arm/camera/request.pem |   # or all from home
+  $ ssh robot cat robot/enclaves/arm/camera/request.pem |   # or in one step
         sros sign_request keystore - | ssh robot sros import - robot""",
 )
 @click.argument("name")
@@ -237,7 +237,7 @@ Example:
     "-p",
     "--policy-file",
     type=PATH,
-    help="The policy that states the rights. [default: by the template of the keystore]",
+    help="Policy with the enclave's rights. [default: the rights of the keystore's template]",
 )
 @click.option(
     "-o",
@@ -247,7 +247,7 @@ Example:
     help="Where to write the answer; - is standard output. [default: request.answer.tar.gz]",
 )
 @click.option(
-    "--renew", is_flag=True, help="Answer for an enclave that exists; it keeps its rights."
+    "--renew", is_flag=True, help="Renew an enclave that exists; it keeps its permissions."
 )
 @click.option("--force", is_flag=True, help="Replace ANSWER if it exists.")
 @dry_run_option
@@ -261,10 +261,10 @@ def sign_request(
 ) -> None:
     """At the keystore: certify the key in REQUEST (or -), and sign the enclave's permissions.
 
-    The answer is one .tar.gz for `sros import` on the robot.  It holds no secret: certificate,
-    permissions, governance, the certificates of the CAs, and revocation lists.  The keystore knows
-    the enclave from then on, without its key.  Compare the key's SHA-256 with the one that the
-    robot printed.
+    The answer is one .tar.gz for `sros import` on the robot.  It contains no secret: certificate,
+    permissions, governance, the certificates of the CAs, and revocation lists.  The keystore then
+    contains the enclave, without its private key.  Compare the key's SHA-256 with the one that
+    the robot printed.
     """
     from sros_tool.keystore.delivery.signing import sign_request as sign
     from sros_tool.keystore.layout import PERMISSIONS
@@ -329,12 +329,12 @@ Example:
 )
 @click.argument("answer", type=PATH)
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
-@click.option("--force", is_flag=True, help="Go back to an older answer, or move to other CAs.")
+@click.option("--force", is_flag=True, help="Accept an older answer, or one from other CAs.")
 @click.option(
     "--ca",
     "pin",
     metavar="FILE|SHA-256",
-    help="Accept it only if this permissions CA signed it: its certificate, or the SHA-256 that "
+    help="Accept ANSWER only from this permissions CA: its certificate, or the SHA-256 that "
     "sign_request and create_keystore print.",
 )
 @dry_run_option
@@ -343,10 +343,10 @@ def import_verb(
 ) -> None:
     """On a robot: install the file ANSWER (or -) next to the key in DIR, or change nothing.
 
-    All of it is checked first: that the certificate is for this key, the chain, the signatures,
-    the dates, and that the archive holds nothing else.  The first answer defines whom the robot
-    trusts; whoever carries it could replace it, unless --ca names the CA.  Later answers have to
-    come from the same CAs.
+    Everything is checked first: that the certificate belongs to the key, its chain, the
+    signatures, the validity, and that the archive has no other files.  The first answer sets the
+    CAs that the robot trusts: give --ca, or an attacker could replace this answer on its way.
+    Later answers must come from the same CAs.
     """
     from sros_tool.keystore.delivery.answer import import_answer
     from sros_tool.keystore.delivery.trust import read_pin
@@ -359,7 +359,7 @@ def import_verb(
         print_plan(folder, done.changes)
         return
     if not done.changes:
-        click.echo(f"'{folder}' already holds enclave {done.name} as it is", err=True)
+        click.echo(f"enclave {done.name} in '{folder}' is already up to date", err=True)
         return
     from sros_tool.validity import iso
 
@@ -369,13 +369,16 @@ def import_verb(
         click.echo(f"  and {_named(done.permissions_ca)}")
     if done.first and not pinned:
         click.echo(
-            "  compare both with the output of sign_request, or use --ca: nothing else vouches "
-            "for them"
+            "  compare both with the output of sign_request, or use --ca: otherwise they are "
+            "not verified"
         )
 
 
 def _read(path: Path, what: str) -> bytes:
-    """Return the bytes of a file or of standard input; refuse more than an answer can have."""
+    """Return the bytes of a file, or of standard input for "-".
+
+    At most one byte more than the size limit of an archive is read from standard input.
+    """
     from sros_tool.keystore.delivery.archive import MAX_PACKED
     from sros_tool.xml import read_bytes
 

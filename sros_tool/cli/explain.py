@@ -1,4 +1,4 @@
-"""``sros explain``: from options to a question, from the question to an answer, text or JSON."""
+"""The verb `explain`: turn the options into a question, and print the answer as text or JSON."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ _WORDS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply"
 def _complete_words(
     ctx: click.Context, parameter: click.Parameter, incomplete: str
 ) -> list[CompletionItem | str]:
-    """Complete the keystore, then its enclaves, then what they could do."""
+    """Complete the keystore, then its enclaves, then the operations of `_WORDS`."""
     from sros_tool.keystore.layout import is_keystore
 
     given: tuple[str, ...] = ctx.params.get("words") or ()
@@ -72,10 +72,12 @@ def _complete_words(
 def _complete_enclave(
     ctx: click.Context, _parameter: click.Parameter, incomplete: str
 ) -> list[CompletionItem | str]:
-    """Complete the enclaves of the keystore that is named, or else of the environment's."""
+    """Complete the enclaves of the keystore in the arguments, or else in the environment."""
     from sros_tool.keystore.layout import enclave_names, is_keystore
 
-    given = ctx.params.get("words") or ctx.args  # args, where an option still lacks its value
+    given = (
+        ctx.params.get("words") or ctx.args
+    )  # click fills only args if an option lacks its value
     named = ctx.params.get("keystore") or (given[0] if given else "")
     root = Path(named or os.environ.get(KEYSTORE_VARIABLE, ""))
     names = enclave_names(root) if is_keystore(root) else ()
@@ -88,11 +90,11 @@ _IGNORED = {
     "--reach": ("kind", "vendor", "all_vendors", "moment", "domain", "time_zone"),
     "--log": ("infrastructure", "kind", "policy", "vendor", "all_vendors"),
 }
-"""The options that have no meaning in each way of asking, by the names of their parameters."""
+"""The parameters that have no effect, for each of the options that choose a mode."""
 
 
 def _refuse_ignored(mode: str) -> None:
-    """Raise `UsageError` for an option that would change nothing."""
+    """Raise `UsageError` if an option is given that has no effect in this mode."""
     context = click.get_current_context()
     for parameter in context.command.params:
         name = parameter.name or ""
@@ -126,23 +128,26 @@ Example:
     shell_complete=_complete_words,
 )
 @click.option(
-    "--type", "kind", type=click.Choice(["topic", "service", "action"]), help="What NAME is."
+    "--type", "kind", type=click.Choice(["topic", "service", "action"]), help="Type of NAME."
 )
 @click.option("--keystore", type=PATH, metavar="ROOT", help="A keystore, or an enclave's folder.")
 @click.option(
     "--policy",
     type=PATH,
     metavar="FILE",
-    help="The policy that the permissions came from; without a keystore, the policy that is asked.",
+    help="Policy that the permissions were made from; without a keystore, explain this policy.",
 )
 @click.option(
     "--vendor",
     type=click.Choice([each.value for each in Vendor]),
     help="The vendor whose decision counts. [default: the vendor of this machine's RMW]",
 )
-@click.option("--all-vendors", is_flag=True, help="Compare what the vendors decide.")
+@click.option("--all-vendors", is_flag=True, help="Compare the decisions of all vendors.")
 @click.option(
-    "--at", "moment", metavar="MOMENT", help="When: 2027-06-01, or 90d from now. [default: now]"
+    "--at",
+    "moment",
+    metavar="MOMENT",
+    help="Decide as of 2027-06-01, or as of 90d from now. [default: now]",
 )
 @click.option(
     "--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's]"
@@ -153,12 +158,12 @@ Example:
     help="Time zone of the robot, in which Fast DDS reads dates: Asia/Tokyo. "
     "[default: this machine's]",
 )
-@click.option("--who", is_flag=True, help="Show which enclaves of the keystore may.")
+@click.option("--who", is_flag=True, help="Show which enclaves of the keystore may do it.")
 @click.option(
     "--reach",
     metavar="ENCLAVE",
     shell_complete=_complete_enclave,
-    help="Show whom this enclave can influence and learn from, over any number of hops.",
+    help="Show which enclaves this one can influence and learn from, over any number of hops.",
 )
 @click.option(
     "--infrastructure",
@@ -185,11 +190,11 @@ def explain(
 ) -> int:
     """Show whether DDS lets an enclave do something, by which rule, and how to change that.
 
-    call and serve are about services, or with --type action call is about an action; execute is
-    about actions. ROOT is a keystore, here or on a robot; ENCLAVE can also be an enclave's folder.
-    With --policy and no keystore, the policy itself is asked, before anything is signed.
+    call and serve apply to services, execute to actions; with --type action, call applies to an
+    action. ROOT is a keystore, here or on a robot; ENCLAVE can also be an enclave's folder. With
+    --policy and no keystore, the policy itself is explained, before anything is signed.
 
-    The exit status is 0 if it is allowed (with --who: to anybody), and 1 if it is denied; with
+    The exit status is 0 if it is allowed (with --who: to any enclave), and 1 if it is denied; with
     --log, 1 if the log reports a fault.
     """
     if sum((who, bool(reach), log is not None)) > 1:
@@ -212,7 +217,7 @@ def _split(
 ) -> tuple[Path | None, tuple[str, ...]]:
     """Return the keystore, if it is the first word or named by the option, and the other words.
 
-    ``verb`` is the position of the action word, if no keystore is named.
+    ``verb`` is the index of the operation (such as publish) in ``words`` without a keystore.
     """
     from sros_tool.keystore.layout import is_keystore
 
@@ -230,7 +235,7 @@ def _is_word(words: tuple[str, ...], place: int) -> bool:
 
 
 class _ContextOptions:
-    """The options that say where and when."""
+    """The options --at, --domain and --time-zone, with their defaults."""
 
     def __init__(self, moment: str | None, domain: str | None, zone: str | None) -> None:
         from sros_tool.cli.common import local_zone, named_zone
@@ -240,7 +245,7 @@ class _ContextOptions:
         self._zone: tzinfo = local_zone(os.environ) if zone is None else named_zone(zone)
 
     def context(self, domains: DomainSet | None) -> JoinContext:
-        """Return where a question is asked of an enclave that is made for these domains."""
+        """Return the domain, time and zone to decide for, if an enclave may join ``domains``."""
         from sros_tool.explain.evaluator import JoinContext
         from sros_tool.runtime.environment import choose_domain
 
@@ -251,7 +256,7 @@ class _ContextOptions:
 
 
 def _vendor_of(name: str | None) -> tuple[Vendor, str]:
-    """Return the vendor of the option, or else of this machine, and why it is that one."""
+    """Return the vendor given by --vendor, or this machine's, and the reason for the choice."""
     from sros_tool.runtime.rmw import vendor_here
 
     return (Vendor(name), "as asked") if name else vendor_here(os.environ)
@@ -270,13 +275,13 @@ def _show_answer(
     options: _ContextOptions,
     as_json: bool,
 ) -> int:
-    """Say whether an enclave may; 0 if the chosen vendor allows it."""
+    """Print whether an enclave may do something; return 0 if the vendor allows it, else 1."""
     from sros_tool.explain.evaluator import Evaluator
     from sros_tool.explain.question import ask
 
     if not 2 <= len(rest) <= 3:
         raise UsageError(
-            "explain takes an enclave, what it wants to do, and a name",
+            "explain takes an enclave, an operation and a name",
             "",
             "Write for example `sros explain /talker publish /chatter`.",
         )
@@ -321,7 +326,7 @@ def _echo(lines: Iterator[str]) -> None:
 def _enclave(
     root: Path | None, name: str, policy: Path | None, options: _ContextOptions
 ) -> LoadedEnclave:
-    """Return the enclave of a keystore, of a folder, or of a policy alone."""
+    """Load an enclave from a keystore, from its folder, or from a policy alone."""
     from dataclasses import replace
 
     own = _policy_of(policy, name)
@@ -337,7 +342,10 @@ def _enclave(
 
 
 def _policy_of(policy: Path | None, enclave: str) -> Enclave | None:
-    """Return the part of the policy file, where there is a file, that is about the enclave."""
+    """Return the enclave in the policy file, or None without a file.
+
+    Raises `PolicyError` if the file does not have an enclave of this name.
+    """
     if policy is None:
         return None
     from sros_tool.errors import PolicyError
@@ -356,9 +364,10 @@ def _policy_of(policy: Path | None, enclave: str) -> Enclave | None:
 def _signed_enclave(
     root: Path | None, name: str, options: _ContextOptions, *, planned: bool = False
 ) -> LoadedEnclave | None:
-    """Return an enclave of a keystore, or in a folder of that name.
+    """Load an enclave from the keystore ``root``, or from the folder ``name``.
 
-    None if there is neither keystore nor folder, or, with ``planned``, no such enclave yet.
+    Returns None if there is neither keystore nor folder, or, with ``planned``, if the keystore does
+    not have the enclave yet.
     """
     from sros_tool.explain.evaluator import load_enclave
     from sros_tool.keystore.layout import enclave_path, list_enclaves
@@ -388,7 +397,7 @@ def _is_enclave(folder: Path) -> bool:
 
 
 def _name_of(folder: Path, options: _ContextOptions) -> str:
-    """Return the name of the enclave of a folder: the common name of its certificate."""
+    """Return the name of the enclave in a folder: the common name of its certificate, or ""."""
     from sros_tool.keystore.reader import open_enclave
     from sros_tool.pki.certificates import common_name_of
 
@@ -397,7 +406,10 @@ def _name_of(folder: Path, options: _ContextOptions) -> str:
 
 
 def _planned_enclave(policy: Enclave, root: Path | None, options: _ContextOptions) -> LoadedEnclave:
-    """Return the rights the policy would give, under the keystore's governance or a new one."""
+    """Return the enclave as the policy would create it, with the keystore's governance.
+
+    Without a keystore, the governance is that of the default template.
+    """
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.evaluator import plan_enclave
     from sros_tool.keystore.reader import governance_of
@@ -429,7 +441,7 @@ def _provenance_notes(answer: Answer, policy: Path | None) -> list[Note]:
 
 
 def _other_type(evaluator: Evaluator, answer: Answer, kind: str | None) -> list[Note]:
-    """Return a note where a service was asked for that the enclave may call as an action."""
+    """Return a note if the enclave may not call a service, but may call an action of this name."""
     from sros_tool.explain.question import ask
 
     question = answer.question
@@ -445,14 +457,14 @@ def _other_type(evaluator: Evaluator, answer: Answer, kind: str | None) -> list[
 # ── the answer as text ─────────────────────────────────────────────────────────────────────
 
 _ADDITION = "allow.xml"
-"""The name in the commands of the file that holds the rights to add."""
+"""Name of the file with the rights to add, in the commands that are proposed."""
 _LABEL_WIDTH = 10
 
 
 def _answer_lines(
     enclave: LoadedEnclave, answer: Answer, why: str, policy: Path | None
 ) -> Iterator[str]:
-    """Yield the answer of one vendor, with its reasons; ``why`` is why it is this vendor's."""
+    """Yield the answer for one vendor as lines; ``why`` is the reason to choose this vendor."""
     decision, grant = answer.decision, answer.grant
     may = f"yes: {enclave.name} may" if answer.allowed else f"no: {enclave.name} may not"
     documented = ", as documented" if answer.as_documented else ""
@@ -467,13 +479,13 @@ def _answer_lines(
         what = f"{'allow' if grant.rules[decision.rule].allow else 'deny'} rule {decision.rule + 1}"
         yield _row("rule", f"{what} of grant {grant.name}: {decision.expression}")
     if answer.wildcard:
-        yield _row("wildcard", f"{answer.wildcard} stands for more than this name")
+        yield _row("wildcard", f"{answer.wildcard} also matches other names")
     for line in answer.lines:
         stated = f"{line.qualifier.value} {line.right} {line.name}"
         yield _row("from", f"{_shown(line.source)}: {stated}")
     if answer.policy_sha256 and policy is None and decision.rule is not None:
         digest = answer.policy_sha256[:12]
-        yield _row("from", f"a policy file with the digest {digest}; name it by --policy")
+        yield _row("from", f"a policy file with the digest {digest}; name it with --policy")
     if answer.allowed:
         yield _row("protected", ", ".join(_protection_words(answer)))
     elif answer.denied_by:
@@ -499,7 +511,7 @@ def _reason(decision: Decision) -> str:
 
 
 def _shown(source: Source) -> str:
-    """Return file and line, relative to this folder if the file lies below it."""
+    """Return file:line, with a relative path if the file is below the working directory."""
     here = Path.cwd()
     file = Path(source.file)
     return f"{file.relative_to(here) if file.is_relative_to(here) else file}:{source.line}"
@@ -531,7 +543,7 @@ def _change_lines(change: PolicyChange) -> Iterator[str]:
     for edit in change.edits:
         if edit.xml:
             group = edit.xml.partition(" ")[0].removeprefix("<")
-            yield f"    at {_shown(edit.source)}, let the <{group}> read"
+            yield f"    at {_shown(edit.source)}, change the <{group}> group to"
             yield from (f"      {line}" for line in edit.xml.splitlines())
         else:
             yield f"    remove the group at {_shown(edit.source)}"
@@ -539,14 +551,14 @@ def _change_lines(change: PolicyChange) -> Iterator[str]:
         yield from (f"    remove: {right.qualifier} {right.describe()}" for right in change.lift)
     for right in change.lift:
         if is_expression(right.name):
-            yield f"    which lifts the denial of everything else in {right.name}, too"
+            yield f"    this also removes the denial of all other names in {right.name}"
     if change.document:
         yield f"    save as {_ADDITION}"
         yield from (f"      {line}" for line in change.document.splitlines())
 
 
 def _commands(enclave: LoadedEnclave, answer: Answer, policy: Path | None) -> list[str]:
-    """Return the commands that put a change into force, in their order."""
+    """Return the shell commands that apply a change, in order."""
     if not answer.change and not answer.sign:
         return []
     file = str(policy) if policy else "POLICY"
@@ -559,7 +571,7 @@ def _commands(enclave: LoadedEnclave, answer: Answer, policy: Path | None) -> li
 
 
 def _table_lines(enclave: LoadedEnclave, answers: Sequence[Answer]) -> Iterator[str]:
-    """Yield one line for each vendor, and where they differ."""
+    """Yield the question, one line for each vendor, and the vendors that differ."""
     yield f"may {enclave.name} {answers[0].question}?"
     width = max(len(each.vendor.title) for each in answers)
     for answer in answers:
@@ -570,13 +582,13 @@ def _table_lines(enclave: LoadedEnclave, answers: Sequence[Answer]) -> Iterator[
 
 
 def _differences(answers: Sequence[Answer]) -> str:
-    """Return a sentence: which vendors answer otherwise than the first of them."""
+    """Return a sentence that names the vendors whose outcome differs from the first one's."""
     first = answers[0]
     others = [each for each in answers if each.outcome is not first.outcome]
     if not others:
-        return "all of them decide alike"
+        return "all vendors decide alike"
     listed = ", ".join(f"{each.vendor.title} ({each.outcome})" for each in others)
-    return f"THEY DIFFER: {first.vendor.title} says {first.outcome}, otherwise decide {listed}"
+    return f"VENDORS DIFFER: {first.vendor.title} ({first.outcome}), but {listed}"
 
 
 # ── the answer as JSON ─────────────────────────────────────────────────────────────────────
@@ -585,7 +597,7 @@ def _differences(answers: Sequence[Answer]) -> str:
 def _question_json(
     enclave: LoadedEnclave, context: JoinContext, question: Question
 ) -> dict[str, Any]:
-    """Return what was asked, where and when."""
+    """Return the enclave, the question, the domain and the time as JSON values."""
     return {
         "enclave": enclave.name,
         "question": {
@@ -601,7 +613,7 @@ def _question_json(
 
 
 def _answer_json(enclave: LoadedEnclave, answer: Answer, policy: Path | None) -> dict[str, Any]:
-    """Return the answer of one vendor."""
+    """Return the answer for one vendor as JSON values."""
     decision = answer.decision
     return {
         "vendor": answer.vendor.value,
@@ -710,14 +722,14 @@ def _show_who(
     options: _ContextOptions,
     as_json: bool,
 ) -> int:
-    """Say which enclaves of the keystore may; 0 if any may."""
+    """Print which enclaves of the keystore may do something; return 0 if any may, else 1."""
     from sros_tool.explain.question import ask
     from sros_tool.explain.who import who
     from sros_tool.keystore.layout import check_keystore
 
     if not 1 <= len(rest) <= 2:
         raise UsageError(
-            "--who takes what is to be done, and a name", "", "As in publish /cmd_vel."
+            "--who takes an operation and a name", "", "Write for example publish /cmd_vel."
         )
     question = ask(rest[0], rest[1] if len(rest) > 1 else "", kind)
     chosen, why = _vendor_of(vendor)
@@ -750,7 +762,7 @@ def _show_who(
 
 
 def _who_lines(found: Sequence[EnclaveOutcome]) -> Iterator[str]:
-    """Yield the enclaves that may, by which wildcard, and how many may not."""
+    """Yield the allowed enclaves, those whose participant does not start now, and the counts."""
     able = [each for each in found if each.outcome.ok]
     for each in able:
         yield each.enclave + (f"  by the wildcard {each.wildcard}" if each.wildcard else "")
@@ -782,7 +794,7 @@ def _show_reach(
     infrastructure: bool,
     as_json: bool,
 ) -> int:
-    """Say whom an enclave can influence and learn from."""
+    """Print which enclaves one enclave can influence and learn from; return 0."""
     from sros_tool.explain.reach import OF_EVERY_NODE, Network
     from sros_tool.keystore.rights import load_rights
 
@@ -798,7 +810,7 @@ def _show_reach(
     if enclave not in network.enclaves:
         raise KeystoreError(
             f"enclave {enclave} has no rights in '{source.path}'",
-            f"There are {', '.join(network.enclaves[:5]) or 'none'}.",
+            f"Enclaves with rights: {', '.join(network.enclaves[:5]) or 'none'}.",
         )
     reach = network.reach(enclave)
     if as_json:
@@ -809,7 +821,7 @@ def _show_reach(
     print_notes(source.notes)
     if without and not as_json:
         text = f"left out: {', '.join(without)}, which every node writes and reads"
-        click.echo(f"{text} (--infrastructure counts it)", err=True)
+        click.echo(f"{text} (include it with --infrastructure)", err=True)
     return 0
 
 
@@ -823,7 +835,7 @@ def _check_there(root: Path, enclave: str) -> None:
 
 
 def _uncontrolled(source: RightsSource) -> dict[str, Any]:
-    """Return what everybody in a keystore may do, as its governance does not control access."""
+    """Return arguments for `Network`: the topics that a governance leaves open to all enclaves."""
     if source.kind != "keystore":
         return {}
     from sros_tool.explain.reach import unguarded
@@ -837,7 +849,7 @@ def _uncontrolled(source: RightsSource) -> dict[str, Any]:
 
 
 def _reach_lines(reach: Reach) -> Iterator[str]:
-    """Yield whom an enclave influences and learns from, each with a shortest path."""
+    """Yield the enclaves that one influences and learns from, each with a shortest path."""
     from sros_tool.explain.reach import path_text
 
     for what, paths in (
@@ -851,7 +863,7 @@ def _reach_lines(reach: Reach) -> Iterator[str]:
 
 
 def _reach_json(reach: Reach) -> dict[str, Any]:
-    """Return whom an enclave influences and learns from, with the hops of a shortest path."""
+    """Return the enclaves that one influences and learns from, with the hops of shortest paths."""
     return {
         "enclave": reach.enclave,
         "influences": _paths_json(reach.influences),
@@ -886,19 +898,19 @@ def _paths_json(paths: dict[str, HopPath]) -> list[dict[str, Any]]:
 def _show_log(
     log: str, root: Path | None, rest: tuple[str, ...], options: _ContextOptions, as_json: bool
 ) -> int:
-    """Explain the lines of a file, or of standard input for "-"; 1 if they report a fault."""
+    """Print explanations of a DDS log, or of standard input for "-"; return 1 for any, else 0."""
     from sros_tool.explain.log import explain_log
 
     if len(rest) > 1:
-        raise UsageError("--log takes a keystore and an enclave at most, and no question")
+        raise UsageError("--log takes at most a keystore and an enclave")
     named: LoadedEnclave | None = None
     if rest:
         named = _signed_enclave(root, rest[0], options)
         if named is None:
             raise UsageError(
-                f"no keystore is named to look for {rest[0]} in",
+                f"no keystore is named for enclave {rest[0]}",
                 "",
-                "Write it before the enclave.",
+                "Write the keystore before the enclave.",
             )
 
     def find(enclave: str) -> LoadedEnclave | None:
@@ -908,7 +920,7 @@ def _show_log(
             return None
         try:
             return _signed_enclave(root, enclave, options)
-        except SrosError:  # of another keystore
+        except SrosError:  # the log names an enclave of another keystore
             return None
 
     findings = explain_log(
@@ -920,7 +932,7 @@ def _show_log(
         for finding in findings:
             _echo(_finding_lines(finding))
         if not findings:
-            click.echo("nothing in it says that DDS Security refused anything", err=True)
+            click.echo("the log reports no refusal by DDS Security", err=True)
     return 1 if findings else 0
 
 

@@ -41,7 +41,7 @@ _DURATION = re.compile(r"\d+[smhdwy]\Z", re.ASCII)
 
 
 class _Words(click.Command):
-    """A command in which ``--watch`` may lack its value, and ``--from-log`` takes several."""
+    """A command whose ``--watch`` needs no value, and whose ``--from-log`` takes several values."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         words: list[str] = []
@@ -53,7 +53,7 @@ class _Words(click.Command):
                 continue
             in_logs = word == "--from-log"
             if in_logs and follows and (follows == "-" or not follows.startswith("-")):
-                continue  # it is repeated before each file
+                continue  # the option is added before each file instead
             words.append(word)
             if word == "--watch" and not _DURATION.match(follows):
                 words.append(_FOREVER)
@@ -78,9 +78,9 @@ Example:
   added 1 right to 'robot.xml'
     /talker_listener/talker ALLOW publish topic /nope
 
-On a secured robot, observe in an enclave of its own: policies/observer.xml (see `sros policies`)
-says the little that it needs; make it with `sros generate_artifacts -k ROOT -p observer.xml`, and
-observe with --keystore ROOT --enclave /sros_observer.""",
+On a secured robot, observe in a separate enclave. Create it with `sros generate_artifacts -k ROOT
+-p observer.xml`: policies/observer.xml (see `sros policies`) has the few rights it needs. Observe
+with --keystore ROOT --enclave /sros_observer.""",
 )
 @click.argument("file", type=PATH, required=False)
 @click.option(
@@ -89,9 +89,9 @@ observe with --keystore ROOT --enclave /sros_observer.""",
     help="Collect everything seen for DURATION, such as 10m, or until Ctrl-C.",
 )
 @click.option(
-    "--spin-time", type=click.FloatRange(0.1, 86400), metavar="S", help="Look for S seconds."
+    "--spin-time", type=click.FloatRange(0.1, 86400), metavar="S", help="Observe for S seconds."
 )
-@click.option("--flat", is_flag=True, help="One file, without includes of common parts.")
+@click.option("--flat", is_flag=True, help="Write one file, without includes of common parts.")
 @click.option("--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or 0]")
 @click.option(
     "--enclave",
@@ -110,11 +110,16 @@ observe with --keystore ROOT --enclave /sros_observer.""",
     multiple=True,
     type=PATH,
     metavar="LOG...",
-    help="Do not observe; propose what Fast DDS or Cyclone DDS denied by these logs (- is stdin).",
+    help="Do not observe; add rights that Fast DDS or Cyclone DDS denied in these logs (- is "
+    "stdin).",
 )
 @click.option("--node", metavar="/NS/NAME", help="The node whose profile --from-log adds to.")
-@click.option("-s", "--use-sim-time", is_flag=True, help="Accepted; observing needs no clock.")
-@click.option("--no-daemon", is_flag=True, help="Accepted; sros never uses the ROS daemon.")
+@click.option(
+    "-s", "--use-sim-time", is_flag=True, help="Accepted and ignored: observing needs no clock."
+)
+@click.option(
+    "--no-daemon", is_flag=True, help="Accepted and ignored: sros never uses the ROS daemon."
+)
 @dry_run_option
 @json_option
 def generate_policy(
@@ -132,11 +137,11 @@ def generate_policy(
     dry_run: bool,
     as_json: bool,
 ) -> int:
-    """Write to FILE the smallest policy that allows everything the robot is seen to do.
+    """Write to FILE the smallest policy that allows everything the robot is observed to do.
 
-    Looks at the running nodes until nothing has changed for a while, some four seconds. An
-    existing FILE keeps its content; new rights are added to it. Read the result before you
-    enforce it: on a robot that is not secured yet, anybody may have added to what is seen.
+    Observes the running nodes until the ROS graph stops changing, about four seconds. An existing
+    FILE keeps its content; new rights are added to it. Read the result before you enforce it: on a
+    robot that is not secured yet, an attacker's nodes are observed, too.
     """
     present = _present_policy(file)
     if logs:
@@ -146,7 +151,7 @@ def generate_policy(
     if node is not None:
         raise UsageError("--node is for --from-log only")
     if watch is not None and spin_time is not None:
-        raise UsageError("--watch and --spin-time are two ways to look", "", "Choose one.")
+        raise UsageError("--watch and --spin-time exclude each other", "", "Choose one.")
     from sros_tool.graph.document import draft, write
     from sros_tool.graph.learn import common_parts, learn
     from sros_tool.resources import policies_dir
@@ -166,15 +171,18 @@ def generate_policy(
     _show(plan, learned, snapshot.observation, dry_run, as_json)
     if not snapshot.settled:
         click.echo(
-            f"the graph kept changing for {snapshot.seconds:.0f} s; --watch keeps what comes and "
-            "goes.",
+            f"the ROS graph kept changing for {snapshot.seconds:.0f} s; use --watch to collect "
+            "nodes that come and go.",
             err=True,
         )
     return 0
 
 
 def _present_policy(file: Path | None) -> Policy | None:
-    """Return the existing policy, if any; read before observing, as it may be broken."""
+    """Return the policy in ``file``, or None without one.
+
+    Called before observing, so that a broken policy is reported at once.
+    """
     from sros_tool.policy.document import read_policy
 
     if file is None:
@@ -220,7 +228,7 @@ def _show(
         for each in plan.added:
             click.echo(f"  {each}")
     else:
-        click.echo(f"nothing to add: '{plan.path}' already covers everything that was seen")
+        click.echo(f"nothing to add: '{plan.path}' already covers everything that was observed")
     if plan.copies:
         click.echo(f"{would}copied {', '.join(sorted(plan.copies))} next to it")
     print_notes(notes)
@@ -236,7 +244,7 @@ def _count(number: int, thing: str) -> str:
 def _observer_environment(
     enclave: str | None, keystore: Path | None, domain: str | None
 ) -> dict[str, str]:
-    """Return the variables to add for the observer: its domain, and its enclave if it has one."""
+    """Return the environment variables to set for the observer: its domain, its enclave if any."""
     from sros_tool.runtime.environment import DOMAIN, domain_from
 
     if enclave is None:
@@ -261,10 +269,10 @@ def _observe(
     *,
     secured: bool,
 ) -> tuple[Snapshot, str]:
-    """Return the observation, and the RMW that made it.
+    """Observe the ROS graph; return the result and the RMW in use.
 
-    ``watch`` is a duration or `_FOREVER`; without it the graph is looked at once, for ``spin_time``
-    seconds if given.
+    ``watch`` is a duration or `_FOREVER`; None observes for ``spin_time`` seconds, or until the
+    graph stops changing.
     """
     from sros_tool.graph.observe import (
         SECURED,
@@ -300,7 +308,7 @@ def _observe(
 
 
 def _enclaves_by_identity(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the enclaves of the observer's keystore by `identity_of` their certificates.
+    """Map `identity_of` each certificate's subject in the observer's keystore to its enclave.
 
     An enclave whose certificate cannot be read is left out.
     """
@@ -345,7 +353,7 @@ def _watch(
 
 @contextmanager
 def _until_signalled() -> Iterator[Callable[[], bool]]:
-    """Catch Ctrl-C and SIGTERM; yield a function that returns whether one has come."""
+    """Catch Ctrl-C and SIGTERM; yield a function that returns whether one was received."""
     came: list[int] = []
 
     def note(number: int, _frame: object) -> None:
@@ -360,7 +368,7 @@ def _until_signalled() -> Iterator[Callable[[], bool]]:
 
 
 def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
-    """Return the failure of the observer, with what its DDS said about security."""
+    """Return the observer's failure as the error that its DDS output explains."""
     from sros_tool.runtime.environment import ENCLAVE
     from sros_tool.runtime.vendor_log import (
         endpoint_refusal,
@@ -372,9 +380,9 @@ def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
     said = f"{error.output}\n{error.reason}"
     if line := missing_security(said):
         return UnavailableError(
-            "the DDS of this rclpy was built without DDS Security, so it cannot look at a secured "
+            "the DDS of this rclpy was built without DDS Security, so it cannot observe a secured "
             "robot",
-            f"It says: {line}",
+            f"DDS says: {line}",
             "Use a ROS 2 whose DDS has it, such as the packages of Ubuntu; `sros doctor` shows "
             "which DDS here enforces security.",
         )
@@ -390,8 +398,8 @@ def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
     if line := participant_refusal(said):
         return SrosError(
             f"DDS refuses the enclave {name}",
-            f"It says: {line}",
-            "See `sros inspect` of the enclave.",
+            f"DDS says: {line}",
+            "Run `sros inspect` on the enclave.",
         )
     last = [line for line in plain_text(error.output).splitlines() if line.strip()][-1:]
     why = error.reason + (f" Its last message: {last[0].strip()}" if last else "")
@@ -399,15 +407,15 @@ def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
 
 
 def _why_empty(environment: dict[str, str], seconds: float, rmw: str, enclave: str | None) -> str:
-    """Return why there may be nothing to see, and where to look."""
+    """Return the likely reasons why no node was observed, and a remedy."""
     from sros_tool.runtime.environment import DOMAIN, ENABLE, KEYSTORE
 
     merged = {**os.environ, **environment}
-    looked = f"Looked at domain {merged.get(DOMAIN) or 0} for {seconds:.0f} s with {rmw}. "
+    looked = f"Observed domain {merged.get(DOMAIN) or 0} for {seconds:.0f} s with {rmw}. "
     if enclave is not None:
         return looked + (
-            f"The observer ran secured, in enclave {enclave}: it sees no node that runs unsecured, "
-            "has a certificate of another CA, or another DDS."
+            f"The observer ran secured, in enclave {enclave}: it does not see nodes that are "
+            "unsecured, have a certificate of another CA, or use another DDS."
         )
     if merged.get(KEYSTORE) and merged.get(ENABLE) != "true":
         return looked + (
@@ -451,7 +459,10 @@ def _from_logs(
     if not learned.profiles:
         print_notes(learned.notes)
         click.echo(
-            "There is nothing to propose." if denials else "The logs report no denial.", err=True
+            "No right can be proposed for the denials in the logs."
+            if denials
+            else "The logs report no denial.",
+            err=True,
         )
         return 1
     if file is None and as_json:
@@ -472,7 +483,7 @@ def _from_logs(
 def _log_text(log: Path) -> str:
     if str(log) != "-" and not log.exists():
         raise UsageError(
-            f"the log '{log}' does not exist", "", "The policy FILE stands before --from-log."
+            f"the log '{log}' does not exist", "", "Write the policy FILE before --from-log."
         )
     return read_log(str(log))
 

@@ -1,4 +1,4 @@
-"""The verb that shows what a keystore, an enclave, a certificate or a document says."""
+"""The verb `inspect`: show the contents of a keystore, an enclave or a single file."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ Example:
     "--ca",
     "authority",
     type=PATH,
-    help="The permissions CA certificate to verify a signed document against.",
+    help="Permissions CA certificate that verifies a signed document.",
 )
 @click.option(
     "--history",
     is_flag=True,
-    help="Show everything that the keystore PATH ever issued, and its present state.",
+    help="Show everything that the keystore PATH ever issued, with its current state.",
 )
 @json_option
 def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) -> int:
-    """Show what PATH says: a keystore, an enclave's folder, a certificate or several, a revocation
-    list, a key or a .p7s file.
+    """Show the contents of PATH.
 
-    The exit status is 1 if an enclave cannot run, a signature does not verify, or the ledger of
-    the keystore does not know a certificate or signed document in it.
+    PATH is a keystore, an enclave's folder, a file of certificates, a revocation list, a private
+    key or a signed document (.p7s). The exit status is 1 if an enclave cannot run, a signature
+    does not verify, or a certificate or signed document is missing from the keystore's ledger.
     """
     from sros_tool.errors import DocumentError
     from sros_tool.keystore.describe import describe
@@ -99,7 +99,7 @@ def _show_history(root: Path, as_json: bool) -> int:
 def _keystore(d: dict[str, Any]) -> Iterator[str]:
     template = d["template"]
     yield f"keystore {d['path']}, " + (
-        f"template {template}" if template else "not made by sros, or an export"
+        f"template {template}" if template else "no template: not made by sros, or an export"
     )
     for role, authority in d["authorities"].items():
         if "error" in authority:

@@ -1,4 +1,4 @@
-"""The verbs that add enclaves and permissions to a keystore, and list what it has."""
+"""The verbs that create keystores, enclaves and permissions, and list enclaves."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ Example:
 def create_enclave(words: tuple[str, ...], dry_run: bool) -> None:
     """Create the enclaves NAME... in the keystore ROOT.
 
-    An enclave that exists keeps its key and its permissions; a file that it lacks is added.
+    An existing enclave keeps its key and its permissions; missing files are added.
     """
     from sros_tool.keystore.lifecycle.create import create_enclaves
 
@@ -85,7 +85,7 @@ Example:
 )
 @dry_run_option
 def create_permission(words: tuple[str, ...], dry_run: bool) -> None:
-    """Give the enclave NAME the permissions that the policy in POLICY_FILE states for it."""
+    """Give the enclave NAME the permissions that POLICY_FILE states for it."""
     from sros_tool.keystore.lifecycle.create import create_permission as create
     from sros_tool.policy.document import read_policy
 
@@ -120,7 +120,7 @@ Example:
   created enclave /talker_listener/talker
   ...""",
 )
-@click.option("-k", "--keystore-root-path", type=PATH, help="The keystore; made if missing.")
+@click.option("-k", "--keystore-root-path", type=PATH, help="The keystore; created if missing.")
 @click.option("-e", "--enclaves", multiple=True, metavar="NAME...", help="Enclaves to create.")
 @click.option(
     "-p",
@@ -128,7 +128,7 @@ Example:
     multiple=True,
     type=PATH,
     metavar="FILE...",
-    help="Policies whose enclaves to create, with their permissions.",
+    help="Policies: create their enclaves, with the permissions stated.",
 )
 @click.option(
     "--template",
@@ -136,7 +136,7 @@ Example:
     default="development",
     show_default=True,
     metavar="NAME|FILE",
-    help="The choices to make a missing keystore by.",
+    help="Template for a missing keystore: a name, or a TOML file.",
     shell_complete=complete_template,
 )
 @dry_run_option
@@ -147,9 +147,9 @@ def generate_artifacts(
     template_name: str,
     dry_run: bool,
 ) -> None:
-    """Create enclaves, and the permissions that policies state for them, all or nothing.
+    """Create enclaves, and the permissions that policies state for them: all or none.
 
-    The permissions in a policy replace the enclave's present ones.
+    The permissions in a policy replace the current permissions of an enclave.
     """
     from sros_tool.keystore.lifecycle.create import generate_artifacts as generate
     from sros_tool.keystore.template import load_template
@@ -247,36 +247,36 @@ Example:
     default="development",
     show_default=True,
     metavar="NAME|FILE",
-    help="The choices to make it by: development, production, sros2, or a TOML file.",
+    help="Template: development, production, sros2, or a TOML file.",
     shell_complete=complete_template,
 )
 @click.option(
     "--domain",
     metavar="IDS",
-    help="The ROS domains it is for, as 0 or 0,7 or 10-19. [default: $ROS_DOMAIN_ID, or 0]",
+    help="ROS domains of its enclaves, as 0 or 0,7 or 10-19. [default: $ROS_DOMAIN_ID, or 0]",
 )
 @click.option(
     "--ca-layout",
     type=click.Choice(["separate", "single"]),
-    help="Two CAs, for identities and permissions, or one for both.",
+    help="Separate CAs for identities and permissions, or one for both.",
 )
 @click.option(
     "--ca-validity",
     metavar="SPAN",
     help="How long the CAs are valid: 5y, until 2031-01-01, or from 2026-12-01/5y.",
 )
-@click.option("--validity", metavar="SPAN", help="The same for certificates.")
-@click.option("--permissions-validity", metavar="SPAN", help="The same for permissions.")
+@click.option("--validity", metavar="SPAN", help="How long certificates are valid.")
+@click.option("--permissions-validity", metavar="SPAN", help="How long permissions are valid.")
 @click.option(
     "--identity-ca",
     type=PATH,
-    help="The certificate of an existing identity CA, with its chain; needs --identity-key.",
+    help="Certificate of an existing identity CA, with its chain; needs --identity-key.",
 )
 @click.option("--permissions-ca", type=PATH, help="The same for the permissions CA.")
 @click.option(
     "--identity-key",
     metavar="URI",
-    help="Where the key of the identity CA is, or is to be made: file:PATH or pkcs11:...",
+    help="Where the identity CA's key is, or where to make it: file:PATH or pkcs11:...",
 )
 @click.option("--permissions-key", metavar="URI", help="The same for the permissions CA.")
 @click.option(
@@ -298,7 +298,7 @@ def create_keystore(
     encrypt_ca_keys: bool,
     dry_run: bool,
 ) -> None:
-    """Create a keystore in the folder ROOT, by the choices of a template.
+    """Create a keystore in the folder ROOT, with the settings of a template.
 
     Passphrases of CA keys come from a prompt, from $SROS_CA_PASSPHRASE or from the file
     $SROS_CA_PASSPHRASE_FILE; the PIN of a token from a prompt or $SROS_PKCS11_PIN.
@@ -371,7 +371,7 @@ def _imported(files: dict[str, Path | None]) -> dict[str, bytes]:
 def _say_new_keystore(
     root: Path, template: Template, domains: DomainSet, imported: frozenset[str] = frozenset()
 ) -> None:
-    """Say what was made, and by which choices."""
+    """Print the new keystore's domains, template, CAs, validity and CA fingerprints."""
     from sros_tool.keystore.layout import ROLES
     from sros_tool.keystore.reader import load_ca_certificate
     from sros_tool.pki.certificates import digest, validity_of
@@ -393,13 +393,13 @@ def _say_new_keystore(
         f"{span_text(template.certificate_validity)}, permissions "
         f"{span_text(template.permissions_validity)}"
     )
-    # By these, those who get something from here know whose it is.
+    # A robot's operator compares them with the CAs of an answer: see `sros import --ca`.
     for role in roles:
         name = f"{role} CA" if template.separate_authorities else "CA"
         certificate = load_ca_certificate(root, role)
         click.echo(f"  {name} SHA-256 {digest(certificate)}")
         if role in imported:
-            click.echo(f"    given, and valid until {iso(validity_of(certificate).not_after)}")
+            click.echo(f"    imported, valid until {iso(validity_of(certificate).not_after)}")
 
 
 def _say_what_is_open(template: Template) -> None:
@@ -408,13 +408,14 @@ def _say_what_is_open(template: Template) -> None:
     if template.default_permissions == EVERYTHING:
         click.echo(
             "still open: a new enclave may publish, subscribe and call everything; "
-            "`sros create_permission` closes it with a policy, `--template production` from the "
-            "start.",
+            "restrict it with `sros create_permission` and a policy, or create the keystore with "
+            "`--template production`.",
             err=True,
         )
     if not template.separate_authorities:
         click.echo(
-            "still open: with one CA for both jobs, Cyclone DDS 0.10.2 and Fast DDS 2.9.1 let an "
-            "enclave sign its own permissions; `--ca-layout separate` closes it.",
+            "still open: with one CA for both, an enclave can sign its own permissions, and "
+            "Cyclone DDS 0.10.2 and Fast DDS 2.9.1 accept them; create the keystore with "
+            "`--ca-layout separate`.",
             err=True,
         )

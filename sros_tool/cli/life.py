@@ -1,4 +1,4 @@
-"""The verbs for the life of keys: renewing and revoking."""
+"""The verbs for the life of keys: `renew`, `revoke`, `crl` and `rotate_ca`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from sros_tool.errors import UsageError
 if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.renew import Renewal
 
-_MANY = 5
+_MAX_NAMES = 5
+"""Number of enclaves that a message names."""
 
 
 @click.command(
@@ -47,13 +48,13 @@ Example:
 @click.option(
     "--all-expiring",
     metavar="DURATION|PERCENT",
-    help="Renew also all that expire within 30d, or have used 66% of their validity.",
+    help="Also renew enclaves that expire within 30d, or have used 66% of their validity.",
 )
 @click.option("--new-key", is_flag=True, help="Make new keys as well.")
 @click.option(
     "--revoke-old",
     is_flag=True,
-    help="Revoke the earlier certificates of what is renewed, as superseded.",
+    help="Revoke earlier certificates of renewed enclaves, with the reason superseded.",
 )
 @dry_run_option
 def renew(
@@ -65,12 +66,12 @@ def renew(
 ) -> None:
     """Issue new certificates for the enclaves NAME..., and sign their permissions again.
 
-    The rights stay as they are.  Running processes keep the files they have loaded; restart them
-    before these expire.
+    The rights stay the same.  Running processes keep the files they have loaded: restart them
+    before those files expire.
 
-    A replaced certificate works until it expires, with the permissions of its time, for anyone
-    who has a copy of the files.  --revoke-old revokes it: nobody who reads the new crl.pem
-    accepts it. Then restart the renewed processes first, and after them the others.
+    Anyone who has a copy of a replaced certificate and its permissions can use them until they
+    expire.  With --revoke-old, processes that load the new crl.pem refuse them: restart the
+    renewed processes first, then all others.
     """
     from sros_tool.keystore.expiry import parse_threshold
     from sros_tool.keystore.lifecycle.renew import renew as work
@@ -122,7 +123,7 @@ def _say_replaced(result: Renewal) -> None:
 def _complete_reason(
     _ctx: click.Context, _parameter: click.Parameter, incomplete: str
 ) -> list[str]:
-    """Completes the reasons of RFC 5280, written as RFC 5280 writes them."""
+    """Complete the revocation reasons of RFC 5280."""
     from sros_tool.pki.crl import REASONS
 
     return [each for each in REASONS if each.startswith(incomplete)]
@@ -153,18 +154,18 @@ Example:
 @click.option(
     "--until-retired",
     is_flag=True,
-    help="While CAs are replaced: revoke without the key of the old identity CA.",
+    help="During a CA rotation: revoke without the key of the old identity CA.",
 )
 @dry_run_option
 def revoke(words: tuple[str, ...], reason: str, until_retired: bool, dry_run: bool) -> None:
-    """Revoke the enclaves NAME...: nobody who reads the new crl.pem talks to them any more.
+    """Revoke the enclaves NAME...: processes that load the new crl.pem refuse them.
 
-    Their files move to the folder "revoked" of the keystore.  Exported enclaves need their
-    crl.pem exported again, and their CA files, too, while a rotation of CAs is under way.
+    Their files move to the folder "revoked" of the keystore.  Export the other enclaves to their
+    robots again: they need the new crl.pem and, during a CA rotation, the CA files.
 
-    In a rotation both CAs revoke, for Fast DDS trusts both. Where the key of the old one is gone,
-    its certificates are refused only once `sros rotate_ca --to retire` is done; --until-retired
-    accepts that.
+    During a rotation both CAs revoke, because Fast DDS trusts both. If the key of the old CA is
+    gone, its certificates are refused only after `sros rotate_ca --to retire`; --until-retired
+    accepts this delay.
     """
     from sros_tool.keystore.lifecycle.revoke import revoke as work
 
@@ -202,14 +203,14 @@ Example:
   $ sros crl keystore --refresh""",
 )
 @click.argument("root", type=PATH, required=False)
-@click.option("--refresh", is_flag=True, help="Sign it again, so that it is valid for longer.")
+@click.option("--refresh", is_flag=True, help="Sign the list again to extend its validity.")
 @json_option
 @dry_run_option
 def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
     """Show the revocation list of the keystore ROOT, or sign it again.
 
-    An expired list makes DDS refuse everybody, so the exit status is 1 when it expires within 30
-    days.
+    DDS refuses every participant once the list has expired, so the exit status is 1 if it expires
+    within 30 days.
     """
     from datetime import timedelta
 
@@ -262,14 +263,15 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
         click.echo(f"revocation list {found.number}, until {iso(found.next_update)}")
         for each in found.revoked:
             click.echo(f"  {each.serial:x}  {iso(each.date)}  {each.reason}")
-        for other in others:  # of the CA that comes or goes, while one replaces the other
+        for other in others:  # of the other CA during a rotation
             click.echo(
                 f"next to it, list {other.number} of {subject_text(other.list.issuer)}, until "
                 f"{iso(other.next_update)}: {len(other.revoked)} revoked"
             )
     if soon:
         click.echo(
-            f"it expires soon, and DDS then refuses everybody: run `sros crl {root} --refresh`.",
+            "the list expires soon, and DDS then refuses every participant: "
+            f"run `sros crl {root} --refresh`.",
             err=True,
         )
     return 1 if soon else 0
@@ -278,7 +280,7 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
 def _say_restart(names: tuple[str, ...]) -> None:
     if not names:
         return
-    shown = ", ".join(names[:_MANY]) + (", ..." if len(names) > _MANY else "")
+    shown = ", ".join(names[:_MAX_NAMES]) + (", ..." if len(names) > _MAX_NAMES else "")
     number = "1 enclave" if len(names) == 1 else f"{len(names)} enclaves"
     click.echo(f"restart the processes of {number} for it to take effect: {shown}", err=True)
 
@@ -312,26 +314,26 @@ Example:
   $ sros rotate_ca keystore --finish   # or all at once; then restart all""",
 )
 @click.argument("root", type=PATH, required=False)
-@click.option("--identity", is_flag=True, help="Only the identity CA.")
-@click.option("--permissions", is_flag=True, help="Only the permissions CA.")
+@click.option("--identity", is_flag=True, help="Replace only the identity CA.")
+@click.option("--permissions", is_flag=True, help="Replace only the permissions CA.")
 @click.option("--status", is_flag=True, help="Show the stage of the keystore (the default).")
 @click.option("--next", "go_on", is_flag=True, help="Do the next stage.")
 @click.option(
     "--to",
     type=click.Choice(["distribute", "reissue", "retire"]),
-    help="Do this stage if it is the next one; nothing if it is done.",
+    help="Do this stage if it is the next one; do nothing if it is already done.",
 )
 @click.option("--finish", is_flag=True, help="Do all stages that remain, at once.")
 @click.option(
     "--same-key",
     is_flag=True,
-    help="Extend the identity CA without a new key; no stages are needed.",
+    help="Extend the validity of the identity CA, with the same key and without stages.",
 )
 @click.option("--ca-validity", metavar="SPAN", help="How long the new CA is valid, such as 10y.")
-@click.option("--identity-key", metavar="URI", help="Where the new key is made: file: or pkcs11:.")
+@click.option("--identity-key", metavar="URI", help="Where to make the new key: file: or pkcs11:.")
 @click.option("--permissions-key", metavar="URI", help="The same for the permissions CA.")
 @click.option("--encrypt-ca-keys", is_flag=True, help="Protect new keys in files by a passphrase.")
-@click.option("--delete-old-key", is_flag=True, help="Do not keep the old key in 'retired'.")
+@click.option("--delete-old-key", is_flag=True, help="Do not keep the old key, in 'retired'.")
 @json_option
 @dry_run_option
 def rotate_ca(
@@ -355,12 +357,12 @@ def rotate_ca(
 
     Stage 1, distribute: a new CA is trusted next to the old one. Stage 2, reissue: the new CA
     issues all certificates, governance and permissions again. Stage 3, retire: the old CA is no
-    longer trusted. Processes notice nothing before they are restarted; restart them all after each
-    stage, and export again what was exported.
+    longer trusted. Processes load the new files only when they start: after each stage, restart
+    them all, and export exported enclaves again.
 
-    Fast DDS (2.9.1) lets processes talk at every moment of this. Cyclone DDS (0.10.2) trusts one
-    CA at a time: after stage 2, restart all its processes together. There, if the
-    identity CA is only about to expire, --same-key renews it and disturbs nobody.
+    With Fast DDS (2.9.1), all processes can talk to each other at every moment of a rotation.
+    Cyclone DDS (0.10.2) trusts one CA at a time: after stage 2, restart all its processes
+    together. If the identity CA only expires soon, use --same-key, which does not need this.
     """
     from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca
     from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca as work
@@ -368,7 +370,7 @@ def rotate_ca(
     from sros_tool.validity import parse_span
 
     if sum((status, go_on, to is not None, finish, same_key)) > 1:
-        raise UsageError("only one of --status, --next, --to, --finish and --same-key makes sense")
+        raise UsageError("give only one of --status, --next, --to, --finish and --same-key")
     root = root or keystore_from_environment()
     if not (go_on or to or finish or same_key):
         _show_status(rotation_status(root, now=now()), as_json)
@@ -378,7 +380,7 @@ def rotate_ca(
         if permissions:
             raise UsageError(
                 "the permissions CA cannot keep its key",
-                "DDS takes what it has signed from the very certificate only.",
+                "DDS accepts signed documents only from exactly the same CA certificate.",
                 "Leave out --permissions or --same-key.",
             )
         step = renew_identity_ca(
@@ -412,11 +414,11 @@ def _say(step: RotationStep, status: RotationStatus, *, together: bool, same_key
         click.echo("nothing is left to do", err=True)
         return
     if same_key:
-        click.echo("renewed the identity CA with its key; what it has issued stays valid")
+        click.echo("renewed the identity CA with the same key; certificates it issued stay valid")
         click.echo(
-            "Restart the processes when it suits; those restarted and those not yet restarted talk "
-            "with each other. Certificates expire when they did: `sros renew "
-            f"{step.root} --all-expiring 30d` renews those that soon do.",
+            "Restart the processes at any time; meanwhile, restarted and not yet restarted "
+            "processes can talk to each other. Certificates keep their expiry: `sros renew "
+            f"{step.root} --all-expiring 30d` renews those that expire soon.",
             err=True,
         )
         return
@@ -424,9 +426,9 @@ def _say(step: RotationStep, status: RotationStatus, *, together: bool, same_key
     done = f"{_DONE['reissue']}, and " if together and reissued else ""
     click.echo(f"{done}{_DONE[step.stage]}: {', '.join(step.files)}")
     for place in step.kept_elsewhere:
-        click.echo(f"the old key at '{place}' is used no longer, and was left there", err=True)
+        click.echo(f"the old key at '{place}' is no longer used; it was not deleted", err=True)
     if step.stage == "retire":
-        how = "together" if together else "when it suits; all of them go on talking"
+        how = "together" if together else "at any time; they can talk to each other meanwhile"
         click.echo(f"Restart all processes {how}.", err=True)
     for remark in status.remarks:
         click.echo(remark, err=True)
@@ -463,7 +465,7 @@ def _show_status(status: RotationStatus, as_json: bool) -> None:
         name = f"{each.roles[0]} CA" if len(each.roles) == 1 else "CA"
         end = f"until {iso(each.validity.not_after)}"
         if each.validity.not_after < now():
-            end = f"ENDED {iso(each.validity.not_after)}"
+            end = f"EXPIRED {iso(each.validity.not_after)}"
         click.echo(
             f"  {name:14} {each.state:7} {each.enclaves} of {status.enclaves} enclaves  {end}"
             f"  {each.subject}"
@@ -473,9 +475,9 @@ def _show_status(status: RotationStatus, as_json: bool) -> None:
 
 
 def _new_keys(identity: str | None, permissions: str | None, encrypt: bool) -> Keyring:
-    """Where new keys are made.
+    """Return a keyring that has only the places given by options, where new keys are made.
 
-    What the environment names are the places of the present keys.
+    Places given by the environment are those of the current keys.
     """
     from dataclasses import replace
 

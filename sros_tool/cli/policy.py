@@ -66,10 +66,10 @@ def merge_policy(
 ) -> None:
     """Print POLICY with the rights of every OTHER policy added.
 
-    Comments, includes, metadata and layout of POLICY stay as they are; the other policies only add
-    rights. A right is added for one direction only, and only if the enclave does not have it yet,
-    also through an include or a wildcard. A DENY always stays and always wins over an ALLOW;
-    contradictions between the policies are reported.
+    Comments, includes, metadata and layout of POLICY do not change. A right is added only if the
+    enclave does not have it yet, by an include or a wildcard either; publish and subscribe are
+    separate rights. A DENY always stays and always wins over an ALLOW; contradictions between the
+    policies are reported.
     """
     from sros_tool.policy.document import read_policy
     from sros_tool.policy.merge import merge_all, merge_notes
@@ -129,7 +129,7 @@ def _print_merged_json(policy: Path, merged: Merged, written: Path | None, *, sh
 
 
 def _check_includes(policy: Path, output: Path, document: bytes) -> None:
-    """Refuse an output from which the relative includes of the policy would lead elsewhere."""
+    """Raise `PolicyError` if the policy's relative includes lead elsewhere from ``output``."""
     from sros_tool.policy.document import read_policy
 
     try:
@@ -138,9 +138,9 @@ def _check_includes(policy: Path, output: Path, document: bytes) -> None:
         same = False
     if not same:
         raise PolicyError(
-            f"the result would not mean the same as '{output}'",
-            f"Its includes are relative, and lead elsewhere than from '{policy}'.",
-            f"Write it into the folder of '{policy}'.",
+            f"the result cannot be written to '{output}'",
+            f"From there, its relative includes lead to other files than from '{policy}'.",
+            f"Write it to the folder of '{policy}'.",
         )
 
 
@@ -162,13 +162,13 @@ Example:
 @click.argument("b", metavar="B", type=PATH)
 @json_option
 def diff_policy(a: Path, b: Path, as_json: bool) -> int:
-    """Compare the rights that A and B give: "-" has only A, "+" only B.
+    """Compare the rights that A and B give: "-" is only in A, "+" only in B.
 
-    Each is a policy file, a permissions.p7s or permissions.xml, the folder of an enclave, or a
-    keystore. Permissions are shown in ROS terms, and their signature is verified where the
-    permissions CA lies with them. If one side is for a single enclave, only that is compared.
+    A and B are policy files, permissions (.p7s or .xml), folders of enclaves, or keystores.
+    Permissions are shown in ROS terms; their signature is verified if the permissions CA is next
+    to them. If A or B is for a single enclave, only this enclave is compared.
 
-    The exit status is 1 if they differ, or if DDS would refuse one of them.
+    The exit status is 1 if the rights differ, or if DDS would refuse A or B.
     """
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.rights import compare
@@ -230,7 +230,8 @@ def _difference_json(
 
 
 _SHOWN = 5
-_ROOM = 256  # bytes below the limit, as names of CAs and signatures vary in length
+_MARGIN = 256
+"""Bytes kept free below the size limit: CA names and signatures vary in length."""
 
 
 class _SeveralObserved(SeveralValues):
@@ -246,9 +247,9 @@ Example:
   /talker: allowed 23, observed 4: 5.8x
     never observed, and removed
       publish topic /status
-    wider than its use
+    wider than used
       request service /*  becomes  request service /add_two_ints
-    never observed, and kept as every node needs it: 11
+    never observed, but kept because every node needs it: 11
     observed, and not allowed
       publish topic /cmd_vel
     permissions.p7s: 4044 bytes, then 4028, of at most 65535
@@ -261,13 +262,13 @@ Example:
     multiple=True,
     type=PATH,
     metavar="OBSERVED...",
-    help="What was observed: policies by generate_policy, or permissions.",
+    help="Observed rights: policies by generate_policy, or permissions.",
 )
 @output_option("Write the narrowed policy to FILE.")
 @click.option(
     "--strict",
     is_flag=True,
-    help="Remove also what every node needs (common/node.xml), if it was not observed.",
+    help="Also remove unused rights that every node needs (common/node.xml).",
 )
 @force_option
 @dry_run_option
@@ -281,13 +282,12 @@ def minimize_policy(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Show what POLICY allows and nobody was observed to use, and narrow it.
+    """Show the rights in POLICY that were never observed in use, and write it without them.
 
-    The number behind "allowed" and "observed" counts pairs of a right and an exact name; a
-    wildcard counts as the names it matches among all that are known: from the policy, from the
-    observations, and from what every node needs. The result is one self-contained file:
-    includes are resolved and comments are not kept, metadata is. A DENY always stays, and an
-    enclave that was not observed at all stays as it is.
+    "allowed" and "observed" count pairs of a right and an exact name. A wildcard counts once for
+    each known name that it matches: names in the policy, in the observations, and in the rights
+    that every node needs. The result is one file: includes are resolved, metadata is kept, and
+    comments are lost. A DENY always stays, and an enclave that was never observed does not change.
     """
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.document import read_policy, write_policy
@@ -304,7 +304,7 @@ def minimize_policy(
     measured = _measure(given, result, seen)
     document = write_policy(result.policy)
     if output and read_policy(output, document) != result.policy:
-        raise PolicyError("the narrowed policy does not read as it was meant")
+        raise PolicyError("the narrowed policy changes when it is written and read again")
     saved = save(output, document) if output and not dry_run else ""
     if as_json:
         value = _minimized_json(policy, result, measured, output if not dry_run else None)
@@ -332,7 +332,7 @@ def _node_basics() -> Sequence[Group]:
 def _scope_notes(given: Policy, result: MinimizedPolicy, seen: frozenset[Right]) -> Iterator[Note]:
     unseen = [use.enclave for use in result.uses if not use.seen]
     if unseen:
-        text = f"never observed, and so left as they are: {', '.join(unseen)}."
+        text = f"never observed, and therefore not changed: {', '.join(unseen)}."
         yield Note("minimize.enclave-never-observed", text)
     unknown = sorted({right.enclave for right in seen} - {each.path for each in given.enclaves})
     if unknown:
@@ -342,7 +342,7 @@ def _scope_notes(given: Policy, result: MinimizedPolicy, seen: frozenset[Right])
 
 @dataclass(frozen=True, slots=True)
 class _Measured:
-    """The signed permissions of an enclave in bytes, and how they could become smaller."""
+    """Sizes of an enclave's signed permissions, in bytes, and wildcards that would reduce them."""
 
     before: int
     after: int
@@ -357,17 +357,17 @@ def _measure(
     from sros_tool.policy.minimize import propose_wildcards
     from sros_tool.policy.rights import policy_rights
 
-    scale = SizeEstimator()
+    estimator = SizeEstimator()
     measured = {}
     for before, after in zip(given.enclaves, result.policy.enclaves, strict=True):
-        sizes = scale.signed_bytes(before), scale.signed_bytes(after)
+        sizes = estimator.signed_bytes(before), estimator.signed_bytes(after)
         proposals: tuple[WildcardProposal, ...] = ()
-        if sizes[1] > MAX_SIGNED_BYTES - _ROOM:
+        if sizes[1] > MAX_SIGNED_BYTES - _MARGIN:
             proposals = propose_wildcards(
                 after.path,
                 policy_rights(result.policy),
                 policy_rights(given) | seen,
-                needed=sizes[1] - MAX_SIGNED_BYTES + _ROOM,
+                needed=sizes[1] - MAX_SIGNED_BYTES + _MARGIN,
                 size=right_bytes,
             )
         measured[before.path] = _Measured(*sizes, proposals)
@@ -376,14 +376,14 @@ def _measure(
 
 def _ratio_text(ratio: float | None) -> str:
     """Return the over-privilege ratio as text, such as 3.5x."""
-    return "nothing of it is in use" if ratio is None else f"{ratio:.1f}x"
+    return "none in use" if ratio is None else f"{ratio:.1f}x"
 
 
 def _use_lines(use: EnclaveUse, measured: _Measured) -> Iterator[str]:
     from sros_tool.dds.permissions import MAX_SIGNED_BYTES
 
     if not use.seen:
-        yield f"{use.enclave}: allowed {use.allowed_pairs}, never observed, left as it is"
+        yield f"{use.enclave}: allowed {use.allowed_pairs}, never observed, not changed"
     else:
         counts = f"allowed {use.allowed_pairs}, observed {use.observed_pairs}"
         yield f"{use.enclave}: {counts}: {_ratio_text(use.ratio)}"
@@ -391,7 +391,7 @@ def _use_lines(use: EnclaveUse, measured: _Measured) -> Iterator[str]:
             yield "  never observed, and removed"
             yield from (f"    {right.describe()}" for right in use.unused)
     if use.wide:
-        yield "  wider than its use" if len(use.wide) == 1 else "  wider than their use"
+        yield "  wider than used"
     for wide in use.wide:
         used = ", ".join(right.describe() for right in wide.used) or "nothing"
         instead = ", ".join(right.describe() for right in wide.replacement)
@@ -401,7 +401,7 @@ def _use_lines(use: EnclaveUse, measured: _Measured) -> Iterator[str]:
             yield f"    {wide.rule.describe()}  covered {used}"
             yield f"      {f'becomes {instead}' if instead else 'not needed: other rules have it'}"
     if use.common:
-        yield f"  never observed, and kept as every node needs it: {len(use.common)}"
+        yield f"  never observed, but kept because every node needs it: {len(use.common)}"
     if use.refused:
         yield "  observed, and not allowed"
         yield from (f"    {right.describe()}" for right in use.refused)
@@ -468,19 +468,19 @@ Example:
     "target",
     type=PATH,
     metavar="DIR",
-    help="Copy them to the new folder DIR, to start your own from.",
+    help="Copy them to the new folder DIR, as a start for your own.",
 )
 @json_option
 @dry_run_option
 def policies(target: Path | None, as_json: bool, dry_run: bool) -> None:
-    """List the policies that ship with sros, with their enclaves, or copy them."""
+    """List the policies that ship with sros and their enclaves, or copy the policies."""
     from sros_tool.policy.document import read_policy
     from sros_tool.resources import policies_dir
 
     source = policies_dir()
     if target is not None:
         if target.exists():
-            raise UsageError(f"'{target}' already exists", "", "Name a folder that does not.")
+            raise UsageError(f"'{target}' already exists", "", "Name a new folder.")
         if dry_run:
             click.echo(f"would copy the policies to '{target}'")
             return

@@ -1,4 +1,4 @@
-"""The verbs of ``sros``; each is imported when it is used, so that help is instant."""
+"""The program ``sros``: its verbs, imported only when used for a fast start, and its errors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sros_tool.errors import SrosError
 
 @dataclass(frozen=True, slots=True)
 class VerbEntry:
-    """A verb: its module, its summary, its other names, and its name in the module if different."""
+    """A verb: its module, one line of help, aliases, and its name in the module if different."""
 
     module: str
     help: str
@@ -35,7 +35,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
             "keystore", "Create enclaves and permissions from policies."
         ),
         "list_enclaves": VerbEntry("keystore", "List the enclaves of a keystore.", ("list_keys",)),
-        "inspect": VerbEntry("inspect", "Show what a keystore, certificate or document says."),
+        "inspect": VerbEntry("inspect", "Show the contents of a keystore or a single file."),
     },
     "Life of keys": {
         "renew": VerbEntry("life", "Renew certificates and permissions of enclaves."),
@@ -49,11 +49,11 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         ),
         "verify": VerbEntry("deployment", "Check whether a robot's enclaves can be used."),
         "create_request": VerbEntry(
-            "deployment", "Make a key on the robot, and a request to sign it."
+            "deployment", "Make a key on the robot, and a signing request."
         ),
         "sign_request": VerbEntry("deployment", "Sign the request of a robot."),
         "import": VerbEntry(
-            "deployment", "Install a signed answer next to its key.", attribute="import_verb"
+            "deployment", "Install a signed answer on the robot.", attribute="import_verb"
         ),
     },
     "Policy": {
@@ -62,14 +62,14 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "diff_policy": VerbEntry(
             "policy", "Compare the rights of policies, permissions, keystores."
         ),
-        "minimize_policy": VerbEntry("policy", "Narrow a policy to what was observed."),
-        "explain": VerbEntry("explain", "Show what DDS will decide, by which rule, and why."),
+        "minimize_policy": VerbEntry("policy", "Remove rights that are not used from a policy."),
+        "explain": VerbEntry("explain", "Show what DDS decides, by which rule, and why."),
         "view": VerbEntry("view", "Draw who may do what, as a page, SVG, DOT or Mermaid."),
         "policies": VerbEntry("policy", "List or copy the policies that ship with sros."),
     },
     "Checks": {
         "check": VerbEntry(
-            "check", "Find what is wrong or weak in policies, keystores, the runtime."
+            "check", "Find errors and weaknesses in policies, keystores, the runtime."
         ),
         "doctor": VerbEntry("check", "Find out which DDS here enforces security."),
     },
@@ -87,7 +87,7 @@ _NAMES = {alias: name for name, verb in _VERBS.items() for alias in (name, *verb
 def _report_steps(ctx: click.Context, _parameter: click.Parameter, count: int) -> None:
     """Log steps on standard error until the program ends: INFO for one -v in all, DEBUG for more.
 
-    Nothing else in sros configures `logging`; libraries of others stay silent.
+    Only the logger of sros is configured, so that other libraries do not log.
     """
     if not count:
         return
@@ -126,10 +126,10 @@ _VERBOSE = click.Option(
 
 
 class _Program(click.Group):
-    """A group whose commands are found by table; hyphen and underscore are the same letter."""
+    """A command group that imports verbs when used, and accepts "-" for "_" in their names."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        """All verbs, without their aliases."""
+        """Return the names of all verbs, without aliases."""
         return list(_VERBS)
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
@@ -147,12 +147,12 @@ class _Program(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """As click does, but an alias shows the verb's own name."""
+        """Resolve a verb as click does, but return the verb's name for an alias."""
         name, command, rest = super().resolve_command(ctx, args)
         return (command.name if command else name), command, rest
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """The verbs by family, without importing any."""
+        """Write the verbs by family, without importing them."""
         for family, verbs in FAMILIES.items():
             with formatter.section(family):
                 formatter.write_dl(
@@ -259,11 +259,11 @@ def _verb() -> str | None:
 
 
 def _os_problem(error: OSError) -> str:
-    if error.filename is None:  # perhaps what was done can only not be printed
+    if error.filename is None:  # no file is to blame, perhaps the working directory
         try:
             Path.cwd()
         except OSError:
-            return "the folder that this runs in does not exist any more. Go to another one."
+            return "the working directory no longer exists. Change to another one."
         return f"the operating system refuses: {error.strerror or error}."
     path = os.fsdecode(error.filename)
     return f"the operating system refuses '{path}': {error.strerror or error}. Nothing was changed."
@@ -275,7 +275,7 @@ def _defect(error: BaseException) -> int:
     return _say(
         _prefixed(
             f"this is a defect of sros: {type(error).__name__}: {error}. Please report it; "
-            "SROS_DEBUG=1 shows where it happened."
+            "SROS_DEBUG=1 prints a traceback."
         ),
         1,
     )

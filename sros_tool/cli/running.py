@@ -1,4 +1,4 @@
-"""The verbs `env`, `run` and `completion`: a process, or a shell, with the environment it needs."""
+"""The verbs `env` and `run`, for processes in an enclave, and `completion`, for shells."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ Example:
 @click.option("--json", "as_json", is_flag=True, help="The same as --format json.")
 @_DOMAIN
 def env(words: tuple[str, ...], form: str, as_json: bool, domain: str | None) -> None:
-    """Print the variables that make a process run in the enclave NAME, and only there."""
+    """Print the environment variables that make a process run in the enclave NAME, or fail."""
     from sros_tool.runtime.environment import render_environment
 
     root, rest = split_root(words)
@@ -61,10 +61,14 @@ def env(words: tuple[str, ...], form: str, as_json: bool, domain: str | None) ->
 
 
 class _WithCommand(click.Command):
-    """A command that leaves alone what follows ``--``, or else the first two arguments."""
+    """A verb with a command as argument, whose options it does not parse.
+
+    The command is all words after ``--``; without it, parsing of options stops at the first word
+    that is not an option.
+    """
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        """Split the command to run from the arguments of sros."""
+        """Parse the arguments of sros, and keep the command to run in ``ctx.meta``."""
         own, command = args, []
         if "--" in args:
             own, command = args[: args.index("--")], args[args.index("--") + 1 :]
@@ -92,15 +96,15 @@ Example:
     shell_complete=complete_keystore_and_enclave,
 )
 @_DOMAIN
-@click.option("--no-ros-args", is_flag=True, help="Leave COMMAND as it is.")
+@click.option("--no-ros-args", is_flag=True, help="Add no arguments to COMMAND.")
 @click.pass_context
 def run(ctx: click.Context, words: tuple[str, ...], domain: str | None, no_ros_args: bool) -> None:
     """Run COMMAND in the enclave NAME of the keystore ROOT, or not at all (strategy Enforce).
 
-    The enclave is checked first; any problem that would keep the command from starting is reported
-    here, not by an obscure message of the middleware. A COMMAND that is known to start a ROS node
-    (`ros2 run`, or an executable of a ROS package) gets the arguments `--ros-args --enclave NAME`,
-    so that the ROS graph shows the enclave.
+    The enclave is checked first, so that problems are reported here and not by an obscure message
+    of the middleware. A COMMAND that is known to start a ROS node (`ros2 run`, or an executable of
+    a ROS package) gets the arguments `--ros-args --enclave NAME`, so that the ROS graph shows the
+    enclave.
     """
     from sros_tool.runtime.environment import with_enclave
 
@@ -125,15 +129,19 @@ def run(ctx: click.Context, words: tuple[str, ...], domain: str | None, no_ros_a
         )
     sys.stdout.flush()
     sys.stderr.flush()
-    for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # by Python, and a command would inherit it
+    for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores them, and COMMAND would too
         signal.signal(ignored, signal.SIG_DFL)
     os.execve(program, command, {**os.environ, **variables})
 
 
 def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict[str, str]:
-    """Return the variables of an enclave after checking that a process can run in it.
+    """Return the environment variables of an enclave after checking that a process can run in it.
 
-    ``domain_text`` is an option's value; without it $ROS_DOMAIN_ID counts.
+    ``domain_text`` is the value of --domain; None stands for $ROS_DOMAIN_ID.
+
+    Raises:
+        UsageError: the domain or the enclave's name is invalid.
+        KeystoreError: the enclave does not exist, or a process cannot run in it.
     """
     from sros_tool.keystore.layout import enclave_path, list_enclaves
     from sros_tool.keystore.missing import no_such_enclave
@@ -175,7 +183,7 @@ Example:
 )
 @click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]))
 def completion(shell: str) -> None:
-    """Print the script with which SHELL completes verbs, options, enclaves and templates."""
+    """Print the script that makes SHELL complete verbs, options, enclaves and templates."""
     from click.shell_completion import get_completion_class
 
     from sros_tool.cli.program import program

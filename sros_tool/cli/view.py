@@ -53,7 +53,7 @@ Examples:
     "--format",
     "form",
     type=click.Choice(_FORMATS),
-    help="What to write. [default: by the suffix of FILE, else html]",
+    help="Output format. [default: by the suffix of FILE, else html]",
 )
 @click.option("--json", "as_json", is_flag=True, help="The same as --format json.")
 @click.option(
@@ -65,7 +65,7 @@ Examples:
     multiple=True,
     type=PATH,
     metavar="OBSERVED...",
-    help="What was observed, to compare with SOURCE: policies or JSON by generate_policy.",
+    help="Observed rights to compare with SOURCE: policies or JSON by generate_policy.",
 )
 @click.option(
     "--template",
@@ -80,7 +80,7 @@ Examples:
     metavar="HOST=ENCLAVE",
     help="Group ENCLAVE, and the enclaves below it, by the host they run on.",
 )
-@click.option("--all", "everything", is_flag=True, help="Draw also what every node needs.")
+@click.option("--all", "everything", is_flag=True, help="Also draw rights that every node needs.")
 @click.option("--graphviz", is_flag=True, help="Lay out the SVG with Graphviz.")
 @force_option
 @dry_run_option
@@ -98,14 +98,14 @@ def view(
     force: bool,
     dry_run: bool,
 ) -> None:
-    """Draw who may do what in SOURCE, or compare two of them in one drawing.
+    """Draw who may do what in SOURCE, or compare two sources in one drawing.
 
-    A SOURCE is a policy file, a keystore (what was really signed), the folder of an enclave, its
-    permissions, or what `sros generate_policy --json` has printed. Two sources are compared: two
-    policies as before and after, a policy and a keystore for drift, and with --observed what is
-    allowed with what is used.
+    A SOURCE is a policy file, a keystore (its signed permissions), the folder of an enclave, its
+    permissions, or the output of `sros generate_policy --json`. Two policies are compared as
+    before and after, a policy and a keystore for drift. --observed compares the rights in SOURCE
+    with those that are used.
 
-    The page is one file that needs no network. No format holds a key or a path of this machine.
+    The page is one file that needs no network. No format contains keys or paths of this machine.
     """
     moment = now()
     written = _format("json" if as_json else form, output, graphviz)
@@ -151,9 +151,9 @@ def _picture(
 
     if len(sources) > 2 or (observed and len(sources) > 1):
         raise UsageError(
-            "at most two sources can be laid over each other",
+            "at most two sources can be compared",
             "",
-            "Name one SOURCE and --observed, or two.",
+            "Name one SOURCE and --observed, or two SOURCEs.",
         )
     read = [added(read_source(path, now=moment), path, _checked(path, moment)) for path in sources]
     if template:
@@ -177,7 +177,7 @@ def _picture(
 
 
 def _check_no_governance(sources: tuple[Path, ...], read: list[PictureSource]) -> None:
-    """Refuse a template where a source has been signed with a governance, which would hold."""
+    """Raise `UsageError` if a source has its own signed governance, so that no template applies."""
     for path, each in zip(sources, read, strict=True):
         if each.origin.kind in ("keystore", "enclave"):
             raise UsageError(
@@ -189,7 +189,7 @@ def _check_no_governance(sources: tuple[Path, ...], read: list[PictureSource]) -
 
 
 def _checked(path: Path, moment: datetime) -> list[PicturedFinding]:
-    """Return what `sros check` finds there; nothing where it cannot check."""
+    """Return the findings of `sros check` for a source, or none if it cannot be checked."""
     from sros_tool.checks.targets import Circumstances, path_findings
     from sros_tool.cli.common import local_zone
     from sros_tool.errors import SrosError
@@ -218,9 +218,9 @@ def _hosts(words: tuple[str, ...]) -> dict[str, str]:
         host, equals, enclave = word.partition("=")
         if not equals or not host or not enclave.startswith("/"):
             raise UsageError(
-                f"{word!r} does not say which enclave runs where",
+                f"--host {word!r} is not HOST=ENCLAVE",
                 "",
-                "Write --host arm=/robot/arm.",
+                "Write for example --host arm=/robot/arm.",
             )
         found[enclave.rstrip("/") or "/"] = host
     return found

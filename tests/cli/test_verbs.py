@@ -316,7 +316,7 @@ def test_an_export_grows_and_is_replaced_on_request_only(keystore: Path, tmp_pat
     sros("distribute_key", keystore, "/a", target).ok()
     sros("distribute_key", keystore, "/b", target).ok()
     assert sros("list_enclaves", target).ok().out.split() == ["/a", "/b"]
-    assert "as it is" in sros("distribute_key", keystore, "/a", target).ok().err
+    assert "already up to date" in sros("distribute_key", keystore, "/a", target).ok().err
     (tmp_path / "p.xml").write_text(policy_text({"/a": publish("new")}))
     sros("create_permission", keystore, "/a", tmp_path / "p.xml").ok()
     before = snapshot(target)

@@ -104,7 +104,7 @@ def test_twins_get_the_union_and_a_note_where_it_does_not(program: Program, tmp_
     [
         ({}, "Nodes may be in another domain (ROS_DOMAIN_ID, --domain)"),
         ({"ROS_SECURITY_KEYSTORE": "/ks"}, "ROS_SECURITY_KEYSTORE is set, so the robot may be"),
-        ({"ROS_DOMAIN_ID": "7"}, "Looked at domain 7 for 1 s with rmw_fake."),
+        ({"ROS_DOMAIN_ID": "7"}, "Observed domain 7 for 1 s with rmw_fake."),
     ],
 )
 def test_an_empty_graph_is_explained(
@@ -136,7 +136,7 @@ def test_tools_alone_are_an_empty_graph(program: Program) -> None:
             "\x1b[31mrt/parameter_events topic not found in allow rule.\x1b[m",
             "the enclave / does not permit an observer. DDS says: rt/parameter_events topic not",
         ),
-        ("node", "PKCS7 data verification failed", "DDS refuses the enclave /. It says: PKCS7"),
+        ("node", "PKCS7 data verification failed", "DDS refuses the enclave /. DDS says: PKCS7"),
         ("node", "Please compile Fast DDS using the -DSECURITY=ON", "was built without DDS Sec"),
     ],
 )

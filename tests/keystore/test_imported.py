@@ -62,7 +62,7 @@ def test_both_authorities_can_be_imported(pki: Path, tmp_path: Path) -> None:
         "--permissions-ca", pki / "permissions.pem", "--permissions-key", pki / "permissions.key",
     ).ok()  # fmt: skip
     assert "separate; certificates 365d" in made.out  # and no validity of a CA that is not made
-    assert made.out.count("    given, and valid until ") == 2
+    assert made.out.count("    imported, valid until ") == 2
     assert not (root / "private").exists()
     sros("create_enclave", root, "/a").ok()
     folder = root / "enclaves/a"
@@ -80,7 +80,7 @@ def test_an_intermediate_comes_with_its_chain(pki: Path, tmp_path: Path) -> None
     ).ok()  # fmt: skip
     assert "portable.intermediate" in made.err
     assert "separate, a new one valid for 3650d; " in made.out
-    assert made.out.count("    given, and valid until ") == 1
+    assert made.out.count("    imported, valid until ") == 1
     sros("create_enclave", root, "/a").ok()
     openssl(
         tmp_path, "verify", "-x509_strict", "-CAfile", str(pki / "chain.pem"),

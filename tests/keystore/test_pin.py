@@ -149,7 +149,7 @@ def test_everybody_says_the_same_fingerprint(tmp_path: Path) -> None:
     assert "would create" in without.out
     done = sros("import", tmp_path / "answer.tgz", robot, "--ca", ca).ok().out
     assert f"SHA-256 {told}" in done
-    assert "nothing else vouches" not in done
+    assert "not verified" not in done
 
 
 def test_without_a_name_it_says_what_to_compare(tmp_path: Path) -> None:
@@ -160,4 +160,4 @@ def test_without_a_name_it_says_what_to_compare(tmp_path: Path) -> None:
     said = sros("import", tmp_path / "answer.tgz", robot).ok().out
     assert next(iter(pin(home))) in said
     assert next(iter(pin(home, "identity"))) in said
-    assert "nothing else vouches for them" in said
+    assert "otherwise they are not verified" in said
