@@ -51,7 +51,7 @@ Example:
   $ sros demo --scenario governance --plot cost.svg
   $ sros demo --scenario all
 
-Exit status: 0 if every row is as expected or was skipped for a stated reason, else 1. Of a
+Exit status: 0 if every row is as expected or was skipped for a stated reason, else 1. In a
 row that is known to be open, the attack is expected to succeed.""",
 )
 @click.option(
