@@ -22,7 +22,7 @@ class Severity(IntEnum):
 
     @property
     def word(self) -> str:
-        """The name as people write it."""
+        """The name in lower case, as options and reports write it."""
         return self.name.lower()
 
 
@@ -33,10 +33,10 @@ NOTE, WARNING, ERROR = Severity.NOTE, Severity.WARNING, Severity.ERROR
 class FindingKind:
     """A kind of finding.
 
-    ``id`` is stable, a family and a name with a dot between them; ``title`` a clause; ``why``,
-    ``source`` and ``remedy`` are sentences.  ``source`` says where the rule comes from: a
-    section of a specification, a vendor and version, ROS.  ``group`` is a further id that stands
-    for several kinds.  ``vendors`` are the DDS vendors that it concerns, where these are not all.
+    ``id`` is stable and has the form ``family.name``.  ``title`` is a clause; ``why``, ``source``
+    and ``remedy`` are sentences.  ``source`` says where the rule comes from: a section of a
+    specification, a vendor and version, ROS.  ``group`` is an id that several kinds share.
+    ``vendors`` are the affected DDS vendors; empty means all.
     """
 
     id: str
@@ -82,10 +82,10 @@ class FindingKind:
 class Finding:
     """A problem found at one place.
 
-    ``subject`` is the thing concerned (an enclave, a variable, a file); ``file`` is a path, or "";
-    ``line`` counts from 1.  ``text`` is the reason here; ``own_remedy`` is the remedy here, if it
-    says more than the kind's.  ``accepted`` names the template or setting that accepts the
-    finding, which then counts as a note.
+    ``subject`` is the affected enclave, variable or file; ``file`` is a path, or ""; ``line``
+    counts from 1.  ``text`` says what was found; ``own_remedy`` replaces the remedy of the kind
+    unless it is empty.  ``accepted`` names the template or setting that accepts the finding, which
+    then counts as a note.
     """
 
     kind: FindingKind
@@ -108,7 +108,7 @@ class Finding:
 
     @property
     def remedy(self) -> str:
-        """What to do."""
+        """The remedy of this finding, or else of its kind."""
         return self.own_remedy or self.kind.remedy
 
     @property
@@ -136,5 +136,5 @@ class Finding:
 def by_id(*kinds: FindingKind) -> Mapping[str, FindingKind]:
     """Map each kind's id to the kind; raise for a duplicate id."""
     table = {kind.id: kind for kind in kinds}
-    assert len(table) == len(kinds), "an id is given twice"
+    assert len(table) == len(kinds), "duplicate id of a kind of finding"
     return table

@@ -97,7 +97,7 @@ NEVER_MATCHES = FindingKind(
     "policy.name-never-matches",
     WARNING,
     "a name that no topic, service or action can have",
-    "A rule with such a name allows, or denies, nothing.",
+    "A rule with this name has no effect.",
     "rmw (validate_full_topic_name.h: at most 247 characters, no part begins with a digit).",
     "Correct the name.",
 )
@@ -105,26 +105,27 @@ DDS_NAME = FindingKind(
     "policy.dds-name",
     WARNING,
     "a DDS name where a ROS name is meant",
-    "rt/, rq/ and rr/ are prefixed to ROS names when they become DDS topics; in a policy the name "
-    "has no prefix.",
+    "ROS 2 puts rt/, rq/ or rr/ before a ROS name to get the name of its DDS topic. Names in a "
+    "policy have no prefix.",
     "ROS 2 design, Topic and Service name mapping to DDS.",
     "Write the ROS name, without its prefix.",
 )
 WRONG_KIND = FindingKind(
     "policy.wrong-kind",
     WARNING,
-    "a topic named as a service, or a service named as a topic",
-    "Every ROS 2 node uses this name for something else, so the rule allows nothing that is used.",
+    "a name of another kind, such as a service in a rule for topics",
+    "Every ROS 2 node uses this name for the other kind, so the rule has no effect.",
     "ROS 2 Jazzy (rclcpp 28, rclpy 7); ROS 2 design, Actions.",
-    "Move the name to the right group of rules.",
+    "Move the name to the group of its kind: <topics> or <services>.",
 )
 EVERYTHING = FindingKind(
     "policy.everything",
     WARNING,
-    "a wildcard that allows acting on everything",
+    "a wildcard that allows publishing, calling or serving every name",
     "The enclave can command every node and answer in place of every other node.",
     "ROS 2 design, ROS 2 Security Enclaves: least privilege.",
-    "Name what the node uses; `sros minimize_policy` narrows it to what was observed.",
+    "Name the topics, services and actions that the node uses; `sros minimize_policy` replaces "
+    "the wildcard by the observed names.",
 )
 WIDE = FindingKind(
     "policy.wide-wildcard",
@@ -137,18 +138,18 @@ WIDE = FindingKind(
 READS_EVERYTHING = FindingKind(
     "policy.reads-everything",
     NOTE,
-    "a wildcard by which an enclave reads across namespaces",
-    "A recorder needs it; any other enclave learns more than it needs.",
+    "a wildcard that allows subscribing across namespaces",
+    "A recorder needs this right; any other enclave learns more than it needs.",
     "ROS 2 design, ROS 2 Security Enclaves: least privilege.",
     "Name the topics, or deny the confidential ones.",
 )
 SETS_PARAMETERS = FindingKind(
     "policy.sets-all-parameters",
     WARNING,
-    "a wildcard by which an enclave sets the parameters of every node",
+    "a wildcard that allows setting the parameters of every node",
     "Parameters switch use_sim_time, remove limits, and change how drivers behave.",
     "ROS 2 Jazzy: set_parameters of every node.",
-    "Name the nodes whose parameters it has to set.",
+    "Name the nodes whose parameters the enclave has to set.",
 )
 SETS_CLOCK = FindingKind(
     "policy.sets-clock",
@@ -157,14 +158,14 @@ SETS_CLOCK = FindingKind(
     "An enclave that sets the clock can make every timeout expire on nodes that use simulated "
     "time.",
     "ROS 2 design, Clock and Time.",
-    "Allow it for a simulator only.",
+    "Allow publishing /clock to a simulator only.",
 )
 NO_COUNTERPART = FindingKind(
     "policy.no-counterpart",
     NOTE,
-    "nobody in the policy is allowed the other side",
-    "Nobody may publish a topic that is subscribed here, or serve a service that is called here. "
-    "It may be a typing error, or the other side is in another policy.",
+    "a name for which no enclave has the counterpart right",
+    "No enclave of the policy may publish this subscribed topic, or serve this called service or "
+    "action. The name may have a typing error, or the other side is in another policy.",
     "sros: the policy as a whole.",
     "Compare the names on both sides, after remapping.",
 )
@@ -178,20 +179,22 @@ _OTHER_SIDE = {"subscribe": "publish", "request": "reply", "call": "execute"}
 
 
 def _check_names(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield the findings about single names."""
+    """Yield findings about single names."""
     for each in checked.statements:
         if reason := _never(each.name):
             yield each.found(NEVER_MATCHES, f"{each.name} matches nothing: {reason}")
         if _DDS_PREFIX.match(each.written):
-            yield each.found(DDS_NAME, f"{each.written} becomes {each.name}")
+            yield each.found(DDS_NAME, f"{each.written} means the ROS name {each.name}")
         if kind := _belongs(each):
-            yield each.found(WRONG_KIND, f"{each.name} is one of the {kind}")
+            yield each.found(
+                WRONG_KIND, f"{each.name} is one of the {kind}, not of the {each.right.kind}"
+            )
         if each.allows:
             yield from _breadth(each)
 
 
 def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield findings for names that only one side (publisher, subscriber, …) is allowed."""
+    """Yield findings about subscribed or called names that no enclave may publish or serve."""
     names: dict[str, set[str]] = {right: set() for pair in RIGHTS.values() for right in pair}
     for each in checked.statements:
         if each.allows:
@@ -204,7 +207,7 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
             continue
         if name not in names[other] and not any(matches(wide, name) for wide in wild[other]):
             if action_part(name)[1]:
-                continue  # the rule is about an action there
+                continue  # the other side may name the whole action
             yield each.found(NO_COUNTERPART, f"no enclave may {other} {name}")
 
 
@@ -234,7 +237,7 @@ def _breadth(each: _Statement) -> Iterator[Finding]:
     text = each.right.describe()
     if _ALL.match(name):
         kind = READS_EVERYTHING if right == "subscribe" else EVERYTHING
-        yield each.found(kind, f"{text} stands for every name")
+        yield each.found(kind, f"{text} matches every name")
     elif literal_prefix(name).count("/") < 2 and is_expression(name.rpartition("/")[2]):
         kind = READS_EVERYTHING if right == "subscribe" else WIDE
         yield each.found(
@@ -242,19 +245,19 @@ def _breadth(each: _Statement) -> Iterator[Finding]:
             f"{text} does not begin with a whole namespace, and does not end with a whole name",
         )
     elif right == "request" and covers(name, "/*/set_parameters"):
-        yield each.found(SETS_PARAMETERS, f"{text} reaches every node")
+        yield each.found(SETS_PARAMETERS, f"{text} matches every node")
 
 
 _INCLUDE_HINT = (
-    '<xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> gives all of that; '
-    "`sros policies --copy` has the file."
+    '<xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> allows '
+    "what every node needs; `sros policies --copy` writes that file."
 )
 
 NO_TYPE_DESCRIPTION = FindingKind(
     "policy.no-type-description",
     ERROR,
     "a node that may not offer ~/get_type_description",
-    "Nodes of Jazzy offer this service, and a node that is denied it exits as soon as it starts.",
+    "Nodes of ROS 2 Jazzy offer this service when they start, and exit if it is denied.",
     "ROS 2 Jazzy, rclcpp 28 and rclpy 7 (node type descriptions interface); REP-2016.",
     f'Allow <services reply="ALLOW"><service>~/get_type_description</service></services>. '
     f"{_INCLUDE_HINT}",
@@ -271,7 +274,8 @@ NO_PARAMETER_EVENTS = FindingKind(
     "policy.no-parameter-events",
     ERROR,
     "a node that may not publish /parameter_events",
-    "Every node announces its parameters there, and fails at its start if this is denied.",
+    "Every node announces its parameters on this topic, and fails when it starts if this is "
+    "denied.",
     "ROS 2 Jazzy, rclcpp 28 (NodeParameters) and rclpy 7 (Node).",
     f'Allow <topics publish="ALLOW"><topic>/parameter_events</topic></topics>. {_INCLUDE_HINT}',
 )
@@ -279,26 +283,26 @@ NO_PARAMETER_SERVICES = FindingKind(
     "policy.no-parameter-services",
     ERROR,
     "a node that may not offer all of its parameter services",
-    "Every node offers all six unless it was created without them, and fails at its start if this "
-    "is denied.",
+    "Every node offers all six unless it was created without them, and fails when it starts if "
+    "one is denied.",
     "ROS 2 Jazzy, rclcpp 28 (ParameterService) and rclpy 7 (start_parameter_services).",
     f'Allow <services reply="ALLOW"> with ~/get_parameters and the others. {_INCLUDE_HINT}',
 )
 NO_PARAMETERS = FindingKind(
     "policy.without-parameters",
     NOTE,
-    "a node that may offer no parameter service at all",
-    "It has everything else that it needs, so it was perhaps created without parameters; "
-    "otherwise it fails at its start.",
+    "a node that may not offer any parameter service",
+    "The node has all other rights that every node needs, so perhaps it was created without "
+    "parameters. Otherwise it fails when it starts.",
     "ROS 2 Jazzy, rclcpp 28 (NodeOptions) and rclpy 7 (start_parameter_services).",
-    f"If it has parameters, allow these services. {_INCLUDE_HINT}",
+    f"If the node has parameters, allow these services. {_INCLUDE_HINT}",
 )
 RELATIVE_GLOBAL = FindingKind(
     "policy.relative-global-name",
     ERROR,
-    "a root name of ROS that is written relative to a namespace",
+    "a global topic of ROS 2 that is written as a relative name",
     "/rosout, /parameter_events and /clock are absolute also for nodes in a namespace, so the "
-    "rule allows a topic that nobody uses. Sample policies of ros2/sros2 have this.",
+    "rule allows a topic that no node uses. Sample policies of ros2/sros2 have this mistake.",
     "rcl 9 (logging_rosout.h: /rosout); rclcpp 28 (/parameter_events, /clock).",
     "Put a / before the name.",
 )
@@ -311,15 +315,16 @@ _BASICS = (
     (NO_PARAMETER_SERVICES, "reply", tuple(f"~/{name}" for name in PARAMETER_SERVICES)),
 )
 _LISTENER = "transform_listener_impl_"
-"""Prefix of the nodes that tf2_ros creates; they have no parameters and no events."""
+"""Name prefix of the nodes of tf2_ros listeners, which have no parameters and no events."""
 _OF_LISTENERS = (NO_TYPE_DESCRIPTION, NO_ROSOUT)
 
 
 def _check_nodes(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield the findings about every node, by all rights of its enclave.
+    """Yield findings about nodes whose enclave lacks a right that every node needs.
 
-    Nodes whose names begin with an underscore are hidden ones, tools that are started without
-    log, parameters and types (ROS 2 design, "Topic and Service Names"; ros2cli does so).
+    Nodes whose names begin with an underscore are skipped: they are hidden nodes of tools such as
+    ros2cli, without log, parameters and type descriptions (ROS 2 design, "Topic and Service
+    Names").
     """
     for enclave in checked.policy.enclaves:
         for profile in enclave.all_profiles():
@@ -353,8 +358,8 @@ DOCUMENT_SIZE = FindingKind(
     "portable.document-size",
     WARNING,
     "signed permissions of 64 KB or more",
-    "They are sent in the handshake. Fast DDS 2.9 never finishes it, and sometimes aborts; Fast "
-    "DDS 2.14 and Cyclone DDS accept them.",
+    "Participants send them in the handshake. Fast DDS 2.9 never finishes such a handshake, and "
+    "sometimes aborts; Fast DDS 2.14 and Cyclone DDS accept them.",
     "ros2/sros2 issue 228; Fast DDS 2.9.1 (SecurityManager.cpp) and 2.14.5, Cyclone DDS 0.10.2; "
     "measured.",
     "Use wildcards (`sros minimize_policy` proposes them), or split the enclave.",
@@ -364,8 +369,8 @@ LONG_NAME = FindingKind(
     "portable.long-name",
     WARNING,
     "a topic whose name is too long for Fast DDS",
-    "From 252 bytes on (prefix and suffix included) an endpoint is created on Fast DDS, and never "
-    "matched; Cyclone DDS accepts it.",
+    "If the DDS topic name has 252 bytes or more (with prefix and suffix), Fast DDS creates the "
+    "endpoint and never matches it; Cyclone DDS does.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Use shorter namespaces and names.",
     vendors=FAST_DDS,
@@ -373,7 +378,7 @@ LONG_NAME = FindingKind(
 DENY_BLOCKS = FindingKind(
     "portable.deny-blocks-topic",
     WARNING,
-    "a denial of one direction of a topic that is allowed in the other",
+    "a topic that is denied in one direction and allowed in the other",
     "Cyclone DDS checks whether the topic may be created at all, and a denial of either direction "
     "forbids it; Fast DDS allows it.",
     "Cyclone DDS 0.10.2 (access_control.c), Fast DDS 2.9.1 and 2.14.5; measured.",
@@ -392,9 +397,9 @@ ENCLAVE_NAMES = FindingKind(
     "portable.enclave-names",
     WARNING,
     "an enclave whose name consists of parts of another enclave's name",
-    "Cyclone DDS compares the parts of two subjects as sets, one way: /robot matches the (public) "
-    "permissions of /robot/admin, and can join with them.",
-    "Cyclone DDS 0.10.2 (access_control.c); reproduced: such an enclave was heard.",
+    "Cyclone DDS checks only that every part of a certificate's subject occurs in the grant's "
+    "subject. So /robot can join with the (public) permissions of /robot/admin.",
+    "Cyclone DDS 0.10.2 (access_control.c); reproduced: readers received data of such an enclave.",
     "Choose names that do not consist of parts of another, such as /robot_admin, or unique "
     "subjects (template production).",
     vendors=(Vendor.CYCLONE,),
@@ -403,19 +408,19 @@ SEVERAL_PROFILES = FindingKind(
     "policy.several-profiles",
     NOTE,
     "an enclave with several <profiles>",
-    "sros joins them. ros2/sros2 makes a grant of each, of which DDS reads only the first.",
+    "sros joins them. ros2/sros2 makes a grant from each, and DDS uses only the first grant.",
     "ros2/sros2 0.13; DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2.",
     "Put all <profile> of an enclave into one <profiles>.",
 )
 
 _OUTSIDE = {each.id: each for each in (DOCUMENT_SIZE, LONG_NAME, DENY_BLOCKS, CHARACTER_SET)}
-_FROM_ALL_SIZES_ON = MAX_SIGNED_BYTES // 2
+_MEASURED_FROM_BYTES = MAX_SIGNED_BYTES // 2
 _ANY_TIME = Window(datetime(2026, 1, 1, tzinfo=UTC), datetime(2027, 1, 1, tzinfo=UTC))
 _DOMAINS = DomainSet.of((0, 0))
 
 
 def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield the findings about the permissions that would be signed for every enclave."""
+    """Yield findings about the permissions that would be signed for each enclave."""
     for enclave in checked.policy.enclaves:
         source = enclave.source
         permissions = permissions_for(
@@ -431,7 +436,7 @@ def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
             text = f"it has {len(enclave.profiles)} <profiles>"
             yield SEVERAL_PROFILES.found(enclave.path, text, source.file, source.line)
     if pairs := mistaken_names(each.path for each in checked.policy.enclaves):
-        text = f"Cyclone DDS takes {some_pairs(pairs)}"
+        text = f"Cyclone DDS mistakes {some_pairs(pairs)}"
         first = checked.policy.enclave(pairs[0][0])
         line = first.source.line if first else None
         yield ENCLAVE_NAMES.found(pairs[0][0], text, checked.policy.file, line)
@@ -447,16 +452,16 @@ def _at_denial(found: Finding, checked: _CheckedPolicy) -> Finding:
 def outside_findings(
     permissions: Permissions, signed_bytes: int, subject: str, file: str, line: int | None = None
 ) -> Iterator[Finding]:
-    """Yield the parts of a permissions document that are outside of the portable profile."""
+    """Yield findings about the parts of permissions that are outside of the portable profile."""
     for identity, fact in outside(permissions, signed_bytes, overlap):
         yield _OUTSIDE[identity].found(subject, fact, file, line)
 
 
 def _signed_bytes(enclave: Enclave) -> int:
-    """Return the size of the signed permissions; small ones are not measured."""
+    """Return the size in bytes of the signed permissions; small ones are only estimated."""
     rights = policy_rights(Policy((enclave,)))
     estimate = sum(map(right_bytes, rights))
-    return SizeEstimator().signed_bytes(enclave) if estimate > _FROM_ALL_SIZES_ON else estimate
+    return SizeEstimator().signed_bytes(enclave) if estimate > _MEASURED_FROM_BYTES else estimate
 
 
 _ORDER = (
@@ -477,7 +482,7 @@ UNREACHABLE = FindingKind(
     WARNING,
     "a permission that a denial covers completely",
     "A denial of the same enclave, perhaps of another node in it, covers every name of the rule, "
-    "so it never allows anything.",
+    "so the permission never allows anything.",
     _ORDER,
     "Remove the permission, or narrow the denial.",
 )
@@ -486,8 +491,7 @@ NO_EFFECT = FindingKind(
     WARNING,
     "a denial of something that no rule allows",
     "Everything that no rule allows is denied anyway. The denial has no effect, and on Cyclone "
-    "DDS it "
-    "can close the other direction of the topic.",
+    "DDS it can block the other direction of the topic.",
     "DDS-Security 1.1, 9.4.1.3 (the default is DENY); Cyclone DDS 0.10.2 refuses a topic of "
     "which one direction is denied.",
     "Remove the denial.",
@@ -495,30 +499,29 @@ NO_EFFECT = FindingKind(
 REDUNDANT_RULE = FindingKind(
     "policy.redundant-rule",
     NOTE,
-    "a permission that a wildcard next to it already gives",
-    "A wildcard in the same profile already covers the name, so the name only makes the document "
-    "longer.",
-    "sros: rights of a profile are joined.",
+    "a name that a wildcard in the same profile already covers",
+    "The rights of a profile add up, so the name only makes the document longer.",
+    "sros: the rights of a profile are joined.",
     "Remove the name, or better the wildcard.",
 )
 HALF_ACTION = FindingKind(
     "policy.action-in-part",
     ERROR,
-    "a part of an action without the others",
-    "An action is three services and two topics, and its client or server makes all five when it "
-    "starts: denied one of them, it fails.",
+    "an action of which only a part is allowed",
+    "An action consists of three services and two topics. Its client or server creates all five "
+    "when it starts, and fails if one of them is denied.",
     "ROS 2 design, Actions; rcl_action 9 (rcl_action_client_init, rcl_action_server_init).",
     'Write <actions call="ALLOW"> or <actions execute="ALLOW"> with the name of the action.',
 )
 
 
 def _check_rules(checked: _CheckedPolicy) -> Iterator[Finding]:
-    """Yield contradictions and repetitions among the statements of each enclave."""
+    """Yield findings about contradicting, useless and repeated statements of an enclave."""
     for each in checked.statements:
         if each.allows:
             yield from _permission(each, checked.rules)
         elif not checked.rules.meeting(each.right._replace(qualifier=ALLOW)):
-            yield each.found(NO_EFFECT, f"nothing allows to {each.right.describe()}")
+            yield each.found(NO_EFFECT, f"no rule allows to {each.right.describe()}")
     yield from _redundant(checked)
 
 
@@ -537,7 +540,7 @@ def _permission(each: _Statement, rules: Rules) -> Iterator[Finding]:
         action = each.name.removesuffix(GOAL)
         whole = WHOLE[each.right.right]
         if not rules.allow(each.right.enclave, whole, action):
-            text = f"{each.name} is allowed, but not all that it takes to {whole} {action}"
+            text = f"{each.name} is allowed, but not everything needed to {whole} {action}"
             yield each.found(HALF_ACTION, text)
 
 
@@ -547,12 +550,12 @@ def _redundant(checked: _CheckedPolicy) -> Iterator[Finding]:
         if each.allows and is_expression(each.name):
             wild[id(each.profile), each.right.right].append(each.name)
     for each in checked.statements:
-        # Included rights are the same for all nodes; a node that does not need them is no fault.
+        # Included rights are the same for all nodes, so a redundant one is not a mistake.
         if not each.allows or each.source.file != each.profile.source.file:
             continue
         for wide in wild.get((id(each.profile), each.right.right), ()):
             if wide != each.name and covers(wide, each.name):
-                yield each.found(REDUNDANT_RULE, f"{each.right.describe()} is part of {wide}")
+                yield each.found(REDUNDANT_RULE, f"{each.right.describe()} is covered by {wide}")
                 break
 
 
@@ -560,7 +563,7 @@ MALFORMED = FindingKind(
     "policy.malformed",
     ERROR,
     "a policy that cannot be read",
-    "Nothing can be made from it.",
+    "No verb of sros can use it.",
     "SROS2 policy XML 0.2.0 (policy.xsd of ros2/sros2) and the names of ROS 2.",
     "Correct it at the reported place.",
 )
@@ -568,8 +571,8 @@ DUPLICATE = FindingKind(
     "policy.duplicate-enclave",
     ERROR,
     "an enclave that is defined twice",
-    "One verb of ros2/sros2 takes the first and another one the last, so rights change with the "
-    "command; sros takes neither.",
+    "Some verbs of ros2/sros2 use the first definition, others the last, so rights depend on the "
+    "command. sros refuses the policy.",
     "ros2/sros2 0.13 (create_permission, generate_artifacts).",
     "Join the two into one <enclave>.",
 )
@@ -592,20 +595,20 @@ REDUNDANT_INCLUDE = FindingKind(
 
 _CHECKS = (_check_rules, _check_nodes, _check_names, _check_counterparts, _check_portability)
 _PLACE = re.compile(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
-_SYNTAX = re.compile(r", line (?P<line>\d+), column \d+")  # as libxml2 says it
+_SYNTAX = re.compile(r", line (?P<line>\d+), column \d+")  # in messages of libxml2
 _INCLUDE = re.compile(r"\{http://www\.w3\.org/200[13]/XInclude\}include\Z")
 _MANY = 1000
 
 
 def _policy_findings(policy: Policy) -> Iterator[Finding]:
-    """Yield all findings in a policy that could be read."""
+    """Yield all findings in a readable policy."""
     checked = _CheckedPolicy(policy)
     for check in _CHECKS:
         yield from check(checked)
 
 
 def policy_file_findings(path: Path) -> Iterator[Finding]:
-    """Yield all findings in a policy file, even if it cannot be read."""
+    """Yield all findings in a policy file; a file that cannot be read is a finding too."""
     try:
         policy = read_policy(path)
     except SrosError as error:
@@ -647,7 +650,7 @@ def _duplicates(path: Path) -> Iterator[tuple[str, int]]:
 
 
 def _includes(path: Path) -> Iterator[Finding]:
-    """Yield the findings about the includes of a file; each included file is read once."""
+    """Yield findings about the includes of a file; each included file is read once."""
     root = parse(read_bytes(path, "policy file"), str(path))
     below: dict[Path, frozenset[Path]] = {}
     for parent in root.iter():
@@ -676,7 +679,7 @@ def _reached(file: Path, known: dict[Path, frozenset[Path]]) -> frozenset[Path]:
     """Return the files that a file includes, directly or through others."""
     if file in known:
         return known[file]
-    known[file] = frozenset()  # for includes in a circle
+    known[file] = frozenset()  # ends circular includes
     reached: set[Path] = set()
     if file.exists() and len(known) < _MANY:
         root = parse(read_bytes(file, "policy file"), str(file))

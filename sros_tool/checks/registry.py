@@ -16,7 +16,7 @@ _MODULES = (policies, files, authorities, enclaves, documents, issued, runtime)
 
 
 def _declared(module: ModuleType) -> Iterator[FindingKind]:
-    """Yield the kinds that are constants of a module, or values of its tables."""
+    """Yield the kinds that a module defines, as constants or as values of dictionaries."""
     for value in vars(module).values():
         for each in value.values() if isinstance(value, dict) else (value,):
             if isinstance(each, FindingKind):
@@ -35,14 +35,14 @@ KINDS: Mapping[str, FindingKind] = by_id(
 class FindingFilter:
     """The selection of findings to report.
 
-    With ``vendor``, findings that concern only other vendors, or differences between vendors, are
+    With ``vendor``, findings about only other vendors, or about differences between vendors, are
     left out.  ``include`` and ``exclude`` hold ids, ids of groups, or patterns with ``*`` and
     ``?``; an empty ``include`` means all.  ``severity`` is the lowest severity that is shown.
 
-    A weakness that the keystore's own settings chose, such as one CA for both jobs by the template
-    sros2, is accepted: it counts as a note, and is named in one line if notes are not shown.  With
-    ``strict`` it counts like any other finding.  A keystore of ros2/sros2 has no settings, so every
-    finding counts in full.
+    A weakness that the keystore's template chose, such as the single CA of template sros2, is
+    accepted: it counts as a note, and is summarised in one line if notes are not shown.  With
+    ``strict`` it counts like any other finding.  A keystore made by ros2/sros2 has no template, so
+    no finding is accepted.
     """
 
     include: tuple[str, ...] = ()
@@ -95,7 +95,7 @@ class ChosenFindings:
 
 
 def select_kinds(selection: FindingFilter) -> Sequence[FindingKind]:
-    """Return the selected kinds, in the order of the list."""
+    """Return the selected kinds, in the order of `KINDS`."""
     return [kind for kind in KINDS.values() if selection.wants(kind)]
 
 

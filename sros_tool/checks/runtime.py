@@ -1,4 +1,4 @@
-"""Findings in the environment of a process, and in the processes that run."""
+"""Checks of environment variables, of the host, and of running processes."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Process:
 class Setting:
     """The input of the runtime checks: environment, clock, RMWs and processes.
 
-    ``clock`` is the time on the host's clock, if ``now`` is another moment.
+    ``now`` is the moment to check for; ``clock`` is the host's clock, or None if it is ``now``.
     ``rmws`` are the installed RMWs; ``insecure_rmws`` maps tried RMWs that do not enforce security
     to the observed result.  ``zone`` is the host's time zone.
     """
@@ -76,7 +76,7 @@ def running_processes(proc: Path = Path("/proc")) -> Iterator[Process]:
             environment = dict(
                 word.split("=", 1) for word in _words(folder / "environ") if "=" in word
             )
-            # The command may hold spaces and brackets; the numbers follow the last bracket.
+            # The command may hold spaces and parentheses; numbers follow the last parenthesis.
             numbers = (folder / "stat").read_text().rpartition(")")[2].split()
             started = begin + timedelta(seconds=int(numbers[19]) / ticks)
             command = tuple(_words(folder / "cmdline"))
@@ -102,13 +102,13 @@ RMW_NOT_INSTALLED = FindingKind(
     "RMW_IMPLEMENTATION names an RMW that is not installed",
     "No node starts.",
     "rmw_implementation 2.15 (functions.cpp).",
-    "Install it, or choose an installed one.",
+    "Install it, or set RMW_IMPLEMENTATION to an installed RMW.",
 )
 RMW_INSECURE = FindingKind(
     "runtime.rmw-without-security",
     ERROR,
     "an RMW that does not enforce DDS Security",
-    "It was built without security, or does not use DDS; nodes fail, or run unsecured.",
+    "The RMW was built without security, or does not use DDS. Nodes fail, or run unsecured.",
     "Found by a test (`sros doctor`); rmw_zenoh reads none of the files of an enclave.",
     "Use an RMW that enforces security according to `sros doctor`.",
 )
@@ -116,49 +116,50 @@ CLOCK_BEHIND = FindingKind(
     "runtime.clock-behind",
     ERROR,
     "the clock of this host is behind",
-    "Files of the keystore were written in the future. Certificates may not be valid yet, and "
-    "expired ones may seem valid.",
+    "The keystore's files were written later than the clock shows. Certificates may not be valid "
+    "yet, and expired ones may seem valid.",
     "RFC 5280, 6.1.3 (the current time); robots without a battery for their clock.",
     "Set the clock before nodes start, for instance by chrony with makestep.",
 )
 DAEMON_UNSECURED = FindingKind(
     "runtime.daemon-unsecured",
     WARNING,
-    "the daemon of ros2 runs without security",
-    "`ros2 topic list` and other commands ask it, and it cannot see a secured robot, so the graph "
-    "seems empty.",
+    "the ros2 daemon runs without security",
+    "`ros2 topic list` and other commands ask the daemon. It cannot see secured nodes, so the "
+    "graph seems empty.",
     "ros2cli 0.32 (daemon); it keeps the environment in which it was started.",
     "Run `ros2 daemon stop`; the next command starts it again, with this environment.",
 )
 DAEMON_OTHER = FindingKind(
     "runtime.daemon-differs",
     WARNING,
-    "the daemon of ros2 runs with another keystore or enclave",
-    "`ros2 topic list` and other commands ask it, and show the graph as that enclave sees it.",
+    "the ros2 daemon runs with another keystore or enclave",
+    "`ros2 topic list` and other commands ask the daemon, and show only what its enclave may see.",
     "ros2cli 0.32 (daemon); it keeps the environment in which it was started.",
-    "Run `ros2 daemon stop`.",
+    "Run `ros2 daemon stop`; the next command starts it again, with this environment.",
 )
 PROCESS_UNSECURED = FindingKind(
     "runtime.process-unsecured",
     WARNING,
     "a node without security next to secured nodes",
-    "It and the secured nodes do not see each other.",
+    "This node and the secured nodes do not see each other.",
     "DDS-Security 1.1, 9.4.1.2 (allow_unauthenticated_participants is false).",
     "Start it with `sros run ROOT NAME -- COMMAND...`.",
 )
 PROCESS_OUTDATED = FindingKind(
     "runtime.process-outdated",
     WARNING,
-    "a process that runs with older files of its enclave",
+    "a process that started before its enclave's files changed",
     "A running participant does not notice changed certificates, permissions or revocation lists.",
     "Fast DDS 2.14.5, Cyclone DDS 0.10.2 (read at the start).",
-    "Restart it.",
+    "Restart the process.",
 )
 MIXED_VENDORS = FindingKind(
     "runtime.mixed-vendors",
     WARNING,
     "secured processes on different RMWs",
-    "Vendors do not talk to each other securely on these versions, and do not report it.",
+    "In these versions, secured nodes on different DDS vendors do not communicate, and do not "
+    "report it.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Use one RMW per robot.",
 )
@@ -170,7 +171,7 @@ _LOADED = ("cert.pem", "permissions.p7s", "governance.p7s", "crl.pem", "identity
 
 
 def _check_host(setting: Setting) -> Iterator[Finding]:
-    """Yield the findings about the RMW, the clock, and the processes that run."""
+    """Yield findings about the RMW, the clock, and the running processes."""
     yield from _rmw(setting)
     yield from _clock(setting)
     yield from _processes(setting)
@@ -179,13 +180,13 @@ def _check_host(setting: Setting) -> Iterator[Finding]:
 def _rmw(setting: Setting) -> Iterator[Finding]:
     chosen = setting.environment.get(RMW, "")
     if chosen and setting.rmws and chosen not in setting.rmws:
-        text = f"{RMW} is {chosen}; there are {', '.join(setting.rmws)}"
+        text = f"{RMW} is {chosen}; installed: {', '.join(setting.rmws)}"
         yield RMW_NOT_INSTALLED.found(RMW, text)
     if not _is_secured(setting.environment):
         return
     used = chosen or DEFAULT_RMW
     if used.startswith(_NOT_DDS):
-        yield RMW_INSECURE.found(used, f"{used} is not on DDS")
+        yield RMW_INSECURE.found(used, f"{used} does not use DDS")
     elif used in setting.insecure_rmws:
         yield RMW_INSECURE.found(used, setting.insecure_rmws[used])
 
@@ -200,7 +201,7 @@ def _clock(setting: Setting) -> Iterator[Finding]:
     written = datetime.fromtimestamp(newest, UTC)
     clock = setting.clock or setting.now
     if written > clock + _TOLERANCE:
-        text = f"it says {iso(clock)}, and '{root}' was written at {iso(written)}"
+        text = f"the clock shows {iso(clock)}, but '{root}' was written at {iso(written)}"
         yield CLOCK_BEHIND.found("clock", text)
 
 
@@ -216,8 +217,8 @@ def _processes(setting: Setting) -> Iterator[Finding]:
         elif _is_secured(environment):
             rmws.setdefault(environment.get(RMW) or DEFAULT_RMW, []).append(process.label)
             yield from _outdated(process)
-        elif secured_here and _is_node_beside(process, setting.environment):
-            text = f"it is in domain {_domain(environment)}, and {ENABLE} is not 'true' for it"
+        elif secured_here and _is_node_in_same_domain(process, setting.environment):
+            text = f"in domain {_domain(environment)}, with {ENABLE} not 'true'"
             yield PROCESS_UNSECURED.found(process.label, text)
     if secured_here:
         rmws.setdefault(setting.environment.get(RMW) or DEFAULT_RMW, []).append("this environment")
@@ -228,7 +229,7 @@ def _processes(setting: Setting) -> Iterator[Finding]:
 
 def _daemon(process: Process, wanted: Mapping[str, str]) -> Iterator[Finding]:
     if not _is_secured(process.environment):
-        text = f"{ENABLE} is not 'true' for {process.label}"
+        text = f"{ENABLE} is not 'true' in the environment of {process.label}"
         yield DAEMON_UNSECURED.found(process.label, text)
         return
     differing = [
@@ -237,7 +238,7 @@ def _daemon(process: Process, wanted: Mapping[str, str]) -> Iterator[Finding]:
         if process.environment.get(name, "") != wanted.get(name, "")
     ]
     if differing:
-        text = f"it has another {', '.join(differing)}"
+        text = f"{', '.join(differing)} differ from this environment"
         yield DAEMON_OTHER.found(process.label, text)
 
 
@@ -253,7 +254,7 @@ def _outdated(process: Process) -> Iterator[Finding]:
         and datetime.fromtimestamp((folder / file).stat().st_mtime, UTC) > process.started
     ]
     if newer:
-        text = f"it runs since {iso(process.started)}; {', '.join(newer)} of {name} are newer"
+        text = f"it started at {iso(process.started)}; later {', '.join(newer)} of {name} changed"
         yield PROCESS_OUTDATED.found(process.label, text)
 
 
@@ -266,8 +267,8 @@ def _is_daemon(process: Process) -> bool:
     return any(mark in word for word in process.command for mark in _DAEMON)
 
 
-def _is_node_beside(process: Process, environment: Mapping[str, str]) -> bool:
-    """Return whether a process is a node in the same domain, as far as its command shows."""
+def _is_node_in_same_domain(process: Process, environment: Mapping[str, str]) -> bool:
+    """Return whether a process runs ROS nodes (``--ros-args``) in the same domain."""
     return "--ros-args" in process.command and _domain(process.environment) == _domain(environment)
 
 
@@ -290,7 +291,7 @@ ENABLE_MISSPELT = FindingKind(
     "runtime.enable-misspelt",
     ERROR,
     "ROS_SECURITY_ENABLE is neither true nor false",
-    "Only `true`, spelled exactly so, enables security; with any other value every node runs "
+    "Only the exact value `true` enables security. With any other value every node runs "
     "unsecured, and does not report it.",
     _RCL,
     f"Write ROS_SECURITY_ENABLE=true. {_ENV}",
@@ -299,15 +300,16 @@ NOT_ENABLED = FindingKind(
     "runtime.not-enabled",
     WARNING,
     "security is configured but not enabled",
-    "Without ROS_SECURITY_ENABLE=true nodes run unsecured, whatever the other variables are.",
+    "Without ROS_SECURITY_ENABLE=true every node runs unsecured, whatever the other variables are.",
     _RCL,
-    f"Write ROS_SECURITY_ENABLE=true, or unset the others. {_ENV}",
+    f"Write ROS_SECURITY_ENABLE=true, or unset the other variables. {_ENV}",
 )
 MISSPELT = FindingKind(
     "runtime.variable-misspelt",
     ERROR,
-    "a variable that nobody reads",
-    "It looks like a typo of a variable that rcl reads, so its value is silently ignored.",
+    "a misspelt or obsolete variable, which ROS 2 ignores",
+    "The name looks like a typo, or an old name, of a variable that rcl reads. rcl ignores it "
+    "without a message.",
     _RCL,
     "Correct the name.",
 )
@@ -315,8 +317,8 @@ STRATEGY_MISSPELT = FindingKind(
     "runtime.strategy-misspelt",
     ERROR,
     "ROS_SECURITY_STRATEGY is neither Enforce nor Permissive",
-    "Only `Enforce`, spelled exactly so, enforces security; with any other value a node whose "
-    "enclave is missing runs unsecured.",
+    "Only the exact value `Enforce` enforces security. With any other value a node whose enclave "
+    "is missing runs unsecured.",
     _RCL,
     f"Write ROS_SECURITY_STRATEGY=Enforce. {_ENV}",
 )
@@ -332,16 +334,17 @@ NOT_ENFORCED = FindingKind(
 KEYSTORE_UNSET = FindingKind(
     "runtime.keystore-unset",
     ERROR,
-    "security is enabled but no keystore is named",
-    "With Enforce no node starts (error not set); without, all run unsecured.",
+    "security is enabled, but ROS_SECURITY_KEYSTORE is not set",
+    'With Enforce no node starts (rcl says "error not set"); without Enforce every node runs '
+    "unsecured.",
     _RCL,
     f"Set ROS_SECURITY_KEYSTORE. {_ENV}",
 )
 KEYSTORE_NOT_FOUND = FindingKind(
     "runtime.keystore-not-found",
     ERROR,
-    "ROS_SECURITY_KEYSTORE names no keystore",
-    "With Enforce no node starts; without, all run unsecured.",
+    "ROS_SECURITY_KEYSTORE is not a keystore",
+    "With Enforce no node starts; without Enforce every node runs unsecured.",
     _RCL,
     f"Correct the path. {_ENV}",
 )
@@ -349,7 +352,8 @@ KEYSTORE_RELATIVE = FindingKind(
     "runtime.keystore-relative",
     WARNING,
     "ROS_SECURITY_KEYSTORE is a relative path",
-    "It means a different folder for each process that is started elsewhere, such as a service.",
+    "The path is relative to the working directory of each process, so a service, for instance, "
+    "looks in another folder.",
     _RCL,
     f"Write the absolute path. {_ENV}",
 )
@@ -357,34 +361,36 @@ ENCLAVE_NOT_FOUND = FindingKind(
     "runtime.enclave-not-found",
     ERROR,
     "the enclave is not in the keystore",
-    "With Enforce the node does not start; without, it runs unsecured. Names are compared exactly.",
+    "With Enforce the node does not start; without Enforce it runs unsecured. Names are compared "
+    "exactly, with upper and lower case.",
     _RCL,
     "Correct the name, or create the enclave with `sros create_enclave`.",
 )
 NO_ENCLAVE = FindingKind(
     "runtime.enclave-unset",
     WARNING,
-    "no enclave is named",
-    "Every process has to say --ros-args --enclave NAME; otherwise it uses the enclave /, which "
-    "the keystore does not have, and does not start.",
+    "ROS_SECURITY_ENCLAVE_OVERRIDE is not set",
+    "A process without `--ros-args --enclave NAME` uses the enclave /, which the keystore does "
+    "not have, and does not start.",
     _RCL,
     _NAME_IT,
 )
 UNSECURED_WITHOUT_ENCLAVE = FindingKind(
     "runtime.unsecured-without-enclave",
     ERROR,
-    "no enclave is named, and nodes run unsecured",
-    "A process that does not say --ros-args --enclave NAME uses the enclave /, which the keystore "
-    "does not have; as ROS_SECURITY_STRATEGY is not exactly `Enforce`, it then runs UNSECURED.",
+    "ROS_SECURITY_ENCLAVE_OVERRIDE is not set, and nodes run unsecured",
+    "A process without `--ros-args --enclave NAME` uses the enclave /, which the keystore does "
+    "not have. It runs UNSECURED, because ROS_SECURITY_STRATEGY is not exactly `Enforce`.",
     _RCL,
     f"Write ROS_SECURITY_STRATEGY=Enforce. {_NAME_IT}",
 )
 DOMAIN_MALFORMED = FindingKind(
     "runtime.domain-malformed",
     ERROR,
-    "ROS_DOMAIN_ID is no domain id",
-    "Nodes do not start, or with a leading zero join another domain than it seems.",
-    "rcl 9 (rcl/src/rcl/domain_id.c: strtoul with base 0); domains above 230 Cyclone DDS refuses.",
+    "ROS_DOMAIN_ID is not a valid domain id",
+    "Nodes do not start. A value with a leading zero is read as octal, so nodes join another "
+    "domain.",
+    "rcl 9 (rcl/src/rcl/domain_id.c: strtoul with base 0); Cyclone DDS refuses domains above 230.",
     "Write one whole number from 0 to 230, without leading zeros.",
 )
 DOMAIN_NOT_GOVERNED = FindingKind(
@@ -394,15 +400,16 @@ DOMAIN_NOT_GOVERNED = FindingKind(
     'No node starts: Fast DDS says "Not found topic access rule for topic ros_discovery_info", '
     'Cyclone DDS "Could not find domain in governance".',
     "DDS-Security 1.1, 9.4.1.2; measured.",
-    "Set ROS_DOMAIN_ID to a domain of the keystore, or make one with --domain.",
+    "Set ROS_DOMAIN_ID to a domain of the keystore, or make a keystore for this domain with `sros "
+    "create_keystore --domain`.",
 )
 CA_KEY_HERE = FindingKind(
     "runtime.ca-key-present",
     NOTE,
-    "nodes run with the keystore that has the keys of the CAs",
-    "An attacker who takes over a node can make any enclave, with any rights.",
+    "nodes use the keystore that holds the CA keys",
+    "An attacker who takes over a node can create any enclave, with any rights.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6.",
-    "Run them with an export (`sros distribute_key`), and keep the keystore elsewhere.",
+    "Run nodes with an export (`sros distribute_key`), and keep this keystore elsewhere.",
 )
 
 _READ = (
@@ -418,7 +425,7 @@ _CLOSE = 0.88
 
 
 def _check_variables(setting: Setting) -> Iterator[Finding]:
-    """Yield the findings about the variables, and the enclave that they name."""
+    """Yield findings about the environment variables and the enclave that they name."""
     environment = setting.environment
     yield from _spelling(environment)
     if environment.get(ENABLE) != "true":
@@ -440,7 +447,7 @@ def _check_variables(setting: Setting) -> Iterator[Finding]:
     if not root.is_absolute():
         yield KEYSTORE_RELATIVE.found(KEYSTORE, _value(environment, KEYSTORE))
     if not is_keystore(root):
-        missing = "does not exist" if not root.exists() else "has no enclaves folder in use"
+        missing = "does not exist" if not root.exists() else "has no enclaves folder with content"
         yield KEYSTORE_NOT_FOUND.found(KEYSTORE, f"'{root}' {missing}")
         return
     yield from _enclave(setting, root, domain)
@@ -461,7 +468,7 @@ def _spelling(environment: Mapping[str, str]) -> Iterator[Finding]:
         close = difflib.get_close_matches(name.upper(), _READ, n=1, cutoff=_CLOSE)
         meant = _OLD.get(name) or (close[0] if close else "")
         if meant:
-            yield MISSPELT.found(name, f"{name} is set; {meant} is meant")
+            yield MISSPELT.found(name, f"{name} is set; ROS 2 reads {meant}")
 
 
 def _enclave(setting: Setting, root: Path, domain: int | None) -> Iterator[Finding]:
@@ -470,15 +477,15 @@ def _enclave(setting: Setting, root: Path, domain: int | None) -> Iterator[Findi
     if governed and domain is not None and domain not in governed:
         text = f"the governance of '{root}' is for domain {governed}, not for {domain}"
         yield DOMAIN_NOT_GOVERNED.found(DOMAIN, text)
-        domain = None  # reported here
+        domain = None  # so that it is not reported again for the enclave
     for role in (IDENTITY, PERMISSIONS):
         if (root / ca_key(role)).exists():
-            yield CA_KEY_HERE.found(KEYSTORE, f"'{root / ca_key(role)}' is there")
+            yield CA_KEY_HERE.found(KEYSTORE, f"'{root / ca_key(role)}' exists")
             break
     if not wanted and "/" not in names:
         enforced = setting.environment.get(STRATEGY) == "Enforce"
         kind = NO_ENCLAVE if enforced else UNSECURED_WITHOUT_ENCLAVE
-        yield kind.found(ENCLAVE, f"it is not set, and '{root}' has no enclave /")
+        yield kind.found(ENCLAVE, f"'{root}' has no enclave /")
         return
     name = wanted or "/"
     if name not in names and not enclave_path(root, name).is_dir():
@@ -495,11 +502,11 @@ def _enclave(setting: Setting, root: Path, domain: int | None) -> Iterator[Findi
 
 
 def _governed(root: Path) -> DomainSet | None:
-    """Return the domains that the governance of a keystore names, as far as it can be read."""
+    """Return the domains of a keystore's governance, or None if it cannot be read."""
     try:
         signed = smime.parse(read_bytes(root / GOVERNANCE_P7S, "governance document"))
         return parse_governance(signed.document).domains().closed()
-    except SrosError:  # reported with the enclave; in an export each has a copy
+    except SrosError:  # reported for the enclave, which has its own copy in an export
         return None
 
 

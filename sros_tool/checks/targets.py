@@ -1,4 +1,4 @@
-"""Detects the kind of a path (policy, keystore, enclave) and checks it."""
+"""Checks of any path: a policy, a keystore, an enclave, or a folder of policies."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sros_tool.keystore.layout import REQUIRED_FILES, is_keystore, locate_enclav
 from sros_tool.policy.model import Policy
 from sros_tool.xml import parse, read_bytes
 
-_OF_AN_ENCLAVE = (*REQUIRED_FILES, "permissions.xml", "crl.pem", "request.pem")
+_ENCLAVE_FILES = (*REQUIRED_FILES, "permissions.xml", "crl.pem", "request.pem")
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ def path_findings(path: Path, at: Circumstances) -> list[Finding]:
         return _keystore(path, at, None)
     enclave = path if path.is_dir() else path.parent
     if any((enclave / name).exists() for name in ("cert.pem", "key.pem", "permissions.p7s")) and (
-        path.is_dir() or path.name in _OF_AN_ENCLAVE
+        path.is_dir() or path.name in _ENCLAVE_FILES
     ):
         root, name = locate_enclave(enclave)
         return _keystore(root, at, name)
@@ -47,8 +47,8 @@ def path_findings(path: Path, at: Circumstances) -> list[Finding]:
             return [finding for each in policies for finding in policy_file_findings(each)]
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave, and holds no policy",
-            "It has no enclaves folder in use, no cert.pem, and no XML file that begins with "
-            "<policy>.",
+            "It has no enclaves folder with content, no cert.pem, and no XML file that begins "
+            "with <policy>.",
         )
     read_bytes(path, "file")
     return list(policy_file_findings(path))

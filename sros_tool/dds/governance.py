@@ -39,16 +39,16 @@ Value = bool | ProtectionKind
 
 @dataclass(frozen=True, slots=True)
 class Attribute:
-    """One setting of a domain rule or a topic rule, as its field below declares it.
+    """One attribute of domain rules or topic rules, from the metadata of its field below.
 
-    Reading, rendering, describing, translating, the readers of the vendors and the proof of a
-    signed document go through `attributes`, in the order of the schema, which the fields have
-    too: an attribute is added by adding its field.
+    All code that reads, writes, describes or compares rules iterates over `attributes`, in the
+    order of the schema and of the fields.  So a new attribute needs only a new field.
 
-    ``name`` is its element and its field; ``term`` is the field of `sros_tool.policy.protection`
-    from which it is made.  ``values`` are those it may have.  ``open`` is the value that protects
-    nothing, ``portable`` the one that protects and that all vendors enforce alike.  ``default``
-    holds where a document lacks the element; None where the schema requires it.
+    ``name`` is the name of the element and of the field; ``term`` is the field of
+    `sros_tool.policy.protection` that it is translated from.  ``values`` are the allowed values.
+    ``open`` is the value that protects nothing; ``portable`` protects, and all vendors enforce it
+    alike.  ``default`` is the value if a document lacks the element; None if the schema requires
+    the element.
     """
 
     name: str
@@ -82,7 +82,7 @@ def _kind(term: str, values: tuple[ProtectionKind, ...] = tuple(ProtectionKind))
 
 @dataclass(frozen=True, slots=True)
 class TopicRule:
-    """How the topics that match an expression are protected."""
+    """The protection of the topics that match an expression."""
 
     topic_expression: str
     enable_discovery_protection: bool = field(metadata=_flag("discovery"))
@@ -95,7 +95,7 @@ class TopicRule:
 
 @dataclass(frozen=True, slots=True)
 class DomainRule:
-    """How some domains are protected; the first topic rule that matches a topic decides."""
+    """The protection of some domains; the first topic rule that matches a topic decides."""
 
     domains: DomainSet
     allow_unauthenticated_participants: bool = field(
@@ -129,13 +129,13 @@ def attributes(rule: type[DomainRule | TopicRule]) -> tuple[Attribute, ...]:
 
 
 def values_of(rule: DomainRule | TopicRule) -> dict[str, bool | str]:
-    """Return the attributes of a rule by their names, protection kinds as texts."""
+    """Map the names of a rule's attributes to their values, protection kinds as text."""
     values = ((each.name, getattr(rule, each.name)) for each in attributes(type(rule)))
     return {name: value if isinstance(value, bool) else str(value) for name, value in values}
 
 
 def settings(rule: type[DomainRule | TopicRule], *, protect: bool) -> dict[str, Any]:
-    """Return all attributes of a rule with the values that protect, or those that do not."""
+    """Map the names of a rule's attributes to protecting values, or else to open ones."""
     return {each.name: each.portable if protect else each.open for each in attributes(rule)}
 
 
@@ -189,7 +189,11 @@ def _attribute_lines(rule: DomainRule | TopicRule) -> Iterator[str]:
 
 
 def parse_governance(data: bytes, name: str = "the governance document") -> Governance:
-    """Read a governance document; raises `DocumentError` where it is not one."""
+    """Return the governance document in ``data``, which errors call ``name``.
+
+    Raises:
+        DocumentError: ``data`` is not a governance document.
+    """
     root = parse(data, name)
     parent = root.find("domain_access_rules")
     if root.tag != "dds" or parent is None:

@@ -44,7 +44,7 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class Grant:
-    """The rights and the validity of one subject; moments are kept as written in the document."""
+    """The rights and the validity of one subject; dates are kept as written in the document."""
 
     name: str
     subject: str
@@ -53,11 +53,11 @@ class Grant:
     rules: tuple[Rule, ...]
     default_allow: bool = False
     default_empty: bool = False
-    """Its ``<default>`` is empty; one vendor crashes on that."""
+    """Whether ``<default>`` is empty; Cyclone DDS crashes on that."""
 
     @property
     def validity(self) -> Window:
-        """The validity of the grant by the standard: a moment without a zone is in UTC."""
+        """The validity of the grant by the standard: a date without a zone is in UTC."""
         return Window(parse_iso(self.not_before), parse_iso(self.not_after))
 
 
@@ -68,12 +68,12 @@ class Permissions:
     grants: tuple[Grant, ...]
 
     def grant_of(self, subject: str) -> Grant | None:
-        """Return the first grant for a subject, or None; DDS reads only the first one."""
+        """Return the first grant for a subject, or None."""
         return next((each for each in self.grants if each.subject == subject), None)
 
 
 def grant(name: str, subject: str, validity: Window, rules: tuple[Rule, ...]) -> Grant:
-    """Return a grant of the portable profile: UTC moments, default DENY."""
+    """Return a grant of the portable profile: dates in UTC, default DENY."""
     return Grant(name, subject, iso(validity.not_before), iso(validity.not_after), rules)
 
 
@@ -139,7 +139,11 @@ def _write_list(lines: list[str], item: str, texts: tuple[str, ...]) -> None:
 
 
 def parse_permissions(data: bytes, name: str = "the permissions document") -> Permissions:
-    """Read a permissions document; raises `DocumentError` where it is not one."""
+    """Return the permissions document in ``data``, which errors call ``name``.
+
+    Raises:
+        DocumentError: ``data`` is not a permissions document.
+    """
     root = parse(data, name)
     parent = root.find("permissions")
     if root.tag != "dds" or parent is None:

@@ -1,6 +1,6 @@
-"""The portable profile: documents that every vendor reads alike, and remarks on others.
+"""The portable profile: documents that every vendor reads alike, and notes on other documents.
 
-Each remark rests on a difference between vendors that was measured on Fast DDS 2.9.1 and 2.14.5
+Each note is about a difference between vendors that was measured on Fast DDS 2.9.1 and 2.14.5
 and on Cyclone DDS 0.10.2.
 """
 
@@ -15,29 +15,29 @@ from sros_tool.errors import Note
 
 _SHOWN = 3
 _LONGEST_TOPIC = 251  # bytes, of DDS names
-_LONGEST_NAME = 8  # parts; longer enclave names are not compared, the subsets would be too many
+_LONGEST_NAME = 8  # parts; a longer enclave name has too many subsets to compare
 
 
 def document_notes(what: str, permissions: Permissions, signed_bytes: int) -> Iterator[Note]:
-    """Yield remarks on a permissions document named ``what``; ``signed_bytes`` is its size."""
+    """Yield notes on a permissions document named ``what``; ``signed_bytes`` is its size."""
     for identity, fact in outside(permissions, signed_bytes):
         yield Note(identity, f"{what}: {fact}{_CONSEQUENCES[identity]}")
 
 
 _CONSEQUENCES = {
-    "portable.document-size": f"; from {MAX_SIGNED_BYTES} on, Fast DDS 2.9 never finishes "
-    "the handshake. Use wildcards, or split the enclave.",
-    "portable.long-name": f"; on Fast DDS no peer matches one of more than "
-    f"{_LONGEST_TOPIC}. Use shorter namespaces and names.",
+    "portable.document-size": f"; with {MAX_SIGNED_BYTES} or more, Fast DDS 2.9 never "
+    "finishes the handshake. Use wildcards, or split the enclave.",
+    "portable.long-name": f"; on Fast DDS no peer matches a topic of more than "
+    f"{_LONGEST_TOPIC} bytes. Use shorter namespaces and names.",
     "portable.deny-blocks-topic": " on Cyclone DDS, which refuses the topic as a whole; Fast "
-    "DDS allows it. What no rule allows is denied anyway, so the denial may be needless.",
+    "DDS allows it. What no rule allows is denied anyway, so perhaps the denial can be removed.",
     "portable.character-set": ". Vendors read plain sets alike, but only * and ? are part of the "
     "portable profile.",
 }
 
 
 def _either_matches(one: str, other: str) -> bool:
-    """Return whether one expression matches the other as a text; other overlaps are not found."""
+    """Return whether one expression matches the text of the other; other overlaps are missed."""
     return fnmatchcase(one, other) or fnmatchcase(other, one)
 
 
@@ -46,7 +46,7 @@ def outside(
     signed_bytes: int,
     share: Callable[[str, str], bool] = _either_matches,
 ) -> Iterator[tuple[str, str]]:
-    """Yield the parts of a document outside of the profile: the id of a remark, and a clause.
+    """Yield the id and a clause of a note for each part of a document outside of the profile.
 
     ``share`` returns whether two expressions match a common name.
     """
@@ -100,26 +100,26 @@ def _blocked(
 
 
 def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:
-    """Yield a remark on enclaves that Cyclone DDS mistakes for each other.
+    """Yield a note on enclaves that Cyclone DDS mistakes for each other.
 
-    ``names`` are all enclaves, ``new`` those just added.
+    ``names`` are all enclaves; a pair is reported if one of the two is in ``new``.
     """
     fresh = set(new)
     pairs = [pair for pair in mistaken_names(names) if not fresh.isdisjoint(pair)]
     if pairs:
         yield Note(
             "portable.enclave-names",
-            f"Cyclone DDS 0.10 accepts the identity of {some_pairs(pairs)}, if it presents that "
-            "other enclave's (public) permissions, because all parts of its name occur there. "
-            "Choose names none of which is made of parts of another, such as /robot_admin.",
+            f"Cyclone DDS 0.10 mistakes {some_pairs(pairs)}, if the first enclave presents the "
+            "(public) permissions of the second, because all parts of its name occur there. "
+            "Choose names that do not consist of parts of another name, such as /robot_admin.",
         )
 
 
 def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
-    """Return the sorted pairs whose first identity Cyclone DDS mistakes for the second.
+    """Return the sorted pairs of enclaves of which Cyclone DDS mistakes the first for the second.
 
-    It compares the parts of two subjects as sets, one way: the identity ``/robot`` fits the
-    permissions of ``/robot/admin``.
+    It checks only that every part of the first subject occurs in the second one: the permissions
+    of ``/robot/admin`` fit the identity ``/robot``.
     """
     parts_of = {name: frozenset(name.strip("/").split("/")) for name in names}
     by_parts: dict[frozenset[str], list[str]] = {}
@@ -137,8 +137,8 @@ def mistaken_names(names: Iterable[str]) -> list[tuple[str, str]]:
 
 
 def some_pairs(pairs: Sequence[tuple[str, str]]) -> str:
-    """Return the first pairs in words: "/robot as /robot/admin and 2 more"."""
-    shown = ", ".join(f"{inner} as {outer}" for inner, outer in pairs[:_SHOWN])
+    """Return the first pairs in words: "/robot for /robot/admin and 2 more"."""
+    shown = ", ".join(f"{inner} for {outer}" for inner, outer in pairs[:_SHOWN])
     return f"{shown} and {len(pairs) - _SHOWN} more" if len(pairs) > _SHOWN else shown
 
 

@@ -58,8 +58,8 @@ def test_found(expected: str, bench: Bench) -> None:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ((), "RTPS messages Fast DDS 2.14 refuses"),
-        ((("rtps_protection_kind>ENCRYPT", "rtps_protection_kind>NONE"),), "they reach none"),
+        ((), "Fast DDS 2.14 refuses the document"),
+        ((("rtps_protection_kind>ENCRYPT", "rtps_protection_kind>NONE"),), "they reach no topic"),
         (
             (
                 ("rtps_protection_kind>ENCRYPT", "rtps_protection_kind>NONE"),
@@ -69,7 +69,7 @@ def test_found(expected: str, bench: Bench) -> None:
                 ("data_protection_kind>ENCRYPT", "data_protection_kind>NONE"),
                 ("discovery_protection_kind>ENCRYPT", "discovery_protection_kind>NONE"),
             ),
-            "on Fast DDS 2.14 anybody reads and writes *",
+            "on Fast DDS 2.14 anybody can read and write *",
         ),
     ],
 )

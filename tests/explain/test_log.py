@@ -39,7 +39,7 @@ CAUSES = {
     "governance unsigned": ("governance.p7s: it is not an S/MIME",),
     "permissions unsigned": ("permissions.p7s: it is not an S/MIME",),
     "permissions expired": ("expired at",),
-    "permissions not yet valid": ("begins at",),
+    "permissions not yet valid": ("is valid only from",),
     "permissions of another enclave": ("no grant of the permissions names the subject",),
     "domain not in governance": ("the governance does not list domain 0",),
     "permissions malformed": ("refuses the permissions",),

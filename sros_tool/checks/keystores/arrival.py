@@ -94,18 +94,18 @@ class Arrival:
 def verify_arrival(
     path: Path, *, now: datetime, domain: int | None = None, zone: tzinfo = UTC
 ) -> Arrival:
-    """Return the findings in a robot's folder, or in the folder of one enclave.
+    """Return the state of the enclaves in a robot's folder, or of one enclave, and all findings.
 
-    A request without an answer is reported too: the enclave does not work without it.
+    A signing request without an answer is reported too: without it the enclave does not work.
 
     Args:
         path: a folder with enclaves, or the folder of an enclave.
-        now: the moment for which it is checked.
+        now: the moment to check for.
         domain: the ROS domain that the enclaves have to join.
         zone: the time zone of the robot.
 
     Raises:
-        DocumentError: ``path`` is neither.
+        DocumentError: ``path`` is neither of them.
     """
     if is_keystore(path):
         root, names, only = path, tuple(enclave_names(path)), None
@@ -117,7 +117,7 @@ def verify_arrival(
             f"'{path}' is neither a keystore nor an enclave",
             "It does not exist."
             if not path.exists()
-            else "It has no enclaves folder in use, and neither cert.pem nor key.pem.",
+            else "It has no enclaves folder with content, and neither cert.pem nor key.pem.",
             "Name the folder that `sros distribute_key` or `sros import` has written to.",
         )
     found = keystore_findings(root, now=now, zone=zone, domain=domain, only=only, on_robot=True)

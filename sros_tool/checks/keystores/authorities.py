@@ -33,8 +33,8 @@ from sros_tool.xml import read_bytes
 NOT_A_CA = FindingKind(
     "keystore.not-a-ca",
     ERROR,
-    "a CA certificate that does not say that it is one",
-    "OpenSSL refuses chains over it.",
+    "a CA certificate without the right to issue certificates",
+    "OpenSSL refuses every chain that contains it.",
     "RFC 5280, 4.2.1.9 and 4.2.1.3 (BasicConstraints, KeyUsage keyCertSign).",
     "Replace it with `sros rotate_ca ROOT`.",
 )
@@ -42,8 +42,8 @@ CA_EXTENSIONS = FindingKind(
     "keystore.ca-extensions",
     NOTE,
     "a CA certificate without key identifiers or key usage",
-    "Fast DDS checks strictly, and refuses it as soon as an intermediate CA is in play. CAs made "
-    "by ros2/sros2 are like this.",
+    "Fast DDS verifies strictly, and refuses such a CA as soon as there is an intermediate CA. "
+    "CAs made by ros2/sros2 lack these extensions.",
     "RFC 5280, 4.2.1.1 to 4.2.1.3; openssl verify -x509_strict.",
     "Before you add intermediate CAs, replace it with `sros rotate_ca ROOT`.",
 )
@@ -51,10 +51,10 @@ INTERMEDIATE = FindingKind(
     "portable.intermediate",
     WARNING,
     "a CA that is not self-signed",
-    "Cyclone DDS accepts only a self-signed CA, the first one in its file. Fast DDS follows a "
-    "chain of "
-    "identity CAs, 2.14 only where each has keyUsage and key identifiers. Fast DDS 2.14 accepts "
-    "documents of an intermediate permissions CA if it has keyUsage, 2.9 if it may sign documents.",
+    "Cyclone DDS accepts only a self-signed CA, as the first certificate of its file. Fast DDS "
+    "verifies a chain of identity CAs; 2.14 requires keyUsage and key identifiers in each of "
+    "them. For an intermediate permissions CA, Fast DDS 2.14 requires keyUsage, 2.9 a purpose "
+    "that allows signing documents.",
     "Fast DDS 2.9.1 and 2.14.5 (FileProvider.cpp), Cyclone DDS 0.10.2; measured.",
     "Use a separate root CA for robots, unless all of them run a Fast DDS that accepts it.",
 )
@@ -62,9 +62,9 @@ CA_PURPOSE = FindingKind(
     "portable.ca-purpose",
     WARNING,
     "a permissions CA whose certificate does not allow signing documents",
-    "Fast DDS 2.9 and Cyclone DDS verify the purpose of S/MIME, and refuse every document "
+    "Fast DDS 2.9 and Cyclone DDS verify the S/MIME purpose, and refuse every document "
     '("unsuitable certificate purpose"): keyUsage must have digitalSignature, extendedKeyUsage '
-    "emailProtection, if they are there. Fast DDS 2.14 does not look at them.",
+    "emailProtection, if present. Fast DDS 2.14 checks neither.",
     "RFC 8550, 4.4.2; Fast DDS 2.9.1 and 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
     "Replace it with `sros rotate_ca ROOT`, or issue its certificate again with digitalSignature.",
     vendors=(Vendor.FAST_2_9, Vendor.CYCLONE),
@@ -82,9 +82,9 @@ SIGNATURE_HASH = FindingKind(
     "portable.signature-hash",
     WARNING,
     "a certificate that is not signed with SHA-256",
-    "Fast DDS refuses SHA-384 in a CA and in an enclave's certificate; Cyclone DDS takes it.",
+    "Fast DDS refuses SHA-384 in a CA and in an enclave's certificate; Cyclone DDS accepts it.",
     "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp), Cyclone DDS 0.10.2; measured.",
-    "Issue it with SHA-256, as sros does.",
+    "Issue the certificate again with SHA-256, as sros does.",
     vendors=FAST_DDS,
 )
 
@@ -92,7 +92,7 @@ SIGNATURE_HASH = FindingKind(
 def _authority_findings(
     role: str, chain: tuple[x509.Certificate, ...], at: datetime, subject: str, file: str
 ) -> Iterator[Finding]:
-    """Yield findings about a CA that some vendor refuses; ``chain`` has its file's certificates."""
+    """Yield findings about a CA that some vendor refuses; ``chain`` is the content of its file."""
     certificate = chain[0]
     name = subject_text(certificate.subject)
     if certificate.issuer != certificate.subject:
@@ -142,7 +142,7 @@ UNREADABLE = FindingKind(
     "keystore.file-unreadable",
     ERROR,
     "a file of the keystore that cannot be read",
-    "Verbs that need it fail.",
+    "Verbs that need the file fail.",
     "sros keystore layout.",
     "Restore it from a backup.",
 )
@@ -151,24 +151,27 @@ ONE_AUTHORITY = FindingKind(
     WARNING,
     "one CA issues identities and signs permissions",
     "Cyclone DDS 0.10.2 and Fast DDS 2.9.1 then accept permissions that an enclave signed for "
-    "itself: they verify a chain, and the chain of every enclave's certificate leads to that CA.",
-    "CVE-2023-24011 class; reproduced on Cyclone DDS 0.10.2, where such an enclave was heard.",
-    "Make a keystore with separate CAs, which all templates but sros2 do.",
+    "itself: they accept every signer whose certificate chain ends at the permissions CA, as that "
+    "of every enclave then does.",
+    "CVE-2023-24011 class; reproduced on Cyclone DDS 0.10.2, where readers received data of such "
+    "an enclave.",
+    "Create a keystore with separate CAs, by any template except sros2.",
 )
 CA_EXPIRES_SOON = FindingKind(
     "keystore.ca-ends-soon",
     WARNING,
     "a CA that expires soon",
-    "Everything that it issued or signed expires with it at the same time, and replacing it takes "
-    "several stages.",
+    "Everything that the CA issued or signed expires with it, and replacing a CA takes several "
+    "stages.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
-    "Begin now, with `sros rotate_ca ROOT`.",
+    "Begin to replace it now, with `sros rotate_ca ROOT`.",
 )
 CA_EXPIRED = FindingKind(
     "keystore.ca-expired",
     ERROR,
     "a CA of the keystore is not valid now",
-    "Nothing can be issued or signed with it, and DDS refuses everything that it issued or signed.",
+    "Nothing can be issued or signed with the CA, and DDS refuses everything that it issued or "
+    "signed.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 (Error '10' verifying CA certificate).",
     "Replace it with `sros rotate_ca ROOT`, or correct the clock.",
 )
@@ -176,15 +179,15 @@ CA_MISSING = FindingKind(
     "keystore.ca-missing",
     ERROR,
     "the certificate of a CA is missing",
-    "Every enclave has links to it.",
+    "The files of every enclave link to it.",
     "ROS 2 keystore layout (public/).",
-    "Restore it from a backup; any enclave that was exported has a copy.",
+    "Restore it from a backup; every exported enclave has a copy.",
 )
 CA_MISMATCH = FindingKind(
     "keystore.ca-key-mismatch",
     ERROR,
     "the key and the certificate of a CA do not belong together",
-    "Nothing that it signs could be verified.",
+    "No signature by this key verifies against the certificate.",
     "RFC 5280, 6.1.3.",
     "Restore the pair from a backup.",
 )
@@ -192,24 +195,24 @@ CA_KEY_PLAIN = FindingKind(
     "keystore.ca-key-plain",
     NOTE,
     "a CA key is in the keystore without a passphrase",
-    "Anyone who copies the folder can make any enclave with any rights.",
+    "Anyone who copies the folder can create any enclave, with any rights.",
     "ros2/sros2 issue 282; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "Make keystores with --encrypt-ca-keys or with keys on a token, or keep private/ offline.",
+    "Create keystores with --encrypt-ca-keys or with keys on a token, or keep private/ offline.",
 )
 SETTINGS_MISSING = FindingKind(
     "keystore.settings-missing",
     WARNING,
-    "a keystore of sros without its settings",
-    "What is added later follows ros2/sros2: an enclave without a policy may do everything, for "
-    "ten years.",
-    "sros: sros.toml holds the choices that a keystore was made by.",
+    "a keystore made by sros without its settings",
+    "New enclaves then follow the defaults of ros2/sros2: without a policy they may do "
+    "everything, for ten years.",
+    "sros: sros.toml holds the settings of a keystore.",
     "Restore sros.toml from a backup.",
 )
 LEDGER_MISSING = FindingKind(
     "keystore.ledger-missing",
     WARNING,
-    "a keystore of sros without its ledger",
-    "Replaced permissions, and certificates from another source, cannot be detected.",
+    "a keystore made by sros without its ledger",
+    "Without it, replaced permissions and certificates from another source cannot be detected.",
     "sros: ledger.jsonl lists everything that was issued.",
     "Restore ledger.jsonl from a backup.",
 )
@@ -225,7 +228,7 @@ CRL_ISSUER = FindingKind(
     "keystore.revocation-list-issuer",
     ERROR,
     "a revocation list that the identity CA did not sign",
-    "DDS cannot verify any certificate with it, and refuses every participant.",
+    "DDS cannot verify any certificate with this list, and refuses every participant.",
     "RFC 5280, 6.3.3; Fast DDS 2.14.5.",
     "Run `sros crl ROOT --refresh`.",
 )
@@ -235,7 +238,7 @@ _LIST_SOON = timedelta(days=30)
 
 
 def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
-    """Yield findings in the certificates and keys of the CAs, and in the revocation list."""
+    """Yield findings about the certificates and keys of the CAs, and the revocation list."""
     for each in keystore.unread:
         why = f"{each.error.what}. {each.error.why}".strip()
         yield UNREADABLE.found(each.path, why, keystore.shown(each.path), remedy=each.error.remedy)
@@ -253,12 +256,12 @@ def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
         if fingerprint not in seen:
             seen.add(fingerprint)
             yield from _authority(keystore, role, chain)
-    yield from _one_for_both(keystore)
+    yield from _shared_ca(keystore)
     yield from _revocation_list(keystore)
 
 
 def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
-    """Yield a finding if only one of settings and ledger is there: ros2/sros2 makes neither."""
+    """Yield a finding if only one of settings and ledger exists: ros2/sros2 makes neither."""
     settings, ledger = ((keystore.root / name).exists() for name in (SETTINGS, LEDGER))
     if ledger and not settings:
         yield SETTINGS_MISSING.found("settings", f"there is no {SETTINGS}", str(keystore.root))
@@ -306,20 +309,20 @@ def _locked() -> str:
     raise _LockedError
 
 
-def _one_for_both(keystore: CheckedKeystore) -> Iterator[Finding]:
+def _shared_ca(keystore: CheckedKeystore) -> Iterator[Finding]:
     found = [chain[0] for chain in keystore.authorities.values()]
     if len(found) == 2:
-        yield from one_for_both(
+        yield from shared_ca_findings(
             keystore, found[0], found[1], keystore.shown(ca_certificate(IDENTITY))
         )
 
 
-def one_for_both(
+def shared_ca_findings(
     keystore: CheckedKeystore, identity: x509.Certificate, permissions: x509.Certificate, file: str
 ) -> Iterator[Finding]:
-    """Yield a finding if one CA does both jobs."""
+    """Yield a finding if the identity CA and the permissions CA have the same key."""
     if identity.public_key() == permissions.public_key():
-        text = f"{subject_text(identity.subject)} does both jobs"
+        text = f"{subject_text(identity.subject)} is identity CA and permissions CA"
         accepted = keystore.accepts(lambda settings: not settings.separate_authorities)
         yield ONE_AUTHORITY.found("the CAs", text, file, accepted=accepted)
 

@@ -1,6 +1,6 @@
-"""Findings in the signed documents of an enclave: permissions, governance, and what vendors decide.
+"""Checks of an enclave's signed permissions and governance, and of the vendors' decisions on them.
 
-Outside of the portable profile vendors read or decide differently.
+Vendors read documents outside of the portable profile, or decide on them, differently.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ SEVERAL_GRANTS = FindingKind(
     "portable.several-grants",
     WARNING,
     "several grants in one document",
-    "For a subject, Fast DDS uses the first grant that is currently valid, Cyclone DDS only the "
-    "first one; Cyclone DDS also uses a grant whose subject only contains the requested one.",
+    "Fast DDS uses the first grant of the subject that is valid now; Cyclone DDS uses the first "
+    "one, valid or not, and also takes a grant whose subject merely contains the certificate's.",
     "Fast DDS 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
-    "Write one grant in one document for each enclave.",
+    "Write one document with one grant for each enclave.",
 )
 DEFAULT_ALLOW = FindingKind(
     "portable.default-allow",
     WARNING,
     "a grant that allows by default",
-    "Fast DDS never looks at <default>, and denies; Cyclone DDS allows whatever no rule names.",
+    "Fast DDS ignores <default>, and denies; Cyclone DDS allows everything that no rule names.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
-    "Write <default>DENY</default>, and allow what is meant.",
+    "Write <default>DENY</default>, and an allow rule for the topics that are meant.",
 )
 ALLOW_RULES = FindingKind(
     "portable.several-allow-rules",
     NOTE,
     "several allow rules in one grant",
-    "Fast DDS decides by the first rule whose topic matches, and then by its partitions; Cyclone "
-    "DDS continues to a rule in which both match.",
+    "Fast DDS decides by the first rule whose topic matches, and denies if its partitions do not; "
+    "Cyclone DDS goes on to a rule in which both match.",
     "Fast DDS 2.14.5 (Permissions.cpp), Cyclone DDS 0.10.2; measured.",
     "Put all topics into one allow rule.",
     vendors=FAST_DDS,
@@ -62,8 +62,9 @@ PARTITIONS = FindingKind(
     "portable.partitions",
     WARNING,
     "partitions in a rule",
-    "Fast DDS ignores them in denials, and denies where an allow rule matches the topic and not "
-    "the partition; Cyclone DDS continues searching. ROS 2 uses the default partition only.",
+    "Fast DDS ignores partitions in deny rules, and denies if an allow rule matches the topic and "
+    "not the partition; Cyclone DDS goes on to the next rule. ROS 2 uses only the default "
+    "partition.",
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Leave partitions out.",
 )
@@ -71,8 +72,8 @@ DOMAIN_RANGE = FindingKind(
     "portable.domain-range",
     ERROR,
     "a range of domains that vendors read differently",
-    "Without <max> it means a single domain; without <min> Cyclone DDS crashes; Cyclone DDS "
-    "refuses domains above 230.",
+    "Fast DDS and Cyclone DDS read a range without <max> as a single domain. Cyclone DDS crashes "
+    "on a range without <min>, and refuses domains above 230.",
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write <id>, or <min> and <max> up to 230.",
 )
@@ -80,7 +81,7 @@ GRANT_NAME = FindingKind(
     "portable.grant-name",
     WARNING,
     "a grant without a name",
-    "Fast DDS refuses the document; Cyclone DDS takes it.",
+    "Fast DDS refuses the document; Cyclone DDS accepts it.",
     "omg_shared_ca_permissions.xsd; Fast DDS 2.14.5; measured.",
     'Write <grant name="...">.',
     vendors=FAST_DDS,
@@ -92,14 +93,14 @@ SUBJECT = FindingKind(
     "Cyclone DDS splits subjects at commas, slashes and bars, and compares characters beyond ASCII "
     "in their escaped form; Fast DDS 2.9 treats spaces around = as part of the name.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
-    "Write it as RFC 4514 does, CN=/name, without , | and quotes in the name.",
+    "Write it in the form of RFC 4514, CN=/name, without , | and quotes in the name.",
 )
 TIME_FORMAT = FindingKind(
     "portable.time-format",
     WARNING,
     "a date that vendors read differently",
-    "Fast DDS drops the offset and reads local time; Cyclone DDS refuses dates without a time, and "
-    "years from 2263 on.",
+    "Fast DDS ignores the offset and reads local time; Cyclone DDS refuses dates without a time, "
+    "and years from 2263 on.",
     "DDS-Security 1.1, 9.4.1.3.2.2; Fast DDS 2.14.5 (mktime), Cyclone DDS 0.10.2; measured.",
     "Write CCYY-MM-DDThh:mm:ssZ.",
 )
@@ -118,7 +119,7 @@ LOCAL_TIME = FindingKind(
     "enclave.permissions-local-time",
     ERROR,
     "permissions that Fast DDS refuses in the time zone of this host",
-    'It reads their dates in local time, and says "Not found the identity subject name in '
+    'Fast DDS reads their dates in local time, and says "Not found the identity subject name in '
     'permissions file".',
     "Fast DDS 2.9.1 and 2.14.5 (mktime); measured.",
     "Run `sros renew ROOT NAME`, or let the host run in UTC.",
@@ -137,9 +138,9 @@ EMPTY_TOPIC = FindingKind(
     "portable.empty-topic",
     ERROR,
     "a <topic> without text",
-    "Cyclone DDS crashes when it reaches it; Fast DDS refuses the document.",
+    "Cyclone DDS crashes when it evaluates the rule; Fast DDS refuses the document.",
     "Cyclone DDS 0.10.2 (a fault in create_topic), Fast DDS 2.9.1; measured.",
-    "Remove it.",
+    "Remove the empty <topic>.",
 )
 NO_EFFECT = FindingKind(
     "permissions.deny-without-effect",
@@ -153,9 +154,9 @@ UNREACHABLE = FindingKind(
     "permissions.unreachable-rule",
     WARNING,
     "a topic in a rule that an earlier rule already decides",
-    "The first rule that matches decides, so this one is never reached.",
+    "The first rule that matches decides, so this rule never decides on the topic.",
     "DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
-    "Remove it, or put the narrower rule first.",
+    "Remove the topic, or put the narrower rule first.",
 )
 DOMAINS = FindingKind(
     "enclave.permissions-domains",
@@ -176,14 +177,14 @@ _DIRECTIONS = ("publish", "subscribe")
 
 
 def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """Yield the findings in the permissions of an enclave, whoever signed them."""
+    """Yield findings about an enclave's permissions, even if the signature is not valid."""
     permissions = enclave.state.permissions
     if permissions is None:
         return
     name, file = enclave.name, enclave.file("permissions.p7s")
     yield from outside_findings(permissions, enclave.state.permissions_bytes, name, file)
     if len(permissions.grants) > 1:
-        yield SEVERAL_GRANTS.found(name, f"it has {len(permissions.grants)}", file)
+        yield SEVERAL_GRANTS.found(name, f"it has {len(permissions.grants)} grants", file)
     for grant in permissions.grants:
         yield from _form(grant, name, file)
     if own := grant_of(enclave):
@@ -193,38 +194,39 @@ def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
 
 
 def _domain_problems(domains: DomainSet) -> Iterator[str]:
-    """Yield what vendors read differently in a set of domains."""
+    """Yield a clause for each range of domains that vendors read differently."""
     for part in domains.ranges:
         if part.first is None or part.last is None:
-            yield f"{part} has one end only"
+            yield f"{part} has only one end"
         elif part.last > MAX_DOMAIN:
             yield f"{part} goes beyond {MAX_DOMAIN}"
 
 
 def _form(grant: Grant, name: str, file: str) -> Iterator[Finding]:
     if not grant.name:
-        yield GRANT_NAME.found(name, f"the grant for {grant.subject} has none", file)
+        yield GRANT_NAME.found(name, f"the grant for {grant.subject} has no name", file)
     if not (_SUBJECT.match(grant.subject) and grant.subject.isascii()):
         yield SUBJECT.found(name, f"the subject is {grant.subject!r}", file)
     if grant.default_allow:
-        yield DEFAULT_ALLOW.found(name, "its default is ALLOW", file)
+        yield DEFAULT_ALLOW.found(name, "<default> is ALLOW", file)
     for moment in (grant.not_before, grant.not_after):
         match = _MOMENT.match(moment)
         if not match or int(match[1]) > _LAST_YEAR:
-            yield TIME_FORMAT.found(name, f"it says {moment!r}", file)
-    if sum(rule.allow for rule in grant.rules) > 1:
-        yield ALLOW_RULES.found(name, "it has more than one", file)
+            yield TIME_FORMAT.found(name, f"the date is {moment!r}", file)
+    allow_rules = sum(rule.allow for rule in grant.rules)
+    if allow_rules > 1:
+        yield ALLOW_RULES.found(name, f"the grant has {allow_rules} allow rules", file)
     problems = [text for rule in grant.rules for text in _domain_problems(rule.domains)]
     for problem in dict.fromkeys(problems):
         yield DOMAIN_RANGE.found(name, f"the range {problem}", file)
     criteria = [each for rule in grant.rules for each in (*rule.publish, *rule.subscribe)]
     if any(each.partitions for each in criteria):
-        yield PARTITIONS.found(name, "its rules name partitions", file)
+        yield PARTITIONS.found(name, "a rule names partitions", file)
     if any(not topic.strip() for each in criteria for topic in each.topics):
-        yield EMPTY_TOPIC.found(name, "it names a topic without a name", file)
+        yield EMPTY_TOPIC.found(name, "a <topic> in a rule is empty", file)
     odd = sorted({t for each in criteria for t in each.topics if _is_odd(t)})
     if odd:
-        yield CHARACTER_CLASS.found(name, f"it says {', '.join(map(repr, odd[:3]))}", file)
+        yield CHARACTER_CLASS.found(name, f"a rule names {', '.join(map(repr, odd[:3]))}", file)
 
 
 def _is_odd(topic: str) -> bool:
@@ -241,9 +243,9 @@ def _times(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding
         for each in (grant.not_before, grant.not_after)
     )
     if begin is None or end is None:
-        return  # the finding about the form of dates reports it
+        return  # TIME_FORMAT reports it
     if not begin <= int(now.timestamp()) <= end:
-        here = f"in {enclave.keystore.zone} Fast DDS takes that for {_utc(begin)} to {_utc(end)}"
+        here = f"in {enclave.keystore.zone} Fast DDS reads that as {_utc(begin)} to {_utc(end)}"
         yield LOCAL_TIME.found(enclave.name, f"{text}, and {here}", file)
     elif now - _WEST < window.not_before or now + _EAST > window.not_after:
         yield TIME_WINDOW.found(enclave.name, f"{text}, and now it is {iso(now)}", file)
@@ -268,10 +270,10 @@ def _order(grant: Grant, name: str, file: str) -> Iterator[Finding]:
                 by = [(b, t) for b, t in earlier if b.allow is not rule.allow and covers(t, topic)]
                 meets = [t for b, t in earlier if b.allow and overlap(t, topic)]
                 if not rule.allow and meets:
-                    text = f"it denies to {direction} {topic} after allowing {meets[0]}"
+                    text = f"a rule denies to {direction} {topic} after one that allows {meets[0]}"
                     yield NO_EFFECT.found(name, text, file)
                 elif rule.allow and by:
-                    text = f"it allows to {direction} {topic} after denying {by[0][1]}"
+                    text = f"a rule allows to {direction} {topic} after one that denies {by[0][1]}"
                     yield UNREACHABLE.found(name, text, file)
 
 
@@ -307,10 +309,10 @@ UNAUTHENTICATED = FindingKind(
     "governance.unauthenticated",
     ERROR,
     "participants without an identity may join",
-    "They can read and write every topic that no rule controls or protects: on Fast DDS 2.14, "
-    "which refuses the document if whole messages are protected. Fast DDS 2.9 ignores it.",
+    "On Fast DDS 2.14 they can read and write every topic without access control and protection; "
+    "with RTPS protection too, it refuses the document. Fast DDS 2.9 ignores the attribute.",
     f"{_GOVERNANCE} (allow_unauthenticated_participants); measured.",
-    "Set it to false.",
+    "Set allow_unauthenticated_participants to false.",
 )
 NO_JOIN_CONTROL = FindingKind(
     "governance.no-join-control",
@@ -324,8 +326,8 @@ NO_JOIN_CONTROL = FindingKind(
 NO_ACCESS_CONTROL = FindingKind(
     "governance.no-access-control",
     WARNING,
-    "topics that everybody in the domain may read or write",
-    "Permissions are not checked for these topics, so a policy for them does nothing.",
+    "topics that every participant in the domain may read or write",
+    "Permissions are not checked for these topics, so a policy has no effect on them.",
     f"{_GOVERNANCE} (enable_read_access_control, enable_write_access_control).",
     _TEMPLATE,
 )
@@ -340,10 +342,10 @@ NO_ENCRYPTION = FindingKind(
 SIGNED_PAYLOAD = FindingKind(
     "governance.signed-payload",
     WARNING,
-    "topics of which Fast DDS loses messages",
-    "Where the payload is only signed, Fast DDS leaves its padding out of the signature: a message "
-    "whose serialized length is not a multiple of four is not accepted by the reader.",
-    "Fast DDS 2.14.5, measured; corrected in its source in August 2026 (pull request 6498).",
+    "topics whose messages Fast DDS loses",
+    "If the payload is only signed, Fast DDS leaves its padding out of the signature: the reader "
+    "rejects every message whose serialized length is not a multiple of four.",
+    "Fast DDS 2.14.5, measured; fixed in its source in August 2026 (pull request 6498).",
     "Sign the submessage, with the payload in it (data NONE, metadata SIGN), or encrypt (data "
     "ENCRYPT).",
 )
@@ -359,8 +361,7 @@ DISCOVERY_OPEN = FindingKind(
     "governance.discovery-open",
     WARNING,
     "discovery without protection",
-    "Anyone who listens learns every node, topic and type, and anyone who writes can announce "
-    "false ones.",
+    "Anyone in the network can read every node, topic and type, and announce false ones.",
     f"{_GOVERNANCE} (discovery_protection_kind, enable_discovery_protection).",
     _TEMPLATE,
 )
@@ -375,17 +376,17 @@ LIVELINESS_OPEN = FindingKind(
 NO_TOPIC_RULE = FindingKind(
     "governance.no-topic-rule",
     ERROR,
-    "topics for which there is no rule",
+    "topics without a topic rule",
     "If no topic rule matches, the endpoint cannot be created; without a rule for "
     "ros_discovery_info no node of ROS 2 starts.",
     f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
-    "Put a rule for * last.",
+    "Add a rule for * as the last one.",
 )
 UNREACHABLE_TOPIC_RULE = FindingKind(
     "governance.unreachable-rule",
     WARNING,
-    "a topic rule that an earlier one hides",
-    "The first rule that matches a topic decides.",
+    "a topic rule that never applies, because an earlier one matches first",
+    "The first topic rule that matches a topic decides.",
     f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
     "Put narrower rules first, as sros does.",
 )
@@ -393,8 +394,8 @@ GOVERNANCE_DOMAIN_RANGE = FindingKind(
     "governance.domain-range",
     ERROR,
     "a range of domains that vendors read differently",
-    "Without <max> it means a single domain; without <min>, or above 230, Cyclone DDS refuses "
-    "the document.",
+    "Fast DDS and Cyclone DDS read a range without <max> as a single domain. Cyclone DDS refuses "
+    "a range without <min>, and domains above 230.",
     "DDS-Security 1.1, 9.4.1.2; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write <id>, or <min> and <max> up to 230.",
 )
@@ -423,25 +424,25 @@ _OPEN = {
     "enable_discovery_protection": DISCOVERY_OPEN,
     "enable_liveliness_protection": LIVELINESS_OPEN,
 }
-"""The kind of finding for each attribute that by itself protects nothing."""
+"""The kind of finding for each attribute whose open value is a weakness of its own."""
 _SIGNING = (ProtectionKind.SIGN, ProtectionKind.SIGN_WITH_ORIGIN_AUTHENTICATION)
 _NONE = (ProtectionKind.NONE,)
 
 
-def check_governance(enclave: CheckedEnclave, *, alone: bool) -> Iterator[Finding]:
-    """Yield the findings in the governance that an enclave loads.
+def check_governance(enclave: CheckedEnclave, *, only_differing: bool) -> Iterator[Finding]:
+    """Yield findings about the governance that an enclave loads.
 
-    The shared governance is reported once for a keystore, by the first enclave.  With ``alone``,
-    this enclave is not the first, and has its own copy, which may differ.
+    All findings are reported once for a keystore, for the first enclave.  For the other enclaves,
+    ``only_differing`` is true, and only a copy that differs from the shared governance is reported.
     """
     governance = enclave.state.governance
     if governance is None:
         return
     file = enclave.file("governance.p7s")
-    if alone:
+    if only_differing:
         own, common = enclave.state.files["governance.p7s"], enclave.keystore.governance
         if common and own != common and _content(own) != _content(common):
-            text = f"'{file}' is not the governance of the keystore"
+            text = f"'{file}' differs from the governance of the keystore"
             yield DIFFERS.found(enclave.name, text, file)
         return
     yield from governance_findings(enclave.keystore, governance, file)
@@ -450,13 +451,13 @@ def check_governance(enclave: CheckedEnclave, *, alone: bool) -> Iterator[Findin
 def governance_findings(
     keystore: CheckedKeystore, governance: Governance, file: str
 ) -> Iterator[Finding]:
-    """Yield findings about everything a governance document leaves open; ``file`` is its path."""
+    """Yield findings about what a governance document leaves unprotected; ``file`` is its path."""
     domains = governance.domains().closed()
     accepted = keystore.accepts(lambda s: governance == governance_for(s.protection, domains))
     for rule in governance.domain_access_rules:
         subject = f"domain {rule.domains}"
         for kind, text in (*_domain_rule(rule), *_topic_rules(rule)):
-            # A template may choose open topics, but nobody chooses to lose messages.
+            # A template may choose open topics; no template chooses to lose messages.
             chosen = "" if kind is SIGNED_PAYLOAD else accepted
             yield kind.found(subject, text, file, accepted=chosen)
         for problem in _domain_problems(rule.domains):
@@ -464,10 +465,10 @@ def governance_findings(
     yield from _copy(keystore)
 
 
-def _let_in(rule: DomainRule) -> str:
+def _reach_of_unauthenticated(rule: DomainRule) -> str:
     """Describe what unauthenticated participants can do on Fast DDS 2.14, which admits them."""
     if rule.rtps_protection_kind is not ProtectionKind.NONE:
-        return "with protected RTPS messages Fast DDS 2.14 refuses the document"
+        return "Fast DDS 2.14 refuses the document, because it also protects RTPS messages"
     hidden = rule.discovery_protection_kind is not ProtectionKind.NONE
     opened = [
         each.topic_expression
@@ -478,18 +479,18 @@ def _let_in(rule: DomainRule) -> str:
         and each.data_protection_kind is ProtectionKind.NONE
     ]
     if not opened:
-        return "every topic is controlled or protected, so on Fast DDS they reach none"
-    return f"on Fast DDS 2.14 anybody reads and writes {', '.join(opened[:3])}"
+        return "on Fast DDS 2.14 they reach no topic, because all are controlled or protected"
+    return f"on Fast DDS 2.14 anybody can read and write {', '.join(opened[:3])}"
 
 
 def _domain_rule(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
     for each, text in _open_attributes(rule):
-        reason = f": {_let_in(rule)}" if _OPEN[each] is UNAUTHENTICATED else ""
+        reason = f": {_reach_of_unauthenticated(rule)}" if _OPEN[each] is UNAUTHENTICATED else ""
         yield _OPEN[each], f"{text}{reason}"
 
 
 def _open_attributes(rule: DomainRule | TopicRule) -> Iterator[tuple[str, str]]:
-    """Yield the attributes that protect nothing and have their own kind of finding, in words."""
+    """Yield the name and a description of each attribute of `_OPEN` with an open value."""
     for each in attributes(type(rule)):
         if each.name in _OPEN and each.is_open(rule):
             yield (
@@ -501,16 +502,16 @@ def _open_attributes(rule: DomainRule | TopicRule) -> Iterator[tuple[str, str]]:
 def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
     expressions = [each.topic_expression for each in rule.topic_access_rules]
     if not any(covers(each, "ros_discovery_info") for each in expressions):
-        yield NO_TOPIC_RULE, "none matches ros_discovery_info"
+        yield NO_TOPIC_RULE, "no topic rule matches ros_discovery_info"
     elif "*" not in expressions:
-        yield NO_TOPIC_RULE, "none is for *"
+        yield NO_TOPIC_RULE, "there is no rule for *"
     for index, topic in enumerate(rule.topic_access_rules):
         yield from _topic_rule(rule, topic)
         hiding = next((e for e in expressions[:index] if covers(e, topic.topic_expression)), None)
         if hiding is not None:
             yield (
                 UNREACHABLE_TOPIC_RULE,
-                f"the rule for {topic.topic_expression} stands behind that for {hiding}",
+                f"the rule for {hiding} stands before the rule for {topic.topic_expression}",
             )
 
 
@@ -525,16 +526,16 @@ def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[FindingKin
         if not controlled
     ]
     if open_for:
-        yield NO_ACCESS_CONTROL, f"everybody may {' and '.join(open_for)} {name}"
+        yield NO_ACCESS_CONTROL, f"every participant may {' and '.join(open_for)} {name}"
     levels = (
         rule.rtps_protection_kind,
         topic.metadata_protection_kind,
         topic.data_protection_kind,
     )
     if all(level in _NONE for level in levels):
-        yield NOT_AUTHENTIC, f"nothing protects {name}"
+        yield NOT_AUTHENTIC, f"messages of {name} are neither signed nor encrypted"
     elif all(level in (*_NONE, *_SIGNING) for level in levels):
-        yield NO_ENCRYPTION, f"{name} is signed only"
+        yield NO_ENCRYPTION, f"messages of {name} are only signed"
     if topic.data_protection_kind in _SIGNING:
         yield SIGNED_PAYLOAD, f"data_protection_kind is {topic.data_protection_kind} for {name}"
     for each, text in _open_attributes(topic):
@@ -544,7 +545,7 @@ def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[FindingKin
 def _copy(keystore: CheckedKeystore) -> Iterator[Finding]:
     xml, signed = keystore.root / GOVERNANCE_XML, keystore.governance
     if signed and xml.is_file() and plain_file(xml) != _content(signed):
-        text = "governance.xml is not what governance.p7s holds"
+        text = "governance.xml differs from the content of governance.p7s"
         yield XML_DIFFERS.found("governance", text, str(xml))
 
 
@@ -566,15 +567,15 @@ DIFFER = FindingKind(
     "vendor.",
 )
 
-_UNHEARD_OF = "rt/sros_nobody_has_this"
+_UNNAMED_TOPIC = "rt/sros_nobody_has_this"
 _SHOWN = 3
 
 
 def check_vendors(enclave: CheckedEnclave, *, outside: bool) -> Iterator[Finding]:
-    """Ask every vendor about every topic that the permissions name.
+    """Yield a finding if vendors decide differently on a topic that the permissions name.
 
-    Vendors decide alike on a document as sros writes it, without anything ``outside`` of the
-    portable profile.  They are not asked about such a document, because that takes long.
+    Vendors decide alike on a document as sros writes it, with nothing ``outside`` of the portable
+    profile.  Such a document is skipped, because deciding every topic takes long.
     """
     state = enclave.state
     if not (state.certificate and state.governance and state.permissions_document):
@@ -637,7 +638,7 @@ def _topics_to_ask(enclave: CheckedEnclave) -> list[str]:
         for criteria in (*rule.publish, *rule.subscribe):
             for topic in criteria.topics:
                 named[_example(topic)] = None
-    return [*named, _UNHEARD_OF]
+    return [*named, _UNNAMED_TOPIC]
 
 
 def _example(expression: str) -> str:

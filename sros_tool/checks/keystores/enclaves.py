@@ -9,7 +9,7 @@ from shlex import quote
 
 from cryptography import x509
 
-from sros_tool.checks.keystores.authorities import key_findings, one_for_both
+from sros_tool.checks.keystores.authorities import key_findings, shared_ca_findings
 from sros_tool.checks.keystores.opened import CheckedEnclave
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, by_id
 from sros_tool.dds.permissions import Grant
@@ -21,7 +21,7 @@ from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
 from sros_tool.xml import read_bytes
 
 _NOT_LOADABLE = "enclave.not-loadable"
-"""The id that stands for all faults in `--include` and `--exclude`."""
+"""The group id of all faults, for `--include` and `--exclude`."""
 
 _LOADING_KINDS = by_id(
     *(
@@ -41,9 +41,9 @@ _LOADING_KINDS = by_id(
 
 
 def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """Yield every problem of an enclave.
+    """Yield a finding for every fault that keeps a process from loading the enclave.
 
-    In the keystore itself, a key that stays on its robot is not a problem.
+    In the keystore itself, it is no fault that a key is only on its robot.
     """
     state = enclave.state
     for problem in state.problems_at_home if enclave.keystore.is_home else state.problems:
@@ -64,7 +64,7 @@ EXPIRES_SOON = FindingKind(
     "enclave.ends-soon",
     WARNING,
     "a certificate or permissions that expire soon",
-    "After that the node no longer starts; on Cyclone DDS a running node stops.",
+    "Once they expire, the node no longer starts; on Cyclone DDS a running node stops.",
     "Fast DDS 2.14.5 (at start), Cyclone DDS 0.10.2 (timer).",
     "Run `sros renew ROOT NAME`, and export the enclave again.",
 )
@@ -72,59 +72,59 @@ OUTLIVES_CA = FindingKind(
     "enclave.outlives-ca",
     WARNING,
     "a certificate that is valid for longer than its CA",
-    "It expires with the CA, whatever its own dates say.",
+    "Once the CA expires, DDS refuses the certificate, whatever its own dates are.",
     "RFC 5280, 6.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2 verify the CA too.",
-    "Plan by the expiry of the CA, or renew the enclave after `sros rotate_ca`.",
+    "Plan with the expiry of the CA, or renew the enclave after `sros rotate_ca`.",
 )
 PERMISSIONS_OUTLIVE = FindingKind(
     "enclave.permissions-outlive",
     WARNING,
     "permissions that are valid for longer than the certificate",
-    "They can be used with a later certificate of the same subject, even if its rights were "
+    "They can be used with a later certificate of the same subject, even if its rights have "
     "changed since.",
     "ros2/sros2 issue 275; DDS-Security 1.1, 9.4.1.3.",
-    "Run `sros renew ROOT NAME`, which signs them for the life of the certificate at most.",
+    "Run `sros renew ROOT NAME`, which signs permissions that expire with the certificate at the "
+    "latest.",
 )
 NAME_MISMATCH = FindingKind(
     "enclave.name-mismatch",
     WARNING,
     "a certificate with the name of another enclave",
-    "DDS does not check the folder of a certificate. The files of two enclaves were mixed up, and "
-    "the node has the rights of the other enclave.",
+    "The files of two enclaves were probably mixed up. DDS does not compare the subject with the "
+    "folder, so the node has the rights of the other enclave.",
     "rcl 9 (security.c); ros2/sros2 (CN is the name of the enclave).",
-    "Restore the files of this enclave, or make it again.",
+    "Restore the files of this enclave, or create it again.",
 )
 IS_A_CA = FindingKind(
     "enclave.certificate-is-ca",
     ERROR,
-    "an enclave whose certificate may issue others",
+    "an enclave whose certificate may issue certificates",
     "Anyone who has its key can issue identities that every node accepts.",
     "RFC 5280, 4.2.1.9.",
-    "Revoke it, and make the enclave again.",
+    "Revoke it, and create the enclave again.",
 )
 NOT_UNIQUE = FindingKind(
     "enclave.subject-not-unique",
     WARNING,
-    "a subject without its unique part",
-    "The keystore gives every certificate such a part, so that neither permissions of another "
-    "enclave nor earlier permissions match it; this certificate is older, or comes from another "
-    "source.",
+    "a subject without the unique part that the keystore adds",
+    "The keystore adds a unique part to every subject, so that neither permissions of another "
+    "enclave nor earlier permissions match it. This certificate is older, or was issued elsewhere.",
     "Cyclone DDS 0.10.2 (subsets of subjects); ros2/sros2 issue 275; measured on both vendors.",
     "Run `sros renew ROOT NAME`.",
 )
 LONG_PERMISSIONS = FindingKind(
     "enclave.long-permissions",
     WARNING,
-    "permissions for years, for a subject that stays the same",
+    "permissions that are valid for years, for a subject that never changes",
     "Replaced permissions stay valid until they expire, for anyone who kept a copy.",
     "ros2/sros2 issue 275; DDS-Security 1.1, 9.4.1.3 (there is no revocation of permissions).",
-    "Use the template production, whose subjects change with every renewal, or shorter ones.",
+    "Use the template production, whose subjects change with every renewal, or a shorter validity.",
 )
 EVERYTHING = FindingKind(
     "keystore.allow-everything",
     WARNING,
     "an enclave that may do everything",
-    "It is authenticated and encrypted, but can still command every node.",
+    "Its messages are authenticated and encrypted, but it can command every node.",
     "ros2/sros2 0.13 grants this to every enclave without a policy.",
     "Give it a policy, with `sros create_permission ROOT NAME POLICY_FILE`.",
 )
@@ -140,17 +140,18 @@ CRL_MISSING = FindingKind(
     "enclave.crl-missing",
     ERROR,
     "an enclave without the revocation list of its keystore",
-    "Its node continues to talk to revoked enclaves.",
+    "Its node continues to communicate with revoked enclaves.",
     "rmw_dds_common (crl.pem), since 2021.",
     "Run `sros crl ROOT --refresh`, and export the enclave again.",
 )
 WAITS = FindingKind(
     "enclave.waits-for-answer",
     NOTE,
-    "an enclave whose signing request is not answered yet",
-    "It has a key but no certificate.",
+    "an enclave whose signing request has no answer yet",
+    "The enclave has a key but no certificate.",
     "sros: create_request, sign_request, import.",
-    "Answer it with `sros sign_request`, and put the answer in place with `sros import`.",
+    "Answer the request with `sros sign_request`, and put the answer into the enclave with `sros "
+    "import`.",
 )
 
 _SOON = timedelta(days=30)
@@ -159,7 +160,7 @@ _EVERY_TOPIC = frozenset({"*", "rt/*"})
 
 
 def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """Yield the findings in a single enclave."""
+    """Yield the findings about a single enclave."""
     if waits_for_answer(enclave.folder):
         yield WAITS.found(enclave.name, "its certificate is missing", enclave.file(REQUEST))
         return
@@ -174,7 +175,7 @@ def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
     if not enclave.keystore.is_home and state.identity_ca and state.permissions_ca:
         file = enclave.file("identity_ca.cert.pem")
         cas = (state.identity_ca, state.permissions_ca)
-        yield from one_for_both(enclave.keystore, *cas, file)
+        yield from shared_ca_findings(enclave.keystore, *cas, file)
     yield from _copies(enclave)
 
 
@@ -189,7 +190,7 @@ def grant_of(enclave: CheckedEnclave) -> Grant | None:
 def _certificate(enclave: CheckedEnclave, certificate: x509.Certificate) -> Iterator[Finding]:
     name, file = enclave.name, enclave.file("cert.pem")
     if common_name_of(certificate.subject) != name:
-        text = f"it is of {subject_text(certificate.subject)}"
+        text = f"its subject is {subject_text(certificate.subject)}"
         yield NAME_MISMATCH.found(name, text, file)
     yield from key_findings(certificate, name, file)
     for extension in certificate.extensions:
@@ -199,12 +200,13 @@ def _certificate(enclave: CheckedEnclave, certificate: x509.Certificate) -> Iter
     ca = enclave.state.identity_ca
     if ca and certificate.not_valid_after_utc > ca.not_valid_after_utc:
         text = (
-            f"it says {iso(certificate.not_valid_after_utc)}, the CA {iso(ca.not_valid_after_utc)}"
+            f"it expires at {iso(certificate.not_valid_after_utc)}, its CA at "
+            f"{iso(ca.not_valid_after_utc)}"
         )
         yield OUTLIVES_CA.found(name, text, file)
     settings = enclave.keystore.settings
     if settings and settings.unique_subject and len(certificate.subject.rdns) < 2:
-        text = f"it is for {subject_text(certificate.subject)} alone"
+        text = f"its subject is only {subject_text(certificate.subject)}"
         yield NOT_UNIQUE.found(name, text, file)
 
 
@@ -227,7 +229,7 @@ def _expiry(
 
 
 def _expires_soon(window: Window, now: datetime) -> bool:
-    """Return whether it expires in 30 days, or is in the last third of a validity under 90 days."""
+    """Return whether ``window`` ends in 30 days, or has a third left if under 90 days long."""
     return window.not_after - now < min(_SOON, (window.not_after - window.not_before) / 3)
 
 
@@ -243,7 +245,7 @@ def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
     ]
     if all(wide) or (grant.default_allow and not any(not rule.allow for rule in grant.rules)):
         accepted = keystore.accepts(lambda s: s.default_permissions == "everything")
-        text = "it may publish and subscribe every topic"
+        text = "the permissions allow publishing and subscribing every topic"
         yield EVERYTHING.found(enclave.name, text, file, accepted=accepted)
     unique = "," in grant.subject or "+" in grant.subject
     window = grant.validity
@@ -255,14 +257,14 @@ def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
 
 
 def _is_as_long(chosen: Span, length: timedelta) -> bool:
-    """Return whether the keystore's template chose this validity, such as a fixed expiry."""
+    """Return whether the template's validity allows ``length``; a fixed expiry always does."""
     return not isinstance(chosen, timedelta) or length <= chosen + BACKDATE
 
 
 def _copies(enclave: CheckedEnclave) -> Iterator[Finding]:
     xml, signed = enclave.folder / "permissions.xml", enclave.state.permissions_document
     if signed and xml.is_file() and plain_file(xml) != plain(signed):
-        text = "permissions.xml is not what permissions.p7s holds"
+        text = "permissions.xml differs from the content of permissions.p7s"
         yield XML_DIFFERS.found(enclave.name, text, enclave.file("permissions.xml"))
     if enclave.keystore.crl and not (enclave.folder / "crl.pem").exists():
         text = "crl.pem is missing"

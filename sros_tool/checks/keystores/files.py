@@ -1,4 +1,4 @@
-"""Checks of a keystore's files: modes, links, and files that do not belong there."""
+"""Checks of a keystore's files: modes, links, and misplaced files."""
 
 from __future__ import annotations
 
@@ -31,16 +31,15 @@ KEY_READABLE = FindingKind(
     ERROR,
     "a private key that others can read",
     "Anyone who can read it can act as that enclave, or with a CA key as any enclave. Neither rcl "
-    "nor DDS looks "
-    "at modes, and ros2/sros2 makes keys with 0644.",
+    "nor DDS checks modes, and ros2/sros2 creates keys with mode 0644.",
     "ros2/sros2 0.13; rcl 9, Fast DDS 2.14.5 and Cyclone DDS 0.10.2 check no modes.",
-    "Run `chmod 600` on it. If others had access, revoke the enclave.",
+    "Run `chmod 600` on the key. If others had access, revoke the enclave.",
 )
 WORLD_WRITABLE = FindingKind(
     "keystore.world-writable",
     ERROR,
     "a file or folder that everybody can change",
-    "Anyone who can replace CA certificates, links or documents decides whom a node trusts.",
+    "Whoever can replace CA certificates, links or documents decides whom a node trusts.",
     "POSIX modes; CWE-732.",
     "Run `chmod o-w` on it.",
 )
@@ -48,7 +47,7 @@ FOLDER_OPEN = FindingKind(
     "keystore.folder-open",
     WARNING,
     "a folder of keys that others may enter",
-    "If any tool writes a key there with a too permissive mode, others can read it at once.",
+    "If a tool writes a key there with a too permissive mode, others can read it at once.",
     "ros2/sros2 0.13 makes private/ with 0755; sros with 0700.",
     "Run `chmod 700` on it.",
 )
@@ -72,7 +71,8 @@ LINK_OUTSIDE = FindingKind(
     "keystore.link-outside",
     WARNING,
     "a link to a file outside of the keystore",
-    "The file is not copied or backed up with the keystore, and its owner there can change it.",
+    "The file is not copied or backed up with the keystore, and whoever may write it there can "
+    "change it.",
     "CWE-59.",
     "Put the file itself into the keystore.",
 )
@@ -80,15 +80,16 @@ INTERRUPTED = FindingKind(
     "keystore.transaction-left",
     WARNING,
     "a write that was interrupted",
-    "DDS still loads a complete set of files, old or new; the next verb that writes does the rest.",
+    "DDS still loads a complete set of files, old or new. The next verb that writes completes or "
+    "undoes the change.",
     "sros: keystore/transaction.py.",
-    "Run any verb of sros that writes, such as `sros create_enclave`; it completes or undoes it.",
+    "Run any verb of sros that writes, such as `sros create_enclave`.",
 )
 STRAY_KEY = FindingKind(
     "keystore.stray-key",
     WARNING,
     "a private key where none belongs",
-    "It is a copy, perhaps from a backup, that nobody maintains.",
+    "It is perhaps a copy from a backup. No verb of sros protects, renews or removes it.",
     "ROS 2 keystore layout: private/*.pem and enclaves/*/key.pem only.",
     "Move it to a safe place, or delete it.",
 )
@@ -96,15 +97,15 @@ CA_KEY_ON_ROBOT = FindingKind(
     "keystore.ca-key-on-robot",
     ERROR,
     "a CA key in an export for a robot",
-    "An attacker on the robot can make any enclave, with any rights.",
+    "An attacker on the robot can create any enclave, with any rights.",
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
-    "Delete it there; if others had access, replace the CA (`sros rotate_ca`).",
+    "Delete the key there; if others had access, replace the CA (`sros rotate_ca`).",
 )
 UNKNOWN_FILE = FindingKind(
     "keystore.unknown-file",
     NOTE,
     "a file that is not part of a keystore",
-    "It is a leftover or a note; nothing reads it.",
+    "Neither ROS 2 nor sros reads the file.",
     "ROS 2 keystore layout.",
     "Delete it, or keep it elsewhere.",
 )
@@ -124,7 +125,7 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
 
     Args:
         keystore: the keystore.
-        names: the enclaves whose folders are looked at; None for the whole keystore.
+        names: the enclaves whose folders are checked; None for the whole keystore.
     """
     root = os.fspath(keystore.root)
     links = _Links(root)
@@ -144,7 +145,7 @@ def _below(start: str, keystore: CheckedKeystore, links: _Links) -> Iterator[Fin
         folders.sort()
         if STAGE in folders:
             folders.remove(STAGE)
-            text = "an interrupted transaction waits to be completed or undone"
+            text = "an interrupted change is neither completed nor undone"
             yield INTERRUPTED.found(root, text, os.path.join(parent, STAGE))
         for name in folders:
             yield from _folder(os.path.join(parent, name), root, home, links)
@@ -171,7 +172,7 @@ def _folder(path: str, root: str, home: bool, links: _Links) -> Iterator[Finding
         return
     yield from _mode(path, mode)
     inside = Path(path).relative_to(root)
-    # Below a closed top folder nobody gets in.
+    # Others cannot enter what is below a closed top folder.
     asked = inside.parts[0] in _KEY_FOLDERS and (len(inside.parts) == 1 or not home)
     if asked and mode & 0o077 and not mode & stat.S_IWOTH:
         yield FOLDER_OPEN.found(path, f"its mode is {stat.S_IMODE(mode):04o}", path)
@@ -189,17 +190,17 @@ def _key_mode(path: str, mode: int) -> Iterator[Finding]:
 
 
 class _Links:
-    """Resolves links; most lead into one of few folders, whose real paths are cached."""
+    """The checks of links; the real paths of their targets' folders are cached."""
 
     def __init__(self, root: str) -> None:
         self._real_root = os.path.realpath(root)
         self._folders: dict[Path, str] = {}
 
     def check(self, link: Path) -> Iterator[Finding]:
-        """Yield the findings about one link."""
+        """Yield findings about one link."""
         target, shown = link.readlink(), str(link)
         if not link.exists():
-            # A missing file that an enclave needs is a finding of the enclave.
+            # `check_enclave` reports a missing file that an enclave needs.
             if not (link.name in REQUIRED_FILES and ENCLAVES in link.parts):
                 yield LINK_DANGLING.found(shown, f"it leads to '{target}'", shown)
             return
@@ -212,7 +213,7 @@ class _Links:
     def _end_of(self, link: Path, target: Path) -> str:
         """Return the real path that a link leads to.
 
-        The folder of the link is a real one, so its path can be shortened before it is followed.
+        The folder of ``link`` contains no link, so ".." in the path can be removed first.
         """
         end = Path(os.path.normpath(link.parent / target))
         if end.is_symlink():
@@ -223,17 +224,17 @@ class _Links:
 
 
 def _other(path: str, inside: str, info: os.stat_result, home: bool) -> Iterator[Finding]:
-    """Yield findings about a file outside of enclaves, such as a misplaced key."""
+    """Yield findings about a file that is not one of an enclave, such as a misplaced key."""
     place = inside.partition(os.sep)[0]
     if info.st_size <= _MOST_READ and _holds_key(path):
         yield from _key_mode(path, info.st_mode)
         if place in (PRIVATE, REVOKED, RETIRED) and home:
             return
         if place == PRIVATE or not home:
-            text = "a private key that belongs to no enclave"
+            text = "it contains a private key that belongs to no enclave"
             yield CA_KEY_ON_ROBOT.found(path, text, path)
         else:
-            yield STRAY_KEY.found(path, "a private key out of place", path)
+            yield STRAY_KEY.found(path, "it contains a private key", path)
         return
     name = Path(path).name
     known = (
@@ -243,7 +244,7 @@ def _other(path: str, inside: str, info: os.stat_result, home: bool) -> Iterator
         or place == RETIRED
     )
     if not known:
-        yield UNKNOWN_FILE.found(path, "neither ROS 2 nor sros has a file of this name there", path)
+        yield UNKNOWN_FILE.found(path, "neither ROS 2 nor sros uses this name there", path)
 
 
 def _holds_key(path: str) -> bool:

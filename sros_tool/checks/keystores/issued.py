@@ -1,4 +1,4 @@
-"""Checks of all enclaves together: against each other, the ledger, and the policies."""
+"""Checks that compare enclaves with each other, with the ledger, and with policies."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SERIAL_TWICE = FindingKind(
     "keystore.serial-twice",
     ERROR,
     "two certificates of one CA with the same serial number",
-    "Revoking one revokes the other.",
+    "A revocation list names serial numbers, so revoking one revokes the other.",
     "RFC 5280, 4.1.2.2.",
     "Run `sros renew ROOT NAME` for one of them.",
 )
@@ -35,7 +35,7 @@ KEY_TWICE = FindingKind(
     "keystore.key-twice",
     ERROR,
     "two enclaves with the same key",
-    "Each of them can act as the other.",
+    "Each enclave can act as the other.",
     "RFC 5280, 4.1.2.6 (the subject is the holder of the key); DDS-Security 1.1, 9.3.",
     "Run `sros renew ROOT NAME --new-key` for one of them.",
 )
@@ -45,7 +45,8 @@ UNEXPLAINED = FindingKind(
     "a certificate or document that the keystore never issued",
     "It came from another source, or the ledger was reset to an earlier state.",
     "sros: ledger.jsonl.",
-    "Find out where it comes from; `sros renew ROOT NAME` issues both again.",
+    "Find out where it comes from; `sros renew ROOT NAME` issues certificate and permissions "
+    "again.",
 )
 OLD_PERMISSIONS = FindingKind(
     "enclave.old-permissions",
@@ -61,16 +62,17 @@ STALE = FindingKind(
     "enclave.stale-permissions",
     WARNING,
     "permissions that differ from the policy",
-    "The policy was changed and not signed since, or the permissions were made from another "
+    "The policy was changed and not signed again, or the permissions were made from another "
     "policy.",
-    "sros: the rights of both, in ROS terms.",
-    "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`; `sros diff_policy` shows all.",
+    "sros: the rights of policy and permissions, in ROS terms.",
+    "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`; `sros diff_policy` shows all "
+    "differences.",
 )
 NOT_IN_POLICY = FindingKind(
     "enclave.not-in-policy",
     NOTE,
     "an enclave that no policy names",
-    "Its rights cannot be compared with anything.",
+    "Its permissions cannot be compared with a policy.",
     "sros: --policy.",
     "Write a policy for it, or revoke it if nobody needs it.",
 )
@@ -78,7 +80,7 @@ NOT_IN_KEYSTORE = FindingKind(
     "keystore.enclave-missing",
     WARNING,
     "an enclave of the policy that the keystore does not have",
-    "A node that is started in it fails.",
+    "A node that starts in this enclave fails.",
     "rcl 9 (security.c).",
     "Run `sros generate_artifacts -k ROOT -p POLICY_FILE`.",
 )
@@ -87,9 +89,9 @@ AUTHORITIES_DIFFER = FindingKind(
     "keystore.authorities-differ",
     ERROR,
     "enclaves that do not trust the same CAs",
-    "Their nodes never talk to each other, and neither Fast DDS nor Cyclone DDS reports why.",
+    "Their nodes never communicate, and neither Fast DDS nor Cyclone DDS reports why.",
     "DDS-Security 1.1, 9.3; Fast DDS 2.9.1, Cyclone DDS 0.10.2; measured.",
-    "Export the enclave again from the keystore of the others, or make it again there.",
+    "Export the enclave again from the keystore of the other enclaves, or create it again there.",
 )
 
 _Key = TypeVar("_Key")
@@ -101,7 +103,7 @@ _AUTHORITY_FILES = (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE)
 
 @dataclass(frozen=True, slots=True)
 class EnclaveSummary:
-    """The summary of an enclave for comparison: small, as it is passed between processes."""
+    """The digests and names of an enclave to compare; small, to be passed between processes."""
 
     name: str
     serial: int
@@ -150,17 +152,17 @@ def _trusted(data: bytes) -> frozenset[str]:
 def check_issued(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
-    """Yield the findings in all enclaves together."""
+    """Yield findings that compare enclaves with each other, the ledger and the policies."""
     for (_, serial), names in _twice(((t.issuer, t.serial), t.name) for t in summaries):
         yield SERIAL_TWICE.found(", ".join(names), f"the serial number is {serial:x}")
     for _, names in _twice((each.key, each.name) for each in summaries):
-        yield KEY_TWICE.found(", ".join(names), "their certificates are for one key")
-    # A unique part in the subject keeps it from matching another one.
+        yield KEY_TWICE.found(", ".join(names), "their certificates have the same public key")
+    # A subject with a unique part matches no other one.
     plain = {each.name for each in summaries if not each.unique}
     names = [each.name for each in summaries]
     pairs = [(inner, outer) for inner, outer in mistaken_names(names) if inner in plain]
     if pairs:
-        text = f"Cyclone DDS takes {some_pairs(pairs)}"
+        text = f"Cyclone DDS mistakes {some_pairs(pairs)}"
         yield ENCLAVE_NAMES.found(pairs[0][0], text, str(keystore.root))
     yield from _trust(keystore, summaries)
     yield from _exported_governance(keystore, summaries)
@@ -179,30 +181,31 @@ def _twice(pairs: Iterable[tuple[_Key, str]]) -> Iterator[tuple[_Key, list[str]]
 
 
 def _trust(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:
-    """Yield enclaves without a common CA; during a rotation each trusts the old and the new.
+    """Yield findings about enclaves that have no CA in common with the keystore.
 
-    The CAs of the keystore are the right ones; in an export, the CAs of most enclaves are.
+    In an export, the CAs of most enclaves count instead.  During a rotation an enclave trusts the
+    old and the new CA, so one common CA is enough.
     """
     for index, (role, file) in enumerate(zip(ROLES, _AUTHORITY_FILES, strict=True)):
         everyone = [each for each in summaries if each.trusted[index]]
         if not everyone:
             continue
         usual, _ = Counter(each.trusted[index] for each in everyone).most_common(1)[0]
-        others = "the others"
+        others = "most other enclaves"
         if chain := keystore.authorities.get(role):
             usual = frozenset(each.fingerprint(hashes.SHA256()).hex() for each in chain)
             others = "the keystore"
         for each in everyone:
             if not each.trusted[index] & usual:
                 place = f"{keystore.root}/{enclave_folder(each.name)}/{file}"
-                text = f"{file} was issued by another CA than {others} have"
+                text = f"{file} contains another CA than {others}"
                 yield AUTHORITIES_DIFFER.found(each.name, text, place)
 
 
 def _exported_governance(
     keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]
 ) -> Iterator[Finding]:
-    """Yield exported enclaves whose copy of the governance differs from the others."""
+    """Yield findings about exported enclaves whose governance differs from the first one's."""
     copies = [each for each in summaries if each.governance]
     for each in copies[1:]:
         if each.governance != copies[0].governance:

@@ -1,4 +1,4 @@
-"""All checks of a keystore, its enclaves divided among all cores."""
+"""All checks of a keystore; its enclaves are checked on all cores in parallel."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from sros_tool.policy.rights import Right
 
 _NAMES_SHOWN = 3
 _OF_THE_KEYSTORE = frozenset({EVERYTHING.id, LONG_PERMISSIONS.id})
-"""Kinds that apply to all enclaves because of the choices of their keystore."""
+"""Ids of the kinds that follow from a choice of the keystore, and so affect all enclaves."""
 
 
 def keystore_findings(
@@ -61,7 +61,7 @@ def keystore_findings(
         zone: the time zone of the host on which its enclaves run.
         domain: the ROS domain that its enclaves have to join.
         policies: policies with which its permissions are compared.
-        only: the enclaves to look at; None for all, and the keystore itself.
+        only: the enclaves to check; None for all of them and the keystore itself.
         on_robot: whether it is on a robot, where no CA key may be.
 
     Raises:
@@ -80,7 +80,7 @@ def keystore_findings(
         for name in share:
             state = open_enclave(enclave_path(root, name), now=now, domain=domain)
             enclave = CheckedEnclave(keystore, name, state)
-            found += _enclave_findings(enclave, wanted, alone=name != first)
+            found += _enclave_findings(enclave, wanted, only_differing=name != first)
             if each := summary_of(enclave):
                 issued.append(each)
         return found, issued
@@ -101,19 +101,19 @@ def keystore_findings(
 
 
 def _enclave_findings(
-    enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]], *, alone: bool
+    enclave: CheckedEnclave, wanted: dict[str, frozenset[Right]], *, only_differing: bool
 ) -> Iterator[Finding]:
     """Yield all findings in one enclave."""
     yield from check_enclave(enclave)
     documents = list(check_documents(enclave))
     yield from documents
-    yield from check_governance(enclave, alone=alone)
+    yield from check_governance(enclave, only_differing=only_differing)
     yield from check_vendors(enclave, outside=bool(documents))
     yield from check_policy(enclave, wanted)
 
 
 def joined(findings: Sequence[Finding]) -> list[Finding]:
-    """Return ``findings`` without repetitions for a shared file or the same choice."""
+    """Join the findings that several enclaves have because of a shared file or the same choice."""
     together: dict[tuple[object, ...], list[Finding]] = {}
     for each in findings:
         one = each.accepted or each.id in _OF_THE_KEYSTORE
@@ -124,7 +124,7 @@ def joined(findings: Sequence[Finding]) -> list[Finding]:
 
 def _governance_alone(keystore: CheckedKeystore) -> Iterator[Finding]:
     """Yield the findings in the governance of a keystore that has no enclave yet."""
-    with suppress(SrosError):  # making an enclave reports it
+    with suppress(SrosError):  # `sros create_enclave` reports it
         document = smime.parse(keystore.governance).document
         governance = parse_governance(document, GOVERNANCE_P7S)
         yield from governance_findings(keystore, governance, keystore.shown(GOVERNANCE_P7S))

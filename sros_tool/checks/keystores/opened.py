@@ -44,10 +44,9 @@ class CheckedKeystore:
     """A keystore, or the part of one that was exported for a robot, as it is checked.
 
     ``settings`` are None if ros2/sros2 made it.  ``authorities`` maps a role to the certificates of
-    its CA file, the issuing one first.  ``governance`` are the bytes of the document that its
-    enclaves share, if there is one.  Without ``is_home`` it is on a robot, where no CA key may be.
-    ``policies`` are compared with its permissions; ``zone`` is the time zone of the host on which
-    its enclaves run.
+    its CA file, the issuing one first.  ``governance`` is the signed document that its enclaves
+    share, or b"".  ``is_home`` is false on a robot, where no CA key may be.  ``policies`` are
+    compared with its permissions; ``zone`` is the time zone of the host on which its enclaves run.
     """
 
     root: Path
@@ -64,9 +63,10 @@ class CheckedKeystore:
     is_home: bool = True
 
     def accepts(self, chosen: Callable[[Template], bool]) -> str:
-        """Return the name of the template, or exporting keystore, that accepts ``chosen``.
+        """Return what accepts a weakness (template or exporting keystore), or "" if nothing does.
 
-        "" if the settings do not accept it, or if there are no settings (ros2/sros2).
+        ``chosen`` returns whether the settings chose the weakness.  Without settings (ros2/sros2)
+        nothing accepts it.
         """
         if self.settings:
             return f"template {self.settings.name}" if chosen(self.settings) else ""
@@ -107,10 +107,10 @@ def read_keystore(
 
     Args:
         root: the keystore, or an export of it.
-        now: the moment for which it is checked.
+        now: the moment to check for.
         zone: the time zone of the host on which its enclaves run.
         policies: policies with which its permissions are compared.
-        on_robot: whether it lies on a robot, whatever it holds.
+        on_robot: whether it is on a robot, even if it contains CA keys.
 
     Raises:
         KeystoreError: ``root`` is no keystore.

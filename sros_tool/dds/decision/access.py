@@ -2,7 +2,7 @@
 
 A decision chooses the grant of the subject (`_choose_grant`), takes its rules for the domain
 (`_rules_for`), applies them to a topic (`_GrantRules`), and combines the result with the access
-control that the governance asks for (`_GovernedDomain`, `_decide_join`, `Access`).
+control that the governance requires (`_GovernedDomain`, `_decide_join`, `Access`).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 def _choose_grant(
     traits: VendorTraits, permissions: Permissions, subject: str, *, at: datetime, zone: tzinfo
 ) -> int | Refusal:
-    """Return the index of the grant, or why there is none."""
+    """Return the index of the grant that decides, or a refusal if there is none."""
     now = at.timestamp()
     outdated: Refusal | None = None
     certified = escaped(subject) if traits.escapes_subjects else subject
@@ -41,7 +41,7 @@ def _choose_grant(
         _state(traits, index, grant, now, zone) for index, grant in enumerate(permissions.grants)
     ]
     for state in states:
-        if state and state.reason == "malformed":  # of whomever it is
+        if state and state.reason == "malformed":  # even if the grant is for another subject
             return state
     for index, (grant, state) in enumerate(zip(permissions.grants, states, strict=True)):
         granted = grant.subject.strip() if traits.trims_texts else grant.subject
@@ -60,19 +60,19 @@ def _choose_grant(
 def _state(
     traits: VendorTraits, index: int, grant: Grant, now: float, zone: tzinfo
 ) -> Refusal | None:
-    """Return why the grant does not hold now; None if it holds."""
+    """Return the reason why the grant is not valid now, or None if it is valid."""
     begin = read_moment(traits.moments, grant.not_before, zone)
     end = read_moment(traits.moments, grant.not_after, zone)
     name = f"grant {grant.name!r}" if grant.name else f"grant {index + 1}"
     if begin is None or end is None:
         wrong = grant.not_before if begin is None else grant.not_after
         return Refusal("malformed", f"{traits.title} cannot read the date {wrong!r} of {name}.")
-    how = ", which it reads in the host's local time" if traits.moments is Moments.LOCAL else ""
+    how = " (read in the host's local time)" if traits.moments is Moments.LOCAL else ""
     # Fast DDS counts whole seconds and includes both ends; Cyclone DDS excludes them.
     strict = traits.moments is Moments.CYCLONE
     if now < begin or (strict and now == begin):
         return Refusal(
-            "not-yet-valid", f"{traits.title}: {name} begins at {grant.not_before}{how}."
+            "not-yet-valid", f"{traits.title}: {name} is valid only from {grant.not_before}{how}."
         )
     seconds = int(now) if traits.moments is Moments.LOCAL else now
     if seconds > end or (strict and now == end):
@@ -81,7 +81,7 @@ def _state(
 
 
 def holds_for(rule: OpenRange, domains: DomainSet, domain: int) -> bool | None:
-    """Return whether ``domain`` is in ``domains``; None if the vendor crashes over the answer."""
+    """Return whether ``domain`` is in ``domains``; None if the vendor crashes."""
     for part in domains.ranges:
         first, last = part.first, part.last
         if first is None:
@@ -162,7 +162,7 @@ def _default_verdict(traits: VendorTraits, grant: Grant) -> RuleVerdict:
 
 
 class _GrantRules:
-    """The rules of a grant in their order, for one verb, or for both to ask about a topic only."""
+    """The rules of a grant in order, for one verb, or for both to decide on a topic alone."""
 
     def __init__(
         self,
@@ -171,7 +171,7 @@ class _GrantRules:
         otherwise: RuleVerdict,
         *verbs: str,
     ) -> None:
-        """Prepare the rules for questions; ``otherwise`` is the verdict if no rule matches."""
+        """Index the topics of ``rules``; ``otherwise`` is the verdict if no rule matches."""
         self._traits = traits
         self._otherwise = otherwise
         self._entries: list[_Entry] = []
@@ -198,7 +198,7 @@ class _GrantRules:
         for position in self._topics.matching(topic):
             entry = self._entries[position]
             if entry.criteria == passed:
-                continue  # of some criteria, only the first topic that matches counts
+                continue  # only the first matching topic of a criteria counts
             passed = entry.criteria
             fits = self._fits(entry, wanted)
             if fits or self._traits.topic_decides or not entry.expression:
@@ -267,7 +267,7 @@ class _GovernedDomain:
         )
 
     def topic_rule(self, topic: str) -> TopicRule | None:
-        """Return the first rule whose expression matches; an empty one may crash the vendor."""
+        """Return the first rule that matches, or None; one without text may crash the vendor."""
         position = self._topics.first(topic)
         return None if position is None else self._topic_rules[position]
 
@@ -282,33 +282,33 @@ class _GovernedDomain:
 def _verdict_text(verdict: RuleVerdict, asked: str, domain: int, *, by_peers: bool = False) -> str:
     """Return ``verdict`` on ``asked`` (``publish rt/a``) as a clause.
 
-    ``by_peers`` means that the own participant allows it and its peers do not.
+    With ``by_peers``, the participant itself allows it, and its peers do not.
     """
     rule = "" if verdict.rule is None else f"rule {verdict.rule + 1}"
-    peers = f" for domain {domain}, and peers keep to that" if by_peers else ""
+    peers = f" for domain {domain}, and peers enforce that" if by_peers else ""
     match verdict.reason:
         case "allow-rule":
             return f"{rule} allows {asked} by {verdict.expression}"
         case "deny-rule":
             return f"{rule} denies {asked} by {verdict.expression}{peers}"
         case "partition":
-            return f"{rule} has {verdict.expression}, but not the partitions of {asked}{peers}"
+            return f"{rule} names {verdict.expression}, but not the partitions of {asked}{peers}"
         case "default":
             word = "ALLOW" if verdict.allowed else "DENY"
             return f"no rule names {asked}, and the grant's default is {word}"
         case "open-range":
-            return f"{rule} has domains without <min>, over which the process crashes"
+            return f"{rule} has domains without <min>, which crashes the process"
         case "empty-topic":
-            return f"{rule} has a <topic> without text, over which the process crashes"
+            return f"{rule} has a <topic> without text, which crashes the process"
         case "empty-default":
-            return "the grant's <default> is empty, over which the process crashes"
+            return "the grant's <default> is empty, which crashes the process"
         case _:
             return f"no rule allows {asked}{peers}"
 
 
 @dataclass(frozen=True, slots=True)
 class _Joining:
-    """The outcome of joining, its reason, and a clause for people."""
+    """The outcome of joining, its reason for programs, and a clause for messages."""
 
     outcome: Outcome
     reason: str
@@ -326,7 +326,7 @@ def _decide_join(
     """Return whether the participant may join; without matching ``rules``, ``otherwise`` counts."""
     where = f"domain {domain}"
     if traits.always_needs_allow_rule and not any(rule.allow for rule in grant.rules):
-        text = "the grant has no allow rule, so nothing starts"
+        text = "the grant has no allow rule, so the participant does not start"
         return _Joining(Outcome.REFUSED, "no-rule", text)
     rule = governed.rule
     if rule is None:
@@ -337,14 +337,14 @@ def _decide_join(
         return _Joining(Outcome.ALLOWED, "domain-not-in-governance", text)
     open_door = rule.allow_unauthenticated_participants
     if traits.refuses_open_rtps and open_door and rule.rtps_protection_kind != ProtectionKind.NONE:
-        text = "the governance lets unauthenticated participants in and protects RTPS"
+        text = "the governance allows unauthenticated participants, but protects RTPS messages"
         return _Joining(Outcome.REFUSED, "unauthenticated-with-rtps-protection", text)
     if not rule.enable_join_access_control:
-        text = f"joining {where} is not access controlled"
+        text = f"the governance does not control joining {where}"
         return _Joining(Outcome.ALLOWED, "unrestricted", text)
     if any(each.allow for _, each in rules):
-        return _Joining(Outcome.ALLOWED, "allow-rule", f"an allow rule holds on {where}")
-    missing = f"no allow rule of the grant holds on {where}"
+        return _Joining(Outcome.ALLOWED, "allow-rule", f"an allow rule covers {where}")
+    missing = f"no allow rule of the grant covers {where}"
     opened = not governed.all_controlled() and otherwise.outcome is not Outcome.ALLOWED
     if traits.always_needs_allow_rule or opened:
         return _Joining(Outcome.PEER_DENIES, "no-rule", f"{missing}, so peers refuse it")
@@ -360,9 +360,9 @@ _ENDPOINTS = (AccessVerb.PUBLISH, AccessVerb.SUBSCRIBE)
 
 
 class Access:
-    """The access control of one vendor; prepared once, asked often.
+    """The access control of one vendor for one subject; prepared once, queried often.
 
-    A peer is assumed to have the same governance, clock and zone, and every right.
+    Peers are assumed to have the same governance, clock and zone, and every right.
     """
 
     def __init__(
@@ -376,9 +376,9 @@ class Access:
         at: datetime,
         zone: tzinfo = UTC,
     ) -> None:
-        """Prepare the answers for ``subject`` (RFC 4514) on ``domain`` at the aware moment ``at``.
+        """Prepare the decisions on ``subject`` (RFC 4514) on ``domain`` at the aware moment ``at``.
 
-        ``zone`` is the host's time zone.  Nothing is raised: the answers report every fault.
+        ``zone`` is the host's time zone.  Nothing is raised: the decisions report every fault.
         """
         self._traits = vendor.traits
         self._domain = domain
@@ -419,15 +419,15 @@ class Access:
         return self.join() if verb is AccessVerb.JOIN else self._endpoint(verb, topic, partitions)
 
     def join(self) -> Decision:
-        """Return the decision whether the participant starts and peers talk to it."""
+        """Return whether the participant starts and peers accept it."""
         return self._join
 
     def publish(self, topic: str, partitions: tuple[str, ...] = ()) -> Decision:
-        """Return the decision whether a writer of ``topic`` can be created and heard."""
+        """Return whether a DataWriter of ``topic`` can be created, and peers match it."""
         return self._endpoint(AccessVerb.PUBLISH, topic, partitions)
 
     def subscribe(self, topic: str, partitions: tuple[str, ...] = ()) -> Decision:
-        """Return the decision whether a reader of ``topic`` can be created and hears."""
+        """Return whether a DataReader of ``topic`` can be created, and peers match it."""
         return self._endpoint(AccessVerb.SUBSCRIBE, topic, partitions)
 
     def _prepare(self, grant: Grant) -> None:
@@ -447,7 +447,7 @@ class Access:
             self._peers = {**self._peers, AccessVerb.SUBSCRIBE: readers}
         self._either = _GrantRules(traits, rules, otherwise, *_ENDPOINTS)
 
-    # ── answering ──────────────────────────────────────────────────────────────────────────
+    # ── deciding ───────────────────────────────────────────────────────────────────────────
 
     def _endpoint(self, verb: AccessVerb, topic: str, partitions: tuple[str, ...]) -> Decision:
         join = self._join
@@ -477,7 +477,7 @@ class Access:
         if rule is None:
             return self._without_topic_rule(topic)
         if traits.crashes_on_empty_texts and not rule.topic_expression.strip():
-            text = "a topic rule of the governance is empty, over which the process crashes"
+            text = "a topic rule of the governance is empty, which crashes the process"
             return self._answer(Outcome.CRASHES, "empty-topic", text)
         writes, reads = rule.enable_write_access_control, rule.enable_read_access_control
         asked = f"{verb} {topic}"
@@ -488,7 +488,7 @@ class Access:
         if not (writes if verb is AccessVerb.PUBLISH else reads):
             if join.outcome is Outcome.PEER_DENIES and not self._in_the_open(rule):
                 return self._peers_refuse(rule)
-            text = f"the governance leaves {asked} open to everybody"
+            text = f"the governance does not control {asked}"
             return self._answer(Outcome.ALLOWED, "unrestricted", text, topic_rule=rule)
         verdict = self._own[verb].ask(topic, partitions)
         if not verdict.allowed:
@@ -525,7 +525,7 @@ class Access:
         return self._answer(Outcome.DENIED, "no-topic-rule", text)
 
     def _peers_refuse(self, rule: TopicRule) -> Decision:
-        text = f"no allow rule of the grant holds on domain {self._domain}, so peers refuse it"
+        text = f"no allow rule of the grant covers domain {self._domain}, so peers refuse it"
         return self._answer(Outcome.PEER_DENIES, "peer-refuses-participant", text, topic_rule=rule)
 
     def _verdict(

@@ -9,7 +9,7 @@ from sros_tool.dds.governance import TopicRule
 
 
 class AccessVerb(StrEnum):
-    """An action that an identity asks for."""
+    """An action of a participant that access control allows or denies."""
 
     JOIN = "join"
     PUBLISH = "publish"
@@ -21,13 +21,13 @@ class Outcome(StrEnum):
 
     ALLOWED = "allowed"
     DENIED = "denied"
-    """The call fails where it is made."""
+    """Creating the endpoint fails."""
     PEER_DENIES = "peer denies"
-    """It is created, but no permitted peer will match it."""
+    """The participant or endpoint is created, but permitted peers do not match it."""
     REFUSED = "refused"
     """The participant does not start at all."""
     CRASHES = "crashes"
-    """The process ends with a fault."""
+    """The process crashes."""
 
     @property
     def ok(self) -> bool:
@@ -39,7 +39,7 @@ class Outcome(StrEnum):
 class Decision:
     """An outcome and what decided it.
 
-    ``reason`` is a stable word for programs (one of `REASONS`), ``text`` a sentence for people.
+    ``reason`` is a stable word for programs (one of `_REASONS`), ``text`` a sentence for people.
     ``grant`` is an index in the permissions, ``rule`` an index in the grant, ``expression`` the
     ``<topic>`` that matched, ``topic_rule`` the rule of the governance for the topic.
     """
@@ -57,22 +57,23 @@ _REASONS = {
     "allow-rule": "an allow rule matches",
     "deny-rule": "a deny rule matches",
     "partition": "the rule that decides does not name the partitions",
-    "default": "no rule matches, and the default of the grant counts",
-    "no-rule": "no rule allows it, and no default counts",
+    "default": "no rule matches, so the default of the grant decides",
+    "no-rule": "no rule allows it, and the vendor ignores the default",
     "unrestricted": "the governance does not control this access",
     "no-topic-rule": "no topic rule of the governance matches the topic",
     "domain-not-in-governance": "no domain rule of the governance lists the domain",
     "peer-refuses-participant": "peers do not accept the participant on this domain",
     "no-grant": "no grant names the subject",
-    "not-yet-valid": "the grant of the subject begins later",
+    "not-yet-valid": "the grant of the subject is not valid yet",
     "expired": "the grant of the subject has expired",
     "malformed": "the vendor does not accept a document",
-    "unauthenticated-with-rtps-protection": "the governance contradicts itself",
+    "unauthenticated-with-rtps-protection": "the governance allows unauthenticated participants, "
+    "but protects RTPS messages",
     "long-name": "the name of the topic is too long for peers",
     "invalid-name": "the vendor does not accept the name of the topic",
-    "open-range": "a range of domains without <min> ends the process",
-    "empty-topic": "an expression without text ends the process",
-    "empty-default": "a default without text ends the process",
+    "open-range": "a range of domains without <min> crashes the process",
+    "empty-topic": "an expression without text crashes the process",
+    "empty-default": "a default without text crashes the process",
 }
 """Every reason and its meaning."""
 
@@ -86,5 +87,5 @@ class Refusal:
     outcome: Outcome = Outcome.REFUSED
 
     def decision(self) -> Decision:
-        """Return the answer to every question under such a document."""
+        """Return the decision on every access: this refusal."""
         return Decision(self.outcome, self.reason, self.text)

@@ -29,10 +29,12 @@ from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule
 
 _BLANKS = " \t\v\r\n"
 _CDATA = "<![CDATA["
-_ROOM = len(_CDATA) - 2  # it looks for more text only if this many characters are left
-_DEEPEST = 200  # nesting of elements; a deeper document is refused anyway, for its names
+_ROOM = len(_CDATA) - 2  # Cyclone DDS looks for more text only if this many bytes are left
+_DEEPEST = (
+    200  # nesting of elements; a deeper document has unknown elements, so it is refused anyway
+)
 _NAME = re.compile("[A-Za-z][A-Za-z0-9_:-]*")
-_PASSED_OVER = re.compile(
+_SKIPPED = re.compile(
     rf"(?:[{_BLANKS}]++|<!--.*?-->|<\?(?:.*?\?>|.*)|<!(?!--|\[CDATA\[)(?:[^>]*>|.*))*+", re.DOTALL
 )
 _QUOTES = {'"': '"', "'": "'", "\xe2\x80\x9c": "\xe2\x80\x9d", "\xe2\x80\x98": "\xe2\x80\x99"}
@@ -42,7 +44,7 @@ _ENTITIES = {"lt": "<", "gt": ">", "amp": "&", "apos": "'", "quot": '"'}
 
 
 def read(xml: bytes) -> XmlElement:
-    """Return the root of a document; raises `UnreadableError` where Cyclone DDS refuses it.
+    """Return the root of a document; raise `UnreadableError` if Cyclone DDS refuses it.
 
     Texts are stripped of surrounding blanks and decoded as UTF-8, invalid bytes as
     surrogates.
@@ -57,17 +59,17 @@ class _Reader:
 
     def root(self) -> XmlElement:
         root = self._element(0)
-        self._pass_over()
+        self._skip()
         if self._index < len(self._text):
-            raise self._error("something follows its root")
+            raise self._error("something follows the root element")
         return root
 
     def _error(self, why: str) -> UnreadableError:
         line = self._text.count("\n", 0, self._index) + 1
-        return UnreadableError(f"its XML cannot be read, {why} (line {line})")
+        return UnreadableError(f"its XML is malformed: {why} (line {line})")
 
-    def _pass_over(self) -> None:
-        found = _PASSED_OVER.match(self._text, self._index)
+    def _skip(self) -> None:
+        found = _SKIPPED.match(self._text, self._index)
         self._index = found.end() if found else self._index
         if self._text.startswith("<!--", self._index):
             raise self._error("a comment is not closed")
@@ -96,25 +98,25 @@ class _Reader:
         raise self._error("an attribute has no value")
 
     def _element(self, depth: int) -> XmlElement:
-        self._pass_over()
+        self._skip()
         if self._text.startswith(_CDATA, self._index) or not self._take("<") or depth > _DEEPEST:
             raise self._error("an element was expected")
         element = XmlElement(self._name())
-        self._pass_over()
+        self._skip()
         while _NAME.match(self._text, self._index):
             name = self._name()
-            self._pass_over()
+            self._skip()
             if not self._take("="):
                 raise self._error(f"the attribute {name} has no value")
-            self._pass_over()
+            self._skip()
             element.attributes[name] = _decoded(self._string())
-            self._pass_over()
+            self._skip()
         if self._take("/>"):
             return element
         if not self._take(">"):
             raise self._error(f"<{element.name}> does not end")
         self._content(element, depth)
-        self._pass_over()
+        self._skip()
         closed = self._take("/>") or (self._take("</") and self._name() == element.name)
         if not closed or not self._take(">"):
             raise self._error(f"<{element.name}> is not closed")
@@ -131,15 +133,15 @@ class _Reader:
             element.children.append(self._element(depth + 1))
 
     def _opens(self) -> bool:
-        """Return whether the next token begins an element; raises where it is not a token."""
-        self._pass_over()
+        """Return whether the next token begins an element; raise if it is malformed."""
+        self._skip()
         text, index = self._text, self._index
         if text[index : index + 1] == "<" and not text.startswith(_CDATA, index):
             closes = text[index + 1 : index + 2] == "/"
             if not _NAME.match(text, index + 1 + closes):
                 raise self._error("a name is malformed")
             return not closes
-        if text.startswith(tuple(_QUOTES), index):  # it reads on to the other quote
+        if text.startswith(tuple(_QUOTES), index):  # Cyclone DDS reads on to the closing quote
             self._string()
             self._index = index
         return False
@@ -226,7 +228,7 @@ _PERMISSIONS = _DOMAINS | {
 
 
 def read_governance(xml: bytes) -> Governance:
-    """Return the governance; raises `UnreadableError`."""
+    """Return the governance in ``xml``; raise `UnreadableError` if Cyclone DDS refuses it."""
     dds = _Node.root(xml, _GOVERNANCE, ())
     parent = dds.last("domain_access_rules")
     rules = parent.all("domain_rule") if parent else []
@@ -236,7 +238,7 @@ def read_governance(xml: bytes) -> Governance:
 
 
 def read_permissions(xml: bytes) -> Permissions:
-    """Return the permissions; raises `UnreadableError`.
+    """Return the permissions in ``xml``; raise `UnreadableError` if Cyclone DDS refuses them.
 
     A ``<topic>`` without text is "", a rule without domains has a range that is open at both ends,
     and a ``<default>`` may be empty: Cyclone DDS crashes when it evaluates one of these.
@@ -279,7 +281,7 @@ class _Node:
         cls, xml: bytes, grammar: Mapping[str, tuple[str, ...]], skipped: tuple[str, ...]
     ) -> _Node:
         if b"\0" in xml:
-            raise UnreadableError("it holds a NUL, at which the signed message ends")
+            raise UnreadableError("it contains a NUL, at which the signed message ends")
         root = read(xml)
         if root.name.lower() != "dds":
             raise UnreadableError("its root is not <dds>")
@@ -318,7 +320,7 @@ def _number(node: _Node) -> int:
     number = int(sign + digits, 8 if octal else 0)
     if not -(2**63) <= number < 2**63:
         raise UnreadableError(f"<{node.tag}> holds {number}, which is far too large")
-    number = (number + 2**31) % 2**32 - 2**31  # it cuts to 32 bits before it checks the range
+    number = (number + 2**31) % 2**32 - 2**31  # truncated to 32 bits before the check
     if not 0 <= number <= MAX_DOMAIN:
         raise UnreadableError(f"<{node.tag}> holds {number}, which is above {MAX_DOMAIN}")
     return number

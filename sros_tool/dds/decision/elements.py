@@ -1,6 +1,7 @@
-"""XML elements as the vendors' parsers see them, and the schemas that the standard checks.
+"""XML elements as the vendors' parsers see them, and a check by the schemas of the standard.
 
-DDS-Security 1.1, the schemas omg_shared_ca_permissions and omg_shared_ca_governance of 20170901.
+Source: DDS-Security 1.1, the schemas omg_shared_ca_permissions and omg_shared_ca_governance of
+20170901.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ class UnreadableError(Exception):
 
     def refusal(self, title: str, document: str) -> Refusal:
         """Return this error as a value; ``title`` names the vendor."""
-        how = "crashes over" if self.outcome is Outcome.CRASHES else "refuses"
+        how = "crashes on" if self.outcome is Outcome.CRASHES else "refuses"
         return Refusal("malformed", f"{title} {how} the {document}: {self}.", self.outcome)
 
 
@@ -62,7 +63,7 @@ def _attributes(rule: type[DomainRule | TopicRule]) -> str:
     )
 
 
-# The children of each element as an expression over "name,"; the others hold text.
+# Allowed children by element, as expressions over "name,"; other elements hold text.
 _DOMAINS = {
     "domains": "(id,|id_range,)+",
     "id_range": "min,(max,)?|max,",
@@ -112,12 +113,12 @@ _EVERYWHERE = "{http://www.w3.org/2001/XMLSchema-instance}"
 
 
 def check_permissions(xml: bytes) -> None:
-    """Check that ``xml`` is valid permissions; raises `UnreadableError`."""
+    """Check ``xml`` by the permissions schema; raise `UnreadableError` if it is not valid."""
     _check(_root(xml), "dds", _PERMISSIONS)
 
 
 def check_governance(xml: bytes) -> None:
-    """Check that ``xml`` is valid governance; raises `UnreadableError`."""
+    """Check ``xml`` by the governance schema; raise `UnreadableError` if it is not valid."""
     _check(_root(xml), "dds", _GOVERNANCE)
 
 

@@ -5,7 +5,7 @@ The parser accepts much that XML forbids: ``--`` in a comment, a lone ``&``, con
 document.
 
 Elements must be in order, texts keep their blanks, and keywords have only one spelling.  Content
-after the last element that it looks for is not read.
+after the last expected element is not read.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _REFERENCE = re.compile("&(?:#x?([^;]*)|(quot|amp|apos|lt|gt));")
 
 
 def read(xml: bytes) -> XmlElement:
-    """Return the first element of a document; raises `UnreadableError` where TinyXML-2 refuses it.
+    """Return the first element of a document; raise `UnreadableError` if TinyXML-2 refuses it.
 
     A text is decoded as UTF-8, invalid bytes as surrogates.
     """
@@ -68,7 +68,7 @@ class _Reader:
 
     def _error(self, why: str) -> UnreadableError:
         line = self._text.count("\r\n", 0, self._index) + 1
-        return UnreadableError(f"its XML cannot be read, {why} (line {line})")
+        return UnreadableError(f"its XML is malformed: {why} (line {line})")
 
     def _read_into(self, document: XmlElement) -> None:
         text = self._text
@@ -143,8 +143,8 @@ def _plain(text: str) -> str:
     """Return the text with its line ends and references resolved, up to a NUL."""
     if "&" not in text:
         return _decoded(_LINE_END.sub("\n", text) if "\r" in text or "\n" in text else text)
-    # It writes into the text that it reads: for a lone "&" it writes nothing, so the
-    # old character stays at that position.
+    # TinyXML-2 writes into the text that it reads: for a lone "&" it writes nothing, so the old
+    # character stays at that position.
     written = list(text)
     place = index = 0
     while index < len(text):
@@ -167,10 +167,10 @@ def _plain(text: str) -> str:
 
 
 def _referred(found: re.Match[str]) -> str | None:
-    """Return the bytes of a reference; None where it is malformed."""
+    """Return the bytes of a reference, or None if it is malformed."""
     if found[2]:
         return _ENTITIES[found[2]]
-    # It reads the digits backwards, from the last one to the mark before them.
+    # TinyXML-2 reads the digits backwards, from the last one to the mark before them.
     base, mark = (16, "x") if found[0][2] == "x" else (10, "#")
     digits = found[1].rpartition(mark)[2]
     if not re.fullmatch("[0-9a-fA-F]*" if base == 16 else "[0-9]*", digits):
@@ -193,17 +193,17 @@ _TRUE, _FALSE = ("true", "True", "TRUE"), ("false", "False", "FALSE")
 
 
 def read_governance(xml: bytes) -> Governance:
-    """Return the governance; raises `UnreadableError`."""
+    """Return the governance in ``xml``; raise `UnreadableError` if Fast DDS refuses it."""
     root = read(xml)
     parent = _first(root, "domain_access_rules")
     if root.children[-1] is not parent:
-        # A comment counts as well.
+        # A comment there is refused too.
         raise UnreadableError("something follows <domain_access_rules>")
     return Governance(tuple(_domain_rule(each) for each in _all(parent, "domain_rule")))
 
 
 def read_permissions(xml: bytes) -> Permissions:
-    """Return the permissions; raises `UnreadableError`."""
+    """Return the permissions in ``xml``; raise `UnreadableError` if Fast DDS refuses them."""
     return Permissions(
         tuple(_grant(each) for each in _all(_first(read(xml), "permissions"), "grant"))
     )
@@ -222,7 +222,7 @@ def _first(root: XmlElement, name: str) -> XmlElement:
 
 
 def _all(parent: XmlElement, name: str) -> list[XmlElement]:
-    """Return the children; there must be at least one, all of the same name."""
+    """Return the children of ``parent``; raise unless there are some, all called ``name``."""
     children = parent.elements
     if not children or any(child.name != name for child in children):
         raise UnreadableError(f"<{parent.name}> needs <{name}> elements and nothing else")
@@ -242,9 +242,9 @@ class _Sequence:
         return self._index < len(self._children) and self._children[self._index].name == name
 
     def next(self, name: str) -> XmlElement:
-        """Return the next child, which must have this name."""
+        """Take the next child; raise `UnreadableError` if it has another name."""
         if not self.is_next(name):
-            raise UnreadableError(f"<{self._name}> lacks <{name}> in its place")
+            raise UnreadableError(f"<{self._name}> lacks <{name}> at its position")
         self._index += 1
         return self._children[self._index - 1]
 
@@ -253,7 +253,7 @@ class _Sequence:
         return self._children[self._index :]
 
     def while_named(self, *names: str) -> list[XmlElement]:
-        """Return the children up to the first that has none of these names."""
+        """Take the children up to the first one with another name."""
         found = []
         while self._index < len(self._children):
             if self._children[self._index].name not in names:
@@ -263,9 +263,9 @@ class _Sequence:
         return found
 
     def end(self) -> None:
-        """Check that no child follows; raises `UnreadableError`."""
+        """Raise `UnreadableError` if another child follows."""
         if self.rest():
-            raise UnreadableError(f"<{self._name}> holds too much: <{self.rest()[0].name}>")
+            raise UnreadableError(f"<{self._name}> contains an unexpected <{self.rest()[0].name}>")
 
 
 # ── texts ──────────────────────────────────────────────────────────────────────────────────

@@ -1,7 +1,8 @@
 """The vendors of DDS Security, and the differences of their decisions, as data.
 
 Fast DDS 2.9.1 and 2.14.5 and Cyclone DDS 0.10.2 were measured on the real libraries.  Vendors that
-were never measured, such as OpenDDS and Connext, decide by the standard, as their manuals do.
+were never measured, such as OpenDDS and Connext, are taken to follow the standard, as their manuals
+say.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ class Style(Enum):
     FNMATCH = auto()
     """POSIX fnmatch of glibc, without escapes, where ``*`` crosses ``/``."""
     CYCLONE = auto()
-    """Cyclone DDS' own ``* ? [..]``."""
+    """The matching of Cyclone DDS for ``*``, ``?`` and ``[..]``."""
 
 
 class Subjects(Enum):
@@ -40,14 +41,14 @@ class Moments(Enum):
     LOCAL = auto()
     """In the standard time of the host's zone, the offset dropped (Fast DDS)."""
     CYCLONE = auto()
-    """With its offset; only complete dates and times from 1970 to 2262, others are long past."""
+    """With its offset; a date that is incomplete or not from 1970 to 2262 is long past."""
 
 
 class OpenRange(Enum):
     """The meaning of a range of domains with one end."""
 
     OPEN = auto()
-    """From N on; up to N."""
+    """Without an upper end from N on; without a lower end up to N."""
     SINGLE = auto()
     """Without an upper end N alone; without a lower end up to N (Fast DDS)."""
     CRASHES = auto()
@@ -73,7 +74,7 @@ class Signers(Enum):
     LISTED = auto()
     """Anyone with a certificate in the file of the permissions CA; no chain is verified (2.14)."""
     CHAIN = auto()
-    """Anyone with a certificate in the message that has a chain to that CA, for S/MIME."""
+    """Anyone whose certificate in the message has a chain to that CA, and the S/MIME purpose."""
 
 
 class Hashes(Enum):
@@ -108,11 +109,11 @@ class DocumentReader(Enum):
 class VendorTraits:
     """The names of one vendor, and its rules where vendors differ.
 
-    By default a rule is the one of the standard.
+    The default of each rule is the rule of the standard.
     """
 
     title: str
-    """The name and version for people."""
+    """The name and version for messages."""
     product: str = ""
     """The name without a version, which its releases share."""
     measured: bool = False
@@ -149,7 +150,7 @@ class VendorTraits:
     needs_domain_rule: bool = True
     """On a domain that the governance does not list, the participant does not even start."""
     shares_open_topics: bool = False
-    """Participants that refused each other still exchange unprotected topics (ran)."""
+    """Participants that refused each other still exchange unprotected topics (measured)."""
     refuses_open_rtps: bool = False
     """Unauthenticated participants together with RTPS protection are refused."""
     signers: Signers = Signers.AUTHORITY
@@ -160,7 +161,7 @@ class VendorTraits:
     hashes: Hashes = Hashes.ANY
     keys: Keys = Keys.ANY
     largest_document: int | None = None
-    """With larger signed permissions, in bytes, a handshake never ends."""
+    """With larger signed permissions, in bytes, a handshake never finishes."""
 
 
 _STANDARD = VendorTraits("DDS-Security 1.1")
@@ -194,7 +195,7 @@ class Vendor(StrEnum):
     """A DDS implementation, or the specification itself.
 
     To add a vendor that decides by the standard, add an entry: options, texts and comparisons
-    follow.  `sros_tool.runtime.rmw` maps RMWs to vendors.  The newest release of a product stands
+    follow.  `sros_tool.runtime.rmw` maps RMWs to vendors.  Put the newest release of a product
     first.
     """
 
@@ -248,12 +249,12 @@ class Vendor(StrEnum):
 
     @property
     def title(self) -> str:  # type: ignore[override]
-        """The name and version for people, as in ``Fast DDS 2.14``."""
+        """The name and version for messages, such as ``Fast DDS 2.14``."""
         return self.traits.title
 
     @property
     def documented_only(self) -> bool:
-        """Whether it was never measured, so that it decides by the standard."""
+        """Whether the vendor was never measured, and is taken to follow the standard."""
         return not self.traits.measured and self is not Vendor.STANDARD
 
 
