@@ -42,17 +42,21 @@ def choose_enclave(environment: Mapping[str, str], enclave: str = "/") -> Securi
     else:
         why = f"{KEYSTORE} is not set."
     if enforce:
-        raise SrosError("cannot start a secured process", why, f"Set {KEYSTORE} and the enclave.")
+        raise SrosError(
+            "cannot start a secured process",
+            why,
+            f"Set {KEYSTORE} to a keystore with this enclave.",
+        )
     return SecurityChoice(None, f"running without security, as {STRATEGY} is not 'Enforce'. {why}")
 
 
 def choose_loadable(environment: Mapping[str, str], enclave: str = "/") -> SecurityChoice:
-    """Return the choice of `choose_enclave`; no security if a file of the enclave is missing.
+    """Return rcl's choice, but without security if a file of the enclave is missing.
 
     Source: rmw_dds_common ``security.cpp``, whose message does not name the file.
 
     Raises:
-        SrosError: The process would not start (Enforce); has the message of the RMWs.
+        SrosError: The process would not start (Enforce); contains the message of the RMWs.
     """
     choice = choose_enclave(environment, enclave)
     folder = choice.enclave
@@ -61,7 +65,7 @@ def choose_loadable(environment: Mapping[str, str], enclave: str = "/") -> Secur
         return choice
     why = f"couldn't find all security files! The enclave has no {', '.join(lacking)}."
     if environment.get(STRATEGY) == "Enforce":
-        raise SrosError("cannot start a secured process", why, "Make the enclave again.")
+        raise SrosError("cannot start a secured process", why, "Create the enclave again.")
     return SecurityChoice(None, f"running without security, as {STRATEGY} is not 'Enforce'. {why}")
 
 

@@ -1,7 +1,7 @@
-"""The RMWs of ROS 2: the middleware of each, how to recognise it, and which are installed.
+"""The RMWs of ROS 2: their middleware, how to recognise it, and which RMWs are installed.
 
-A vendor is added to sros by its rules in `sros_tool.dds.decision.vendors`, its row in `MIDDLEWARE`
-here, and its texts in `sros_tool.runtime.vendor_log`.
+To add a vendor to sros, add its rules in `sros_tool.dds.decision.vendors`, its row in `MIDDLEWARE`
+here, and its log texts in `sros_tool.runtime.vendor_log`.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def vendor_of(rmw: str) -> Vendor | None:
 def rmw_implementations(environment: Mapping[str, str]) -> tuple[str, ...]:
     """Return the RMWs in the ament index, starting with the one that rclpy would use.
 
-    The prefixes are those in AMENT_PREFIX_PATH, and the prefix of this Python, which wheels use.
+    Searches the prefixes in AMENT_PREFIX_PATH, and the prefix of this Python, which wheels use.
     """
     prefixes = [*environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
     found = {

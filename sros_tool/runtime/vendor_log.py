@@ -1,10 +1,10 @@
-"""The table of the security messages that DDS vendors, rcl and the RMWs log, and their meanings.
+"""The security messages that DDS vendors, rcl and the RMWs log, and their meanings.
 
-Fast DDS writes coloured text to standard output, Cyclone DDS to its log sink or standard error.
-With ROS_SECURITY_LOG_FILE, Fast DDS writes its reasons to that file instead, in another form.
-Each text was seen in a real log of Fast DDS 2.9.1 or 2.14.5 (Permissions.cpp, SecurityManager.cpp,
-PKIDH.cpp), Cyclone DDS 0.10.2 (access_control.c, authentication.c, q_omg_security.c), or rcl of
-Jazzy.
+Fast DDS writes coloured text to standard output, Cyclone DDS writes to its log sink or to standard
+error.  With ROS_SECURITY_LOG_FILE, Fast DDS writes the reasons of refusals to that file instead, in
+another form.  Each text was seen in a real log of Fast DDS 2.9.1 or 2.14.5 (Permissions.cpp,
+SecurityManager.cpp, PKIDH.cpp), Cyclone DDS 0.10.2 (access_control.c, authentication.c,
+q_omg_security.c), or rcl of Jazzy.
 
 To add a vendor, add its rows to `_LOG_TEXTS`, the text that it puts around a reason to `_FRAME`,
 and its words for writers and readers to `DIRECTIONS`.
@@ -24,14 +24,14 @@ from sros_tool.faults import Fault
 
 
 class Refused(Enum):
-    """The thing that a message says is refused."""
+    """What a message says is refused."""
 
     ALL_SECURITY = auto()
-    """DDS Security as such: it is not built in."""
+    """Every secured participant: DDS Security is not built in."""
     PARTICIPANT = auto()
-    """The files of the process's own participant, or its domain."""
+    """The participant of the process: its files or its domain are not accepted."""
     TOPIC = auto()
-    """A topic, a writer or a reader."""
+    """A topic, a DataWriter or a DataReader."""
 
 
 _ROS = None
@@ -44,13 +44,13 @@ class LogText:
 
     ``pattern`` is searched in a line without colours; its groups are fields such as ``path``,
     ``domain`` and ``topic``.  ``cause`` and ``remedy`` may use these fields in braces; ``cause`` is
-    "" if the text alone does not give one.  Many texts have several possible causes: ``faults`` are
-    faults of an enclave that can cause the text, to be searched in the enclave, and ``unseen`` is
+    "" if the text alone does not show a cause.  Many texts have several possible causes: ``faults``
+    are the faults of an enclave that can cause the text, to look for in the enclave; ``unseen`` is
     the remedy if the enclave has none of them.
 
-    ``weak`` is 0 for a text that names a cause, and higher the less it says: of all texts of a
-    process, only those with the lowest value count.  ``refuses`` is None if the text alone does not
-    prove that DDS Security refused something.
+    ``weak`` is 0 for a text that names a cause, and higher for less specific texts: of all texts of
+    a process, only those with the lowest value count.  ``refuses`` is None if the text alone does
+    not prove that DDS Security refused something.
     """
 
     id: str
@@ -105,14 +105,14 @@ _ALL = (
     *_SIGNATURE, *_GRANT, *_DOCUMENT, Fault.GOVERNANCE_DOMAIN, Fault.PERMISSIONS_DOMAIN,
 )  # fmt: skip
 
-_CHECK = "Name the keystore and the enclave, and sros looks for the true cause there."
-_FILE = "Where ROS_SECURITY_LOG_FILE is set, give `sros explain --log` that file."
+_CHECK = "Give `sros explain --log` the keystore and the enclave: it then finds the cause there."
+_FILE = "If ROS_SECURITY_LOG_FILE is set, give `sros explain --log` that file."
 _CHECK_OR_FILE = f"{_CHECK} {_FILE}"
 _RENEW = "Renew it: `sros renew KEYSTORE ENCLAVE`."
 _SIGN = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
 _SIGN_ONE = (
-    f"Name the keystore and the enclave, and sros finds out there which of the two it is. {_SIGN} "
-    "A governance has to be restored from a backup: every enclave depends on it."
+    f"Give `sros explain --log` the keystore and the enclave: it finds which of the two. {_SIGN} "
+    "Restore a governance from a backup: every enclave depends on it."
 )
 _READABLE = (
     "Allow the user that runs the node to read it, and to enter the folders above it: `ls -lL "
@@ -125,12 +125,12 @@ _SET_DOMAIN = (
 _PEERS = "Give both sides enclaves of the same keystore; `sros inspect` shows the CA of each."
 _FAST, _CYCLONE = Vendor.FAST, Vendor.CYCLONE
 _DENIED_ENDPOINT = (
-    "a publisher, subscription, client or server is denied by the permissions; this text does "
-    "not say of which topic (`invalid allocator` has nothing to do with memory)"
+    "the permissions deny a publisher, subscription, client or server; this message does not name "
+    "the topic (`invalid allocator` has nothing to do with memory)"
 )
 _ASK_FOR_TOPIC = (
-    "Look for the line before it that names the topic, on standard output or in the file of "
-    "ROS_SECURITY_LOG_FILE; or ask `sros explain` for each topic of the node."
+    "Look for an earlier line that names the topic, on standard output or in the file of "
+    "ROS_SECURITY_LOG_FILE; or run `sros explain` for each topic of the node."
 )
 
 _LOG_TEXTS: tuple[LogText, ...] = (
@@ -146,13 +146,13 @@ _LOG_TEXTS: tuple[LogText, ...] = (
         "enclave-missing", _ROS,
         r"rcl: SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
         "the enclave's folder {path} does not exist: ROS_SECURITY_KEYSTORE or the enclave's name "
-        "is not right", "Correct it: `sros list_enclaves KEYSTORE` shows the names.",
+        "is wrong", "Correct it: `sros list_enclaves KEYSTORE` shows the names.",
     ),
     _text(
         "runs-unsecured", _ROS, r"SECURITY ERROR: directory '(?P<path>[^']*)' does not exist",
         "the enclave's folder {path} does not exist, and as ROS_SECURITY_STRATEGY is not exactly "
-        "Enforce, the node GOES ON UNSECURED",
-        "Start it by `sros run`, which runs it secured or not at all.",
+        "Enforce, the node RUNS UNSECURED",
+        "Start it with `sros run`, which runs it secured or not at all.",
     ),
     _text(
         "keystore-unset", _ROS, r"failed to initialize rcl: error not set",
@@ -162,21 +162,21 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "files-missing", _ROS, r"couldn't find all security files",
         "a file of the enclave is missing or a broken link; the message does not say which",
-        "Complete it: `sros create_enclave KEYSTORE ENCLAVE`, or export it again.", _FILES,
+        "Restore it: `sros create_enclave KEYSTORE ENCLAVE`, or export the enclave again.", _FILES,
         refuses=Refused.PARTICIPANT,
     ),
     # ── Cyclone DDS, meeting peers ─────────────────────────────────────────────────────────
     _text(
         "peer-refused", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed: "
         r"Certificate not valid: error: (?P<why>[^;]+)",
-        "a PEER was refused, not this process: its certificate is not accepted ({why}); with "
-        "another CA on either side, the other one logs this or nothing",
+        "a PEER was refused, not this process: its certificate is not accepted ({why}); if the CAs "
+        "differ, the peer logs the same message or nothing",
         _PEERS,
     ),
     _text(
         "peer-handshake", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed",
-        "a PEER failed to prove who it is: most often its key.pem is not the key of its cert.pem, "
-        "which Cyclone DDS does not notice on its own side; or it is of another DDS or version",
+        "a PEER failed to authenticate: most often its key.pem is not the key of its cert.pem, "
+        "which Cyclone DDS does not check for its own enclave; or it runs another DDS or version",
         "Run `sros verify` or `sros inspect` on the enclave of every peer.", (Fault.KEY_MISMATCH,),
     ),
     # ── Cyclone DDS, starting ──────────────────────────────────────────────────────────────
@@ -200,30 +200,30 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "revoked", _CYCLONE, r"Certificate not valid: error: certificate revoked",
         "the certificate of the enclave is revoked",
-        "It is meant to be kept out; to let it run again, create it again with another key: `sros "
+        "Revoked enclaves are refused on purpose. To use it again, create it with a new key: `sros "
         "create_enclave KEYSTORE ENCLAVE`.",
         (Fault.REVOKED,),
     ),
     _text(
         "crl-expired", _CYCLONE, r"Certificate not valid: error: CRL (?:has expired|is not yet)",
-        "the revocation list is out of date, so that everybody is refused",
+        "the CRL has expired or is not valid yet, so that every participant is refused",
         "Sign it again: `sros crl KEYSTORE --refresh`.",
         (Fault.CRL_EXPIRED, Fault.CRL_NOT_YET_VALID),
     ),
     _text(
         "crl-unreadable", _CYCLONE, r"Failed to read CRL",
-        "crl.pem is not a revocation list, so that everybody is refused",
+        "crl.pem is not a CRL, so that every participant is refused",
         "Sign it again: `sros crl KEYSTORE --refresh`.", (Fault.CRL_MALFORMED,),
     ),
     _text(
         "key-encrypted", _CYCLONE, r"Failed to parse certificate: .*(?:bad decrypt|empty password)",
-        "the message says certificate but means the key: key.pem is encrypted, and "
-        "DDS asks for no passphrase",
+        "key.pem is encrypted, and DDS does not ask for a passphrase (the message wrongly says "
+        "certificate)",
         "Store key.pem without a passphrase, mode 0600.", (Fault.KEY_ENCRYPTED,),
     ),
     _text(
         "pem-unreadable", _CYCLONE, r"Failed to parse (?:certificate|private key)",
-        "cert.pem or key.pem is not a PEM file; the message says certificate for both",
+        "cert.pem or key.pem is not a PEM file (the message says certificate for both)",
         "Restore the file.", (Fault.CERTIFICATE_MALFORMED, *_KEY, *_FILES),
     ),
     _text(
@@ -263,8 +263,8 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     ),
     _text(
         "malformed", _CYCLONE, r"Can not parse (?P<what>governance|permissions) file",
-        "the {what} document, although signed, is not one that Cyclone DDS accepts",
-        "Have sros write it; `sros check` names what vendors read differently.",
+        "Cyclone DDS does not accept the {what} document, although it is signed correctly",
+        "Generate it with sros; `sros check` reports what vendors read differently.",
         _DOCUMENT,
     ),
     _text(
@@ -275,34 +275,34 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     # ── Fast DDS, meeting peers ────────────────────────────────────────────────────────────
     _text(
         "peer-permissions-ca", _FAST, r"Remote participant PermissionsCA differs from local",
-        "a PEER was refused: its permissions CA is not the one of this process. The two have "
-        "enclaves of different keystores, or one was started before the CA was replaced and one "
-        "after",
+        "a PEER was refused: its permissions CA is not that of this process. Both have enclaves of "
+        "different keystores, or one of them was started before the CA was replaced and the other "
+        "after it",
         _PEERS + " Restart both after each stage of `sros rotate_ca KEYSTORE`.",
     ),
     _text(
         "peer-version", _FAST, r"Remote participant PermissionsCA algorithm differs from local",
-        "a PEER was refused: it runs another version of Fast DDS, or its permissions CA has a key "
-        "of another kind", "Run one version of Fast DDS on all hosts of the robot.",
+        "a PEER was refused: it runs another version of Fast DDS, or its permissions CA has "
+        "another type of key", "Run one version of Fast DDS on all hosts of the robot.",
     ),
     _text(
         "peer-permissions", _FAST, r"Remote participant doesn't found in its permissions file",
         "a PEER was refused: by the clock and the time zone of this host its permissions have "
         "expired or are not valid yet, or they have no grant for its certificate",
-        "Compare clocks and time zones of both hosts, for Fast DDS reads dates in local time; "
+        "Compare clocks and time zones of both hosts: Fast DDS reads dates in local time; "
         "`sros inspect KEYSTORE` shows how long each enclave is valid, and `sros renew KEYSTORE "
         "ENCLAVE` renews the peer's.",
     ),
     _text(
         "peer-signature", _FAST, r"Cannot read as PKCS7 the permissions file",
         "a PEER was refused: its permissions are not signed by the permissions CA of this process, "
-        "although that has the same name: enclaves of two keystores, or a changed file", _PEERS,
+        "although its CA has the same name: enclaves of two keystores, or a changed file", _PEERS,
     ),
     _text(
         "peer-malformed", _FAST,
         r"Error validating remote permissions for \S+ \(Malformed permissions file",
-        "a PEER was refused: its permissions, although signed, are not accepted by Fast DDS",
-        "Have sros write the peer's permissions: `sros create_permission KEYSTORE ENCLAVE POLICY`.",
+        "a PEER was refused: Fast DDS does not accept its permissions, although signed correctly",
+        "Generate them again with sros: `sros create_permission KEYSTORE ENCLAVE POLICY`.",
     ),
     _text(
         "peer-domain", _FAST, r"Error checking remote participant"
@@ -315,15 +315,15 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "peer-refused", _FAST, r"Error validating remote permissions for"
         r"|Remote participant doesn't sent the signed permissions|Not receive remote permissions",
-        "a PEER was refused, not this process: its permissions did not arrive, or are not accepted",
+        "a PEER was refused, not this process: its permissions did not arrive or were not accepted",
         _PEERS,
     ),
     # ── Fast DDS, starting ─────────────────────────────────────────────────────────────────
     _text(
         "identity", _FAST, r"SECURITY\s*Error\]\s*->\s*Function validate_local_identity"
         r"|PKIDH::validate_local_identity :\s*\Z",
-        "the identity is refused, and the reason is left out: the certificate or its CA is out of "
-        "date, of another CA, damaged or revoked, or crl.pem is out of date or damaged",
+        "the identity is refused, and the message gives no reason: the certificate or its CA is "
+        "out of date, from another CA, damaged or revoked, or crl.pem is out of date or damaged",
         _CHECK, (*_CERTIFICATE, Fault.CERTIFICATE_MALFORMED, *_CA, *_CRL),
     ),
     _text(
@@ -336,7 +336,7 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "key-mismatch", _FAST, r"Error verifying private key",
         "key.pem is not the key of cert.pem",
-        "Restore the key, or give the enclave another: `sros renew KEYSTORE ENCLAVE --new-key`.",
+        "Restore the key, or give the enclave a new one: `sros renew KEYSTORE ENCLAVE --new-key`.",
         (Fault.KEY_MISMATCH,),
         refuses=Refused.PARTICIPANT,
     ),
@@ -369,8 +369,8 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     ),
     _text(
         "grant", _FAST, r"Not found the identity subject name in permissions file",
-        "one text for three causes: the permissions have expired, are not valid yet, or have no "
-        "grant for this subject. Fast DDS reads their dates in the local time of the host",
+        "one of three causes: the permissions have expired, are not valid yet, or have no grant "
+        "for this subject name. Fast DDS reads their dates in the local time of the host",
         _CHECK, _GRANT,
         refuses=Refused.PARTICIPANT,
     ),
@@ -391,8 +391,8 @@ _LOG_TEXTS: tuple[LogText, ...] = (
         "malformed", _FAST, r"Malformed (?P<what>permissions|governance) file"
         r"|Error loading (?:Permissions|Governance) XML|XMLPARSER\s*Error\].*Function "
         r"parse_(?:grant|rule|criteria|permissions|domain|topic|participant|governance)",
-        "a document, although signed, is not one that Fast DDS accepts",
-        "Have sros write it; `sros check` names what vendors read differently.",
+        "Fast DDS does not accept a document, although it is signed correctly",
+        "Generate it with sros; `sros check` reports what vendors read differently.",
         _DOCUMENT,
         refuses=Refused.PARTICIPANT,
     ),
@@ -406,23 +406,23 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "participant", _FAST, r"Error while configuring security plugin"
         r"|Participant is not allowed with its own permissions file",
-        "the process may not join; Fast DDS 2.14 says why in a line of its own, or in the file of "
-        "ROS_SECURITY_LOG_FILE, and neither is in this log", _CHECK_OR_FILE, _ALL,
+        "the process may not join; Fast DDS 2.14 gives the reason in another line, or in the file "
+        "of ROS_SECURITY_LOG_FILE, and neither is in this log", _CHECK_OR_FILE, _ALL,
         unseen=_FILE, weak=1,
     ),
     _text(
         "participant", _FAST, r"Cannot create participant due to initialization error"
         r"|Problem creating RTPSParticipant|failed to create participant",
-        "the process may not join, and this log does not say why: Fast DDS 2.9 is silent about "
-        "signatures, expired permissions and subjects, 2.14 reports them on standard output or in "
-        "the file of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL, unseen=_FILE, weak=2,
+        "the process may not join, and this log gives no reason: Fast DDS 2.9 logs nothing about "
+        "signatures, expired permissions and subjects, 2.14 logs them on standard output or in the "
+        "file of ROS_SECURITY_LOG_FILE", _CHECK_OR_FILE, _ALL, unseen=_FILE, weak=2,
     ),
     _text(
         "service", _ROS, r"(?:could not|failed to) create (?:service|client)"
         r"|create_(?:service|client)\(\) failed",
-        "a service or client is denied by the permissions, and this text does not say which. Of a "
-        "node that fails when it is created it is a service of its own: it runs under another "
-        "name, or in another namespace, than the policy's node",
+        "the permissions deny a service or client, and this message does not name it. If the node "
+        "fails when it is created, a standard service of the node is denied: the node has another "
+        "name or namespace than in the policy",
         "Compare the node's name and namespace with the policy's profile (ns, node); the line that "
         "names the topic is on standard output or in the file of ROS_SECURITY_LOG_FILE.", weak=2,
     ),
@@ -437,7 +437,7 @@ _LOG_TEXTS: tuple[LogText, ...] = (
         r"|create_(?:publisher|subscription)\(\) could not create",
         _DENIED_ENDPOINT, _ASK_FOR_TOPIC, weak=3,
     ),
-    # ── denied topics: their right and node are found in the lines nearby ──────────────────
+    # ── denied topics: nearby lines show the denied right and the node ─────────────────────
     _text(
         # Matched only at the start of a word, for speed: a line may be one very long word.
         "topic-denied", _FAST, r"(?<![^\s(])(?P<topic>[^\s(]+) topic "
@@ -473,8 +473,8 @@ UNKNOWN = LogText(
         r"|SECURITY ERROR"
     ),
     "a line of DDS Security that sros does not know",
-    "Read the line itself: it may matter. If it kept a node from starting, `sros "
-    "check KEYSTORE` and `sros explain KEYSTORE ENCLAVE join` check all that DDS checks.",
+    "Read the line: it may matter. If it kept a node from starting, `sros check KEYSTORE` and "
+    "`sros explain KEYSTORE ENCLAVE join` check all that DDS checks.",
 )
 """The meaning of a line that looks like a DDS Security message but is not in `_LOG_TEXTS`."""
 
@@ -499,7 +499,7 @@ CONTINUED = re.compile(r"^(?:[0-9A-F]{8,}:error:|\(code: )")
 """The start of a line that continues the line before it: OpenSSL's error stack."""
 
 PEER = re.compile(r"check_remote_data|remote (?:writer|reader)")
-"""The words that show that a peer's permissions deny a topic, not those of the process."""
+"""The words that show that a peer's permissions deny a topic, not the process's permissions."""
 
 DIRECTIONS: Mapping[str, re.Pattern[str]] = {
     "writer": re.compile(
@@ -513,7 +513,7 @@ DIRECTIONS: Mapping[str, re.Pattern[str]] = {
     "client": re.compile(r"create(?:_c| c|C)lient"),
     "server": re.compile(r"create(?:_s| s|S)ervice"),
 }
-"""The words, in lines near a denied topic, for the kind of endpoint that was denied."""
+"""The words in lines near a denied topic that show the kind of the denied endpoint."""
 
 # ── reading ────────────────────────────────────────────────────────────────────────────────
 
@@ -555,7 +555,7 @@ _TOPIC_DENIED = [
 
 
 def log_text(line: str) -> tuple[LogText, re.Match[str]] | None:
-    """Return the row that explains a line, or None; denied topics have no such row."""
+    """Return the text that explains a line, with its match, or None; see also `denied_topic`."""
     for text in _LOG_TEXTS:
         if text.cause and (match := text.pattern.search(line)):
             return text, match
@@ -563,14 +563,14 @@ def log_text(line: str) -> tuple[LogText, re.Match[str]] | None:
 
 
 def plain_text(output: str) -> str:
-    """Return the output of a process without colours."""
+    """Return the output of a process without ANSI colour codes."""
     return _COLOUR.sub("", output)
 
 
 def plain_refusal(line: str) -> str:
     """Return the message in a line of a DDS log, without time, severity and source positions.
 
-    It is empty only if the line is: without a message, the name of the failed function is used.
+    Without a message, returns the name of the failed function; returns "" only for an empty line.
     """
     line = " ".join(plain_text(line).split())
     if words := " ".join(_FRAME.sub("", line).split()):
@@ -592,7 +592,7 @@ _FRAME = re.compile(
     r"|Remote secure participant \S+ not allowed\. ?|[0-9A-F]{16}:error:[0-9A-F]+:[\w ]+:"
     r"|:\.\./\S+\.c:\d+|\[\w+\] failed: |validate_local_identity: |Error\. (?=Error|validate)"
 )
-"""The text that vendors put around the reason of a refusal, of no use to a user."""
+"""The text that vendors put around the reason of a refusal, such as times and positions."""
 
 _NO_REASON = "{}, and Fast DDS gives no reason"
 _FUNCTION = re.compile(r"(?:-> Function |::)(\w+)(?: :)?\s*\Z")

@@ -97,25 +97,25 @@ def test_a_good_file(folder: Path) -> None:
         (CLAIM, CLAIM.replace("heard", "liked"), 23, "'liked' is not a status"),
         (CLAIM, CLAIM.replace('"heard"', '["heard"]'), 23, "is not a status"),
         (CLAIM, CLAIM.replace('"camera"', '["camera"]'), 23, "no party ['camera']"),
-        (CLAIM, CLAIM.replace('expected = "heard"', "x = 1"), 23, "has no expected status; there"),
+        (CLAIM, CLAIM.replace('expected = "heard"', "x = 1"), 23, "has no expected status; use"),
         (CLAIM, CLAIM.replace("viewer", "camera"), 23, "camera is a talker, and cannot be the lis"),
         (CLAIM, 'claim = { party = "spy", expected = "readable" }', 23, "spy is a listener, and"),
-        (CLAIM, CLAIM.replace("listener", "client"), 23, "needs listener and talker, and no other"),
-        (CLAIM, CLAIM.replace('"heard"', '"started"'), 23, "needs party, and no other keys"),
+        (CLAIM, CLAIM.replace("listener", "client"), 23, "needs listener, talker and expected,"),
+        (CLAIM, CLAIM.replace('"heard"', '"started"'), 23, "needs party and expected, and no"),
         (CLAIM, "claim = 3", 23, "claim is not a table"),
         (CLAIM, 'claim = ["viewer hears camera"]', 23, '\'viewer hears camera\' is not a table'),
-        (CLAIM, 'claims = ["viewer hears camera"]', 23, "there are tables [[row.claim]]"),
+        (CLAIM, 'claims = ["viewer hears camera"]', 23, "write tables [[row.claim]]"),
         (CLAIM, 'claims = ["viewer hears camera"]', 23, 'listener = "spy", talker = "camera"'),
         (CONTROL, "", 29, "a crash would look the same"),
         ("because", "becuase", 27, "'becuase' is not a key"),
         ('role = "listener"\ntopic = "/image"\n\n[[row]]',
-         'role = "listener"\nkeystore = "foreign"\n\n[[row]]', 19, "this one is unsecured"),
+         'role = "listener"\nkeystore = "foreign"\n\n[[row]]', 19, "this party is unsecured"),
         ('enclave = "/arm/viewer"', 'enclave = "/arm/viewer"\nkeystore = "theirs"', 14,
-         "'theirs' is not a keystore; there are own, foreign"),
+         "'theirs' is not a keystore; use one of own, foreign"),
         ('policy = "robot.xml"', 'policy = "other.xml"', 2, "other.xml"),
         ('policy = "robot.xml"\n', "", 1, "no policy"),
         (CLAIM, "", 22, "has no claim"),
-        ('name = "the viewer sees"', "name = 3", 22, "3, not a text"),
+        ('name = "the viewer sees"', "name = 3", 22, "3, not a string"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_reported_with_its_line(
@@ -155,7 +155,7 @@ def test_claims_in_a_list(folder: Path) -> None:
 
 def test_a_party_that_is_no_table(folder: Path) -> None:
     text = 'policy = "robot.xml"\nparty = [{ name = "a", role = "talker" }, 3]\n'
-    with pytest.raises(DocumentError, match=r"line 2: there is no party"):
+    with pytest.raises(DocumentError, match=r"line 2: the scenario needs party tables"):
         read_scenario(write(folder, text))
 
 

@@ -378,7 +378,7 @@ def test_rcl_alone_makes_one_look_at_the_name(keystore: Path, tmp_path: Path) ->
     log = tmp_path / "stderr.log"
     log.write_text("RCLError: failed to create service: create_service() failed to create ...\n")
     found = sros("explain", keystore, ENCLAVE, "--log", log).out
-    assert "another name, or in another namespace, than the policy's node" in found
+    assert "another name or namespace than in the policy" in found
     assert "its permissions are for the node /talker" in found
 
 

@@ -1,4 +1,4 @@
-"""Scenarios of the user's own: a TOML file of parties and rows over a policy of theirs.
+"""User-defined scenarios: a TOML file with parties and rows, and the policy of their enclaves.
 
 ::
 
@@ -8,7 +8,7 @@
     [[party]]
     name = "camera"
     role = "talker"                       # a value of `sros_tool.demo.scenarios.model.Role`
-    enclave = "/arm/camera"               # left out: unsecured
+    enclave = "/arm/camera"               # without it: unsecured
     topic = "/image"                      # or the name of a service or action
 
     [[party]]
@@ -18,7 +18,7 @@
 
     [[row]]
     name = "a spy does not see the camera"
-    because = "..."                       # the mechanism, for the table
+    because = "..."                       # the reason, shown as the mechanism
 
     [[row.claim]]
     listener = "spy"
@@ -30,7 +30,8 @@
     talker = "camera"
     expected = "heard"
 
-``expected`` is a status as the table shows it, and says which parties a claim names: `_PARTIES`.
+``expected`` is a status as in the table of the demo; it decides by which keys a claim names its
+parties (`_PARTIES`).
 ``keystore = "foreign"`` gives a party the identity of another CA; ``variables`` is a table of
 environment variables.  A claim that something does not happen needs another claim or a control
 that something does happen.
@@ -74,7 +75,7 @@ _PARTIES: Mapping[Relation, tuple[str, ...]] = {
     Relation.IS_REFUSED: ("party",),
     Relation.STARTS: ("party",),
 }
-"""The keys that name the parties of a claim: whom it is about, and the other one."""
+"""The keys that name the parties of a claim: first its subject, then the other party."""
 
 _CLAIMS: Mapping[str, tuple[Relation, bool]] = {
     "heard": (Relation.HEARS, True),
@@ -114,20 +115,24 @@ def read_scenario(path: Path) -> Scenario:
     """Read a scenario file.
 
     Raises:
-        DocumentError: with the line of what is not understood.
+        DocumentError: the file is not a valid scenario; the message has the line.
     """
     try:
         text = read_bytes(path, "scenario").decode()
         data = parse_toml(text)
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise DocumentError(
-            f"the scenario '{path}' is not valid TOML", f"{error}.", "Correct it there."
+            f"the scenario '{path}' is not valid TOML", f"{error}.", "Correct the file."
         ) from error
     return _Reader(path, text).scenario(data)
 
 
 class _Reader:
-    """Reads one file; tables are numbered by their place in it, for the line of an error."""
+    """A reader of one scenario file.
+
+    Methods take the kind of a table ("party"; "": top level) and its index among the tables of that
+    kind, to find the line for an error.
+    """
 
     def __init__(self, path: Path, text: str) -> None:
         self._path = path
@@ -138,7 +143,7 @@ class _Reader:
         file = self._path.parent / self._text(data, "policy", "", 0)
         try:
             policy = read_policy(file)
-        except (SrosError, ValueError) as error:  # a name that holds NUL is of no file
+        except (SrosError, ValueError) as error:  # ValueError: NUL in the file name
             raise self._error("", 0, "policy", str(error)) from error
         parties = {}
         for place, table in enumerate(self._tables(data, "party")):
@@ -159,7 +164,7 @@ class _Reader:
         roles = {role.value: role for role in Role}
         word = self._text(table, "role", "party", place)
         if word not in roles:
-            problem = f"{word!r} is not a role; there are {', '.join(roles)}"
+            problem = f"{word!r} is not a role; use one of {', '.join(roles)}"
             raise self._error("party", place, "role", problem)
         role = roles[word]
         topic = self._text(table, "topic", "party", place, "")
@@ -177,13 +182,13 @@ class _Reader:
         word = self._text(table, "keystore", "party", place, OWN)
         keystores = {each.value: each for each in SoundKeystore}
         if word not in keystores:
-            problem = f"{word!r} is not a keystore; there are {', '.join(keystores)}"
+            problem = f"{word!r} is not a keystore; use one of {', '.join(keystores)}"
             raise self._error("party", place, "keystore", problem)
         if not enclave:
             for key in ("keystore", "variables"):
                 if key in table:
-                    problem = f"{key} is for a party with an enclave, and this one is unsecured"
-                    raise self._error("party", place, key, problem, "Name its enclave.")
+                    problem = f"{key} needs an enclave, but this party is unsecured"
+                    raise self._error("party", place, key, problem, "Give it an enclave.")
             return UNSECURED
         if policy.enclave(enclave) is None:
             paths = [each.path for each in policy.enclaves]
@@ -196,7 +201,7 @@ class _Reader:
         if not isinstance(variables, dict) or not all(
             isinstance(value, str) for value in variables.values()
         ):
-            raise self._error("party", place, "variables", "variables is not a table of texts")
+            raise self._error("party", place, "variables", "variables is not a table of strings")
         return Identity(keystores[word], enclave, tuple(variables.items()))
 
     def _row(self, table: Mapping[str, Any], place: int, parties: Mapping[str, Party]) -> Row:
@@ -239,20 +244,22 @@ class _Reader:
                 if expected is None
                 else f"{expected!r} is not a status that can be expected"
             )
-            raise self._error("row", place, key, f"{problem}; there are {', '.join(_CLAIMS)}")
+            raise self._error("row", place, key, f"{problem}; use one of {', '.join(_CLAIMS)}")
         relation, holds = _CLAIMS[expected]
         keys = _PARTIES[relation]
         if set(table) != {*keys, "expected"}:
-            problem = f"a {key} that is {expected!r} needs {' and '.join(keys)}, and no other keys"
+            problem = (
+                f"a {key} {expected!r} needs {', '.join(keys)} and expected, and no other keys"
+            )
             raise self._error("row", place, key, f"{problem}; it has {', '.join(table)}")
         names = [table[each] for each in keys]
         for each, name in zip(keys, names, strict=True):
             if not isinstance(name, str) or name not in parties:
-                problem = f"there is no party {name!r}; there are {', '.join(parties)}"
+                problem = f"there is no party {name!r}; use one of {', '.join(parties)}"
                 raise self._error("row", place, key, problem)
             role = parties[name].role
             if role not in (SPEAKING if relation is Relation.READABLE else _FITTING[each]):
-                problem = f"{name} is a {role}, and cannot be the {each} that is {expected!r}"
+                problem = f"{name} is a {role}, and cannot be the {each} of status {expected!r}"
                 raise self._error("row", place, key, problem)
         return Claim(relation, names[0], names[1] if len(names) > 1 else "", holds)
 
@@ -269,12 +276,12 @@ class _Reader:
                 if claim.relation is not Relation.HEARS or other.talker == claim.talker
             ]
             if not fitting:
-                who = f" somebody else hears {claim.talker}" if claim.talker else " something works"
+                who = f"a listener hears {claim.talker}" if claim.talker else "something works"
                 raise self._error(
                     "row",
                     place,
                     "claim",
-                    f"nothing shows that{who} at the same time: a crash would look the same",
+                    f"no claim or control shows that {who} meanwhile: a crash would look the same",
                     "Add a control, such as the rightful listener that hears the same talker.",
                 )
 
@@ -287,17 +294,19 @@ class _Reader:
             or not tables
             or not all(isinstance(each, dict) for each in tables)
         ):
-            raise self._error("", 0, kind, f"there is no {kind}", f"Add a table [[{kind}]].")
+            raise self._error(
+                "", 0, kind, f"the scenario needs {kind} tables", f"Write [[{kind}]] tables."
+            )
         return tables
 
     def _check_keys(self, table: Mapping[str, Any], kind: str, place: int) -> None:
         for key in table:
             if key in ("claims", "controls"):
-                problem = f"{key!r} is not a key here; there are tables [[row.{key[:-1]}]]"
+                problem = f"{key!r} is not a key here; write tables [[row.{key[:-1]}]]"
                 raise self._error(kind, place, key, problem, _EXAMPLE)
             if key not in _KEYS[kind]:
                 known = ", ".join(sorted(_KEYS[kind]))
-                problem = f"{key!r} is not a key here; there are {known}"
+                problem = f"{key!r} is not a key here; use one of {known}"
                 raise self._error(kind, place, key, problem)
 
     def _text(
@@ -311,7 +320,7 @@ class _Reader:
         value = table.get(key, default)
         if not isinstance(value, str) or (default is None and not value):
             what = f"the {kind or 'scenario'} has no {key}" if key not in table else ""
-            raise self._error(kind, place, key, what or f"{key} is {value!r}, not a text")
+            raise self._error(kind, place, key, what or f"{key} is {value!r}, not a string")
         return value
 
     def _error(
@@ -321,7 +330,7 @@ class _Reader:
         return DocumentError(f"the scenario '{self._path}', line {line}: {problem}", "", remedy)
 
     def _line(self, kind: str, place: int, key: str) -> int:
-        """Return the line of a key in the table of that kind and number, or that of the table."""
+        """Return the line number of a key in a table, or of its head if it lacks the key."""
         heads = [n for n, text in enumerate(self._lines) if re.match(rf"\s*\[\[{kind}\]\]", text)]
         start = heads[place] if kind and place < len(heads) else 0
         ends = (
@@ -339,5 +348,5 @@ class _Reader:
 
 
 def _happens(claim: Claim) -> bool:
-    """Return whether a claim is of something that works, not of a silence or a refusal."""
+    """Return whether a claim expects that something works, not silence or a refusal."""
     return claim.holds and claim.relation is not Relation.IS_REFUSED
