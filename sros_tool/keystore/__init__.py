@@ -1,1 +1,1 @@
-"""The keystore on disk: its layout, reading it, changing it, and sending parts of it to robots."""
+"""Keystores on disk: their layout, reading them, changing them, and delivery to robots."""

@@ -76,7 +76,7 @@ def _file(path: Path, data: bytes, now: datetime, authority: Path | None) -> Des
     if b"-----BEGIN CERTIFICATE-----" in data:
         return {"kind": "certificate", **_certificates(data, "in it", now)}
     if CRL_MARK in data:
-        return {"kind": "revocation list", **_list(load_crl(data, "in it"), now)}
+        return {"kind": "revocation list", **_revocation_list(load_crl(data, "in it"), now)}
     if b"PRIVATE KEY-----" in data:
         mode = path.stat().st_mode & 0o777
         key = load_key(data, "in it")
@@ -181,11 +181,11 @@ def _certificates(data: bytes, name: str, now: datetime) -> Description:
     if further:  # the chain of a CA, or the other CA during a rotation
         described["further"] = [_describe_certificate(each, now) for each in further]
     if CRL_MARK in data:
-        described["crl"] = _list(load_crl(data, name), now)
+        described["crl"] = _revocation_list(load_crl(data, name), now)
     return described
 
 
-def _list(crl: RevocationList, now: datetime) -> Description:
+def _revocation_list(crl: RevocationList, now: datetime) -> Description:
     """Describe a revocation list; with an expired one DDS refuses all certificates of its CA."""
     return {
         "issuer": subject_text(crl.list.issuer),

@@ -37,7 +37,7 @@ class HistoryStatus(StrEnum):
     CURRENT = "current"
     """It is in the keystore, and has not expired."""
     SUPERSEDED = "superseded"
-    """It was replaced in the keystore, but is neither revoked nor expired: DDS still accepts it."""
+    """It is no longer in the keystore, but neither revoked nor expired: DDS still accepts it."""
     REVOKED = "revoked"
     RETIRED = "retired"
     """A CA that was replaced, and is no longer trusted."""

@@ -1,4 +1,4 @@
-"""The verbs of deployment as a person or a script uses them, pipes and terminals included."""
+"""The deployment commands as users and scripts call them, with pipes and terminals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PROGRAM = f"{sys.executable} -m sros_tool"
 
 @pytest.fixture(autouse=True)
 def importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Processes that are started elsewhere find the package, too."""
+    """Let processes in other working directories import the package."""
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
 
 
@@ -124,7 +124,7 @@ def test_a_dry_run_of_a_pipe(keystore: Path) -> None:
     assert len(said) == 6
 
 
-# ── keys that are born on the robot ────────────────────────────────────────────────────────
+# ── keys created on the robot ─────────────────────────────────────────────────────────────
 
 
 def test_from_the_request_to_a_process_that_runs(keystore: Path, tmp_path: Path) -> None:
@@ -271,7 +271,7 @@ def test_verify_says_what_is_wrong_and_answers_by_its_status(
     assert ended.status == 1
     assert "/b  NOT LOADABLE\n" in ended.out
     assert f"{out}/enclaves/b/cert.pem: error: a file that an enclave needs is miss" in ended.out
-    # No command that needs the keys of the CAs is proposed for the robot's folder.
+    # A robot's folder has no CA keys, so no remedy may need them.
     assert "In the keystore that has the CA keys: Create the missing file: `sros " in ended.out
     assert "`sros create_enclave KEYSTORE /b`. Then export the enclave again." in ended.out
     assert f"{out}/enclaves/a/key.pem: error: a private key that others can read" in ended.out
@@ -294,7 +294,7 @@ def test_a_finding_outside_of_its_enclave_names_its_file_from_the_root(tmp_path:
     assert not [each for each in findings if ".." in each["file"]]
 
 
-# ── with what else happens to a keystore ───────────────────────────────────────────────────
+# ── after a rotation or a revocation ───────────────────────────────────────────────────────
 
 
 def test_a_robot_follows_a_rotation_of_the_cas_by_answers(keystore: Path, tmp_path: Path) -> None:
@@ -306,7 +306,7 @@ def test_a_robot_follows_a_rotation_of_the_cas_by_answers(keystore: Path, tmp_pa
         assert ended.returncode == 0, ended
         assert "not verified" not in ended.stdout
         sros("verify", tmp_path / "robot").ok()
-    # One that missed the stages knows nobody who could vouch for the new CAs.
+    # A robot that missed the stages of the rotation cannot trust the new CAs.
     sros("rotate_ca", keystore, "--finish").ok()
     ended = shell(line, tmp_path)
     assert "has not signed it" in ended.stderr

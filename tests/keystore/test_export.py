@@ -1,4 +1,4 @@
-"""Exports of several enclaves, and what is said of them where they arrive."""
+"""Exports of several enclaves, and their verification on the robot."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ BORN = "/arm/eye"
 
 @pytest.fixture(scope="session")
 def made_fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A keystore with four enclaves, and one whose key is on its robot."""
+    """A keystore with four enclaves, and a fifth whose key is on its robot."""
     folder = tmp_path_factory.mktemp("fleet")
     domains = DomainSet.of((5, 6))
     template = load_template("production")
@@ -53,7 +53,7 @@ def arrived(made_fleet: Path, tmp_path: Path) -> Path:
     return tmp_path / "robot"
 
 
-# ── what is chosen ─────────────────────────────────────────────────────────────────────────
+# ── selection ──────────────────────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_a_lost_key_is_not_taken_for_one_on_a_robot(fleet: Path, tmp_path: Path)
         distribute(fleet, ["/base"], tmp_path / "out", now=NOW)
 
 
-# ── what is said on the other side ─────────────────────────────────────────────────────────
+# ── verification on the robot ──────────────────────────────────────────────────────────────
 
 
 def test_what_arrived_as_it_was_sent_is_fine(arrived: Path) -> None:
@@ -249,9 +249,9 @@ def test_a_copy_of_the_whole_keystore_has_ca_keys(fleet: Path) -> None:
         "private/identity_ca.key.pem",
         "private/permissions_ca.key.pem",
     }
-    # The key of one enclave is on its robot, and missing here.
+    # Only the enclave whose key is on its robot has other findings.
     assert {each.subject for each in findings if each not in keys} == {BORN}
-    # The links of an enclave lead out of its folder, but not out of the keystore.
+    # The enclave's links lead to other folders of the same keystore.
     assert not verify_arrival(fleet / "enclaves/base", now=NOW).findings
 
 

@@ -1,4 +1,4 @@
-"""Keystores upon authorities that were made elsewhere, and spans of validity with dates."""
+"""Keystores with imported CAs, and validities with dates."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def openssl(folder: Path, *words: str) -> None:
 
 @pytest.fixture(scope="module")
 def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A root, an intermediate below it, the chain of both, and CAs that vendors differ about."""
+    """A root CA, an intermediate CA, their chain, and CAs that only some vendors accept."""
     folder = tmp_path_factory.mktemp("pki")
     curve = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes")
     root = ("-x509", "-days", "900", "-addext", CA, "-addext", USAGE)
@@ -61,7 +61,7 @@ def test_both_authorities_can_be_imported(pki: Path, tmp_path: Path) -> None:
         "--identity-ca", pki / "root.pem", "--identity-key", pki / "root.key",
         "--permissions-ca", pki / "permissions.pem", "--permissions-key", pki / "permissions.key",
     ).ok()  # fmt: skip
-    assert "separate; certificates 365d" in made.out  # and no validity of a CA that is not made
+    assert "separate; certificates 365d" in made.out  # without a validity for the imported CAs
     assert made.out.count("    imported, valid until ") == 2
     assert not (root / "private").exists()
     sros("create_enclave", root, "/a").ok()

@@ -1,4 +1,4 @@
-"""What all verbs that issue share: what ends early with its CA says so, whoever issues it."""
+"""Every command that issues reports a validity that the CA's expiry shortens."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.template import load_template
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
-LATE = NOW + timedelta(days=1800)  # the CAs of production live for 1825 days
+LATE = NOW + timedelta(days=1800)  # CAs of the production template are valid for 1825 days
 
 
 @pytest.fixture
@@ -38,13 +38,13 @@ def test_what_is_answered_late_ends_with_its_ca(root: Path, tmp_path: Path) -> N
 
 @pytest.mark.parametrize(("days", "said"), [(90, 2), (300, 1), (2000, 0)])
 def test_what_a_short_lived_ca_reissues_ends_with_it(days: int, said: int, root: Path) -> None:
-    """Certificates last 365 days, permissions 180."""
+    """Certificates are valid for 365 days, permissions for 180."""
     done = rotate_ca(root, finish=True, validity=timedelta(days=days), now=NOW)
     assert len(early(done.notes)) == said
 
 
 def test_a_loss_of_days_in_years_is_not_worth_a_word(tmp_path: Path) -> None:
-    """In development all of it lasts ten years, and is made one after the other."""
+    """In the development template, CAs, certificates and permissions are valid for ten years."""
     root = tmp_path / "ks"
     create_keystore(root, template=load_template("development"), now=NOW)
     for days, said in ((0, 0), (30, 0), (60, 2)):

@@ -1,4 +1,4 @@
-"""The keys of the authorities: encrypted, away from the keystore, and found again."""
+"""The keys of the CAs: encrypted, outside the keystore, and found there again."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_keys_away_from_the_keystore(tmp_path: Path) -> None:
     assert not (root / "private").exists()
     assert {key.stat().st_mode & 0o777 for key in away.iterdir()} == {0o600}
     assert load_settings(root).identity_key == places["identity"]
-    create_enclaves(root, ["/a"], now=NOW)  # the settings tell where the keys are
+    create_enclaves(root, ["/a"], now=NOW)  # finds the keys by the settings
     away.rename(tmp_path / "drawer")
     with pytest.raises(KeystoreError, match="SROS_IDENTITY_KEY"):
         create_enclaves(root, ["/b"], now=NOW)

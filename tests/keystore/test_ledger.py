@@ -1,4 +1,4 @@
-"""The ledger knows everything that was issued, and the history what became of it."""
+"""The ledger lists everything that was issued, and the history shows its present state."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ def test_the_status_of_everything(tmp_path: Path) -> None:
         ("revocation", "/b"): ["revoked"] * 2,
         ("crl", ""): ["current"],
     }
-    end = NOW + timedelta(days=181)  # of the first permissions, but of no certificate
+    end = NOW + timedelta(days=181)  # the first permissions expired, but no certificate
     found = statuses(root, end)
     assert found["permissions", "/a"] == ["expired", "current"]
     assert found["permissions", "/c"] == ["expired"]

@@ -1,4 +1,4 @@
-"""The first answer that a robot gets is accepted from the CA that a person named, if one did."""
+"""With a pinned CA, a robot accepts only answers that this CA signed, the first one included."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ def test_the_named_ca_is_accepted_and_no_other(home: Path, robot: Path, tmp_path
         import_answer(robot, answers[1], now=NOW, pinned=pin(home))
     assert snapshot(robot) == before
     assert import_answer(robot, answers[0], now=NOW, pinned=pin(home)).first
-    # Moving to other CAs is no reason to accept anybody.
+    # The permission to move to other CAs does not disable the pin.
     with pytest.raises(KeystoreError, match="not signed by the pinned CA"):
         import_answer(robot, answers[1], now=NOW, pinned=pin(home), force=True)
     import_answer(robot, answers[1], now=NOW, pinned=pin(evil), force=True)
 
 
 def test_the_identity_ca_does_not_vouch_for_the_permissions(robot: Path, tmp_path: Path) -> None:
-    """On its way, permissions, governance and their CA are replaced; the certificate is genuine."""
+    """An attacker keeps the certificate, and replaces permissions, governance and their CA."""
     home, evil = made(tmp_path, "home"), made(tmp_path, "evil", "development")
     genuine = unpack(answer_of(home, robot))
     forged = unpack(answer_of(evil, robot))
@@ -88,13 +88,13 @@ def test_the_identity_ca_does_not_vouch_for_the_permissions(robot: Path, tmp_pat
     with pytest.raises(KeystoreError, match=digest(authority.certificate)):
         import_answer(robot, archive, now=NOW, pinned=pin(home))
     assert snapshot(robot) == before
-    # It is a good forgery: whoever names nobody believes it.
+    # The forgery is good: without a pin it is accepted.
     import_answer(robot, archive, now=NOW)
     assert not verify_arrival(robot, now=NOW).findings
 
 
 def resigned(home: Path, files: dict[str, bytes], subject: str) -> dict[str, bytes]:
-    """The permissions for another subject, signed by a keystore's permissions CA."""
+    """Return files with permissions for ``subject``, signed by a keystore's permissions CA."""
     text = (home / FOLDER / "permissions.xml").read_text()
     text = re.sub(r"<subject_name>[^<]*", f"<subject_name>{subject}", text)
     text = re.sub(r"<not_after>[^<]*", "<not_after>2027-01-01T00:00:00Z", text)

@@ -1,4 +1,4 @@
-"""Permissions are proven to say what their policy says; nothing is written where they do not."""
+"""Permissions are proven to match their policy; otherwise nothing is written."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_the_policies_that_ship(file: Path) -> None:
 @settings(max_examples=30)
 @given(policies())
 def test_whatever_compares_equal_is_decided_equally(policy: Policy) -> None:
-    """The step from equal sets to equal decisions, on the engine, for policies of every kind."""
+    """Equal sets of expressions mean equal decisions of the engine, for random policies."""
     for enclave in policy.enclaves:
         made = permissions_of(enclave)
         assert signed_expressions(made, DOMAINS) == stated_expressions(enclave)
@@ -67,7 +67,7 @@ def test_whatever_compares_equal_is_decided_equally(policy: Policy) -> None:
 @settings(max_examples=30)
 @given(policies())
 def test_what_is_stated_is_what_the_rights_of_the_policy_say(policy: Policy) -> None:
-    """The DDS names of the proof are those of the translation, by the policy's own meaning."""
+    """The DDS expressions of the proof allow exactly the topics that the policy allows."""
     rules = Rules(policy_rights(policy))
     for enclave in policy.enclaves:
         stated = stated_expressions(enclave)
@@ -78,7 +78,7 @@ def test_what_is_stated_is_what_the_rights_of_the_policy_say(policy: Policy) -> 
                     assert stated.allow(verb, topic) == allowed, (verb, topic)
 
 
-# ── what is wrong is found ─────────────────────────────────────────────────────────────────
+# ── errors are found ───────────────────────────────────────────────────────────────────────
 
 
 def of_text(groups: str, tmp_path: Path) -> Enclave:
@@ -147,7 +147,7 @@ def test_what_is_wrong_is_found(wrong: str, tmp_path: Path) -> None:
 def test_a_vendor_that_reads_a_wildcard_otherwise_is_found(
     count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However large the document is."""
+    """Matchers are compared for small and for large documents."""
     names = [f"/t{number}" for number in range(count)]
     assert proof.matched_as_meant("rt/robot[0-9]/*")
     prove(enclave := of_text(publish(*names, "/a[bc]"), tmp_path), permissions_of(enclave), DOMAINS)
@@ -205,14 +205,14 @@ def test_a_wildcard_is_told_apart_from_all_others(expressions: list[str]) -> Non
         assert any(matches(one, name) for name in found)
 
 
-# ── where it is used ───────────────────────────────────────────────────────────────────────
+# ── use by commands ────────────────────────────────────────────────────────────────────────
 
 
 @pytest.mark.parametrize("count", [1, 6])
 def test_nothing_is_written_where_it_does_not_hold(
     count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A translation that loses denials, or allows more than was said, does not reach the disk."""
+    """Permissions without the deny rules, or with additional rights, are not written."""
     policy = tmp_path / "robot.xml"
     groups = '<topics publish="ALLOW"><topic>/a/*</topic></topics>'
     groups += '<topics publish="DENY"><topic>/a/secret</topic></topics>'

@@ -1,4 +1,4 @@
-"""Keys that are born on the robot: requests, answers, and what is refused on either side."""
+"""Keys created on the robot: requests, answers, and what each side refuses."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ def test_places_in_which_no_key_is_made(case: str, tmp_path: Path) -> None:
     assert snapshot(tmp_path) == before
 
 
-# ── at home: signing ───────────────────────────────────────────────────────────────────────
+# ── at the keystore: signing ───────────────────────────────────────────────────────────────
 
 
 def test_signing_records_everything_but_the_key(home: Path, robot: Path) -> None:
@@ -269,7 +269,7 @@ def ed25519_request() -> bytes:
 
 
 def with_another_key() -> bytes:
-    """A request that carries a key whose owner has not signed it."""
+    """Return a request with the public key of another party, so that its signature fails."""
     mine, theirs = generate_key(), generate_key()
     request = x509.load_pem_x509_csr(make_request(mine, NAME)).public_bytes(Encoding.DER)
     form = (Encoding.X962, PublicFormat.UncompressedPoint)
@@ -599,7 +599,7 @@ def test_answers_that_were_tampered_with_leave_nothing(
 
 
 def test_an_earlier_governance_cannot_be_slipped_in(home: Path, robot: Path) -> None:
-    """It is signed by the right CA; only the list of the files tells it from the present one."""
+    """An earlier governance has a valid signature; only the signed file list excludes it."""
     files = unpack(sign(home, robot).archive)
     earlier = home.parent / "earlier"
     shutil.copytree(home, earlier, symlinks=True)
@@ -615,7 +615,7 @@ def test_an_earlier_governance_cannot_be_slipped_in(home: Path, robot: Path) -> 
 
 
 def test_a_repacked_answer_is_as_good(home: Path, robot: Path) -> None:
-    """The positive twin: what counts is what it holds, not how it was packed."""
+    """The positive twin: the content counts, not the way it was packed."""
     import_answer(robot, rebuilt(unpack(sign(home, robot).archive)), now=NOW)
     assert not verify_arrival(robot, now=NOW).findings
 

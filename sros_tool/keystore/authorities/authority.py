@@ -52,7 +52,7 @@ class Authority:
     key: PrivateKey
 
     def issuer(self) -> Issuer:
-        """Return the issuer that signs certificates for this authority."""
+        """Return an `Issuer` that signs certificates with this CA."""
         return Issuer(self.certificate, self.key)
 
     def sign(self, document: bytes, what: str) -> bytes:
@@ -83,6 +83,7 @@ def check_meaning(read: object, meant: object, what: str) -> None:
 
 
 def _with_lf(document: bytes) -> bytes:
+    """Return ``document`` with LF line ends; S/MIME writes CRLF."""
     return document.replace(b"\r\n", b"\n")
 
 

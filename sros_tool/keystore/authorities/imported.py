@@ -108,6 +108,7 @@ def _chain(
 
 
 def _check_ca(certificate: x509.Certificate, role: str, now: datetime) -> None:
+    """Raise `PkiError` if a certificate may not issue others, or is not valid ``now``."""
     name = subject_text(certificate.subject)
     extensions = certificate.extensions
     try:

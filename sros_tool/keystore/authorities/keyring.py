@@ -140,7 +140,7 @@ def check_imported_keys(roles: Iterable[str], keyring: Keyring, template: Templa
             )
         if not template.separate_authorities and role != IDENTITY:
             raise UsageError(
-                "a keystore with one CA for both roles takes no separate permissions CA",
+                "a keystore with one CA for both roles accepts no separate permissions CA",
                 "",
                 "Give --identity-ca alone, or add --ca-layout separate.",
             )

@@ -87,6 +87,7 @@ def _listed(files: dict[str, bytes]) -> bytes:
 
 
 def _with_lf(document: bytes) -> bytes:
+    """Return ``document`` with LF line ends; S/MIME writes CRLF."""
     return document.replace(b"\r\n", b"\n")
 
 

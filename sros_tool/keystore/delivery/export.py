@@ -65,7 +65,7 @@ def select(
     `distribute`.
 
     Raises:
-        KeystoreError: a pattern matches no enclave, or no enclave is left.
+        KeystoreError: a pattern matches no enclave, or the keys of all matches are on robots.
     """
     existing = list_enclaves(root)
     chosen = list(dict.fromkeys(names))

@@ -221,7 +221,7 @@ def _check_key(root: Path, request: SigningRequest) -> None:
 
 
 def _check_result(answer: RequestAnswer, request: SigningRequest, now: datetime) -> None:
-    """Check that the robot will accept the answer."""
+    """Raise `KeystoreError` if the robot would reject the answer."""
     try:
         check_answer(answer, request.public_key, now=now)
     except SrosError as error:
@@ -267,7 +267,7 @@ def _present_certificate(root: Path, name: str) -> x509.Certificate:
 
 
 def _answer_files(root: Path, issued: Issued) -> dict[str, bytes]:
-    """Return the files of the answer by their paths in a keystore, sorted."""
+    """Map the paths of the answer's files to their content, sorted by path."""
     name = issued.issuance.name
     folder = enclave_folder(name)
     files = {

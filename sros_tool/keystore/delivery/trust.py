@@ -37,7 +37,7 @@ def read_pin(text: str) -> frozenset[str]:
 
 
 def trusted_in(folder: Path, file: str) -> list[x509.Certificate]:
-    """Return the distinct CA certificates in the CA file ``file`` of all enclaves of a folder."""
+    """Return the distinct certificates in all files named ``file`` of a folder's enclaves."""
     found: dict[str, x509.Certificate] = {}
     for path in sorted((folder / ENCLAVES).rglob(file)):
         if path.exists():
@@ -78,7 +78,7 @@ def refuse_ca_keystore(folder: Path, remedy: str) -> None:
     if (folder / PRIVATE).exists() or (folder / PUBLIC).exists():
         raise KeystoreError(
             f"'{folder}' is a keystore with CAs",
-            "Signing requests and their answers belong into a folder on the robot.",
+            "Signing requests and their answers belong in a folder on the robot.",
             remedy,
         )
 

@@ -88,7 +88,9 @@ class ExpressionSets:
 
     def allow(self, verb: str, topic: str) -> bool:
         """Return whether a policy allows ``topic``: a rule allows it, and no rule denies it."""
-        return _meant(self.allowed[verb], topic) and not _meant(self.denied[verb], topic)
+        return _any_matches(self.allowed[verb], topic) and not _any_matches(
+            self.denied[verb], topic
+        )
 
     def all(self) -> Iterator[str]:
         """Yield every expression, perhaps more than once."""
@@ -161,7 +163,10 @@ def stated_expressions(policy: Enclave) -> ExpressionSets:
 
 
 def signed_expressions(permissions: Permissions, domains: DomainSet) -> ExpressionSets | None:
-    """Return the expressions of permissions, or None unless they have the simple form above."""
+    """Return the expressions that permissions allow and deny.
+
+    Return None if the permissions do not have the form that the module text describes.
+    """
     if len(permissions.grants) != 1 or permissions.grants[0].default_allow:
         return None
     found = ExpressionSets.none()
@@ -279,7 +284,7 @@ def _topics(permissions: Permissions) -> Iterator[str]:
                 yield from criteria.topics
 
 
-def _meant(expressions: set[str], topic: str) -> bool:
+def _any_matches(expressions: set[str], topic: str) -> bool:
     return topic in expressions or any(
         matches(each, topic) for each in expressions if is_expression(each)
     )
