@@ -39,7 +39,7 @@ def asked(tmp_path: Path, name: str = NAME) -> Path:
 # ── distribute_key ─────────────────────────────────────────────────────────────────────────
 
 
-def test_several_enclaves_are_told_one_by_one(keystore: Path, tmp_path: Path) -> None:
+def test_exported_enclaves_are_listed(keystore: Path, tmp_path: Path) -> None:
     ended = sros("distribute_key", keystore, "/b", "/a", tmp_path / "out").ok()
     assert ended.out.splitlines() == [
         f"exported enclave /b to '{tmp_path / 'out'}'",
@@ -78,7 +78,7 @@ def test_through_a_pipe_with_the_modes_of_keys(keystore: Path, tmp_path: Path) -
     assert ended.returncode == 0, ended
 
 
-def test_a_pipe_that_breaks_and_one_that_gets_nothing(keystore: Path, tmp_path: Path) -> None:
+def test_broken_and_empty_pipes(keystore: Path, tmp_path: Path) -> None:
     assert shell("sros distribute_key ks --all - | true", tmp_path).stderr.count("Traceback") == 0
     ended = shell("sros distribute_key ks /none - > out", tmp_path)
     assert ended.returncode == 1
@@ -92,7 +92,9 @@ def test_a_pipe_that_breaks_and_one_that_gets_nothing(keystore: Path, tmp_path: 
 @pytest.mark.parametrize(
     "words", [["distribute_key", "ks", "/a", "-"], ["sign_request", "ks", "r.pem", "-o", "-"]]
 )
-def test_a_terminal_gets_no_archive(words: list[str], keystore: Path, tmp_path: Path) -> None:
+def test_no_archive_is_written_to_a_terminal(
+    words: list[str], keystore: Path, tmp_path: Path
+) -> None:
     shutil.copy(asked(tmp_path), tmp_path / "r.pem")
     before = snapshot(tmp_path)
     leader, follower = pty.openpty()
@@ -111,7 +113,7 @@ def test_a_terminal_gets_no_archive(words: list[str], keystore: Path, tmp_path: 
     assert snapshot(tmp_path) == before
 
 
-def test_a_forgotten_target_is_noticed(keystore: Path) -> None:
+def test_a_missing_target_is_refused(keystore: Path) -> None:
     ended = sros("distribute_key", keystore, "/a", "/b")
     assert ended.status == 2
     assert "no target is named" in ended.err
@@ -127,7 +129,7 @@ def test_a_dry_run_of_a_pipe(keystore: Path) -> None:
 # ── keys created on the robot ─────────────────────────────────────────────────────────────
 
 
-def test_from_the_request_to_a_process_that_runs(keystore: Path, tmp_path: Path) -> None:
+def test_from_the_request_to_a_running_process(keystore: Path, tmp_path: Path) -> None:
     ended = sros("create_request", NAME, tmp_path / "robot").ok()
     digest = ended.out.splitlines()[1].split()[-1]
     request = tmp_path / "robot" / FOLDER / "request.pem"
@@ -193,7 +195,7 @@ def test_roots_from_the_environment(keystore: Path, tmp_path: Path) -> None:
         "import good.tgz robot",
     ],
 )
-def test_a_dry_run_tells_what_the_verb_then_does(line: str, keystore: Path, tmp_path: Path) -> None:
+def test_a_dry_run_prints_what_the_command_does(line: str, keystore: Path, tmp_path: Path) -> None:
     request = asked(tmp_path)
     shutil.copy(request, tmp_path / "r.pem")
     shutil.copytree(keystore, tmp_path / "twin", symlinks=True)
@@ -239,7 +241,7 @@ MISUSE: dict[str, tuple[str, int, str]] = {
 
 
 @pytest.mark.parametrize("case", MISUSE)
-def test_misuse_is_told_in_one_paragraph(case: str, keystore: Path, tmp_path: Path) -> None:
+def test_misuse_is_reported_in_one_paragraph(case: str, keystore: Path, tmp_path: Path) -> None:
     line, status, why = MISUSE[case]
     request = asked(tmp_path)
     shutil.copy(request, tmp_path / "r.pem")
@@ -259,9 +261,7 @@ def test_misuse_is_told_in_one_paragraph(case: str, keystore: Path, tmp_path: Pa
 # ── verify ─────────────────────────────────────────────────────────────────────────────────
 
 
-def test_verify_says_what_is_wrong_and_answers_by_its_status(
-    keystore: Path, tmp_path: Path
-) -> None:
+def test_verify_reports_faults_and_sets_its_exit_status(keystore: Path, tmp_path: Path) -> None:
     sros("distribute_key", keystore, "/a", "/b", tmp_path / "out").ok()
     out = tmp_path / "out"
     assert sros("verify", out, "--domain", "0").ok().err == ""

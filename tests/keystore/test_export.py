@@ -85,13 +85,15 @@ def test_selection(
     ("patterns", "why"),
     [(["/leg/*"], "matches '/leg/*'"), ([BORN], "not in keystore"), ([""], "matches")],
 )
-def test_a_selection_of_nothing_is_refused(patterns: list[str], why: str, made_fleet: Path) -> None:
+def test_an_empty_selection_is_refused(patterns: list[str], why: str, made_fleet: Path) -> None:
     with pytest.raises(KeystoreError) as caught:
         select(made_fleet, [], patterns)
     assert why in str(caught.value)
 
 
-def test_several_enclaves_go_whole_or_not_at_all(fleet: Path, tmp_path: Path) -> None:
+def test_several_enclaves_are_exported_completely_or_not_at_all(
+    fleet: Path, tmp_path: Path
+) -> None:
     before = snapshot(tmp_path)
     for wrong, why in ((BORN, "made on its robot"), ("/none", "does not exist")):
         for target in ("out", "out.tar.gz"):
@@ -118,7 +120,7 @@ def test_folder_archive_and_pipe_hold_the_same(fleet: Path, tmp_path: Path) -> N
     }
 
 
-def test_a_lost_key_is_not_taken_for_one_on_a_robot(fleet: Path, tmp_path: Path) -> None:
+def test_a_lost_key_does_not_count_as_a_key_on_a_robot(fleet: Path, tmp_path: Path) -> None:
     (fleet / "enclaves/base/key.pem").unlink()
     with pytest.raises(KeystoreError, match=r"key\.pem: missing"):
         distribute(fleet, ["/base"], tmp_path / "out", now=NOW)
@@ -127,7 +129,7 @@ def test_a_lost_key_is_not_taken_for_one_on_a_robot(fleet: Path, tmp_path: Path)
 # ── verification on the robot ──────────────────────────────────────────────────────────────
 
 
-def test_what_arrived_as_it_was_sent_is_fine(arrived: Path) -> None:
+def test_an_unchanged_export_has_no_findings(arrived: Path) -> None:
     arrival = verify_arrival(arrived, now=NOW, domain=5)
     assert not arrival.findings
     assert [(each.name, each.loadable, each.domains) for each in arrival.enclaves] == [
@@ -255,7 +257,7 @@ def test_a_copy_of_the_whole_keystore_has_ca_keys(fleet: Path) -> None:
     assert not verify_arrival(fleet / "enclaves/base", now=NOW).findings
 
 
-def test_a_revoked_enclave_that_arrived_is_told(fleet: Path, tmp_path: Path) -> None:
+def test_a_revoked_enclave_on_the_robot_is_a_finding(fleet: Path, tmp_path: Path) -> None:
     distribute(fleet, ["/base", "/armada"], tmp_path / "robot", now=NOW)
     revoke(fleet, ["/base"], now=NOW)
     distribute(fleet, ["/armada"], tmp_path / "robot", now=NOW)
@@ -282,7 +284,7 @@ def test_verifying_changes_nothing(arrived: Path) -> None:
     assert snapshot(arrived) == before
 
 
-def test_an_update_replaces_what_was_sent_before(fleet: Path, tmp_path: Path) -> None:
+def test_an_update_replaces_the_files_of_an_earlier_export(fleet: Path, tmp_path: Path) -> None:
     distribute(fleet, ["/base"], tmp_path / "robot", now=NOW)
     (tmp_path / "p.xml").write_text(policy_text({"/base": publish("new")}))
     generate_artifacts(fleet, policies=[read_policy(tmp_path / "p.xml")], now=NOW)

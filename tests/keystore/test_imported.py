@@ -54,7 +54,7 @@ def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_both_authorities_can_be_imported(pki: Path, tmp_path: Path) -> None:
+def test_both_cas_can_be_imported(pki: Path, tmp_path: Path) -> None:
     root = tmp_path / "ks"
     made = sros(
         "create_keystore", root, "--template", "production",
@@ -72,7 +72,7 @@ def test_both_authorities_can_be_imported(pki: Path, tmp_path: Path) -> None:
     assert sros("inspect", root).status == 0
 
 
-def test_an_intermediate_comes_with_its_chain(pki: Path, tmp_path: Path) -> None:
+def test_an_intermediate_ca_is_imported_with_its_chain(pki: Path, tmp_path: Path) -> None:
     root = tmp_path / "ks"
     made = sros(
         "create_keystore", root, "--identity-ca", pki / "chain.pem", "--identity-key",
@@ -101,7 +101,7 @@ def test_an_intermediate_comes_with_its_chain(pki: Path, tmp_path: Path) -> None
         ("root.pem", "nothing/x.key", 1, "nothing"),
     ],
 )
-def test_what_cannot_be_imported(
+def test_a_ca_that_cannot_be_imported_changes_nothing(
     certificate: str, key: str | None, status: int, words: str, pki: Path, tmp_path: Path
 ) -> None:
     before = sorted(pki.iterdir())
@@ -116,7 +116,9 @@ def test_what_cannot_be_imported(
 @pytest.mark.parametrize(
     ("name", "note"), [("sha384", "portable.signature-hash"), ("rsa3072", "portable.key-algorithm")]
 )
-def test_what_vendors_differ_about_is_said(name: str, note: str, pki: Path, tmp_path: Path) -> None:
+def test_a_ca_that_some_vendors_refuse_gets_a_note(
+    name: str, note: str, pki: Path, tmp_path: Path
+) -> None:
     place = ("--identity-ca", pki / f"{name}.pem", "--identity-key", pki / f"{name}.key")
     assert note in sros("create_keystore", tmp_path / "ks", *place).ok().err
     plain = ("--identity-ca", pki / "root.pem", "--identity-key", pki / "root.key")
@@ -132,7 +134,7 @@ def test_what_vendors_differ_about_is_said(name: str, note: str, pki: Path, tmp_
         ("only certifies, sha384", "no DDS vendor accepts it", set()),
     ],
 )
-def test_who_refuses_what_a_permissions_ca_signs_is_said(
+def test_vendors_that_refuse_a_permissions_ca_are_named(
     made: str, words: str, takes: set[Vendor], tmp_path: Path
 ) -> None:
     certificate, key = authority(
@@ -187,19 +189,19 @@ def test_who_refuses_what_a_permissions_ca_signs_is_said(
         ),
     ],
 )
-def test_spans(text: str, span: Span, begin: datetime, end: datetime) -> None:
+def test_validities_are_parsed(text: str, span: Span, begin: datetime, end: datetime) -> None:
     assert parse_span(text) == span
     assert parse_span(span_text(span)) == span
     assert window(NOW, span) == Window(begin, end)
 
 
 @pytest.mark.parametrize("text", ["", "x", "90", "0d", "2026-13-01", "/90d", "90d/90d", "a/b/c"])
-def test_what_is_no_span(text: str) -> None:
+def test_an_invalid_validity_is_refused(text: str) -> None:
     with pytest.raises(UsageError):
         parse_span(text)
 
 
-def test_a_span_that_is_over_makes_no_keystore(tmp_path: Path) -> None:
+def test_a_validity_in_the_past_creates_no_keystore(tmp_path: Path) -> None:
     ended = sros("create_keystore", tmp_path / "ks", "--validity", "2020-01-01")
     assert ended.status == 2
     assert "expired at 2020-01-01" in ended.err

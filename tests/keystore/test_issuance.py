@@ -29,7 +29,7 @@ def early(notes: tuple[Note, ...]) -> list[str]:
     return [each.text for each in notes if each.id == "keystore.ends-with-ca"]
 
 
-def test_what_is_answered_late_ends_with_its_ca(root: Path, tmp_path: Path) -> None:
+def test_an_answer_near_the_expiry_of_the_ca_gets_a_note(root: Path, tmp_path: Path) -> None:
     made = create_request(tmp_path / "robot", "/r")
     data = made.file.read_bytes()
     assert len(early(sign_request(root, data, now=LATE).notes)) == 2
@@ -37,13 +37,13 @@ def test_what_is_answered_late_ends_with_its_ca(root: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize(("days", "said"), [(90, 2), (300, 1), (2000, 0)])
-def test_what_a_short_lived_ca_reissues_ends_with_it(days: int, said: int, root: Path) -> None:
+def test_reissuing_with_a_short_lived_ca_gives_a_note(days: int, said: int, root: Path) -> None:
     """Certificates are valid for 365 days, permissions for 180."""
     done = rotate_ca(root, finish=True, validity=timedelta(days=days), now=NOW)
     assert len(early(done.notes)) == said
 
 
-def test_a_loss_of_days_in_years_is_not_worth_a_word(tmp_path: Path) -> None:
+def test_a_validity_shortened_by_less_than_one_percent_gets_no_note(tmp_path: Path) -> None:
     """In the development template, CAs, certificates and permissions are valid for ten years."""
     root = tmp_path / "ks"
     create_keystore(root, template=load_template("development"), now=NOW)

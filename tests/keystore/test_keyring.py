@@ -37,7 +37,7 @@ def test_an_encrypted_key_signs_with_its_passphrase_only(tmp_path: Path) -> None
     assert list_enclaves(root) == ("/a",)
 
 
-def test_a_passphrase_is_asked_for_once_a_key(tmp_path: Path) -> None:
+def test_a_passphrase_is_asked_for_once_per_key(tmp_path: Path) -> None:
     asked: list[str] = []
 
     def handler(what: str) -> str:
@@ -73,7 +73,7 @@ def test_keys_away_from_the_keystore(tmp_path: Path) -> None:
     assert list_enclaves(root) == ("/a", "/b")
 
 
-def test_a_key_of_another_authority_is_refused(tmp_path: Path) -> None:
+def test_a_key_of_another_ca_is_refused(tmp_path: Path) -> None:
     for name in ("one", "two"):
         create_keystore(tmp_path / name, template=load_template("production"), now=NOW)
     other = {"identity": f"file:{tmp_path / 'two/private/identity_ca.key.pem'}"}
@@ -96,7 +96,7 @@ def test_a_failed_keystore_leaves_no_key_outside(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_one_authority_has_one_place(tmp_path: Path) -> None:
+def test_a_single_ca_has_one_key_place(tmp_path: Path) -> None:
     template = load_template("sros2")
     with pytest.raises(KeystoreError, match="one place"):
         create_keystore(

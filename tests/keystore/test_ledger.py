@@ -38,7 +38,9 @@ def told(root: Path) -> list[tuple[str, str]]:
 @pytest.mark.parametrize(
     ("template", "authorities"), [("production", 2), ("development", 2), ("sros2", 1)]
 )
-def test_every_verb_says_what_it_issued(template: str, authorities: int, tmp_path: Path) -> None:
+def test_every_command_records_what_it_issues(
+    template: str, authorities: int, tmp_path: Path
+) -> None:
     root = made(tmp_path / "ks", "/a", "/b", template=template)
     both = [("certificate", "/a"), ("permissions", "/a")]
     expected = [("ca", "")] * authorities + [("governance", "")] + both
@@ -56,7 +58,7 @@ def test_every_verb_says_what_it_issued(template: str, authorities: int, tmp_pat
     assert told(root) == expected
 
 
-def test_entries_are_of_what_lies_there(tmp_path: Path) -> None:
+def test_entries_describe_the_files_in_the_keystore(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     by_kind = {entry.what: entry for entry in read_ledger(root)}
     issued = certificate(root / "enclaves/a/cert.pem")
@@ -71,7 +73,7 @@ def test_entries_are_of_what_lies_there(tmp_path: Path) -> None:
     assert by_kind["permissions"].not_after == "2026-11-28T00:00:00Z"
 
 
-def test_a_renewal_remembers_the_policy(tmp_path: Path) -> None:
+def test_a_renewal_keeps_the_digest_of_the_policy(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a", "/b")
     policy = tmp_path / "p.xml"
     policy.write_text(policy_text({"/a": publish("x")}))
@@ -87,7 +89,7 @@ def test_a_renewal_remembers_the_policy(tmp_path: Path) -> None:
     assert digests == [default, default, own, own, own, default]
 
 
-def test_nothing_is_written_where_nothing_is_issued(tmp_path: Path) -> None:
+def test_without_new_documents_the_ledger_does_not_change(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     before = snapshot(root)
     renew(root, ["/a"], now=NOW, dry_run=True)
@@ -100,7 +102,7 @@ def test_nothing_is_written_where_nothing_is_issued(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("line", ["{", "[]", "3", '{"unknown": 1}', '{"time": "x"}', "\xff"])
-def test_a_damaged_ledger_is_told_and_kept(line: str, tmp_path: Path) -> None:
+def test_a_damaged_ledger_is_reported_and_kept(line: str, tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     with (root / LEDGER).open("a", encoding="latin-1") as file:
         file.write(line + "\n")
@@ -112,7 +114,7 @@ def test_a_damaged_ledger_is_told_and_kept(line: str, tmp_path: Path) -> None:
     assert snapshot(root) == before
 
 
-def test_a_line_that_lacks_its_end_is_completed(tmp_path: Path) -> None:
+def test_a_missing_newline_at_the_end_is_added(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
     ledger = root / LEDGER
     ledger.write_bytes(ledger.read_bytes().removesuffix(b"\n"))
@@ -146,7 +148,7 @@ def statuses(root: Path, now: datetime) -> dict[tuple[str, str], list[str]]:
     return found
 
 
-def test_the_status_of_everything(tmp_path: Path) -> None:
+def test_every_item_has_its_status(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a", "/b", "/c")
     later = NOW + timedelta(days=90)
     renew(root, ["/a", "/b"], now=later)
@@ -173,7 +175,7 @@ def test_the_status_of_everything(tmp_path: Path) -> None:
     assert any(path.startswith("revoked/") for path in paths)
 
 
-def test_what_nobody_issued_is_named(tmp_path: Path) -> None:
+def test_files_without_an_entry_are_listed(tmp_path: Path) -> None:
     root, other = made(tmp_path / "ks", "/a", "/b"), made(tmp_path / "other", "/a")
     assert history(root, now=NOW).unexplained == ()
     for file in ("cert.pem", "permissions.p7s"):
@@ -211,7 +213,7 @@ def test_history_as_text_and_json(tmp_path: Path) -> None:
     assert document["unexplained"] == []
 
 
-def test_history_is_of_a_keystore(tmp_path: Path) -> None:
+def test_history_needs_a_keystore(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for path in (tmp_path, tmp_path / "file"):
         ended = sros("inspect", path, "--history")

@@ -56,7 +56,7 @@ def pin(home: Path, role: str = "permissions") -> frozenset[str]:
     return frozenset({digest(certificate(home / f"public/{role}_ca.cert.pem"))})
 
 
-def test_the_named_ca_is_accepted_and_no_other(home: Path, robot: Path, tmp_path: Path) -> None:
+def test_only_the_pinned_ca_is_accepted(home: Path, robot: Path, tmp_path: Path) -> None:
     evil = made(tmp_path, "evil")
     answers = answer_of(home, robot), answer_of(evil, robot)
     before = snapshot(robot)
@@ -107,7 +107,7 @@ def resigned(home: Path, files: dict[str, bytes], subject: str) -> dict[str, byt
     return {**files, f"{FOLDER}/permissions.p7s": message.stdout}
 
 
-def test_after_a_rotation_the_new_ca_is_named(robot: Path, tmp_path: Path) -> None:
+def test_after_a_rotation_the_new_ca_is_pinned(robot: Path, tmp_path: Path) -> None:
     home = made(tmp_path, "home")
     old = pin(home)
     for stage in (RotationStage.DISTRIBUTE, RotationStage.REISSUE, RotationStage.RETIRE):
@@ -126,7 +126,7 @@ def openssl_fingerprint(path: Path) -> str:
     return run(words).stdout.strip()
 
 
-def test_everybody_says_the_same_fingerprint(tmp_path: Path) -> None:
+def test_all_commands_print_the_same_fingerprint(tmp_path: Path) -> None:
     home, robot = tmp_path / "home", tmp_path / "robot"
     created = sros("create_keystore", home, "--template", "production").ok().out
     (told,) = re.findall(r"permissions CA SHA-256 ([0-9a-f]{64})", created)
@@ -152,7 +152,7 @@ def test_everybody_says_the_same_fingerprint(tmp_path: Path) -> None:
     assert "not verified" not in done
 
 
-def test_without_a_name_it_says_what_to_compare(tmp_path: Path) -> None:
+def test_without_a_pin_the_fingerprints_to_compare_are_printed(tmp_path: Path) -> None:
     home, robot = made(tmp_path, "home"), tmp_path / "robot"
     sros("create_request", NAME, robot).ok()
     request = robot / FOLDER / "request.pem"

@@ -47,7 +47,7 @@ def permissions_of(enclave: Enclave) -> Permissions:
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_the_policies_that_ship(file: Path) -> None:
+def test_shipped_policies_are_proven(file: Path) -> None:
     for enclave in read_policy(file).enclaves:
         made = permissions_of(enclave)
         assert signed_expressions(made, DOMAINS) == stated_expressions(enclave)
@@ -56,7 +56,7 @@ def test_the_policies_that_ship(file: Path) -> None:
 
 @settings(max_examples=30)
 @given(policies())
-def test_whatever_compares_equal_is_decided_equally(policy: Policy) -> None:
+def test_equal_expressions_give_equal_decisions(policy: Policy) -> None:
     """Equal sets of expressions mean equal decisions of the engine, for random policies."""
     for enclave in policy.enclaves:
         made = permissions_of(enclave)
@@ -66,7 +66,7 @@ def test_whatever_compares_equal_is_decided_equally(policy: Policy) -> None:
 
 @settings(max_examples=30)
 @given(policies())
-def test_what_is_stated_is_what_the_rights_of_the_policy_say(policy: Policy) -> None:
+def test_stated_expressions_allow_what_the_policy_allows(policy: Policy) -> None:
     """The DDS expressions of the proof allow exactly the topics that the policy allows."""
     rules = Rules(policy_rights(policy))
     for enclave in policy.enclaves:
@@ -134,7 +134,7 @@ WRONG: dict[str, Callable[[Grant], Grant]] = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-def test_what_is_wrong_is_found(wrong: str, tmp_path: Path) -> None:
+def test_wrong_permissions_are_found(wrong: str, tmp_path: Path) -> None:
     enclave = of_text(GROUPS, tmp_path)
     made = permissions_of(enclave)
     prove(enclave, made, DOMAINS)
@@ -144,7 +144,7 @@ def test_what_is_wrong_is_found(wrong: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 400])
-def test_a_vendor_that_reads_a_wildcard_otherwise_is_found(
+def test_a_vendor_that_matches_a_wildcard_differently_is_found(
     count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Matchers are compared for small and for large documents."""
@@ -165,7 +165,7 @@ def test_a_vendor_that_reads_a_wildcard_otherwise_is_found(
     assert asked == [enclave], "the engine has the last word"
 
 
-def test_another_form_that_means_the_same_is_accepted(tmp_path: Path) -> None:
+def test_equivalent_permissions_of_another_form_are_accepted(tmp_path: Path) -> None:
     enclave = of_text(publish("/a", "/b"), tmp_path)
     made = permissions_of(enclave)
 
@@ -199,7 +199,7 @@ def test_example_topics() -> None:
 
 
 @given(st.lists(st.sampled_from(["rt/a", "rt/*", "rt/a*", "rt/?", "rt/[ab]", "*"]), max_size=4))
-def test_a_wildcard_is_told_apart_from_all_others(expressions: list[str]) -> None:
+def test_example_topics_distinguish_every_wildcard(expressions: list[str]) -> None:
     found = example_topics(expressions)
     for one in {each for each in expressions if "*" in each}:
         assert any(matches(one, name) for name in found)
@@ -209,7 +209,7 @@ def test_a_wildcard_is_told_apart_from_all_others(expressions: list[str]) -> Non
 
 
 @pytest.mark.parametrize("count", [1, 6])
-def test_nothing_is_written_where_it_does_not_hold(
+def test_permissions_that_fail_the_proof_are_not_written(
     count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Permissions without the deny rules, or with additional rights, are not written."""
@@ -243,7 +243,7 @@ def test_nothing_is_written_where_it_does_not_hold(
     sros("generate_artifacts", "-k", keystore, "-p", policy).ok()
 
 
-def test_what_is_signed_is_what_was_proven(tmp_path: Path) -> None:
+def test_the_signed_permissions_are_the_proven_ones(tmp_path: Path) -> None:
     policy = tmp_path / "robot.xml"
     policy.write_text(policy_text({"/robot": GROUPS}))
     sros("create_keystore", tmp_path / "ks").ok()

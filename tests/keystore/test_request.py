@@ -78,7 +78,7 @@ def sign(home: Path, robot: Path, now: datetime = NOW, *, renew: bool = False) -
 # ── on the robot: the request ──────────────────────────────────────────────────────────────
 
 
-def test_a_request_has_a_key_that_stays(robot: Path, free_umask: None) -> None:
+def test_the_key_of_a_request_stays_on_the_robot(robot: Path, free_umask: None) -> None:
     files = snapshot(robot)
     assert set(files) == {
         "enclaves",
@@ -118,7 +118,7 @@ def test_no_key_is_replaced(robot: Path) -> None:
         create_request(robot, "/third", again=True)
 
 
-def test_a_dry_run_makes_nothing(tmp_path: Path) -> None:
+def test_a_dry_run_creates_nothing(tmp_path: Path) -> None:
     made = create_request(tmp_path / "robot", NAME, dry_run=True)
     assert [change.path for change in made.changes] == [
         f"{FOLDER}/key.pem",
@@ -146,7 +146,7 @@ BAD_PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("case", BAD_PLACES)
-def test_places_in_which_no_key_is_made(case: str, tmp_path: Path) -> None:
+def test_folders_where_no_request_can_be_made(case: str, tmp_path: Path) -> None:
     make, why = BAD_PLACES[case]
     make(tmp_path / "robot")
     before = snapshot(tmp_path)
@@ -208,7 +208,7 @@ def test_without_a_policy_the_rights_are_the_default_of_the_template(
     assert "rt/rosout" in topics_of(home / FOLDER)
 
 
-def test_an_enclave_that_exists_is_not_given_to_whoever_asks(
+def test_a_request_for_an_existing_enclave_is_refused(
     home: Path, robot: Path, tmp_path: Path
 ) -> None:
     sign(home, robot)
@@ -224,7 +224,7 @@ def test_an_enclave_that_exists_is_not_given_to_whoever_asks(
     assert note.id == "request.new-key"
 
 
-def test_other_verbs_know_an_enclave_without_its_key(
+def test_other_commands_handle_an_enclave_whose_key_is_on_its_robot(
     home: Path, robot: Path, tmp_path: Path
 ) -> None:
     sign(home, robot)
@@ -355,7 +355,7 @@ def test_the_answer_appears_with_the_keystore_or_not_at_all(
     sign_request(home, request_of(robot), now=NOW, renew=True, answer=target, force=True)
 
 
-def test_an_answer_that_the_robot_would_refuse_is_not_made(home: Path, robot: Path) -> None:
+def test_an_answer_that_the_robot_would_reject_is_not_written(home: Path, robot: Path) -> None:
     revoke(home, ["/base"], now=NOW)
     before = snapshot(home)
     distant = NOW + timedelta(days=4 * 365)
@@ -390,7 +390,7 @@ def test_an_answer_completes_the_enclave(home: Path, robot: Path, free_umask: No
     assert not remains(robot)
 
 
-def test_the_root_enclave_is_asked_for_as_well(home: Path, tmp_path: Path) -> None:
+def test_the_root_enclave_can_be_requested(home: Path, tmp_path: Path) -> None:
     made = create_request(tmp_path / "robot", "/")
     answer = sign_request(home, made.file.read_bytes(), now=NOW).archive
     import_answer(tmp_path / "robot", answer, now=NOW)
@@ -398,7 +398,7 @@ def test_the_root_enclave_is_asked_for_as_well(home: Path, tmp_path: Path) -> No
     assert not verify_arrival(tmp_path / "robot/enclaves", now=NOW).findings
 
 
-def test_what_was_revoked_is_told_to_the_robot(home: Path, robot: Path) -> None:
+def test_an_answer_carries_the_revocation_list(home: Path, robot: Path) -> None:
     first = sign(home, robot).archive
     import_answer(robot, first, now=NOW)
     revoke(home, ["/base"], now=LATER)
@@ -408,7 +408,7 @@ def test_what_was_revoked_is_told_to_the_robot(home: Path, robot: Path) -> None:
     assert not verify_arrival(robot, now=LATER).findings
 
 
-def test_going_back_needs_force(home: Path, robot: Path) -> None:
+def test_an_older_answer_needs_force(home: Path, robot: Path) -> None:
     old = sign(home, robot).archive
     refresh_crl(home, now=LATER)
     import_answer(robot, sign(home, robot, LATER, renew=True).archive, now=LATER)
@@ -420,7 +420,7 @@ def test_going_back_needs_force(home: Path, robot: Path) -> None:
     assert not (robot / FOLDER / "crl.pem").exists()
 
 
-def test_a_robot_keeps_to_its_keystore(home: Path, robot: Path, tmp_path: Path) -> None:
+def test_an_answer_of_another_keystore_needs_force(home: Path, robot: Path, tmp_path: Path) -> None:
     import_answer(robot, sign(home, robot).archive, now=NOW)
     create_keystore(tmp_path / "evil", template=load_template("production"), now=NOW)
     evil = sign(tmp_path / "evil", robot).archive
@@ -434,7 +434,7 @@ def test_a_robot_keeps_to_its_keystore(home: Path, robot: Path, tmp_path: Path) 
     import_answer(robot, evil, now=NOW, force=True)
 
 
-def test_an_answer_needs_the_key_that_asked(home: Path, robot: Path, tmp_path: Path) -> None:
+def test_an_answer_is_for_the_key_of_its_request(home: Path, robot: Path, tmp_path: Path) -> None:
     archive = sign(home, robot).archive
     create_request(tmp_path / "twin", NAME)
     before = snapshot(tmp_path)
@@ -453,7 +453,7 @@ def test_an_answer_needs_the_key_that_asked(home: Path, robot: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("days", [-2, 400])
-def test_an_answer_has_to_be_in_date(days: int, home: Path, robot: Path) -> None:
+def test_an_answer_outside_its_validity_is_refused(days: int, home: Path, robot: Path) -> None:
     archive = sign(home, robot).archive
     with pytest.raises(PkiError, match=r"expired|not valid before"):
         import_answer(robot, archive, now=NOW + timedelta(days=days))
@@ -583,7 +583,7 @@ TAMPERED: dict[str, tuple[Callable[[Files], bytes], str]] = {
 
 
 @pytest.mark.parametrize("case", TAMPERED)
-def test_answers_that_were_tampered_with_leave_nothing(
+def test_a_tampered_answer_changes_nothing(
     case: str, home: Path, robot: Path, tmp_path: Path
 ) -> None:
     tamper, why = TAMPERED[case]
@@ -598,7 +598,7 @@ def test_answers_that_were_tampered_with_leave_nothing(
     import_answer(robot, archive, now=NOW)
 
 
-def test_an_earlier_governance_cannot_be_slipped_in(home: Path, robot: Path) -> None:
+def test_an_earlier_governance_in_an_answer_is_refused(home: Path, robot: Path) -> None:
     """An earlier governance has a valid signature; only the signed file list excludes it."""
     files = unpack(sign(home, robot).archive)
     earlier = home.parent / "earlier"
@@ -614,13 +614,13 @@ def test_an_earlier_governance_cannot_be_slipped_in(home: Path, robot: Path) -> 
         import_answer(robot, rebuilt(mixed), now=NOW)
 
 
-def test_a_repacked_answer_is_as_good(home: Path, robot: Path) -> None:
+def test_a_repacked_answer_is_accepted(home: Path, robot: Path) -> None:
     """The positive twin: the content counts, not the way it was packed."""
     import_answer(robot, rebuilt(unpack(sign(home, robot).archive)), now=NOW)
     assert not verify_arrival(robot, now=NOW).findings
 
 
-def test_the_request_that_is_kept_at_home_serves_to_answer_again(home: Path, robot: Path) -> None:
+def test_the_request_kept_in_the_keystore_can_be_signed_again(home: Path, robot: Path) -> None:
     sign(home, robot)
     kept = (home / FOLDER / "request.pem").read_bytes()
     assert load_request(kept, "kept").public_key == load_request(request_of(robot), "").public_key
