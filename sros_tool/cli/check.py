@@ -55,9 +55,9 @@ Example:
   $ sros check --needs-renewal 30d keystore || \\
         sros renew keystore --all-expiring 30d
 
-Findings that the keystore's template accepts on purpose count as notes and share one line;
---strict reports them like all others. Exit status: 1 if a finding of the --fail-on severity
-or higher is shown, else 0.""",
+Findings that the keystore's template accepts count as notes and share one line; --strict
+reports them like all others. Exit status: 1 if a finding of the --fail-on severity or higher is
+shown, else 0.""",
 )
 @click.argument("targets", metavar="[policy|keystore|runtime] [PATH]...", nargs=-1, type=PATH)
 @click.option("--list", "as_list", is_flag=True, help="List all kinds of findings.")
@@ -109,7 +109,10 @@ or higher is shown, else 0.""",
     "--domain", metavar="ID", help="The ROS domain that the enclaves must be able to join."
 )
 @click.option(
-    "--at", "moment", metavar="MOMENT", help="Check as of 2027-06-01, or as of 90d from now."
+    "--at",
+    "moment",
+    metavar="MOMENT",
+    help="Check as of a date (2027-06-01) or a time from now (90d).",
 )
 @click.option(
     "--format",

@@ -82,7 +82,7 @@ row that is known to be open, the attack is expected to succeed.""",
     metavar="ROOT",
     help="Attack a copy of this keystore (with --scenario attacks); it is only read.",
 )
-@click.option("--topic", help="ROS topic to talk on.  [default: /chatter]")
+@click.option("--topic", help="ROS topic of talkers and listeners.  [default: /chatter]")
 @click.option(
     "--domain",
     type=int,

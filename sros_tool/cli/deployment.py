@@ -150,8 +150,10 @@ Example:
   $ sros verify robot --at 2027-06-01 || echo 'renew before June'""",
 )
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
-@click.option("--domain", metavar="ID", help="Also check whether it may join this ROS domain.")
-@click.option("--at", metavar="MOMENT", help="Check as of 2027-06-01, or as of 90d from now.")
+@click.option("--domain", metavar="ID", help="Also check whether enclaves may join this domain.")
+@click.option(
+    "--at", metavar="MOMENT", help="Check as of a date (2027-06-01) or time from now (90d)."
+)
 @json_option
 def verify(folder: Path | None, domain: str | None, at: str | None, as_json: bool) -> int:
     """On a robot: report whether the enclaves in DIR, or the enclave DIR, can be used.
@@ -200,7 +202,7 @@ Example:
 @click.option("--again", is_flag=True, help="Make the request again, for the existing key.")
 @dry_run_option
 def create_request(name: str, folder: Path | None, again: bool, dry_run: bool) -> None:
-    """On a robot: make the key of the enclave NAME in the folder DIR, and a signing request.
+    """On a robot: create the key of the enclave NAME in the folder DIR, and a signing request.
 
     The key never leaves DIR.  Send the request to the keystore, where `sros sign_request` answers
     it; `sros import` installs the answer next to the key.

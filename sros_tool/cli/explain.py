@@ -147,7 +147,7 @@ Example:
     "--at",
     "moment",
     metavar="MOMENT",
-    help="Decide as of 2027-06-01, or as of 90d from now. [default: now]",
+    help="Decide as of a date (2027-06-01) or a time from now (90d). [default: now]",
 )
 @click.option(
     "--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's]"

@@ -86,7 +86,7 @@ with --keystore ROOT --enclave /sros_observer.""",
 @click.option(
     "--watch",
     metavar="[DURATION]",
-    help="Collect everything seen for DURATION, such as 10m, or until Ctrl-C.",
+    help="Collect all observations for DURATION, such as 10m, or until Ctrl-C.",
 )
 @click.option(
     "--spin-time", type=click.FloatRange(0.1, 86400), metavar="S", help="Observe for S seconds."

@@ -136,7 +136,7 @@ Example:
     default="development",
     show_default=True,
     metavar="NAME|FILE",
-    help="Template for a missing keystore: a name, or a TOML file.",
+    help="Template to create a missing keystore from: a name, or a TOML file.",
     shell_complete=complete_template,
 )
 @dry_run_option

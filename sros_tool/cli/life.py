@@ -333,7 +333,9 @@ Example:
 @click.option("--identity-key", metavar="URI", help="Where to make the new key: file: or pkcs11:.")
 @click.option("--permissions-key", metavar="URI", help="The same for the permissions CA.")
 @click.option("--encrypt-ca-keys", is_flag=True, help="Protect new keys in files by a passphrase.")
-@click.option("--delete-old-key", is_flag=True, help="Do not keep the old key, in 'retired'.")
+@click.option(
+    "--delete-old-key", is_flag=True, help="Delete the old key: keep no copy in 'retired'."
+)
 @json_option
 @dry_run_option
 def rotate_ca(

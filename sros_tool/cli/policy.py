@@ -67,9 +67,9 @@ def merge_policy(
     """Print POLICY with the rights of every OTHER policy added.
 
     Comments, includes, metadata and layout of POLICY do not change. A right is added only if the
-    enclave does not have it yet, by an include or a wildcard either; publish and subscribe are
-    separate rights. A DENY always stays and always wins over an ALLOW; contradictions between the
-    policies are reported.
+    enclave does not have it yet; rights from includes and wildcards count. Publish and subscribe
+    are separate rights. A DENY always stays and always wins over an ALLOW; contradictions between
+    the policies are reported.
     """
     from sros_tool.policy.document import read_policy
     from sros_tool.policy.merge import merge_all, merge_notes
@@ -282,7 +282,7 @@ def minimize_policy(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Show the rights in POLICY that were never observed in use, and write it without them.
+    """Show the rights in POLICY that were never observed in use, and write a policy without them.
 
     "allowed" and "observed" count pairs of a right and an exact name. A wildcard counts once for
     each known name that it matches: names in the policy, in the observations, and in the rights

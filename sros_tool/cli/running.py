@@ -50,7 +50,10 @@ Example:
 @click.option("--json", "as_json", is_flag=True, help="The same as --format json.")
 @_DOMAIN
 def env(words: tuple[str, ...], form: str, as_json: bool, domain: str | None) -> None:
-    """Print the environment variables that make a process run in the enclave NAME, or fail."""
+    """Print the environment variables that make a process run in the enclave NAME.
+
+    The strategy is Enforce: a process that cannot run in the enclave does not start.
+    """
     from sros_tool.runtime.environment import render_environment
 
     root, rest = split_root(words)

@@ -146,7 +146,7 @@ def _node_for(right: Right, policy: Enclave | None) -> tuple[str, str]:
 
 
 def _edits(lift: list[Right], policy: Enclave) -> Iterator[GroupEdit]:
-    """Yield the new version, without these denials, of each group that has one."""
+    """Yield a replacement without these denials for each group that contains one."""
     groups: dict[Source, Group] = {}
     lifted: dict[Source, set[tuple[str, str]]] = {}
     for right in lift:

@@ -199,22 +199,22 @@ _ANY_NODE = ("/", "*")
 """The namespace and name of a profile for any node."""
 
 _OTHER = (
-    "not proposed, as these nodes are not in the policy under that name; start them as it says "
-    "(--ros-args -r __node:=NAME -r __ns:=NAMESPACE), or, if the node is right, give it a profile "
+    "not proposed, because the policy has no profile for nodes with these names; start them with "
+    "the names in the policy (--ros-args -r __node:=NAME -r __ns:=NAMESPACE), or add a profile "
     "with --node /NAMESPACE/NAME: {}"
 )
 _WHOLE = (
-    "all the rights that every node needs are proposed together, instead of one after each "
-    "restart, as the profile has none of them: {}"
+    "the profile has none of the rights that every node needs, so all of them are proposed "
+    "together, instead of one after each restart: {}"
 )
 _SEVERAL = Note(
     "log.several-enclaves",
-    "the log names several enclaves, and each denial counts for the one that its process named "
-    "last; check that processes without a label of their own did not write at the same time",
+    "the log names several enclaves, and each denial counts for the enclave that its process "
+    "named last; check that no two processes without a label wrote to the log at the same time",
 )
 
 _NODE_PARTS = ("common/node.xml", "common/node/parameters.xml")
-"""The parts of which a node probably lacks all rights if it lacks one; the widest part first."""
+"""Common parts, the widest first: a node that lacks one right of a part probably lacks all."""
 
 
 def as_learned(
@@ -311,7 +311,7 @@ def _whole_parts(
     has: frozenset[NodeRight],
     common: CommonParts,
 ) -> tuple[str, ...]:
-    """Return the part of which the node has no right and was denied one, if any."""
+    """Return the first part from which the node has no right and was denied one, if any."""
     if is_expression(place[1]):
         return ()
     for part in _NODE_PARTS:
@@ -336,21 +336,22 @@ def _notes(missing: MissingRights) -> tuple[Note, ...]:
     texts = {
         "log.unclear": (
             missing.unclear,
-            "not proposed, as the log does not say whether these were to be published or "
+            "not proposed, because the log does not say whether these topics were published or "
             "subscribed: {}",
         ),
         "log.denied-by-rule": (
             missing.by_rule,
-            "not proposed, as a DENY in the policy refuses these, and allowing them would not "
-            "help: {}",
+            "not proposed, because a DENY in the policy refuses these topics, and an ALLOW would "
+            "not help: {}",
         ),
         "log.of-a-peer": (
             missing.remote,
-            "not proposed, as these were denied to a peer, whose enclave the log does not name: {}",
+            "not proposed, because these topics were denied to a peer, and the log does not name "
+            "its enclave: {}",
         ),
         "log.no-ros-name": (
             missing.foreign,
-            "not proposed, as a policy cannot name these topics: {}",
+            "not proposed, because a policy cannot name these topics: {}",
         ),
     }
     several = len(missing.rights) > 1

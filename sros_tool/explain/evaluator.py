@@ -89,7 +89,7 @@ class LoadedEnclave:
     policy: Enclave | None = None
 
     def problems(self, traits: VendorTraits) -> tuple[Problem, ...]:
-        """Return the faults, except those of documents, that keep a vendor's process out."""
+        """Return the faults, except in documents, that keep a vendor's process from starting."""
         if self.state is None or self.at is None:
             return ()
         return tuple(
@@ -281,7 +281,8 @@ class Evaluator:
         """Return the answer that results from the decisions on the process and its endpoints."""
         found = [*own, *asked]
         outcome = min((decision.outcome for _, decision in found), key=_WORST_FIRST.index)
-        # The question's own topics explain an allowed outcome; the first such decision any other.
+        # The first topic of the question explains an allowed outcome; any other outcome is
+        # explained by the first decision that has it.
         deciding = [each for each in found if each[1].outcome is outcome]
         part, decision = asked[0] if asked and outcome.ok else deciding[0]
         grant = None

@@ -253,7 +253,7 @@ class _Examiner:
         who = "a peer" if denial.remote else denial.enclave or "the process"
         by = "a rule of the policy denies it" if denial.by_rule else "no rule allows it"
         if node := serving_node(denial):
-            by += f"; every node has such a service, and this is the one of node {node}"
+            by += f"; every node has this service, and here it belongs to node {node}"
         finding = LogFinding(
             "topic-denied",
             denial.vendor,

@@ -131,9 +131,9 @@ def _checked(name: str, word: str, kind: str) -> str:
     remedy = ""
     if not problem and is_expression(name):
         problem = "It has a wildcard, and a node uses one name."
-        remedy = "Ask for one name, as it shows in the running robot."
+        remedy = "Write one name, as the running robot shows it."
     elif not problem and not name.startswith("/"):
-        problem = "It is relative to a node, and an enclave may hold nodes of many namespaces."
+        problem = "It is relative to a node, and an enclave may have nodes of many namespaces."
         own = f"/NODE/{name[1:].lstrip('/') or 'NAME'}"
         remedy = f"Write {own if name.startswith('~') else f'/{name}'}, or /NAMESPACE/... in full."
     elif not problem and name == "/":

@@ -26,8 +26,9 @@ _XINCLUDE = "http://www.w3.org/2001/XInclude"
 _UNIT = "  "
 _HEADER = """\
 <?xml version="1.0" encoding="UTF-8"?>
-<!-- What the robot was seen to do, or what it was denied, by sros generate_policy. Read it before
-     you enforce it: what was not seen is not allowed, and what was seen need not be meant. -->
+<!-- Written by sros generate_policy: rights that the robot was observed to use, or was denied.
+     Review it before you enforce it: rights that were not observed are not allowed, and rights
+     that were observed may be unwanted. -->
 """
 
 
@@ -120,7 +121,7 @@ def _parted(
 
 
 def write(plan: Draft) -> None:
-    """Write a draft; a failure leaves every file as it was.
+    """Write a draft; after a failure, no file is changed.
 
     Raises `PolicyError` if the new policy, read again, would not have the expected rights.
     """
@@ -144,11 +145,11 @@ def _check(plan: Draft) -> None:
         found = policy_rights(read_policy(plan.path, plan.document))
         if plan.least <= found <= plan.most:
             return
-        why = f"It would differ in {min(found ^ plan.least, key=order)}."
+        why = f"The written policy would differ in {min(found ^ plan.least, key=order)}."
     except DocumentError as error:
         why = f"{error}"
     raise PolicyError(
-        f"what was learned cannot be written to '{plan.path}'", why, "Try --flat, without includes."
+        f"the learned rights cannot be written to '{plan.path}'", why, "Add --flat: no includes."
     )
 
 

@@ -4,7 +4,7 @@ Names come over the network; on an unsecured robot, anybody can send them.  So e
 not a plain ROS name is left out, above all a topic that is *named* like a wildcard.  The policy
 uses relative names where they are shorter, and ``*`` for the part of a node's name that changes
 with every start.  A common part is included only if the node has every right in it, so that an
-include never grants more than was seen.
+include never grants more than was observed.
 """
 
 from __future__ import annotations
@@ -403,27 +403,27 @@ _TEXTS = {
     "runs, so all of these enclaves get their rights; start them one at a time under --watch to "
     "distinguish them: {}",
     "changing-name": "nodes whose name changes with every start have a profile with a wildcard: {}",
-    "half-service": "left out, as only one half of a service was seen (look again with a longer "
-    "--spin-time): {}",
-    "no-ros-name": "left out, as a policy cannot name topics that have no ROS name: {}",
-    "odd-name": "left out, as these are not valid ROS names; somebody may be trying to get a "
-    "wildcard into your policy: {}",
-    "odd-node": "left out, as no policy can name these nodes or their enclaves: {}",
+    "half-service": "left out, because only the request or the reply of these services was "
+    "observed; observe again with a longer --spin-time: {}",
+    "no-ros-name": "left out, because a policy cannot name topics that have no ROS name: {}",
+    "odd-name": "left out, because these are not valid ROS names; an attacker may be trying to get "
+    "a wildcard into your policy: {}",
+    "odd-node": "left out, because a policy cannot name these nodes or their enclaves: {}",
     "partial-action": "only parts of an action are used, so they are listed as "
     "topics and services: {}",
     "root-enclave": "all {} nodes run in the enclave /, and share all rights; start each process "
-    "with `--ros-args --enclave /its/name` and learn again to distinguish them",
+    "with `--ros-args --enclave /its/name`, and generate the policy again",
     "service-event": "service introspection is on: every subscriber of these topics can read the "
-    "requests; remove the topics from the policy if that is for debugging only: {}",
-    "sets-clock": "may set the clock of every node that uses simulated time; meant for a simulator "
-    "or a player: {}",
-    "silent": "left out, as they were announced but had no endpoint: {}",
-    "stray": "left out, as the writers or readers of these topics belong to no ROS node: {}",
-    "unknown-enclave": "left out, as the graph does not show in which enclaves these nodes run: "
-    "it was set by ROS_SECURITY_ENCLAVE_OVERRIDE, and the observer's keystore has no "
-    "certificate for it; observe with the keystore that has their enclaves (--keystore), or "
+    "requests; remove the topics from the policy if introspection is for debugging only: {}",
+    "sets-clock": "these nodes may set the clock of every node that uses simulated time; only a "
+    "simulator or a player needs this: {}",
+    "silent": "left out, because these nodes were announced but had no endpoint: {}",
+    "stray": "left out, because the writers or readers of these topics belong to no ROS node: {}",
+    "unknown-enclave": "left out, because the graph does not show in which enclaves these nodes "
+    "run: ROS_SECURITY_ENCLAVE_OVERRIDE sets it, and the observer's keystore has no certificate "
+    "for it; observe with the keystore that has their enclaves (--keystore), or "
     "start them with `--ros-args --enclave /its/name`: {}",
-    "tool": "left out, as they are tools that observe the robot: {}",
+    "tool": "left out, because these nodes are tools that observe the robot: {}",
 }
 
 

@@ -169,7 +169,7 @@ class RosGraph:
         what = {
             "import": "rclpy cannot be imported",
             "participant": "rclpy cannot start",
-            "node": "rclpy cannot start a node to observe the graph with",
+            "node": "rclpy cannot start a node to observe the graph",
         }[answer["failed"]]
         return ObserverError(what, f"{answer['reason']}".rstrip(".") + ".", output)
 
@@ -178,7 +178,7 @@ def _require_rclpy() -> None:
     """Raise `UnavailableError` if this Python has no rclpy."""
     if importlib.util.find_spec("rclpy") is None:
         raise UnavailableError(
-            "rclpy is not installed for this Python, and without it sros cannot see the ROS graph",
+            "rclpy is not installed for this Python, and sros needs it to observe the ROS graph",
             f"Python is {sys.executable}.",
             "On a machine with ROS 2, source its setup file first (. /opt/ros/jazzy/setup.bash); "
             "elsewhere install sros with it: pip install 'sros_tool[ros]'. "
@@ -200,12 +200,12 @@ _TICK = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Settling:
-    """The rule when a graph counts as complete.
+    """The rule when an observed graph counts as complete, in seconds.
 
-    It does after ``least`` seconds, once it has not changed for ``still`` seconds, but at the
-    latest after ``most`` seconds.  Fast DDS announces its participants in a first burst, and then
-    every 3 s.  With many participants, parts of the burst get lost: a graph of half a robot was
-    seen not to change from 0.4 to 3.4 s.
+    It is complete once ``least`` has passed and it has not changed for ``still``, but at the latest
+    after ``most``.  Fast DDS announces its participants in a first burst, and then every 3 s.  With
+    many participants, parts of the burst get lost: a graph of half a robot did not change from 0.4
+    to 3.4 s.
     """
 
     least: float = 4.0

@@ -371,7 +371,7 @@ def test_a_node_of_another_name_is_told(keystore: Path, log: str, node: str) -> 
     found = sros("explain", keystore, ENCLAVE, "--log", path).out
     assert f"the permissions are for the node /talker, and this is the node {node}" in found
     assert "`--ros-args -r __node:=talker -r __ns:=/`" in found
-    assert f"this is the one of node {node}" in sros("explain", "--log", path).out
+    assert f"here it belongs to node {node}" in sros("explain", "--log", path).out
 
 
 def test_rcl_alone_makes_one_look_at_the_name(keystore: Path, tmp_path: Path) -> None:

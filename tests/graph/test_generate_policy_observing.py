@@ -129,7 +129,7 @@ def test_tools_alone_are_an_empty_graph(program: Program) -> None:
     [
         ("import", "", "rclpy cannot be imported. RuntimeError: invalid allocator"),
         ("init", "", "rclpy cannot start. RuntimeError"),
-        ("node", "", "rclpy cannot start a node to observe the graph with. RuntimeError"),
+        ("node", "", "rclpy cannot start a node to observe the graph. RuntimeError"),
         ("crash", "boom", "the process that observes the ROS graph failed. It ended with status"),
         (
             "node",

@@ -78,8 +78,9 @@ ROBOT = [
 
 EXPECTED = """\
 <?xml version="1.0" encoding="UTF-8"?>
-<!-- What the robot was seen to do, or what it was denied, by sros generate_policy. Read it before
-     you enforce it: what was not seen is not allowed, and what was seen need not be meant. -->
+<!-- Written by sros generate_policy: rights that the robot was observed to use, or was denied.
+     Review it before you enforce it: rights that were not observed are not allowed, and rights
+     that were observed may be unwanted. -->
 <policy version="0.2.0" xmlns:xi="http://www.w3.org/2001/XInclude">
   <enclaves>
     <enclave path="/adder">
