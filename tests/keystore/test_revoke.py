@@ -283,7 +283,7 @@ def test_what_cannot_be_revoked_changes_nothing(spoil: object, said: str, tmp_pa
 
 def test_no_reason(tmp_path: Path) -> None:
     root = made(tmp_path / "ks", "/a")
-    with pytest.raises(UsageError, match="is not a reason"):
+    with pytest.raises(UsageError, match="unknown reason 'boredom' for a revocation"):
         revoke(root, ["/a"], now=NOW, reason="boredom")
     with pytest.raises(KeystoreError, match="not a valid keystore"):
         revoke(tmp_path / "none", ["/a"], now=NOW)

@@ -571,7 +571,7 @@ def test_refusals(separate: Path, tmp_path: Path) -> None:
 
 def test_one_ca_for_both_jobs_is_replaced_for_both(tmp_path: Path) -> None:
     root = make(tmp_path, "sros2")
-    with pytest.raises(UsageError, match="both jobs"):
+    with pytest.raises(UsageError, match="both roles"):
         rotate_ca(root, roles=["identity"], now=NOW)
 
 

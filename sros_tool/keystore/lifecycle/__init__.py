@@ -1,1 +1,1 @@
-"""The life of a keystore: create, renew, revoke, rotate its CAs."""
+"""The life cycle of a keystore: creation, renewal, revocation, and rotation of its CAs."""

@@ -1,4 +1,4 @@
-"""Creating keystores and enclaves: authorities, governance, settings, keys and permissions."""
+"""Creation of keystores and enclaves: CAs, governance, settings, keys and permissions."""
 
 from __future__ import annotations
 
@@ -80,10 +80,10 @@ _NONE_IMPORTED: Mapping[str, bytes] = MappingProxyType({})
 
 @dataclass(frozen=True, slots=True)
 class Creation:
-    """What was created, or with ``dry_run`` would be.
+    """The result of creating a keystore or enclaves; with ``dry_run``, the result it would have.
 
-    ``created`` are new enclaves; ``changed`` ones got new permissions, ``completed`` ones a file
-    that was missing; ``kept`` ones were not changed.
+    ``created`` are the new enclaves, ``changed`` the enclaves with new permissions, ``completed``
+    the enclaves that got missing files, and ``kept`` the enclaves without changes.
     """
 
     root: Path
@@ -108,14 +108,14 @@ def create_keystore(
     imported: Mapping[str, bytes] = _NONE_IMPORTED,
     dry_run: bool = False,
 ) -> Creation:
-    """Create a keystore for ``domains`` (default: 0) by the choices of ``template``.
+    """Create a keystore for ``domains`` (default: 0) from ``template``.
 
-    ``imported`` are PEM certificates of existing CAs by role ("identity", "permissions"); the
-    ``keyring`` has their keys.
+    ``imported`` maps roles ("identity", "permissions") to PEM certificates of existing CAs, whose
+    keys the ``keyring`` opens.
 
     Raises:
-        KeystoreError: ``root`` holds a keystore or a part of one: a new CA never joins the
-            remains of an older one.
+        KeystoreError: ``root`` holds a keystore or a part of one: enclaves of an older CA would
+            not work with a new one.
     """
     if not dry_run:
         tidy(root)
@@ -145,10 +145,10 @@ def create_enclaves(
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> Creation:
-    """Create enclaves with the default rights of the keystore's template.
+    """Create enclaves with the default permissions of the keystore's template.
 
-    An existing enclave keeps its key and its permissions, and gets the files that it lacks.
-    ``domain`` is the caller's ROS_DOMAIN_ID; it must be one of the keystore's domains.
+    An existing enclave keeps its key and its permissions, and gets its missing files.  ``domain``
+    is the caller's ROS_DOMAIN_ID; the governance must name it.
     """
     return generate_artifacts(
         root,
@@ -171,7 +171,7 @@ def create_permission(
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
 ) -> Creation:
-    """Replace the permissions of an existing enclave by the ones that ``policy`` states for it."""
+    """Replace the permissions of an existing enclave with the rights in ``policy``."""
     check_enclave_name(name)
     if not dry_run:
         tidy(root)
@@ -198,10 +198,10 @@ def generate_artifacts(
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> Creation:
-    """Create the named enclaves and the policies' enclaves, with permissions, all or nothing.
+    """Create the named enclaves and the enclaves of policies, with permissions, all or nothing.
 
-    Permissions of a policy replace the enclave's present ones.  If there is no keystore and
-    ``create`` is given, a keystore is created by that template.
+    If a policy names an existing enclave, the enclave's permissions are replaced.  If the keystore
+    does not exist and ``create`` is given, it is created from that template.
     """
     wanted = _wanted(enclaves, policies)
     if not dry_run:
@@ -221,16 +221,16 @@ def generate_artifacts(
 
 
 def _wanted(names: Sequence[str], policies: Sequence[Policy]) -> dict[str, Enclave | None]:
-    """Map each enclave to the rights of its policy; raise if two policies differ."""
+    """Map enclaves to their rights in the policies, or None; raise if two policies differ."""
     wanted: dict[str, Enclave | None] = {check_enclave_name(name): None for name in names}
     for policy in policies:
         for enclave in policy.enclaves:
             other = wanted.get(enclave.path)
             if other is not None and other != enclave:
                 raise PolicyError(
-                    f"the enclave {enclave.path} is given by two policies",
-                    f"It stands at {other.source} and at {enclave.source}, and they differ.",
-                    "Join the two.",
+                    f"the enclave {enclave.path} is in two policies that differ",
+                    f"It is at {other.source} and at {enclave.source}.",
+                    "Merge them into one policy, for example with `sros merge_policy`.",
                 )
             wanted[enclave.path] = enclave
     return wanted
@@ -241,7 +241,10 @@ def _wanted(names: Sequence[str], policies: Sequence[Policy]) -> dict[str, Encla
 
 @dataclass(frozen=True, slots=True)
 class _Keystore:
-    """A keystore to add enclaves to, with its enclaves, and ledger entries if it is new."""
+    """A keystore that enclaves are added to; ``names`` are the existing enclaves.
+
+    ``entries`` are the ledger entries of a new keystore.
+    """
 
     authorities: Authorities
     template: Template
@@ -269,8 +272,8 @@ def _write_keystore(
     now: datetime,
     imported: Mapping[str, bytes],
 ) -> _Keystore:
-    """Stage a new keystore: its authorities, its governance and its settings."""
-    _check_free(transaction.root)  # another process may have made it meanwhile
+    """Stage a new keystore: its CAs, its governance and its settings."""
+    _check_free(transaction.root)  # another process may have created it meanwhile
     for span in (template.certificate_validity, template.permissions_validity):
         window(now, span)  # raises if the CAs could not issue anything
     authorities = create_authorities(transaction, template, keyring, now, imported)
@@ -286,29 +289,33 @@ def _write_keystore(
     entries.append(document_entry(now, "governance", message))
     transaction.write(
         SETTINGS,
-        b"# The choices by which sros made this keystore; what is added later follows them.\n"
+        b"# The settings of this keystore; sros uses them for each enclave that is added.\n"
         + render_template(keyring.settings_with_places(template)).encode(),
     )
     return _Keystore(authorities, template, domains, entries=tuple(entries))
 
 
 def _check_free(root: Path) -> None:
-    """Raise `KeystoreError` if ``root`` is not free for a new keystore."""
+    """Raise `KeystoreError` if a new keystore cannot be created at ``root``."""
     if is_keystore(root):
         raise _already_exists(root)
     if root.resolve() == Path("/"):
-        raise KeystoreError("the root of the file system cannot be a keystore")
+        raise KeystoreError(
+            "the root of the file system cannot be a keystore", "", "Choose another path."
+        )
     if os.path.lexists(root) and not root.is_dir():
-        raise KeystoreError(f"'{root}' is in the way", "It is not a folder.")
+        raise KeystoreError(
+            f"'{root}' is in the way", "It is not a folder.", "Choose another path."
+        )
     remains = [part for part in (PUBLIC, PRIVATE, ENCLAVES) if (root / part).exists()]
     if remains:
         if is_keystore(root):  # another process has just completed it
             raise _already_exists(root)
         raise KeystoreError(
             f"'{root}' already holds parts of a keystore",
-            f"There are {', '.join(remains)}; a new CA next to them would lock out every enclave "
-            "that trusts the old one.",
-            "Restore what is missing, or choose another path.",
+            f"It has {', '.join(remains)}; with a new CA, every enclave that trusts the old CA "
+            "would be locked out.",
+            "Restore the missing files, or choose another path.",
         )
 
 
@@ -331,7 +338,7 @@ def _check_typo(root: Path) -> None:
         if is_keystore(root.absolute().parent / name):
             raise UsageError(
                 f"'{root}' does not exist, and '{name}' next to it is a keystore",
-                "This may be a typing error, so no second keystore is made.",
+                "The name may be a typo, so no second keystore is created.",
                 f"Name '{root.with_name(name)}', or run `sros create_keystore {root}` first.",
             )
 
@@ -340,7 +347,7 @@ def _check_typo(root: Path) -> None:
 
 
 class _Outcome(Enum):
-    """The change made to an enclave."""
+    """What happened to an enclave; the members are the fields of `Creation`."""
 
     CREATED = "created"
     CHANGED = "changed"
@@ -355,7 +362,7 @@ def _write_enclaves(
     now: datetime,
     progress: Progress | None = None,
 ) -> Creation:
-    """Create or complete each enclave, give it the permissions of its policy, and commit."""
+    """Create or complete the enclaves, sign the permissions of their policies, and commit."""
     writer = EnclaveWriter(
         transaction,
         keystore.template,
@@ -402,7 +409,7 @@ def _write_enclave(
     policy: Enclave | None,
     now: datetime,
 ) -> tuple[_Outcome, tuple[Note, ...]]:
-    """Stage the files that an enclave lacks, and permissions if there is a policy for it."""
+    """Stage the missing files of an enclave, and new permissions if ``policy`` is given."""
     present = present_files(transaction.root, name)
     before = len(transaction.changes)
     identity = _identity(transaction.root, keystore, name, present, now)
@@ -424,15 +431,17 @@ def _write_enclave(
 def _identity(
     root: Path, keystore: _Keystore, name: str, present: set[str], now: datetime
 ) -> NewIdentity | x509.Certificate:
-    """Return an enclave's certificate; without one, the subject and the key to issue it for."""
+    """Return the certificate of an enclave, or the subject and key for a new certificate.
+
+    If the enclave has signed permissions, the new certificate gets their subject.
+    """
     folder = enclave_path(root, name)
     if CERTIFICATE_FILE in present:
         if not present & {KEY_FILE, REQUEST}:
             raise KeystoreError(
                 f"enclave {name} has a certificate but no key",
-                f"Its {KEY_FILE} is missing, and a new key would make the certificate useless.",
-                f"Restore the key, or remove '{folder / CERTIFICATE_FILE}' to have both made "
-                "again.",
+                f"Its {KEY_FILE} is missing, and the certificate does not work with a new key.",
+                f"Restore the key, or remove '{folder / CERTIFICATE_FILE}' to create both again.",
             )
         return _usable_certificate(root, keystore, name, now)
     subject = enclave_subject(name, unique=keystore.template.unique_subject)
@@ -458,8 +467,8 @@ def _usable_certificate(
     if not issued_by(certificate, keystore.authorities.identity.certificate):
         raise KeystoreError(
             f"the certificate of enclave {name} was not issued by the identity CA of this keystore",
-            f"'{path}' names {subject_text(certificate.issuer)} as its issuer, so no node of "
-            "this keystore would talk to it.",
+            f"'{path}' names the issuer {subject_text(certificate.issuer)}; other nodes of this "
+            "keystore would refuse the enclave.",
             "Restore the right certificate, or remove the enclave's folder and create it again.",
         )
     validity = validity_of(certificate)
@@ -473,7 +482,10 @@ def _usable_certificate(
 
 
 def _permissions_subjects(path: Path, authority: x509.Certificate) -> Iterator[x509.Name]:
-    """Yield the subjects in signed permissions; none if the permissions cannot be used."""
+    """Yield the subjects of the grants in signed permissions.
+
+    Yield none if the permissions cannot be read, or if ``authority`` did not sign them.
+    """
     try:
         signed = smime.parse(read_bytes(path, "permissions document"))
         signed.verify(authority)

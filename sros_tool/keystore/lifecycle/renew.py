@@ -1,4 +1,4 @@
-"""Renewing enclaves: a new certificate each, and the same permissions signed again."""
+"""Renewal of enclaves: new certificates, and the same permissions signed again."""
 
 from __future__ import annotations
 
@@ -52,11 +52,12 @@ _REASON = "superseded"
 
 @dataclass(frozen=True, slots=True)
 class Renewal:
-    """The result of a renewal, or with ``dry_run`` the result that it would have.
+    """The result of a renewal; with ``dry_run``, the result it would have.
 
-    ``works_until`` is the latest expiry of the certificates that were replaced and not revoked;
-    None if all of them have expired.  ``restart`` are the enclaves whose processes trust the
-    revoked certificates until they are restarted.  ``remarks`` are sentences about open tasks.
+    ``works_until`` is the latest expiry of the replaced certificates, or None if they have expired
+    or were revoked.  ``revoked`` is the number of revoked certificates.  ``restart`` are the
+    enclaves whose processes trust the revoked certificates until they are restarted.  ``remarks``
+    are sentences about open tasks.
     """
 
     root: Path
@@ -91,15 +92,15 @@ def renew(
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> Renewal:
-    """Renew the named enclaves, or all that are due by ``expiring``; all or nothing.
+    """Renew the named enclaves, and all that are due by ``expiring``; all or nothing.
 
-    The new certificate is for the same key, or with ``new_key`` for a new one; the signed rights
-    do not change.  Certificate, key and permissions of an enclave change at the same moment.  A
-    replaced certificate works until it expires, for anyone who has its files, unless it is
-    revoked; ``revoke_old`` revokes all earlier certificates of the renewed enclaves.
+    The new certificate is for the same key, or with ``new_key`` for a new key; the signed rights do
+    not change.  All files change at the same moment.  A replaced certificate works for anyone who
+    has its key until it expires or is revoked; ``revoke_old`` revokes all earlier certificates of
+    the renewed enclaves.
 
     Raises:
-        KeystoreError: an enclave cannot be renewed; one error names every such enclave.
+        KeystoreError: enclaves cannot be renewed; the error names all of them.
     """
     if not dry_run:
         tidy(root)
@@ -160,7 +161,7 @@ def renew(
 def _superseded(
     replaced: Sequence[_Replaced], ledger: Sequence[Entry], lists: Lists, now: datetime
 ) -> list[Entry]:
-    """Return ledger entries that revoke all earlier certificates that have not expired yet."""
+    """Return the ledger entries for revoking all earlier certificates that have not expired."""
     listed = {each.serial for each in lists.present.revoked} if lists.present else set()
     issued: dict[str, list[Entry]] = {each.name: [] for each in replaced}
     for entry in ledger:
@@ -168,7 +169,7 @@ def _superseded(
             issued[entry.enclave].append(entry)
     found = []
     for each in replaced:
-        # A keystore of ros2/sros2 has certificates that its ledger does not know.
+        # The ledger lacks certificates that ros2/sros2 issued.
         subjects = still_valid(issued[each.name], each.name, now)
         if each.not_after >= now:
             subjects[each.serial] = each.subject
@@ -181,7 +182,7 @@ def _superseded(
 
 
 class _Renewer:
-    """Renews enclaves one by one, for `EnclaveWriter.for_each`."""
+    """Renewer of single enclaves, for `EnclaveWriter.for_each`."""
 
     def __init__(
         self,
@@ -204,7 +205,10 @@ class _Renewer:
     def renew_if_due(
         self, name: str, threshold: Threshold | None
     ) -> _Replaced | UnreadableEnclave | None:
-        """Renew an enclave and return the replaced certificate; None if it is not due."""
+        """Renew an enclave and return the replaced certificate; None if it is not due.
+
+        Without ``threshold`` it is always due.  If its files cannot be read, return that error.
+        """
         try:
             state = read_credentials(self._root, name)
             if threshold and not state.lifetime().due(threshold, self._now):
@@ -218,7 +222,7 @@ class _Renewer:
         return _Replaced(name, old.serial_number, state.grant.subject, until)
 
     def _issuance(self, state: Credentials) -> Issuance:
-        """Verify an enclave's documents, and return the issuance that replaces them."""
+        """Verify the files of an enclave, and return what to issue in their place."""
         name = state.name
         if not issued_by(state.certificate, self._authorities.identity.certificate):
             raise KeystoreError(
@@ -240,7 +244,8 @@ class _Renewer:
         if not (enclave_path(self._root, name) / KEY_FILE).exists():
             raise KeystoreError(
                 f"the key of enclave {name} is not in this keystore",
-                "It was made on its robot and stays there, so no new one is made here.",
-                "Have a new request made there, and sign it with --renew.",
+                "It was generated on the robot and stays there, so no new key is generated here.",
+                "Create a new request on the robot with `sros create_request`, and sign it here "
+                "with `sros sign_request --renew`.",
             )
         return generate_key()

@@ -1,9 +1,9 @@
-"""The revocation lists of a keystore: signed again, and put where DDS reads them.
+"""Signing of the revocation lists of a keystore, in the files that DDS reads.
 
-The list of the issuing identity CA is the ``crl.pem`` of every enclave.  During a rotation there is
-a second identity CA; its list is in the file of the CAs.  Fast DDS 2.9.1 trusts both CAs and reads
-lists in that file, but reads only one list in ``crl.pem``; Cyclone DDS 0.10.2 trusts the issuing
-CA alone (all of this ran).
+``crl.pem`` in every enclave is the list of the issuing identity CA.  During a rotation there is a
+second identity CA; its list is in the file of the identity CAs.  Fast DDS 2.9.1 trusts both CAs and
+reads lists in that file, but reads only one list in ``crl.pem``; Cyclone DDS 0.10.2 trusts the
+issuing CA alone (all measured).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from sros_tool.validity import BACKDATE, Window, iso
 
 @dataclass(frozen=True, slots=True)
 class SignedList:
-    """A list as PEM, when it expires, and its ledger entry."""
+    """A signed revocation list as PEM, its expiry ``end`` in UTC, and its ledger entry."""
 
     document: bytes
     end: datetime
@@ -63,7 +63,7 @@ def sign_list(
     template: Template,
     now: datetime,
 ) -> SignedList:
-    """Sign a list that expires no later than its CA: an expired list locks everybody out."""
+    """Sign a revocation list that expires with its CA at the latest."""
     validity = validity_of(authority.certificate)
     moment = now.replace(microsecond=0)
     begin = max(moment - BACKDATE, validity.not_before)
@@ -81,23 +81,24 @@ def sign_list(
 
 
 def _carried_over(old: RevocationList | None, expiries: Mapping[int, str]) -> list[Revoked]:
-    """Return the entries that a new list takes over: all that had not expired at the old list.
+    """Return the entries of the ``old`` list that the next list repeats.
 
-    RFC 5280, 3.3: an entry stays until one list that was issued after the certificate expired has
-    held it.  ``expiries`` maps serial numbers to the expiry of the certificate (ISO 8601, UTC); an
-    entry without an expiry is kept for ever.
+    These are the certificates that had not expired when the old list was issued: RFC 5280, 3.3,
+    keeps an entry until it was on one list after the certificate's expiry.  ``expiries`` maps
+    serial numbers to expiries (ISO 8601, UTC); an entry without an expiry is always repeated.
     """
     if old is None:
         return []
-    # The start of a list is up to BACKDATE before its issue, so some entries stay a little longer.
+    # thisUpdate is up to BACKDATE before the signing, so some entries are kept a little longer.
     issued = iso(old.this_update)
     return [each for each in old.revoked if expiries.get(each.serial, issued) >= issued]
 
 
 class Lists:
-    """Signer of the lists of all trusted identity CAs, within a transaction.
+    """Signer of the revocation lists of all trusted identity CAs, within a transaction.
 
-    ``remarks`` are sentences about lists that could not be signed.
+    ``present`` is the list before the change.  ``remarks`` are sentences about lists that could not
+    be signed.
     """
 
     def __init__(
@@ -122,14 +123,15 @@ class Lists:
     def sign(
         self, newly: Sequence[Revoked], names: Sequence[str], *, incomplete: bool
     ) -> tuple[datetime, list[Entry]]:
-        """Stage the lists with the ``newly`` revoked; return their first expiry and ledger entries.
+        """Sign and stage the lists; return their first expiry and their ledger entries.
 
-        Each list has all serial numbers: the ledger does not say which of two CAs issued one, and a
-        serial number of the other CA does no harm.  With ``incomplete``, the key of the old CA may
-        be missing.
+        ``newly`` are the certificates to revoke, ``names`` the enclaves that get the lists.  Each
+        list has all serial numbers: the ledger does not say which of two CAs issued a certificate,
+        and a serial number of the other CA does no harm.
 
         Raises:
-            KeystoreError: the key of the old CA is missing, and ``incomplete`` is not set.
+            KeystoreError: a revocation needs the key of the old CA, which is missing, and
+                ``incomplete`` is not set.
         """
         expiries = self._expiries()
         signed = self._sign(self._authority, self.present, newly, expiries, 0)
@@ -166,7 +168,7 @@ class Lists:
                 expiries.setdefault(found.serial_number, iso(validity_of(found).not_after))
         return expiries
 
-    # ── the other CA, while one replaces the other ─────────────────────────────────────────
+    # ── the second CA during a rotation ────────────────────────────────────────────────────
 
     def _sign_second(
         self,
@@ -176,7 +178,10 @@ class Lists:
         *,
         incomplete: bool,
     ) -> SignedList | None:
-        """Stage the list of the other trusted identity CA, in the file of the CAs."""
+        """Sign the list of the second identity CA, and stage it in the file of the identity CAs.
+
+        Return None if there is no second CA or its list cannot be signed.
+        """
         rotation = read_rotation(self._root)
         file = identity_file(self._root)
         replaced = next((each for each in rotation.replacements if each.file == file), None)
@@ -187,7 +192,7 @@ class Lists:
         wanted = replaced.new if coming else replaced.old
         (other,) = [each for each in certificates if digest(each) == wanted]
         if coming and lists_confusable(certificates[0], other):
-            return None  # all processes are restarted together in this case anyway
+            return None  # in this case all processes have to be restarted together anyway
         old = carried_crl(self._root, file)
         try:
             authority = self._open(other, replaced, coming=coming)
@@ -196,7 +201,7 @@ class Lists:
             if not coming:
                 self._without(other, error, newly, old, incomplete=incomplete)
             return None
-        # The next stage puts this list in place of the present one, so its number must be higher.
+        # The next stage replaces the present list with this one, so its number must be higher.
         least = (self.present.number if self.present else 0) + 2 if coming else 0
         signed = self._sign(authority, old, () if coming else newly, expiries, least)
         bundle = b"".join(map(pem, certificates)) + signed.document
@@ -207,11 +212,11 @@ class Lists:
         self, certificate: x509.Certificate, replaced: Replacement, *, coming: bool
     ) -> Authority:
         place = replaced.key if coming else replaced.place_of_old(certificate)
-        # The environment variables name the key of the issuing CA.
+        # The places in the environment variables are for the key of the issuing CA.
         keyring = replace(self._keyring, places={})
         key = keyring.open(self._root, IDENTITY, replace(self._template, identity_key=place))
         if not same_key(certificate, key):
-            raise KeystoreError(f"that at '{place}' is another")
+            raise KeystoreError(f"the key at '{place}' belongs to another CA")
         return Authority(certificate, key)
 
     def _without(
@@ -223,19 +228,21 @@ class Lists:
         *,
         incomplete: bool,
     ) -> None:
-        """Note that the old CA cannot sign its list; raise if a revocation needs it."""
+        """Add a remark on the unsigned list of the old CA; raise if a revocation needs it."""
         name = subject_text(old_ca.subject)
         if newly and not incomplete:
             raise KeystoreError(
-                f"the key of the old identity CA {name} is not at hand",
-                f"Until that CA is retired, Fast DDS accepts what it has issued, so it has to sign "
-                f"the revocation, too: {error.what}.",
+                f"the key of the old identity CA {name} is not available",
+                f"Until that CA is retired, Fast DDS accepts its certificates, so it also has to "
+                f"sign a revocation list: {error.what}.",
                 f"Restart all processes and run `sros rotate_ca {self._root} --to retire` first; "
                 "or add --until-retired, and retire it soon.",
             )
         text = f"The list of the old identity CA {name} was not signed again"
         if newly:
-            text += "; Fast DDS accepts the revoked certificates that it issued until it is retired"
+            text += (
+                "; until it is retired, Fast DDS accepts the revoked certificates that it issued"
+            )
         elif old:
             text += f"; it expires at {iso(old.next_update)}, and Fast DDS then refuses "
             text += "the enclaves of that CA"

@@ -1,4 +1,4 @@
-"""Revoking enclaves: the list names their certificates, and their files move to ``revoked``."""
+"""Revocation of enclaves: their certificates are put on the list, their files into ``revoked``."""
 
 from __future__ import annotations
 
@@ -39,10 +39,11 @@ _PRIVATE = "key.pem"
 
 @dataclass(frozen=True, slots=True)
 class Revocation:
-    """The revoked certificates, and the expiry of the list.
+    """The result of a revocation; with ``dry_run``, the result it would have.
 
-    ``restart`` are the enclaves whose processes trust the revoked certificates until they are
-    restarted.  ``remarks`` are sentences about open tasks.
+    ``revoked`` are the revoked enclaves.  ``restart`` are the enclaves whose processes trust the
+    revoked certificates until they are restarted.  ``next_update`` is the expiry of the revocation
+    list, in UTC.  ``remarks`` are sentences about open tasks.
     """
 
     root: Path
@@ -66,13 +67,20 @@ def revoke(
     """Revoke the certificates of enclaves and move their files to ``revoked`` in the keystore.
 
     All certificates of an enclave that are in the ledger and have not expired are revoked: an
-    attacker with the key could use an earlier one, too.  Every other enclave gets ``crl.pem``, a
-    link to the list.  ``reason`` is one of `REASONS`.  During a rotation of the identity CA both
-    CAs revoke; if the key of the old CA is missing, ``until_retired`` accepts that Fast DDS trusts
-    its certificates until it is retired.
+    attacker with the key could use an earlier certificate, too.  The other enclaves get
+    ``crl.pem``, a link to the list.  During a rotation of the identity CA, both CAs sign a list; if
+    the key of the old CA is missing, ``until_retired`` accepts that Fast DDS trusts its
+    certificates until it is retired.
+
+    Raises:
+        KeystoreError: an enclave does not exist, the identity CA did not issue its certificate, or
+            the key of a CA is missing.
+        UsageError: ``reason`` is not one of `REASONS`.
     """
     if reason not in REASONS:
-        raise UsageError(f"{reason!r} is not a reason", f"Reasons are {', '.join(REASONS)}.")
+        raise UsageError(
+            f"unknown reason {reason!r} for a revocation", "", f"Choose {', '.join(REASONS)}."
+        )
     if not dry_run:
         tidy(root)
     _check_names(root, names)
@@ -116,7 +124,7 @@ def refresh_crl(
 ) -> Revocation:
     """Sign the revocation list again, so that it is valid for longer.
 
-    Its entries stay, except certificates that had expired before the present list was signed.
+    Its entries are kept, except certificates that had expired before the present list was signed.
     """
     if not dry_run:
         tidy(root)
@@ -135,7 +143,7 @@ def refresh_crl(
 
 
 def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
-    """Return all enclaves of the keystore; raise if a named one is not among them."""
+    """Return all enclaves of the keystore; raise if one of ``names`` does not exist."""
     existing = list_enclaves(root)
     for name in names:
         check_enclave_name(name)
@@ -145,7 +153,7 @@ def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def still_valid(issued: Sequence[Entry], name: str, now: datetime) -> dict[int, str]:
-    """Map serial numbers to subjects, for an enclave's certificates that have not expired."""
+    """Map the serial numbers of an enclave's certificates that have not expired to subjects."""
     return {
         int(each.serial, 16): each.subject
         for each in issued
@@ -154,7 +162,10 @@ def still_valid(issued: Sequence[Entry], name: str, now: datetime) -> dict[int, 
 
 
 def _move_away(transaction: Transaction, authority: Authority, name: str) -> tuple[int, str]:
-    """Stage the move of an enclave's files; return its certificate's serial number and subject."""
+    """Stage the move of an enclave's files to ``revoked``.
+
+    Return the serial number and the subject of its certificate.
+    """
     folder = enclave_folder(name)
     path = transaction.root / folder / "cert.pem"
     certificate = read_certificate(path)
@@ -168,7 +179,7 @@ def _move_away(transaction: Transaction, authority: Authority, name: str) -> tup
     for file in _FILES:
         source = transaction.root / folder / file
         if name == "/" and file == "governance.p7s":
-            continue  # of the enclave / of the keystore itself
+            continue  # the governance of the keystore is in the folder of the enclave /
         if not source.is_symlink() and not source.exists():
             continue
         if not source.is_symlink():
@@ -179,11 +190,11 @@ def _move_away(transaction: Transaction, authority: Authority, name: str) -> tup
 
 
 def link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
-    """Stage links to the revocation list, in each enclave where the link is missing."""
+    """Stage the link ``crl.pem`` to the revocation list for each enclave without it."""
     for name in names:
         folder = enclave_folder(name)
         path = transaction.root / folder / "crl.pem"
         target = "../" * folder.count("/") + f"../{CRL}"
-        # Some ways to copy a keystore turn the link into a file, which would never be updated.
+        # Some ways to copy a keystore replace the link by a file, which would never be updated.
         if not path.is_symlink() or str(path.readlink()) != target:
             transaction.link(f"{folder}/crl.pem", target)

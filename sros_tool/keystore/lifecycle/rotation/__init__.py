@@ -1,1 +1,1 @@
-"""CA rotation: its state and its stages."""
+"""CA rotation: the stages, and the state of a keystore in between."""

@@ -1,7 +1,8 @@
-"""The stages of a CA rotation, and how each stage changes a keystore.
+"""The stages of a CA rotation, and the changes that each stage makes to a keystore.
 
-distribute: enclaves trust a new CA in addition to the old one.  reissue: the new CA issues and
-signs everything again.  retire: enclaves no longer trust the old CA.  Each is one transaction.
+distribute: enclaves trust the new CA in addition to the old CA.  reissue: the new CA issues all
+certificates and signs all documents again.  retire: enclaves no longer trust the old CA.  Each
+stage is one transaction.
 """
 
 from __future__ import annotations
@@ -86,11 +87,11 @@ from sros_tool.xml import read_bytes
 
 @dataclass(frozen=True, slots=True)
 class RotationStep:
-    """The result of a rotation step, or with ``dry_run`` the result that it would have.
+    """The result of a rotation step; with ``dry_run``, the result it would have.
 
-    ``stage`` is the reached stage.  ``files`` are the stems of the files of the CAs that are
-    replaced.  ``kept_elsewhere`` are the places of old keys outside of the keystore; sros leaves
-    them there.
+    ``stage`` is the stage of the keystore afterwards.  ``files`` are the stems of the CA files that
+    are replaced ("identity_ca", "permissions_ca" or "ca").  ``kept_elsewhere`` are the places of
+    old keys outside of the keystore, which sros does not delete.
     """
 
     root: Path
@@ -116,11 +117,16 @@ def rotate_ca(
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> RotationStep:
-    """Rotate up to the stage ``to`` (default: the next one), or to the end with ``finish``.
+    """Rotate the CAs to the stage ``to`` (default: the next stage), or with ``finish`` to the end.
 
-    If the stage ``to`` is reached already, nothing is changed.  ``roles`` ("identity",
-    "permissions"; default both) matter only when a rotation begins.  ``keyring`` opens the present
-    keys; ``new_keys`` names the places of new keys outside of the keystore.
+    If the keystore is at the stage ``to`` already, nothing is changed.  ``roles`` ("identity",
+    "permissions"; default: both) and ``validity`` of the new CAs are only used when a rotation
+    begins.  ``keyring`` opens the present keys; ``new_keys`` names the places of new keys outside
+    of the keystore.
+
+    Raises:
+        KeystoreError: a key is missing, or an enclave cannot be moved to the new CA.
+        UsageError: the stage ``to`` is over, or is not the next stage.
     """
     if not dry_run:
         tidy(root)
@@ -150,24 +156,24 @@ def _wanted(root: Path, rotation: Rotation, to: RotationStage | None) -> Rotatio
     """Return the stage to go to; NONE if there is nothing to do.
 
     Raises:
-        UsageError: the stage is over, or another one comes before it.
+        UsageError: the stage ``to`` is over, or is not the next stage.
     """
     if to is None:
         return rotation.following()
     if to is RotationStage.RETIRE and rotation.stage is RotationStage.NONE:
-        return RotationStage.NONE  # this stage is done
+        return RotationStage.NONE  # an earlier rotation is complete
     order = list(RotationStage)
     ahead = order.index(to) - order.index(rotation.stage)
     if ahead > 1:
         raise UsageError(
-            f"the stage {to} cannot be reached yet",
-            f"Before it come {rotation.following()}, and restarting the processes.",
+            f"the stage {to} is not the next one",
+            f"The next stage is {rotation.following()}; after it, restart the processes.",
             f"Run `sros rotate_ca {root} --next`, or `--finish` to do all stages at once.",
         )
     if ahead < 0:
         raise UsageError(
             f"the stage {to} is over",
-            f"The keystore is at {rotation.stage}; a rotation does not go back.",
+            f"The keystore is at {rotation.stage}, and a rotation cannot go back.",
             f"Run `sros rotate_ca {root} --next`.",
         )
     return to
@@ -181,11 +187,16 @@ def renew_identity_ca(
     validity: Span | None = None,
     dry_run: bool = False,
 ) -> RotationStep:
-    """Issue a certificate that expires later to the identity CA, with the same name and key.
+    """Issue a new certificate for the identity CA, with the same name and key and a later expiry.
 
-    Nothing else changes: on Cyclone DDS 0.10.2 and Fast DDS 2.9.1 (ran) all certificates that the
-    CA issued have a valid chain to both its certificates.  A permissions CA cannot be renewed this
-    way: the documents that it signed name one exact certificate.
+    Nothing else changes: on Cyclone DDS 0.10.2 and Fast DDS 2.9.1 (measured), the certificates that
+    the CA issued have a valid chain to its old and to its new certificate.  A permissions CA cannot
+    be renewed this way: DDS accepts its documents only with the certificate that they embed.
+
+    Raises:
+        KeystoreError: the keystore has a single CA, a rotation is under way, or the CA is not
+            self-signed or its key is missing.
+        UsageError: the new certificate would expire before the present one.
     """
     if not dry_run:
         tidy(root)
@@ -195,18 +206,24 @@ def renew_identity_ca(
         if len(authority_files(root)) == 1:
             raise KeystoreError(
                 "the one CA of this keystore cannot keep its key",
-                "It signs permissions, too, and DDS takes these from the very certificate only.",
+                "It also signs permissions, and DDS accepts them only with the certificate that "
+                "they embed.",
                 "Rotate it without --same-key.",
             )
         if read_rotation(root).stage is not RotationStage.NONE:
-            raise KeystoreError("a rotation is under way", "", "Finish it first.")
+            raise KeystoreError(
+                f"a rotation of the CAs of keystore '{root}' is under way",
+                "",
+                f"Finish it first with `sros rotate_ca {root} --next`.",
+            )
         template = load_settings(root)
         key = keyring.open(root, IDENTITY, template)
         old, *above = certificates_of(root, "identity_ca")
         if above or not same_key(old, key):
             raise KeystoreError(
-                "the identity CA cannot be renewed with its key",
-                "It is not self-signed, or the key is not its own.",
+                "the identity CA cannot be renewed with the same key",
+                "It is not self-signed, or the key belongs to another certificate.",
+                "Rotate it without --same-key.",
             )
         new = issue_ca(key, old.subject, window(now, validity or template.authority_validity))
         _check_later(old, new)
@@ -222,8 +239,8 @@ def renew_identity_ca(
 class _Rotator:
     """Writer of one rotation step, within a transaction.
 
-    ``replacements`` are the CAs that it replaces, ``kept_elsewhere`` the places of old keys that
-    stay outside of the keystore, ``notes`` are about the issued documents.
+    ``replacements`` are the CAs that are replaced, ``kept_elsewhere`` the places of old keys
+    outside of the keystore, and ``notes`` remarks on the issued documents.
     """
 
     def __init__(
@@ -257,10 +274,11 @@ class _Rotator:
         validity: Span | None,
         progress: Progress | None,
     ) -> RotationStage:
-        """Stage all changes up to ``stage``; return the reached stage.
+        """Stage all changes up to ``stage``; return the stage of the keystore afterwards.
 
-        If the new identity CA has no revocation list yet, it is distributed first, and the stage
-        does not change: Fast DDS 2.9.1 refuses every enclave of a CA without a list (ran).
+        If revocations need a list of the new identity CA and it is missing, it is distributed, and
+        the stage stays DISTRIBUTE: where a list exists, Fast DDS 2.9.1 refuses every enclave of a
+        CA without a list (measured).
         """
         if self._rotation.stage is RotationStage.REISSUE:
             self._retire()
@@ -312,19 +330,22 @@ class _Rotator:
         self._write_state(RotationStage.DISTRIBUTE)
 
     def _empty_crl(self, authority: Authority, number: int) -> bytes:
-        """Return an empty revocation list of a new CA."""
+        """Return an empty revocation list of a new CA, as PEM."""
         signed = sign_list(authority, (), number=number, template=self._template, now=self._now)
         self._entries.append(signed.entry)
         return signed.document
 
     def _lacks_crl(self, successors: list[_Successor]) -> bool:
-        """Return whether a revocation was made after the new identity CA was distributed."""
+        """Return whether the distributed identity CA needs a revocation list and has none.
+
+        This happens after the first revocation, if that was during the stage DISTRIBUTE.
+        """
         return (self._root / CRL).exists() and any(
             self._takes_crl(each) and not carried_crl(self._root, each.file) for each in successors
         )
 
     def _takes_crl(self, each: _Successor) -> bool:
-        """Return whether the list of a new CA can be distributed before that CA issues."""
+        """Return whether a new CA's revocation list can be distributed with the CA."""
         return IDENTITY in each.roles and not lists_confusable(each.old[0], each.new.certificate)
 
     def _reissue(
@@ -361,8 +382,8 @@ class _Rotator:
     ) -> None:
         """Stage the certificates, governance and permissions that the new CAs issue.
 
-        Keys, subjects and rights stay.  Certificates and documents of a CA that is not replaced do
-        not change, so its key is not needed.
+        Keys, subjects and rights do not change, nor do certificates and documents of a CA that is
+        not replaced, so its key is not needed.
         """
         if permissions:
             self._sign_governance(permissions)
@@ -384,7 +405,7 @@ class _Rotator:
                 raise KeystoreError(
                     f"enclave {name} cannot be moved to the new CA: {error.what}",
                     error.why,
-                    error.remedy or f"See `sros inspect {folder}`; nothing was changed.",
+                    error.remedy or f"Run `sros inspect {folder}`. Nothing was changed.",
                 ) from error
 
         writer.for_each(self._names, reissue, progress)
@@ -392,7 +413,7 @@ class _Rotator:
         self.notes = writer.notes
 
     def _sign_governance(self, permissions: _Successor) -> None:
-        """Sign the unchanged governance of the keystore, and enclaves' copies, again."""
+        """Sign the governance of the keystore and its copies in enclaves again, unchanged."""
         copies = [
             f"{enclave_folder(each)}/{GOVERNANCE_FILE}" for each in self._names if each != "/"
         ]
@@ -402,7 +423,7 @@ class _Rotator:
                 continue
             signed = smime.parse(read_bytes(real, "governance document"))
             signed.verify(permissions.old[0])
-            parse_governance(signed.document)  # raises if DDS could not read it
+            parse_governance(signed.document)  # raises if it is malformed
             message = permissions.new.sign(signed.document, "the governance document")
             self._transaction.write(path, message)
             self._entries.append(document_entry(self._now, "governance", message))
@@ -429,7 +450,7 @@ class _Rotator:
         self._transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
 
     def _install_key(self, each: _Successor) -> str:
-        """Move the old key to ``retired`` and put the new one in its place.
+        """Stage the move of the old key to ``retired`` and of the new key to the place of the old.
 
         Return the place of the old key if it is outside of the keystore, else "".
         """
@@ -454,7 +475,7 @@ class _Rotator:
         return old_key
 
     def _write_settings(self, successors: list[_Successor]) -> None:
-        """Write the places of the new keys into the settings."""
+        """Stage the settings with the places of the new keys."""
         places = {
             role: "" if each.key.startswith(f"{PRIVATE}/") else each.key
             for each in successors
@@ -466,11 +487,13 @@ class _Rotator:
             permissions_key=places.get(PERMISSIONS, self._template.permissions_key),
         )
         if template != self._template:
-            comment = b"# The choices of this keystore; what is added later follows them.\n"
+            comment = (
+                b"# The settings of this keystore; sros uses them for each enclave that is added.\n"
+            )
             self._transaction.write(SETTINGS, comment + render_template(template).encode())
 
 
-# ── what an enclave gets ───────────────────────────────────────────────────────────────────
+# ── files of one enclave ───────────────────────────────────────────────────────────────────
 
 
 def _issuance(
@@ -480,10 +503,10 @@ def _issuance(
     permissions: _Successor | None,
     policies: dict[str, str],
 ) -> Issuance | None:
-    """Return what the new CAs issue for an enclave; None if it still waits for a certificate.
+    """Return what the new CAs issue for an enclave; None if it has no certificate yet.
 
     Raises:
-        KeystoreError: the enclave is not of the old CA.
+        KeystoreError: the old CA did not issue its certificate or sign its permissions.
     """
     folder = enclave_path(root, name)
     path = folder / CERTIFICATE_FILE
@@ -494,8 +517,8 @@ def _issuance(
     if identity:
         if not issued_by(kept, identity.old[0]):
             raise KeystoreError(
-                f"its certificate was not issued by the identity CA of this keystore but by "
-                f"{subject_text(kept.issuer)}"
+                f"its certificate was issued by {subject_text(kept.issuer)}, not by the identity "
+                "CA of this keystore"
             )
         certificate = NewIdentity(kept.subject, kept.public_key())  # type: ignore[arg-type]
     rights = None
@@ -523,9 +546,10 @@ def _verified_rights(
 
 @dataclass(frozen=True, slots=True)
 class _Successor:
-    """A new CA, and the certificate of the CA that it replaces, with the chain above that.
+    """A new CA, and the certificates of the CA that it replaces.
 
-    ``file`` is the stem of the CA file, ``key`` the place of the new key: a URI, or a path in the
+    ``file`` is the stem of the CA file.  ``old`` is the certificate of the old CA, followed by the
+    other certificates in that file.  ``key`` is the place of the new key: a URI, or a path in the
     keystore.
     """
 
@@ -536,7 +560,7 @@ class _Successor:
     key: str
 
     def replacement(self) -> Replacement:
-        """Return the entry about it in the rotation's file."""
+        """Return the entry of this CA in the file of the rotation."""
         return Replacement(self.file, digest(self.old[0]), digest(self.new.certificate), self.key)
 
 
@@ -550,9 +574,10 @@ def _make_successors(
     *,
     next_to: bool,
 ) -> list[_Successor]:
-    """Make new CAs for ``roles`` (none: for all), and stage their keys.
+    """Create new CAs for ``roles`` (empty: for both roles), and stage their keys.
 
-    In the keystore, the new keys lie ``next_to`` the present keys, or replace them.
+    New keys in the keystore get names next to the present keys if ``next_to``; otherwise they
+    replace them.
     """
     root = transaction.root
     files = authority_files(root)
@@ -560,8 +585,8 @@ def _make_successors(
     for file, serves in files.items():
         if wanted & set(serves) and not set(serves) <= wanted:
             raise UsageError(
-                f"the CA in '{PUBLIC}/{file}.cert.pem' does both jobs",
-                "It can only be replaced for both.",
+                f"the CA in '{PUBLIC}/{file}.cert.pem' is the identity CA and the permissions CA",
+                "It can only be replaced in both roles.",
                 "Leave out --identity and --permissions.",
             )
     check_places(new_keys, replace(template, separate_authorities=len(files) > 1))
@@ -581,10 +606,10 @@ def _check_place(
 ) -> None:
     if not new_keys.places.get(role) and not (root / f"{PRIVATE}/{file}.key.pem").is_file():
         raise KeystoreError(
-            f"the key of the {role} CA is not in the keystore, so its successor's should not be "
-            "either",
-            f"It is at '{keyring.place(role, template)}'.",
-            f"Name a place for the new one with --{role}-key.",
+            f"the key of the {role} CA is not in the keystore, so the key of the new CA should not "
+            "be there either",
+            f"The present key is at '{keyring.place(role, template)}'.",
+            f"Name a place for the new key with --{role}-key.",
         )
 
 
@@ -609,9 +634,9 @@ def _make_successor(
         raise KeystoreError(
             f"the key at '{place}' belongs to the present {roles[0]} CA",
             "A new CA needs a new key.",
-            "Name another place.",
+            f"Name another place with --{roles[0]}-key.",
         )
-    # Fast DDS refuses peers whose permissions CA has another name (2.9.1: ran).
+    # Fast DDS 2.9.1 refuses peers whose permissions CA has another name (measured).
     name = old[0].subject
     if PERMISSIONS not in roles:
         name = common_name(f"{template.authority_name} identity CA {secrets.token_hex(4)}")
@@ -622,7 +647,7 @@ def _make_successor(
 def _distributed(
     root: Path, rotation: Rotation, keyring: Keyring, template: Template
 ) -> list[_Successor]:
-    """Return the new CAs that were distributed, with their keys."""
+    """Return the new CAs of a rotation at the stage DISTRIBUTE, with their keys."""
     found = []
     files = authority_files(root)
     for each in rotation.replacements:
@@ -635,7 +660,7 @@ def _distributed(
             raise KeystoreError(
                 f"the key at '{each.key}' does not belong to the new {roles[0]} CA",
                 "",
-                "Restore it from a backup.",
+                "Restore the key from a backup.",
             )
         old = tuple(one for one in certificates if one != new)
         found.append(_Successor(each.file, roles, old, Authority(new, key), each.key))
@@ -643,11 +668,11 @@ def _distributed(
 
 
 def _check_later(old: x509.Certificate, new: x509.Certificate) -> None:
-    """Raise `UsageError` if a new CA would expire before the old one and no validity was named."""
+    """Raise `UsageError` if the new CA certificate expires before the old one."""
     if new.not_valid_after_utc < old.not_valid_after_utc:
         raise UsageError(
             "the new CA would expire before the old one",
-            f"The old one expires at {old.not_valid_after_utc:%Y-%m-%d}, the new one would at "
+            f"The old CA expires at {old.not_valid_after_utc:%Y-%m-%d}, the new CA would expire at "
             f"{new.not_valid_after_utc:%Y-%m-%d}.",
-            "Say how long it is to be valid with --ca-validity.",
+            "Choose a longer validity with --ca-validity.",
         )

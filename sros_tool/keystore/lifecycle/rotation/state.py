@@ -1,4 +1,4 @@
-"""The state of a rotation of CAs: its stage, the CAs it replaces, and the enclaves of each CA.
+"""The state of a CA rotation: its stage, the replaced CAs, and the number of enclaves of each CA.
 
 This module only reads; `stages` makes the changes.
 """
@@ -38,28 +38,29 @@ from sros_tool.values import as_plain
 from sros_tool.xml import read_bytes
 
 _SOON = timedelta(days=90)
-"""The remaining time from which a CA should be replaced."""
+"""The remaining validity at which a remark advises to replace a CA."""
 
 
 class RotationStage(StrEnum):
-    """The stages of a rotation, in their order; NONE is before the first and after the last."""
+    """The stages of a rotation, in order; a keystore without a rotation is at NONE."""
 
     NONE = "none"
     DISTRIBUTE = "distribute"
-    """The new CA is trusted next to the old one, which still issues."""
+    """Both CAs are trusted; the old CA issues."""
     REISSUE = "reissue"
-    """The new CA has issued everything; the old one is still trusted."""
+    """Both CAs are trusted; the new CA issues, and has issued everything again."""
     RETIRE = "retire"
     """The old CA is no longer trusted; the rotation is complete."""
 
 
 @dataclass(frozen=True, slots=True)
 class Replacement:
-    """A CA and the one that replaces it.
+    """An old CA, and the new CA that replaces it.
 
-    ``file`` is the stem of its files ("identity_ca", "permissions_ca", or "ca" for both jobs);
-    ``old`` and ``new`` are the SHA-256 of the certificates; ``key`` is the place of the new key, a
-    URI or a path in the keystore; ``old_key`` is the place of the old key, "" if that is `RETIRED`.
+    ``file`` is the stem of the CA file ("identity_ca", "permissions_ca", or "ca" for both roles).
+    ``old`` and ``new`` are the SHA-256 fingerprints of the certificates.  ``key`` is the place of
+    the new key: a URI, or a path in the keystore.  ``old_key`` is the place of the old key, or ""
+    if it is in `RETIRED`.
     """
 
     file: str
@@ -69,26 +70,30 @@ class Replacement:
     old_key: str = ""
 
     def place_of_old(self, certificate: x509.Certificate) -> str:
-        """Return the place of the old CA's key after the reissue, by the old ``certificate``."""
+        """Return the place of the key of the old CA, ``certificate``, after the stage REISSUE."""
         return self.old_key or retired_key(certificate)
 
 
 @dataclass(frozen=True, slots=True)
 class Rotation:
-    """A rotation: its last finished stage, and the CAs that it replaces."""
+    """A rotation: the stage of the keystore, and the CAs that are replaced."""
 
     stage: RotationStage = RotationStage.NONE
     replacements: tuple[Replacement, ...] = ()
 
     def following(self) -> RotationStage:
-        """Return the next stage."""
+        """Return the stage after the present one."""
         order = list(RotationStage)
         return order[order.index(self.stage) + 1]
 
 
 @dataclass(frozen=True, slots=True)
 class AuthorityStatus:
-    """A trusted CA: ``state`` is issuing, next or old; ``enclaves`` is how many are on it."""
+    """A trusted CA, for people and programs.
+
+    ``state`` is "issuing", "next" or "old".  ``enclaves`` is the number of enclaves with a
+    certificate or permissions of this CA.
+    """
 
     file: str
     roles: tuple[str, ...]
@@ -101,7 +106,7 @@ class AuthorityStatus:
 
 @dataclass(frozen=True, slots=True)
 class RotationStatus:
-    """The stage of a keystore, its CAs, its number of enclaves, and remarks on what to do."""
+    """The rotation of a keystore, its CAs, the number of its enclaves, and next steps."""
 
     root: Path
     rotation: Rotation
@@ -111,15 +116,15 @@ class RotationStatus:
 
 
 def retired_key(certificate: x509.Certificate) -> str:
-    """Return the path of the key of a CA that was replaced."""
+    """Return the path in the keystore for the key of a replaced CA."""
     return f"{RETIRED}/{certificate.serial_number:x}.key.pem"
 
 
 def read_rotation(root: Path) -> Rotation:
-    """Return the rotation that is under way, or an empty one.
+    """Return the rotation that is under way, or an empty `Rotation`.
 
     Raises:
-        KeystoreError: the file of the rotation does not fit the CAs.
+        KeystoreError: the file of the rotation is damaged, or does not fit the CA certificates.
     """
     path = root / ROTATION
     if not path.exists():
@@ -143,7 +148,7 @@ def read_rotation(root: Path) -> Rotation:
 
 
 def render_rotation(rotation: Rotation) -> bytes:
-    """Return the content of the file of a rotation."""
+    """Return the file of a rotation, as JSON that `read_rotation` reads."""
     content = {
         "stage": rotation.stage.value,
         "replacements": as_plain(rotation.replacements),
@@ -152,7 +157,7 @@ def render_rotation(rotation: Rotation) -> bytes:
 
 
 def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
-    """Return the stage of a keystore, and each trusted CA with its expiry and its enclaves."""
+    """Return the stage of a keystore, its trusted CAs with their validity, and remarks."""
     names = list_enclaves(root)
     rotation = read_rotation(root)
     by_file = {each.file: each for each in rotation.replacements}
@@ -185,7 +190,7 @@ def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
 def _count(
     root: Path, names: Sequence[str], role: str, authorities: tuple[x509.Certificate, ...]
 ) -> Counter[int]:
-    """Count the enclaves of each CA, by their certificates or by their signed permissions."""
+    """Count the enclaves of each CA, by index: for identity CAs by certificate, else by signer."""
     counts: Counter[int] = Counter()
     for name in names:
         folder = root / enclave_folder(name)
@@ -198,14 +203,14 @@ def _count(
                 signed = smime.parse(read_bytes(folder / "permissions.p7s", "permissions"))
                 signer = signed.signer()
                 fits = [signer == each for each in authorities]
-        except SrosError:  # `sros inspect` says what is wrong with it
+        except SrosError:  # `sros inspect` reports the error
             continue
         if True in fits:
             counts[fits.index(True)] += 1
     return counts
 
 
-# ── what the vendors make of it ────────────────────────────────────────────────────────────
+# ── remarks ────────────────────────────────────────────────────────────────────────────────
 
 
 def _ending(states: Sequence[AuthorityStatus], now: datetime) -> list[str]:
@@ -218,53 +223,52 @@ def _ending(states: Sequence[AuthorityStatus], now: datetime) -> list[str]:
         end = iso(each.validity.not_after)
         if each.validity.not_after < now:
             remarks.append(
-                f"The {name} expired at {end}, and no process starts any more: replace it at once "
-                "with --finish."
+                f"The {name} expired at {end}, and processes no longer start: replace it now with "
+                "--finish."
             )
         elif each.roles == (IDENTITY,):
             remarks.append(
-                f"The {name} expires at {end}: --same-key extends it and disturbs nobody; "
-                "--next begins to replace it."
+                f"The {name} expires at {end}: extend it with --same-key, which needs no restart; "
+                "or begin to replace it with --next."
             )
         else:
             remarks.append(
-                f"The {name} expires at {end}: --next begins to replace it. With Fast DDS, robots "
-                "run "
-                "on; with Cyclone DDS, plan a common restart of all processes."
+                f"The {name} expires at {end}: begin to replace it with --next. With Fast DDS, "
+                "robots keep running; with Cyclone DDS, plan to restart all processes together."
             )
     return remarks
 
 
 def _remarks(root: Path, rotation: Rotation) -> list[str]:
-    """Return remarks on the processes to restart at this stage, by vendor."""
+    """Return remarks on the processes to restart at the stage DISTRIBUTE or REISSUE, by vendor."""
     files = [each.file for each in rotation.replacements]
     if rotation.stage is RotationStage.DISTRIBUTE:
         return [
-            "All vendors: restart the processes one by one, when it suits; those restarted and "
-            "those not yet restarted talk with each other. Go on when all have been restarted."
+            "All vendors: restart the processes one by one, at any time; processes before and "
+            "after the restart communicate. Continue when all have been restarted."
         ]
     hindrance = _fast_dds_hindrance(root, files)
     remarks = [
         f"Fast DDS: {hindrance} Restart all processes together."
         if hindrance
-        else "Fast DDS: restart the processes one by one, when it suits; those restarted and those "
-        "not yet restarted talk with each other. Go on when all have been restarted.",
-        "Cyclone DDS: it trusts one CA at a time, so restart all processes together; one that is "
-        "restarted does not talk with one that is not.",
+        else "Fast DDS: restart the processes one by one, at any time; processes before and after "
+        "the restart communicate. Continue when all have been restarted.",
+        "Cyclone DDS: it trusts one CA at a time, so restart all processes together; processes "
+        "before and after the restart do not communicate.",
     ]
     if any(file != "permissions_ca" for file in files):
         remarks.append(
-            "What is revoked now is revoked by both CAs, as long as the key of the old one is at "
-            "hand."
+            "Revocations at this stage are signed by both CAs, if the key of the old CA is "
+            "available."
         )
     return remarks
 
 
 def lists_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
-    """Return whether OpenSSL may take a revocation list of one CA for a list of the other.
+    """Return whether OpenSSL may take the revocation list of one CA for the list of the other.
 
-    OpenSSL looks for a list by name and key identifier.  If both CAs have the same name and the
-    old one has no identifier, Fast DDS 2.9.1 finds the wrong list and starts no process (ran).
+    OpenSSL finds a list by name and key identifier.  If both CAs have the same name and the old CA
+    has no identifier, Fast DDS 2.9.1 uses the wrong list and no process starts (measured).
     """
     return old.subject == new.subject and not _has_identifier(old)
 
@@ -280,15 +284,15 @@ def _has_identifier(certificate: x509.Certificate) -> bool:
 def _fast_dds_hindrance(root: Path, files: Sequence[str]) -> str:
     """Return why Fast DDS cannot trust the old and the new CA at once, as a sentence, or "".
 
-    Fast DDS 2.9.1 (ran) distinguishes two CAs of the same name by their key identifiers, and needs
-    permissions CAs of the same name and algorithm on both sides.
+    Fast DDS 2.9.1 (measured) distinguishes two CAs of the same name by their key identifiers, and
+    refuses a peer whose permissions CA has another name or key algorithm.
     """
     for file in files:
         if file == "identity_ca":
             continue
         for certificate in certificates_of(root, file):
             if not isinstance(certificate.public_key(), ec.EllipticCurvePublicKey):
-                return "the old permissions CA has a key of another kind than the new one."
+                return "the old permissions CA has another key algorithm than the new one."
             if not _has_identifier(certificate):
                 return (
                     f"the old {'CA' if file == 'ca' else f'{PERMISSIONS} CA'} has no key "
