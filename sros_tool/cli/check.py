@@ -379,8 +379,8 @@ Example:
       a secured participant fails: RCLError: error creating node: This Fast
       DDS version doesn't have the security libraries
   Cyclone DDS (libddsc)        enforces security  Cyclone DDS 0.10.2
-      in an enclave made by sros it created the allowed writer on /chatter,
-      and refused writer and reader on /sros_not_allowed: ...
+      with an enclave made by sros, it created the allowed writer on /chatter
+      and refused the denied writer and reader on /sros_not_allowed: ...
   DDS Security can be enforced here.
 
 Exit status: 1 if nothing here enforces security, or if a finding is an error; else 0.""",

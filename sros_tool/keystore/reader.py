@@ -180,7 +180,7 @@ def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
     raise KeystoreError(
         f"ROS_DOMAIN_ID is {domain}, but keystore '{root}' is for domain {domains} only",
         "A node that joins any other domain with it is refused by DDS.",
-        f"Set ROS_DOMAIN_ID to {domains}, or make a keystore with --domain {domain}.",
+        f"Set ROS_DOMAIN_ID to {domains}, or create a keystore with --domain {domain}.",
     )
 
 

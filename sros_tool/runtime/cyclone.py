@@ -1,6 +1,6 @@
 """Cyclone DDS 0.10 from Python: participants, writers and readers of strings, with DDS Security.
 
-A refusal by DDS Security is a `SecurityRefusedError`; everything else that fails is a `DdsError`,
+A refusal by DDS Security raises a `SecurityRefusedError`; every other failure raises a `DdsError`,
 so that a crash is never mistaken for a refusal.  One process must not have two participants with
 different enclaves in one domain: in Cyclone 0.10 the second one gets the permissions of the first.
 
@@ -28,8 +28,10 @@ from sros_tool.resources import unpacked_dds_dir
 _Value = TypeVar("_Value")
 
 FOLDER_VARIABLE = "SROS_CYCLONEDDS_DIR"
-"""The variable that names the only folder to search: one with libddsc, or one into which Debian's
-packages were unpacked."""
+"""The variable that names the only folder to search for libddsc.
+
+It may also be a folder into which Debian's packages were unpacked.
+"""
 
 _SYSTEM_NAMES = ("libddsc.so.0debian", "libddsc.so.0t64", "libddsc.so.0")
 """The shared object names of Debian 12, of Debian 13, and of an installation from source or ROS."""
@@ -94,8 +96,10 @@ class Publication:
 class Participant:
     """A DDS participant in ``domain`` (0 to 230), secured by the files of ``enclave`` if given.
 
-    Raises `SecurityRefusedError`, `DdsError`, and `UnavailableError` if Cyclone DDS or its
-    security plugins are missing.
+    Raises:
+        SecurityRefusedError: DDS Security refuses the participant.
+        DdsError: creating it failed for another reason.
+        UnavailableError: Cyclone DDS or its security plugins are missing.
     """
 
     def __init__(self, domain: int, enclave: Path | None = None) -> None:
@@ -112,15 +116,25 @@ class Participant:
         self.domain = domain
 
     def writer(self, topic: str) -> Writer:
-        """Return a reliable writer of strings on the DDS topic ``topic`` ("rt/chatter")."""
+        """Return a reliable DataWriter of strings on the DDS topic ``topic`` ("rt/chatter").
+
+        Raises:
+            SecurityRefusedError: the permissions deny it.
+            DdsError: creating it failed for another reason.
+        """
         return Writer(self._library, self._endpoint("writer", topic))
 
     def reader(self, topic: str) -> Reader:
-        """Return a reliable reader of strings on the DDS topic ``topic`` ("rt/chatter")."""
+        """Return a reliable DataReader of strings on the DDS topic ``topic`` ("rt/chatter").
+
+        Raises:
+            SecurityRefusedError: the permissions deny it.
+            DdsError: creating it failed for another reason.
+        """
         return Reader(self._library, self._endpoint("reader", topic), self.handle)
 
     def publications(self) -> tuple[Publication, ...]:
-        """Return the writers that this participant has discovered, and its own, sorted."""
+        """Return this participant's writers and those it has discovered, sorted by topic."""
         api = self._library.api
         reader = api.dds_create_reader(self.handle, _BUILTIN_PUBLICATIONS, None, None)
         if reader < 0:
@@ -197,7 +211,11 @@ class Writer:
         self.handle = handle
 
     def write(self, text: str) -> None:
-        """Send one message.  Raises `DdsError`."""
+        """Send one message.
+
+        Raises:
+            DdsError: the message could not be written.
+        """
         sample = StringSample(text.encode())
         code = self._library.api.dds_write(self.handle, ctypes.byref(sample))
         if code < 0:
@@ -244,7 +262,10 @@ def security_properties(enclave: Path, plugins: Path | None) -> dict[str, str]:
     """Return the properties that make Cyclone DDS load ``enclave``, as rmw_cyclonedds sets them.
 
     ``plugins`` is the folder of libdds_security_*.so; without it, the dynamic loader searches for
-    them.  Raises `DdsError` if a file of the enclave is missing.
+    them.
+
+    Raises:
+        DdsError: a file of the enclave is missing.
     """
     folder = enclave.absolute()
     for name in ENCLAVE_FILES:
@@ -252,7 +273,7 @@ def security_properties(enclave: Path, plugins: Path | None) -> dict[str, str]:
             raise DdsError(
                 f"cannot load the enclave {folder}",
                 f"It has no file {name}.",
-                "Make the enclave again with `sros create_enclave`.",
+                "Create the enclave again with `sros create_enclave`.",
             )
     properties = {key: f"file:{folder / name}" for key, name in _FILE_PROPERTIES.items()}
     if (folder / "crl.pem").is_file():
@@ -287,7 +308,7 @@ def _qos(library: CycloneLibrary) -> Iterator[Any]:
 def _take(
     library: CycloneLibrary, handle: int, limit: int, copy: Callable[[int], _Value]
 ) -> list[_Value]:
-    """Take up to ``limit`` samples; ``copy`` converts each one before it is given back to DDS."""
+    """Take up to ``limit`` samples; ``copy`` converts each before DDS gets its memory back."""
     samples = (ctypes.c_void_p * limit)()
     infos = (SampleInfo * limit)()
     count = library.api.dds_take(handle, samples, infos, limit, limit)
@@ -344,16 +365,17 @@ def _describe_return(library: CycloneLibrary, code: int) -> str:
 
 @functools.cache
 def load_cyclone() -> CycloneLibrary:
-    """Load libddsc 0.10.x once per process.
+    """Load libddsc 0.10.x, once per process.
 
-    Raises `UnavailableError` if there is none, or only a version with another C interface.
+    Raises:
+        UnavailableError: there is no libddsc, or only one with another C interface.
     """
     api, path = _load_first()
     version = version_of(path)
     if not version.startswith(_SUPPORTED):
         raise UnavailableError(
             f"cannot use {path}: it is Cyclone DDS {version}",
-            f"sros speaks the C interface of Cyclone DDS {_SUPPORTED}x only.",
+            f"sros supports only the C interface of Cyclone DDS {_SUPPORTED}x.",
             INSTALL_ADVICE,
         )
     for name, (result, arguments) in _SIGNATURES.items():
@@ -423,10 +445,10 @@ def _library_files(folder: Path) -> list[Path]:
 
 
 def _load_all(files: Iterable[Path]) -> None:
-    """Load libraries that depend on each other; ignore those that cannot be loaded.
+    """Load libraries that depend on each other; ignore libraries that cannot be loaded.
 
-    Once they are loaded, libddsc finds them by name, without LD_LIBRARY_PATH.  Libraries that
-    others depend on are loaded first; else the loader might add the system's copies of them.
+    After that, libddsc finds them by name, without LD_LIBRARY_PATH.  Loads dependencies first:
+    otherwise the dynamic loader might load the system's copies of them.
     """
     waiting = sorted(files, key=_load_order)
     while waiting:
@@ -477,7 +499,7 @@ def plugins_next_to(path: Path) -> Path | None:
     return None
 
 
-# ── its C interface ────────────────────────────────────────────────────────────────────────
+# ── the C interface of libddsc ────────────────────────────────────────────────────────────
 
 
 class TopicDescriptor(ctypes.Structure):

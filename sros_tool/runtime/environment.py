@@ -1,7 +1,7 @@
 """The environment variables and arguments that make a process run secured, as rcl reads them.
 
-ROS_SECURITY_ENCLAVE_OVERRIDE secures a process, and the ROS graph does not show it; the graph shows
-the enclave of ``--ros-args --enclave``.
+ROS_SECURITY_ENCLAVE_OVERRIDE decides which enclave secures a process.  The ROS graph does not show
+it, but the enclave of ``--ros-args --enclave``.
 
 Source: rcl 9.x ``security.c``, ``context.c`` and ``domain_id.c``.
 """
@@ -31,7 +31,7 @@ def domain_from(environment: Mapping[str, str]) -> int | None:
     """Return ROS_DOMAIN_ID as a number, or None if it is unset or empty.
 
     Raises:
-        UsageError: It is not a domain id; rcl refuses to start then, too.
+        UsageError: It is not a domain id; rcl would not start either.
     """
     text = environment.get(DOMAIN, "")
     if not text:
@@ -48,10 +48,10 @@ def domain_from(environment: Mapping[str, str]) -> int | None:
 
 
 def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
-    """Return the domain for a process of the keystore at ``root``, which is for ``domains``.
+    """Return the domain for a process that uses the keystore at ``root``, which is for ``domains``.
 
-    It is ``wanted`` (from an option or ROS_DOMAIN_ID), if given.  Otherwise it is 0, the default of
-    ROS, if the keystore is for it, and else the first domain of the keystore.
+    Prefers ``wanted`` (from an option or ROS_DOMAIN_ID), then 0, the default of ROS, if the
+    keystore is for it, then the first domain of the keystore.
 
     Raises:
         KeystoreError: The keystore is not for the ``wanted`` domain.
@@ -61,15 +61,15 @@ def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
             raise KeystoreError(
                 f"keystore '{root}' is for domain {domains}, not for {wanted}",
                 "DDS would refuse the node.",
-                f"Set {DOMAIN} to {next(iter(domains))}, or make a keystore with "
-                f"--domain {wanted}.",
+                f"Set {DOMAIN} to {next(iter(domains))}, or create a keystore with"
+                f" --domain {wanted}.",
             )
         return wanted
     return 0 if 0 in domains else next(iter(domains))
 
 
 def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
-    """Return the variables that make a process run in enclave ``name``, or not start at all."""
+    """Return the variables that make a process run secured in enclave ``name``, or not start."""
     return {
         KEYSTORE: str(root.absolute()),
         ENABLE: "true",
@@ -82,15 +82,15 @@ def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
 def render_environment(variables: Mapping[str, str], form: str) -> str:
     """Return the variables as text in a form: sh, fish, json, systemd or docker.
 
-    ``docker`` is an env-file, ``systemd`` the lines of a unit; neither can hold a line break.
+    ``docker`` is an env-file, ``systemd`` the lines of a unit; neither may contain a line break.
 
     Raises:
-        UsageError: A value has a line break that the form cannot hold.
+        UsageError: A value has a line break, which the form does not allow.
     """
     if form == "json":
         return json.dumps(dict(variables), indent=2) + "\n"
     if form in ("docker", "systemd") and any("\n" in value for value in variables.values()):
-        raise UsageError(f"the form {form} cannot hold a path with a line break")
+        raise UsageError(f"the form {form} does not allow a path with a line break")
     return "".join(_LINES[form](name, value) for name, value in variables.items())
 
 
@@ -126,8 +126,8 @@ _PYTHON = re.compile(r"python[\d.]*\Z")
 def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
     """Return the command with ``--ros-args --enclave`` added, if it certainly starts a ROS node.
 
-    Such commands are ``ros2 run``, an executable or Python script of a ROS package
-    (``lib/PACKAGE/NAME``), and all with ``--ros-args``.  A command that names an enclave keeps it.
+    These are ``ros2 run``, an executable or Python script of a ROS package (``lib/PACKAGE/NAME``),
+    and commands with ``--ros-args``.  A command that names an enclave is returned unchanged.
     """
     command = tuple(command)
     if Path(command[0]).name == "ros2" and not _is_ros2_run(command):
@@ -141,7 +141,7 @@ def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
 
 
 def _is_ros2_run(command: Sequence[str]) -> bool:
-    """Return whether it is ``ros2 run [--prefix PREFIX] PACKAGE EXECUTABLE ...``."""
+    """Return whether a command is ``ros2 run [--prefix PREFIX] PACKAGE EXECUTABLE ...``."""
     if Path(command[0]).name != "ros2" or tuple(command[1:2]) != ("run",):
         return False
     words = list(command[2:])
@@ -153,7 +153,7 @@ def _is_ros2_run(command: Sequence[str]) -> bool:
 
 
 def _is_of_package(command: Sequence[str]) -> bool:
-    """Return whether a ROS package installed the program, or the script that Python runs."""
+    """Return whether the program, or the script that Python runs, belongs to a ROS package."""
     script = command[1] if _PYTHON.match(Path(command[0]).name) and len(command) > 1 else ""
     path = Path(script or shutil.which(command[0]) or command[0])
     if path.parent.parent.name != "lib" or not path.is_file():

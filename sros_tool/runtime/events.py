@@ -1,8 +1,8 @@
-"""The reports of a running process: one JSON object per line, appended to a file.
+"""The events that a running process reports: one JSON object per line, appended to a file.
 
-Times are seconds of CLOCK_MONOTONIC, which all processes of a machine share.  A line is written
-with one system call, so that lines never get mixed; an unfinished last line is left for the next
-read.
+Times are seconds of CLOCK_MONOTONIC, which all processes of a machine share.  Each line is written
+with one system call, so that lines of different writers never mix.  A reader leaves an incomplete
+last line for the next read.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class EventWriter:
         stage: ProcessStage | None = None,
         publishers: Mapping[str, int] | None = None,
     ) -> None:
-        """Write one event with the present time."""
+        """Append one event with the current time."""
         if self._file is None:
             return
         record: dict[str, Any] = {"event": kind.value, "time": round(time.monotonic(), 6)}

@@ -1,8 +1,8 @@
-"""Move the calling process into its own network, so that a demo and the host do not interfere.
+"""Move the calling process into a separate network, so that demo and host do not interfere.
 
 The network namespace has only a loopback interface, and disappears with the last process in it.
-Root needs CAP_SYS_ADMIN; other users need a user namespace, which also grants the right to capture
-packets inside (capabilities(7), user_namespaces(7)).
+Creating it needs CAP_SYS_ADMIN or a user namespace, which also grants the right to capture packets
+in the new network (capabilities(7), user_namespaces(7)).
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ _LOCAL_PORTS = Path("/proc/sys/net/ipv4/ip_local_port_range")
 _BELOW_DDS = "1024 7399"
 """A port range that no domain uses: their ports begin at 7400 (RTPS 2.5 §9.6.2.3)."""
 
-_ALONE = 0
 _TRIAL_SECONDS = 60
 
 
@@ -58,7 +57,7 @@ class _RouteEntry(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Isolation:
-    """The ability of a process to get its own network, with the reason if it cannot."""
+    """Whether a process can get a separate network, with the reason if it cannot."""
 
     isolated: bool
     reason: str = ""
@@ -75,12 +74,12 @@ def try_isolation() -> Isolation:
         try:
             enter_isolation()
         except OSError as error:
-            reason = f"no network namespace of its own: {error.strerror or error}"
+            reason = f"no separate network namespace: {error.strerror or error}"
         except BaseException as error:  # a forked child must never return into its caller
-            reason = f"no network namespace of its own: {error}"
+            reason = f"no separate network namespace: {error}"
         finally:
             os.write(write_end, (reason or "yes").encode())
-            os._exit(_ALONE)
+            os._exit(0)
     os.close(write_end)
     with os.fdopen(read_end, "rb") as answers:
         answer = answers.read().decode("utf-8", "replace")
@@ -91,7 +90,7 @@ def try_isolation() -> Isolation:
 
 
 def enter_isolation() -> None:
-    """Move this process, which must have only one thread, into its own network namespace.
+    """Move this process, which must have only one thread, into a new network namespace.
 
     Raises:
         OSError: The kernel does not allow it. The process may then be in a user namespace without
@@ -126,16 +125,16 @@ def _unshare(flags: int) -> None:
 
 def _bring_up_loopback() -> None:
     """Do ``ip link set lo up multicast on; ip route add 224.0.0.0/4 dev lo`` without iproute2."""
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asker:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
         request = struct.pack("16sH14x", b"lo", 0)
-        answer = fcntl.ioctl(asker, _SIOCGIFFLAGS, request)
+        answer = fcntl.ioctl(control, _SIOCGIFFLAGS, request)
         (flags,) = struct.unpack_from("H", answer, 16)
         request = struct.pack("16sH14x", b"lo", flags | _IFF_UP | _IFF_MULTICAST)
-        fcntl.ioctl(asker, _SIOCSIFFLAGS, request)
-        _add_multicast_route(asker)
+        fcntl.ioctl(control, _SIOCSIFFLAGS, request)
+        _add_multicast_route(control)
 
 
-def _add_multicast_route(asker: socket.socket) -> None:
+def _add_multicast_route(control: socket.socket) -> None:
     device = ctypes.create_string_buffer(b"lo")
     entry = _RouteEntry(
         destination=_internet_address("224.0.0.0"),
@@ -144,14 +143,14 @@ def _add_multicast_route(asker: socket.socket) -> None:
         flags=_RTF_UP,
         device=ctypes.addressof(device),
     )
-    fcntl.ioctl(asker, _SIOCADDRT, bytes(entry))
+    fcntl.ioctl(control, _SIOCADDRT, bytes(entry))
 
 
 def _keep_off_ports_of_dds() -> None:
-    """Keep the kernel from assigning ports of DDS domains to sockets that ask for any port.
+    """Stop the kernel from assigning ports of DDS domains to sockets that bind to any free port.
 
-    From domain 102 on, the well-known ports are in the range from which Linux assigns them.
-    Sometimes a participant could not join because its port was assigned to another socket.
+    From domain 102 on, the ports of DDS are in the range from which Linux assigns free ports: a
+    participant could not join if its port was assigned to another socket.
     """
     with contextlib.suppress(OSError):  # a container may forbid it
         _LOCAL_PORTS.write_text(_BELOW_DDS, encoding="ascii")

@@ -1,8 +1,8 @@
 """The process that tries one DDS; only `sros_tool.runtime.stacks` starts it.
 
 It joins with the enclave that the environment names, then creates endpoints that the enclave's
-permissions allow and some that they deny, and reports each result.  The parent judges the results:
-a crash of this process must not count as one.
+permissions allow and some that they deny, and reports each result.  The parent judges the results,
+so that a crash of this process does not count as a refusal.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def _join_rclpy() -> tuple[Ask, Close]:
 
 
 def _join_cyclone() -> tuple[Ask, Close]:
-    """Join as a participant of the libddsc that sros uses."""
+    """Join as a participant with the libddsc that `sros_tool.runtime.cyclone` loads."""
     participant = Participant(domain_of(os.environ), choose_enclave(os.environ).enclave)
 
     def ask(kind: str, topic: str) -> None:
@@ -98,7 +98,11 @@ _JOINS: dict[str, Callable[[], tuple[Ask, Close]]] = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Join, then create endpoints on two topics; arguments are ``KIND REPORT ALLOWED DENIED``."""
+    """Join, then create endpoints on two topics; arguments are ``KIND REPORT ALLOWED DENIED``.
+
+    KIND is a key of `_JOINS`, REPORT the file for the events, the others are ROS topics.  Returns
+    the exit status.
+    """
     kind, report, allowed, denied = sys.argv[1:] if arguments is None else arguments
     if try_isolation().isolated:
         enter_isolation()
@@ -129,7 +133,7 @@ def _report_failure(events: EventWriter, error: Exception, stage: ProcessStage, 
     refused = isinstance(error, SecurityRefusedError)
     reason = f"{type(error).__name__}: {error}"
     if isinstance(error, SrosError):
-        # Without the remedy: that depends on all findings.
+        # Without the remedy, which depends on the results of all stacks.
         reason = str(SrosError(error.what, error.why)).rstrip(".")
     if stage is not ProcessStage.ENDPOINT:
         time.sleep(_LOG_FLUSH_SECONDS)
@@ -138,7 +142,7 @@ def _report_failure(events: EventWriter, error: Exception, stage: ProcessStage, 
 
 
 def _dds_in_memory() -> str:
-    """Return name, version and file of the DDS loaded in this process, one per line; or ""."""
+    """Return name, version and file of the DDS in this process, one per line; "" if none."""
     for each in MIDDLEWARE:
         for prefix in each.libraries:
             for file in loaded_libraries(prefix):

@@ -1,8 +1,9 @@
-"""Find out which installed DDS stacks enforce security, by trying each in an enclave of sros.
+"""Find out which installed DDS stacks enforce security, by trying each with an enclave of sros.
 
-A name or a version does not show how a library was built, so each stack is tried, in a separate
-process.  Only two results mean "does not enforce": it reports that security is not built in, or it
-creates an endpoint that the permissions deny.  Any other failure means "could not be tried".
+The name or version of a library does not show how it was built, so each stack is tried in a
+separate process.  Only two results mean "does not enforce": the stack reports that security is not
+built in, or creates an endpoint that the permissions deny.  Any other failure means "could not be
+tried".
 """
 
 from __future__ import annotations
@@ -80,12 +81,12 @@ class Stack:
 
 
 def survey(probe: ProbeEnclave) -> tuple[Stack, ...]:
-    """Return every stack that sros knows, also those that are not installed."""
+    """Try every stack that sros knows; the result includes stacks that are not installed."""
     return (*rclpy_stacks(probe), cyclone_stack(probe), _cyclonedds_package_stack(probe))
 
 
 def rclpy_stacks(probe: ProbeEnclave) -> Iterator[Stack]:
-    """Yield one stack per installed RMW, rclpy's default first; each is tried when requested."""
+    """Try each installed RMW of rclpy in turn, the default first, and yield the result."""
     if importlib.util.find_spec("rclpy") is None:
         yield _without_rclpy()
         return
@@ -94,7 +95,7 @@ def rclpy_stacks(probe: ProbeEnclave) -> Iterator[Stack]:
 
 
 def cyclone_stack(probe: ProbeEnclave) -> Stack:
-    """Return the stack of the libddsc that sros uses (`sros_tool.runtime.cyclone`)."""
+    """Try the libddsc that sros uses (`sros_tool.runtime.cyclone`), and return the result."""
     run = _run_probe("cyclone", probe, {})
     verdict = judge(run, probe.allowed, probe.denied)
     dds, version, where = _identity(run)
@@ -115,7 +116,7 @@ def cyclone_stack(probe: ProbeEnclave) -> Stack:
 
 
 def _cyclonedds_package_stack(probe: ProbeEnclave) -> Stack:
-    """Return the stack of the Python package ``cyclonedds``, which contains its own libddsc."""
+    """Try the Python package ``cyclonedds``, which contains a libddsc, and return the result."""
     spec = importlib.util.find_spec("cyclonedds")
     if spec is None:
         return _absent("cyclonedds (Python package)", "cyclonedds", "Cyclone DDS")
@@ -142,7 +143,7 @@ def _cyclonedds_package_stack(probe: ProbeEnclave) -> Stack:
 
 
 def _probe_rmw(probe: ProbeEnclave, rmw: str) -> Stack:
-    variables = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}  # leaves nothing in shared memory
+    variables = {"FASTDDS_BUILTIN_TRANSPORTS": "UDPv4"}  # no files in shared memory
     if rmw:
         variables[RMW] = rmw
     if below := middleware_of(rmw):
@@ -253,7 +254,7 @@ def _wait(process: subprocess.Popen[bytes]) -> int | None:
 
 @dataclass(frozen=True)
 class ProbeVerdict:
-    """The answer whether a DDS enforces security (None: could not be tried), with the evidence."""
+    """Whether a DDS enforces security (None: could not be tried), with the evidence."""
 
     enforces: bool | None
     evidence: str
@@ -289,8 +290,8 @@ def judge(run: ProbeRun, allowed: str, denied: str) -> ProbeVerdict:
         return _untried(f"endpoints on {denied} failed, but not by a security refusal. {reason}")
     return ProbeVerdict(
         True,
-        f"in an enclave made by sros it created the allowed writer on {allowed}, and refused"
-        f" writer and reader on {denied}: {refusals[0]}",
+        f"with an enclave made by sros, it created the allowed writer on {allowed} and refused the"
+        f" denied writer and reader on {denied}: {refusals[0]}",
     )
 
 

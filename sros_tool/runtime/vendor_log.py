@@ -111,7 +111,7 @@ _CHECK_OR_FILE = f"{_CHECK} {_FILE}"
 _RENEW = "Renew it: `sros renew KEYSTORE ENCLAVE`."
 _SIGN = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
 _SIGN_ONE = (
-    f"Give `sros explain --log` the keystore and the enclave: it finds which of the two. {_SIGN} "
+    f"Give `sros explain --log` the keystore and the enclave: it finds which one it is. {_SIGN} "
     "Restore a governance from a backup: every enclave depends on it."
 )
 _READABLE = (
