@@ -1,10 +1,10 @@
 """Policy files (SROS2 policy XML 0.2.0): reading them with their includes, and writing them.
 
-The grammar follows the schema of ros2/sros2; in addition every name is checked: a rule that can
-never match anything is an error, because somebody relies on that right or denial.
+The grammar follows the schema of ros2/sros2.  In addition every name is checked: a name that ROS
+does not allow is an error, because its author relies on that right or denial.
 
-Includes (``xi:include``) never leave the root folder of the policy.  Nodes of included documents
-are never moved into another document: a moved node of lxml can crash the interpreter.
+Includes (``xi:include``) are read only from the folder of the policy and the folders below.  Nodes
+of included documents are never moved into another document: a moved lxml node can crash Python.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _MAX_BYTES = 64 * 1024 * 1024
 
 @dataclass(frozen=True, slots=True)
 class IncludedFile:
-    """A document, and the includes through which it was reached."""
+    """A document, and the includes that lead to it, each with file and xpointer."""
 
     file: Path
     trail: tuple[tuple[Path, str], ...] = ()
@@ -53,7 +53,7 @@ class IncludedFile:
 
 @dataclass(slots=True)
 class Includer:
-    """Reader of the documents below ``root``; each one is read once."""
+    """A reader of the policy files in ``root`` and below; each file is read once."""
 
     root: Path
     _documents: dict[Path, etree._Element] = field(default_factory=dict)
@@ -62,17 +62,17 @@ class Includer:
     _digests: list[bytes] = field(default_factory=list)
 
     def digest(self) -> str:
-        """Return the SHA-256, hexadecimal, of all documents read so far, whatever their order."""
+        """Return the SHA-256 (hexadecimal) of all documents read so far, in any order."""
         return hashlib.sha256(b"".join(sorted(self._digests))).hexdigest()
 
     def load(self, file: Path) -> etree._Element:
-        """Return the root element of a document (its real path)."""
+        """Return the root element of the document at ``file``, which is a real path."""
         if file not in self._documents:
-            self.hold(file, read_bytes(file, "policy file"))
+            self.use_content(file, read_bytes(file, "policy file"))
         return self._documents[file]
 
-    def hold(self, file: Path, content: bytes) -> None:
-        """Keep ``content`` to use in place of the file (its real path), wherever it is included."""
+    def use_content(self, file: Path, content: bytes) -> None:
+        """Use ``content`` in place of the file with this real path, wherever it is included."""
         self._bytes += len(content)
         if self._bytes > _MAX_BYTES:
             raise PolicyError(
@@ -98,7 +98,9 @@ class Includer:
         where = f"{place.file}:{element.sourceline}"
         self._count += 1
         if self._count > _MAX_INCLUDES or len(place.trail) >= _MAX_DEPTH:
-            raise PolicyError(f"{where}: there are too many includes, or they are nested too deep")
+            raise PolicyError(
+                f"{where}: there are too many includes, or they are nested too deeply"
+            )
         if element.get("parse", "xml") != "xml":
             raise PolicyError(
                 f"{where}: an include of plain text is not accepted",
@@ -132,15 +134,15 @@ class Includer:
             return place.file
         path = Path(unquote(href))
         try:
-            # Unlike Path.resolve, realpath does not fail at a circle of links.
+            # Unlike Path.resolve, realpath does not fail on circular links.
             file = Path(os.path.realpath(place.file.parent / path))
         except (OSError, ValueError) as error:
-            raise PolicyError(f"{where}: the include of {href!r} names no file") from error
+            raise PolicyError(f"{where}: the include of {href!r} is not a valid path") from error
         if "://" in href or href.startswith("file:") or not file.is_relative_to(self.root):
             raise PolicyError(
                 f"{where}: the include of '{href}' leaves the folder of the policy",
-                f"Includes are read from '{self.root}' and the folders below it only.",
-                "Copy the file there, or put the policy at the top of both.",
+                f"Includes are read only from '{self.root}' and the folders below it.",
+                "Copy the file there, or move the policy to a folder above both files.",
             )
         return file
 
@@ -153,7 +155,7 @@ def _point(target: etree._Element, pointer: str, where: str) -> list[etree._Elem
         found = None
     if not isinstance(found, list) or not all(isinstance(e, etree._Element) for e in found):
         raise PolicyError(
-            f"{where}: the xpointer {pointer!r} is not understood",
+            f"{where}: the xpointer {pointer!r} is not valid",
             "It must select elements by an XPath.",
             'Write for example xpointer="xpointer(/profile/*)".',
         )
@@ -171,11 +173,13 @@ _QUALIFIERS = {qualifier.value: qualifier for qualifier in Qualifier}
 
 
 def read_policy(path: Path, content: bytes | None = None) -> Policy:
-    """Read a policy file and its includes, which must lie in its folder or below.
+    """Return the policy in a file and its includes, which must be in its folder or below.
 
-    With ``content``, that is read in place of the file, which need not exist.
-    Raises `PolicyError` (or another `DocumentError`) with file and line for anything that the
-    format does not have, for names that ROS does not have, and for an enclave given twice.
+    ``content`` replaces the content of the file, which then need not exist.
+
+    Raises:
+        PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
+            a name is not a valid ROS name, or an enclave is defined twice.
     """
     return _Reader(path, content).policy()
 
@@ -186,7 +190,7 @@ class _Reader:
         self._file = Path(os.path.realpath(path))
         self._includer = Includer(self._file.parent)
         if content is not None:
-            self._includer.hold(self._file, content)
+            self._includer.use_content(self._file, content)
         elif not self._file.exists():
             raise PolicyError(f"the policy file '{path}' does not exist")
 
@@ -206,21 +210,21 @@ class _Reader:
             raise PolicyError(
                 f"{where}: the policy has version {version!r}",
                 f"sros reads version {VERSION} of the SROS2 policy format.",
-                "Version 0.1.0 says contexts and context for enclaves and enclave."
+                "Version 0.1.0 writes <contexts> and <context> for <enclaves> and <enclave>."
                 if version.startswith("0.1")
                 else "",
             )
         enclaves: dict[str, Enclave] = {}
         blocks = [self._expect(child, at, "enclaves") for child, at in self._children(root, place)]
         if len(blocks) != 1:
-            raise PolicyError(f"{where}: <policy> must hold exactly one <enclaves>")
+            raise PolicyError(f"{where}: <policy> must contain exactly one <enclaves>")
         for child, at in self._children(*blocks[0]):
             enclave = self._enclave(*self._expect(child, at, "enclave"))
             if enclave.path in enclaves:
                 raise PolicyError(
-                    f"{enclave.source}: the enclave {enclave.path} is given twice",
+                    f"{enclave.source}: the enclave {enclave.path} is defined twice",
                     f"It is already defined at {enclaves[enclave.path].source}, so it is "
-                    "unclear which one applies.",
+                    "unclear which definition applies.",
                     "Join the two into one <enclave>.",
                 )
             enclaves[enclave.path] = enclave
@@ -260,7 +264,7 @@ class _Reader:
             else:
                 profiles.append(self._profile(*self._expect(child, at, "profile")))
         if not profiles:
-            raise PolicyError(f"{self._where(element, place)}: <profiles> holds no <profile>")
+            raise PolicyError(f"{self._where(element, place)}: <profiles> contains no <profile>")
         return Profiles(tuple(profiles), element.get("type", ""), metadata)
 
     def _profile(self, element: etree._Element, place: IncludedFile) -> Profile:
@@ -285,8 +289,8 @@ class _Reader:
         kind = tag_of(element)
         if kind not in RIGHTS:
             raise PolicyError(
-                f"{self._where(element, place)}: <profile> cannot hold <{kind}>",
-                f"It holds {', '.join(f'<{each}>' for each in RIGHTS)} only.",
+                f"{self._where(element, place)}: <profile> cannot contain <{kind}>",
+                f"It can contain only {', '.join(f'<{each}>' for each in RIGHTS)}.",
             )
         self._attributes(element, place, optional=RIGHTS[kind])
         rights = []
@@ -296,21 +300,21 @@ class _Reader:
                 continue
             if value not in _QUALIFIERS:
                 raise PolicyError(
-                    f"{self._where(element, place)}: {right}={value!r} is not understood",
+                    f"{self._where(element, place)}: {right}={value!r} is not valid",
                     "A right is ALLOW or DENY.",
                 )
             rights.append((right, _QUALIFIERS[value]))
         if not rights:
             raise PolicyError(
-                f"{self._where(element, place)}: the <{kind}> neither allow nor deny anything",
-                f"They lack {' and '.join(RIGHTS[kind])}.",
-                f'Write for example <{kind} {RIGHTS[kind][0]}="ALLOW">, or remove them.',
+                f"{self._where(element, place)}: <{kind}> neither allows nor denies anything",
+                f"It has neither {'= nor '.join(RIGHTS[kind])}=.",
+                f'Write for example <{kind} {RIGHTS[kind][0]}="ALLOW">, or remove it.',
             )
         item = kind.removesuffix("s")
         items = self._children(element, place)
         names = tuple(self._name(*self._expect(child, at, item), node) for child, at in items)
         if not names:
-            raise PolicyError(f"{self._where(element, place)}: the <{kind}> name no {item}")
+            raise PolicyError(f"{self._where(element, place)}: <{kind}> names no {item}")
         lines: tuple[int, ...] = ()
         if all(at.file == place.file for _, at in items):  # names can be included one by one
             lines = tuple(child.sourceline or 0 for child, _ in items)
@@ -320,11 +324,11 @@ class _Reader:
         name = element.text or ""
         problem = expression_problem(name)
         if not problem and name.startswith("~") and not node:
-            problem = "It is private to a node, and the profile has an empty node name."
+            problem = "A name with ~ is private to a node, and the profile has an empty node name."
         if not problem and name == "/":
             problem = "It is a namespace, not a name."
         if not problem and len(element):
-            problem = "It holds other elements."
+            problem = "It contains other elements."
         if problem:
             raise PolicyError(
                 f"{self._where(element, place)}: {name!r} is not a valid {tag_of(element)} name",
@@ -339,8 +343,8 @@ class _Reader:
         for text in (element.text, *(child.tail for child in element)):
             if text and not text.isspace():
                 raise PolicyError(
-                    f"{self._where(element, place)}: <{tag_of(element)}> holds loose text",
-                    f"{text.strip()[:40]!r} stands between its elements.",
+                    f"{self._where(element, place)}: <{tag_of(element)}> contains loose text",
+                    f"{text.strip()[:40]!r} is between its elements.",
                 )
         return list(self._includer.children(element, place))
 
@@ -349,7 +353,7 @@ class _Reader:
     ) -> tuple[etree._Element, IncludedFile]:
         if element.tag != tag:
             raise PolicyError(
-                f"{self._where(element, place)}: <{tag_of(element)}> stands where <{tag}> must"
+                f"{self._where(element, place)}: <{tag_of(element)}> stands in place of <{tag}>"
             )
         return element, place
 
@@ -387,7 +391,7 @@ class _Reader:
 
 
 def write_policy(policy: Policy) -> bytes:
-    """Return the policy as XML in UTF-8; `read_policy` gives the same value back."""
+    """Return the policy as XML in UTF-8; `read_policy` reads the same value from it."""
     root = etree.Element("policy", version=policy.version)
     enclaves = etree.SubElement(root, "enclaves")
     metadata: list[tuple[etree._Element, str]] = []

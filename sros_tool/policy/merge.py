@@ -1,11 +1,11 @@
 """Merging policies into a policy file: the missing rights, and the edits that add them in place.
 
 A merge never weakens a denial, and adds a right only for the requested direction.  All other text
-of the file stays byte for byte, comments and line ends included.
+of the file stays unchanged byte for byte, with its comments and line ends.
 
-A name goes into a group with exactly its rights, in a profile with its namespace and node.  Both
-are added if the file itself lacks them; included files do not change.  The result is read again and
-proven to hold the old rights and the added ones, and nothing else.
+A name is added to a group with exactly its rights, in a profile with its namespace and node.  The
+group and the profile are added if the file itself lacks them; included files do not change.  The
+result is read again and proven to state exactly the old and the added rights.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ _SHOWN = 3
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """A right that one side allows and the other denies, wholly or in part.
+    """A right that one side allows and the other denies, completely or in part.
 
-    The denial always wins.  With ``new``, the merge added the denial to a file that allowed the
-    right; otherwise the file had the denial, and the merge asked for the right.
+    The denial always wins.  With ``new``, the merge adds the denial to a file that allows the
+    right; otherwise the file has the denial, and the merge requests the right.
     """
 
     denied: Right
@@ -54,7 +54,7 @@ class Contradiction:
 
 @dataclass(frozen=True, slots=True)
 class AddedName:
-    """A name to add to a profile, as written there, and its rights to add."""
+    """A name to add to a profile, as written there, with its rights."""
 
     kind: str
     name: str
@@ -63,7 +63,7 @@ class AddedName:
 
 @dataclass(frozen=True, slots=True)
 class ProfileKey:
-    """A profile, by its enclave, namespace and node."""
+    """The enclave, namespace and node that identify a profile."""
 
     enclave: str
     ns: str
@@ -72,7 +72,7 @@ class ProfileKey:
 
 @dataclass(frozen=True, slots=True)
 class MergePlan:
-    """The names to add by profile, the same as rights, and the contradictions."""
+    """The names to add to each profile, the rights that they add, and the contradictions."""
 
     entries: dict[ProfileKey, tuple[AddedName, ...]]
     added: tuple[Right, ...]
@@ -80,10 +80,10 @@ class MergePlan:
 
 
 def plan_merge(before: Policy, additions: Policy) -> MergePlan:
-    """Return the rights of ``additions`` that ``before`` lacks.
+    """Return the plan that adds the rights of ``additions`` that ``before`` lacks.
 
-    Rights that ``before`` already allows in that enclave, by any profile or wildcard, and rights
-    that it completely denies are left out.
+    It leaves out rights that any profile or wildcard of the enclave already allows, and rights that
+    the enclave completely denies.
     """
     return _Planner(before, additions).plan()
 
@@ -132,7 +132,7 @@ class _Planner:
             return True
         denial = right._replace(qualifier=DENY)
         for denied in folded(self._file.meeting(denial)):
-            if not self._asked.cover(denied):  # else both sides mean the same exception
+            if not self._asked.cover(denied):  # otherwise both sides state this denial
                 self._contradictions.append(Contradiction(denied, right, False))
         return not (self._file.cover(right) or self._file.cover(denial))
 
@@ -163,7 +163,7 @@ def _entry_order(entry: AddedName) -> tuple[int, GroupRights, str]:
 
 
 def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
-    """Return a remark for each denial that limits a merge."""
+    """Return a note for each denial that limits a merge."""
     by_denial: dict[tuple[Right, bool], list[Right]] = {}
     for each in contradictions:
         by_denial.setdefault((each.denied, each.new), []).append(each.allowed)
@@ -174,10 +174,10 @@ def merge_notes(contradictions: Sequence[Contradiction]) -> tuple[Note, ...]:
         if len(shown) > _SHOWN:
             some += f" and {len(shown) - _SHOWN} more"
         if new:
-            text = f"{denied} was added. It takes away from what the file allows: {some}."
+            text = f"{denied} was added. It removes rights that the file allows: {some}."
             notes.append(Note("merge.newly-denied", text))
         else:
-            text = f"{denied} stays, and takes precedence over what was asked for: {some}."
+            text = f"{denied} stays, and overrides requested rights: {some}."
             notes.append(Note("merge.still-denied", text))
     return tuple(notes)
 
@@ -195,7 +195,7 @@ _COMMENTS_OF_THE_LINE = re.compile(r"(?:[ \t]*<!--.*?-->)+(?=[ \t]*(?:\r?\n|\Z))
 class PlacedElement:
     """An element and its positions in the text, in characters from the start of the document.
 
-    ``inner`` is where its content begins, ``close`` where its end tag does; an element without
+    ``inner`` is the begin of its content, ``close`` the begin of its end tag.  An element without
     end tag (``<a/>``) has ``inner == close == end``.
     """
 
@@ -216,12 +216,12 @@ class PlacedElement:
         return self.xml.get(attribute, "")
 
     def named(self, tag: str) -> Iterator[PlacedElement]:
-        """Return the child elements with that tag, without the included ones."""
+        """Yield the child elements with this tag, without included elements."""
         return (child for child in self.children if child.tag == tag)
 
 
 class EditedText:
-    """A policy file as text; edits are collected, and made all at once."""
+    """The text of a policy file; edits are collected, and applied by `document`."""
 
     def __init__(self, data: bytes, name: str) -> None:
         self._name = name
@@ -247,7 +247,7 @@ class EditedText:
         )
 
     def _elements(self, root: etree._Element) -> PlacedElement:
-        """Return the tree of placed elements: lxml does not know the positions of elements."""
+        """Return the tree of elements with their positions, which lxml does not know."""
         nodes = root.iter()
         top: PlacedElement | None = None
         stack: list[PlacedElement] = []
@@ -258,7 +258,7 @@ class EditedText:
             elif mark["open"]:
                 node = next(nodes, None)
                 if node is None or etree.QName(node).localname != mark["open"].split(":")[-1]:
-                    raise self._unsuitable(f"<{mark['open']}> is not where it was expected.")
+                    raise self._unsuitable(f"<{mark['open']}> is not at the expected position.")
                 end = mark.end()
                 element = PlacedElement(node, mark.start(), end, end, end)
                 if stack:
@@ -267,13 +267,13 @@ class EditedText:
                 if not mark["empty"]:
                     stack.append(element)
         if top is None or stack or next(nodes, None) is not None:
-            raise self._unsuitable("Its elements are not where they were expected.")
+            raise self._unsuitable("Its elements are not at the expected positions.")
         return top
 
-    # ── how it is laid out ─────────────────────────────────────────────────────────────────
+    # ── layout of the text ────────────────────────────────────────────────────────────────
 
     def indent_of(self, element: PlacedElement) -> str | None:
-        """Return the white space before an element that begins its line; None for any other."""
+        """Return the white space before an element if it begins a line, else None."""
         line = max(self.text.rfind("\n", 0, element.start), self.text.rfind("\r", 0, element.start))
         before = self.text[line + 1 : element.start].removeprefix("\ufeff")
         if before.strip(" \t") or (line < 0 and element is not self.root):
@@ -294,20 +294,20 @@ class EditedText:
         return "  "
 
     def after(self, element: PlacedElement) -> int:
-        """Return the place behind an element and the comments that follow on its line."""
+        """Return the position after an element and after the comments on the rest of its line."""
         comments = _COMMENTS_OF_THE_LINE.match(self.text, element.end)
         if comments and self.indent_of(element) is not None:
             return comments.end()
         return element.end
 
-    # ── changing it ────────────────────────────────────────────────────────────────────────
+    # ── edits ───────────────────────────────────────────────────────────────────────────
 
     def put(self, place: int, text: str, until: int | None = None) -> None:
-        """Insert ``text`` at a position, or replace the text from there up to ``until``."""
+        """Insert ``text`` at position ``place``; with ``until``, replace the text up to there."""
         self._edits.append((place, place if until is None else until, text))
 
     def document(self) -> bytes:
-        """Return the document with all edits."""
+        """Return the document with all edits applied."""
         pieces, done = [], 0
         for start, end, text in sorted(self._edits, key=lambda edit: edit[0]):
             pieces += [self.text[done:start], text]
@@ -316,7 +316,7 @@ class EditedText:
 
 
 def _encoding(data: bytes, root: etree._Element) -> str:
-    """Return the encoding of a document; a byte order mark stays a character of it."""
+    """Return the encoding of a document that keeps a byte order mark as a character."""
     declared = root.getroottree().docinfo.encoding or "utf-8"
     if data.startswith(codecs.BOM_UTF16_LE):
         return "utf-16-le"
@@ -327,9 +327,9 @@ def _encoding(data: bytes, root: etree._Element) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """A policy file after a merge: its new bytes, the added rights, and the contradictions.
+    """A policy file after a merge: its new content, the added rights, and the contradictions.
 
-    Without additions ``document`` is the file byte for byte.
+    Without additions ``document`` is the unchanged content of the file.
     """
 
     document: bytes
@@ -338,17 +338,18 @@ class Merged:
 
 
 def merge_into(path: Path, additions: Policy) -> Merged:
-    """Return the policy file at ``path`` with the rights of ``additions``; nothing is written.
+    """Return the policy file at ``path`` with the rights of ``additions``; write nothing.
 
-    Raises `PolicyError` (or another `DocumentError`) if the file is no policy, or where a right
-    cannot be added: its enclave stands in an included file, or a changed part is included elsewhere
-    and would give more than was asked.
+    Raises:
+        PolicyError: (or another `DocumentError`) the file is not a policy, or a right cannot be
+            added: its enclave is in an included file, or the changed part is also included
+            elsewhere, where it would add rights that were not requested.
     """
     return merge_all(path, (additions,))
 
 
 def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
-    """Return the policy file with several policies merged one after the other."""
+    """Return the policy file at ``path`` with several policies merged one after the other."""
     document = read_bytes(path, "policy file")
     before = read_policy(path, document)
     added: list[Right] = []
@@ -365,12 +366,12 @@ def merge_all(path: Path, policies: Iterable[Policy]) -> Merged:
 
 
 def _proven(path: Path, document: bytes, before: Policy, added: Sequence[Right]) -> Policy:
-    """Return the policy of a document; raise `PolicyError` if not ``before`` and ``added``."""
+    """Return the policy in ``document``; raise unless its rights are ``before`` plus ``added``."""
     try:
         after = read_policy(path, document)
     except DocumentError as error:
         raise PolicyError(
-            f"'{path}' with what is to be added would not be a valid policy: {error.what}",
+            f"'{path}' with the added rights would not be a valid policy: {error.what}",
             error.why,
             error.remedy,
         ) from error
@@ -378,10 +379,10 @@ def _proven(path: Path, document: bytes, before: Policy, added: Sequence[Right])
     wrong = sorted(policy_rights(after) ^ expected)
     if wrong:
         raise PolicyError(
-            f"the rights cannot be added to '{path}' without changing others",
+            f"the rights cannot be added to '{path}' without changing other rights",
             f"The result would differ in {wrong[0]}, probably because a part of the file is "
-            "included a second time.",
-            "Add them by hand, or merge into a file without such an include.",
+            "also included elsewhere.",
+            "Add the rights by hand, or merge into a file without such an include.",
         )
     return after
 
@@ -419,7 +420,7 @@ def _profile(place: ProfileKey, entries: Sequence[AddedName]) -> _New:
     return _New(f'profile ns="{place.ns}" node="{place.node}"', children=_groups(entries))
 
 
-# ── where they go ──────────────────────────────────────────────────────────────────────────
+# ── positions ────────────────────────────────────────────────────────────────────────────
 
 
 class _Editor:
@@ -440,11 +441,11 @@ class _Editor:
             included = self._policy.enclave(path)
             if included is not None or not blocks:
                 raise PolicyError(
-                    f"nothing can be added to the enclave {path} in '{self._path}'",
-                    f"It is included from {included.source}."
+                    f"rights of the enclave {path} cannot be added to '{self._path}'",
+                    f"The enclave is included from {included.source}."
                     if included
                     else "Its <enclaves> are included from another file.",
-                    "Merge into the file that contains it.",
+                    "Merge into the file that contains this part.",
                 )
             profiles = _New("profiles", children=[_profile(*each) for each in places.items()])
             self._append(blocks[0], _New(f'enclave path="{path}"', children=[profiles]))
@@ -484,7 +485,7 @@ class _Editor:
                 self._add_names(group, kind, [entry.name for entry in same])
 
     def _add_names(self, group: PlacedElement, kind: str, names: Sequence[str]) -> None:
-        """Insert names in order into a sorted group, at the end of any other."""
+        """Insert names into a group: in order if it is sorted, otherwise at its end."""
         present = [child.xml.text or "" for child in group.named(kind.removesuffix("s"))]
         is_sorted = len(present) == len(group.children) and present == sorted(present)
         for name in names:
@@ -497,10 +498,10 @@ class _Editor:
             else:
                 self._put_first(group, new)
 
-    # ── writing them there ─────────────────────────────────────────────────────────────────
+    # ── writing elements ───────────────────────────────────────────────────────────────────
 
     def _append(self, parent: PlacedElement, new: _New) -> None:
-        """Write an element behind the last one of ``parent`` that is not its metadata."""
+        """Write an element after the last child of ``parent``, but before its metadata."""
         last = next((each for each in reversed(parent.children) if each.tag != "metadata"), None)
         if last:
             self._put_after(last, new)
@@ -512,7 +513,7 @@ class _Editor:
         self._text.put(self._text.after(sibling), self._rendered(new, indent))
 
     def _put_first(self, parent: PlacedElement, new: _New) -> None:
-        """Write an element before all others, but not before a comment that may be about all."""
+        """Write an element first, or second if a comment stands before the first one."""
         text, first = self._text, parent.children[0]
         if text.text[parent.inner : first.start].strip():
             self._put_after(first, new)
@@ -535,7 +536,7 @@ class _Editor:
         text.put(place, rendered)
 
     def _rendered(self, new: _New, indent: str | None) -> str:
-        """Return the text of an element, on its own lines if its neighbours are."""
+        """Return the text of an element, on separate lines if its neighbours are."""
         tag = new.start.split(" ", 1)[0]
         before = "" if indent is None else self._text.newline + indent
         if not new.children:

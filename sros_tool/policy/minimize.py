@@ -1,11 +1,11 @@
 """Minimizing a policy to the observed rights, and wildcards that make a large policy smaller.
 
 The over-privilege of an enclave is its number of allowed pairs (right, name), divided by the number
-of observed ones.  A pair is one of publish, subscribe, request, reply, call, execute with one exact
+of observed pairs.  A pair is one of publish, subscribe, request, reply, call, execute with an exact
 name.  A wildcard counts as the known names that it matches: the exact names of that kind (topics,
 services or actions) in the policy, in the observations of all enclaves, and among the names that
-every node needs.  Pairs that a DENY takes away do not count, nor do observed pairs that are not
-allowed: they cannot have worked.
+every node needs.  Pairs that a DENY removes do not count.  Observed pairs that are not
+allowed do not count either: they cannot have worked.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _Pair = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class _WideRule:
-    """A wildcard, the observed rights that it allowed, and the rights that can replace it.
+    """A wildcard, the observed rights that it allows, and the rights that can replace it.
 
     ``replacement`` leaves out rights that other rules of the enclave allow by exact name.
     """
@@ -52,9 +52,10 @@ class _WideRule:
 class EnclaveUse:
     """The rights of an enclave compared with its observed rights.
 
-    ``unused`` rules were never observed and are removed; ``common`` ones were never observed and
-    stay, because every node needs them; ``refused`` rights were observed, and the policy does not
-    allow them.  An enclave that was never ``seen`` does not change.
+    ``unused`` rights were never observed and are removed.  ``common`` rights were never observed
+    and stay, because every node needs them.  ``refused`` rights were observed, but the policy does
+    not allow them.  ``wide`` are the wildcards that are replaced.  An enclave that was never
+    ``seen`` does not change.
     """
 
     enclave: str
@@ -69,13 +70,13 @@ class EnclaveUse:
 
     @property
     def ratio(self) -> float | None:
-        """Allowed over observed pairs, 1.0 for the least policy; None if nothing was observed."""
+        """Allowed pairs per observed pair, 1.0 at best; None if nothing was observed."""
         return self.allowed_pairs / self.observed_pairs if self.observed_pairs else None
 
 
 @dataclass(frozen=True, slots=True)
 class MinimizedPolicy:
-    """The narrowed policy, without includes, and the use of each enclave."""
+    """The narrowed policy, with its includes written out, and the use of each enclave."""
 
     policy: Policy
     uses: tuple[EnclaveUse, ...]
@@ -84,10 +85,10 @@ class MinimizedPolicy:
 def minimize(
     policy: Policy, observed: Iterable[Right], common: Sequence[Group] = ()
 ) -> MinimizedPolicy:
-    """Narrow ``policy`` to the ALLOW rights of ``observed``.
+    """Return ``policy`` narrowed to the ALLOW rights in ``observed``.
 
-    A DENY always stays.  ``common`` are the rights that every node needs: if the policy allows
-    them to a node with a profile, they stay, observed or not.
+    Every DENY stays.  ``common`` are the rights that every node needs.  They stay, observed or not,
+    if the policy allows them to a node with a profile.
     """
     seen = folded(right for right in observed if right.qualifier is ALLOW)
     by_enclave: dict[str, set[Right]] = defaultdict(set)
@@ -106,7 +107,7 @@ def minimize(
 
 
 class _KnownNames:
-    """All exact names that policies and observations hold, by kind, sorted."""
+    """All exact names in policies and observations, by kind, sorted."""
 
     def __init__(self, all_rights: Iterable[Iterable[Right]]) -> None:
         found: dict[str, set[str]] = defaultdict(set)
@@ -171,14 +172,14 @@ class _Narrowing:
 
     def result(self) -> tuple[Enclave, EnclaveUse]:
         if not self._observed:
-            return self._enclave, self._told({*self._stated}, ())
+            return self._enclave, self._use_of({*self._stated}, ())
         kept = {right for right in self._stated if self._stays(right)}
         wide = self._narrowed(kept)
         self._prove([*kept, *(right for each in wide for right in each.replacement)])
         replacements = {each.rule: each.replacement for each in wide}
-        return _narrowed_enclave(self._enclave, kept, replacements), self._told(kept, wide)
+        return _narrowed_enclave(self._enclave, kept, replacements), self._use_of(kept, wide)
 
-    def _told(self, kept: set[Right], wide: Sequence[_WideRule]) -> EnclaveUse:
+    def _use_of(self, kept: set[Right], wide: Sequence[_WideRule]) -> EnclaveUse:
         seen = bool(self._observed)
         unused = [right for right in self._stated if not self._is_observed(right)]
         rewritten = {each.rule for each in wide}
@@ -196,10 +197,10 @@ class _Narrowing:
             remaining_pairs=len(self._pairs(remaining) | in_use),
         )
 
-    # ── what stays, and what takes the place of wildcards ──────────────────────────────────
+    # ── rules that stay, and replacements of wildcards ─────────────────────────────────────
 
     def _stays(self, rule: Right) -> bool:
-        """Return whether a rule does not change: a name in use, or a wildcard observed as such."""
+        """Return whether a rule stays: common, an observed name, or itself an observed wildcard."""
         if rule in self._common:
             return True
         if not is_expression(rule.name):
@@ -212,7 +213,7 @@ class _Narrowing:
         )
 
     def _narrowed(self, kept: set[Right]) -> tuple[_WideRule, ...]:
-        """Return the used and common wildcards, each with the rights that no other rule allows."""
+        """Return the used and common wildcards to replace, and the rights that replace each."""
         wide = [rule for rule in self._stated if is_expression(rule.name) and rule not in kept]
         owners: dict[Right, list[Right]] = defaultdict(list)
         for rule in wide:
@@ -258,7 +259,7 @@ class _Narrowing:
     # ── counting ───────────────────────────────────────────────────────────────────────────
 
     def _pairs(self, rights: Iterable[Right]) -> set[_Pair]:
-        """Return the pairs of a right and a known name that ``rights`` allow and nothing denies."""
+        """Return the pairs (right, known name) that ``rights`` allow and no rule denies."""
         rights = folded(rights)
         found: set[_Pair] = set()
         wild = False
@@ -269,7 +270,9 @@ class _Narrowing:
                 found.update((right.right, name) for name in matched)
             else:
                 found.add((right.right, right.name))
-        if wild:  # wildcards of services and topics can mean actions, or the rest of one
+        if (
+            wild
+        ):  # wildcards of services and topics can match all parts of an action, or the missing ones
             found = self._with_actions(found, Rules(rights))
         if not self._denied:
             return found
@@ -280,7 +283,7 @@ class _Narrowing:
         }
 
     def _with_actions(self, found: set[_Pair], rules: Rules) -> set[_Pair]:
-        """Return the pairs, with every action that ``rules`` mean as a whole counted once."""
+        """Return the pairs, with every action that ``rules`` allow completely as one pair."""
         pairs = set(found)
         for action in ("call", "execute"):
             for name in self._names.of(KIND_OF[action]):
@@ -292,7 +295,7 @@ class _Narrowing:
 
 
 def _for_nodes(enclave: Enclave, common: Sequence[Group]) -> Iterator[Right]:
-    """Yield what every node needs, for each node that the enclave has a profile for."""
+    """Yield the ``common`` rights of each node that the enclave has a profile for."""
     for profile in enclave.all_profiles():
         for group in common:
             for name in group.names:
@@ -309,8 +312,8 @@ def _narrowed_enclave(
 ) -> Enclave:
     """Return ``enclave`` with its denials, the ALLOW rights in ``kept``, and names for wildcards.
 
-    The names that replace a wildcard are written once, at its first place, and in its form:
-    relative, private or absolute.  Profiles stay, even without a rule.
+    The names that replace a wildcard are written once, where it occurs first, and in its form:
+    relative, private or absolute.  Profiles without a rule stay.
     """
     pending = dict(replacements)
     blocks = []
@@ -325,7 +328,7 @@ def _narrowed_enclave(
 def _profile(
     path: str, profile: Profile, kept: Set[Right], pending: dict[Right, Sequence[Right]]
 ) -> Profile:
-    """Return the narrowed profile; remove from ``pending`` the names that it takes."""
+    """Return the narrowed profile; remove the replacements that it contains from ``pending``."""
     said: dict[tuple[str, str], dict[tuple[str, Qualifier], None]] = {}
     for group in profile.groups:
         for name in group.names:
@@ -351,7 +354,7 @@ def _profile(
 
 
 def _written(fqn: str, like: str, profile: Profile) -> str:
-    """Return an absolute name in the form of its rule (relative, private), if that is possible."""
+    """Return an absolute name in the form of ``like`` (relative, private), if possible."""
     if like.startswith("/"):
         return fqn
     prefix = expand("~/" if like.startswith("~") else "", profile.ns, profile.node)
@@ -364,15 +367,15 @@ def _written(fqn: str, like: str, profile: Profile) -> str:
 # ── wildcards in place of names ────────────────────────────────────────────────────────────
 
 _DIGITS = re.compile(r"\d+")
-_FEWEST = 3  # the least number of names for a wildcard
+_FEWEST = 3  # names that a wildcard must replace
 
 
 @dataclass(frozen=True, slots=True)
 class WildcardProposal:
-    """A wildcard in place of names: ``saves`` bytes of the signed document.
+    """A wildcard in place of names, which ``saves`` that many bytes of the signed document.
 
     ``adds`` are the known topics and services of other enclaves that it would newly allow.  A safe
-    proposal has none; it still allows names that nobody has used so far.
+    proposal adds none of them, but still allows names that nobody uses so far.
     """
 
     rule: Right
@@ -391,9 +394,9 @@ def propose_wildcards(
 ) -> tuple[WildcardProposal, ...]:
     """Return wildcards that make an enclave's document ``needed`` bytes smaller, if possible.
 
-    ``rights`` are the enclave's, ``known`` are every enclave's, and ``size`` returns the bytes that
-    a right takes.  The largest savings come first; wildcards that newly allow a known name are used
-    only if the safe ones do not suffice.
+    ``rights`` are the rights of this enclave, ``known`` the rights of all enclaves; ``size``
+    returns the size of a right in bytes.  The largest savings come first; wildcards that newly
+    allow a known name are used only if the safe ones do not suffice.
     """
     own = [right for right in rights if right.enclave == enclave and right.qualifier is ALLOW]
     rules = Rules(own)
@@ -401,7 +404,7 @@ def propose_wildcards(
     candidates: dict[frozenset[Right], WildcardProposal] = {}
     for rule, found in _candidates(own).items():
         other = candidates.get(frozenset(found))
-        # Of wildcards that stand for the same names, the most specific one allows least.
+        # Of wildcards for the same names, the longest one allows least.
         if other is None or len(rule.name) > len(other.rule.name):
             adds = tuple(sorted(_added(rule, foreign), key=order))
             saves = sum(map(size, found)) - size(rule)
@@ -426,7 +429,7 @@ def propose_wildcards(
 
 
 def _candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
-    """Return the wildcards that stand for several names of one right, with these."""
+    """Map wildcards to the rights that they can replace, at least `_FEWEST` of them."""
     found: dict[Right, list[Right]] = defaultdict(list)
     for right in rights:
         if right.name.startswith("/") and not is_expression(right.name):
@@ -436,7 +439,7 @@ def _candidates(rights: Iterable[Right]) -> dict[Right, list[Right]]:
 
 
 def _wider(name: str) -> Iterator[str]:
-    """Return wider patterns: the folder with ``*`` (not the root); ``*`` for each number."""
+    """Yield wildcards for a name: ``*`` after each namespace but the root, or for numbers."""
     tokens = name.split("/")[1:-1]
     for depth in range(1, len(tokens) + 1):
         yield "/" + "/".join((*tokens[:depth], "*"))
@@ -448,7 +451,7 @@ def _wider(name: str) -> Iterator[str]:
 
 
 def _foreign(enclave: str, own: Rules, known: Iterable[Right]) -> dict[str, list[str]]:
-    """Map each right to the known names that the enclave is not allowed, in parts of actions."""
+    """Map each right to the known names for which the enclave lacks it, actions as parts."""
     by_service: dict[bool, set[str]] = {True: set(), False: set()}
     for part in unfolded(known):
         if not is_expression(part.name):

@@ -1,7 +1,7 @@
 """The policy language of ROS: who may publish, subscribe, request, reply, call and execute.
 
-Names follow SROS2 policy XML 0.2.0.  All values can be compared; their origin (`Source`)
-does not count in a comparison.
+Names follow SROS2 policy XML 0.2.0.  Values are equal if they state the same; the file and line
+(`Source`) that they were read from do not matter.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ RIGHTS: dict[str, tuple[str, str]] = {
     "services": ("request", "reply"),
     "actions": ("call", "execute"),
 }
-"""The kinds of groups, and the two rights that each kind gives or denies."""
+"""The kinds of groups, and the two rights that a group of each kind allows or denies."""
 
 
 class Qualifier(StrEnum):
@@ -111,5 +111,5 @@ class Policy:
     file: str = field(default="", compare=False)
 
     def enclave(self, path: str) -> Enclave | None:
-        """Return the enclave of that path, or None."""
+        """Return the enclave with this path, or None."""
         return next((each for each in self.enclaves if each.path == path), None)

@@ -1,10 +1,11 @@
-"""Names with wildcards: matching names, covering and overlapping other wildcards.
+"""Expressions with wildcards: which names they match, and whether they cover or overlap others.
 
-``*`` stands for any characters, "/" among them, ``?`` for one, ``[abc]``, ``[a-c]`` and ``[!a-c]``
-for one of a set or outside of it: glibc's fnmatch without escapes, as the DDS vendors match.
+``*`` matches any characters, also "/"; ``?`` matches one character; ``[abc]`` and ``[a-c]`` match
+one character of a set, ``[!a-c]`` one that is not in it.  This is fnmatch of glibc without escapes,
+as the DDS vendors match.
 
-`overlap` compares two expressions; `common_name` any number, with exceptions, and finds an example.
-Its names are absolute ROS names: an overlap that no ROS name can have is none.
+`overlap` compares two expressions.  `common_name` compares any number, also with exceptions, and
+returns an example; it only considers valid absolute ROS names.
 """
 
 from __future__ import annotations
@@ -29,12 +30,12 @@ _ANY: frozenset[str] = frozenset()
 
 @lru_cache(maxsize=_MANY)
 def compiled(expression: str) -> re.Pattern[str]:
-    """Return the regular expression that matches the same names."""
+    """Return the regular expression that matches the same names as ``expression``."""
     return re.compile(translate(expression))
 
 
 def matches(expression: str, name: str) -> bool:
-    """Return whether ``name``, which has no wildcards, is meant by ``expression``."""
+    """Return whether ``expression`` matches ``name``, which has no wildcards."""
     return compiled(expression).match(name) is not None
 
 
@@ -46,8 +47,8 @@ def literal_prefix(expression: str) -> str:
 def covers(wide: str, narrow: str) -> bool:
     """Return whether ``wide`` matches every name that ``narrow`` matches.
 
-    True is always right.  False can be wrong for exotic patterns: ``?*`` and ``*?`` match the same
-    names, but do not cover each other here.  A caller then keeps a rule too many, never too few.
+    True is always correct.  False can be wrong for unusual expressions: ``?*`` and ``*?`` match the
+    same names, but do not cover each other here.  Callers then keep a redundant rule.
     """
     if wide == narrow:
         return True
@@ -76,7 +77,7 @@ def _covers(wide: str, narrow: str) -> bool:
 
 
 def overlap(one: str, other: str) -> bool:
-    """Return whether both match a common name."""
+    """Return whether some name matches both expressions."""
     if not is_expression(one):
         return matches(other, one) if is_expression(other) else one == other
     if not is_expression(other):
@@ -114,7 +115,7 @@ def _overlap(one: str, other: str) -> bool:
 
 
 def _after_stars(reached: set[int], pieces: tuple[frozenset[str], ...]) -> set[int]:
-    """Return the places reached when the following stars match nothing."""
+    """Return ``reached`` and the positions after stars, which can match nothing."""
     grown = set(reached)
     for i in sorted(reached):
         while i < len(pieces) and pieces[i] is _ANY:
@@ -125,7 +126,7 @@ def _after_stars(reached: set[int], pieces: tuple[frozenset[str], ...]) -> set[i
 
 @lru_cache(maxsize=_MANY)
 def _pieces(expression: str) -> tuple[frozenset[str], ...]:
-    """Return the pieces of an expression: `_ANY` for ``*``, else the characters of one place."""
+    """Return the pieces of an expression: `_ANY` for ``*``, else the set of matching characters."""
     found: list[frozenset[str]] = []
     for piece in _PIECE.finditer(expression):
         negated, members, literal = piece.groups()
@@ -160,9 +161,9 @@ def common_name(
 ) -> str | None:
     """Return the shortest absolute ROS name that all of ``wanted`` and none of ``unwanted`` match.
 
-    Without ``absolute``, the name has no first "/", like DDS topics.  None if there is no name.
-    If the search gets too large (many ``?`` after ``*``), ``unwanted`` is ignored: an overlap too
-    many is reported, never one too few.
+    Without ``absolute``, the name has no leading "/", like DDS topics.  Returns None if there is no
+    such name.  If the search gets too large (many ``?`` after ``*``), ``unwanted`` is ignored, so
+    that no overlap is missed.
     """
     inner, outer = tuple(dict.fromkeys(wanted)), tuple(dict.fromkeys(unwanted))
     for name in inner:
@@ -215,7 +216,7 @@ def _spelt(state: _State, before: dict[_State, tuple[_State, str] | None]) -> st
 
 
 def _representatives(patterns: list[_Pieces]) -> str:
-    """Return one letter of each kind that the patterns, and the grammar of names, distinguish."""
+    """Return one letter for each set of letters that patterns and ROS names treat alike."""
     special = {piece for pattern in patterns for piece in pattern if piece is not _ANY}
     kinds: dict[tuple[object, ...], str] = {}
     for letter in _LETTERS:
@@ -246,7 +247,7 @@ def _step(reached: frozenset[int], letter: str, pattern: _Pieces) -> frozenset[i
 
 
 def _closed(reached: set[int], pattern: _Pieces) -> frozenset[int]:
-    """Return the ``reached`` places and the places after stars that match nothing."""
+    """Return the ``reached`` positions and the positions after stars that match nothing."""
     return frozenset(place for at in reached for place in _onward(at, pattern))
 
 

@@ -1,4 +1,4 @@
-"""The protection of a robot's messages in ROS terms: per topic, service and action."""
+"""The protection of messages in ROS terms: by domain, topic, service and action."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Level(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class TopicProtection:
-    """The protection of a topic: its payload, its protocol messages, and who is checked."""
+    """The protection of a topic: its payload, its submessages, and its access control."""
 
     data: Level = Level.ENCRYPT
     metadata: Level = Level.ENCRYPT

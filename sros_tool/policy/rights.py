@@ -1,6 +1,6 @@
-"""Rights and denials on absolute names: what a policy states, and how two policies differ.
+"""Rights and denials on absolute names: the rights of a policy, and how two policies differ.
 
-Two documents mean the same if their rights in normal form are equal.  An action consists of
+Two documents have the same meaning if their rights in normal form are equal.  An action consists of
 three services and two topics (ROS 2 design "Actions"): `unfolded` splits it into them, `folded`
 joins them again.
 """
@@ -18,13 +18,13 @@ from sros_tool.policy.patterns import covers, overlap
 from sros_tool.values import shows
 
 KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
-"""The kind of group in which a right stands, such as topics for publish."""
+"""The kind of group for each right, such as topics for publish."""
 
 RIGHT_ORDER = {right: number for number, right in enumerate(KIND_OF)}
 """The order in which rights are listed: publish, subscribe, request, reply, call, execute."""
 
 WHOLE = {"request": "call", "reply": "execute"}
-"""The right to an action that consists of that right to its services."""
+"""The right to an action, for each right to its services."""
 
 ACTION_PARTS: dict[str, tuple[tuple[str, str], ...]] = {
     action: tuple(
@@ -36,7 +36,7 @@ ACTION_PARTS: dict[str, tuple[tuple[str, str], ...]] = {
         ("execute", "reply", "publish"),
     )
 }
-"""The parts of a right to an action: rights, and the suffix of the action's name."""
+"""The parts of a right to an action: pairs of a right and a suffix of the action's name."""
 
 GOAL = f"{ACTION_INSIDE}send_goal"
 """The suffix of the service by which an action is recognised."""
@@ -46,8 +46,8 @@ GOAL = f"{ACTION_INSIDE}send_goal"
 class Right(NamedTuple):
     """One right or denial of an enclave; ``name`` is absolute, perhaps with wildcards.
 
-    A name without a leading "/" is a DDS topic that ROS has no word for; it occurs only in
-    permissions that sros did not make.
+    A name without a leading "/" is a DDS topic without a ROS name; it occurs only in permissions
+    that sros did not make.
     """
 
     enclave: str
@@ -57,7 +57,7 @@ class Right(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """Topics, services or actions; dds for a topic that ROS has no word for."""
+        """Topics, services or actions; dds for a topic without a ROS name."""
         return KIND_OF[self.right] if self.name.startswith("/") else "dds"
 
     def __str__(self) -> str:
@@ -80,7 +80,7 @@ GroupRights = tuple[tuple[str, Qualifier], ...]
 
 
 def groupable(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
-    """Return the groups for ``rights`` on a name: two where one is both allowed and denied."""
+    """Yield the groups for ``rights`` to a name: two if a right is both allowed and denied."""
     ordered = sorted(rights, key=lambda each: (RIGHT_ORDER[each[0]], each[1]))
     if len({right for right, _ in ordered}) == len(ordered):
         yield tuple(ordered)
@@ -90,7 +90,7 @@ def groupable(rights: Iterable[tuple[str, Qualifier]]) -> Iterator[GroupRights]:
 
 
 def policy_rights(policy: Policy) -> frozenset[Right]:
-    """Return the rights that a policy states, as written, with absolute names."""
+    """Return the rights in a policy as written there, but with absolute names."""
     return frozenset(
         right
         for enclave in policy.enclaves
@@ -100,7 +100,7 @@ def policy_rights(policy: Policy) -> frozenset[Right]:
 
 
 def profile_rights(enclave: str, profile: Profile) -> Iterator[Right]:
-    """Yield the rights that one profile of an enclave states."""
+    """Yield the rights in one profile of an enclave."""
     ns, node = profile.ns, profile.node
     for group in profile.groups:
         for name in group.names:
@@ -128,7 +128,7 @@ def unfolded(rights: Iterable[Right]) -> frozenset[Right]:
 
 
 def folded(rights: Iterable[Right]) -> frozenset[Right]:
-    """Return the normal form: all parts of an action become the action, and are listed once."""
+    """Return the normal form: the five parts of an action are replaced by the action."""
     remaining = set(unfolded(rights))
     actions = [
         Right(each.enclave, each.qualifier, WHOLE[each.right], each.name.removesuffix(GOAL))
@@ -141,17 +141,17 @@ def folded(rights: Iterable[Right]) -> frozenset[Right]:
     return frozenset(remaining.union(whole))
 
 
-# ── asking ─────────────────────────────────────────────────────────────────────────────────
+# ── queries ────────────────────────────────────────────────────────────────────────────────
 
 
 class Rules:
     """A set of rights with fast queries: exact names are looked up, only wildcards are matched."""
 
     def __init__(self, rights: Iterable[Right]) -> None:
-        self._said = unfolded(rights)
+        self._stated = unfolded(rights)
         self._names: dict[_Place, list[str]] = defaultdict(list)
         self._wild: dict[_Place, list[str]] = defaultdict(list)
-        for enclave, qualifier, right, name in sorted(self._said):
+        for enclave, qualifier, right, name in sorted(self._stated):
             place = (enclave, qualifier, right)
             self._names[place].append(name)
             if is_expression(name):
@@ -162,7 +162,7 @@ class Rules:
         return all(self._covering(part) for part in parts(right))
 
     def covering(self, right: Right) -> tuple[Right, ...]:
-        """Return the rights by which `cover` is true, without repetition; none if it is false."""
+        """Return the rights that together cover all of ``right``, or () if `cover` is false."""
         found = [self._covering(part) for part in parts(right)]
         return tuple(dict.fromkeys(each for each in found if each)) if all(found) else ()
 
@@ -175,7 +175,7 @@ class Rules:
                 candidates = self._names.get(place, ())
             else:
                 candidates = self._wild.get(place, ())
-                if part in self._said:
+                if part in self._stated:
                     found[part] = None
             for name in candidates:
                 if overlap(name, part.name):
@@ -183,12 +183,12 @@ class Rules:
         return tuple(found)
 
     def allow(self, enclave: str, right: str, name: str) -> bool:
-        """Return whether ``name`` may be used: something allows it, and nothing denies any part."""
+        """Return whether ``name`` is allowed completely, and no part of it is denied."""
         wanted = Right(enclave, ALLOW, right, name)
         return self.cover(wanted) and not self.meeting(wanted._replace(qualifier=DENY))
 
     def _covering(self, part: Right) -> Right | None:
-        if part in self._said:
+        if part in self._stated:
             return part
         place = part[:3]
         for wide in self._wild.get(place, ()):
@@ -204,7 +204,7 @@ _Place = tuple[str, Qualifier, str]
 class RightsDifference:
     """The rights that only one side has, in normal form and sorted.
 
-    ``covered`` maps some of them to the wildcards by which the other side has them all the same.
+    ``covered`` maps some of these rights to the wildcards of the other side that cover them.
     """
 
     only_first: tuple[Right, ...]
@@ -215,7 +215,7 @@ class RightsDifference:
         return bool(self.only_first or self.only_second)
 
     def lines(self) -> list[tuple[str, Right]]:
-        """Return every difference with its sign, "-" for the first side, sorted by `order`."""
+        """Return each different right with "-" (first side only) or "+" (second), by `order`."""
         found = [("-", each) for each in self.only_first] + [("+", e) for e in self.only_second]
         return sorted(found, key=lambda line: (*order(line[1]), line[0] == "+"))
 
@@ -223,9 +223,9 @@ class RightsDifference:
 def compare(
     first: Iterable[Right], second: Iterable[Right], scope: frozenset[str] | None = None
 ) -> RightsDifference:
-    """Return how two sets of rights differ, within the enclaves of ``scope`` (None: all).
+    """Return the differences of two sets of rights, for the enclaves in ``scope`` (None: all).
 
-    The difference is empty if and only if both allow and deny the same; an action counts as its
+    The difference is empty if and only if both state the same rights; an action counts as its
     services and topics.
     """
     one, other = (

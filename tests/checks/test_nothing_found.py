@@ -46,7 +46,7 @@ def test_nothing_is_found(template: str, tmp_path: Path) -> None:
     for step, path in life(tmp_path, template):
         ended = sros("check", path)
         assert ended.status == 0, (step, ended)
-        accepted = [line for line in ended.out.splitlines() if line.startswith("accepted, as the ")]
+        accepted = [line for line in ended.out.splitlines() if line.startswith("accepted by the ")]
         assert ended.out.splitlines() == accepted, step
         if template == "sros2" and not step.startswith("create_request"):
             assert "[keystore.one-authority]" in ended.out, step

@@ -37,8 +37,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 ADDED = ["/a ALLOW publish topic /y", "/b ALLOW publish topic /z"]
 STILL = (
-    "note [merge.still-denied]: /a DENY publish topic /cmd_vel stays, and takes precedence "
-    "over what was asked for: publish topic /cmd_vel."
+    "note [merge.still-denied]: /a DENY publish topic /cmd_vel stays, and overrides "
+    "requested rights: publish topic /cmd_vel."
 )
 
 

@@ -452,7 +452,7 @@ def test_merging_again_adds_nothing(learned: Learned) -> None:
 def test_a_merge_that_fails_leaves_the_file_as_it_was(learned: Learned) -> None:
     ended = learned.ended["elsewhere"]
     assert ended.status == 1
-    assert ended.err.startswith("Unable to generate policy: nothing can be added to the enclave")
+    assert ended.err.startswith("Unable to generate policy: rights of the enclave")
     assert (learned.folder / "elsewhere.xml").read_text() == ELSEWHERE
     assert sorted(each.name for each in learned.folder.iterdir()) == [
         "common", "elsewhere.xml", "flat.xml", "older.xml", "robot.xml",
