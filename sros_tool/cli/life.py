@@ -418,8 +418,8 @@ def _say(step: RotationStep, status: RotationStatus, *, together: bool, same_key
     if same_key:
         click.echo("renewed the identity CA with the same key; certificates it issued stay valid")
         click.echo(
-            "Restart the processes at any time; meanwhile, restarted and not yet restarted "
-            "processes can talk to each other. Certificates keep their expiry: `sros renew "
+            "Restart the processes at any time; processes before and after the restart "
+            "communicate. Certificates keep their expiry: `sros renew "
             f"{step.root} --all-expiring 30d` renews those that expire soon.",
             err=True,
         )
@@ -430,7 +430,7 @@ def _say(step: RotationStep, status: RotationStatus, *, together: bool, same_key
     for place in step.kept_elsewhere:
         click.echo(f"the old key at '{place}' is no longer used; it was not deleted", err=True)
     if step.stage == "retire":
-        how = "together" if together else "at any time; they can talk to each other meanwhile"
+        how = "together" if together else "at any time; processes before and after the restart communicate"
         click.echo(f"Restart all processes {how}.", err=True)
     for remark in status.remarks:
         click.echo(remark, err=True)
