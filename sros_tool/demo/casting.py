@@ -100,7 +100,7 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario) -> UserKeysto
             f"no two enclaves of keystore '{root}' may talk on {topic or 'a topic'}",
             "An attack needs an enclave that may publish a topic (named without wildcards), and"
             " another enclave that may subscribe to it.",
-            "Name the topic with --topic, or attack a keystore made by the demo.",
+            "Name the topic with --topic, or attack a keystore that `sros demo --keep` made.",
         )
     service = _service(rights, cast) if "server" in cast else ""
     topic = chosen.removeprefix("rt")
@@ -114,8 +114,8 @@ def _best_cast(rights: Mapping[str, Grant], wanted: str) -> tuple[dict[str, str]
     """
     best: tuple[int, dict[str, str], str] = (-1, {}, "")
     for topic in [wanted] if wanted else sorted(each for each in _topics(rights) if "rt/" in each):
-        talkers = {name for name in rights if may(rights[name], "publish", topic)}
-        listeners = {name for name in rights if may(rights[name], "subscribe", topic)}
+        talkers = {name for name in rights if allows(rights[name], "publish", topic)}
+        listeners = {name for name in rights if allows(rights[name], "subscribe", topic)}
         pair = next(
             (
                 (talker, listener)
@@ -161,9 +161,9 @@ def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
             service, begin = service_of(topic)
             if begin == "rr" and ACTION_INSIDE not in service:
                 request = dds_names("request", service).publish[0]
-                if "parameter" not in topic and may(rights[client], "publish", request):
+                if "parameter" not in topic and allows(rights[client], "publish", request):
                     found = {"server": server, "client": client}
-                    if not may(rights[client], "publish", topic):
+                    if not allows(rights[client], "publish", topic):
                         return found
     return found
 
@@ -173,7 +173,7 @@ def _service(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
     for topic in _application_topics(rights[cast["server"]], "publish"):
         name, begin = service_of(topic)
         requests = dds_names("request", name).publish[0]
-        if begin == "rr" and may(rights[cast["client"]], "publish", requests):
+        if begin == "rr" and allows(rights[cast["client"]], "publish", requests):
             return name
     return SERVICE
 
@@ -184,7 +184,7 @@ def _first_topic(rights: Mapping[str, Grant], cast: Mapping[str, str]) -> str:
         for topic in _application_topics(rights[cast["talker"]], "publish")
         if topic[:3] == "rt/"
     ]
-    return next((t for t in own if may(rights[cast["listener"]], "subscribe", t)), "")
+    return next((t for t in own if allows(rights[cast["listener"]], "subscribe", t)), "")
 
 
 def _within(short: str, long: str) -> bool:
@@ -223,10 +223,10 @@ def enclave_grant(root: Path, enclave: str) -> Grant | None:
     return grants[0] if grants else None
 
 
-def may(grant: Grant, verb: str, topic: str) -> bool:
+def allows(grant: Grant, verb: str, topic: str) -> bool:
     """Return whether a grant allows ``verb`` (publish or subscribe) on a DDS topic.
 
-    As in all vendors, the first rule that names the topic decides.
+    The first rule that names the topic decides, as with the vendors; without one, it is denied.
     """
     for rule in grant.rules:
         if any(matches(expression, topic) for expression in _expressions(rule, verb)):
@@ -249,8 +249,8 @@ def is_node_allowed(grant: Grant, node: str) -> bool:
     """Return whether a grant allows all standard services of the node ``node`` (absolute)."""
     names = (dds_names("reply", f"{node}/{service}") for service in NODE_SERVICES)
     return all(
-        all(may(grant, "publish", topic) for topic in each.publish)
-        and all(may(grant, "subscribe", topic) for topic in each.subscribe)
+        all(allows(grant, "publish", topic) for topic in each.publish)
+        and all(allows(grant, "subscribe", topic) for topic in each.subscribe)
         for each in names
     )
 

@@ -62,7 +62,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class CostResult:
-    """The cost of security; ``first`` has the seconds to the first message by kind."""
+    """The cost of security; ``first`` has the seconds to the first message by protection kind."""
 
     kinds: tuple[str, ...]
     payloads: tuple[int, ...]

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
-from sros_tool.demo.casting import CastMember, UserKeystore, enclave_grant, may, node_names
+from sros_tool.demo.casting import CastMember, UserKeystore, allows, enclave_grant, node_names
 from sros_tool.demo.forger import Forge, KeystoreCopy, Undefended, name_of
 from sros_tool.demo.scenarios.model import (
     FOREIGN,
@@ -57,7 +57,7 @@ class KeystoreSpec:
 
 @dataclass(frozen=True)
 class KeystoreSet:
-    """The keystores of a scenario, sound and forged, and the enclave of each part.
+    """The keystores of a scenario, unforged and forged, and the enclave of each part.
 
     ``missing`` has the reason for each keystore that could not be made.  The scenario's own
     keystore is a copy of the ``user`` keystore, if given: that copy and its forgeries have the
@@ -144,7 +144,7 @@ class KeystoreSet:
         grant = self._grant(party.identity)
         topics = dds_names(right, name)
         if grant is None or not all(
-            may(grant, verb, each)
+            allows(grant, verb, each)
             for verb in ("publish", "subscribe")
             for each in getattr(topics, verb)
         ):

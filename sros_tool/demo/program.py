@@ -82,7 +82,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
         progress("looking for a DDS that enforces security")
         backend = _find_backend(options.backend, folder, topic, now)
         for scenario, row_domains in zip(scenarios, domains, strict=True):
-            under = folder if len(scenarios) == 1 else folder / scenario.name
+            scenario_folder = folder if len(scenarios) == 1 else folder / scenario.name
             keystore_domains = (
                 user.domains if user else DomainSet.of((row_domains[0], row_domains[-1]))
             )
@@ -92,7 +92,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
                 for row in scenario.rows
             )
             scenario = replace(scenario, rows=rows)
-            keystores = create_keystores(under, scenario, spec, user)
+            keystores = create_keystores(scenario_folder, scenario, spec, user)
             progress(
                 f"{scenario.name}: running {len(scenario.rows)} rows on {backend.name}"
                 f" ({backend.dds}): {backend.why}"
@@ -103,19 +103,21 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
                 backend=backend,
                 keystores=keystores,
                 topic=topic,
-                folder=under / "rows",
+                folder=scenario_folder / "rows",
                 limits=options.limits,
                 own_networks=isolation.isolated,
             )
-            shown = run_isolated(partial(run_rows, plan), isolation, progress)
+            row_results = run_isolated(partial(run_rows, plan), isolation, progress)
             cost = None
             if scenario.measured:
                 measuring = partial(
-                    measure_cost, plan, scenario.measured, under / "cost", options.effort
+                    measure_cost, plan, scenario.measured, scenario_folder / "cost", options.effort
                 )
                 cost = run_isolated(measuring, isolation, progress)
             cast = keystores.members(scenario.rows, on_ros=backend.name == RCLPY) if user else ()
-            results.append(ScenarioResult(scenario.name, scenario.title, tuple(shown), cost, cast))
+            results.append(
+                ScenarioResult(scenario.name, scenario.title, tuple(row_results), cost, cast)
+            )
         result = DemoResult(backend, topic, isolation, template.name, tuple(results))
         if options.keep is not None:
             text = json.dumps(result.as_json(), indent=2) + "\n"
@@ -185,7 +187,7 @@ def _is_selected(row: Row, options: DemoOptions) -> bool:
 def _domains(
     scenario: Scenario, options: DemoOptions, user: UserKeystore | None, isolation: Isolation
 ) -> tuple[int, ...]:
-    """Return a domain for each row; with the user's keystore, always the same one."""
+    """Return a domain for each row; with a user's keystore, its first domain for all rows."""
     if user is not None:
         if not isolation.isolated:
             raise UnavailableError(

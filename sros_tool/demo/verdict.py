@@ -296,7 +296,7 @@ def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> _Findin
     sent = sum(
         1 for event in talker.events if event.kind is EventKind.SENT and _in_window(event, record)
     )
-    # Silence on the wire proves nothing unless the messages went over the captured wire.
+    # Missing text proves something only if the messages were in the captured packets.
     if count.protected * 2 < max(2, sent):
         return _Finding(
             RowStatus.UNDECIDED,

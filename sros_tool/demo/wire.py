@@ -134,7 +134,7 @@ def _socket_inode(link: Path) -> str:
     try:
         target = str(link.readlink())
     except OSError:
-        return ""  # closed meanwhile
+        return ""  # closed since it was listed
     return target.removeprefix("socket:[").removesuffix("]") if target[:8] == "socket:[" else ""
 
 

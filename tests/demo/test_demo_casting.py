@@ -10,8 +10,8 @@ import pytest
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import Grant
 from sros_tool.demo.casting import (
+    allows,
     is_node_allowed,
-    may,
     naming_arguments,
     node_names,
     nodes_named,
@@ -67,7 +67,7 @@ def test_where_no_node_is_allowed_the_name_stays_and_dds_decides(tmp_path: Path)
     file = tmp_path / "policy.xml"
     file.write_text(policy_text({"/a": publish("chatter")}))
     grant = grant_of(file, "/a")
-    assert may(grant, "publish", "rt/chatter")
+    assert allows(grant, "publish", "rt/chatter")
     assert not list(nodes_named(grant))
     assert node_names(Role.TALKER, grant) == ("/talker",)
 

@@ -33,7 +33,7 @@ _LOST = 2.0
 
 @dataclass(frozen=True)
 class _Channel:
-    """The connection from one end to the other one.
+    """The connection between the two ends, as one end uses it.
 
     ``wait`` waits for a message, at most the given seconds; ``take`` returns the messages received
     since its last call, oldest first.

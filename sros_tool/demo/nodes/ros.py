@@ -143,8 +143,8 @@ def _observer(node: Any, options: NodeOptions, events: EventWriter) -> None:
 
     def look() -> None:
         counts = {topic: node.count_publishers(topic) for topic in (options.topic, *options.also)}
-        # The list of names is only logged, since a node lists its own topics too: only the count
-        # of publishers shows whether a talker is visible.
+        # A node lists its own topics too, so the list of names is only logged: the count of
+        # publishers shows whether a talker is visible.
         listed = " ".join(sorted(name for name, _ in node.get_topic_names_and_types()))
         node.get_logger().info(f"Publishers: {counts}; topics: {listed}")
         events.report(EventKind.SEEN, listed, publishers=counts)

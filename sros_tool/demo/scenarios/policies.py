@@ -59,7 +59,7 @@ def _shipped_policy(file: str) -> Policy:
 
 
 def talking_policy(topic: str) -> Policy:
-    """Return the shipped policy for ``topic``, with two more enclaves that may not use it."""
+    """Return the shipped talker and listener on ``topic``, and one of each that may not use it."""
     shipped = _shipped_policy(_POLICY_FILE)
     by_path = {enclave.path: enclave for enclave in shipped.enclaves}
     talker, listener = by_path[_TALKER], by_path[_LISTENER]

@@ -81,7 +81,6 @@ ROWS: tuple[Row, ...] = (
         attack="the attacker's own permissions CA",
         removed="the listener's permissions CA",
         victims=Undefended(forger.another_permissions_ca_trusted),
-        crowd=False,
     ),
     *(
         injection(
@@ -273,6 +272,5 @@ ROWS: tuple[Row, ...] = (
         attack="weaker governance",
         removed="the wrong signature",
         victims=Undefended(forger.weaker_governance),
-        crowd=False,
     ),
 )

@@ -56,13 +56,12 @@ def injection(
     open_because: str = "",
     remedy: str = "",
     tampered: bool = False,
-    crowd: bool = True,
 ) -> Row:
     """Return a row that shows whether the attacker is heard on the topic.
 
     With ``tampered``, the files of the listener were changed: it may fail to start, and the control
-    is another listener with unchanged files.  Otherwise, the control is a rightful talker, except
-    with ``removed`` or without ``crowd``.
+    is another listener with unchanged files.  Otherwise, the control is a rightful talker; a row
+    with ``removed`` has no control.
     """
     listener = Party("listener", Role.LISTENER, Identity(victims, "listener"), intruder=tampered)
     parties = [Party(_ATTACKER, Role.TALKER, attacker, intruder=True), listener]
@@ -73,7 +72,7 @@ def injection(
             Party("talker", Role.TALKER, Identity(OWN, "talker")),
         ]
         controls.append(Claim(Relation.HEARS, "untouched listener", "talker"))
-    elif crowd and not removed:
+    elif not removed:
         parties.append(Party("talker", Role.TALKER, Identity(victims, "talker")))
         controls.append(Claim(Relation.HEARS, "listener", "talker"))
     return Row(
@@ -132,7 +131,7 @@ def listening(
     )
 
 
-def looking(
+def discovering(
     name: str,
     attacker: Identity,
     expected: RowStatus,
@@ -168,7 +167,7 @@ def looking(
     )
 
 
-def asking(
+def calling(
     name: str,
     attacker: Identity,
     expected: RowStatus,

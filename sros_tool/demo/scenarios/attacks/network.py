@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sros_tool.demo import forger
 from sros_tool.demo.forger import Undefended
-from sros_tool.demo.scenarios.attacks.kinds import injection, listening, looking, open_to
+from sros_tool.demo.scenarios.attacks.kinds import discovering, injection, listening, open_to
 from sros_tool.demo.scenarios.model import (
     OWN,
     UNSECURED,
@@ -126,7 +126,7 @@ ROWS: tuple[Row, ...] = (
         removed="the refusal of unauthenticated participants",
         victims=_OPEN_GOVERNANCE,
     ),
-    looking(
+    discovering(
         "an unsecured node lists topics",
         UNSECURED,
         RowStatus.NOT_VISIBLE,
@@ -141,7 +141,7 @@ ROWS: tuple[Row, ...] = (
             ),
         ),
     ),
-    looking(
+    discovering(
         "an unsecured node lists topics, open governance",
         UNSECURED,
         RowStatus.VISIBLE,
@@ -166,7 +166,7 @@ ROWS: tuple[Row, ...] = (
         removed="the refusal of unauthenticated participants",
         victims=_OPEN_GOVERNANCE,
     ),
-    looking(
+    discovering(
         "an enclave without rights lists topics",
         Identity(OWN, "guest"),
         RowStatus.VISIBLE,

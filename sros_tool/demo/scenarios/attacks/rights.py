@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sros_tool.demo import forger
 from sros_tool.demo.forger import Undefended
-from sros_tool.demo.scenarios.attacks.kinds import asking, injection, listening, posing_as_server
+from sros_tool.demo.scenarios.attacks.kinds import calling, injection, listening, posing_as_server
 from sros_tool.demo.scenarios.model import OWN, Condition, Identity, Row, RowStatus, Variant
 
 ROWS: tuple[Row, ...] = (
@@ -72,14 +72,14 @@ ROWS: tuple[Row, ...] = (
         removed="least privilege",
         victims=Undefended(forger.talker_may_do_everything),
     ),
-    asking(
+    calling(
         "an enclave calls a service that it was not given",
         Identity(OWN, "guest"),
         RowStatus.REFUSED,
         "its signed permissions allow neither the request nor the reply",
         attack="an enclave calls a service",
     ),
-    asking(
+    calling(
         "an enclave calls a service, wildcard permissions",
         Identity(Undefended(forger.guest_may_do_everything), "guest"),
         RowStatus.ANSWERED,
