@@ -49,7 +49,7 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
             one next to it.
 
     Raises:
-        DocumentError: ``path`` is of no such kind, or cannot be read.
+        DocumentError: ``path`` is none of these kinds, or cannot be read.
     """
     if path.is_dir():
         if is_keystore(path):
@@ -72,7 +72,7 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
 
 
 def _file(path: Path, data: bytes, now: datetime, authority: Path | None) -> Description:
-    """Describe a file by its content, whatever its name."""
+    """Describe a file; its content decides the kind, not its name."""
     if b"-----BEGIN CERTIFICATE-----" in data:
         return {"kind": "certificate", **_certificates(data, "in it", now)}
     if CRL_MARK in data:

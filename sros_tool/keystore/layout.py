@@ -13,9 +13,9 @@ from sros_tool.errors import DocumentError, KeystoreError
 
 ENCLAVES, PUBLIC, PRIVATE = "enclaves", "public", "private"
 SETTINGS = "sros.toml"
-"""The settings of the keystore; keystores of ros2/sros2 have no such file."""
+"""The settings of the keystore; keystores of ros2/sros2 do not have this file."""
 LEDGER = "ledger.jsonl"
-"""The log of issued certificates and documents; keystores of ros2/sros2 have no such file."""
+"""The log of issued certificates and documents; keystores of ros2/sros2 do not have it."""
 
 IDENTITY, PERMISSIONS = "identity", "permissions"
 ROLES = (IDENTITY, PERMISSIONS)

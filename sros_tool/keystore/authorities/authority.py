@@ -204,7 +204,8 @@ def write_bundle(
 ) -> None:
     """Stage ``bundle`` (PEM) as the CA file named ``file``, and update its copies in enclaves.
 
-    ``roles`` are the roles of the CA, ``names`` the enclaves of the keystore.
+    ``file`` lacks the suffix ``.cert.pem``; ``roles`` are the roles of the CA, ``names`` the
+    enclaves of the keystore.
     """
     transaction.write(f"{PUBLIC}/{file}.cert.pem", bundle)
     for role in roles:

@@ -57,7 +57,7 @@ def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> Im
         raise PkiError(
             f"the certificate of the {role} CA cannot be read",
             "It is not PEM, or it is damaged.",
-            "Name a PEM file with the certificate of the CA and those of its issuers.",
+            "Name a PEM file with the certificates of the CA and its issuers.",
         ) from error
     own = [each for each in certificates if same_key(each, key)]
     if len(certificates) > _MOST_CERTIFICATES:

@@ -27,8 +27,12 @@ Secrets = Callable[[str], str]
 
 
 def no_secrets(what: str) -> str:
-    """Raise `PkiError`: the secrets handler of callers that have no secrets."""
-    raise PkiError(f"{what} is needed, but there is no way to ask for it")
+    """Raise `PkiError`; the secrets handler of a keyring that is given none."""
+    raise PkiError(
+        f"{what} is needed",
+        "The keyring has no secrets handler to ask for it.",
+        "Pass one, as in `Keyring(secrets=...)`.",
+    )
 
 
 @dataclass(frozen=True, slots=True)

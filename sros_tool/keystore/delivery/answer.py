@@ -39,7 +39,7 @@ _AGAIN = "Have the request signed again, and import the new answer."
 SEAL = "answer.p7s"
 """The list of all files of an answer with their digests, signed by the permissions CA.
 
-Without it, whoever transports an answer could put an older governance or another CA into it.
+Without it, anyone who transports an answer could put an older governance or another CA into it.
 """
 
 
@@ -76,7 +76,7 @@ class ImportedEnclave:
 
 
 def seal(files: dict[str, bytes], authority: Authority) -> bytes:
-    """Return the signed list of the files of an answer."""
+    """Return the file list of an answer as an S/MIME message that ``authority`` signed."""
     return authority.sign(_listed(files), "the file list of the answer")
 
 
@@ -95,8 +95,7 @@ def _read_answer(data: bytes) -> RequestAnswer:
     """Read an answer from its archive (``.tar.gz``), without verifying it.
 
     Raises:
-        DocumentError: the archive is damaged, lacks a file, or holds files of anything but one
-            enclave.
+        DocumentError: the archive is damaged, or does not hold exactly the files of one enclave.
     """
     try:
         files = unpack(data)

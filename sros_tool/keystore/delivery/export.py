@@ -58,7 +58,7 @@ class ExportSelection:
 def select(
     root: Path, names: Sequence[str], patterns: Sequence[str] = (), *, every: bool = False
 ) -> ExportSelection:
-    """Return the enclaves to export: ``names``, and those that match a pattern, or ``every`` one.
+    """Return the enclaves to export: ``names``, and the matches of ``patterns``, or ``every`` one.
 
     In a pattern ``*`` stands for any part of a name, "/" included, as in policies.  An enclave
     whose key is on its robot is left out if it only matches a pattern; a named one is refused by
@@ -173,7 +173,7 @@ def _write_folder(
 ) -> tuple[Change, ...]:
     if _real(target).is_relative_to(_real(root)):
         raise KeystoreError(
-            f"'{target}' is the keystore itself or lies in it", "", "Choose another folder."
+            f"'{target}' is the keystore itself or a folder in it", "", "Choose another folder."
         )
     if os.path.lexists(target) and not target.is_dir():
         raise KeystoreError(

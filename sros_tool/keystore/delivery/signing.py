@@ -187,7 +187,7 @@ def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
     if exists and not renew:
         raise KeystoreError(
             f"enclave {name} exists already in keystore '{root}'",
-            "Whoever sent the request would get its rights.",
+            "The sender of the request would get the rights of this enclave.",
             "If that is intended, add --renew; otherwise have the request made for another name.",
         )
     if renew and not exists:
@@ -215,7 +215,7 @@ def _check_key(root: Path, request: SigningRequest) -> None:
         if key.public_key() != request.public_key:
             raise KeystoreError(
                 f"enclave {request.name} has another key in keystore '{root}'",
-                "Its key.pem would not fit the certificate for the key of the request.",
+                "Its key.pem would not fit a certificate for the key in the request.",
                 f"Revoke the enclave first, with `sros revoke {root} {request.name}`.",
             )
 

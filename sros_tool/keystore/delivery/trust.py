@@ -17,8 +17,8 @@ from sros_tool.xml import read_bytes
 def read_pin(text: str) -> frozenset[str]:
     """Return the SHA-256 of the pinned CAs, in lower-case hexadecimal.
 
-    ``text`` is a fingerprint or the path of a certificate file.  A fingerprint may be written as by
-    ``openssl x509 -fingerprint -sha256``, with colons and capitals.
+    ``text`` is a fingerprint or the path of a certificate file.  A fingerprint can have colons and
+    capitals, as ``openssl x509 -fingerprint -sha256`` prints it.
 
     Raises:
         UsageError: ``text`` is neither a fingerprint nor a certificate file.

@@ -237,7 +237,7 @@ class EnclaveWriter:
     ) -> dict[str, Result]:
         """Run ``work`` for each enclave on all cores, and map the enclaves to the results.
 
-        Whatever forked workers issue and stage is added to this writer and its transaction.  The
+        All that forked workers issue and stage is added to this writer and its transaction.  The
         session of a token does not survive a fork, so with a key on a token there are no workers.
         """
         own_process = os.getpid()
