@@ -207,7 +207,7 @@ FINDINGS: dict[str, tuple[Callable[[Path], object], str, str, str]] = {
     ),
     "an answer that is not here yet": (
         lambda robot: create_request(robot, "/late"),
-        *("/late", "request.pem", "not answered yet"),
+        *("/late", "request.pem", "certificate is missing"),
     ),
 }
 
