@@ -1,7 +1,7 @@
-"""Reasons for which a DDS vendor refuses to load an enclave or a CA.
+"""Reasons why a DDS vendor refuses to load an enclave or a CA.
 
-Vendors differ by the traits in `sros_tool.dds.decision.vendors`.  `sros_tool.keystore.reader` finds
-the faults that matter to all vendors; they are not checked here again.
+Vendors differ by the traits in `sros_tool.dds.decision.vendors`.  Faults that all vendors refuse
+are found by `sros_tool.keystore.reader` and not checked here again.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _SIDES = (
 _VENDOR_SPECIFIC = frozenset(
     {Fault.CA_EXPIRED, Fault.CA_NOT_YET_VALID, Fault.CERTIFICATE_ISSUER, Fault.SIGNATURE}
 )
-"""Faults that only some vendors have."""
+"""Faults of `OpenedEnclave` for which only some vendors refuse an enclave."""
 
 _certificates = lru_cache(maxsize=16)(load_certificates)
 
@@ -54,12 +54,12 @@ _certificates = lru_cache(maxsize=16)(load_certificates)
 def vendor_problems(
     traits: VendorTraits, state: OpenedEnclave, at: datetime
 ) -> tuple[Problem, ...]:
-    """Return the problems that a vendor has with an enclave when it loads it at ``at``.
+    """Return the problems for which a vendor refuses to load an enclave at the time ``at``.
 
-    The content of its documents is not judged here, except by the problems of `OpenedEnclave`.
+    The content of governance and permissions only counts by the problems in ``state``.
     """
     kept = [each for each in state.problems if each.fault not in _VENDOR_SPECIFIC]
-    # A fault of these for every vendor is not reported twice.
+    # Files that every vendor refuses already: do not report a second problem.
     known = {
         each.file
         for each in kept
@@ -117,7 +117,7 @@ def _authority_fault(
 ) -> tuple[str, Fault] | None:
     """Return why the vendor refuses a CA file, and the fault; None if it accepts the file.
 
-    ``certificates`` are all of the file, in their order.
+    ``certificates`` are all certificates of the file, in order.
     """
     trusted = _trusted(traits, certificates)
     if not trusted:
@@ -131,10 +131,9 @@ def _authority_fault(
 
 
 def authority_refusals(role: str, certificates: Certificates, at: datetime) -> dict[Vendor, str]:
-    """Map the vendors that refuse certificates or documents of a CA to the reason.
+    """Map each measured vendor that refuses the certificates or documents of a CA to the reason.
 
-    ``certificates`` are all certificates of its file, the CA itself first.  Only measured vendors
-    are asked.
+    ``certificates`` are all certificates of the CA file, the issuing CA first.
     """
     refusals = {}
     for vendor in MEASURED:
@@ -144,7 +143,7 @@ def authority_refusals(role: str, certificates: Certificates, at: datetime) -> d
             refusals[vendor] = fault[0]
         elif role == IDENTITY:
             below = chain_fault(certificates[0], _trusted(traits, certificates), at=at)
-            key = "" if _key_fits(traits, certificates[0]) else "its key is not of a kind it takes"
+            key = "" if _key_fits(traits, certificates[0]) else "its key algorithm is not supported"
             refusals[vendor] = below or key
         elif traits.signers is Signers.CHAIN:
             trusted = _trusted(traits, certificates)
@@ -153,18 +152,19 @@ def authority_refusals(role: str, certificates: Certificates, at: datetime) -> d
 
 
 def refusals_text(refusals: Mapping[Vendor, str]) -> str:
-    """Return clauses on the measured vendors that refuse a CA, with the reason, and the others."""
+    """Return clauses on the vendors that refuse a CA, with reasons, and on the other vendors."""
     by_text: dict[str, list[str]] = {}
     for vendor, text in refusals.items():
         by_text.setdefault(text, []).append(vendor.title)
     clauses = [
-        f"{' and '.join(titles)} {'refuses' if len(titles) == 1 else 'refuse'} what it issues or "
-        f"signs: {text}"
+        f"{' and '.join(titles)} {'refuses' if len(titles) == 1 else 'refuse'} the certificates "
+        f"or documents of this CA: {text}"
         for text, titles in by_text.items()
     ]
-    takes = [vendor.title for vendor in MEASURED if vendor not in refusals]
-    if takes:
-        clauses.append(f"{' and '.join(takes)} {'takes' if len(takes) == 1 else 'take'} it")
+    accepts = [vendor.title for vendor in MEASURED if vendor not in refusals]
+    if accepts:
+        verb = "accepts" if len(accepts) == 1 else "accept"
+        clauses.append(f"{' and '.join(accepts)} {verb} it")
     return "; ".join(clauses)
 
 
@@ -173,7 +173,7 @@ def _signer_fault(
 ) -> str:
     """Return why the vendor refuses the signature of a document, or "".
 
-    ``certificates`` are all of the permissions CA's file, in their order.
+    ``certificates`` are all certificates of the permissions CA's file, in order.
     """
     trusted = _trusted(traits, certificates)
     if traits.signers is Signers.AUTHORITY:

@@ -1,4 +1,4 @@
-"""The error for a missing enclave: was it revoked, or is its name a typo?"""
+"""The error for a missing enclave, which says whether it was revoked or its name may be a typo."""
 
 from __future__ import annotations
 
@@ -12,31 +12,31 @@ from sros_tool.keystore.ledger import Entry, read_ledger
 from sros_tool.names import check_enclave_name
 
 _SHOWN = 5
-"""The number of enclaves that are named before the rest is only counted."""
+"""The number of enclaves that an error names; it counts the others."""
 _ALIKE = 0.75
-"""The lowest similarity (`difflib`) of a typo: one letter of four differs, or two of eight."""
+"""The lowest similarity (`difflib`) of a typo: one of four letters differs, or two of eight."""
 
 
 def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
-    """Return the error for the missing enclave ``name``; ``there`` are the existing ones."""
+    """Return the error for the missing enclave ``name``; ``there`` are the existing enclaves."""
     if revocation := _revocation(root, name):
         return _was_revoked(root, revocation)
     what = f"enclave {name} does not exist in keystore '{root}'"
     meant = likely_names(name, there)
     if meant:
-        return KeystoreError(what, "", f"Perhaps {' or '.join(meant)} is meant.")
+        return KeystoreError(what, "", f"Perhaps you mean {' or '.join(meant)}.")
     try:
         check_enclave_name(name)
     except InvalidNameError as error:
         return error
     names = sorted(there)
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
-    why = f"It has {', '.join(names[:_SHOWN]) or 'none'}{more}."
-    return KeystoreError(what, why, f"Make it with `sros create_enclave {root} {name}`.")
+    why = f"The keystore has {', '.join(names[:_SHOWN]) or 'no enclave'}{more}."
+    return KeystoreError(what, why, f"Create it with `sros create_enclave {root} {name}`.")
 
 
 def _revocation(root: Path, name: str) -> Entry | None:
-    """Return the ledger's entry of an enclave's revocation, if nothing was issued for it since."""
+    """Return the ledger entry of an enclave's revocation; None if it has a later certificate."""
     try:
         entries = read_ledger(root)
     except SrosError:
@@ -46,7 +46,7 @@ def _revocation(root: Path, name: str) -> Entry | None:
     ]
     if not of_enclave or of_enclave[-1].what != "revocation":
         return None
-    # Earlier certificates were revoked with it; only one of them has files.
+    # One revocation has an entry for each certificate; only one of them has files.
     kept = (e for e in reversed(of_enclave) if e.serial and (root / REVOKED / e.serial).is_dir())
     return next(kept, of_enclave[-1])
 
@@ -56,16 +56,16 @@ def _was_revoked(root: Path, entry: Entry) -> SrosError:
     folder = root / REVOKED / entry.serial
     return KeystoreError(
         f"enclave {entry.enclave} of keystore '{root}' was revoked at {entry.time}{reason}",
-        f"Its files lie in '{folder}'." if folder.is_dir() else "",
-        f"If it is needed again, make it again with `sros create_enclave {root} {entry.enclave}`.",
+        f"Its files are in '{folder}'." if folder.is_dir() else "",
+        f"To use it again, create it with `sros create_enclave {root} {entry.enclave}`.",
     )
 
 
 def likely_names(name: str, there: Collection[str]) -> tuple[str, ...]:
-    """Return at most three enclaves that ``name`` may mean.
+    """Return at most three enclaves that a mistyped ``name`` may mean.
 
-    These are the enclaves whose names end in it, because people leave out the beginning; otherwise
-    the ones whose last part has a similar spelling.
+    These are the enclaves whose names end with ``name``, because people leave out the namespace;
+    without any, the enclaves whose last part is spelled alike.
     """
     end = "/" + name.strip("/")
     if end == "/":

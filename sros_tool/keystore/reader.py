@@ -1,8 +1,8 @@
-"""The only reader of keystores and enclaves: their parts, their grants, and their problems.
+"""The only reader of keystores and enclaves: their files, their grants, and their problems.
 
-The checks of DDS at the creation of a participant are repeated here, after Fast DDS 2.14.5 and
-Cyclone DDS 0.10, and name the cause, which the vendors seldom do.  For differences between vendors
-see `sros_tool.keystore.loading`.
+It repeats the checks that Fast DDS 2.14.5 and Cyclone DDS 0.10 make when a participant is created,
+and names the cause of a refusal, which the vendors seldom do.  `sros_tool.keystore.loading` has the
+differences between vendors.
 """
 
 from __future__ import annotations
@@ -74,9 +74,10 @@ _Parsed = TypeVar("_Parsed")
 
 
 class OpenedKeystore:
-    """A keystore opened for reading: each part is read when it is first asked for.
+    """A keystore, or an export for a robot, opened for reading.
 
-    It may be an export for a robot.  A part that exists and cannot be read raises `SrosError`.
+    Each property reads its file at the first access; it raises `SrosError` if the file exists and
+    cannot be read.
     """
 
     def __init__(self, root: Path) -> None:
@@ -84,50 +85,50 @@ class OpenedKeystore:
 
     @property
     def is_home(self) -> bool:
-        """Whether it has a place for CAs; else it was exported for a robot."""
+        """Whether it is a keystore with CAs or settings, not an export for a robot."""
         return any((self.root / part).exists() for part in (PUBLIC, PRIVATE, SETTINGS))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The names of its enclaves, sorted."""
+        """The sorted names of the enclaves."""
         return tuple(enclave_names(self.root))
 
     @cached_property
     def settings(self) -> Template | None:
-        """Its settings; None for a keystore of ros2/sros2 and for an export."""
+        """The settings; None for a keystore of ros2/sros2 and for an export."""
         return load_settings(self.root) if (self.root / SETTINGS).exists() else None
 
     @cached_property
     def governance(self) -> Governance:
-        """The governance that DDS loads, its signature verified."""
+        """The governance that DDS loads, with its signature verified."""
         return governance_of(self.root)
 
     @cached_property
     def domains(self) -> DomainSet:
-        """The ROS domains that its governance is for."""
+        """The ROS domains that the governance names."""
         return self.governance.domains().closed()
 
     @cached_property
     def revocation_list(self) -> RevocationList | None:
-        """The list of the issuing identity CA, if anything was ever revoked."""
+        """The revocation list of the issuing identity CA, or None before the first revocation."""
         return read_crl(self.root)
 
     @cached_property
     def ledger(self) -> tuple[Entry, ...]:
-        """Everything that was issued, oldest first; nothing where there is no ledger."""
+        """The ledger entries of all issued files, oldest first; empty without a ledger."""
         from sros_tool.keystore.ledger import read_ledger
 
         return read_ledger(self.root)
 
     def authority(self, role: str) -> tuple[x509.Certificate, ...]:
-        """Return the certificates of a CA's file, the issuing one first; none without a file."""
+        """Return the certificates in a CA's file, the issuing CA first; empty without a file."""
         path = self.root / ca_certificate(role)
         if not path.exists():
             return ()
         return load_certificates(read_bytes(path, "certificate"), f"'{path}'")
 
     def enclave(self, name: str, *, now: datetime, domain: int | None = None) -> OpenedEnclave:
-        """Return an enclave of it, as `open_enclave` does."""
+        """Return an enclave of the keystore, as `open_enclave` does."""
         return open_enclave(enclave_path(self.root, name), now=now, domain=domain)
 
 
@@ -135,14 +136,14 @@ def open_keystore(root: Path) -> OpenedKeystore:
     """Return the keystore ``root``, opened for reading.
 
     Raises:
-        KeystoreError: ``root`` is no keystore.
+        KeystoreError: ``root`` is not a keystore.
     """
     check_keystore(root)
     return OpenedKeystore(root)
 
 
 def load_settings(root: Path) -> Template:
-    """Return the keystore's settings, or ros2/sros2's defaults if it has none."""
+    """Return the settings of a keystore; without settings, the template for ros2/sros2."""
     from sros_tool.keystore.template import load_template, read_template
 
     path = root / SETTINGS
@@ -150,10 +151,10 @@ def load_settings(root: Path) -> Template:
 
 
 def load_governance(root: Path, authority: x509.Certificate) -> Governance:
-    """Return the governance that DDS loads, its signature verified by a permissions CA.
+    """Return the governance that DDS loads, after verifying that ``authority`` signed it.
 
     Raises:
-        KeystoreError: it is missing or malformed, or the signature is not that CA's.
+        KeystoreError: the governance is missing or malformed, or its signature does not verify.
     """
     path = root / GOVERNANCE_P7S
     try:
@@ -169,52 +170,56 @@ def load_governance(root: Path, authority: x509.Certificate) -> Governance:
 
 
 def governance_of(root: Path) -> Governance:
-    """Return the governance that DDS loads, verified by the keystore's own permissions CA."""
+    """Return the governance that DDS loads, verified with the permissions CA of the keystore."""
     return load_governance(root, load_ca_certificate(root, PERMISSIONS))
 
 
 def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
-    """Raise `KeystoreError` if ``domain`` is given and the keystore is not made for it."""
+    """Raise `KeystoreError` if ``domain`` is given and not among ``domains``."""
     if domain is None or domain in domains:
         return
     raise KeystoreError(
         f"ROS_DOMAIN_ID is {domain}, but keystore '{root}' is for domain {domains} only",
-        "A node that joins any other domain with it is refused by DDS.",
+        "In any other domain, DDS refuses a node with this keystore.",
         f"Set ROS_DOMAIN_ID to {domains}, or create a keystore with --domain {domain}.",
     )
 
 
-# ── its authorities ────────────────────────────────────────────────────────────────────────
+# ── CAs ────────────────────────────────────────────────────────────────────────────────────
 
 
 def read_certificate(path: Path, what: str = "certificate") -> x509.Certificate:
-    """Return the first certificate of a PEM file; ``what`` names it in errors.
+    """Return the first certificate of a PEM file; ``what`` describes the file in errors.
 
     Raises:
-        SrosError: the file is missing, or holds no certificate.
+        SrosError: the file is missing, or is not a readable certificate.
     """
     return load_certificate(read_bytes(path, what), f"'{path}'")
 
 
 def load_ca_certificate(root: Path, role: str) -> x509.Certificate:
-    """Return the certificate of the identity or permissions CA of a keystore."""
+    """Return the certificate of the issuing identity or permissions CA of a keystore."""
     return read_certificate(root / ca_certificate(role), f"{role} CA certificate")
 
 
 def authority_files(root: Path) -> dict[str, tuple[str, ...]]:
-    """Map the stem of each CA file to the roles of its CA."""
+    """Map the stem of each CA file to the roles of its CA.
+
+    Raises:
+        KeystoreError: a CA file is missing, or is a link to a file outside of the keystore.
+    """
     found: dict[str, tuple[str, ...]] = {}
     for role in ROLES:
         path = root / ca_certificate(role)
         file = path
-        # A link into the stage stands for a file; an interrupted transaction left it.
+        # A link into the stage, left by an interrupted transaction, stands for the file itself.
         if path.is_symlink() and STAGE not in (to := str(path.readlink())):
             file = path.with_name(to)
         if not file.is_file() or file.parent != path.parent:
             raise KeystoreError(
-                f"keystore '{root}' has no {role} CA of its own",
-                f"'{path}' is missing, or leads out of the keystore.",
-                "Use the keystore that it was exported from.",
+                f"keystore '{root}' has no {role} CA",
+                f"'{path}' is missing, or is a link to a file outside of the keystore.",
+                "Use the keystore that this one was exported from.",
             )
         stem = file.name.removesuffix(".cert.pem")
         found[stem] = (*found.get(stem, ()), role)
@@ -222,27 +227,27 @@ def authority_files(root: Path) -> dict[str, tuple[str, ...]]:
 
 
 def identity_file(root: Path) -> str | None:
-    """Return the stem of the identity CA's file; None for a copy of a keystore without CAs."""
+    """Return the stem of the identity CA's file; None for an export, which has no CA files."""
     with suppress(KeystoreError):
         return next(file for file, roles in authority_files(root).items() if IDENTITY in roles)
     return None
 
 
 def certificates_of(root: Path, file: str) -> tuple[x509.Certificate, ...]:
-    """Return all certificates of a CA file, the issuing one first."""
+    """Return all certificates of a CA file, the issuing CA first."""
     path = root / PUBLIC / f"{file}.cert.pem"
     return load_certificates(read_bytes(path, "CA certificate"), f"'{path}'")
 
 
 def carried_crl(root: Path, file: str) -> RevocationList | None:
-    """Return the revocation list that a CA file carries next to its certificates, or None."""
+    """Return the revocation list in a CA file, after its certificates, or None."""
     path = root / PUBLIC / f"{file}.cert.pem"
     data = read_bytes(path, "CA certificate")
     return load_crl(data, f"in '{path}'") if CRL_MARK in data else None
 
 
 def read_crl(root: Path) -> RevocationList | None:
-    """Return the list of the issuing identity CA, or None if nothing was ever revoked."""
+    """Return the revocation list of the issuing identity CA; None before the first revocation."""
     path = root / CRL
     if not path.exists():
         return None
@@ -250,7 +255,7 @@ def read_crl(root: Path) -> RevocationList | None:
 
 
 def read_lists(root: Path) -> tuple[RevocationList, ...]:
-    """Return all lists that DDS reads: the issuing identity CA's, and one next to a second CA."""
+    """Return the revocation lists that DDS reads: of the issuing identity CA, and of a second."""
     file = identity_file(root)
     found = (read_crl(root), carried_crl(root, file) if file else None)
     return tuple(each for each in found if each)
@@ -261,9 +266,10 @@ def read_lists(root: Path) -> tuple[RevocationList, ...]:
 
 @dataclass(frozen=True, slots=True)
 class SignedGrant:
-    """A signed permissions document, not verified yet, with its SHA-256 in hexadecimal.
+    """A signed permissions document, not verified yet, and its grant to one subject.
 
-    ``grant`` is the first for the subject, which is the one that DDS reads, or None.
+    ``digest`` is the SHA-256 of the whole file, in hexadecimal.  ``grant`` is the first grant for
+    the subject, which is the one that DDS reads, or None.
     """
 
     signed: smime.SignedDocument
@@ -289,7 +295,7 @@ def read_granted(path: Path, subject: str) -> SignedGrant:
 @shows("file", "text", "code")
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A fault that keeps a process from running in an enclave, with its file and the reason."""
+    """A fault of an enclave, with the file that has it and the reason as a clause."""
 
     file: str
     text: str
@@ -297,7 +303,7 @@ class Problem:
 
     @property
     def code(self) -> str:
-        """The stable word for programs, such as ``key-mismatch``."""
+        """The stable id of the fault, for programs, such as ``key-mismatch``."""
         return self.fault.id
 
     def __str__(self) -> str:
@@ -306,7 +312,10 @@ class Problem:
 
 @dataclass(frozen=True, slots=True)
 class OpenedEnclave:
-    """The readable content of an enclave's files, and the problems in them."""
+    """The content of an enclave's files as far as they can be read, and their problems.
+
+    ``permissions_bytes`` is the size of ``permissions.p7s``.
+    """
 
     certificate: x509.Certificate | None
     identity_ca: x509.Certificate | None
@@ -316,15 +325,15 @@ class OpenedEnclave:
     permissions_bytes: int
     problems: tuple[Problem, ...]
     files: Mapping[str, bytes] = field(default_factory=dict, repr=False)
-    """The bytes of the required files, of those that can be read."""
+    """The content of the required files that can be read, by file name."""
     permissions_document: bytes = field(default=b"", repr=False)
-    """The XML within ``permissions.p7s``, also where it cannot be read as permissions."""
+    """The XML in ``permissions.p7s``, even if malformed; empty if its signature is not valid."""
     key_on_robot: bool = False
-    """Its key was made on its robot, and stays there."""
+    """Whether the key was generated on the robot and stays there."""
 
     @property
     def subject(self) -> str:
-        """The subject of its certificate, or ""."""
+        """The subject of the enclave's certificate, or ""."""
         return subject_text(self.certificate.subject) if self.certificate else ""
 
     @property
@@ -334,7 +343,7 @@ class OpenedEnclave:
 
     @property
     def problems_at_home(self) -> tuple[Problem, ...]:
-        """Its problems, except that its key is on its robot."""
+        """The problems, except the missing key of an enclave whose key is on the robot."""
         if not self.key_on_robot:
             return self.problems
         return tuple(
@@ -344,11 +353,14 @@ class OpenedEnclave:
         )
 
     def domains(self) -> DomainSet | None:
-        """Return the domains that governance names, or None without governance."""
+        """Return the ROS domains that the governance names, or None without governance."""
         return self.governance.domains().closed() if self.governance else None
 
     def valid_until(self) -> datetime | None:
-        """Return the moment until which it is loadable: the first expiry of its parts."""
+        """Return the first expiry among its certificates and its grant, in UTC.
+
+        Return None if the certificate or the permissions cannot be read.
+        """
         if not (self.certificate and self.permissions):
             return None
         certificates = (self.certificate, self.identity_ca, self.permissions_ca)
@@ -359,9 +371,9 @@ class OpenedEnclave:
 
 
 def open_enclave(folder: Path, *, now: datetime, domain: int | None = None) -> OpenedEnclave:
-    """Return the content of an enclave's files at ``now``, and the problems in them.
+    """Return the content of an enclave's files, and their problems at the time ``now``.
 
-    With ``domain``, also whether it may join that ROS domain.
+    With ``domain``, also check whether the enclave may join that ROS domain.
     """
     return _EnclaveFiles(folder, now).check(domain)
 
@@ -373,7 +385,7 @@ _EXPIRY_OF_PERMISSIONS = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_V
 _ENCRYPTED = re.compile(rb"ENCRYPTED")
 _SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
 
-# Enclaves of a keystore share some files, which are read only once.
+# The enclaves of a keystore share some files, which are parsed only once.
 _load_certificate = lru_cache(maxsize=8)(load_certificate)
 _parse_governance = lru_cache(maxsize=8)(parse_governance)
 
@@ -390,13 +402,13 @@ def _signed_document(message: bytes, authority: x509.Certificate | None) -> byte
 def _load_crl(
     data: bytes, authority: x509.Certificate | None
 ) -> tuple[x509.CertificateRevocationList, bool]:
-    """Return a revocation list, and whether that authority signed it."""
+    """Return a revocation list, and whether ``authority`` signed it (True without one)."""
     crl = x509.load_pem_x509_crl(data)
     return crl, authority is None or signed_by(crl, authority)
 
 
 class _EnclaveFiles:
-    """Checker of the files of one enclave, which collects its problems."""
+    """Checker of the files of one enclave, which collects the problems."""
 
     def __init__(self, folder: Path, now: datetime) -> None:
         self._folder = folder
@@ -475,7 +487,7 @@ class _EnclaveFiles:
         return certificate
 
     def _check_validity(self, name: str, validity: Window, faults: tuple[Fault, Fault]) -> None:
-        """Note the first of ``faults`` if it expired, the second if it is not valid yet."""
+        """Add the first of ``faults`` if ``validity`` is over, the second if it has not begun."""
         expired, not_yet_valid = faults
         if self._now > validity.not_after:
             self._add(name, f"it expired at {iso(validity.not_after)}", expired)
@@ -512,17 +524,19 @@ class _EnclaveFiles:
         try:
             crl, authentic = _load_crl(read_bytes(path, "revocation list"), ca)
         except (SrosError, ValueError):
-            text = "it is not a revocation list, and DDS then refuses everybody"
+            text = "it is not a revocation list, so DDS refuses every participant"
             self._add(CRL_FILE, text, Fault.CRL_MALFORMED)
             return
         if not authentic:
-            text = "it is not of the identity CA, and DDS then refuses everybody"
+            text = "it is not of the identity CA, so DDS refuses every participant"
             self._add(CRL_FILE, text, Fault.CRL_ISSUER)
         if crl.last_update_utc > self._now:
-            text = f"it is not valid before {iso(crl.last_update_utc)}: everybody is refused"
+            text = (
+                f"it is not valid before {iso(crl.last_update_utc)}: every participant is refused"
+            )
             self._add(CRL_FILE, text, Fault.CRL_NOT_YET_VALID)
         if crl.next_update_utc and crl.next_update_utc < self._now:
-            text = f"it expired at {iso(crl.next_update_utc)}: everybody is refused"
+            text = f"it expired at {iso(crl.next_update_utc)}: every participant is refused"
             self._add(CRL_FILE, text, Fault.CRL_EXPIRED)
         if certificate and crl.get_revoked_certificate_by_serial_number(certificate.serial_number):
             self._add(CERTIFICATE_FILE, "it is revoked by crl.pem", Fault.REVOKED)
@@ -570,5 +584,5 @@ class _EnclaveFiles:
             self._add(name, error.what, Fault.PERMISSIONS_MALFORMED)
         rules = [rule for rule in grant.rules if rule.allow]
         if domain is not None and not any(domain in rule.domains.closed() for rule in rules):
-            text = f"no rule of it allows anything in domain {domain}"
+            text = f"none of its rules allows anything in domain {domain}"
             self._add(name, text, Fault.PERMISSIONS_DOMAIN)

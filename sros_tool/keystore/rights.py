@@ -1,7 +1,7 @@
 """The rights that a policy, a permissions document, an enclave or a keystore gives.
 
-DDS loads ``permissions.p7s``, so that file counts in enclaves and keystores.  Its signature is
-verified against the permissions CA next to it.
+The rights of enclaves and keystores are read from ``permissions.p7s``, which is the file that DDS
+loads.  Its signature is verified with the permissions CA next to it.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ _COMMON_NAME = re.compile(r"(?:^|[,/])\s*CN\s*=\s*(/[^,]*?)\s*(?:,|$)")
 class RightsSource:
     """The rights that a file or folder gives.
 
-    ``kind`` is policy, permissions, enclave or keystore.  ``scope`` are the enclaves that it
-    can give rights to; None for all.  ``sound`` is False if DDS would refuse a part of it:
-    a signature that does not verify, permissions that are missing or cannot be read.
+    ``kind`` is "policy", "permissions", "enclave" or "keystore".  ``scope`` are the enclaves that
+    it can give rights to; None for all.  ``sound`` is False if DDS would refuse a part of it: a
+    signature that does not verify, or permissions that are missing or malformed.
     """
 
     path: Path
@@ -53,11 +53,11 @@ class RightsSource:
 def load_rights(path: Path) -> RightsSource:
     """Return the rights that ``path`` gives.
 
-    It is a policy file, ``permissions.p7s`` or ``permissions.xml``, the folder of an enclave, or a
+    ``path`` is a policy file, ``permissions.p7s`` or ``permissions.xml``, an enclave folder, or a
     keystore.
 
     Raises:
-        DocumentError: ``path`` is anything else.
+        DocumentError: ``path`` is anything else, or malformed.
     """
     if path.is_dir():
         if is_keystore(path):
@@ -112,7 +112,10 @@ def _keystore(root: Path) -> RightsSource:
 
 @dataclass(slots=True)
 class _Reader:
-    """Reader of permissions, which collects notes about them."""
+    """Reader of permissions documents, which collects notes about them.
+
+    ``unsure`` are notes about documents whose signature is missing or was not verified.
+    """
 
     sound: bool = True
     unsure: list[Note] = field(default_factory=list)
@@ -130,7 +133,7 @@ class _Reader:
             self._verify(signed, file, what)
             data = signed.document
         else:
-            text = f"{what}: not signed. DDS loads {PERMISSIONS_FILE} instead."
+            text = f"{what}: the file is not signed; DDS loads {PERMISSIONS_FILE} instead."
             self.unsure.append(Note("rights.unsigned", text))
         permissions = parse_permissions(data, f"'{file}'")
         self.notes += [
@@ -144,8 +147,8 @@ class _Reader:
         try:
             authority = self._authority_for(file)
             if authority is None:
-                text = f"{what}: the signature was not verified, for no {PERMISSIONS_CA_FILE} "
-                text += "lies with it."
+                text = f"{what}: the signature was not verified, because there is no "
+                text += f"{PERMISSIONS_CA_FILE} next to the file."
                 self.unsure.append(Note("rights.not-verified", text))
                 return
             signed.verify(authority)
@@ -165,7 +168,7 @@ class _Reader:
 
 
 def _first_of_each(permissions: Permissions) -> dict[str, Grant]:
-    """Return the grant of each enclave: DDS reads the first one of a subject only."""
+    """Map each enclave to its first grant, which is the only one that DDS reads."""
     grants: dict[str, Grant] = {}
     for grant in permissions.grants:
         grants.setdefault(_enclave_of(grant), grant)
@@ -179,24 +182,24 @@ def _enclave_of(grant: Grant) -> str:
 
 
 def _left_out(grants: Iterable[Grant]) -> Iterator[Note]:
-    """Yield notes on parts of a grant that cannot be said in ROS terms."""
+    """Yield notes on the parts of grants that the rights in ROS terms leave out."""
     seen: set[str] = set()
     for grant in grants:
         name = _enclave_of(grant)
         if name in seen:
-            text = f"a further grant for {grant.subject} is left out: DDS reads the first one only."
+            text = f"another grant for {grant.subject} is ignored: DDS reads only the first one."
             yield Note("rights.later-grant", text)
             continue
         seen.add(name)
         if grant.default_allow:
-            text = "what no rule names is allowed by <default>, except on Fast DDS."
+            text = "<default> allows all topics that no rule names, except with Fast DDS."
             yield Note("rights.default-allow", text)
         if any(c.partitions for r in grant.rules for c in (*r.publish, *r.subscribe)):
-            yield Note("rights.partitions", "its partitions are left out of the comparison.")
+            yield Note("rights.partitions", "its partitions are ignored.")
         if len({rule.domains for rule in grant.rules}) > 1:
-            text = "its rules are for different domains, which are left out of the comparison."
+            text = "its rules are for different domains, and the domains are ignored."
             yield Note("rights.domains", text)
         kinds = [rule.allow for rule in grant.rules]
         if False in kinds[kinds.index(True) if True in kinds else len(kinds) :]:
-            text = "a deny_rule stands after an allow_rule; DDS takes the first one that matches."
+            text = "a deny_rule follows an allow_rule, and the first rule that matches decides."
             yield Note("rights.rule-order", text)

@@ -1,6 +1,6 @@
-"""Keystore templates: named sets of choices, each one readable TOML file.
+"""Keystore templates: named settings for new keystores, as TOML files.
 
-A keystore keeps a copy of its choices (`sros.toml`), so that later additions follow them.
+A keystore keeps a copy of its settings (``sros.toml``), which apply to enclaves added later.
 """
 
 from __future__ import annotations
@@ -22,18 +22,20 @@ from sros_tool.xml import read_bytes
 
 DEFAULT_TEMPLATE = "development"
 EVERYTHING, NODE_BASICS = "everything", "node_basics"
-_LONGEST_AUTHORITY_NAME = 40  # characters; the common name adds the role and a number
+_LONGEST_AUTHORITY_NAME = 40  # characters; a common name also has the role and a number
 _DATA_LEVELS = (Level.NONE, Level.SIGN, Level.ENCRYPT)
 _KINDS: dict[str, str] = {"topic": "topics", "service": "services", "action": "actions"}
+_TYPES: dict[type, str] = {str: "a string", bool: "a boolean", list: "a list"}
 
 
 @dataclass(frozen=True, slots=True)
 class Template:
-    """The choices for a keystore.
+    """The settings of a keystore.
 
-    Durations count from the creation of a certificate or document.  ``identity_key`` and
-    ``permissions_key`` are the URIs of CA keys outside of the keystore.  With ``unique_subject``,
-    the subject of every certificate has a unique part.
+    ``authority_name`` begins the common names of its CAs.  Durations count from the creation of a
+    certificate or document.  ``default_permissions`` is `EVERYTHING` or `NODE_BASICS`.
+    ``identity_key`` and ``permissions_key`` are the URIs of CA keys outside of the keystore.  With
+    ``unique_subject``, the subject of every certificate has a unique part.
     """
 
     name: str
@@ -57,10 +59,10 @@ def template_names() -> tuple[str, ...]:
 
 
 def load_template(choice: str) -> Template:
-    """Return the template of that name, or in the file of that path.
+    """Return the shipped template named ``choice``, or the template in the TOML file ``choice``.
 
     Raises:
-        DocumentError: there is none, or it holds anything that is not understood.
+        DocumentError: the template does not exist, or is malformed.
     """
     if choice in template_names():
         return read_template(templates_dir() / f"{choice}.toml")
@@ -75,7 +77,7 @@ def load_template(choice: str) -> Template:
 
 
 def read_template(path: Path) -> Template:
-    """Return the template in a file; raise `DocumentError` if it is not understood."""
+    """Return the template in a file; raise `DocumentError` if it is malformed."""
     data = read_bytes(path, "template")
     try:
         text = data.decode()
@@ -85,15 +87,20 @@ def read_template(path: Path) -> Template:
             f"the template '{path}' is not valid TOML", f"{error}.".capitalize()
         ) from error
     except _TemplateError as error:
-        raise DocumentError(f"the template '{path}' is not understood", f"{error}.") from error
+        raise DocumentError(f"the template '{path}' is not valid", f"{error}.") from error
 
 
 class _TemplateError(ValueError):
-    pass
+    """A key of a template that is missing, unknown, or has a value that is not valid."""
 
 
 def parse_template(text: str, name: str) -> Template:
-    """Return the template in a TOML text; an unknown key is an error, because it may be a typo."""
+    """Parse a template from TOML text; ``name`` is its name if the text has none.
+
+    Raises:
+        tomllib.TOMLDecodeError: the text is not TOML.
+        _TemplateError: a key is missing, unknown (it may be a typo), or has a wrong value.
+    """
     table = _Table(parse_toml(text), "")
     authorities = table.table("authorities")
     certificates = table.table("certificates")
@@ -120,7 +127,7 @@ def parse_template(text: str, name: str) -> Template:
 
 
 def render_template(template: Template) -> str:
-    """Return the template as TOML text; `parse_template` returns the same value again."""
+    """Return the template as TOML text, from which `parse_template` returns an equal template."""
     protection = template.protection
     lines = [
         f"name = {_toml(template.name)}",
@@ -158,8 +165,8 @@ def _authority_name(table: _Table) -> str:
     name = table.text("name", "sros")
     if not 0 < len(name) <= _LONGEST_AUTHORITY_NAME or not name.isprintable():
         raise _TemplateError(
-            f"{table.path}.name is {name!r}, not a text of 1 to {_LONGEST_AUTHORITY_NAME} "
-            "printable characters"
+            f"{table.path}.name is {name!r}, which is not 1 to {_LONGEST_AUTHORITY_NAME} printable "
+            "characters"
         )
     return name
 
@@ -174,7 +181,7 @@ def _topic_lines(protection: TopicProtection) -> list[str]:
 def _toml(value: str | bool) -> str:
     if isinstance(value, bool):
         return json.dumps(value)
-    # A JSON string is a TOML basic string, except for one character that TOML wants escaped.
+    # A JSON string is a TOML basic string, except for one character that TOML requires escaped.
     return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
@@ -183,7 +190,7 @@ _OF_DOMAIN: dict[str, Any] = {
     for field in fields(DomainProtection)
     if field.name not in ("default", "named")
 }
-"""The settings of [protection] for the whole domain, with their usual values."""
+"""The keys of [protection] for the whole domain, with their defaults."""
 
 
 def _protection(table: _Table) -> DomainProtection:
@@ -194,8 +201,8 @@ def _protection(table: _Table) -> DomainProtection:
     domain = DomainProtection(**values)
     if domain.allow_unauthenticated_participants and domain.rtps is not Level.NONE:
         raise _TemplateError(
-            'protection.allow_unauthenticated_participants goes with rtps = "NONE" only, since '
-            "Fast DDS refuses to start otherwise"
+            'protection.allow_unauthenticated_participants needs rtps = "NONE", because Fast DDS '
+            "refuses to start otherwise"
         )
     default = _topic_protection(table.table("default"), TopicProtection())
     named = []
@@ -206,7 +213,7 @@ def _protection(table: _Table) -> DomainProtection:
                 problem = expression_problem(name)
                 if problem or name.startswith("~"):
                     raise _TemplateError(
-                        f"{entry.path}.names holds {name!r}, which is not a valid {item} name: "
+                        f"{entry.path}.names has {name!r}, which is not a valid {item} name: "
                         f"{problem or 'it is private to a node.'}".rstrip(".")
                     )
             protection = _topic_protection(entry, default)
@@ -228,7 +235,7 @@ def _topic_protection(table: _Table, default: TopicProtection) -> TopicProtectio
 
 
 class _Table:
-    """A TOML table whose keys are taken one by one; an unused key is an error."""
+    """A TOML table; each method removes a key, and `finish` refuses the keys that are left."""
 
     def __init__(self, values: object, path: str) -> None:
         if not isinstance(values, dict):
@@ -241,7 +248,7 @@ class _Table:
         if value is None:
             raise _TemplateError(f"{self._at(key)} is missing")
         if not isinstance(value, kind):
-            raise _TemplateError(f"{self._at(key)} is {value!r}, not a {kind.__name__}")
+            raise _TemplateError(f"{self._at(key)} is {value!r}, not {_TYPES[kind]}")
         return value
 
     def _at(self, key: str) -> str:

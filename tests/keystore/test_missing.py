@@ -37,13 +37,13 @@ def test_who_may_be_meant(name: str, meant: tuple[str, ...]) -> None:
 def test_the_error_names_who_may_be_meant_and_does_not_say_to_make_it() -> None:
     text = str(no_such_enclave(Path("robot"), "/telop", THERE))
     assert text == (
-        "enclave /telop does not exist in keystore 'robot'. Perhaps /mobile_robot/teleop is meant."
+        "enclave /telop does not exist in keystore 'robot'. Perhaps you mean /mobile_robot/teleop."
     )
 
 
 def test_where_nobody_is_meant_the_error_says_who_is_there() -> None:
     text = str(no_such_enclave(Path("robot"), "/camera", [*THERE, "/x", "/y"]))
-    assert "/x and 1 more. Make it with `sros create_enclave robot /camera`." in text
+    assert "/x and 1 more. Create it with `sros create_enclave robot /camera`." in text
 
 
 def test_a_name_that_could_not_be_made_is_told_so() -> None:
@@ -64,7 +64,7 @@ def test_of_a_revoked_enclave_it_says_since_when(tmp_path: Path) -> None:
     (entry, *_) = (e for e in read_ledger(root) if e.what == "revocation" and e.serial == serial)
     said = (
         f"enclave /camera of keystore '{root}' was revoked at {entry.time} (keyCompromise). Its "
-        f"files lie in '{root}/revoked/{serial}'. If it is needed again, make it again with "
+        f"files are in '{root}/revoked/{serial}'. To use it again, create it with "
         f"`sros create_enclave {root} /camera`."
     )
     assert str(no_such_enclave(root, "/camera", list_enclaves(root))) == said

@@ -666,7 +666,7 @@ def test_a_list_of_files_that_a_stranger_made_up_moves_nothing(
     made_up_stage(keystore, live, [[path, "", ""]])
     (keystore / STAGE / live / stage_of.number(path)).write_text("mine")
     before = snapshot(keystore.parent)
-    with pytest.raises(KeystoreError, match=r"no path in a keystore.*restore"):
+    with pytest.raises(KeystoreError, match=r"not a path in a keystore.*restore"):
         create_enclaves(keystore, ["/new"], now=NOW)
     assert snapshot(keystore.parent) == before
 
@@ -721,7 +721,7 @@ def test_a_stage_of_an_unknown_format_is_refused_and_not_touched(
         lambda: create_enclaves(keystore, ["/new"], now=NOW),
         lambda: recovery.tidy(keystore),
     ):
-        with pytest.raises(KeystoreError, match=r"unknown to this version.*version of sros that"):
+        with pytest.raises(KeystoreError, match=r"does not know the format.*version of sros that"):
             verb()
         assert snapshot(keystore) == before
 

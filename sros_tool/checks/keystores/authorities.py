@@ -333,7 +333,7 @@ def _revocation_list(keystore: CheckedKeystore) -> Iterator[Finding]:
         return
     file = keystore.shown(CRL)
     if crl.next_update - keystore.now < _LIST_SOON:
-        text = f"it expires at {iso(crl.next_update)}, and DDS then refuses everybody"
+        text = f"it expires at {iso(crl.next_update)}, and DDS then refuses every participant"
         yield CRL_EXPIRES_SOON.found("revocation list", text, file)
     identity = keystore.authorities.get(IDENTITY, ())
     if identity and not any(signed_by(crl.list, each) for each in identity):

@@ -1,1 +1,1 @@
-"""Atomic changes of a keystore: stage, commit, recovery."""
+"""Atomic changes of many files of a keystore: staging, commit and recovery."""

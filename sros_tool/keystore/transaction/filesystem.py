@@ -1,4 +1,4 @@
-"""File system operations of a transaction: locks, flushes, exchanges, moves of folders."""
+"""File system operations of a transaction: locks, flushes, exchanges of names, and moves."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def lock_folder(folder: Path, wait: float | None = None) -> int:
     """Lock a folder for this process; return the file descriptor that holds the lock.
 
     The lock is on the folder itself, so that no lock file remains.  ``wait`` is in seconds
-    (default: `LOCK_SECONDS`).
+    (default: 60).
 
     Raises:
-        KeystoreError: another process held the lock all the time.
+        KeystoreError: another process held the lock for ``wait`` seconds.
     """
     wait = _LOCK_SECONDS if wait is None else wait
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -45,13 +45,13 @@ def lock_folder(folder: Path, wait: float | None = None) -> int:
                 raise KeystoreError(
                     f"keystore '{folder}' is busy",
                     f"Another process has been writing to it for {wait:.0f} seconds.",
-                    "Try again when it is done.",
+                    "Try again when that process has finished.",
                 ) from None
             time.sleep(0.02)
 
 
 def flush_file_system(folder: Path) -> None:
-    """Flush the file system of ``folder`` once: a flush for each file would cost far more."""
+    """Flush the whole file system of ``folder`` to disk; to flush each file would take longer."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         if _c_library().syncfs(handle) != 0:
@@ -64,7 +64,7 @@ def flush_file_system(folder: Path) -> None:
 
 
 def flush_folder(folder: Path) -> None:
-    """Flush a folder to the disk: the names in it, not the contents of its files."""
+    """Flush the entries of a folder to disk, without the contents of its files."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)
@@ -73,9 +73,10 @@ def flush_folder(folder: Path) -> None:
 
 
 def exchange(one: str, other: str) -> bool:
-    """Atomically exchange two names (``renameat2``); return whether that was possible.
+    """Atomically exchange two paths (``renameat2``).
 
-    Nothing is changed if the kernel, the C library or the file system does not support it.
+    Return False, without a change, if the kernel, the C library or the file system does not support
+    the exchange.
     """
     try:
         rename = _c_library().renameat2
@@ -97,10 +98,10 @@ def _c_library() -> ctypes.CDLL:
 
 
 def is_folder(path: str | Path) -> bool:
-    """Return whether a real folder is at ``path``.
+    """Return whether ``path`` is a folder and not a symbolic link; False if it does not exist.
 
     Raises:
-        KeystoreError: something else is there.
+        KeystoreError: ``path`` is a file or a symbolic link.
     """
     try:
         mode = os.lstat(path).st_mode
@@ -110,15 +111,19 @@ def is_folder(path: str | Path) -> bool:
         raise KeystoreError(
             f"'{path}' is a symbolic link",
             "Files written below it would be stored elsewhere, outside of the keystore.",
-            "Put a real folder in its place.",
+            "Replace the link with a real folder.",
         )
     if not stat.S_ISDIR(mode):
-        raise KeystoreError(f"'{path}' is in the way", "It is not a folder.")
+        raise KeystoreError(f"'{path}' is in the way", "It is not a folder.", "Move it away.")
     return True
 
 
 def make_folders(root: Path, folders: Iterable[str]) -> None:
-    """Create the missing folders; raise `KeystoreError` if one is not a real folder."""
+    """Create the missing folders below ``root``.
+
+    Raises:
+        KeystoreError: one of the paths is a file or a symbolic link.
+    """
     seen = {""}
 
     def make(folder: str) -> None:
@@ -134,9 +139,9 @@ def make_folders(root: Path, folders: Iterable[str]) -> None:
 
 
 def move_into_place(source: Path, target: Path) -> None:
-    """Move everything below ``source``, if it exists, to the same place below ``target``.
+    """Move everything below ``source``, if it exists, to the same paths below ``target``.
 
-    The enclaves come last: a folder without them does not count as a keystore yet.
+    The folder of the enclaves is moved last: a folder without it does not count as a keystore yet.
     """
     if not source.is_dir():
         return
@@ -152,11 +157,11 @@ def move_into_place(source: Path, target: Path) -> None:
 
 
 def remove_empty_folders(root: Path, paths: Iterable[str]) -> None:
-    """Remove the parent folders of ``paths`` that are empty, except at the first level."""
+    """Remove the empty parent folders of ``paths``, except the folders directly in ``root``."""
     for path in paths:
         folder = path.rpartition("/")[0]
         with contextlib.suppress(OSError):  # it is not empty
             while "/" in folder:
-                with contextlib.suppress(FileNotFoundError):  # removed before an interruption
+                with contextlib.suppress(FileNotFoundError):  # an earlier recovery removed it
                     os.rmdir(root / folder)
                 folder = folder.rpartition("/")[0]

@@ -1,8 +1,8 @@
-"""Recovery: completes or undoes an interrupted transaction of a keystore.
+"""Recovery of a keystore: completes a committed transaction, or undoes an uncommitted one.
 
-Every transaction ends with it: after the commit, plain files replace the links into the stage, and
-new folders move to their places.  Each step can be repeated and skips finished work, so an
-interrupted recovery is recovered, too.
+Every transaction ends with a recovery: after the commit, plain files replace the links into the
+stage, and new folders move to their places.  Each step can be repeated and skips finished work, so
+an interrupted recovery can be repeated, too.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def tidy(root: Path) -> None:
     """Complete or undo an interrupted transaction of the keystore, if there is one.
 
     Raises:
-        KeystoreError: the keystore is busy, or the stage is not one of this version.
+        KeystoreError: the keystore is busy, or another version of sros wrote the stage.
     """
     if (root / STAGE).is_dir():
         lock = filesystem.lock_folder(root)
@@ -59,19 +59,19 @@ def tidy(root: Path) -> None:
 
 
 def recover(root: Path) -> None:
-    """Complete or undo an interrupted transaction, for a caller that holds the lock."""
+    """Complete or undo an interrupted transaction, if there is one; the caller holds the lock."""
     stage = root / STAGE
     if not is_folder(stage):
         return
     live = stage / LIVE
     to = _target(stage)
     if to == AFTER:
-        _LOG.info("moving what was committed to its place in the keystore '%s'", root)
+        _LOG.info("moving the committed files to their places in the keystore '%s'", root)
         _complete(root, stage, read_manifest(stage))
         move_into_place(stage / ADDED, root)
         filesystem.flush_folder(root)
     elif to == BEFORE:
-        _LOG.info("undoing the transaction that was not committed in the keystore '%s'", root)
+        _LOG.info("undoing an uncommitted transaction in the keystore '%s'", root)
         _undo(root, stage, read_manifest(stage))
     with contextlib.suppress(FileNotFoundError):
         os.unlink(live)  # first: without it, the rest of the stage only needs to be removed
@@ -82,7 +82,7 @@ def _target(stage: Path) -> str | None:
     """Return the target of the link ``live``: BEFORE, AFTER, or None if nothing was changed yet.
 
     Raises:
-        KeystoreError: the stage is not of this version's format (`stage`); nothing is touched.
+        KeystoreError: the stage has a file or folder that this version does not know.
     """
     strange = next((name for name in sorted(os.listdir(stage)) if not _KNOWN.fullmatch(name)), "")
     to = None
@@ -92,7 +92,7 @@ def _target(stage: Path) -> str | None:
     if strange:
         raise KeystoreError(
             f"the interrupted change in '{stage}' can be neither completed nor undone",
-            f"Its format is unknown to this version of sros: {strange!r} is not part of it.",
+            f"This version of sros does not know the format: {strange!r} is not part of it.",
             "Complete it with the version of sros that began it, or restore the keystore from a "
             "backup.",
         )
@@ -100,7 +100,7 @@ def _target(stage: Path) -> str | None:
 
 
 def _complete(root: Path, stage: Path, moves: Sequence[Move]) -> None:
-    """Replace the links into the stage by the new files and links."""
+    """Replace the links into the stage with the new files and links."""
     make_folders(root, {move.path.rpartition("/")[0] for move in moves})
 
     def complete(part: Sequence[Move]) -> None:
@@ -115,7 +115,7 @@ def _complete(root: Path, stage: Path, moves: Sequence[Move]) -> None:
                     _symlink(after, spare)
                     os.replace(spare, real)
             else:
-                with contextlib.suppress(FileNotFoundError):  # it was done before
+                with contextlib.suppress(FileNotFoundError):  # an earlier recovery moved it
                     os.replace(f"{stage}/{AFTER}/{name}", real)
             if before is not None:
                 with contextlib.suppress(FileNotFoundError):
@@ -126,7 +126,7 @@ def _complete(root: Path, stage: Path, moves: Sequence[Move]) -> None:
 
 
 def _undo(root: Path, stage: Path, moves: Sequence[Move]) -> None:
-    """Restore everything that a link into the stage replaced."""
+    """Restore the files that links into the stage replaced."""
     spare = f"{stage}/spare"
     for path, before, _ in moves:
         real = f"{root}/{path}"
@@ -142,7 +142,7 @@ def _undo(root: Path, stage: Path, moves: Sequence[Move]) -> None:
 
 
 def _symlink(text: str, path: str) -> None:
-    with contextlib.suppress(FileNotFoundError):  # left by an interruption
+    with contextlib.suppress(FileNotFoundError):  # left by an interrupted recovery
         os.unlink(path)
     os.symlink(text, path)
 

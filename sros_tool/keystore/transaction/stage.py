@@ -2,8 +2,9 @@
 
 ``.sros-transaction`` in the keystore holds
 
-- ``after``: new files and links for existing folders, flat, each named by the `number` of its path;
-- ``before``: the files that they replace, by the same numbers, from the start of the change;
+- ``after``: new files and links for existing folders, in one flat folder, each named by the
+  `number` of its path;
+- ``before``: the replaced files and links, named in the same way; created by the commit;
 - ``live``: a link to ``before`` or ``after``; pointing it at ``after`` is the commit;
 - ``added``: new folders, as they will be in the keystore;
 - ``manifest.json``: a `Move` for each path in ``after``, and for each path to remove.
@@ -29,8 +30,8 @@ _VERSION = 2
 class Move(NamedTuple):
     """The change of one path in an existing folder of the keystore.
 
-    ``before`` and ``after`` describe the content of the path: None for nothing, "" for a file, and
-    the target text for a symbolic link.
+    ``before`` and ``after`` say what is at the path: None for nothing, "" for a file, and the
+    target of a symbolic link.
     """
 
     path: str
@@ -40,7 +41,10 @@ class Move(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One file that a transaction creates or replaces; ``path`` is relative to the keystore."""
+    """One file or link that a transaction changes.
+
+    ``action`` is "create", "replace" or "remove"; ``path`` is relative to the keystore.
+    """
 
     action: str
     path: str
@@ -48,24 +52,24 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Staged:
-    """The staged changes of a forked worker, for the process that commits."""
+    """The changes that a forked worker staged, sent to the process that commits."""
 
     changes: tuple[Change, ...]
     moves: tuple[Move, ...]
 
 
 def number(path: str) -> str:
-    """Return the name of a path in the stage; short, so that a link to it fits into an inode."""
+    """Return the name in the stage for a path; it is short, so that a link fits into an inode."""
     return hashlib.blake2b(os.fsencode(path), digest_size=8).hexdigest()
 
 
 def bridge_text(path: str) -> str:
-    """Return the target text of the link that is at ``path`` during the change."""
+    """Return the target of the link that is at ``path`` during the commit."""
     return "../" * path.count("/") + f"{STAGE}/{LIVE}/{number(path)}"
 
 
 def seen_from_stage(path: str, text: str) -> str:
-    """Return the target text of the link at ``path``, rewritten for a link in the stage."""
+    """Return the link target ``text`` of ``path``, rewritten for a link in the stage."""
     return text if text.startswith("/") else f"../../{path.rpartition('/')[0]}/{text}"
 
 
@@ -77,21 +81,21 @@ def point_live(stage: Path, to: str) -> None:
 
 
 def write_manifest(stage: Path, moves: Sequence[Move]) -> None:
-    """Write the list of all moves; flush it to the disk before the first move."""
+    """Write the manifest; the caller flushes it to disk before the first move."""
     with open(stage / MANIFEST, "x", encoding="utf-8") as file:
         file.write(json.dumps({"version": _VERSION, "moves": moves}))
 
 
 def read_manifest(stage: Path) -> tuple[Move, ...]:
-    """Return the list of moves.
+    """Return the moves in the manifest.
 
     Raises:
-        KeystoreError: it cannot be read, or no transaction of this version wrote it.
+        KeystoreError: the manifest is damaged, or another version of sros wrote it.
     """
     try:
         read = json.loads((stage / MANIFEST).read_bytes())
         if read["version"] != _VERSION:
-            raise ValueError(f"it is not of version {_VERSION}")
+            raise ValueError(f"its version is not {_VERSION}")
         return tuple(_move(*each) for each in read["moves"])
     except (OSError, ValueError, TypeError, KeyError) as error:
         raise KeystoreError(
@@ -103,10 +107,10 @@ def read_manifest(stage: Path) -> tuple[Move, ...]:
 
 
 def _move(path: str, before: str | None, after: str | None) -> Move:
-    # A keystore may come from an archive, with a stage that somebody made up.
+    # A keystore may come from an archive with a forged stage.
     for each in (before, after):
         if each is not None and not isinstance(each, str):
-            raise ValueError(f"{each!r} is no file")
+            raise ValueError(f"{each!r} is not the state of a path")
     if not path or not set(path.split("/")).isdisjoint({"", ".", "..", STAGE}):
-        raise ValueError(f"{path!r} is no path in a keystore")
+        raise ValueError(f"{path!r} is not a path in a keystore")
     return Move(path, before, after)

@@ -1,13 +1,13 @@
-"""Changes many files of a keystore as one: all of them, or none, whenever the machine stops.
+"""Transactions: change all of many files in a keystore, or none, even if the machine stops.
 
-New files are written below ``.sros-transaction`` in the keystore (`stage`).  Existing files change
-together at a single moment (`Transaction.commit`): each path first becomes a link to
-``.sros-transaction/live/<number>``; ``live`` is a link to ``before``, so that this is still the
-old content.  Then ``live`` is pointed at ``after``: that is the commit.  Finally plain files
-replace the links, and new folders move to their places (`recovery`).  If the machine stops at any
-moment, DDS finds either all old files or all new ones, and the next transaction tidies up.
+New files are written below ``.sros-transaction`` in the keystore (`stage`).  The commit
+(`Transaction.commit`) changes existing files in three steps.  Each path becomes a link to
+``.sros-transaction/live/<number>``; ``live`` is a link to ``before``, so the content is still the
+old one.  Then ``live`` is pointed at ``after``, which changes all files at once.  Finally plain
+files replace the links, and new folders move to their places (`recovery`).  If the machine stops at
+any moment, DDS finds either all old files or all new files, and the next transaction recovers.
 
-A new keystore is made in a folder next to its path, and one rename puts it in place.
+A new keystore is created in a sibling folder and renamed to its path.
 """
 
 from __future__ import annotations
@@ -50,11 +50,11 @@ _LOG = logging.getLogger(__name__)
 
 
 class Transaction:
-    """A change of many files of a keystore, with the lock on it.
+    """An atomic change of many files of a keystore, which is locked meanwhile.
 
     Use it as a context manager; without `commit` nothing changes.  With ``fresh``, the keystore may
-    be new, and then appears as a whole; otherwise it must exist.  With ``dry_run`` nothing is
-    written, and ``changes`` lists the files that would be.
+    be new; otherwise it must exist.  With ``dry_run`` nothing is written, and ``changes`` lists the
+    changes that would be made.
     """
 
     def __init__(self, root: Path, *, fresh: bool = False, dry_run: bool = False) -> None:
@@ -67,12 +67,12 @@ class Transaction:
         self._stage = root / STAGE
         self._added = f"{self._stage}/{ADDED}"
         self._staged: set[str] = set()
-        self._folders: dict[str, bool] = {}  # whether the folder is there already
+        self._folders: dict[str, bool] = {}  # whether the folder exists in the keystore
         self._moves: list[Move] = []
         self._undo: list[Callable[[], None]] = []
 
     def on_failure(self, undo: Callable[[], None]) -> None:
-        """Call ``undo`` when the transaction ends without a commit."""
+        """Have ``undo`` called if the transaction ends without a commit."""
         self._undo.append(undo)
 
     # ── begin and end ──────────────────────────────────────────────────────────────────────
@@ -92,7 +92,7 @@ class Transaction:
             self._remove_stale_siblings()
             self._make_parents()
             self._make_sibling()
-            _LOG.info("began to make the keystore '%s'", self.root)
+            _LOG.info("began to create the keystore '%s'", self.root)
             return
         self._lock = filesystem.lock_folder(self.root)
         recover(self.root)
@@ -131,7 +131,7 @@ class Transaction:
             missing.append(parent)
             parent = parent.parent
         for each in reversed(missing):
-            with contextlib.suppress(FileExistsError):  # another process made it meanwhile
+            with contextlib.suppress(FileExistsError):  # another process created it meanwhile
                 each.mkdir()
                 self._made_parents.insert(0, each)
 
@@ -140,7 +140,7 @@ class Transaction:
             self._stage = self.root.parent / f".{self.root.name}.sros-{secrets.token_hex(4)}"
             self._added = f"{self._stage}"
             self._stage.mkdir(mode=0o700)
-            # Until it is locked, another process may take it for a stale one and remove it.
+            # Until the folder is locked, another process may take it for a stale one and remove it.
             with contextlib.suppress(FileNotFoundError):
                 lock = filesystem.lock_folder(self._stage)
                 if self._stage.exists():
@@ -158,7 +158,7 @@ class Transaction:
     # ── staging ──────────────────────────────────────────────────────────────────
 
     def write(self, path: str, data: bytes, *, private: bool = False) -> None:
-        """Stage a file; only its owner can ever read a ``private`` one."""
+        """Stage a file with the content ``data``; a ``private`` file always has mode 0600."""
         staged = self._prepare(path, "")
         if staged is None:
             return
@@ -191,7 +191,10 @@ class Transaction:
         self._moves.append(Move(path, before, None))
 
     def _prepare(self, path: str, after: str) -> str | None:
-        """Return the path to write a staged file to; ``after`` means the same as in `Move`."""
+        """Record a change of ``path``, and return the path of its staged file.
+
+        ``after`` is as in `Move`.  Return None in a dry run.
+        """
         exists = self._prepare_folder(path.rpartition("/")[0])
         before = self._at(path) if exists else None
         self._begin_change(path, "create" if before is None else "replace")
@@ -215,11 +218,11 @@ class Transaction:
         except FileNotFoundError:
             return None
         if stat.S_ISDIR(mode):
-            raise KeystoreError(f"'{real}' is in the way", "It is a folder.")
+            raise KeystoreError(f"'{real}' is in the way", "It is a folder.", "Move it away.")
         return os.readlink(real) if stat.S_ISLNK(mode) else ""
 
     def _prepare_folder(self, path: str, *, wanted: bool = True) -> bool:
-        """Stage a folder if it is not in the keystore yet; return whether it is."""
+        """Return whether a folder exists in the keystore; if not and ``wanted``, stage it."""
         if path in self._folders:
             return self._folders[path]
         exists = not self._new_root
@@ -245,7 +248,7 @@ class Transaction:
     # ── by forked workers ───────────────────────────────────────────────────────────────
 
     def mark(self) -> tuple[int, int]:
-        """Return a mark of what is staged so far, for `since`."""
+        """Return a mark of the changes staged so far, for `since`."""
         return len(self.changes), len(self._moves)
 
     def since(self, mark: tuple[int, int]) -> Staged:
@@ -261,7 +264,11 @@ class Transaction:
     # ── commit ─────────────────────────────────────────────────────────────────────────────
 
     def commit(self) -> None:
-        """Put all staged changes in place and flush them to the disk."""
+        """Put all staged changes in place atomically, and flush them to disk.
+
+        Raises:
+            KeystoreError: another process has created the keystore meanwhile.
+        """
         if self.dry_run or not self.changes:
             return
         if self._new_root:
@@ -275,7 +282,7 @@ class Transaction:
         point_live(self._stage, AFTER)
         self._undo.clear()
         self._report_commit()
-        with contextlib.suppress(OSError, SrosError):  # it is committed; `_end` tries once more
+        with contextlib.suppress(OSError, SrosError):  # already committed; `_end` tries again
             recover(self.root)
 
     def _report_commit(self) -> None:
@@ -291,12 +298,14 @@ class Transaction:
         except OSError as error:
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
                 raise KeystoreError(
-                    f"keystore '{self.root}' already exists", "Another process just made it."
+                    f"keystore '{self.root}' already exists",
+                    "Another process has just created it.",
+                    "Choose another path.",
                 ) from error
             raise
         self._made_parents.clear()
         self._undo.clear()
-        with contextlib.suppress(OSError):  # it is in place; the system flushes it soon
+        with contextlib.suppress(OSError):  # already in place; the system flushes it soon
             filesystem.flush_folder(self.root.parent)
 
 
@@ -304,7 +313,7 @@ class Transaction:
 
 
 def _bridge(root: Path, stage: Path, moves: Sequence[Move]) -> None:
-    """Replace each path by a link through ``live`` to its old content, now in ``before``."""
+    """Replace each path with a link through ``live`` to its old content, now in ``before``."""
     if not moves:
         return
     os.mkdir(stage / BEFORE, 0o700)
@@ -313,14 +322,14 @@ def _bridge(root: Path, stage: Path, moves: Sequence[Move]) -> None:
     if _can_exchange(stage):
         map_slices(moves, work.by_exchange)
         return
-    # A second name, or a copy: for file systems that cannot exchange two names.
+    # A file system that cannot exchange two names: make hard links or copies first.
     if any(copied for _, copied in map_slices(moves, work.keep)):
         filesystem.flush_file_system(stage / BEFORE)
     map_slices(moves, work.by_replacement)
 
 
 def _can_exchange(stage: Path) -> bool:
-    """Return whether the file system can exchange two names, by a try."""
+    """Return whether the file system can exchange two names, by trying it."""
     spare = f"{stage}/spare"
     os.symlink(BEFORE, spare)  # the same as `live`, so that exchanging them changes nothing
     can = filesystem.exchange(spare, f"{stage}/{LIVE}")
@@ -329,14 +338,17 @@ def _can_exchange(stage: Path) -> bool:
 
 
 class _Bridge:
-    """Two ways to replace paths by links, each applied to a slice of the moves."""
+    """Two ways to replace paths with links, each for a slice of the moves.
+
+    One is `by_exchange`; the other is `keep`, followed by `by_replacement`.
+    """
 
     def __init__(self, root: str, stage: str) -> None:
         self._root = root
         self._stage = stage
 
     def by_exchange(self, moves: Sequence[Move]) -> None:
-        """Exchange each file with a link that was prepared in ``before``."""
+        """Exchange each file with a link created in ``before``."""
         root, before = self._root, f"{self._stage}/{BEFORE}"
         for move in moves:
             if move.before != "":
@@ -349,7 +361,7 @@ class _Bridge:
                 raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP), f"{root}/{move.path}")
 
     def keep(self, moves: Sequence[Move]) -> bool:
-        """Hard-link each old file into ``before``; return whether one had to be copied instead."""
+        """Hard-link or copy each old file into ``before``; return whether a file was copied."""
         copied = False
         for move in moves:
             if move.before != "":
@@ -364,7 +376,7 @@ class _Bridge:
         return copied
 
     def by_replacement(self, moves: Sequence[Move]) -> None:
-        """Replace each file by its link, after `keep`."""
+        """Replace each file with its link, after `keep`."""
         for move in moves:
             self._place(move)
 
