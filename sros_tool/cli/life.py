@@ -430,7 +430,11 @@ def _say(step: RotationStep, status: RotationStatus, *, together: bool, same_key
     for place in step.kept_elsewhere:
         click.echo(f"the old key at '{place}' is no longer used; it was not deleted", err=True)
     if step.stage == "retire":
-        how = "together" if together else "at any time; processes before and after the restart communicate"
+        how = (
+            "together"
+            if together
+            else "at any time; processes before and after the restart communicate"
+        )
         click.echo(f"Restart all processes {how}.", err=True)
     for remark in status.remarks:
         click.echo(remark, err=True)

@@ -7,7 +7,7 @@ pairs run the same program, so only the protection differs.
 ``note`` (what the numbers contain), ``first_message`` (a list of ``{"kind", "seconds", "ratio"}``)
 and ``measurements`` (a list of ``{"kind", "payload", "latency_us", "messages_per_s",
 "megabytes_per_s", "latency_ratio", "throughput_ratio"}``).  Every ratio is secured divided
-by unsecured in the same run: slower is a latency ratio above 1 and a throughput ratio below 1.
+by unsecured in the same run: a latency ratio above 1, or a throughput ratio below 1, is slower.
 """
 
 from __future__ import annotations

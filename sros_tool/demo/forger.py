@@ -315,13 +315,13 @@ def _trust_another_permissions_ca(copy: KeystoreCopy, part: str) -> None:
 
 
 def permissions_signed_by_itself(copy: KeystoreCopy) -> None:
-    """Give the guest permissions with one more topic, signed with its own key."""
+    """Give the guest permissions with one more topic, signed with the guest's key."""
     signed = smime.sign(_wider_permissions(copy), copy.certificate("guest"), copy.key("guest"))
     copy.put("guest", PERMISSIONS_FILE, signed)
 
 
 def permissions_and_governance_signed_by_itself(copy: KeystoreCopy) -> None:
-    """Sign the guest's permissions and governance with its own key, so that its DDS accepts them.
+    """Sign permissions and governance with the guest's key, so that the guest's DDS accepts them.
 
     The guest's permissions CA file gets the identity CA, for vendors that check a chain, and the
     guest's certificate, for vendors that check only the signer.
@@ -334,7 +334,7 @@ def permissions_and_governance_signed_by_itself(copy: KeystoreCopy) -> None:
 
 
 def enclave_among_the_signers(copy: KeystoreCopy) -> None:
-    """Sign the guest's permissions with its own key; guest and listener trust its certificate."""
+    """Sign permissions with the guest's key; make guest and listener trust its certificate."""
     permissions_signed_by_itself(copy)
     trusted = copy.read("guest", PERMISSIONS_CA_FILE) + pem(copy.certificate("guest"))
     for part in ("guest", "listener"):

@@ -88,7 +88,7 @@ class RunPlan:
 
 
 def run_rows(plan: RunPlan, progress: Progress) -> list[RowResult]:
-    """Return the results of all rows; ``progress`` gets a line for each finished row."""
+    """Run the rows of a plan; return their results.  ``progress`` gets a line for each row."""
     return asyncio.run(_Runner(plan, progress).run())
 
 

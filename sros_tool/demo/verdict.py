@@ -278,7 +278,7 @@ def _judge_view(
         return _Finding(RowStatus.UNDECIDED, f"{claim.subject} did not look in that time")
     most = max(event.publishers.get(talker.topic, 0) for event in looks)
     counted = f"{observer.through} counts {most} publishers on {talker.topic}"
-    return _Finding(STATUS_OF[Relation.SEES, most > 0], f"{counted} in {len(looks)} looks")
+    return _Finding(STATUS_OF[Relation.SEES, most > 0], f"{counted} in {len(looks)} polls")
 
 
 def _judge_wire(claim: Claim, record: RowRecord, talker: PartyRecord) -> _Finding:
