@@ -1,8 +1,8 @@
 """Casting: choose enclaves of a keystore for the parts of a scenario, and their node names.
 
-Both depend on the signed permissions.  A ROS node offers services under its own name (parameters,
-types), and an enclave made from a policy allows these only for the nodes in that policy: a node
-with another name fails at start.  So a node gets one of the names that its enclave allows.
+Both depend on the signed permissions.  A ROS node offers standard services under its name
+(parameters, types), and an enclave made from a policy allows these only for the nodes in that
+policy: a node with another name fails at start.  So a node gets a name that its enclave allows.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def open_user_keystore(root: Path, topic: str, scenario: Scenario) -> UserKeysto
     domains = governance_of(root).domains()
     rights = {name: grants for name in names if (grants := enclave_grant(root, name))}
     template = load_settings(root)
-    # Keystores made from this template get their own keys.
+    # A keystore created from this template gets new CA keys, not the user's.
     template = replace(template, identity_key="", permissions_key="")
     wanted = f"rt{topic}" if topic else ""
     guessed = not set(scenario.cast.values()) <= set(names)

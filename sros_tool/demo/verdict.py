@@ -275,7 +275,7 @@ def _judge_view(
 ) -> _Finding:
     looks = [e for e in observer.events if e.kind is EventKind.SEEN and _in_window(e, record)]
     if not looks:
-        return _Finding(RowStatus.UNDECIDED, f"{claim.subject} did not look in that time")
+        return _Finding(RowStatus.UNDECIDED, f"{claim.subject} counted nothing in the window")
     most = max(event.publishers.get(talker.topic, 0) for event in looks)
     counted = f"{observer.through} counts {most} publishers on {talker.topic}"
     return _Finding(STATUS_OF[Relation.SEES, most > 0], f"{counted} in {len(looks)} polls")

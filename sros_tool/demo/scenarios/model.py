@@ -155,7 +155,7 @@ class Party:
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim that ``subject`` hears, sees ... ``talker``, or (if ``holds`` is false) does not.
+    """A claim that ``relation`` holds between ``subject`` and ``talker``, or does not (``holds``).
 
     ``denied`` is the denial that must be the reason, a status in `DENIALS`; None: any reason.
     """
