@@ -117,7 +117,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(checkout: Path) -> None:
     (checkout / "pyproject.toml").unlink()
     answer = start(checkout, "demo", PYTHON=sys.executable)
     assert answer.returncode == 1
-    assert answer.stderr.startswith("dev: cannot go on: ")
+    assert answer.stderr.startswith("dev: cannot continue: ")
     assert "pyproject.toml" in answer.stderr
     assert "Traceback" not in answer.stderr
 
@@ -181,7 +181,7 @@ def test_an_environment_that_a_person_made_is_not_removed(
 ) -> None:
     (venv / "pyvenv.cfg").touch()
     monkeypatch.setattr(environment, "output_of", lambda command: "3.99.0\n")
-    with pytest.raises(SetupError, match="was not made by this program"):
+    with pytest.raises(SetupError, match="was not created by"):
         environment._usable(Record(), record.current())
     assert (venv / "pyvenv.cfg").exists()
 

@@ -1,1 +1,1 @@
-"""What `./dev` does: sets up a checkout with Python's standard library alone, then runs it."""
+"""The commands of `./dev`: set up a checkout with only Python's standard library, and run it."""

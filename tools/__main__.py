@@ -1,4 +1,4 @@
-"""Start `./dev`.  Runs under any Python 3.11 or newer, isolated, before anything is installed."""
+"""The entry point of `./dev`, for any Python 3.11 or newer, before anything is installed."""
 
 import sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Packages of Debian and Ubuntu: installed by root, or only unpacked where nobody is root."""
+"""Packages of Debian and Ubuntu: installed as root, or else only unpacked."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ def available() -> bool:
 
 
 def install(pattern: str, lock: int | None = None) -> bool:
-    """Install, as root, the package whose name matches ``pattern`` wholly.
+    """Install, as root, the package whose whole name matches ``pattern``; return the success.
 
-    Updates the package lists first.  Returns False without root, where no such package exists,
-    or where apt fails; the log has its output.
+    Updates the package lists first.  Fails without root, without such a package, or if apt fails;
+    the log has the output of apt.
     """
     return install_all([pattern], lock) == []
 
@@ -33,7 +33,7 @@ def install_all(patterns: Sequence[str], lock: int | None = None) -> list[str]:
     if prefix is None or not available():
         return list(patterns)
     apt_get = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", *_PATIENT]
-    # One unreachable third-party source makes `update` fail while the rest is fine: go on.
+    # Continue: one unreachable third-party source makes `update` fail for all.
     succeeds([*apt_get, "update"], keep_open=lock)
     names = {pattern: find(pattern) for pattern in patterns}
     found = [name for name in names.values() if name]
@@ -41,7 +41,7 @@ def install_all(patterns: Sequence[str], lock: int | None = None) -> list[str]:
         say(f"installing {', '.join(found)} through apt")
         command = [*apt_get, "install", "-y", "--no-install-recommends"]
         if not succeeds([*command, *found], keep_open=lock):
-            # One of them may be broken while the others are fine.
+            # Try each one: perhaps only one of them is broken.
             lost = {name for name in found if not succeeds([*command, name], keep_open=lock)}
             return [each for each, name in names.items() if name is None or name in lost]
     return [pattern for pattern, name in names.items() if name is None]
@@ -62,22 +62,22 @@ FOR_TESTS: tuple[tuple[str, str, Callable[[], bool]], ...] = (
     ),
     ("chromium", "a browser for the pages", _command("chromium")),
 )
-"""What the tests compare sros with: the package, what it is, and whether it is installed."""
+"""Programs and libraries for the tests: package pattern, description, test of existence."""
 
 
 def provide_for_tests(lock: int | None = None) -> None:
-    """Install `FOR_TESTS`; where one cannot be installed, its tests are skipped and say so."""
+    """Install what is missing of `FOR_TESTS`; the tests of a package that fails are skipped."""
     missing = {package: what for package, what, there in FOR_TESTS if not there()}
     if not missing:
         return
     for what in missing.values():
-        say(f"not on this machine, and some tests compare with it: {what}")
+        say(f"missing, but some tests need it: {what}")
     for package in install_all(list(missing), lock):
-        say(f"{missing[package]} ({package}) cannot be installed; going on without")
+        say(f"{missing[package]} ({package}) cannot be installed; continuing without it")
 
 
 def find(pattern: str, options: Sequence[str] = ()) -> str | None:
-    """Return the first installable package whose name matches ``pattern`` wholly."""
+    """Return the first installable package whose whole name matches ``pattern``, or None."""
     stem = re.match(r"[a-z0-9.+-]*", pattern)
     names = output_of(["apt-cache", *options, "pkgnames", stem.group() if stem else ""]) or ""
     for name in sorted(names.split()):
@@ -87,10 +87,10 @@ def find(pattern: str, options: Sequence[str] = ()) -> str | None:
 
 
 def unpack(pattern: str, folder: Path, lock: int | None = None) -> bool:
-    """Download the package that matches ``pattern`` and unpack it into ``folder``, without root.
+    """Unpack the package that matches ``pattern`` into ``folder``, without root.
 
-    Also unpacks its dependencies that are not installed.  Where the system's package lists have
-    no such package or an outdated one, private lists are fetched.
+    Also unpacks its dependencies that are not installed.  Fetches private package lists if the
+    system's lists lack the package or are outdated.  Returns the success.
     """
     if not available():
         return False
@@ -108,8 +108,8 @@ def needed(
 ) -> list[str]:
     """Return ``package`` and all its direct and indirect dependencies that are not installed.
 
-    ``depends`` returns the output of `apt-cache depends --important`.  Of alternatives, an
-    installed one is enough; else the first real package is taken.
+    ``depends`` returns the output of `apt-cache depends --important`.  If a dependency has
+    alternatives, an installed one is enough; otherwise the first real package is taken.
     """
     wanted = [package]
     for name in wanted:

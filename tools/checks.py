@@ -1,4 +1,4 @@
-"""The test command: format, lint, types and tests, all of them run, one line at the end."""
+"""The commands test and lint: format, lint, types and tests, with a summary line at the end."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _NOTHING_COLLECTED = 5
 _PLUGINS = "xdist.plugin,_hypothesis_pytestplugin"
 
 LONG = "--long"
-"""The argument for the long forms of the tests; the same as the variable SROS_LONG."""
+"""The argument for more random and exhaustive cases; like the variable SROS_LONG."""
 
 WITH_DDS = ("tests/integration", "tests/explain")
-"""The folders of all tests that start DDS processes; the others are not imported for them."""
+"""The folders with tests that start DDS processes; pytest imports only these for them."""
 
 RUFF = {
     "ruff check": ["-m", "ruff", "check", "--quiet"],
@@ -34,16 +34,16 @@ MYPY = {"mypy": ["-m", "mypy", "--no-error-summary"]}
 
 
 def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> int:
-    """Run every check even after failures; return the worst exit status.
+    """Run every check, even after failures; return the worst exit status.
 
     Without ``arguments``, mypy and the tests that start DDS processes run at the same time as the
-    other tests; their output is shown when the others have ended.  More DDS tests run at once than
-    there are cores: each has a network of its own and mostly waits.  With ``arguments``, pytest
-    runs once, with these.
+    other tests; their output is shown after that of the other tests.  There are twice as many
+    processes for DDS tests as cores: each has a separate network and mostly waits.  With
+    ``arguments``, pytest runs once, with these arguments.
     """
     started = time.monotonic()
     if read_record().ros_around:
-        # ROS 2 brings pytest plugins of its own, made for other versions of pytest.
+        # ROS 2 installs pytest plugins that are made for other versions of pytest.
         env = {**env, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_PLUGINS": _PLUGINS}
     if LONG in arguments:
         arguments = [each for each in arguments if each != LONG]
@@ -70,7 +70,7 @@ def run(arguments: list[str], env: Mapping[str, str], *, with_tests: bool) -> in
         for name, words in parts.items()
     }
     with ExitStack() as running:
-        # The one whose output is seen as it comes is started last, and ends first in general.
+        # The step with direct output is started last, and usually ends first.
         order = sorted(steps, key=lambda name: name == "tests")
         begun = {
             name: running.enter_context(_Step(name, steps[name], env, aside=name != "tests"))
@@ -113,7 +113,7 @@ def count(report: Path) -> Counter[str]:
 
 
 class _Step:
-    """A check that runs; ``aside`` keeps its output until it has ended and is asked for it."""
+    """A running check; with ``aside``, its output is kept in a log until `end` shows it."""
 
     def __init__(
         self, name: str, words: list[str], env: Mapping[str, str], *, aside: bool = False

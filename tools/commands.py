@@ -1,4 +1,4 @@
-"""The commands of `./dev`: which setup each one needs, and what it then runs."""
+"""The commands of `./dev`: the setup that each one needs, and the program that it runs."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ from tools.steps import CHECKOUT, VENV, SetupError, locked, say
 USAGE = """\
 Usage: ./dev COMMAND [ARGUMENTS…]
 
-  demo [ARGUMENTS…]   show on a real DDS that secured nodes are closed to all others: sros demo
-  test [ARGUMENTS…]   ruff, mypy and pytest; ARGUMENTS go to pytest, but --long: it brings more
-                      random and exhaustive cases, and takes much longer
-  lint                ruff and mypy alone
-  bench [ARGUMENTS…]  measure: python -m benchmarks
-  sros ARGUMENTS…     run this checkout's sros
-  setup               set up everything for the above, also what is thought to be in place
+  demo [ARGUMENTS…]   show on a real DDS that secured nodes are closed to other nodes (sros demo)
+  test [ARGUMENTS…]   run ruff, mypy and pytest; ARGUMENTS go to pytest, except --long: run more
+                      random and exhaustive cases, which takes much longer
+  lint                run only ruff and mypy
+  bench [ARGUMENTS…]  run the benchmarks (python -m benchmarks)
+  sros ARGUMENTS…     run the sros of this checkout
+  setup               set up everything that the other commands need, and check it again
 
-Each sets up first what it needs: a virtual environment in .venv, for demo and test also a DDS
-that enforces security. PYTHON names the Python to build upon, otherwise a fitting one is found.
+Each command first sets up what it needs: a virtual environment in .venv; for demo and test also a
+DDS that enforces security. The variable PYTHON names the Python to use instead of the one found.
 """
 
 
 @dataclass(frozen=True)
 class Needs:
-    """What must be installed before a command runs."""
+    """The setup that a command needs: groups of packages, a DDS, and programs for the tests."""
 
     groups: tuple[str, ...] = ("package",)
     dds: bool = False
@@ -55,32 +55,32 @@ def main(arguments: list[str]) -> int:
         return 0
     command, rest = (arguments[0], arguments[1:]) if arguments else ("", [])
     if command not in NEEDS:
-        problem = f"there is no command {command!r}" if command else "a command is missing"
+        problem = f"unknown command {command!r}" if command else "a command is missing"
         print(f"dev: {problem}.\n\n{USAGE}", end="", file=sys.stderr)
         return 2
     try:
-        set_up(NEEDS[command], afresh=command == "setup")
+        set_up(NEEDS[command], again=command == "setup")
         return _run(command, rest)
     except SetupError as error:
         print(f"dev: {error}", file=sys.stderr)
     except OSError as error:
         where = f" {error.filename}" if error.filename else ""
-        print(f"dev: cannot go on:{where} {error.strerror or error}", file=sys.stderr)
+        print(f"dev: cannot continue:{where} {error.strerror or error}", file=sys.stderr)
     except KeyboardInterrupt:
-        print("\ndev: interrupted; run it again to start over", file=sys.stderr)
+        print("\ndev: interrupted; run the command again to start over", file=sys.stderr)
         return 130
     return 1
 
 
-def set_up(needs: Needs, *, afresh: bool = False) -> None:
+def set_up(needs: Needs, *, again: bool = False) -> None:
     """Install what a command needs and the record of the last setup does not list.
 
-    ``afresh`` asks pip and the system again whatever the record says.
+    With ``again``, check and install everything, whatever the record lists.
     """
     with locked() as lock:
         record = read_record()
         groups = list(needs.groups)
-        if afresh:
+        if again:
             record = replace(record, groups=[], dds=None, rmw=None)
         if not holds(record, current(), groups):
             record = prepare(groups, record, lock)
@@ -96,17 +96,17 @@ def set_up(needs: Needs, *, afresh: bool = False) -> None:
 def _with_dds(needs: Needs, record: Record, lock: int) -> Record:
     """Provide a DDS that enforces security; return the record with its path."""
     if record.ros_around and not needs.for_tests:
-        # The demo prefers the DDS of a sourced ROS 2; the tests ask for Cyclone DDS besides.
-        if not _stands(record.rmw):
+        # The demo prefers the DDS of a sourced ROS 2; the tests also need Cyclone DDS.
+        if not _exists(record.rmw):
             record = replace(record, rmw=dds.enforced_by_ros(PYTHON))
         if record.rmw:
             return record
-    if not _stands(record.dds):
+    if not _exists(record.dds):
         record = replace(record, dds=dds.provide(PYTHON, lock))
     return record
 
 
-def _stands(path: str | None) -> bool:
+def _exists(path: str | None) -> bool:
     return path is not None and Path(path).exists()
 
 
@@ -128,5 +128,5 @@ def _run(command: str, arguments: list[str]) -> int:
 
 
 def _become(program: list[str], env: dict[str, str]) -> NoReturn:
-    """Replace this process by the program, which then gets its signals and exit status."""
+    """Replace this process by the program, so that signals and exit status are its own."""
     os.execve(program[0], program, env)

@@ -12,10 +12,10 @@ from tools import apt
 from tools.steps import CHECKOUT, LOG, VENV, output_of, root_prefix, say
 
 UNPACKED = CHECKOUT / ".dds"
-"""Where the package looks for a DDS before it asks the system."""
+"""The folder where sros looks for a DDS before it asks the system."""
 
 PACKAGE = r"libddsc0\w*"
-"""Cyclone DDS 0.10 with its security plugins: libddsc0debian, libddsc0t64, or as it comes."""
+"""Cyclone DDS 0.10 with its security plugins: libddsc0debian, libddsc0t64, or similar."""
 
 _VARIABLE = "SROS_CYCLONEDDS_DIR"
 
@@ -30,17 +30,17 @@ except UnavailableError:
 
 
 def provide(python: Path, lock: int | None) -> str | None:
-    """Provide Cyclone DDS with security plugins; return their folder, None without them.
+    """Provide Cyclone DDS with security plugins; return their folder, or None.
 
-    Never fails: without a DDS the commands still run, and say what is missing.
+    Never raises: without a DDS the commands still run, and report what is missing.
     """
     plugins = plugins_found_by(python)
     if plugins is None:
-        # An sros that is being worked on and does not start is no reason to install anything.
-        say("sros cannot be asked whether a DDS is here; going on")
+        # Install nothing only because an edited sros does not start.
+        say("sros does not start, so it cannot look for a DDS; continuing")
         return None
     if not plugins and UNPACKED.exists():
-        # Of another machine, or damaged: the package would prefer it to what apt may bring.
+        # From another machine, or damaged: sros would prefer it to a DDS that apt installs.
         shutil.rmtree(UNPACKED)
         plugins = plugins_found_by(python)
     if plugins:
@@ -48,11 +48,11 @@ def provide(python: Path, lock: int | None) -> str | None:
 
     missing = "no DDS that enforces security on this machine"
     if not apt.available():
-        say(f"{missing}, and no apt to bring one; going on without")
+        say(f"{missing}, and no apt to install one; continuing without it")
         return None
     tried = []
     if root_prefix() is not None:
-        say(f"{missing}: bringing Cyclone DDS through apt")
+        say(f"{missing}: installing Cyclone DDS with apt")
         apt.install(PACKAGE, lock)
         plugins = plugins_found_by(python)
         tried.append("apt-get install")
@@ -61,12 +61,12 @@ def provide(python: Path, lock: int | None) -> str | None:
         plugins = _unpack(python, lock)
         tried.append("apt-get download")
     if not plugins:
-        say(f"no DDS that enforces security came by {' or '.join(tried)} (see {LOG}); going on")
+        say(f"{' and '.join(tried)} brought no DDS that enforces security (see {LOG}); continuing")
     return plugins or None
 
 
 def enforced_by_ros(python: Path) -> str | None:
-    """Return the DDS library of the sourced ROS 2 if `sros doctor` saw it enforce security."""
+    """Return the DDS library of the sourced ROS 2 if it enforces security by `sros doctor`."""
     try:
         answer = json.loads(output_of([python, "-m", "sros_tool", "doctor", "--json"]) or "{}")
         enforcing = [stack for stack in answer["stacks"] if stack["enforces"]]
@@ -76,12 +76,12 @@ def enforced_by_ros(python: Path) -> str | None:
 
 
 def chosen_by_user() -> bool:
-    """Return whether a variable names the DDS to use, so that none is installed."""
+    """Return whether SROS_CYCLONEDDS_DIR names the DDS to use, so that none is installed."""
     return bool(os.environ.get(_VARIABLE))
 
 
 def plugins_found_by(python: Path, folder: Path | None = None) -> str | None:
-    """Return where sros finds the security plugins; empty if nowhere, None if sros does not start.
+    """Return the folder of the security plugins, "" without, or None if sros does not start.
 
     With ``folder``, only that folder is searched.
     """

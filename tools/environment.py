@@ -1,6 +1,6 @@
-"""The virtual environment of the checkout: created, filled, and created again when damaged.
+"""The virtual environment of the checkout: created, filled, and created again if damaged.
 
-A record in it lists what a finished setup installed; a mark says that one was interrupted.
+A record in it lists what a finished setup installed; a mark file shows an interrupted setup.
 """
 
 from __future__ import annotations
@@ -39,23 +39,24 @@ from tools.steps import (
 )
 
 GROUPS = ("package", "test", "ros", "ros-test")
-"""Everything that can be installed, in the order in which it is."""
+"""All groups of packages, in the order of installation."""
 
 ROS_GROUPS = ("ros", "ros-test")
-"""Left out where a sourced ROS 2 brings rclpy, or where no wheel fits."""
+"""Groups that are left out if a sourced ROS 2 has rclpy, or if no wheel fits."""
 
 _TITLES = {
-    "package": "sros and what it needs",
-    "test": "what the tests need",
+    "package": "sros and its dependencies",
+    "test": "the dependencies of the tests",
     "ros": "rclpy of ROS 2 Jazzy",
     "ros-test": "the interfaces for tests of live ROS",
 }
 
 
 def prepare(groups: list[str], record: Record, lock: int) -> Record:
-    """Create the environment where needed and install ``groups`` of `GROUPS`; return the record.
+    """Create the environment if needed, and install ``groups`` of `GROUPS`; return the record.
 
-    Raises `SetupError`, with the end of the log.
+    Raises:
+        SetupError: something cannot be installed; its text has the end of the log.
     """
     now = current()
     if record.surroundings == now.surroundings and record.base == now.base:
@@ -67,12 +68,12 @@ def prepare(groups: list[str], record: Record, lock: int) -> Record:
         record = Record()
     elif LOG.exists():
         LOG.unlink()
-    stands = (
+    is_current = (
         record.requirements == now.requirements
         and record.surroundings == now.surroundings
         and whole(record)
     )
-    if not stands:
+    if not is_current:
         record = Record()
     done = list(record.groups)
     with _unfinished():
@@ -89,34 +90,34 @@ def prepare(groups: list[str], record: Record, lock: int) -> Record:
 
 
 def _usable(record: Record, now: Record) -> bool:
-    """Return whether the environment on disk can be used; refuse one that a person made."""
+    """Return whether .venv can be used; raise `SetupError` for a user's .venv that does not fit."""
     if not VENV.exists():
         return False
     if UNFINISHED.exists():
-        say("the last setup was interrupted: making .venv again")
+        say("the last setup was interrupted: creating .venv again")
         return False
     if record.checkout:
         reason = difference(record, now)
         if reason:
-            say(f"{reason}: making .venv again")
+            say(f"{reason}: creating .venv again")
         return reason is None
     answer = output_of([PYTHON, "-I", "-c", "import platform; print(platform.python_version())"])
     if not (VENV / "pyvenv.cfg").exists() or answer is None:
-        say("the .venv here does not run: making it again")
+        say("the Python in .venv does not start: creating .venv again")
         return False
     if answer.strip() != now.version or output_of([PYTHON, "-m", "pip", "--version"]) is None:
         raise SetupError(
-            f"{VENV} was not made by this program, and Python {now.version} cannot build upon it"
-            f" (it runs Python {answer.strip()}). Remove it or give it another name, then run"
-            " this again."
+            f"{VENV} was not created by ./dev, and Python {now.version} cannot use it (it has"
+            f" Python {answer.strip()}, or no pip). Remove or rename it, then run this command"
+            " again."
         )
-    say("using the .venv that is here")
+    say("using the existing .venv")
     return True
 
 
 @contextlib.contextmanager
 def _unfinished() -> Iterator[None]:
-    """Mark the environment while it changes; a kill leaves the mark, an error of pip does not."""
+    """Mark the environment while it changes; only a killed setup leaves the mark behind."""
     UNFINISHED.touch()
     try:
         yield
@@ -131,18 +132,18 @@ def _make(now: Record, lock: int) -> None:
     if VENV.is_symlink() or VENV.is_file():
         VENV.unlink()
     elif VENV.exists():
-        # Without this file it is no environment, so a half removed one is never built upon.
+        # Without this file Python does not take a half removed .venv for an environment.
         (VENV / "pyvenv.cfg").unlink(missing_ok=True)
         shutil.rmtree(VENV)
     VENV.mkdir()
     UNFINISHED.touch()
-    say(f"making .venv with Python {now.version}")
+    say(f"creating .venv with Python {now.version}")
     command = [now.base, "-I", "-m", "venv", str(VENV)]
     if now.ros_around:
         # The rclpy of a sourced ROS needs the system's numpy and yaml.
         command.append("--system-site-packages")
     if not succeeds(command, env=_quiet_environment(), keep_open=lock):
-        raise SetupError(f"cannot make a virtual environment in {VENV}. {log_tail()}")
+        raise SetupError(f"cannot create a virtual environment in {VENV}. {log_tail()}")
 
 
 def _make_sure_of_venv(now: Record, lock: int) -> None:
@@ -150,14 +151,14 @@ def _make_sure_of_venv(now: Record, lock: int) -> None:
         return
     package = f"python{now.version.rpartition('.')[0]}-venv"
     if now.base.startswith("/usr/bin/") and root_prefix() is not None and apt.available():
-        say(f"this Python has no venv and ensurepip: bringing {package} through apt")
+        say(f"this Python has no venv and ensurepip: installing {package} with apt")
         apt.install(package.replace(".", r"\."), lock)
         importlib.invalidate_caches()
         if _has_venv():
             return
     raise SetupError(
-        f"Python {now.version} ({now.base}) comes without venv and ensurepip, which make the"
-        " virtual environment that sros is installed into. On Debian and Ubuntu install them"
+        f"Python {now.version} ({now.base}) comes without venv and ensurepip, which create the"
+        " virtual environment for sros. On Debian and Ubuntu install them"
         f" with 'sudo apt-get update && sudo apt-get install {package}' and run this again; or name"
         " another Python that has them: PYTHON=/path/to/python3 ./dev …"
     )
@@ -168,7 +169,7 @@ def _has_venv() -> bool:
 
 
 def _install(group: str, now: Record, lock: int) -> bool:
-    """Install one group; return whether it need not be tried again.  Raises `SetupError`."""
+    """Install one group; return False to try again next time.  Raises `SetupError`."""
     optional = group in ROS_GROUPS
     if optional and (now.ros_around or not _rclpy_fits(group, now)):
         return True
@@ -178,12 +179,12 @@ def _install(group: str, now: Record, lock: int) -> bool:
         return True
     if not optional:
         raise SetupError(f"pip cannot install {_TITLES[group]}. {log_tail()}")
-    say(f"{_TITLES[group]} cannot be installed (see {LOG}); going on without")
+    say(f"{_TITLES[group]} cannot be installed (see {LOG}); continuing without it")
     return False
 
 
 def _requirements(group: str) -> list[str]:
-    """Return what pip installs; with the extras by content, the package is not built again."""
+    """Return what pip installs; extras are listed singly, so that sros is not built again."""
     if group == "package":
         return ["--editable", str(CHECKOUT)]
     if group == "ros-test":
@@ -198,14 +199,14 @@ def _rclpy_fits(group: str, now: Record) -> bool:
     if system == "x86_64 with glibc" and 10 <= minor <= 13:
         return True
     if group == "ros":
-        say(f"no rclpy wheel fits Python {now.version} on {system}; going on without rclpy")
+        say(f"no rclpy wheel fits Python {now.version} on {system}; continuing without rclpy")
     return False
 
 
 def _quiet_environment() -> dict[str, str]:
     env = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     env |= {"PIP_DISABLE_PIP_VERSION_CHECK": "1", "PIP_NO_INPUT": "1", "PIP_USER": "0"}
-    # The ROS wheels start every Python of the environment twice unless told that they have.
+    # Without this the ROS wheels start every Python of the environment twice.
     return env | {"_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
 
 

@@ -1,4 +1,4 @@
-"""The record of a finished setup, and its comparison with what is here now."""
+"""The record of a finished setup, and its comparison with the present state."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LIVE_ROS = ("ros-std-srvs==5.3.6", "ros-test-msgs==2.0.3")
 """Interfaces that only the tests of a live ROS graph use; built for the rclpy wheels."""
 
 UNFINISHED = VENV / "sros-setup.unfinished"
-"""Exists while an installer runs; an environment in which it is found is not trusted."""
+"""The mark file that exists while an installer runs; an environment with it is not trusted."""
 
 _RECORD = VENV / "sros-setup.json"
 _SURROUNDINGS = ("PYTHONPATH", "AMENT_PREFIX_PATH", "CONDA_PREFIX")
@@ -27,11 +27,11 @@ _SURROUNDINGS = ("PYTHONPATH", "AMENT_PREFIX_PATH", "CONDA_PREFIX")
 
 @dataclass(frozen=True)
 class Record:
-    """What a finished setup found and made.
+    """The state that a finished setup found and installed.
 
-    ``base`` is the interpreter behind the environment, ``ros_around`` whether it has an rclpy of
-    its own (a sourced ROS 2).  ``dds`` is the folder of Cyclone's security plugins, ``rmw`` the
-    DDS library of that ROS 2 if it enforces security.
+    ``base`` is the interpreter of the environment; ``ros_around`` says whether it has the rclpy of
+    a sourced ROS 2.  ``dds`` is the folder of Cyclone DDS' security plugins; ``rmw`` is the DDS
+    library of the sourced ROS 2 if it enforces security.
     """
 
     checkout: str = ""
@@ -47,7 +47,7 @@ class Record:
 
 
 def read_record() -> Record:
-    """Return the record of the last setup; an empty one where none can be trusted."""
+    """Return the record of the last setup, or an empty one if it is missing or not trusted."""
     try:
         found = Record(**json.loads(_RECORD.read_text(encoding="utf-8")))
     except (OSError, ValueError, TypeError):
@@ -97,20 +97,20 @@ def holds(record: Record, now: Record, groups: list[str]) -> bool:
 
 
 def difference(record: Record, now: Record) -> str | None:
-    """Return why an environment must be made again; None where it can be reused."""
+    """Return why the environment must be created again, or None if it can be used."""
     if record.checkout != now.checkout:
         return f"this checkout was moved here from {record.checkout}"
     if (record.base, record.version) != (now.base, now.version):
-        return f"Python {record.version} ({record.base}) gave way to {now.version} ({now.base})"
+        return f"Python {record.version} ({record.base}) was replaced by {now.version} ({now.base})"
     if record.ros_around != now.ros_around:
         return f"a ROS 2 with rclpy is {'now' if now.ros_around else 'no longer'} sourced"
     if not PYTHON.exists():
-        return "the Python in .venv is gone"
+        return "the Python in .venv is missing"
     return None
 
 
 def whole(record: Record) -> bool:
-    """Return whether the environment still has all that the setup installed."""
+    """Return whether the environment still has everything that the setup installed."""
     packages = _site_packages(record.version)
     return PYTHON.exists() and all((packages / name).exists() for name in record.distributions)
 

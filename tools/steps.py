@@ -1,4 +1,4 @@
-"""One step of a setup: say what is done, run an installer quietly, show its end if it fails."""
+"""Steps of a setup: report the step, run an installer quietly, show its last output lines."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ VENV = CHECKOUT / ".venv"
 LOG = VENV / "setup.log"
 
 _PATIENCE = 1800
-"""Seconds after which an installer is taken for hung."""
+"""Seconds after which an installer is stopped."""
 
 _TAIL = 15
 """Lines of an installer's output that are shown when it fails."""
 
 
 class SetupError(Exception):
-    """A setup cannot go on: what is missing, why, and how to get it, in one paragraph."""
+    """An error that ends a setup; its text says what is missing, why, and how to get it."""
 
 
 def say(text: str) -> None:
@@ -41,8 +41,8 @@ def succeeds(
 ) -> bool:
     """Run an installer with its output in the log; return whether its exit status was 0.
 
-    The installer inherits the file descriptor ``keep_open``, the lock: if it outlives a killed
-    setup, the next setup still waits for it.
+    The installer inherits ``keep_open``, the file descriptor of the lock.  So the next setup waits
+    for an installer that still runs after its setup was killed.
     """
     LOG.parent.mkdir(parents=True, exist_ok=True)
     with LOG.open("ab") as log:
@@ -68,7 +68,7 @@ def succeeds(
 
 
 def output_of(command: Sequence[str | Path], env: Mapping[str, str] | None = None) -> str | None:
-    """Return a command's stdout; None where it fails or cannot be started."""
+    """Return a command's stdout, or None if it fails or cannot be started."""
     try:
         ended = subprocess.run(
             command,
@@ -100,8 +100,8 @@ def log_tail() -> str:
 def locked() -> Iterator[int]:
     """Lock this checkout against other setups; yield the descriptor that holds the lock.
 
-    The lock is on the checkout's folder itself: it leaves nothing behind, and ends with the
-    last process that has it open.
+    The lock is on the checkout's folder itself, so it needs no file.  It ends with the last process
+    that has the descriptor open.
     """
     lock = os.open(CHECKOUT, os.O_RDONLY | os.O_DIRECTORY)
     try:
@@ -117,7 +117,7 @@ def locked() -> Iterator[int]:
 
 @functools.cache
 def root_prefix() -> list[str] | None:
-    """Return the words before a command that root runs; None where that needs a password."""
+    """Return the words that make root run a command; None if that needs a password."""
     if os.geteuid() == 0:
         return []
     if shutil.which("sudo") and output_of(["sudo", "-n", "true"]) is not None:

@@ -1,8 +1,8 @@
-"""Compose the picture of one source, or an overlay of two, from rights and governance.
+"""The picture of one source, or the overlay of two, made from rights and governance.
 
-Wildcards become the known names that they match, and denials override permissions.  Known names
-are the exact names in the rights of all sources.  An action is shown as one name, also for a right
-to only some of its parts, such as the right of a recorder that subscribes to ``/*``.
+A wildcard is replaced by the known names that it matches, and denials override permissions.  Known
+names are the exact names in the rights of all sources.  An action is shown as one name, also for a
+right to only some of its parts, such as the right of a recorder that subscribes to ``/*``.
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ _OVERLAYS = {
     "change": Overlay("change", "removed", "added"),
     "drift": Overlay("drift", "only in the policy", "only in what was signed"),
 }
-"""The meaning of each kind of overlay."""
+"""Every kind of overlay."""
 
 
 @dataclass(frozen=True, slots=True)
 class PictureSource:
     """The content of one source of a picture.
 
-    ``nodes`` are the nodes of each enclave, ``enclaves`` describes the enclaves' certificates;
-    ``scope`` are the enclaves that the source can describe, None for all.
+    ``nodes`` maps enclaves to their nodes; ``enclaves`` has the enclaves with their certificates;
+    ``scope`` has the enclaves that the source is about, or None for all.
     """
 
     origin: SourceTitle
@@ -72,10 +72,10 @@ class PictureSource:
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """Information in addition to the sources.
+    """Information that is not in the sources.
 
-    ``common`` are the rights that every node needs; ``hosts`` maps an enclave, or the namespace
-    that contains it, to the host that it runs on.
+    ``common`` are the rights that every node needs; ``hosts`` maps enclaves, or namespaces of
+    enclaves, to the hosts that they run on.
     """
 
     common: Sequence[Right] = ()
@@ -216,14 +216,14 @@ def _namespace_of(name: str) -> str:
     return name.rpartition("/")[0] or "/"
 
 
-# ── two sources over each other ─────────────────────────────────────────────────────────
+# ── overlays of two sources ────────────────────────────────────────────────────────────
 
 
 def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) -> list[Edge]:
     """Return the edges of both sides, each marked with its side.
 
-    An edge on both sides counts as a wildcard edge only if it is one on both sides.  With
-    ``allowed_by``, the first side alone decides: an observed right always has an exact name.
+    An edge on both sides keeps its wildcards only if both sides have it by wildcards.  With
+    ``allowed_by``, only the first side counts: an observed right always has an exact name.
     """
     sides = [{_identity(edge): edge for edge in side} for side in (first, second)]
     found = []
@@ -240,7 +240,7 @@ def _marked(first: Iterable[Edge], second: Iterable[Edge], *, allowed_by: bool) 
 
 
 def _neutral(edge: Edge, unseen: frozenset[str]) -> Edge:
-    """Return ``edge``, marked as on both sides if it is a denial or of an ``unseen`` enclave."""
+    """Return ``edge``, marked BOTH if it is a denial or its enclave is ``unseen``."""
     neutral = edge.qualifier is not ALLOW or edge.enclave in unseen
     return replace(edge, mark=OverlaySide.BOTH) if neutral else edge
 
@@ -256,7 +256,7 @@ def _changed(first: frozenset[Right], second: frozenset[Right]) -> tuple[Overlay
             OverlaySide.FIRST if sign == "-" else OverlaySide.SECOND,
             str(right),
             tuple(
-                f"the other has it by {each.describe()}"
+                f"the other side has it by {each.describe()}"
                 for each in difference.covered.get(right, ())
             ),
         )
@@ -265,10 +265,10 @@ def _changed(first: frozenset[Right], second: frozenset[Right]) -> tuple[Overlay
 
 
 def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
-    """Return the rights that were allowed but never observed, and the other way round.
+    """Return the rights that were allowed but never observed, or observed but not allowed.
 
     Rights that every node needs are left out.  The names that a wildcard matches are only counted:
-    the list for a recorder of all topics would fill pages.
+    there are too many for a recorder of all topics.
     """
     found: dict[tuple[OverlaySide, Right], tuple[str, ...]] = {}
     reached: dict[Right, list[bool]] = defaultdict(list)
@@ -281,7 +281,7 @@ def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
             found[edge.mark, right] = ()
     for right, unused in reached.items():
         if any(unused):
-            note = f"{sum(unused)} of the {len(unused)} names that it reaches were never observed"
+            note = f"{sum(unused)} of the {len(unused)} names that it matches were never observed"
             found[OverlaySide.FIRST, right] = (note,)
     return tuple(
         OverlayDifference(mark, str(right), notes)
@@ -289,7 +289,7 @@ def _unused(edges: Iterable[Edge]) -> tuple[OverlayDifference, ...]:
     )
 
 
-# ── the names that rights reach ─────────────────────────────────────────────────────────
+# ── names that rights match ─────────────────────────────────────────────────────────────
 
 
 class Known:
@@ -323,10 +323,10 @@ class Known:
         return self._matched[key]
 
     def drawn(self, right: Right) -> tuple[str, ...]:
-        """Return the names to draw for a right: known names, and wildcards that match none.
+        """Return the names to draw for a right: known names, and wildcards without known names.
 
-        Such a wildcard is drawn for an ALLOW that shares names with it, and for a DENY that covers
-        it completely.
+        A wildcard without known names is drawn for every ALLOW that overlaps with it, and for every
+        DENY that covers it.
         """
         if not is_expression(right.name):
             return (right.name,)
@@ -359,16 +359,16 @@ _Found = dict[Qualifier, set[str]]
 
 
 def _edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = ()) -> list[Edge]:
-    """Return unsorted edges from every right and denial to the names that it matches.
+    """Return an unsorted edge for each right or denial and each name that it matches.
 
-    A wildcard that matches no known name is drawn as a name itself.  ``common`` are the rights
-    that every node needs, of any enclave.
+    A wildcard that matches no known name is drawn as a name.  ``common`` are the rights that every
+    node of any enclave needs.
     """
     topics: dict[tuple[str, str, str, str], _Found] = defaultdict(lambda: defaultdict(set))
     for each in unfolded(rights):
         by = each.name if is_expression(each.name) else ""
         for reached in known.drawn(each):
-            # A wildcard that is drawn as a name counts as an exact name.
+            # A wildcard drawn as a name is treated like an exact name.
             said = "" if reached == by else by
             topics[each.enclave, each.kind, each.right, reached][each.qualifier].add(said)
     whole: dict[tuple[str, str, Qualifier], dict[tuple[str, str], set[str]]] = defaultdict(dict)
@@ -401,7 +401,7 @@ def _action_edges(
     qualifier: Qualifier,
     members: dict[tuple[str, str], set[str]],
 ) -> Iterable[Edge]:
-    """Yield one edge for a whole action, or one for each right to only some of its parts."""
+    """Yield one edge for a right to the whole action, or for each right to some of its parts."""
     remaining = dict(members)
     for right, needed in _WHOLE.items():
         if needed <= members.keys():
@@ -418,7 +418,7 @@ def _action_edges(
 
 
 def _by(names: set[str], *, action: bool = False) -> tuple[str, ...]:
-    """Return the expressions in ``names``, or () if it has the exact name (an empty text)."""
+    """Return the expressions in ``names``, or () if "", the mark of an exact name, is there."""
     if "" in names:
         return ()
     return tuple(
@@ -440,8 +440,8 @@ def protection_of(governance: Governance | None, kind: str, name: str) -> Protec
     """Return the weakest protection of the DDS topics of a name, by the first domain rule.
 
     The protection of whole RTPS messages protects every topic in them.  A topic without a rule
-    counts as not protected: vendors refuse it.  Access counts as controlled if it is for all of
-    the topics in all domains, as in `sros_tool.explain.reach`.
+    counts as not protected: vendors refuse it.  Access counts as controlled if all domain rules
+    control it for all of these topics, as in `sros_tool.explain.reach`.
     """
     if governance is None or not governance.domain_access_rules:
         return UNKNOWN
@@ -475,7 +475,7 @@ def _topics(kind: str, name: str) -> tuple[str, ...]:
 
 
 def _rules_of(domain: DomainRule, topic: str) -> Iterator[TopicRule]:
-    """Yield the rule of a topic; for a wildcard, every rule that may apply to a matching topic."""
+    """Yield the rule of a topic; for a wildcard, all rules that may apply to its topics."""
     for rule in domain.topic_access_rules:
         if overlap(rule.topic_expression, topic):
             yield rule

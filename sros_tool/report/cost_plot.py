@@ -1,6 +1,6 @@
 """Plots of the cost of security: latency and throughput over the payload size.
 
-Both axes are logarithmic.  Each kind of protection has its own shape and colour of points.  The
+Both axes are logarithmic.  Each kind of protection has one shape and colour of points.  The
 input is the JSON that `sros_tool.demo.cost` describes.
 """
 
@@ -21,14 +21,14 @@ _SHAPES = (
     "M0 -5L4.6 3.8H-4.6z",
     "M0 5L4.6 -3.8H-4.6z",
 )
-"""The shapes of points, by kind: a circle, a square, a rhombus, two triangles."""
+"""The shapes of points as SVG paths: a circle, a square, a rhombus, two triangles."""
 
 _PLOTS = (
     ("Latency in µs, over the payload", "latency_us"),
     ("Throughput in MB/s, over the payload", "megabytes_per_s"),
 )
 _COLOURS = ("#1b1b1b", "#0072b2", "#b8860b", "#00795a", "#a3497e")
-"""The colours, after Okabe and Ito: distinguishable for people with colour blindness."""
+"""The colours, after Okabe and Ito, which colour-blind people can distinguish."""
 
 _STYLE = (
     ".grid{stroke:#ddd;fill:none}"
@@ -52,7 +52,7 @@ def cost_section(cost: Json) -> str:
         for title, field in _PLOTS
     )
     return (
-        f'<h3>What it costs</h3><ul class="kinds">{legend}</ul><div class="plots">{plots}</div>'
+        f'<h3>Cost of security</h3><ul class="kinds">{legend}</ul><div class="plots">{plots}</div>'
         f'<p class="soft">{escape(cost["note"])}.</p>{_table(cost)}'
     )
 
@@ -163,7 +163,7 @@ def _table(cost: Json) -> str:
     heads = "".join(f'<th scope="col">{payload_text(size)}</th>' for size in cost["payloads"])
     lines = [
         '<div class="wide" tabindex="0" role="region" aria-label="Costs"><table class="costs">'
-        "<caption>Latency in µs and throughput in MB/s; in brackets, times that of the first "
+        "<caption>Latency in µs and throughput in MB/s; in parentheses, the ratio to the first "
         'kind</caption><thead><tr><th scope="col">Protection</th>'
         f'<th scope="col">First message</th>{heads}</tr></thead><tbody>'
     ]

@@ -1,4 +1,4 @@
-"""Render the result of a demo as an HTML page: its rows, and the cost of security.
+"""The result of a demo as an HTML page: its rows, and the cost of security.
 
 The input is the JSON value of ``sros demo --json`` (`sros_tool.demo.result`).  The page has no
 script; it can be opened from disk, and printed.
@@ -26,7 +26,7 @@ def render_demo_page(result: Json) -> str:
 
 
 def without_folders(value: Any, folders: Sequence[str]) -> Any:
-    """Return a JSON value in which these folder paths are replaced by "…" in all texts."""
+    """Return a JSON value with these folder paths replaced by "…" in all texts."""
     if isinstance(value, str):
         for folder in sorted(folders, key=len, reverse=True):
             value = value.replace(folder, "…") if len(folder) > 1 else value
@@ -61,7 +61,7 @@ def _head(result: Json) -> str:
     tiles = [
         ("good" if good == len(rows) else "error", f"{good} of {len(rows)}", "rows as expected"),
         ("", str(sum(bool(row.get("defence_removed")) for row in rows)), "with a defence removed"),
-        ("warning" if opened else "", str(opened), "doors known to be open"),
+        ("warning" if opened else "", str(opened), "known to be open"),
         ("", str(skipped), "skipped"),
     ]
     shown = "".join(
@@ -71,7 +71,7 @@ def _head(result: Json) -> str:
     )
     why = f'<p class="soft">{escape(result["why"])}</p>' if result.get("why") else ""
     return (
-        f"<header><h1>What was tried, and what came of it</h1><p>{', '.join(facts)}.</p>{why}"
+        f"<header><h1>Attempts and their results</h1><p>{', '.join(facts)}.</p>{why}"
         f'<ul class="tiles">{shown}</ul></header>'
     )
 

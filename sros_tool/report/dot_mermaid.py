@@ -1,4 +1,4 @@
-"""Render a scene as DOT for Graphviz or as Mermaid for Markdown; both do their own layout."""
+"""A scene as DOT for Graphviz or as Mermaid for Markdown, which place the cards themselves."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def render_mermaid(picture: Picture, scene: Scene) -> str:
 
 
 def graphviz_svg(dot: str) -> str:
-    """Return the SVG that Graphviz makes from DOT text.  Raises `UnavailableError` without it."""
+    """Return the SVG that Graphviz draws from DOT text; `UnavailableError` without Graphviz."""
     try:
         done = subprocess.run(
             ["dot", "-Tsvg"], input=dot, capture_output=True, text=True, timeout=_WAIT, check=True
@@ -86,11 +86,11 @@ def graphviz_svg(dot: str) -> str:
     return done.stdout
 
 
-# ── common to both ─────────────────────────────────────────────────────────────────────────
+# ── both formats ───────────────────────────────────────────────────────────────────────────
 
 
 def _once(scene: Scene) -> Mapping[str, Card]:
-    """Return one card for each node: the two cards of an enclave in a scene are one node here."""
+    """Map node ids to cards; the two cards of an enclave in a scene are one node here."""
     found: dict[str, Card] = {}
     for card in sorted(scene.cards, key=lambda each: (each.role, each.members, each.column)):
         found.setdefault(_key(card.id), card)
@@ -98,7 +98,7 @@ def _once(scene: Scene) -> Mapping[str, Card]:
 
 
 def _clusters(cards: Mapping[str, Card]) -> dict[str, list[str]]:
-    """Return the enclaves by group; empty if there is only one group."""
+    """Map groups to node ids of their enclaves; empty if there is only one group."""
     found: dict[str, list[str]] = defaultdict(list)
     for key, card in cards.items():
         if card.role == "enclave":

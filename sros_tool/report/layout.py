@@ -1,4 +1,4 @@
-"""Lay out a picture in three columns: senders left, names in the middle, listeners right.
+"""The layout of a picture in three columns: senders left, names in the middle, listeners right.
 
 SVG and the page use the same scene; Graphviz and Mermaid use its cards, but place them themselves.
 Lengths are in pixels at normal text size; x grows to the right and y downwards.
@@ -32,11 +32,11 @@ LINE, PAD, SMALL = 16, 7, 14
 """The height of a line of text, the padding of a card, and the height of a line of a note."""
 _GAP, _LEAD, _TOP, _MARGIN = 9.0, 24.0, 34.0, 14
 _SIDE_LETTERS, _NAMES_LETTERS = 20, 35  # letters per line on a card
-_ONLOOKER_LINES, _ONLOOKER_SHARE = 8, 0.3  # an onlooker has more bundles, and a larger share
-_MOST_ONLOOKERS = 26  # as there are letters
-_FEW_BUNDLES, _MOST_BUNDLES = 24, 80  # more: private names are only counted; bundles are joined
-_MOST_ENCLAVES = 40  # more are drawn as groups
-_MOST_NAMES, _SHOWN_NAMES = 8, 4  # up to 8 names are all on the card, else the first 4
+_ONLOOKER_LINES, _ONLOOKER_SHARE = 8, 0.3  # onlookers have more bundles than both limits
+_MOST_ONLOOKERS = 26  # the number of letters
+_FEW_BUNDLES, _MOST_BUNDLES = 24, 80  # with more: private names are counted; bundles joined
+_MOST_ENCLAVES = 40  # with more, groups are drawn
+_MOST_NAMES, _SHOWN_NAMES = 8, 4  # a card has up to 8 names; of more, the first 4
 _SWEEPS = 24
 
 KIND_NAMES = {"topics": "topic", "services": "service", "actions": "action", "dds": "DDS topic"}
@@ -68,7 +68,7 @@ _COMMON = {
     "actions": "used by every node",
     "dds": "used by every node",
 }
-"""The note on a card whose names every node may use, if those rights are not drawn."""
+"""The note on a card of names that every node may use, if those rights are not drawn."""
 OWN = "own:"
 SENDERS, LISTENERS = "may send", "may receive"
 
@@ -78,7 +78,8 @@ class Scene:
     """Cards and the links between them.
 
     ``shown`` is the number of names that are drawn, or counted on the card of their only enclave;
-    ``hidden`` is the number of names left out because only rights that every node needs use them.
+    ``hidden`` is the number of names that only have rights that every node needs, which this scene
+    leaves out.
     """
 
     id: str
@@ -98,9 +99,9 @@ class Card:
     """A rectangle with text: an enclave, a group of enclaves, or a bundle of names.
 
     ``column`` is 0, 1 or 2; an enclave that sends and listens has a card on both sides.  ``lines``
-    are its text, ``notes`` are smaller text below.  ``members`` are all its enclaves or names.
-    Cards of names have ``kind``, ``level`` and ``tags`` (letters of onlookers), cards of enclaves
-    have ``group``.
+    is the text, ``notes`` smaller text below it.  ``members`` are all enclaves or names of the
+    card.  Only cards of names have ``kind``, ``level`` and ``tags`` (letters of onlookers); only
+    cards of enclaves have ``group``.
     """
 
     id: str
@@ -121,7 +122,7 @@ class Card:
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """An arrow from the right edge of one card to the left edge of another one.
+    """An arrow from the right edge of one card to the left edge of another card.
 
     ``rights`` is its label, such as publish; ``wildcard`` says that only wildcards give the right.
     """
@@ -139,7 +140,7 @@ class Link:
 
 @dataclass(frozen=True, slots=True)
 class Onlooker:
-    """An enclave with so many names that a letter (``tag``) on their cards replaces the lines."""
+    """An enclave with so many names that their cards show its letter (``tag``) instead of lines."""
 
     tag: str
     enclave: str
@@ -162,8 +163,8 @@ def scenes_of(picture: Picture, *, placed: bool = True) -> tuple[Scene, ...]:
 
     With few enclaves, the first scene leaves out the rights that every node needs, and the second
     one has everything.  With many enclaves, the first scene has the groups and the links between
-    them, and then each group has a scene with its neighbours.  Without ``placed``, scenes have no y
-    and no frames, for formats that place cards themselves.
+    them, and each group has another scene with its neighbours.  Without ``placed``, scenes have no
+    y and no frames, for formats that place cards themselves.
     """
     groups = {each.path: each.group for each in picture.enclaves}
     titles = sorted(set(groups.values()))
@@ -174,7 +175,7 @@ def scenes_of(picture: Picture, *, placed: bool = True) -> tuple[Scene, ...]:
             title = "With what every node needs"
             scenes.append(_scene(picture, "all", title, picture.edges, str, placed=placed))
         return tuple(scenes)
-    # Groups begin with a colon, as no enclave does.
+    # Group ids begin with a colon; enclave names never do.
     outside = {path: f":{group}" for path, group in groups.items()}
     overview = outside.__getitem__
     scenes = [_scene(picture, "essential", "Overview", essential, overview, placed=placed)]
@@ -211,10 +212,10 @@ def _scene(
 
 
 class _Draft:
-    """A builder of a scene: first the cards and ties, then their positions.
+    """The builder of a scene: first the cards and links, then their positions.
 
-    ``members`` are the enclaves of each node of the scene, ``everybody`` the nodes that have any
-    right to a name, drawn or not.
+    ``members`` maps each node of the scene to its enclaves; ``everybody`` maps each name to the
+    nodes with any right to it, drawn or not.
     """
 
     def __init__(
@@ -256,7 +257,7 @@ class _Draft:
         return plain and (tie.node, tie.right) in self._looking
 
     def _alone(self, bundle: Bundle) -> str:
-        """Return the only node with ties to these names, except onlookers; "" if there are more."""
+        """Return the node with ties to these names if only one, except onlookers; otherwise ""."""
         looking = {tie.node for tie in bundle.ties if self._looks(tie)}
         drawn = {tie.node for tie in bundle.ties if not self._looks(tie)}
         if any(
@@ -308,7 +309,7 @@ class _Draft:
     def _cards(self) -> Iterable[Card]:
         sides = {end for key in self._ties for end in key[:2] if end[0] in "sl"}
         sides |= {f"{'s' if SENDS[right] else 'l'}{node}" for node, right in self._looking}
-        # In the scene of a group: all its enclaves, but only those neighbours that have links.
+        # The scene of a group has all enclaves of the group, but only neighbours with links.
         inner = {node for node in self._members if not node.startswith(":")}
         idle = (inner or set(self._members)) - {side[1:] for side in sides}
         sides |= {f"s{node}" for node in idle}
@@ -319,7 +320,7 @@ class _Draft:
             yield self._names_card(number, bundle)
 
     def _side_card(self, side: str, *, first: bool) -> Card:
-        """Return the card of an enclave or group; the ``first`` one counts private names."""
+        """Return a card of an enclave or group; its ``first`` card counts its private names."""
         node, sends = side[1:], side[0] == "s"
         members = tuple(self._members[node])
         is_group = node.startswith(":")
@@ -381,7 +382,7 @@ class _Draft:
     # ── links ──────────────────────────────────────────────────────────────────────────────
 
     def _links(self, cards: dict[str, Card]) -> tuple[Link, ...]:
-        """Return the links, with their ends distributed over the edges of the cards."""
+        """Return the links, with their ends spread over the edges of the cards."""
         keys = sorted(self._ties)
         ports: dict[tuple[str, bool], list[tuple[float, int]]] = defaultdict(list)
         for number, (source, target, *_) in enumerate(keys):
@@ -412,10 +413,10 @@ class _Draft:
 
 
 def _onlookers(bundles: Sequence[Bundle]) -> dict[tuple[str, str], int]:
-    """Return the number of names of each onlooker, by node and right.
+    """Map each onlooker (node and right) to the number of its names.
 
     An onlooker, such as ("/recorder", "subscribe"), has wildcards that match so many names that its
-    lines would hide all others.
+    lines would hide all other lines.
     """
     reached: dict[tuple[str, str], list[Bundle]] = defaultdict(list)
     wild: dict[tuple[str, str], int] = defaultdict(int)
@@ -442,18 +443,18 @@ def counted(number: int, thing: str) -> str:
 
 
 def _own_text(own: Mapping[str, int]) -> list[str]:
-    """Return short lines like ``own: 3 topics, 2 services`` for names of one enclave only."""
+    """Return lines like ``own: 3 topics, 2 services`` for names that only one enclave uses."""
     found = [counted(number, KIND_NAMES[kind]) for kind, number in own.items() if number]
     lines = [f"{OWN} {', '.join(found[:2])}"]
     return [*lines, ", ".join(found[2:])] if found[2:] else lines
 
 
 def _names_title(bundle: Bundle) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the text (names, or wildcards for them) and the notes of a bundle's card."""
+    """Return the lines (names, or wildcards that match them) and the notes of a bundle's card."""
     kind, names = KIND_NAMES[bundle.kind], bundle.names
     if bundle.partial:
         return (f"{_common_namespace(names)}/…",), (
-            f"{counted(len(names), kind)}; a line is for some of them",
+            f"{counted(len(names), kind)}; each line is for some of them",
         )
     if len(names) <= _MOST_NAMES:
         return names, ()
@@ -474,7 +475,7 @@ def _common_namespace(names: Sequence[str]) -> str:
 
 
 def _wrapped(text: str, letters: int) -> tuple[str, ...]:
-    """Return ``text`` in lines of at most ``letters``, split at a slash or underscore."""
+    """Return ``text`` in lines of at most ``letters``, split at slashes or underscores."""
     lines = []
     while len(text) > letters:
         cut = max(
@@ -494,7 +495,7 @@ def _wrapped(text: str, letters: int) -> tuple[str, ...]:
 def _tops(
     columns: Sequence[Sequence[ColumnItem]], lines: Sequence[tuple[str, str]]
 ) -> dict[str, float]:
-    """Return the y of all cards; the tallest column is packed, the others are aligned to it."""
+    """Map cards to their y; the tallest column is packed, the other columns aligned to it."""
     extent = [_extent(column) for column in columns]
     tallest = max(range(3), key=lambda number: (extent[number], number == 1))
     tops = place_column(columns[tallest], {}, _GAP, _TOP, _LEAD if tallest != 1 else 0)
@@ -544,8 +545,8 @@ def order_columns(
 ) -> tuple[list[ColumnItem], list[ColumnItem], list[ColumnItem]]:
     """Return the items of the three columns in an order with few crossings of lines.
 
-    ``lines`` are pairs of ids of items in neighbouring columns.  The result is the best order of
-    all sweeps.
+    ``lines`` are pairs of ids of items in neighbouring columns.  The result is the order with the
+    fewest crossings of all sweeps.
     """
     near: dict[str, list[str]] = {item.id: [] for item in (*left, *middle, *right)}
     for one, other in lines:
@@ -565,7 +566,7 @@ def order_columns(
 
 
 def _places(columns: Sequence[Sequence[ColumnItem]]) -> dict[str, float]:
-    """Return the position of each item in its column, from 0 to 1."""
+    """Map each item to its position in its column, from 0 to 1."""
     return {
         item.id: (number + 0.5) / len(column)
         for column in columns
@@ -633,7 +634,7 @@ def place_column(
     top: float,
     lead: float = 0,
 ) -> dict[str, float]:
-    """Return the y of each item, without overlap, and near the ``wanted`` y of its centre.
+    """Map each item to a y so that its centre is near the ``wanted`` y, without overlaps.
 
     Items keep their order, with ``gap`` between them, and are not above ``top``; there is ``lead``
     more space above the first item of each group.

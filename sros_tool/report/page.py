@@ -1,8 +1,8 @@
-"""Render a picture as one HTML file with its script, style and data; it needs no network.
+"""HTML pages that contain their script, style and data, and need no network.
 
-The content security policy allows only the script and style in the file, by their digests, and
-nothing else.  The data is JSON in which every character that could end its element is escaped, and
-the script inserts it only as text.
+The content security policy allows only the script and style in the file, by their digests.  The
+data is JSON in which every character that could end its element is escaped, and the script inserts
+it only as text.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _ESCAPES = {ord(c): f"\\u{ord(c):04x}" for c in "<>&\u2028\u2029"}
 
 
 def render_page(picture: Picture, scenes: tuple[Scene, ...], now: datetime) -> str:
-    """Return the page of a picture with its scenes; ``now`` is the date of its findings."""
+    """Return the HTML page of a picture with its scenes; ``now`` is the date of its findings."""
     script, style = asset("view.js"), asset("view.css")
     origins = ", ".join(f"{each.kind} {each.title}" for each in picture.origins)
     made = f"{origins}. Findings are as of {iso(now)[:10]}."
@@ -42,12 +42,12 @@ def render_page(picture: Picture, scenes: tuple[Scene, ...], now: datetime) -> s
 
 
 def asset(name: str) -> str:
-    """Return the content of a file that was built for pages (from web/, see package.json there)."""
+    """Return the content of a file in assets/, which web/package.json builds from web/."""
     return (_ASSETS / name).read_text("utf-8")
 
 
 def document(title: str, body: str, style: str, script: str = "", data: object = None) -> str:
-    """Return a self-contained HTML document; ``body`` is markup, ``data`` is for the script."""
+    """Return a self-contained HTML document; ``body`` is HTML, ``data`` the script's input."""
     policy = f"default-src 'none'; style-src {_digest(style)}; base-uri 'none'; form-action 'none'"
     if script:
         policy += f"; script-src {_digest(script)}"
@@ -86,7 +86,7 @@ def _digest(text: str) -> str:
 
 
 def _data(picture: Picture, scenes: tuple[Scene, ...]) -> dict[str, Any]:
-    """Return the data for the script: names in bundles, which are much shorter than edges."""
+    """Return the script's data: bundles of names, which need much less space than edges."""
     return {
         "overlay": as_plain(picture.overlay),
         "enclaves": [_enclave(each) for each in picture.enclaves],

@@ -1,7 +1,7 @@
 """The picture of a robot's rights as plain values, the input of every output format.
 
-Everything is sorted, and contains no paths of the machine and no time of creation, so the same
-sources give the same picture.
+Everything is sorted and contains neither paths of the machine nor a time of creation, so the same
+sources always give the same picture.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from sros_tool.values import as_plain, shows
 SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
     ("subscribe", "reply", "execute"), False
 )
-"""Whether the arrow of a right leads to the name, because the enclave sends first."""
+"""Whether the arrow of a right points to the name, because the enclave sends first."""
 
 _KINDS = (*RIGHTS, "dds")
 """The kinds of names in display order; dds is a topic without a ROS name."""
 
 
 class OverlaySide(StrEnum):
-    """The side of an overlay that has something; always BOTH without an overlay."""
+    """The side of an overlay that has a right; always BOTH without an overlay."""
 
     BOTH = "both"
     FIRST = "first"
@@ -47,8 +47,8 @@ class Protection:
     """The protection of a name by governance: the weakest of all its DDS topics.
 
     ``data``, ``metadata`` and ``rtps`` are protection kinds of DDS-Security 1.1.  Without
-    ``read_control``, everybody with an identity may read, independently of permissions; without
-    ``write_control``, everybody may write.
+    ``read_control``, every authenticated participant may read, whatever its permissions; without
+    ``write_control``, every authenticated participant may write.
     """
 
     level: WireLevel
@@ -60,7 +60,7 @@ class Protection:
 
 
 UNKNOWN = Protection(WireLevel.UNKNOWN)
-"""The protection if no governance is known, as for a policy alone."""
+"""The protection if no governance is known, such as for a policy alone."""
 
 
 @shows(
@@ -88,7 +88,7 @@ class Edge:
 
     @property
     def sends(self) -> bool:
-        """Whether the arrow leads from the enclave to the name."""
+        """Whether the arrow points from the enclave to the name."""
         return SENDS[self.right]
 
     @property
@@ -99,7 +99,7 @@ class Edge:
 
 @dataclass(frozen=True, slots=True)
 class Name:
-    """A topic, service or action, or a ``wildcard`` that matches no known name."""
+    """A topic, service or action; or a ``wildcard`` without any known name."""
 
     kind: str
     name: str
@@ -124,8 +124,8 @@ class Statement:
 class PicturedEnclave:
     """An enclave in a picture; ``group`` is its host or its namespace.
 
-    ``subject``, ``issuer``, ``serial`` and ``key`` describe its certificate, "" without one.
-    ``problems`` keep a process from running in it.  In an overlay of use, an enclave that was not
+    ``subject``, ``issuer``, ``serial`` and ``key`` describe its certificate; "" without one.
+    ``problems`` keep a process from using it.  In an overlay of use, an enclave that was not
     ``observed`` counts as neither used nor unused.
     """
 
@@ -191,8 +191,8 @@ class Overlay:
 class OverlayDifference:
     """A right that only one side has, with ``notes``.
 
-    For a change, the notes are the wildcards by which the other side has the right nevertheless;
-    for use, the number of names that a wildcard matches and that were never observed.
+    For a change, the notes are the wildcards of the other side that cover the right; for use, the
+    number of names that a wildcard matches and that were never observed.
     """
 
     mark: OverlaySide
@@ -229,13 +229,13 @@ class Tie:
 
     @property
     def sends(self) -> bool:
-        """Whether the arrow leads from the enclave to the names."""
+        """Whether the arrow points from the enclave to the names."""
         return SENDS[self.right]
 
 
 @dataclass(frozen=True, slots=True)
 class Bundle:
-    """Sorted names of one kind and protection, which all have the same ties.
+    """Sorted names of the same kind and protection, with the same ties.
 
     In a ``partial`` bundle, each tie is for only some of the names.
     """
@@ -250,7 +250,7 @@ class Bundle:
 def fold(
     names: Iterable[Name], edges: Iterable[Edge], owner: Callable[[str], str] = str
 ) -> tuple[Bundle, ...]:
-    """Return the names that have an edge, in bundles, sorted by kind and first name.
+    """Return the names that have an edge in bundles, sorted by kind and first name.
 
     ``owner`` maps an enclave to the node that represents it: itself, or its group.
     """
@@ -279,7 +279,7 @@ def fold(
 
 
 def coarsened(bundles: Iterable[Bundle]) -> tuple[Bundle, ...]:
-    """Return bundles joined if the same nodes send; they no longer show who receives which name.
+    """Return bundles with the same senders joined; they do not show who receives which name.
 
     Denials and differences stay separate, because users look for them.
     """

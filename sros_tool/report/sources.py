@@ -1,7 +1,7 @@
-"""Read the sources of pictures: policies, permissions, keystores and observations.
+"""Sources of pictures: policies, permissions, keystores and observations.
 
-Every source is shown by its base name, because its path on this machine is private.  Private keys
-are never read; only their existence is checked.
+A picture shows only the base name of a source, because paths of this machine are private.
+Enclave keys are read only to report faults such as a key that does not fit its certificate.
 """
 
 from __future__ import annotations
@@ -51,7 +51,10 @@ def read_source(path: Path, *, now: datetime) -> PictureSource:
     """Return the source at ``path``: a policy, permissions, an enclave, a keystore, an observation.
 
     An observation is a learned policy, or the output of ``sros generate_policy --json``.  Faults of
-    a keystore become findings.  Raises `DocumentError` for anything else.
+    a keystore become findings.
+
+    Raises:
+        DocumentError: ``path`` is none of these.
     """
     if path.is_file() and read_bytes(path, "file").lstrip()[:1] == b"{":
         return _observation(path)
@@ -78,7 +81,7 @@ def read_source(path: Path, *, now: datetime) -> PictureSource:
 def with_findings(
     source: PictureSource, path: Path, findings: Iterable[PicturedFinding]
 ) -> PictureSource:
-    """Return ``source``, read from ``path``, with more findings, whose texts get no other path.
+    """Return ``source``, read from ``path``, with more findings, without the path in their texts.
 
     A finding keeps its enclave only if the source has an enclave of that name.
     """
@@ -88,7 +91,7 @@ def with_findings(
 
 
 def _base_name(path: Path) -> str:
-    """Return the name of a source in a picture, in characters that every format supports."""
+    """Return the base name of a source, in characters that every format supports."""
     name = path.absolute().name or "/"
     return "".join(
         letter if letter.isprintable() else "\N{REPLACEMENT CHARACTER}" for letter in name
@@ -96,13 +99,13 @@ def _base_name(path: Path) -> str:
 
 
 def common_rights() -> tuple[Right, ...]:
-    """Return the rights that every node needs, from the shipped policy."""
+    """Return the rights that every node needs, from the policy that ships with sros."""
     policy = read_policy(policies_dir() / "defaults" / "node_basics.xml")
     return tuple(sorted(policy_rights(policy)))
 
 
 def template_governance(choice: str) -> Governance:
-    """Return the governance of a keystore made from this template."""
+    """Return the governance of a keystore made from the template ``choice``."""
     from sros_tool.dds.domains import DomainSet
 
     return governance_for(load_template(choice).protection, DomainSet.of((0, 0)))
@@ -123,7 +126,7 @@ def _observation(path: Path) -> PictureSource:
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DocumentError(
             f"'{path}' is not an observation",
-            "It is JSON, but not the output of `sros generate_policy --json`.",
+            "It contains JSON, but not the output of `sros generate_policy --json`.",
         ) from error
     learned = learn(observed)
     policy = learned.policy()

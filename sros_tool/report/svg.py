@@ -1,4 +1,4 @@
-"""Render a scene as a self-contained SVG file, for light and dark backgrounds."""
+"""A scene as a self-contained SVG file, for light and dark backgrounds."""
 
 from __future__ import annotations
 
@@ -224,7 +224,7 @@ def _legend(picture: Picture, scene: Scene) -> Iterable[str]:
         rows.append(('<path class="link second" d="M0 -4h40"/>', picture.overlay.second))
     yield _row(rows)
     if any(note.startswith(OWN) for card in scene.cards for note in card.notes):
-        yield _row([("", f"{OWN} what no other enclave may use")])
+        yield _row([("", f"{OWN} names that no other enclave may use")])
     if scene.onlookers:
         yield _row(
             (

@@ -38,7 +38,7 @@ def test_a_wildcard_that_became_names_is_a_difference_though_nothing_moved(tmp_p
     assert edge(picture, "/a", "publish", "/x").mark is OverlaySide.BOTH
     assert {d.text: d.notes for d in picture.differences} == {
         "/a ALLOW publish topic /*": (),
-        "/a ALLOW publish topic /x": ("the other has it by publish topic /*",),
+        "/a ALLOW publish topic /x": ("the other side has it by publish topic /*",),
     }
 
 
@@ -79,7 +79,7 @@ def test_what_a_wildcard_reaches_and_nobody_used_is_counted(tmp_path: Path) -> N
         (
             OverlaySide.FIRST,
             "/r ALLOW subscribe topic /*",
-            ("4 of the 6 names that it reaches were never observed",),
+            ("4 of the 6 names that it matches were never observed",),
         ),
         (OverlaySide.FIRST, "/w ALLOW publish topic /t0", ()),
     ]

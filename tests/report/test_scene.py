@@ -124,7 +124,7 @@ def test_what_cannot_be_folded_is_joined_by_its_senders_and_says_so(tmp_path: Pa
     assert sorted(len(card.members) for card in cards) == [1, 118]
     joined = max(cards, key=lambda card: len(card.members))
     assert joined.lines == ("/ns/…",)
-    assert joined.notes == ("118 topics; a line is for some of them",)
+    assert joined.notes == ("118 topics; each line is for some of them",)
     denied = [link for link in scene.links if link.qualifier is DENY]
     assert [(link.source != joined.id, link.target) for link in denied] == [(True, "l/l0")]
 
