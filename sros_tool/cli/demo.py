@@ -177,7 +177,7 @@ def demo(
         if path is not None:  # fail before the demo runs, not after it
             check_output(path, force=force)
     if keep is not None and keep.exists() and not keep.is_dir():
-        raise UsageError(f"cannot keep anything in '{keep}'", "It is a file.", "Name a folder.")
+        raise UsageError(f"--keep '{keep}' is not a folder", "It is a file.", "Name a folder.")
     if plot is not None and not any(scenario.measured for scenario in options.scenarios):
         raise UsageError(
             "there is nothing to plot",

@@ -177,7 +177,7 @@ def generate_artifacts(
         )
     if result.new_keystore and not dry_run:
         click.echo(f"'{root}' is not a valid keystore, creating new keystore", err=True)
-        _say_new_keystore(root, template, result.domains)
+        _print_new_keystore(root, template, result.domains)
     _show(result, dry_run)
 
 
@@ -193,7 +193,7 @@ def _show(result: Creation, dry_run: bool) -> None:
             for name in names:
                 click.echo(text.format(name))
     for name in result.kept:
-        click.echo(f"enclave {name} already exists: left as it is", err=True)
+        click.echo(f"enclave {name} already exists: not changed", err=True)
     print_notes(result.notes)
 
 
@@ -280,7 +280,7 @@ Example:
 )
 @click.option("--permissions-key", metavar="URI", help="The same for the permissions CA.")
 @click.option(
-    "--encrypt-ca-keys", is_flag=True, help="Protect new CA keys in files by a passphrase."
+    "--encrypt-ca-keys", is_flag=True, help="Protect new CA keys in files with a passphrase."
 )
 @dry_run_option
 def create_keystore(
@@ -326,8 +326,8 @@ def create_keystore(
     if dry_run:
         print_plan(root, result.changes)
         return
-    _say_new_keystore(root, template, result.domains, frozenset(imported))
-    _say_what_is_open(template)
+    _print_new_keystore(root, template, result.domains, frozenset(imported))
+    _print_open_rights(template)
 
 
 def _choices(
@@ -368,7 +368,7 @@ def _imported(files: dict[str, Path | None]) -> dict[str, bytes]:
     }
 
 
-def _say_new_keystore(
+def _print_new_keystore(
     root: Path, template: Template, domains: DomainSet, imported: frozenset[str] = frozenset()
 ) -> None:
     """Print the new keystore's domains, template, CAs, validity and CA fingerprints."""
@@ -402,7 +402,7 @@ def _say_new_keystore(
             click.echo(f"    imported, valid until {iso(validity_of(certificate).not_after)}")
 
 
-def _say_what_is_open(template: Template) -> None:
+def _print_open_rights(template: Template) -> None:
     from sros_tool.keystore.template import EVERYTHING
 
     if template.default_permissions == EVERYTHING:

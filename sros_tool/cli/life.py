@@ -50,7 +50,7 @@ Example:
     metavar="DURATION|PERCENT",
     help="Also renew enclaves that expire within 30d, or have used 66% of their validity.",
 )
-@click.option("--new-key", is_flag=True, help="Make new keys as well.")
+@click.option("--new-key", is_flag=True, help="Create new keys as well.")
 @click.option(
     "--revoke-old",
     is_flag=True,
@@ -100,10 +100,10 @@ def renew(
         if not result.renewed:
             click.echo("no enclave needs to be renewed", err=True)
     print_notes(result.notes)
-    _say_replaced(result)
+    _print_replaced(result)
 
 
-def _say_replaced(result: Renewal) -> None:
+def _print_replaced(result: Renewal) -> None:
     from sros_tool.validity import iso
 
     if result.works_until:
@@ -115,7 +115,7 @@ def _say_replaced(result: Renewal) -> None:
         )
         click.echo(f"{what}, unless revoked: see --revoke-old", err=True)
     elif result.restart:
-        _say_restart(result.restart)
+        _print_restart(result.restart)
     for remark in result.remarks:
         click.echo(remark, err=True)
 
@@ -188,7 +188,7 @@ def revoke(words: tuple[str, ...], reason: str, until_retired: bool, dry_run: bo
     else:
         for name in result.revoked:
             click.echo(f"revoked enclave {name}")
-    _say_restart(result.restart)
+    _print_restart(result.restart)
     for remark in result.remarks:
         click.echo(remark, err=True)
 
@@ -227,7 +227,7 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
         if dry_run:
             print_plan(root, result.changes)
             return 0
-        _say_restart(result.restart)
+        _print_restart(result.restart)
         for remark in result.remarks:
             click.echo(remark, err=True)
     lists = read_lists(root)
@@ -277,7 +277,7 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
     return 1 if soon else 0
 
 
-def _say_restart(names: tuple[str, ...]) -> None:
+def _print_restart(names: tuple[str, ...]) -> None:
     if not names:
         return
     shown = ", ".join(names[:_MAX_NAMES]) + (", ..." if len(names) > _MAX_NAMES else "")
@@ -332,7 +332,9 @@ Example:
 @click.option("--ca-validity", metavar="SPAN", help="How long the new CA is valid, such as 10y.")
 @click.option("--identity-key", metavar="URI", help="Where to make the new key: file: or pkcs11:.")
 @click.option("--permissions-key", metavar="URI", help="The same for the permissions CA.")
-@click.option("--encrypt-ca-keys", is_flag=True, help="Protect new keys in files by a passphrase.")
+@click.option(
+    "--encrypt-ca-keys", is_flag=True, help="Protect new keys in files with a passphrase."
+)
 @click.option(
     "--delete-old-key", is_flag=True, help="Delete the old key: keep no copy in 'retired'."
 )
@@ -407,11 +409,13 @@ def rotate_ca(
     if dry_run:
         print_plan(root, step.changes)
     else:
-        _say(step, rotation_status(root, now=now()), together=finish, same_key=same_key)
+        _print_step(step, rotation_status(root, now=now()), together=finish, same_key=same_key)
     print_notes(step.notes)
 
 
-def _say(step: RotationStep, status: RotationStatus, *, together: bool, same_key: bool) -> None:
+def _print_step(
+    step: RotationStep, status: RotationStatus, *, together: bool, same_key: bool
+) -> None:
     if not step.changes:
         click.echo("nothing is left to do", err=True)
         return

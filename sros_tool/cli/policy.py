@@ -98,13 +98,13 @@ def merge_policy(
     elif target is None:
         click.echo(merged.document, nl=False)
     if not dry_run and not as_json:
-        _say_added(merged)
+        _print_added(merged)
     print_notes(merge_notes(merged.contradictions))
     if saved:
         click.echo(saved, err=True)
 
 
-def _say_added(merged: Merged) -> None:
+def _print_added(merged: Merged) -> None:
     count = len(merged.added)
     if not count:
         click.echo("no right was missing", err=True)

@@ -49,7 +49,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         ),
         "verify": VerbEntry("deployment", "Check whether a robot's enclaves can be used."),
         "create_request": VerbEntry(
-            "deployment", "Make a key on the robot, and a signing request."
+            "deployment", "Create a key on the robot, and a signing request."
         ),
         "sign_request": VerbEntry("deployment", "Sign the request of a robot."),
         "import": VerbEntry(
@@ -62,7 +62,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "diff_policy": VerbEntry(
             "policy", "Compare the rights of policies, permissions, keystores."
         ),
-        "minimize_policy": VerbEntry("policy", "Remove rights that are not used from a policy."),
+        "minimize_policy": VerbEntry("policy", "Remove unused rights from a policy."),
         "explain": VerbEntry("explain", "Show what DDS decides, by which rule, and why."),
         "view": VerbEntry("view", "Draw who may do what, as a page, SVG, DOT or Mermaid."),
         "policies": VerbEntry("policy", "List or copy the policies that ship with sros."),
@@ -227,19 +227,19 @@ def report_error(error: BaseException) -> int:
     if isinstance(error, click.UsageError):
         return _usage(error)
     if isinstance(error, SrosError):
-        return _say(_prefixed(str(error)), error.exit_status)
+        return _print_error(_prefixed(str(error)), error.exit_status)
     if isinstance(error, OSError):
-        return _say(_prefixed(_os_problem(error)), 1)
+        return _print_error(_prefixed(_os_problem(error)), 1)
     return _defect(error)
 
 
 def _usage(error: click.UsageError) -> int:
     message = error.format_message()
     where = error.ctx.command_path if error.ctx else "sros"
-    return _say(f"{where}: {message} See `{where} --help`.", 2)
+    return _print_error(f"{where}: {message} See `{where} --help`.", 2)
 
 
-def _say(text: str, status: int) -> int:
+def _print_error(text: str, status: int) -> int:
     print(visible(" ".join(text.split())), file=sys.stderr)
     return status
 
@@ -272,7 +272,7 @@ def _os_problem(error: OSError) -> str:
 def _defect(error: BaseException) -> int:
     if os.environ.get("SROS_DEBUG"):
         traceback.print_exception(error)
-    return _say(
+    return _print_error(
         _prefixed(
             f"this is a defect of sros: {type(error).__name__}: {error}. Please report it; "
             "SROS_DEBUG=1 prints a traceback."

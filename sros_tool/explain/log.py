@@ -313,8 +313,8 @@ class _Examiner:
         if domain and int(domain) in governed:
             return
         yield (
-            f"the governance is for domain {governed}: the process was in {where}, or had another "
-            "governance then",
+            f"the governance is for domain {governed}: the process was in {where}, or had loaded "
+            "another governance",
             remedy(Fault.GOVERNANCE_DOMAIN, self._root, enclave.name).replace(
                 "domain of the keystore", f"domain of the keystore, such as {next(iter(governed))}"
             ),
@@ -350,8 +350,8 @@ def _other_node(denial: Denial, answer: Answer) -> tuple[list[str], str]:
         )
     if not nodes and (node or denial.topic in _TOPICS_OF_EVERY_NODE):
         return [f"the permissions lack {_EVERY_NODE}"], (
-            'Put <xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> into the '
-            "node's profile: `sros generate_policy POLICY --enclave ENCLAVE --from-log LOG` does."
+            'Add <xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/> to the '
+            "node's profile, or run `sros generate_policy POLICY --enclave ENCLAVE --from-log LOG`."
         )
     return [], ""
 

@@ -1,4 +1,4 @@
-"""Observe the live ROS graph: through rclpy, for how long, and in which enclave each node runs.
+"""Observe the live ROS graph through rclpy, and find the enclave of each node.
 
 `RosGraph` runs rclpy in a separate process (`sros_tool.graph.observer`); `settle`, `look_for` and
 `watch` decide for how long.  Times are in seconds; clock and source are passed in.
@@ -399,7 +399,7 @@ _DEFAULT_ENCLAVE = ("/",)
 
 
 def identity_of(subject: bytes) -> str:
-    """Return the first 6 bytes, in hex, of a participant with this certificate subject (DER)."""
+    """Return the first 6 bytes (hex) of the participant identifier for a subject name (DER)."""
     digest = int(sha256(subject).hexdigest()[:_DIGITS], 16)
     return f"{_FIRST_BIT | digest >> 1:x}"
 

@@ -53,11 +53,11 @@ def main() -> int:
         )
     except Exception as error:  # whatever rclpy raises has to reach the parent as a reason
         time.sleep(_LOG_FLUSH_SECONDS)
-        _say(report, {"failed": stage, "reason": f"{type(error).__name__}: {error}"})
+        _send(report, {"failed": stage, "reason": f"{type(error).__name__}: {error}"})
         return 1
     rmw = rclpy.get_rmw_implementation_identifier()
     try:
-        _say(report, {"ready": rmw})
+        _send(report, {"ready": rmw})
         _look(node, report, period, rmw in _ORDERED)
     except BrokenPipeError:
         pass
@@ -73,7 +73,7 @@ def _look(node: Any, report: Any, period: float, ordered: bool) -> None:
         now = _sight(node)
         if now is not None and now != before:
             listed, endpoints = before = now
-            _say(report, {"ordered": ordered, "listed": listed, "endpoints": endpoints})
+            _send(report, {"ordered": ordered, "listed": listed, "endpoints": endpoints})
 
 
 def _sight(node: Any) -> tuple[list[Any], list[Any]] | None:
@@ -109,7 +109,7 @@ def _endpoints(node: Any) -> list[tuple[str, str, str, str, str]]:
     return sorted(found)
 
 
-def _say(report: Any, value: object) -> None:
+def _send(report: Any, value: object) -> None:
     report.write(json.dumps(value) + "\n")
 
 
