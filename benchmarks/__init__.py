@@ -1,1 +1,4 @@
-"""Measures sros side by side with the floor of each task, in the same run."""
+"""Benchmarks of sros, each next to the floor of its task, measured in the same run.
+
+The floor is the time of the unavoidable work, such as the same cryptography and files alone.
+"""

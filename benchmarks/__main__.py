@@ -1,4 +1,4 @@
-"""``python -m benchmarks``: a table on stdout, and with ``--json FILE`` the same as JSON."""
+"""The command ``python -m benchmarks``, which prints a table; ``--json FILE`` also writes JSON."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RULES = 14
 
 @dataclass(frozen=True)
 class Row:
-    """One figure: seconds (or as ``unit`` says), its floor, and the limit that it should keep."""
+    """One figure in ``unit``, its floor in the same unit, and the limit that it should keep."""
 
     name: str
     value: float
@@ -42,13 +42,13 @@ class Row:
 def main() -> int:
     """Run every benchmark; with ``--check``, exit 1 if a limit is not kept."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="also write the figures to this file")
     parser.add_argument(
-        "--rounds", type=int, default=5, help="each figure is the median of so many"
+        "--rounds", type=int, default=5, help="rounds of each figure, which is the median"
     )
-    parser.add_argument("--enclaves", type=int, default=1000)
-    parser.add_argument("--topics", type=int, default=20000)
-    parser.add_argument("--renew", type=int, default=0, help="also renew so many enclaves (10000)")
+    parser.add_argument("--enclaves", type=int, default=1000, help="enclaves of a keystore")
+    parser.add_argument("--topics", type=int, default=20000, help="topics of one policy group")
+    parser.add_argument("--renew", type=int, default=0, help="also renew this number of enclaves")
     parser.add_argument("--check", action="store_true", help="exit 1 if a limit is not kept")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as name:
@@ -83,7 +83,7 @@ def _renewal(folder: Path, count: int) -> list[Row]:
     kept = found.taken <= 2 * found.floor
     return [
         Row(f"renew {count} enclaves", found.taken, found.floor, "2 x floor", kept),
-        Row("... floor: the old not verified", found.taken, found.unchecked, "-", True),
+        Row("... floor, without verifying the old files", found.taken, found.unchecked, "-", True),
     ]
 
 
@@ -118,7 +118,7 @@ def _artifacts(folder: Path, count: int, rounds: int) -> list[Row]:
         (folder / f"floor{index}").mkdir()
     floor = _timed(lambda i: make_enclaves(folder / f"floor{i}", files, count), rounds)
     task = f"policy of {count} enclaves, {RULES} rules each -> all artifacts"
-    again_task = "the same again: permissions replaced, keys kept"
+    again_task = "... again: permissions replaced, keys kept"
     kept = made <= 2 * floor and made < 1.5
     return [
         Row(task, made, floor, "2 x floor and 1.5 s", kept),
@@ -184,7 +184,7 @@ root, count = Path(sys.argv[1]), int(sys.argv[2])
 now = datetime.now(UTC)
 create_keystore(root, template=load_template("development"), now=now)
 generate_artifacts(root, enclaves=[f"/robot{i}/part" for i in range(count)], now=now)
-# Not ru_maxrss, which starts with the size of the parent.
+# Not ru_maxrss, which includes the size of the parent process.
 print(next(line for line in open("/proc/self/status") if line.startswith("VmHWM")).split()[1])
 """
 

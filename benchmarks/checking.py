@@ -1,4 +1,4 @@
-"""Checking a keystore of many enclaves, and the policy that they come from."""
+"""Benchmarks of checking a keystore of many enclaves, and its policy."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 from benchmarks.inputs import enclaves_policy
 
 Figure = tuple[str, float, str, bool]
-"""What was measured, seconds, the limit, and whether it is kept."""
+"""The task, its seconds, the limit, and whether it is kept."""
 
 
 def checking(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Figure]:
-    """Seconds that it takes to check so many enclaves with so many rules each."""
+    """Measure the checks of a keystore with this number of enclaves, and of rules in each."""
     from sros_tool.checks.keystores.keystore import keystore_findings
     from sros_tool.checks.kind import WARNING
     from sros_tool.checks.policies import policy_file_findings
@@ -34,13 +34,13 @@ def checking(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Figur
         found = keystore_findings(root, now=now)
         assert not [each for each in found if each.severity >= WARNING]
 
-    def beside_policy() -> None:
+    def with_policy() -> None:
         found = keystore_findings(root, now=now, policies=(policy,))
         assert not [each for each in found if each.severity >= WARNING]
 
     measured = (
         (f"sros check: a keystore of {enclaves} enclaves", keystore),
-        ("... beside the policy that it was made from", beside_policy),
+        ("... compared with the policy that it was made from", with_policy),
         (f"sros check: a policy of {enclaves} enclaves", lambda: list(policy_file_findings(file))),
     )
     figures = []

@@ -1,7 +1,7 @@
-"""How long the decision engine takes, with names that it has not seen before.
+"""Benchmarks of the decision engine, with names that it has not seen before.
 
-The floor of a decision is a call of Python with the same arguments that looks the name up and
-makes a `Decision`.
+The floor of a decision is a Python function with the same arguments that looks the name up and
+returns a `Decision`.
 """
 
 from __future__ import annotations
@@ -25,10 +25,11 @@ _LIMIT = 60.0
 _PREPARED = 1000
 
 Figure = tuple[str, float, float | None, str, bool]
+"""The task, its seconds, the floor, the limit, and whether it is kept."""
 
 
 def deciding() -> Iterator[Figure]:
-    """Name, seconds, floor, limit, and whether it was kept."""
+    """Measure a million decisions of two vendors, and the preparation of many enclaves."""
     names = [_name(index) for index in range(_ASKED)]
     floor = _seconds(_nothing, names)
     for vendor in (Vendor.FAST, Vendor.CYCLONE):
@@ -45,7 +46,7 @@ def deciding() -> Iterator[Figure]:
 
 
 def _name(index: int) -> str:
-    """Half of the names are plainly allowed, a quarter by a wildcard, a quarter not at all."""
+    """Return a name: of four, two are allowed by name, one by a wildcard, and one is denied."""
     match index % 4:
         case 0 | 1:
             return f"rt/fleet/topic_{index % 100}"
@@ -65,7 +66,7 @@ def _nothing(topic: str, partitions: tuple[str, ...] = ()) -> Decision:
 
 
 def _seconds(ask: Callable[[str], Decision], names: list[str]) -> float:
-    """Seconds of one core for a million, from the best of three."""
+    """Return the CPU seconds of a million decisions, from the best of three rounds."""
     times = []
     for _ in range(3):
         begin = time.process_time()

@@ -1,4 +1,4 @@
-"""Asking every enclave of a keystore at once: who may do something, and whom one can influence."""
+"""Benchmarks of ``sros explain`` on a keystore of many enclaves, and of proving permissions."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from pathlib import Path
 from benchmarks.inputs import enclaves_policy
 
 Figure = tuple[str, float, str, bool]
-"""What was measured, seconds, the limit, and whether it is kept."""
+"""The task, its seconds, the limit, and whether it is kept."""
 
 
 def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Figure]:
-    """Seconds of ``sros explain --who`` and ``--reach``, and of proving what is signed."""
+    """Measure ``sros explain --who`` and ``--reach``, and the proof of permissions to sign."""
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.dds.domains import DomainSet
     from sros_tool.explain.evaluator import JoinContext
@@ -59,7 +59,7 @@ def explaining(folder: Path, enclaves: int, rules: int, rounds: int) -> list[Fig
     measured = (
         (f"sros explain --who: {enclaves} enclaves asked", ask_all, 2.0),
         (f"sros explain --reach among {enclaves} enclaves", follow, 2.0),
-        (f"proving that permissions of {enclaves} say what policies say", prove_all, 0.15),
+        (f"proving that permissions of {enclaves} match their policy", prove_all, 0.15),
     )
     figures = []
     for name, work, limit in measured:

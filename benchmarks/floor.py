@@ -1,4 +1,4 @@
-"""The floor of making enclaves: the same cryptography and the same files, with nothing else."""
+"""The floor of creating enclaves: only the same cryptography and the same files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sros_tool.validity import window
 
 
 def sizes_of(folder: Path) -> list[tuple[str, int | str]]:
-    """Name and size of each file of an enclave, or the target of a link."""
+    """Return the name of each file of an enclave, with its size, or the target of a link."""
     return [
         (each.name, os.readlink(each) if each.is_symlink() else each.stat().st_size)
         for each in sorted(folder.iterdir())
@@ -23,7 +23,7 @@ def sizes_of(folder: Path) -> list[tuple[str, int | str]]:
 
 
 def make_enclaves(folder: Path, files: list[tuple[str, int | str]], count: int) -> None:
-    """Per enclave: a key, its PEM, a certificate, two raw signatures, and the same files."""
+    """Make for each enclave a key, its PEM, a certificate, two signatures, and ``files``."""
     key = generate_key()
     validity = window(datetime.now(UTC), timedelta(days=365))
     ca = issue_ca(key, common_name("floor"), validity)

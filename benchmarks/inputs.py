@@ -1,4 +1,4 @@
-"""Policies of any size, for measuring."""
+"""Policies of any size for the benchmarks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _GROUPS = (
 
 
 def enclaves_policy(enclaves: int, rules: int) -> str:
-    """A policy of so many enclaves, each with one profile of so many names in five groups."""
+    """Return a policy with this number of enclaves, and of names in five groups of each."""
     parts = []
     for index in range(enclaves):
         groups = []
@@ -32,7 +32,7 @@ def enclaves_policy(enclaves: int, rules: int) -> str:
 
 
 def topics_policy(topics: int) -> str:
-    """A policy of one enclave that publishes so many topics."""
+    """Return a policy of one enclave that publishes this number of topics."""
     names = "".join(f"<topic>/fleet/topic_{index}</topic>" for index in range(topics))
     return _policy(
         '<enclave path="/big"><profiles><profile ns="/" node="big">'

@@ -1,9 +1,9 @@
-"""Renewing many enclaves, beside its floor: the same cryptography and files, with nothing else.
+"""The benchmark of renewing many enclaves, and its floor: only the same cryptography and files.
 
-Part of the cryptography is to verify what is replaced: the new certificate takes over the key of
-the old one, and the new permissions the rights of the old ones.  Without the two signatures,
-whoever can write to an enclave's folder would have any key certified, and any rights signed.  The
-floor is measured with that and without it.
+Renewing verifies the replaced files: the new certificate keeps the key of the old one, and the new
+permissions keep the old rights.  Without verifying the two signatures, whoever can write to an
+enclave's folder could get any key certified and any rights signed.  The floor is measured with and
+without verifying.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ RENEWED = ("cert.pem", "permissions.p7s", "permissions.xml")
 
 @dataclass(frozen=True)
 class Renewal:
-    """Seconds for so many enclaves: of sros, of the floor, and of the floor without its checks."""
+    """The seconds of sros, of the floor, and of the floor without verifying."""
 
     taken: float
     floor: float
@@ -32,7 +32,7 @@ class Renewal:
 
 
 def measure_renewal(folder: Path, count: int) -> Renewal:
-    """Renew ``count`` enclaves of a keystore, and replace as many files of the same sizes."""
+    """Measure renewing ``count`` enclaves, and replacing files of the same number and sizes."""
     from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
     from sros_tool.keystore.lifecycle.renew import renew
     from sros_tool.keystore.template import load_template
@@ -52,7 +52,9 @@ def measure_renewal(folder: Path, count: int) -> Renewal:
                 (place / str(index) / name).write_bytes(b"o" * size)
     os.sync()
     times: list[tuple[float, float, float]] = []
-    for day in range(1, ROUNDS + 1):  # in turns, so that a busy moment does not meet one alone
+    for day in range(
+        1, ROUNDS + 1
+    ):  # in turns, so that a busy moment does not affect only one of them
         later = now + timedelta(days=day)
         times.append(
             (
@@ -66,11 +68,11 @@ def measure_renewal(folder: Path, count: int) -> Renewal:
 
 
 def replace_files(folder: Path, files: list[tuple[str, int]], count: int, *, check: bool) -> None:
-    """Per enclave: a certificate for a key that exists, one signature, and files replaced.
+    """Issue for each enclave a certificate for an existing key, sign once, and replace ``files``.
 
-    With ``check``, the two files that tell the key and the rights are read, and two signatures
-    verified.  One flush makes all of it last, and comes before the first file gets its name.  All
-    of it is spread over the cores as sros spreads it.
+    With ``check``, certificate and permissions are read, and two signatures verified.  All files
+    are flushed once before the first one is renamed.  The work is spread over the cores as sros
+    does it.
     """
     from cryptography.hazmat.primitives import hashes
     from cryptography.hazmat.primitives.asymmetric import ec

@@ -1,7 +1,7 @@
-"""How long it takes to learn the policy of a large graph, with real nodes of rclpy.
+"""Benchmarks of learning the policy of a large graph, with real nodes of rclpy.
 
-``python -m benchmarks.observing FOLDER`` measures in a network of its own and prints JSON;
-`observing` runs that and returns its figures.
+``python -m benchmarks.observing FOLDER`` measures in a separate network namespace and prints JSON;
+`observing` runs this command and returns its figures.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import Any
 PROCESSES, NODES_EACH, TOPICS_EACH = 10, 5, 6
 NODES = PROCESSES * NODES_EACH
 ENDPOINTS = 500
-"""Beside its topics, a node without parameter services has 4: log, events, and its types."""
+"""Six topics, and four more of a node without parameter services: log, events, types."""
 
 _DOMAIN = "219"
 _LIMIT = 5.0
@@ -49,10 +49,11 @@ executor.spin()
 """
 
 Figure = tuple[str, float, str, bool]
+"""The task, its seconds, the limit, and whether it is kept."""
 
 
 def observing() -> list[Figure]:
-    """Name, seconds, limit, and whether it was kept; nothing where there is no rclpy."""
+    """Measure one look at a large graph, and learning its policy; [] without rclpy."""
     if importlib.util.find_spec("rclpy") is None:
         return []
     with tempfile.TemporaryDirectory() as folder:
@@ -73,7 +74,7 @@ def observing() -> list[Figure]:
 
 
 def main() -> None:
-    """Start the nodes, and measure beside them."""
+    """Start the nodes, measure, and print the seconds as JSON."""
     from sros_tool.runtime.netns import enter_isolation, try_isolation
 
     if try_isolation().isolated:
@@ -125,7 +126,7 @@ def _measured(folder: Path) -> dict[str, float]:
 
 
 def _look() -> float:
-    """One look through rclpy, in this process, once it knows the whole graph."""
+    """Return the seconds of one look at the whole graph with rclpy in this process."""
     import rclpy
 
     from sros_tool.graph.observer import NODE_NAME, _sight

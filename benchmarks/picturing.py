@@ -1,8 +1,8 @@
-"""How long a picture of 100 enclaves and 1000 names takes, and the page to open.
+"""Benchmarks of drawing a picture of 100 enclaves and 1000 names, and of opening its page.
 
-Two fleets: one in which names stay within a robot but for a few, as they mostly do, and one
-in which every name goes from one enclave to two drawn at random, so that no two are alike and
-nothing can be folded.
+There are two fleets.  In the usual one, most names are used only within a robot.  In the other one,
+two random enclaves read each name, so that no two names have the same readers and nothing can be
+folded.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ _LIMIT_SECONDS, _LIMIT_BYTES = 2.0, 2_000_000
 _FLAGS = ["--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
 
 Figure = tuple[str, float, float | None, str, bool, str]
-"""What was measured, the figure, its floor, the limit, whether it is kept, and the unit."""
+"""The task, its figure, the floor, the limit, whether it is kept, and the unit."""
 
 
 def picturing(folder: Path, rounds: int) -> Iterator[Figure]:
-    """From a policy file to a page, its size, and from disk to a page that can be used."""
+    """Measure making a page from a policy file, its size, and opening it in a browser."""
     for kind, text in (("within robots", _robots()), ("at random", _random())):
         file, page = folder / "pictured.xml", folder / "pictured.html"
         file.write_text(text)
@@ -82,7 +82,7 @@ def _seconds(work: Callable[[], object]) -> float:
 
 
 def _opened(page: Path, rounds: int) -> float | None:
-    """Seconds until the page can be used; None where there is no Playwright or Chromium."""
+    """Return the seconds until the page can be used; None without Playwright or Chromium."""
     chromium = shutil.which("chromium") or shutil.which("chromium-browser")
     if importlib.util.find_spec("playwright") is None or chromium is None:
         return None
@@ -110,7 +110,7 @@ def _name(robot: int, part: int, number: int) -> str:
 
 
 def _robots() -> str:
-    """Each part is read by two of its robot, and three of each robot by the next robot."""
+    """Return a policy: two parts of its robot read each part, and the next robot three parts."""
 
     def read(robot: int, part: int) -> list[str]:
         near = [
@@ -122,7 +122,7 @@ def _robots() -> str:
 
 
 def _random() -> str:
-    """Each name is read by two enclaves that are drawn; always the same ones."""
+    """Return a policy in which two random enclaves read each name; the same in every run."""
     draw = random.Random(7)
     readers: dict[tuple[int, int], list[str]] = {}
     for robot in range(ROBOTS):
