@@ -1,4 +1,4 @@
-"""The floors of docs/architecture.md hold, no import is circular, and public names are needed."""
+"""The layers of docs/architecture.md hold, no import is circular, and public names are needed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import pytest
 PROJECT = Path(__file__).parents[1]
 PACKAGE = PROJECT / "sros_tool"
 
-FLOORS = {
+LAYERS = {
     1: {"errors", "faults", "names", "validity", "values"}
     | {"xml", "files", "parallel", "resources"},
     2: {"pki", "policy", "dds"},
@@ -25,10 +25,10 @@ FLOORS = {
     6: {"api", "cli"},
     7: {"__init__", "__main__"},
 }
-FLOOR_OF = {room: floor for floor, rooms in FLOORS.items() for room in rooms}
+LAYER_OF = {package: layer for layer, packages in LAYERS.items() for package in packages}
 
 # Where a process of its own runs the nodes of rclpy. Nothing else may need ROS.
-ROS_ROOMS = {"graph", "demo"}
+ROS_PACKAGES = {"graph", "demo"}
 ROS_MODULES = {"runtime/probe_child.py"}
 
 
@@ -46,18 +46,18 @@ def imported(source: str, module: tuple[str, ...]) -> Iterator[tuple[int, str]]:
 def misplaced(source: str, path: str) -> list[str]:
     """Imports that the module `path`, relative to the package, may not have."""
     parts = ("sros_tool", *Path(path).with_suffix("").parts)
-    room = parts[1]
+    package = parts[1]
     found = []
     for line, name in imported(source, parts):
         first, *rest = name.split(".")
-        if first == "rclpy" and room not in ROS_ROOMS and path not in ROS_MODULES:
+        if first == "rclpy" and package not in ROS_PACKAGES and path not in ROS_MODULES:
             found.append(f"{path}:{line} imports rclpy")
-        if first != "sros_tool" or not rest or rest[0] == room or rest[0] == "__version__":
+        if first != "sros_tool" or not rest or rest[0] == package or rest[0] == "__version__":
             continue
-        # Rooms on one floor do not know each other, but for the small modules at the bottom.
-        if FLOOR_OF[rest[0]] >= FLOOR_OF[room] and FLOOR_OF[room] != 1:
+        # Packages of one layer do not import each other, except the small modules of layer 1.
+        if LAYER_OF[rest[0]] >= LAYER_OF[package] and LAYER_OF[package] != 1:
             found.append(f"{path}:{line} imports {name}, which is not below it")
-        elif FLOOR_OF[rest[0]] > FLOOR_OF[room]:
+        elif LAYER_OF[rest[0]] > LAYER_OF[package]:
             found.append(f"{path}:{line} imports {name}, which is above it")
     return found
 
@@ -65,8 +65,8 @@ def misplaced(source: str, path: str) -> list[str]:
 MODULES = sorted(str(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py"))
 
 
-def test_every_room_has_a_floor() -> None:
-    assert {Path(module).with_suffix("").parts[0] for module in MODULES} == set(FLOOR_OF)
+def test_every_package_has_a_layer() -> None:
+    assert {Path(module).with_suffix("").parts[0] for module in MODULES} == set(LAYER_OF)
 
 
 def test_nothing_imports_from_above_or_beside() -> None:
@@ -109,7 +109,7 @@ def test_the_search_sees_what_is_misplaced_and_only_that(
 
 
 CLOCKS = {"datetime.now", "datetime.utcnow", "datetime.today", "date.today", "time.time"}
-CLOCK_ROOM = {"cli/common.py", "api.py"}
+CLOCK_MODULES = {"cli/common.py", "api.py"}
 """`now`, `_moment`, and the offset of a machine whose zone has no name."""
 
 
@@ -125,7 +125,7 @@ def clocks(source: str) -> list[int]:
 
 def test_only_the_command_line_and_the_api_ask_the_clock() -> None:
     found = {module for module in MODULES if clocks((PACKAGE / module).read_text())}
-    assert found == CLOCK_ROOM
+    assert found == CLOCK_MODULES
     assert clocks("import datetime\nnow = datetime.datetime.now") == [2]
     assert clocks("time.monotonic(); now()") == []
 
@@ -138,18 +138,20 @@ def test_the_modules_that_may_need_ros_are_the_ones_that_do() -> None:
         if name.split(".")[0] == "rclpy"
     }
     assert not ROS_MODULES - users
-    assert {Path(module).parts[0] for module in users - ROS_MODULES} == ROS_ROOMS
+    assert {Path(module).parts[0] for module in users - ROS_MODULES} == ROS_PACKAGES
 
 
-def test_the_documentation_has_the_same_floors() -> None:
+def test_the_documentation_has_the_same_layers() -> None:
     text = (PROJECT / "docs" / "architecture.md").read_text()
     rows = re.findall(r"^\| ([1-6]) \| (.+?) \|", text, re.MULTILINE)
-    told = {
-        room.removesuffix("/").removesuffix(".py"): int(floor)
-        for floor, rooms in rows
-        for room in re.findall(r"`([^`]+)`", rooms)
+    documented = {
+        package.removesuffix("/").removesuffix(".py"): int(layer)
+        for layer, packages in rows
+        for package in re.findall(r"`([^`]+)`", packages)
     }
-    assert told == {room: floor for room, floor in FLOOR_OF.items() if not room.startswith("__")}
+    assert documented == {
+        package: layer for package, layer in LAYER_OF.items() if not package.startswith("__")
+    }
 
 
 # ── every module of a tree by its name, and the names in it ────────────────────────────────
