@@ -153,7 +153,7 @@ class Fault(Enum):
     CRL_MALFORMED = (
         "crl-malformed",
         "a revocation list that cannot be read",
-        "Fast DDS refuses every participant, also its own, with an empty reason.",
+        "With Fast DDS the node does not start, and its log has an empty reason.",
         "Fast DDS 2.14.5 (PKIDH.cpp); measured.",
         _CRL,
     )
@@ -225,7 +225,7 @@ class Fault(Enum):
         'DDS) or "Could not find domain in governance" (Cyclone DDS, code 141).',
         "DDS-Security 1.1, 9.4.1.2; measured.",
         "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env {root} {enclave} --domain ID` "
-        "prints the variables; for another domain, make a keystore with `sros create_keystore "
+        "prints the variables; for another domain, create a keystore with `sros create_keystore "
         "--domain`.",
     )
     PERMISSIONS_EXPIRED = (

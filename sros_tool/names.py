@@ -29,7 +29,7 @@ PARAMETER_SERVICES = (
 NODE_SERVICES = (*PARAMETER_SERVICES, "get_type_description")
 """All services that a node of ROS 2 Jazzy offers under its own name, as ``~/NAME``."""
 
-ACTION_INSIDE = "/_action/"
+ACTION_SEPARATOR = "/_action/"
 """Separates the name of an action from the names of its services and topics."""
 
 ACTION_SERVICES = ("cancel_goal", "get_result", "send_goal")
@@ -163,5 +163,5 @@ def action_part(name: str) -> tuple[str, str]:
 
     Both are "" if ``name`` does not belong to an action.
     """
-    action, _, part = name.rpartition(ACTION_INSIDE)
+    action, _, part = name.rpartition(ACTION_SEPARATOR)
     return (action, part) if part in (*ACTION_SERVICES, *ACTION_TOPICS) else ("", "")

@@ -40,11 +40,11 @@ class Window:
             )
 
     def contains(self, moment: datetime) -> bool:
-        """Return whether ``moment`` lies within the window."""
+        """Return whether ``moment`` is within the window."""
         return self.not_before <= moment <= self.not_after
 
     def within(self, outer: Window) -> Window:
-        """Return the part of this window that lies in ``outer``."""
+        """Return the part of this window that is in ``outer``."""
         return Window(max(self.not_before, outer.not_before), min(self.not_after, outer.not_after))
 
 

@@ -74,14 +74,14 @@ def parse(data: bytes, name: str) -> etree._Element:
             (entities could read other files).
     """
     if not data.strip():
-        raise DocumentError(f"{name} is empty", "", "An XML document was expected.")
+        raise DocumentError(f"{name} is empty", "An XML document was expected.")
     try:
         root = etree.fromstring(data, _parser())
     except (etree.XMLSyntaxError, ValueError) as error:
         why = getattr(error, "msg", "") or str(error)
         raise DocumentError(f"{name} is not well-formed XML", f"{why}.".capitalize()) from error
     if root is None:
-        raise DocumentError(f"{name} has no element", "", "An XML document was expected.")
+        raise DocumentError(f"{name} has no element", "An XML document was expected.")
     if root.getroottree().docinfo.doctype:
         raise DocumentError(
             f"{name} has a document type declaration",

@@ -452,7 +452,7 @@ def _show_status(status: RotationStatus, as_json: bool) -> None:
         print_json(
             {
                 "stage": rotation.stage,
-                "next": rotation.following(),
+                "next": rotation.next_stage(),
                 "enclaves": status.enclaves,
                 "authorities": [
                     {
@@ -470,7 +470,7 @@ def _show_status(status: RotationStatus, as_json: bool) -> None:
             }
         )
         return
-    click.echo(f"stage: {rotation.stage}, next: {rotation.following()}")
+    click.echo(f"stage: {rotation.stage}, next: {rotation.next_stage()}")
     for each in status.authorities:
         name = f"{each.roles[0]} CA" if len(each.roles) == 1 else "CA"
         end = f"until {iso(each.validity.not_after)}"

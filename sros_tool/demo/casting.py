@@ -29,7 +29,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.reader import governance_of, load_settings
 from sros_tool.keystore.template import Template
-from sros_tool.names import ACTION_INSIDE, NODE_SERVICES
+from sros_tool.names import ACTION_SEPARATOR, NODE_SERVICES
 from sros_tool.pki import smime
 from sros_tool.policy.patterns import matches
 from sros_tool.translate import dds_names, service_of
@@ -159,7 +159,7 @@ def _serving(rights: Mapping[str, Grant]) -> dict[str, str]:
     for server, client in permutations(rights, 2):
         for topic in _application_topics(rights[server], "publish"):
             service, begin = service_of(topic)
-            if begin == "rr" and ACTION_INSIDE not in service:
+            if begin == "rr" and ACTION_SEPARATOR not in service:
                 request = dds_names("request", service).publish[0]
                 if "parameter" not in topic and allows(rights[client], "publish", request):
                     found = {"server": server, "client": client}
@@ -240,7 +240,7 @@ def _application_topics(grant: Grant, verb: str) -> Iterator[str]:
     Topics of every node, hidden topics and topics of actions are left out.
     """
     for topic in _allowed(grant, verb):
-        private = topic.startswith("rt/_") or ACTION_INSIDE in topic
+        private = topic.startswith("rt/_") or ACTION_SEPARATOR in topic
         if topic not in _TOPICS_OF_EVERY_NODE and not private:
             yield topic
 

@@ -17,7 +17,7 @@ from sros_tool.errors import Note, UsageError
 from sros_tool.graph.learn import CommonParts, Learned, LearnedProfile, NodeRight, groups_of
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.names import (
-    ACTION_INSIDE,
+    ACTION_SEPARATOR,
     ACTION_SERVICES,
     ACTION_TOPICS,
     NODE_SERVICES,
@@ -186,7 +186,7 @@ def _right(denial: Denial) -> NodeRight:
 def _without_parts(rights: set[NodeRight]) -> frozenset[NodeRight]:
     """Return the rights without the topics that belong to an action among them."""
     parts = {
-        NodeRight(way, f"{each.name}{ACTION_INSIDE}{topic}")
+        NodeRight(way, f"{each.name}{ACTION_SEPARATOR}{topic}")
         for each in rights
         for way in ({"call": SUBSCRIBE, "execute": PUBLISH}.get(each.right),)
         if way

@@ -20,7 +20,7 @@ from sros_tool.explain.question import Part, Question, ask
 from sros_tool.explain.remedy import remedy
 from sros_tool.faults import Fault
 from sros_tool.graph.observation import PUBLISH
-from sros_tool.names import ACTION_INSIDE
+from sros_tool.names import ACTION_SEPARATOR
 from sros_tool.policy.patterns import covers
 from sros_tool.runtime.vendor_log import (
     CONTINUED,
@@ -380,7 +380,7 @@ def _in_ros_terms(denial: Denial) -> tuple[str, str]:
     prefix, topic = denial.topic[:2], denial.topic[2:]
     if (prefix, denial.direction) in _HALVES:
         word, end = _HALVES[prefix, denial.direction]
-        name, part, _ = topic.removesuffix(end).partition(ACTION_INSIDE)
+        name, part, _ = topic.removesuffix(end).partition(ACTION_SEPARATOR)
         return ("execute" if part and word == "serve" else word), name
     if prefix == "rt" and topic.startswith("/"):
         return denial.direction or "use", topic

@@ -19,7 +19,7 @@ from functools import lru_cache
 from itertools import product
 
 from sros_tool.dds.governance import Governance
-from sros_tool.names import ACTION_INSIDE, is_expression
+from sros_tool.names import ACTION_SEPARATOR, is_expression
 from sros_tool.policy.model import DENY
 from sros_tool.policy.patterns import common_name, literal_prefix, matches, overlap
 from sros_tool.policy.rights import Right
@@ -266,7 +266,7 @@ def _plain_first(topic: str) -> tuple[bool, bool, bool, bool, str]:
     return (
         topic == "rt/rosout",
         kind == "rr/",
-        kind != "rt/" or ACTION_INSIDE in topic,
+        kind != "rt/" or ACTION_SEPARATOR in topic,
         is_expression(topic),
         topic,
     )
@@ -311,7 +311,7 @@ def _in_ros_terms(topic: str) -> tuple[str, str, str]:
     name = _ros_part(topic, topic[:2], end) if kind else ""
     if not name.startswith("/"):
         return "dds", "publish", topic
-    action, part, _ = name.partition(ACTION_INSIDE)
+    action, part, _ = name.partition(ACTION_SEPARATOR)
     if part and action:
         return "actions", "call" if right == "request" else "execute", action
     return kind, right, name

@@ -19,7 +19,7 @@ from sros_tool.dds.permissions import Criteria, Rule
 from sros_tool.errors import DocumentError, InvalidNameError, Note
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE, Endpoint, Observation, ObservedNode
 from sros_tool.names import (
-    ACTION_INSIDE,
+    ACTION_SEPARATOR,
     check_enclave_name,
     check_namespace,
     expand,
@@ -148,7 +148,7 @@ def _rights_of(node: ObservedNode, notes: _Notes) -> list[tuple[_Place, frozense
 
 
 def _note_about(right: NodeRight, node: ObservedNode, notes: _Notes) -> None:
-    if ACTION_INSIDE in right.name:
+    if ACTION_SEPARATOR in right.name:
         notes.add("partial-action", f"{node.fqn} {right.right} {right.name}")
     elif right.name.endswith("/_service_event"):
         notes.add("service-event", f"{node.fqn} {right.right} {right.name}")

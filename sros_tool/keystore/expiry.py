@@ -17,7 +17,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     list_enclaves,
 )
-from sros_tool.keystore.reader import read_certificate, read_granted
+from sros_tool.keystore.reader import read_certificate, read_signed_grant
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.validity import BACKDATE, Window, iso, parse_duration
@@ -143,7 +143,7 @@ def read_credentials(root: Path, name: str) -> Credentials:
     try:
         certificate = read_certificate(folder / CERTIFICATE_FILE)
         subject = subject_text(certificate.subject)
-        granted = read_granted(folder / PERMISSIONS_FILE, subject)
+        granted = read_signed_grant(folder / PERMISSIONS_FILE, subject)
     except SrosError as error:
         raise KeystoreError(
             f"enclave {name} cannot be read: {error.what}",

@@ -239,7 +239,7 @@ def certificates_of(root: Path, file: str) -> tuple[x509.Certificate, ...]:
     return load_certificates(read_bytes(path, "CA certificate"), f"'{path}'")
 
 
-def carried_crl(root: Path, file: str) -> RevocationList | None:
+def embedded_crl(root: Path, file: str) -> RevocationList | None:
     """Return the revocation list in a CA file, after its certificates, or None."""
     path = root / PUBLIC / f"{file}.cert.pem"
     data = read_bytes(path, "CA certificate")
@@ -257,7 +257,7 @@ def read_crl(root: Path) -> RevocationList | None:
 def read_lists(root: Path) -> tuple[RevocationList, ...]:
     """Return the revocation lists that DDS reads: of the issuing identity CA, and of a second."""
     file = identity_file(root)
-    found = (read_crl(root), carried_crl(root, file) if file else None)
+    found = (read_crl(root), embedded_crl(root, file) if file else None)
     return tuple(each for each in found if each)
 
 
@@ -277,7 +277,7 @@ class SignedGrant:
     grant: Grant | None
 
 
-def read_granted(path: Path, subject: str) -> SignedGrant:
+def read_signed_grant(path: Path, subject: str) -> SignedGrant:
     """Return the grant of a ``permissions.p7s`` to a subject, without verifying its signature.
 
     Raises:

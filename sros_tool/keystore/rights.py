@@ -61,9 +61,9 @@ def load_rights(path: Path) -> RightsSource:
     """
     if path.is_dir():
         if is_keystore(path):
-            return _keystore(path)
+            return _keystore_rights(path)
         if (path / PERMISSIONS_FILE).exists():
-            return _one(path, "enclave", path / PERMISSIONS_FILE)
+            return _document_rights(path, "enclave", path / PERMISSIONS_FILE)
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
             f"It has no enclaves folder, and no {PERMISSIONS_FILE}.",
@@ -73,18 +73,18 @@ def load_rights(path: Path) -> RightsSource:
     if not signed and parse(data, f"'{path}'").tag == "policy":
         policy = read_policy(path)
         return RightsSource(path, "policy", policy_rights(policy), None, True, ())
-    return _one(path, "permissions", path)
+    return _document_rights(path, "permissions", path)
 
 
-def _one(path: Path, kind: str, file: Path) -> RightsSource:
+def _document_rights(path: Path, kind: str, file: Path) -> RightsSource:
     reader = _Reader()
     rights, scope = reader.permissions(file, str(path))
     return RightsSource(
-        path, kind, rights, frozenset(scope), reader.sound, tuple(reader.unsure + reader.notes)
+        path, kind, rights, frozenset(scope), reader.sound, tuple(reader.unverified + reader.notes)
     )
 
 
-def _keystore(root: Path) -> RightsSource:
+def _keystore_rights(root: Path) -> RightsSource:
     reader = _Reader()
     rights: set[Right] = set()
     for name in enclave_names(root):
@@ -106,7 +106,7 @@ def _keystore(root: Path) -> RightsSource:
         frozenset(rights),
         None,
         reader.sound,
-        tuple(reader.unsure[:1] + reader.notes),
+        tuple(reader.unverified[:1] + reader.notes),
     )
 
 
@@ -114,11 +114,11 @@ def _keystore(root: Path) -> RightsSource:
 class _Reader:
     """Reader of permissions documents, which collects notes about them.
 
-    ``unsure`` are notes about documents whose signature is missing or was not verified.
+    ``unverified`` are notes about documents whose signature is missing or was not verified.
     """
 
     sound: bool = True
-    unsure: list[Note] = field(default_factory=list)
+    unverified: list[Note] = field(default_factory=list)
     notes: list[Note] = field(default_factory=list)
     _authorities: dict[bytes, x509.Certificate] = field(default_factory=dict)
 
@@ -134,7 +134,7 @@ class _Reader:
             data = signed.document
         else:
             text = f"{what}: the file is not signed; DDS loads {PERMISSIONS_FILE} instead."
-            self.unsure.append(Note("rights.unsigned", text))
+            self.unverified.append(Note("rights.unsigned", text))
         permissions = parse_permissions(data, f"'{file}'")
         self.notes += [
             Note(note.id, f"{what}: {note.text}") for note in _left_out(permissions.grants)
@@ -149,7 +149,7 @@ class _Reader:
             if authority is None:
                 text = f"{what}: the signature was not verified, because there is no "
                 text += f"{PERMISSIONS_CA_FILE} next to the file."
-                self.unsure.append(Note("rights.not-verified", text))
+                self.unverified.append(Note("rights.not-verified", text))
                 return
             signed.verify(authority)
         except SrosError as error:

@@ -270,7 +270,7 @@ def _attribute_text(attribute: x509.NameAttribute[str | bytes]) -> str:
     return f"{known}={_CONTROL.sub(lambda found: f'{chr(92)}{ord(found[0]):02X}', text)}"
 
 
-def subject_of(text: str) -> x509.Name:
+def parse_subject(text: str) -> x509.Name:
     """Parse the text of a distinguished name, as `subject_text` returns it.
 
     Raises:

@@ -58,7 +58,9 @@ def _issuer(
     found = [
         each
         for each in among
-        if each.subject == certificate.issuer and _signs(each) and _issued_by(certificate, each)
+        if each.subject == certificate.issuer
+        and _may_sign_certificates(each)
+        and _issued_by(certificate, each)
     ]
     return next((each for each in found if validity_of(each).contains(at)), next(iter(found), None))
 
@@ -70,7 +72,7 @@ def _extension(certificate: x509.Certificate, kind: type[Extension]) -> Extensio
         return None
 
 
-def _signs(certificate: x509.Certificate) -> bool:
+def _may_sign_certificates(certificate: x509.Certificate) -> bool:
     usage = _extension(certificate, x509.KeyUsage)
     return usage is None or usage.key_cert_sign
 
@@ -105,7 +107,7 @@ def purpose_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
 
 
 def _strict_faults(chain: Sequence[x509.Certificate]) -> Iterator[str]:
-    if not _signs(chain[-1]):
+    if not _may_sign_certificates(chain[-1]):
         yield f"the keyUsage of {subject_text(chain[-1].subject)} lacks keyCertSign"
     usage = _extension(chain[0], x509.KeyUsage)
     if usage and usage.key_cert_sign and _extension(chain[0], x509.BasicConstraints) is None:

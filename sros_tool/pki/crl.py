@@ -44,7 +44,7 @@ class RevocationList:
     revoked: tuple[Revoked, ...]
     list: x509.CertificateRevocationList
 
-    def names(self, serial: int) -> bool:
+    def revokes(self, serial: int) -> bool:
         """Return whether the list revokes the certificate with the serial number ``serial``."""
         return any(each.serial == serial for each in self.revoked)
 

@@ -62,6 +62,7 @@ def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None)
         raise PkiError(
             f"the private key {name} is neither an elliptic-curve nor an RSA key",
             "DDS Security accepts EC prime256v1 and RSA 2048.",
+            "Use a key of one of these kinds.",
         )
     return key
 

@@ -68,7 +68,7 @@ def load_request(data: bytes, what: str) -> SigningRequest:
             "Only EC prime256v1 and RSA 2048 are accepted by every DDS vendor.",
             "Create the key with `sros create_request`.",
         )
-    if not isinstance(digest, _DIGESTS) or not _holds(request):
+    if not isinstance(digest, _DIGESTS) or not _has_valid_signature(request):
         raise PkiError(
             f"the signature of the request {what} is not valid",
             "The sender did not prove possession of the key, or the request was changed "
@@ -87,7 +87,7 @@ def load_request(data: bytes, what: str) -> SigningRequest:
     )
 
 
-def _holds(request: x509.CertificateSigningRequest) -> bool:
+def _has_valid_signature(request: x509.CertificateSigningRequest) -> bool:
     try:
         return request.is_signature_valid
     except (ValueError, UnsupportedAlgorithm):

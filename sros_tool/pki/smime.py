@@ -133,7 +133,7 @@ class SignedDocument:
                 "The document was changed after it was signed, or its signature is damaged.",
             )
 
-    def carries_digest(self) -> bool:
+    def digest_matches(self) -> bool:
         """Return whether the messageDigest attribute is the digest of the content."""
         digest = hashes.Hash(self._digest_algorithm)
         digest.update(self.content)
@@ -141,7 +141,7 @@ class SignedDocument:
 
     def is_intact(self, signer: x509.Certificate) -> bool:
         """Return whether the signature verifies with the key of ``signer``."""
-        if self._signed_attributes and not self.carries_digest():
+        if self._signed_attributes and not self.digest_matches():
             return False
         signed = self._signed_attributes or self.content
         key = signer.public_key()

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from sros_tool.names import ACTION_INSIDE, ACTION_SERVICES, ACTION_TOPICS, expand, is_expression
+from sros_tool.names import ACTION_SEPARATOR, ACTION_SERVICES, ACTION_TOPICS, expand, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Profile, Qualifier
 from sros_tool.policy.patterns import covers, overlap
 from sros_tool.values import shows
@@ -28,8 +28,8 @@ WHOLE = {"request": "call", "reply": "execute"}
 
 ACTION_PARTS: dict[str, tuple[tuple[str, str], ...]] = {
     action: tuple(
-        [(of_services, f"{ACTION_INSIDE}{each}") for each in ACTION_SERVICES]
-        + [(of_topics, f"{ACTION_INSIDE}{each}") for each in ACTION_TOPICS]
+        [(of_services, f"{ACTION_SEPARATOR}{each}") for each in ACTION_SERVICES]
+        + [(of_topics, f"{ACTION_SEPARATOR}{each}") for each in ACTION_TOPICS]
     )
     for action, of_services, of_topics in (
         ("call", "request", "subscribe"),
@@ -38,7 +38,7 @@ ACTION_PARTS: dict[str, tuple[tuple[str, str], ...]] = {
 }
 """The parts of a right to an action: pairs of a right and a suffix of the action's name."""
 
-GOAL = f"{ACTION_INSIDE}send_goal"
+GOAL = f"{ACTION_SEPARATOR}send_goal"
 """The suffix of the service by which an action is recognised."""
 
 

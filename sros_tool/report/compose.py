@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule
-from sros_tool.names import ACTION_INSIDE, is_expression
+from sros_tool.names import ACTION_SEPARATOR, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Qualifier
 from sros_tool.policy.patterns import covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import (
@@ -350,7 +350,7 @@ class Known:
 _NO_ACTION = Right("", ALLOW, "call", "")
 _WHOLE: dict[str, frozenset[tuple[str, str]]] = {
     right: frozenset(
-        (part.right, part.name.removeprefix(ACTION_INSIDE))
+        (part.right, part.name.removeprefix(ACTION_SEPARATOR))
         for part in parts(_NO_ACTION._replace(right=right))
     )
     for right in ("call", "execute")
@@ -375,7 +375,7 @@ def _edges_of(rights: Iterable[Right], known: Known, common: Sequence[Right] = (
     edges = []
     for (enclave, kind, right, name), found in topics.items():
         qualifier = DENY if DENY in found else ALLOW
-        action, inside, part = name.rpartition(ACTION_INSIDE)
+        action, inside, part = name.rpartition(ACTION_SEPARATOR)
         if inside and (action in known.actions or is_expression(action)):
             whole[enclave, action, qualifier][right, part] = found[qualifier]
             continue
@@ -422,7 +422,7 @@ def _by(names: set[str], *, action: bool = False) -> tuple[str, ...]:
     if "" in names:
         return ()
     return tuple(
-        sorted({each.rpartition(ACTION_INSIDE)[0] or each if action else each for each in names})
+        sorted({each.rpartition(ACTION_SEPARATOR)[0] or each if action else each for each in names})
     )
 
 

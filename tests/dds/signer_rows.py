@@ -18,7 +18,7 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import common_name, pem, subject_of
+from sros_tool.pki.certificates import common_name, parse_subject, pem
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem
 
 YES, REFUSED = "matched", "refused"
@@ -123,7 +123,7 @@ def write_enclave(
     made = row.made
     issuer = made.issuer or ROOT
     key = generate_key()
-    name = subject_of(subject)
+    name = parse_subject(subject)
     certificate = (
         x509.CertificateBuilder(
             issuer[0].subject,

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from sros_tool.pki import smime
-from sros_tool.pki.certificates import Issuer, common_name, issue_ca, pem, subject_of
+from sros_tool.pki.certificates import Issuer, common_name, issue_ca, parse_subject, pem
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.validity import Window
 from tests.integration.fastdds import build, isolated
@@ -87,7 +87,7 @@ class Workshop:
         if subject not in self._identities:
             folder = self._folder(f"identity {subject}".encode())
             key = generate_key()
-            certificate = self._issuer.issue(subject_of(subject), key.public_key(), self.window)
+            certificate = self._issuer.issue(parse_subject(subject), key.public_key(), self.window)
             (folder / "key.pem").write_bytes(key_pem(key))
             (folder / "cert.pem").write_bytes(pem(certificate))
             for each, authority in self.authorities.items():

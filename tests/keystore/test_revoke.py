@@ -105,7 +105,7 @@ def test_earlier_certificates_are_revoked_too(tmp_path: Path) -> None:
     other = serial(root, "/b")
     revoke(root, ["/a"], now=NOW + 30 * DAY)
     assert {each.serial for each in crl_of(root).revoked} == set(serials)
-    assert not crl_of(root).names(other)
+    assert not crl_of(root).revokes(other)
     told = [int(each.serial, 16) for each in read_ledger(root) if each.what == "revocation"]
     assert sorted(told) == sorted(serials)
 
@@ -154,7 +154,7 @@ def test_again_under_the_same_name(tmp_path: Path) -> None:
     create_enclaves(root, ["/a", "/new"], now=NOW)
     new = certificate(root / "enclaves/a/cert.pem")
     assert new.public_key() != old.public_key()
-    assert not crl_of(root).names(new.serial_number)
+    assert not crl_of(root).revokes(new.serial_number)
     for name in ("a", "new"):
         assert not problems(root / "enclaves" / name)
         assert (root / "enclaves" / name / "crl.pem").is_symlink()

@@ -256,7 +256,7 @@ def test_same_key(separate: Path) -> None:
 def test_same_key_is_not_for_a_ca_that_signs_permissions(tmp_path: Path) -> None:
     root = make(tmp_path, "sros2")
     before = snapshot(root)
-    with pytest.raises(KeystoreError, match="cannot keep its key"):
+    with pytest.raises(KeystoreError, match="cannot be renewed with the same key"):
         renew_identity_ca(root, now=NOW)
     assert snapshot(root) == before
 

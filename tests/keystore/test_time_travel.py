@@ -199,7 +199,7 @@ def refusal(root: Path, thief: Thief, now: datetime) -> str:
     if not issuers:
         return "not trusted"
     lists = [each for each in read_lists(root) if signed_by(each.list, issuers[0])]
-    if any(each.names(thief.certificate.serial_number) for each in lists):
+    if any(each.revokes(thief.certificate.serial_number) for each in lists):
         return "revoked"
     return "" if validity_of(thief.certificate).contains(now) else "ended"
 

@@ -664,7 +664,7 @@ def test_a_list_of_files_that_a_stranger_made_up_moves_nothing(
     path: str, live: str, keystore: Path
 ) -> None:
     made_up_stage(keystore, live, [[path, "", ""]])
-    (keystore / STAGE / live / stage_of.number(path)).write_text("mine")
+    (keystore / STAGE / live / stage_of.staged_name(path)).write_text("mine")
     before = snapshot(keystore.parent)
     with pytest.raises(KeystoreError, match=r"not a path in a keystore.*restore"):
         create_enclaves(keystore, ["/new"], now=NOW)
@@ -676,7 +676,7 @@ def test_a_list_of_files_leads_through_no_link(keystore: Path, tmp_path: Path) -
     (keystore / "enclaves/a").rename(outside)
     (keystore / "enclaves/a").symlink_to(outside)
     made_up_stage(keystore, "after", [["enclaves/a/authorized_keys", None, ""]])
-    number = stage_of.number("enclaves/a/authorized_keys")
+    number = stage_of.staged_name("enclaves/a/authorized_keys")
     (keystore / STAGE / "after" / number).write_text("mine")
     before = snapshot(tmp_path)
     with pytest.raises(KeystoreError, match="symbolic link"):

@@ -9,7 +9,7 @@ import pytest
 from cryptography import x509
 from cryptography.x509.oid import NameOID
 
-from sros_tool.pki.certificates import issue_ca, pem, subject_of, subject_text
+from sros_tool.pki.certificates import issue_ca, parse_subject, pem, subject_text
 from sros_tool.pki.keys import generate_key
 from sros_tool.validity import Window, parse_iso
 
@@ -60,4 +60,4 @@ def test_as_openssl_prints_it(name: x509.Name, tmp_path: Path) -> None:
     text = subject_text(certificate.subject)
     assert text == printed.removeprefix("subject=").removesuffix("\n")
     if "#" not in text:
-        assert subject_of(text) == certificate.subject
+        assert parse_subject(text) == certificate.subject

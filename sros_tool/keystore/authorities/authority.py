@@ -67,7 +67,7 @@ class Authority:
         message = smime.sign(document, self.certificate, self.key)
         signed = smime.parse(message)
         check_meaning(
-            (signed.carries_digest(), _with_lf(signed.document)), (True, _with_lf(document)), what
+            (signed.digest_matches(), _with_lf(signed.document)), (True, _with_lf(document)), what
         )
         return message
 

@@ -47,7 +47,7 @@ from sros_tool.keystore.reader import (
     load_governance,
     load_settings,
     read_certificate,
-    read_granted,
+    read_signed_grant,
 )
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
@@ -250,7 +250,7 @@ def _new_key_note(root: Path, request: SigningRequest) -> list[Note]:
 def _earlier_rights(root: Path, name: str, authority: x509.Certificate) -> EarlierRights:
     """Return the rights in an enclave's present permissions, after verifying their signature."""
     subject = text_of(_present_certificate(root, name).subject)
-    old = read_granted(enclave_path(root, name) / PERMISSIONS_FILE, subject)
+    old = read_signed_grant(enclave_path(root, name) / PERMISSIONS_FILE, subject)
     old.signed.verify(authority)
     if old.grant is None:
         raise PkiError(

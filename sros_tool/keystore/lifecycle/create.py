@@ -65,7 +65,7 @@ from sros_tool.pki.certificates import (
     common_name_of,
     enclave_subject,
     issued_by,
-    subject_of,
+    parse_subject,
     subject_text,
     validity_of,
 )
@@ -203,7 +203,7 @@ def generate_artifacts(
     If a policy names an existing enclave, the enclave's permissions are replaced.  If the keystore
     does not exist and ``create`` is given, it is created from that template.
     """
-    wanted = _wanted(enclaves, policies)
+    wanted = _rights_by_enclave(enclaves, policies)
     if not dry_run:
         tidy(root)
     if create is None or is_keystore(root):
@@ -220,7 +220,9 @@ def generate_artifacts(
         return _write_enclaves(transaction, keystore, wanted, now, progress)
 
 
-def _wanted(names: Sequence[str], policies: Sequence[Policy]) -> dict[str, Enclave | None]:
+def _rights_by_enclave(
+    names: Sequence[str], policies: Sequence[Policy]
+) -> dict[str, Enclave | None]:
     """Map enclaves to their rights in the policies, or None; raise if two policies differ."""
     wanted: dict[str, Enclave | None] = {check_enclave_name(name): None for name in names}
     for policy in policies:
@@ -378,16 +380,16 @@ def _write_enclaves(
     append(transaction, [*keystore.entries, *writer.entries])
     transaction.commit()
     outcomes = {name: outcome for name, (outcome, _) in done.items()}
-    created = _with(outcomes, _Outcome.CREATED)
+    created = _names_with(outcomes, _Outcome.CREATED)
     return Creation(
         transaction.root,
         keystore.template,
         keystore.domains,
         bool(keystore.entries),
         created,
-        _with(outcomes, _Outcome.CHANGED),
-        _with(outcomes, _Outcome.COMPLETED),
-        _with(outcomes, _Outcome.KEPT),
+        _names_with(outcomes, _Outcome.CHANGED),
+        _names_with(outcomes, _Outcome.COMPLETED),
+        _names_with(outcomes, _Outcome.KEPT),
         tuple(transaction.changes),
         (
             *(note for _, notes in done.values() for note in notes),
@@ -397,7 +399,7 @@ def _write_enclaves(
     )
 
 
-def _with(outcomes: Mapping[str, _Outcome], outcome: _Outcome) -> tuple[str, ...]:
+def _names_with(outcomes: Mapping[str, _Outcome], outcome: _Outcome) -> tuple[str, ...]:
     return tuple(name for name, each in outcomes.items() if each is outcome)
 
 
@@ -490,6 +492,6 @@ def _permissions_subjects(path: Path, authority: x509.Certificate) -> Iterator[x
         signed = smime.parse(read_bytes(path, "permissions document"))
         signed.verify(authority)
         grants = parse_permissions(signed.document, f"'{path}'").grants
-        yield from [subject_of(grant.subject) for grant in grants]
+        yield from [parse_subject(grant.subject) for grant in grants]
     except (SrosError, ValueError):
         return

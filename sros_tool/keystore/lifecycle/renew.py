@@ -32,7 +32,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.ledger import Entry, append, read_ledger
-from sros_tool.keystore.lifecycle.revocation_list import Lists
+from sros_tool.keystore.lifecycle.revocation_list import RevocationLists
 from sros_tool.keystore.lifecycle.revoke import link_everywhere, still_valid
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import load_settings
@@ -136,12 +136,14 @@ def renew(
         entries, lists, count = writer.entries, None, 0
         if revoke_old and replaced:
             ledger = read_ledger(root)
-            lists = Lists(transaction, authorities.identity, template, keyring, ledger, now)
+            lists = RevocationLists(
+                transaction, authorities.identity, template, keyring, ledger, now
+            )
             revocations = _superseded(replaced, ledger, lists, now)
             count = len(revocations)
             date = now.replace(microsecond=0)
-            newly = [Revoked(int(each.serial, 16), date, _REASON) for each in revocations]
-            _, signed = lists.sign(newly, existing, incomplete=False)
+            new_entries = [Revoked(int(each.serial, 16), date, _REASON) for each in revocations]
+            _, signed = lists.sign(new_entries, existing, incomplete=False)
             entries += [*revocations, *signed]
             link_everywhere(transaction, existing)
         append(transaction, entries)
@@ -159,7 +161,7 @@ def renew(
 
 
 def _superseded(
-    replaced: Sequence[_Replaced], ledger: Sequence[Entry], lists: Lists, now: datetime
+    replaced: Sequence[_Replaced], ledger: Sequence[Entry], lists: RevocationLists, now: datetime
 ) -> list[Entry]:
     """Return the ledger entries for revoking all earlier certificates that have not expired."""
     listed = {each.serial for each in lists.present.revoked} if lists.present else set()

@@ -22,13 +22,13 @@ from sros_tool.keystore.ledger import Entry, document_entry
 from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
     RotationStage,
-    lists_confusable,
+    crls_confusable,
     read_rotation,
 )
 from sros_tool.keystore.reader import (
     authority_files,
-    carried_crl,
     certificates_of,
+    embedded_crl,
     identity_file,
     read_certificate,
     read_crl,
@@ -94,7 +94,7 @@ def _carried_over(old: RevocationList | None, expiries: Mapping[int, str]) -> li
     return [each for each in old.revoked if expiries.get(each.serial, issued) >= issued]
 
 
-class Lists:
+class RevocationLists:
     """Signer of the revocation lists of all trusted identity CAs, within a transaction.
 
     ``present`` is the list before the change.  ``remarks`` are sentences about lists that could not
@@ -121,23 +121,23 @@ class Lists:
         self.remarks: list[str] = []
 
     def sign(
-        self, newly: Sequence[Revoked], names: Sequence[str], *, incomplete: bool
+        self, new_entries: Sequence[Revoked], names: Sequence[str], *, incomplete: bool
     ) -> tuple[datetime, list[Entry]]:
         """Sign and stage the lists; return their first expiry and their ledger entries.
 
-        ``newly`` are the certificates to revoke, ``names`` the enclaves that get the lists.  Each
-        list has all serial numbers: the ledger does not say which of two CAs issued a certificate,
-        and a serial number of the other CA does no harm.
+        ``new_entries`` are the certificates to revoke, ``names`` the enclaves that get the lists.
+        Each list has all serial numbers: the ledger does not say which of two CAs issued a
+        certificate, and a serial number of the other CA does no harm.
 
         Raises:
             KeystoreError: a revocation needs the key of the old CA, which is missing, and
                 ``incomplete`` is not set.
         """
         expiries = self._expiries()
-        signed = self._sign(self._authority, self.present, newly, expiries, 0)
+        signed = self._sign(self._authority, self.present, new_entries, expiries, 0)
         self._transaction.write(CRL, signed.document)
         found = [signed]
-        if second := self._sign_second(newly, names, expiries, incomplete=incomplete):
+        if second := self._sign_second(new_entries, names, expiries, incomplete=incomplete):
             found.append(second)
         return min(each.end for each in found), [each.entry for each in found]
 
@@ -145,13 +145,13 @@ class Lists:
         self,
         authority: Authority,
         old: RevocationList | None,
-        newly: Sequence[Revoked],
+        new_entries: Sequence[Revoked],
         expiries: Mapping[int, str],
         least: int,
     ) -> SignedList:
         kept = _carried_over(old, expiries)
         listed = {each.serial for each in kept}
-        kept += [each for each in newly if each.serial not in listed]
+        kept += [each for each in new_entries if each.serial not in listed]
         number = max(old.number + 1 if old else 1, least)
         return sign_list(authority, kept, number=number, template=self._template, now=self._now)
 
@@ -172,7 +172,7 @@ class Lists:
 
     def _sign_second(
         self,
-        newly: Sequence[Revoked],
+        new_entries: Sequence[Revoked],
         names: Sequence[str],
         expiries: Mapping[int, str],
         *,
@@ -191,19 +191,19 @@ class Lists:
         certificates = certificates_of(self._root, file)
         wanted = replaced.new if coming else replaced.old
         (other,) = [each for each in certificates if digest(each) == wanted]
-        if coming and lists_confusable(certificates[0], other):
+        if coming and crls_confusable(certificates[0], other):
             return None  # in this case all processes have to be restarted together anyway
-        old = carried_crl(self._root, file)
+        old = embedded_crl(self._root, file)
         try:
             authority = self._open(other, replaced, coming=coming)
         except KeystoreError as error:
             # The new CA has issued nothing yet; the next stage of the rotation signs its list.
             if not coming:
-                self._without(other, error, newly, old, incomplete=incomplete)
+                self._handle_missing_key(other, error, new_entries, old, incomplete=incomplete)
             return None
         # The next stage replaces the present list with this one, so its number must be higher.
         least = (self.present.number if self.present else 0) + 2 if coming else 0
-        signed = self._sign(authority, old, () if coming else newly, expiries, least)
+        signed = self._sign(authority, old, () if coming else new_entries, expiries, least)
         bundle = b"".join(map(pem, certificates)) + signed.document
         write_bundle(self._transaction, file, authority_files(self._root)[file], bundle, names)
         return signed
@@ -211,7 +211,7 @@ class Lists:
     def _open(
         self, certificate: x509.Certificate, replaced: Replacement, *, coming: bool
     ) -> Authority:
-        place = replaced.key if coming else replaced.place_of_old(certificate)
+        place = replaced.key if coming else replaced.old_key_place(certificate)
         # The places in the environment variables are for the key of the issuing CA.
         keyring = replace(self._keyring, places={})
         key = keyring.open(self._root, IDENTITY, replace(self._template, identity_key=place))
@@ -219,18 +219,18 @@ class Lists:
             raise KeystoreError(f"the key at '{place}' belongs to another CA")
         return Authority(certificate, key)
 
-    def _without(
+    def _handle_missing_key(
         self,
         old_ca: x509.Certificate,
         error: KeystoreError,
-        newly: Sequence[Revoked],
+        new_entries: Sequence[Revoked],
         old: RevocationList | None,
         *,
         incomplete: bool,
     ) -> None:
         """Add a remark on the unsigned list of the old CA; raise if a revocation needs it."""
         name = subject_text(old_ca.subject)
-        if newly and not incomplete:
+        if new_entries and not incomplete:
             raise KeystoreError(
                 f"the key of the old identity CA {name} is not available",
                 f"Until that CA is retired, Fast DDS accepts its certificates, so it also has to "
@@ -239,7 +239,7 @@ class Lists:
                 "or add --until-retired, and retire it soon.",
             )
         text = f"The list of the old identity CA {name} was not signed again"
-        if newly:
+        if new_entries:
             text += (
                 "; until it is retired, Fast DDS accepts the revoked certificates that it issued"
             )

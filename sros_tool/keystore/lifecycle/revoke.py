@@ -21,7 +21,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.ledger import Entry, append, read_ledger
-from sros_tool.keystore.lifecycle.revocation_list import Lists
+from sros_tool.keystore.lifecycle.revocation_list import RevocationLists
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import load_settings, read_certificate
 from sros_tool.keystore.transaction.recovery import tidy
@@ -89,7 +89,7 @@ def revoke(
         template = load_settings(root)
         authority = load_authority(root, IDENTITY, template, keyring, now)
         issued = read_ledger(root)
-        lists = Lists(transaction, authority, template, keyring, issued, now)
+        lists = RevocationLists(transaction, authority, template, keyring, issued, now)
         listed = {each.serial for each in lists.present.revoked} if lists.present else set()
         revoked: list[Revoked] = []
         entries: list[Entry] = []
@@ -133,7 +133,7 @@ def refresh_crl(
         existing = list_enclaves(root)
         template = load_settings(root)
         authority = load_authority(root, IDENTITY, template, keyring, now)
-        lists = Lists(transaction, authority, template, keyring, read_ledger(root), now)
+        lists = RevocationLists(transaction, authority, template, keyring, read_ledger(root), now)
         next_update, entries = lists.sign((), existing, incomplete=True)
         link_everywhere(transaction, existing)
         append(transaction, entries)

@@ -31,9 +31,9 @@ from sros_tool.keystore.transaction.stage import (
     LIVE,
     MANIFEST,
     Move,
-    bridge_text,
-    number,
+    link_to_stage,
     read_manifest,
+    staged_name,
 )
 from sros_tool.parallel import map_slices
 
@@ -106,7 +106,7 @@ def _complete(root: Path, stage: Path, moves: Sequence[Move]) -> None:
     def complete(part: Sequence[Move]) -> None:
         spare = f"{stage}/spare.{os.getpid()}"
         for path, before, after in part:
-            real, name = f"{root}/{path}", number(path)
+            real, name = f"{root}/{path}", staged_name(path)
             if after is None:
                 if _leads_into_stage(real, path):
                     os.unlink(real)
@@ -138,7 +138,7 @@ def _undo(root: Path, stage: Path, moves: Sequence[Move]) -> None:
             _symlink(before, spare)
             os.replace(spare, real)
         else:
-            os.replace(f"{stage}/{BEFORE}/{number(path)}", real)
+            os.replace(f"{stage}/{BEFORE}/{staged_name(path)}", real)
 
 
 def _symlink(text: str, path: str) -> None:
@@ -149,6 +149,6 @@ def _symlink(text: str, path: str) -> None:
 
 def _leads_into_stage(real: str, path: str) -> bool:
     try:
-        return os.readlink(real) == bridge_text(path)
+        return os.readlink(real) == link_to_stage(path)
     except OSError:
         return False

@@ -3,7 +3,7 @@
 ``.sros-transaction`` in the keystore holds
 
 - ``after``: new files and links for existing folders, in one flat folder, each named by the
-  `number` of its path;
+  `staged_name` of its path;
 - ``before``: the replaced files and links, named in the same way; created by the commit;
 - ``live``: a link to ``before`` or ``after``; pointing it at ``after`` is the commit;
 - ``added``: new folders, as they will be in the keystore;
@@ -58,17 +58,17 @@ class Staged:
     moves: tuple[Move, ...]
 
 
-def number(path: str) -> str:
+def staged_name(path: str) -> str:
     """Return the name in the stage for a path; it is short, so that a link fits into an inode."""
     return hashlib.blake2b(os.fsencode(path), digest_size=8).hexdigest()
 
 
-def bridge_text(path: str) -> str:
+def link_to_stage(path: str) -> str:
     """Return the target of the link that is at ``path`` during the commit."""
-    return "../" * path.count("/") + f"{STAGE}/{LIVE}/{number(path)}"
+    return "../" * path.count("/") + f"{STAGE}/{LIVE}/{staged_name(path)}"
 
 
-def seen_from_stage(path: str, text: str) -> str:
+def relocated_target(path: str, text: str) -> str:
     """Return the link target ``text`` of ``path``, rewritten for a link in the stage."""
     return text if text.startswith("/") else f"../../{path.rpartition('/')[0]}/{text}"
 

@@ -2,7 +2,7 @@
 
 New files are written below ``.sros-transaction`` in the keystore (`stage`).  The commit
 (`Transaction.commit`) changes existing files in three steps.  Each path becomes a link to
-``.sros-transaction/live/<number>``; ``live`` is a link to ``before``, so the content is still the
+``.sros-transaction/live/<name>``; ``live`` is a link to ``before``, so the content is still the
 old one.  Then ``live`` is pointed at ``after``, which changes all files at once.  Finally plain
 files replace the links, and new folders move to their places (`recovery`).  If the machine stops at
 any moment, DDS finds either all old files or all new files, and the next transaction recovers.
@@ -38,10 +38,10 @@ from sros_tool.keystore.transaction.stage import (
     Change,
     Move,
     Staged,
-    bridge_text,
-    number,
+    link_to_stage,
     point_live,
-    seen_from_stage,
+    relocated_target,
+    staged_name,
     write_manifest,
 )
 from sros_tool.parallel import map_slices
@@ -179,7 +179,7 @@ class Transaction:
         staged = self._prepare(path, target)
         if staged is not None:
             flat = self._folders[path.rpartition("/")[0]]
-            os.symlink(seen_from_stage(path, target) if flat else target, staged)
+            os.symlink(relocated_target(path, target) if flat else target, staged)
 
     def remove(self, path: str) -> None:
         """Stage the removal of a file or link, and of folders that become empty."""
@@ -202,7 +202,7 @@ class Transaction:
             self._moves.append(Move(path, before, after))
         if self.dry_run:
             return None
-        return f"{self._stage}/{AFTER}/{number(path)}" if exists else f"{self._added}/{path}"
+        return f"{self._stage}/{AFTER}/{staged_name(path)}" if exists else f"{self._added}/{path}"
 
     def _begin_change(self, path: str, action: str) -> None:
         if path in self._staged:
@@ -355,8 +355,8 @@ class _Bridge:
                 self._keep_link(move)
                 self._place(move)
                 continue
-            kept = f"{before}/{number(move.path)}"
-            os.symlink(bridge_text(move.path), kept)
+            kept = f"{before}/{staged_name(move.path)}"
+            os.symlink(link_to_stage(move.path), kept)
             if not filesystem.exchange(kept, f"{root}/{move.path}"):
                 raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP), f"{root}/{move.path}")
 
@@ -367,7 +367,10 @@ class _Bridge:
             if move.before != "":
                 self._keep_link(move)
                 continue
-            real, kept = f"{self._root}/{move.path}", f"{self._stage}/{BEFORE}/{number(move.path)}"
+            real, kept = (
+                f"{self._root}/{move.path}",
+                f"{self._stage}/{BEFORE}/{staged_name(move.path)}",
+            )
             try:
                 os.link(real, kept, follow_symlinks=False)
             except OSError:  # a file system, or an owner, that allows no hard links
@@ -382,14 +385,14 @@ class _Bridge:
 
     def _keep_link(self, move: Move) -> None:
         if move.before:
-            kept = f"{self._stage}/{BEFORE}/{number(move.path)}"
-            os.symlink(seen_from_stage(move.path, move.before), kept)
+            kept = f"{self._stage}/{BEFORE}/{staged_name(move.path)}"
+            os.symlink(relocated_target(move.path, move.before), kept)
 
     def _place(self, move: Move) -> None:
         real = f"{self._root}/{move.path}"
         if move.before is None:
-            os.symlink(bridge_text(move.path), real)
+            os.symlink(link_to_stage(move.path), real)
             return
         spare = f"{self._stage}/spare.{os.getpid()}"
-        os.symlink(bridge_text(move.path), spare)
+        os.symlink(link_to_stage(move.path), spare)
         os.replace(spare, real)

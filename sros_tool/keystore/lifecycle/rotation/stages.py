@@ -52,19 +52,19 @@ from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
     Rotation,
     RotationStage,
-    lists_confusable,
+    crls_confusable,
     read_rotation,
     render_rotation,
     retired_key,
 )
 from sros_tool.keystore.reader import (
     authority_files,
-    carried_crl,
     certificates_of,
+    embedded_crl,
     load_settings,
     read_certificate,
     read_crl,
-    read_granted,
+    read_signed_grant,
 )
 from sros_tool.keystore.template import Template, render_template
 from sros_tool.keystore.transaction.recovery import tidy
@@ -134,7 +134,7 @@ def rotate_ca(
     with Transaction(root, dry_run=dry_run) as transaction:
         names = list_enclaves(root)
         rotation = read_rotation(root)
-        stage = RotationStage.RETIRE if finish else _wanted(root, rotation, to)
+        stage = RotationStage.RETIRE if finish else _target_stage(root, rotation, to)
         rotator = _Rotator(
             transaction, rotation, names, keyring, now, delete_old_key=delete_old_key
         )
@@ -152,14 +152,14 @@ def rotate_ca(
     )
 
 
-def _wanted(root: Path, rotation: Rotation, to: RotationStage | None) -> RotationStage:
+def _target_stage(root: Path, rotation: Rotation, to: RotationStage | None) -> RotationStage:
     """Return the stage to go to; NONE if there is nothing to do.
 
     Raises:
         UsageError: the stage ``to`` is over, or is not the next stage.
     """
     if to is None:
-        return rotation.following()
+        return rotation.next_stage()
     if to is RotationStage.RETIRE and rotation.stage is RotationStage.NONE:
         return RotationStage.NONE  # an earlier rotation is complete
     order = list(RotationStage)
@@ -167,7 +167,7 @@ def _wanted(root: Path, rotation: Rotation, to: RotationStage | None) -> Rotatio
     if ahead > 1:
         raise UsageError(
             f"the stage {to} is not the next one",
-            f"The next stage is {rotation.following()}; after it, restart the processes.",
+            f"The next stage is {rotation.next_stage()}; after it, restart the processes.",
             f"Run `sros rotate_ca {root} --next`, or `--finish` to do all stages at once.",
         )
     if ahead < 0:
@@ -205,9 +205,9 @@ def renew_identity_ca(
         names = list_enclaves(root)
         if len(authority_files(root)) == 1:
             raise KeystoreError(
-                "the one CA of this keystore cannot keep its key",
-                "It also signs permissions, and DDS accepts them only with the certificate that "
-                "they embed.",
+                f"the CA of keystore '{root}' cannot be renewed with the same key",
+                "It is also the permissions CA, and DDS accepts permissions only with the "
+                "certificate that they embed.",
                 "Rotate it without --same-key.",
             )
         if read_rotation(root).stage is not RotationStage.NONE:
@@ -341,12 +341,12 @@ class _Rotator:
         This happens after the first revocation, if that was during the stage DISTRIBUTE.
         """
         return (self._root / CRL).exists() and any(
-            self._takes_crl(each) and not carried_crl(self._root, each.file) for each in successors
+            self._takes_crl(each) and not embedded_crl(self._root, each.file) for each in successors
         )
 
     def _takes_crl(self, each: _Successor) -> bool:
         """Return whether a new CA's revocation list can be distributed with the CA."""
-        return IDENTITY in each.roles and not lists_confusable(each.old[0], each.new.certificate)
+        return IDENTITY in each.roles and not crls_confusable(each.old[0], each.new.certificate)
 
     def _reissue(
         self, successors: list[_Successor], stage: RotationStage, progress: Progress | None
@@ -530,7 +530,7 @@ def _issuance(
 def _verified_rights(
     root: Path, name: str, subject: str, permissions: _Successor, policies: dict[str, str]
 ) -> EarlierRights:
-    old = read_granted(enclave_path(root, name) / PERMISSIONS_FILE, subject)
+    old = read_signed_grant(enclave_path(root, name) / PERMISSIONS_FILE, subject)
     old.signed.verify(permissions.old[0])
     if old.grant is None:
         raise KeystoreError(

@@ -69,7 +69,7 @@ class Replacement:
     key: str
     old_key: str = ""
 
-    def place_of_old(self, certificate: x509.Certificate) -> str:
+    def old_key_place(self, certificate: x509.Certificate) -> str:
         """Return the place of the key of the old CA, ``certificate``, after the stage REISSUE."""
         return self.old_key or retired_key(certificate)
 
@@ -81,7 +81,7 @@ class Rotation:
     stage: RotationStage = RotationStage.NONE
     replacements: tuple[Replacement, ...] = ()
 
-    def following(self) -> RotationStage:
+    def next_stage(self) -> RotationStage:
         """Return the stage after the present one."""
         order = list(RotationStage)
         return order[order.index(self.stage) + 1]
@@ -182,7 +182,9 @@ def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
                 )
             )
     remarks = (
-        _ending(states, now) if rotation.stage is RotationStage.NONE else _remarks(root, rotation)
+        _expiry_remarks(states, now)
+        if rotation.stage is RotationStage.NONE
+        else _restart_remarks(root, rotation)
     )
     return RotationStatus(root, rotation, tuple(states), len(names), tuple(remarks))
 
@@ -213,7 +215,7 @@ def _count(
 # ── remarks ────────────────────────────────────────────────────────────────────────────────
 
 
-def _ending(states: Sequence[AuthorityStatus], now: datetime) -> list[str]:
+def _expiry_remarks(states: Sequence[AuthorityStatus], now: datetime) -> list[str]:
     """Return remarks on CAs that expire soon, or have expired."""
     remarks = []
     for each in states:
@@ -239,7 +241,7 @@ def _ending(states: Sequence[AuthorityStatus], now: datetime) -> list[str]:
     return remarks
 
 
-def _remarks(root: Path, rotation: Rotation) -> list[str]:
+def _restart_remarks(root: Path, rotation: Rotation) -> list[str]:
     """Return remarks on the processes to restart at the stage DISTRIBUTE or REISSUE, by vendor."""
     files = [each.file for each in rotation.replacements]
     if rotation.stage is RotationStage.DISTRIBUTE:
@@ -264,7 +266,7 @@ def _remarks(root: Path, rotation: Rotation) -> list[str]:
     return remarks
 
 
-def lists_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
+def crls_confusable(old: x509.Certificate, new: x509.Certificate) -> bool:
     """Return whether OpenSSL may take the revocation list of one CA for the list of the other.
 
     OpenSSL finds a list by name and key identifier.  If both CAs have the same name and the old CA
@@ -292,11 +294,11 @@ def _fast_dds_hindrance(root: Path, files: Sequence[str]) -> str:
             continue
         for certificate in certificates_of(root, file):
             if not isinstance(certificate.public_key(), ec.EllipticCurvePublicKey):
-                return "the old permissions CA has another key algorithm than the new one."
+                return "the old permissions CA has another key algorithm than the new CA."
             if not _has_identifier(certificate):
                 return (
                     f"the old {'CA' if file == 'ca' else f'{PERMISSIONS} CA'} has no key "
-                    "identifier (ros2/sros2 made it), so it cannot be distinguished from the new "
-                    "one."
+                    "identifier (ros2/sros2 created it), so it cannot be distinguished from the "
+                    "new CA."
                 )
     return ""
