@@ -48,7 +48,7 @@ class Process:
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
+class RuntimeState:
     """The input of the runtime checks: environment, clock, RMWs and processes.
 
     ``now`` is the moment to check for; ``clock`` is the host's clock, or None if it is ``now``.
@@ -170,58 +170,58 @@ _TOLERANCE = timedelta(minutes=2)
 _LOADED = ("cert.pem", "permissions.p7s", "governance.p7s", "crl.pem", "identity_ca.cert.pem")
 
 
-def _check_host(setting: Setting) -> Iterator[Finding]:
+def _check_host(state: RuntimeState) -> Iterator[Finding]:
     """Yield findings about the RMW, the clock, and the running processes."""
-    yield from _rmw(setting)
-    yield from _clock(setting)
-    yield from _processes(setting)
+    yield from _rmw(state)
+    yield from _clock(state)
+    yield from _processes(state)
 
 
-def _rmw(setting: Setting) -> Iterator[Finding]:
-    chosen = setting.environment.get(RMW, "")
-    if chosen and setting.rmws and chosen not in setting.rmws:
-        text = f"{RMW} is {chosen}; installed: {', '.join(setting.rmws)}"
+def _rmw(state: RuntimeState) -> Iterator[Finding]:
+    chosen = state.environment.get(RMW, "")
+    if chosen and state.rmws and chosen not in state.rmws:
+        text = f"{RMW} is {chosen}; installed: {', '.join(state.rmws)}"
         yield RMW_NOT_INSTALLED.found(RMW, text)
-    if not _is_secured(setting.environment):
+    if not _is_secured(state.environment):
         return
     used = chosen or DEFAULT_RMW
     if used.startswith(_NOT_DDS):
         yield RMW_INSECURE.found(used, f"{used} does not use DDS")
-    elif used in setting.insecure_rmws:
-        yield RMW_INSECURE.found(used, setting.insecure_rmws[used])
+    elif used in state.insecure_rmws:
+        yield RMW_INSECURE.found(used, state.insecure_rmws[used])
 
 
-def _clock(setting: Setting) -> Iterator[Finding]:
-    root = setting.environment.get(KEYSTORE, "")
+def _clock(state: RuntimeState) -> Iterator[Finding]:
+    root = state.environment.get(KEYSTORE, "")
     if not root or not Path(root).is_dir():
         return
     files = [each for name in ("ledger.jsonl", "enclaves/*.p7s", "enclaves/**/cert.pem")
              for each in Path(root).glob(name)]  # fmt: skip
     newest = max((each.stat().st_mtime for each in files if each.exists()), default=0.0)
     written = datetime.fromtimestamp(newest, UTC)
-    clock = setting.clock or setting.now
+    clock = state.clock or state.now
     if written > clock + _TOLERANCE:
         text = f"the clock shows {iso(clock)}, but '{root}' was written at {iso(written)}"
         yield CLOCK_BEHIND.found("clock", text)
 
 
-def _processes(setting: Setting) -> Iterator[Finding]:
-    secured_here = _is_secured(setting.environment)
+def _processes(state: RuntimeState) -> Iterator[Finding]:
+    secured_here = _is_secured(state.environment)
     rmws: dict[str, list[str]] = {}
-    for process in setting.processes:
+    for process in state.processes:
         environment = process.environment
         if _is_daemon(process):
             # Each domain has its own daemon; commands ask the daemon of their domain.
-            if secured_here and _domain(environment) == _domain(setting.environment):
-                yield from _daemon(process, setting.environment)
+            if secured_here and _domain(environment) == _domain(state.environment):
+                yield from _daemon(process, state.environment)
         elif _is_secured(environment):
             rmws.setdefault(environment.get(RMW) or DEFAULT_RMW, []).append(process.label)
             yield from _outdated(process)
-        elif secured_here and _is_node_in_same_domain(process, setting.environment):
+        elif secured_here and _is_node_in_same_domain(process, state.environment):
             text = f"in domain {_domain(environment)}, with {ENABLE} not 'true'"
             yield PROCESS_UNSECURED.found(process.label, text)
     if secured_here:
-        rmws.setdefault(setting.environment.get(RMW) or DEFAULT_RMW, []).append("this environment")
+        rmws.setdefault(state.environment.get(RMW) or DEFAULT_RMW, []).append("this environment")
     if len({_vendor(rmw) for rmw in rmws}) > 1:
         text = "; ".join(f"{rmw}: {', '.join(users[:3])}" for rmw, users in sorted(rmws.items()))
         yield MIXED_VENDORS.found("RMWs", text)
@@ -254,7 +254,7 @@ def _outdated(process: Process) -> Iterator[Finding]:
         and datetime.fromtimestamp((folder / file).stat().st_mtime, UTC) > process.started
     ]
     if newer:
-        text = f"it started at {iso(process.started)}; later {', '.join(newer)} of {name} changed"
+        text = f"it started at {iso(process.started)}; {', '.join(newer)} of {name} changed later"
         yield PROCESS_OUTDATED.found(process.label, text)
 
 
@@ -424,9 +424,9 @@ _OLD = {
 _CLOSE = 0.88
 
 
-def _check_variables(setting: Setting) -> Iterator[Finding]:
+def _check_variables(state: RuntimeState) -> Iterator[Finding]:
     """Yield findings about the environment variables and the enclave that they name."""
-    environment = setting.environment
+    environment = state.environment
     yield from _spelling(environment)
     if environment.get(ENABLE) != "true":
         return
@@ -450,7 +450,7 @@ def _check_variables(setting: Setting) -> Iterator[Finding]:
         missing = "does not exist" if not root.exists() else "has no enclaves folder with content"
         yield KEYSTORE_NOT_FOUND.found(KEYSTORE, f"'{root}' {missing}")
         return
-    yield from _enclave(setting, root, domain)
+    yield from _enclave(state, root, domain)
 
 
 def _spelling(environment: Mapping[str, str]) -> Iterator[Finding]:
@@ -471,8 +471,8 @@ def _spelling(environment: Mapping[str, str]) -> Iterator[Finding]:
             yield MISSPELT.found(name, f"{name} is set; ROS 2 reads {meant}")
 
 
-def _enclave(setting: Setting, root: Path, domain: int | None) -> Iterator[Finding]:
-    names, wanted = set(enclave_names(root)), setting.environment.get(ENCLAVE, "")
+def _enclave(state: RuntimeState, root: Path, domain: int | None) -> Iterator[Finding]:
+    names, wanted = set(enclave_names(root)), state.environment.get(ENCLAVE, "")
     governed = _governed(root)
     if governed and domain is not None and domain not in governed:
         text = f"the governance of '{root}' is for domain {governed}, not for {domain}"
@@ -483,7 +483,7 @@ def _enclave(setting: Setting, root: Path, domain: int | None) -> Iterator[Findi
             yield CA_KEY_HERE.found(KEYSTORE, f"'{root / ca_key(role)}' exists")
             break
     if not wanted and "/" not in names:
-        enforced = setting.environment.get(STRATEGY) == "Enforce"
+        enforced = state.environment.get(STRATEGY) == "Enforce"
         kind = NO_ENCLAVE if enforced else UNSECURED_WITHOUT_ENCLAVE
         yield kind.found(ENCLAVE, f"'{root}' has no enclave /")
         return
@@ -493,7 +493,7 @@ def _enclave(setting: Setting, root: Path, domain: int | None) -> Iterator[Findi
         hint = f"; it has {close[0]}" if close else ""
         yield ENCLAVE_NOT_FOUND.found(ENCLAVE, f"'{root}' has no enclave {name}{hint}")
         return
-    found = keystore_findings(root, now=setting.now, zone=setting.zone, domain=domain, only=(name,))
+    found = keystore_findings(root, now=state.now, zone=state.zone, domain=domain, only=(name,))
     for each in found:
         if each.id == "enclave.governance-domain":
             yield DOMAIN_NOT_GOVERNED.found(DOMAIN, each.text, each.file)
@@ -515,6 +515,6 @@ def _value(environment: Mapping[str, str], name: str) -> str:
     return f"{name} is not set" if value is None else f"{name} is {value!r}"
 
 
-def runtime_findings(setting: Setting) -> list[Finding]:
+def runtime_findings(state: RuntimeState) -> list[Finding]:
     """Return all findings in an environment and on its host."""
-    return joined([*_check_variables(setting), *_check_host(setting)])
+    return joined([*_check_variables(state), *_check_host(state)])

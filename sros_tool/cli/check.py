@@ -251,14 +251,14 @@ def _findings_here(
 
     ``insecure_rmws`` maps RMWs that were found not to enforce security to the evidence.
     """
-    from sros_tool.checks.runtime import Setting, running_processes, runtime_findings
+    from sros_tool.checks.runtime import RuntimeState, running_processes, runtime_findings
     from sros_tool.cli.common import local_zone
     from sros_tool.runtime.rmw import rmw_implementations
 
     zone = local_zone(environment)
     rmws, processes = rmw_implementations(environment), tuple(running_processes())
-    setting = Setting(environment, moment, zone, processes, rmws, insecure_rmws, now())
-    return runtime_findings(setting)
+    state = RuntimeState(environment, moment, zone, processes, rmws, insecure_rmws, now())
+    return runtime_findings(state)
 
 
 def _shown(finding: Finding) -> Finding:

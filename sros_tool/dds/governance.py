@@ -146,7 +146,7 @@ class Governance:
     domain_access_rules: tuple[DomainRule, ...]
 
     def domains(self) -> DomainSet:
-        """Return all domains that some rule names."""
+        """Return the domains of all rules."""
         return DomainSet(tuple(p for r in self.domain_access_rules for p in r.domains.ranges))
 
 

@@ -139,7 +139,7 @@ class _Planner:
 
 @dataclass(frozen=True, slots=True)
 class _Name:
-    """A name as first written, and the rights wanted on it."""
+    """A name as first written, and the rights to add to it."""
 
     written: str
     rights: dict[tuple[str, Qualifier], None]

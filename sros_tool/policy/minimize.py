@@ -132,7 +132,7 @@ class _KnownNames:
 
 
 class _Narrowing:
-    """The narrowing of one enclave."""
+    """One enclave while it is narrowed to its observed rights."""
 
     def __init__(
         self,

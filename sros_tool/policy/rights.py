@@ -167,7 +167,7 @@ class Rules:
         return tuple(dict.fromkeys(each for each in found if each)) if all(found) else ()
 
     def meeting(self, right: Right) -> tuple[Right, ...]:
-        """Return the rights of this set that share a name with ``right``."""
+        """Return the rights of this set that match some name that ``right`` matches."""
         found: dict[Right, None] = {}
         for part in parts(right):
             place = part[:3]

@@ -179,7 +179,7 @@ class Overlay:
     """The kind of an overlay of two sources.
 
     ``kind`` is use (allowed and observed), change (before and after) or drift (policy and
-    keystore); ``first`` and ``second`` are the meanings of a right that only that side has.
+    keystore); ``first`` and ``second`` label a right that only the first or second side has.
     """
 
     kind: str

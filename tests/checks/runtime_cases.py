@@ -1,4 +1,4 @@
-"""How each finding about the runtime comes about: what is changed in a sound setting."""
+"""How each finding about the runtime comes about: what is changed in a sound state."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import timedelta
 
-from sros_tool.checks.runtime import Process, Setting
+from sros_tool.checks.runtime import Process, RuntimeState
 from tests.checks.bench import Bench
 
-Change = Callable[[Setting, Bench], Setting]
+Change = Callable[[RuntimeState, Bench], RuntimeState]
 
 ENABLE, STRATEGY = "ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY"
 KEYSTORE, ENCLAVE = "ROS_SECURITY_KEYSTORE", "ROS_SECURITY_ENCLAVE_OVERRIDE"
@@ -18,7 +18,7 @@ DOMAIN, RMW = "ROS_DOMAIN_ID", "RMW_IMPLEMENTATION"
 UNSECURED = {DOMAIN: "0"}
 
 
-def sound_setting(bench: Bench) -> Setting:
+def sound_state(bench: Bench) -> RuntimeState:
     """A host on which everything is as `sros env` sets it, with a node and the daemon running."""
     environment = {
         KEYSTORE: str(bench.root),
@@ -39,15 +39,15 @@ def sound_setting(bench: Bench) -> Setting:
     node = Process(7, ("/usr/bin/talker", "--ros-args"), environment, started)
     daemon = Process(8, ("python3", "-c", "from ros2cli.daemon import main"), environment, started)
     rmws = ("rmw_fastrtps_cpp", "rmw_cyclonedds_cpp", "rmw_zenoh_cpp")
-    return Setting(environment, started, processes=(node, daemon), rmws=rmws)
+    return RuntimeState(environment, started, processes=(node, daemon), rmws=rmws)
 
 
 def having(**variables: str | None) -> Change:
     """Variables set, or with None unset."""
 
-    def change(setting: Setting, _: Bench) -> Setting:
-        environment = {**setting.environment, **variables}
-        return replace(setting, environment={n: v for n, v in environment.items() if v is not None})
+    def change(state: RuntimeState, _: Bench) -> RuntimeState:
+        environment = {**state.environment, **variables}
+        return replace(state, environment={n: v for n, v in environment.items() if v is not None})
 
     return change
 
@@ -55,31 +55,31 @@ def having(**variables: str | None) -> Change:
 def running(index: int, **variables: str | None) -> Change:
     """The same for one of the processes."""
 
-    def change(setting: Setting, bench: Bench) -> Setting:
-        process = setting.processes[index]
-        alone = replace(setting, environment=process.environment)
+    def change(state: RuntimeState, bench: Bench) -> RuntimeState:
+        process = state.processes[index]
+        alone = replace(state, environment=process.environment)
         changed = replace(process, environment=having(**variables)(alone, bench).environment)
-        processes = list(setting.processes)
+        processes = list(state.processes)
         processes[index] = changed
-        return replace(setting, processes=tuple(processes))
+        return replace(state, processes=tuple(processes))
 
     return change
 
 
-def _written_in_the_future(setting: Setting, bench: Bench) -> Setting:
-    moment = (setting.now + timedelta(days=3)).timestamp()
+def _written_in_the_future(state: RuntimeState, bench: Bench) -> RuntimeState:
+    moment = (state.now + timedelta(days=3)).timestamp()
     os.utime(bench.path("ledger.jsonl"), (moment, moment))
-    return setting
+    return state
 
 
-def _written_since(setting: Setting, bench: Bench) -> Setting:
-    moment = (setting.now + timedelta(minutes=1)).timestamp()
+def _written_since(state: RuntimeState, bench: Bench) -> RuntimeState:
+    moment = (state.now + timedelta(minutes=1)).timestamp()
     os.utime(bench.path("enclaves/base/permissions.p7s"), (moment, moment))
-    return setting
+    return state
 
 
-def _without_ca_keys(setting: Setting, bench: Bench) -> Setting:
-    return having(**{KEYSTORE: str(bench.export())})(setting, bench)
+def _without_ca_keys(state: RuntimeState, bench: Bench) -> RuntimeState:
+    return having(**{KEYSTORE: str(bench.export())})(state, bench)
 
 
 CASES: dict[str, Change] = {
@@ -96,8 +96,8 @@ CASES: dict[str, Change] = {
     "runtime.unsecured-without-enclave": having(**{ENCLAVE: None, STRATEGY: "Permissive"}),
     "runtime.domain-malformed": having(**{DOMAIN: "010"}),
     "runtime.domain-not-governed": having(**{DOMAIN: "7"}),
-    "runtime.ca-key-present": lambda setting, bench: having(**{KEYSTORE: str(bench.root)})(
-        setting, bench
+    "runtime.ca-key-present": lambda state, bench: having(**{KEYSTORE: str(bench.root)})(
+        state, bench
     ),
     "runtime.rmw-not-installed": having(**{RMW: "rmw_connextdds"}),
     "runtime.rmw-without-security": having(**{RMW: "rmw_zenoh_cpp"}),

@@ -1,4 +1,4 @@
-"""Each finding about the runtime comes about where it should, and not in a sound setting."""
+"""Each finding about the runtime comes about where it should, and not in a sound state."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from zoneinfo import ZoneInfo
 import pytest
 
 from sros_tool.checks.kind import ERROR, WARNING
-from sros_tool.checks.runtime import Setting, running_processes, runtime_findings
+from sros_tool.checks.runtime import RuntimeState, running_processes, runtime_findings
 from tests.checks.bench import DAY, Bench
 from tests.checks.runtime_cases import (
     CASES,
@@ -24,7 +24,7 @@ from tests.checks.runtime_cases import (
     SOUND,
     having,
     running,
-    sound_setting,
+    sound_state,
 )
 from tests.support.children import wait_for
 
@@ -36,31 +36,31 @@ SPELLING = {
 }
 
 
-def ids(setting: Setting) -> set[str]:
-    return {each.id for each in runtime_findings(setting)}
+def ids(state: RuntimeState) -> set[str]:
+    return {each.id for each in runtime_findings(state)}
 
 
 @pytest.fixture
-def sound_one(bench: Bench) -> Setting:
+def sound_one(bench: Bench) -> RuntimeState:
     """A host whose keystore is an export, without keys of CAs."""
-    setting = SOUND(sound_setting(bench), bench)
-    processes = [replace(each, environment=setting.environment) for each in setting.processes]
-    return replace(setting, processes=tuple(processes))
+    state = SOUND(sound_state(bench), bench)
+    processes = [replace(each, environment=state.environment) for each in state.processes]
+    return replace(state, processes=tuple(processes))
 
 
-def test_nothing_in_a_sound_setting(sound_one: Setting) -> None:
+def test_nothing_in_a_sound_setting(sound_one: RuntimeState) -> None:
     assert ids(sound_one) == set()
 
 
 def test_nothing_without_any_security() -> None:
-    setting = Setting({"PATH": "/usr/bin", "ROS_DISTRO": "jazzy"}, datetime.now(UTC))
-    assert ids(setting) == set()
+    state = RuntimeState({"PATH": "/usr/bin", "ROS_DISTRO": "jazzy"}, datetime.now(UTC))
+    assert ids(state) == set()
 
 
 @pytest.mark.parametrize("expected", CASES)
-def test_found(expected: str, sound_one: Setting, bench: Bench, tmp_path: Path) -> None:
+def test_found(expected: str, sound_one: RuntimeState, bench: Bench, tmp_path: Path) -> None:
     assert expected not in ids(sound_one)
-    setting = sound_one
+    state = sound_one
     if expected in ("runtime.clock-behind", "runtime.process-outdated"):
         bench.root = Path(sound_one.environment[KEYSTORE])
         (bench.root / "ledger.jsonl").touch()
@@ -68,10 +68,10 @@ def test_found(expected: str, sound_one: Setting, bench: Bench, tmp_path: Path) 
         for path in bench.root.rglob("*"):
             os.utime(path, (begin, begin))
         assert expected not in ids(sound_one)
-    assert expected in ids(CASES[expected](setting, bench))
+    assert expected in ids(CASES[expected](state, bench))
 
 
-def test_what_keeps_the_enclave_from_loading_is_found_too(sound_one: Setting) -> None:
+def test_what_keeps_the_enclave_from_loading_is_found_too(sound_one: RuntimeState) -> None:
     root = Path(sound_one.environment[KEYSTORE])
     (root / "enclaves/base/permissions.p7s").unlink()
     (found,) = runtime_findings(sound_one)
@@ -79,32 +79,32 @@ def test_what_keeps_the_enclave_from_loading_is_found_too(sound_one: Setting) ->
     assert "permissions.p7s" in found.text
 
 
-def test_the_daemon_of_another_domain_is_not_asked(sound_one: Setting, bench: Bench) -> None:
+def test_the_daemon_of_another_domain_is_not_asked(sound_one: RuntimeState, bench: Bench) -> None:
     unsecured = running(1, ROS_SECURITY_ENABLE=None)(sound_one, bench)
     assert ids(unsecured) == {"runtime.daemon-unsecured"}
     assert ids(running(1, ROS_DOMAIN_ID="3")(unsecured, bench)) == set()
 
 
 def test_the_domain_is_told_whatever_the_enclave(bench: Bench) -> None:
-    setting = sound_setting(bench)
-    assert not ids(setting) - {"runtime.ca-key-present"}
-    wrong = having(**{DOMAIN: "7", ENCLAVE: "/nobody"})(setting, bench)
+    state = sound_state(bench)
+    assert not ids(state) - {"runtime.ca-key-present"}
+    wrong = having(**{DOMAIN: "7", ENCLAVE: "/nobody"})(state, bench)
     assert ids(wrong) >= {"runtime.domain-not-governed", "runtime.enclave-not-found"}
 
 
-def test_a_robot_whose_clock_is_behind(sound_one: Setting) -> None:
+def test_a_robot_whose_clock_is_behind(sound_one: RuntimeState) -> None:
     behind = replace(sound_one, now=sound_one.now - 400 * DAY)
     assert "enclave.certificate-not-yet-valid" in ids(behind)
 
 
 @pytest.mark.parametrize(("zone", "found"), [("America/Los_Angeles", True), ("UTC", False)])
-def test_the_time_zone_of_the_host(zone: str, found: bool, sound_one: Setting) -> None:
+def test_the_time_zone_of_the_host(zone: str, found: bool, sound_one: RuntimeState) -> None:
     """Twenty hours before it was signed is within the back-dating, in UTC."""
     early = replace(sound_one, now=sound_one.now - timedelta(hours=20), zone=ZoneInfo(zone))
     assert ("enclave.permissions-local-time" in ids(early)) == found
 
 
-def test_an_rmw_that_was_tried(sound_one: Setting) -> None:
+def test_an_rmw_that_was_tried(sound_one: RuntimeState) -> None:
     tried = replace(sound_one, insecure_rmws={"rmw_fastrtps_cpp": "no security libraries"})
     (found,) = runtime_findings(tried)
     assert (found.id, found.text) == ("runtime.rmw-without-security", "no security libraries")
@@ -113,7 +113,9 @@ def test_an_rmw_that_was_tried(sound_one: Setting) -> None:
 
 
 @pytest.mark.parametrize("name", ["ROS_SECURITY_ROOT_DIRECTORY", "ros_security_enable"])
-def test_variables_of_old_and_in_small_letters(name: str, sound_one: Setting, bench: Bench) -> None:
+def test_variables_of_old_and_in_small_letters(
+    name: str, sound_one: RuntimeState, bench: Bench
+) -> None:
     assert ids(having(**{name: "x"})(sound_one, bench)) == {"runtime.variable-misspelt"}
 
 
@@ -154,11 +156,11 @@ def test_real_processes_are_read() -> None:
 )
 def test_spelling(variables: dict[str, str], told: set[str]) -> None:
     named = {f"ROS_SECURITY_{name}": value for name, value in variables.items()}
-    found = {each.removeprefix("runtime.") for each in ids(Setting(named, datetime.now(UTC)))}
+    found = {each.removeprefix("runtime.") for each in ids(RuntimeState(named, datetime.now(UTC)))}
     assert found & SPELLING == told
 
 
-def test_what_no_enclave_leads_to_is_of_a_severity_that_is_shown(sound_one: Setting) -> None:
+def test_what_no_enclave_leads_to_is_of_a_severity_that_is_shown(sound_one: RuntimeState) -> None:
     """Permissive runs unsecured, which is worse than not starting under Enforce."""
     found = {
         strategy: {

@@ -380,7 +380,7 @@ NO_TOPIC_RULE = FindingKind(
     "If no topic rule matches, the endpoint cannot be created; without a rule for "
     "ros_discovery_info no node of ROS 2 starts.",
     f"{_GOVERNANCE}; Fast DDS 2.14.5, Cyclone DDS 0.10.2; measured.",
-    "Add a rule for * as the last one.",
+    "Add a rule for * at the end.",
 )
 UNREACHABLE_TOPIC_RULE = FindingKind(
     "governance.unreachable-rule",

@@ -170,7 +170,9 @@ def check_issued(
     if keystore.policies:
         wanted = {each.path for policy in keystore.policies for each in policy.enclaves}
         for name in sorted(wanted.difference(keystore.names)):
-            yield NOT_IN_KEYSTORE.found(name, "the keystore does not have it", str(keystore.root))
+            yield NOT_IN_KEYSTORE.found(
+                name, "the keystore does not have this enclave", str(keystore.root)
+            )
 
 
 def _twice(pairs: Iterable[tuple[_Key, str]]) -> Iterator[tuple[_Key, list[str]]]:

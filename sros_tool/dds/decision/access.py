@@ -419,15 +419,15 @@ class Access:
         return self.join() if verb is AccessVerb.JOIN else self._endpoint(verb, topic, partitions)
 
     def join(self) -> Decision:
-        """Return whether the participant starts and peers accept it."""
+        """Return the decision on the participant: whether it starts, and peers accept it."""
         return self._join
 
     def publish(self, topic: str, partitions: tuple[str, ...] = ()) -> Decision:
-        """Return whether a DataWriter of ``topic`` can be created, and peers match it."""
+        """Return the decision on a DataWriter: whether it is created, and peers match it."""
         return self._endpoint(AccessVerb.PUBLISH, topic, partitions)
 
     def subscribe(self, topic: str, partitions: tuple[str, ...] = ()) -> Decision:
-        """Return whether a DataReader of ``topic`` can be created, and peers match it."""
+        """Return the decision on a DataReader: whether it is created, and peers match it."""
         return self._endpoint(AccessVerb.SUBSCRIBE, topic, partitions)
 
     def _prepare(self, grant: Grant) -> None:

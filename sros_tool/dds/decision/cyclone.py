@@ -372,7 +372,7 @@ def _domain_rule(node: _Node) -> DomainRule:
         if part.first is None:
             raise UnreadableError("an <id_range> lacks its <min>")
         if part.last is not None and part.last < part.first:
-            raise UnreadableError("an <id_range> ends before it begins")
+            raise UnreadableError("an <id_range> has a <max> below its <min>")
     rules = topics.all("topic_rule") if topics else []
     if not rules:
         raise UnreadableError("a <domain_rule> has no topic rules")

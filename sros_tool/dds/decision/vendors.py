@@ -129,7 +129,7 @@ class VendorTraits:
     """A character beyond ASCII in a certificate's subject is compared as ``\\C3\\B6``."""
     moments: Moments = Moments.STANDARD
     passes_over_outdated_grants: bool = False
-    """A later grant is used if the first of the subject is out of date."""
+    """A later grant is used if the first grant of the subject is not valid now."""
     open_range: OpenRange = OpenRange.OPEN
     filters_own_domain: bool = True
     """Rules for other domains do not count for the own participant (they never do for peers)."""
