@@ -133,7 +133,7 @@ WIDE = FindingKind(
     "a wildcard wider than a namespace",
     "* also matches slashes, so the rule reaches nodes and namespaces that you may not expect.",
     "DDS-Security 1.1, 9.4.1.3 (POSIX fnmatch, in which * also matches a slash).",
-    "Begin it with a whole namespace, as in /arm/*, or end it with a whole name.",
+    "Begin the name with a whole namespace, as in /arm/*, or end it with a whole name.",
 )
 READS_EVERYTHING = FindingKind(
     "policy.reads-everything",
@@ -370,7 +370,7 @@ LONG_NAME = FindingKind(
     WARNING,
     "a topic whose name is too long for Fast DDS",
     "If the DDS topic name has 252 bytes or more (with prefix and suffix), Fast DDS creates the "
-    "endpoint and never matches it; Cyclone DDS does.",
+    "endpoint and never matches it; Cyclone DDS matches it.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Use shorter namespaces and names.",
     vendors=FAST_DDS,
@@ -400,7 +400,7 @@ ENCLAVE_NAMES = FindingKind(
     "Cyclone DDS checks only that every part of a certificate's subject occurs in the grant's "
     "subject. So /robot can join with the (public) permissions of /robot/admin.",
     "Cyclone DDS 0.10.2 (access_control.c); reproduced: readers received data of such an enclave.",
-    "Choose names that do not consist of parts of another, such as /robot_admin, or unique "
+    "Choose names that do not consist of parts of another name, such as /robot_admin, or unique "
     "subjects (template production).",
     vendors=(Vendor.CYCLONE,),
 )
@@ -408,7 +408,8 @@ SEVERAL_PROFILES = FindingKind(
     "policy.several-profiles",
     NOTE,
     "an enclave with several <profiles>",
-    "sros joins them. ros2/sros2 makes a grant from each, and DDS uses only the first grant.",
+    "sros joins all blocks. ros2/sros2 makes one grant from each, and DDS uses only the first "
+    "grant.",
     "ros2/sros2 0.13; DDS-Security 1.1, 9.4.1.3; Fast DDS 2.14.5 and Cyclone DDS 0.10.2.",
     "Put all <profile> of an enclave into one <profiles>.",
 )
@@ -475,7 +476,7 @@ CONTRADICTION = FindingKind(
     "the same name is allowed and denied",
     "The denial wins, so the permission has no effect; one of them is a mistake.",
     _ORDER,
-    "Remove the wrong one.",
+    "Remove the permission or the denial.",
 )
 UNREACHABLE = FindingKind(
     "policy.unreachable-rule",
@@ -590,7 +591,7 @@ REDUNDANT_INCLUDE = FindingKind(
     "an include that adds nothing",
     "The same profile includes the file again, directly or through another file.",
     "XInclude 1.0.",
-    "Remove it.",
+    "Remove the include.",
 )
 
 _CHECKS = (_check_rules, _check_nodes, _check_names, _check_counterparts, _check_portability)

@@ -285,7 +285,7 @@ _NAME_IT = (
     "Start each process with `sros run ROOT NAME -- COMMAND...`, or set its enclave in the launch "
     "file."
 )
-_ENV = '`eval "$(sros env ROOT NAME)"` sets all of them.'
+_ENV = '`eval "$(sros env ROOT NAME)"` sets all variables.'
 
 ENABLE_MISSPELT = FindingKind(
     "runtime.enable-misspelt",
@@ -352,8 +352,8 @@ KEYSTORE_RELATIVE = FindingKind(
     "runtime.keystore-relative",
     WARNING,
     "ROS_SECURITY_KEYSTORE is a relative path",
-    "The path is relative to the working directory of each process, so a service, for instance, "
-    "looks in another folder.",
+    "Each process resolves the path in its working directory, so a service, for instance, looks "
+    "in another folder.",
     _RCL,
     f"Write the absolute path. {_ENV}",
 )
@@ -361,8 +361,8 @@ ENCLAVE_NOT_FOUND = FindingKind(
     "runtime.enclave-not-found",
     ERROR,
     "the enclave is not in the keystore",
-    "With Enforce the node does not start; without Enforce it runs unsecured. Names are compared "
-    "exactly, with upper and lower case.",
+    "With Enforce the node does not start; without Enforce it runs unsecured. Names are "
+    "case-sensitive.",
     _RCL,
     "Correct the name, or create the enclave with `sros create_enclave`.",
 )
@@ -388,7 +388,7 @@ DOMAIN_MALFORMED = FindingKind(
     "runtime.domain-malformed",
     ERROR,
     "ROS_DOMAIN_ID is not a valid domain id",
-    "Nodes do not start. A value with a leading zero is read as octal, so nodes join another "
+    "Nodes do not start; if the value has a leading zero, they read it as octal and join another "
     "domain.",
     "rcl 9 (rcl/src/rcl/domain_id.c: strtoul with base 0); Cyclone DDS refuses domains above 230.",
     "Write one whole number from 0 to 230, without leading zeros.",

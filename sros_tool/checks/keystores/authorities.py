@@ -150,12 +150,12 @@ ONE_AUTHORITY = FindingKind(
     "keystore.one-authority",
     WARNING,
     "one CA issues identities and signs permissions",
-    "Cyclone DDS 0.10.2 and Fast DDS 2.9.1 then accept permissions that an enclave signed for "
-    "itself: they accept every signer whose certificate chain ends at the permissions CA, as that "
-    "of every enclave then does.",
+    "Cyclone DDS 0.10.2 and Fast DDS 2.9.1 accept every signer whose certificate chain ends at "
+    "the permissions CA. With one CA this includes every enclave, so an enclave can sign "
+    "permissions for itself.",
     "CVE-2023-24011 class; reproduced on Cyclone DDS 0.10.2, where readers received data of such "
     "an enclave.",
-    "Create a keystore with separate CAs, by any template except sros2.",
+    "Create a keystore with separate CAs, from any template except sros2.",
 )
 CA_EXPIRES_SOON = FindingKind(
     "keystore.ca-ends-soon",
@@ -179,7 +179,7 @@ CA_MISSING = FindingKind(
     "keystore.ca-missing",
     ERROR,
     "the certificate of a CA is missing",
-    "The files of every enclave link to it.",
+    "Every enclave has a link to this file.",
     "ROS 2 keystore layout (public/).",
     "Restore it from a backup; every exported enclave has a copy.",
 )

@@ -90,8 +90,8 @@ SUBJECT = FindingKind(
     "portable.subject",
     WARNING,
     "a subject that vendors compare differently",
-    "Cyclone DDS splits subjects at commas, slashes and bars, and compares characters beyond ASCII "
-    "in their escaped form; Fast DDS 2.9 treats spaces around = as part of the name.",
+    "Cyclone DDS splits subjects at commas, slashes and vertical bars, and compares characters "
+    "beyond ASCII in their escaped form; Fast DDS 2.9 treats spaces around = as part of the name.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
     "Write it in the form of RFC 4514, CN=/name, without , | and quotes in the name.",
 )
@@ -111,8 +111,8 @@ TIME_WINDOW = FindingKind(
     "Fast DDS reads the dates of permissions in the host's local time: they begin up to 12 hours "
     "late in the west, and expire up to 14 hours early in the east.",
     "Fast DDS 2.9.1 and 2.14.5 (mktime); measured in Los Angeles and Tokyo.",
-    "Sign them with a not_before at least 14 hours in the past, as sros does, and renew them in "
-    "time.",
+    "Sign permissions with a not_before at least 14 hours in the past, as sros does, and renew "
+    "them in time.",
     vendors=FAST_DDS,
 )
 LOCAL_TIME = FindingKind(
@@ -303,7 +303,7 @@ def _domains(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Findi
 
 
 _GOVERNANCE = "DDS-Security 1.1, 9.4.1.2"
-_TEMPLATE = "Make a keystore by a template with more protection, such as production."
+_TEMPLATE = "Create a keystore from a template with more protection, such as production."
 
 UNAUTHENTICATED = FindingKind(
     "governance.unauthenticated",

@@ -41,7 +41,7 @@ WORLD_WRITABLE = FindingKind(
     "a file or folder that everybody can change",
     "Whoever can replace CA certificates, links or documents decides whom a node trusts.",
     "POSIX modes; CWE-732.",
-    "Run `chmod o-w` on it.",
+    "Run `chmod o-w` on the file or folder.",
 )
 FOLDER_OPEN = FindingKind(
     "keystore.folder-open",
@@ -49,7 +49,7 @@ FOLDER_OPEN = FindingKind(
     "a folder of keys that others may enter",
     "If a tool writes a key there with a too permissive mode, others can read it at once.",
     "ros2/sros2 0.13 makes private/ with 0755; sros with 0700.",
-    "Run `chmod 700` on it.",
+    "Run `chmod 700` on the folder.",
 )
 LINK_DANGLING = FindingKind(
     "keystore.link-dangling",
@@ -71,8 +71,8 @@ LINK_OUTSIDE = FindingKind(
     "keystore.link-outside",
     WARNING,
     "a link to a file outside of the keystore",
-    "The file is not copied or backed up with the keystore, and whoever may write it there can "
-    "change it.",
+    "The file is not copied or backed up with the keystore, and anyone with write access there "
+    "can change it.",
     "CWE-59.",
     "Put the file itself into the keystore.",
 )
