@@ -382,7 +382,7 @@ def _moment(now: datetime | None) -> datetime:
         return datetime.now(UTC)
     if now.tzinfo is None:
         raise UsageError(
-            f"the moment {now.isoformat()} has no time zone", "", "Add one, such as tzinfo=UTC."
+            f"the time {now.isoformat()} has no time zone", "", "Add one, such as tzinfo=UTC."
         )
     return now
 

@@ -53,11 +53,11 @@ class PkiError(SrosError):
 
 
 class KeystoreError(SrosError):
-    """A keystore that is missing, broken, busy, or would be weakened."""
+    """A keystore that is missing, broken or busy, or a change that would weaken it."""
 
 
 class UnavailableError(SrosError):
-    """A missing DDS stack, RMW or privilege."""
+    """A missing DDS stack, RMW, Python package or privilege."""
 
 
 @dataclass(frozen=True, slots=True)

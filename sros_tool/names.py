@@ -46,7 +46,7 @@ find an error in it.
 _PLAIN = re.compile(r"(?:~?/)?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*\Z")
 _TOKEN = re.compile(r"[A-Za-z_][A-Za-z0-9_]*\Z")
 _WILDCARDS = frozenset("*?[")
-# One segment of a name in a policy: the letters of a ROS name, * ? and plain [sets].
+# A name in a policy: the characters of ROS names, ``*``, ``?`` and plain [sets].
 _EXPRESSION = re.compile(
     r"(?:~(?=/|\Z))?(?:[A-Za-z0-9_/*?]|\[!?[A-Za-z0-9_/]+(?:-[A-Za-z0-9_]+)*\])*\Z"
 )

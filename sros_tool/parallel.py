@@ -111,9 +111,7 @@ def _die_with(parent: int) -> None:
     if os.getppid() != parent:
         os._exit(1)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # the parent also gets SIGINT and kills its workers
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets SIGINT, too, and kills workers
 
 
 def _collect(worker: int, pipe: int) -> Result:  # type: ignore[type-var]

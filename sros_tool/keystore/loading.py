@@ -56,7 +56,8 @@ def vendor_problems(
 ) -> tuple[Problem, ...]:
     """Return the problems for which a vendor refuses to load an enclave at the time ``at``.
 
-    The content of governance and permissions only counts by the problems in ``state``.
+    Of governance and permissions, only signature and size are checked here; problems in their
+    content are taken from ``state``.
     """
     kept = [each for each in state.problems if each.fault not in _VENDOR_SPECIFIC]
     # Files that every vendor refuses already: do not report a second problem.

@@ -110,7 +110,7 @@ class OpenedKeystore:
 
     @cached_property
     def revocation_list(self) -> RevocationList | None:
-        """The revocation list of the issuing identity CA, or None before the first revocation."""
+        """The revocation list of the issuing identity CA, or None if the keystore has no list."""
         return read_crl(self.root)
 
     @cached_property
@@ -247,7 +247,7 @@ def embedded_crl(root: Path, file: str) -> RevocationList | None:
 
 
 def read_crl(root: Path) -> RevocationList | None:
-    """Return the revocation list of the issuing identity CA; None before the first revocation."""
+    """Return the revocation list of the issuing identity CA; None if the keystore has no list."""
     path = root / CRL
     if not path.exists():
         return None
@@ -278,7 +278,7 @@ class SignedGrant:
 
 
 def read_signed_grant(path: Path, subject: str) -> SignedGrant:
-    """Return the grant of a ``permissions.p7s`` to a subject, without verifying its signature.
+    """Read a ``permissions.p7s`` and its grant to ``subject``, without verifying its signature.
 
     Raises:
         SrosError: the file is not a signed permissions document.

@@ -137,7 +137,7 @@ class Issuer:
         self._authority_id = authority_identifier(certificate)
 
     def issue(self, subject: x509.Name, public: PublicKey, validity: Window) -> x509.Certificate:
-        """Return a certificate that is not a CA; shorten ``validity`` to the validity of the CA."""
+        """Issue a certificate that is not a CA; it expires with the CA at the latest."""
         return (
             _builder(subject, self._name, public, validity.within(self._validity))
             .add_extension(_NOT_A_CA, critical=True)
@@ -182,7 +182,7 @@ def pem(certificate: x509.Certificate) -> bytes:
 
 
 def load_certificate(data: bytes, name: str) -> x509.Certificate:
-    """Return the first certificate of a PEM file, read in full; ``name`` names the file in errors.
+    """Return the first certificate of a PEM file; ``name`` names the file in errors.
 
     Raises:
         PkiError: the certificate cannot be read.

@@ -215,7 +215,7 @@ def _decoded(encoded: bytes) -> bytes:
 
 @lru_cache(maxsize=16)
 def _certificate(data: bytes) -> x509.Certificate:
-    # All documents of a keystore embed the same certificate.
+    # All documents of a keystore embed the certificate of the permissions CA.
     return read_in_full(x509.load_der_x509_certificate(data))
 
 

@@ -32,7 +32,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.ledger import Entry, append, read_ledger
-from sros_tool.keystore.lifecycle.revocation_list import RevocationLists
+from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
 from sros_tool.keystore.lifecycle.revoke import link_everywhere, still_valid
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import load_settings
@@ -95,7 +95,7 @@ def renew(
     """Renew the named enclaves, and all that are due by ``expiring``; all or nothing.
 
     The new certificate is for the same key, or with ``new_key`` for a new key; the signed rights do
-    not change.  All files change at the same moment.  A replaced certificate works for anyone who
+    not change.  All files are replaced at once.  A replaced certificate works for anyone who
     has its key until it expires or is revoked; ``revoke_old`` revokes all earlier certificates of
     the renewed enclaves.
 
@@ -136,7 +136,7 @@ def renew(
         entries, lists, count = writer.entries, None, 0
         if revoke_old and replaced:
             ledger = read_ledger(root)
-            lists = RevocationLists(
+            lists = RevocationListSigner(
                 transaction, authorities.identity, template, keyring, ledger, now
             )
             revocations = _superseded(replaced, ledger, lists, now)
@@ -161,7 +161,10 @@ def renew(
 
 
 def _superseded(
-    replaced: Sequence[_Replaced], ledger: Sequence[Entry], lists: RevocationLists, now: datetime
+    replaced: Sequence[_Replaced],
+    ledger: Sequence[Entry],
+    lists: RevocationListSigner,
+    now: datetime,
 ) -> list[Entry]:
     """Return the ledger entries for revoking all earlier certificates that have not expired."""
     listed = {each.serial for each in lists.present.revoked} if lists.present else set()

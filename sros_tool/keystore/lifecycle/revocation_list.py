@@ -94,7 +94,7 @@ def _carried_over(old: RevocationList | None, expiries: Mapping[int, str]) -> li
     return [each for each in old.revoked if expiries.get(each.serial, issued) >= issued]
 
 
-class RevocationLists:
+class RevocationListSigner:
     """Signer of the revocation lists of all trusted identity CAs, within a transaction.
 
     ``present`` is the list before the change.  ``remarks`` are sentences about lists that could not

@@ -21,7 +21,7 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.ledger import Entry, append, read_ledger
-from sros_tool.keystore.lifecycle.revocation_list import RevocationLists
+from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import load_settings, read_certificate
 from sros_tool.keystore.transaction.recovery import tidy
@@ -89,7 +89,7 @@ def revoke(
         template = load_settings(root)
         authority = load_authority(root, IDENTITY, template, keyring, now)
         issued = read_ledger(root)
-        lists = RevocationLists(transaction, authority, template, keyring, issued, now)
+        lists = RevocationListSigner(transaction, authority, template, keyring, issued, now)
         listed = {each.serial for each in lists.present.revoked} if lists.present else set()
         revoked: list[Revoked] = []
         entries: list[Entry] = []
@@ -133,7 +133,9 @@ def refresh_crl(
         existing = list_enclaves(root)
         template = load_settings(root)
         authority = load_authority(root, IDENTITY, template, keyring, now)
-        lists = RevocationLists(transaction, authority, template, keyring, read_ledger(root), now)
+        lists = RevocationListSigner(
+            transaction, authority, template, keyring, read_ledger(root), now
+        )
         next_update, entries = lists.sign((), existing, incomplete=True)
         link_everywhere(transaction, existing)
         append(transaction, entries)
@@ -153,7 +155,7 @@ def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
 
 
 def still_valid(issued: Sequence[Entry], name: str, now: datetime) -> dict[int, str]:
-    """Map the serial numbers of an enclave's certificates that have not expired to subjects."""
+    """Map serial numbers to subjects, for the certificates of ``name`` that have not expired."""
     return {
         int(each.serial, 16): each.subject
         for each in issued

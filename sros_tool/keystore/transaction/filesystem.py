@@ -51,7 +51,7 @@ def lock_folder(folder: Path, wait: float | None = None) -> int:
 
 
 def flush_file_system(folder: Path) -> None:
-    """Flush the whole file system of ``folder`` to disk, which is faster than each file."""
+    """Flush the whole file system of ``folder`` to disk; flushing each file would be slower."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         if _c_library().syncfs(handle) != 0:

@@ -31,8 +31,8 @@ from sros_tool.keystore.transaction.stage import (
     LIVE,
     MANIFEST,
     Move,
-    link_to_stage,
     read_manifest,
+    stage_link_target,
     staged_name,
 )
 from sros_tool.parallel import map_slices
@@ -149,6 +149,6 @@ def _symlink(text: str, path: str) -> None:
 
 def _leads_into_stage(real: str, path: str) -> bool:
     try:
-        return os.readlink(real) == link_to_stage(path)
+        return os.readlink(real) == stage_link_target(path)
     except OSError:
         return False

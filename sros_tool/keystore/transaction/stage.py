@@ -63,7 +63,7 @@ def staged_name(path: str) -> str:
     return hashlib.blake2b(os.fsencode(path), digest_size=8).hexdigest()
 
 
-def link_to_stage(path: str) -> str:
+def stage_link_target(path: str) -> str:
     """Return the target of the link that is at ``path`` during the commit."""
     return "../" * path.count("/") + f"{STAGE}/{LIVE}/{staged_name(path)}"
 

@@ -1,4 +1,4 @@
-"""Transactions: change all of many files in a keystore, or none, even if the machine stops.
+"""Transactions: atomic changes of many files in a keystore, even if the machine stops.
 
 New files are written below ``.sros-transaction`` in the keystore (`stage`).  The commit
 (`Transaction.commit`) changes existing files in three steps.  Each path becomes a link to
@@ -38,9 +38,9 @@ from sros_tool.keystore.transaction.stage import (
     Change,
     Move,
     Staged,
-    link_to_stage,
     point_live,
     relocated_target,
+    stage_link_target,
     staged_name,
     write_manifest,
 )
@@ -356,7 +356,7 @@ class _Bridge:
                 self._place(move)
                 continue
             kept = f"{before}/{staged_name(move.path)}"
-            os.symlink(link_to_stage(move.path), kept)
+            os.symlink(stage_link_target(move.path), kept)
             if not filesystem.exchange(kept, f"{root}/{move.path}"):
                 raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP), f"{root}/{move.path}")
 
@@ -391,8 +391,8 @@ class _Bridge:
     def _place(self, move: Move) -> None:
         real = f"{self._root}/{move.path}"
         if move.before is None:
-            os.symlink(link_to_stage(move.path), real)
+            os.symlink(stage_link_target(move.path), real)
             return
         spare = f"{self._stage}/spare.{os.getpid()}"
-        os.symlink(link_to_stage(move.path), spare)
+        os.symlink(stage_link_target(move.path), spare)
         os.replace(spare, real)

@@ -89,7 +89,7 @@ class Rotation:
 
 @dataclass(frozen=True, slots=True)
 class AuthorityStatus:
-    """A trusted CA, for people and programs.
+    """A trusted CA, and its state in a rotation.
 
     ``state`` is "issuing", "next" or "old".  ``enclaves`` is the number of enclaves with a
     certificate or permissions of this CA.
