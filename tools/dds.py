@@ -36,7 +36,7 @@ def provide(python: Path, lock: int | None) -> str | None:
     """
     plugins = plugins_found_by(python)
     if plugins is None:
-        # Install nothing only because an edited sros does not start.
+        # Do not install a DDS only because an edited sros does not start.
         say("sros does not start, so it cannot look for a DDS; continuing")
         return None
     if not plugins and UNPACKED.exists():

@@ -102,7 +102,7 @@ def test_search_finds_enclaves_and_names_and_shows_who_may_do_what(
         assert "May listen (3)" in text and "/mobile_robot/base" in text
         assert "encrypted" in text
         page.fill("#search", "no such thing")
-        assert "Nothing is called so." in page.inner_text("#results")
+        assert "No name matches." in page.inner_text("#results")
 
 
 def test_an_enclave_tells_its_rights_certificate_validity_and_findings(

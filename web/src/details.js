@@ -128,7 +128,7 @@ export function enclaveDetails(model, path, act) {
     );
     parts.push(section(`${title} (${names.length})`, longList(items)));
   }
-  if (common) parts.push(el("p", { class: "soft", text: "And what every node needs to start." }));
+  if (common) parts.push(el("p", { class: "soft", text: "In addition, all rights that every node needs to start." }));
   const written = enclave.statements;
   if (written.length) {
     const items = written.map((each) =>
@@ -159,7 +159,7 @@ export function nameDetails(model, kind, name, act) {
     ),
   ];
   if (protection.level === "unknown") {
-    parts.push(el("p", { class: "soft", text: "How it is protected is not known: a policy does not say." }));
+    parts.push(el("p", { class: "soft", text: "The protection is not known: a policy does not state it." }));
   } else {
     parts.push(
       facts([

@@ -178,7 +178,7 @@ function search() {
     ...names.map((each) => item(KINDS[each.kind], each.name, () => found(() => act.name(each.kind, each.name)))),
   ];
   if (more) items.push(el("li", { class: "soft", text: `and ${more} more: type on` }));
-  if (text.trim() && !items.length) items.push(el("li", { class: "soft", text: "Nothing is called so." }));
+  if (text.trim() && !items.length) items.push(el("li", { class: "soft", text: "No name matches." }));
   byId("results").replaceChildren(...items);
   byId("results").hidden = !items.length;
   byId("search-status").textContent = text.trim() ? `${enclaves.length + names.length + more} found` : "";
@@ -220,7 +220,7 @@ function fillLists() {
     showTab("map");
     act.enclave(path);
   };
-  const none = el("p", { class: "soft", text: "Nothing was found." });
+  const none = el("p", { class: "soft", text: "There are no findings." });
   const list = el("ul", { class: "plain cards" }, sorted.map((each) => findingItem(each, onEnclave)));
   byId("findings").replaceChildren(sorted.length ? list : none);
   byId("tab-findings").textContent = sorted.length ? `Findings (${sorted.length})` : "Findings";

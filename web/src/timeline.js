@@ -1,4 +1,4 @@
-// When everything ends: certificates, permissions, authorities, revocation lists.
+// The expiry of certificates, permissions, CAs and revocation lists.
 
 import { axisTop } from "d3-axis";
 import { scaleUtc } from "d3-scale";
@@ -15,8 +15,8 @@ export const dateText = (moment) => moment.slice(0, 10);
 export function leftText(each) {
   const days = daysLeft(each);
   if (Date.parse(each.not_before) > Date.now()) return "not valid yet";
-  if (days < 0) return `ended ${counted(-days, "day")} ago`;
-  return days === 0 ? "ends today" : `${counted(days, "day")} left`;
+  if (days < 0) return `expired ${counted(-days, "day")} ago`;
+  return days === 0 ? "expires today" : `${counted(days, "day")} left`;
 }
 
 function state(each) {
@@ -39,21 +39,21 @@ function rows(validities) {
 
 export function timeline(validities, onEnclave) {
   if (!validities.length) {
-    return [el("p", { class: "soft", text: "Nothing here ends: the picture is of policies, and no keystore was given." })];
+    return [el("p", { class: "soft", text: "No expiry is known: the picture shows policies, not a keystore." })];
   }
   const times = validities.flatMap((each) => [Date.parse(each.not_before), Date.parse(each.not_after)]);
-  // Authorities outlive everything by years; what ends first must still be told apart.
+  // CAs expire years later than the rest; the scale must still separate what expires first.
   const leaves = validities.filter((each) => each.enclave).map((each) => Date.parse(each.not_after));
   const last = Math.max(Date.now(), ...(leaves.length ? leaves : times));
   const first = Math.min(Date.now(), ...times);
   const scale = scaleUtc([first, last + (last - first) * 0.08], [6, WIDTH - 6]).clamp(true);
   const axis = svg("svg", { viewBox: `0 0 ${WIDTH} 22`, class: "axis", "aria-hidden": "true" });
   select(axis).append("g").attr("transform", "translate(0 21)").call(axisTop(scale).ticks(6).tickSizeOuter(0));
-  const head = ["What", "Ends", "Left"].map((text) => el("th", { scope: "col", text }));
+  const head = ["What", "Expires", "Left"].map((text) => el("th", { scope: "col", text }));
   head.push(el("th", { scope: "col", class: "bars" }, el("span", { class: "hidden", text: "Time" }), axis));
   const body = rows(validities).map((each) => row(each, scale, onEnclave));
   return [
-    el("p", { class: "soft", text: "What ends first stands first; the line is today. A bar with an arrow goes on." }),
+    el("p", { class: "soft", text: "The first to expire stands first; the line is today. A bar with an arrow continues beyond the chart." }),
     el("table", { class: "timeline" }, el("thead", {}, el("tr", {}, head)), el("tbody", {}, body)),
   ];
 }

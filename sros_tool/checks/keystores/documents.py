@@ -627,7 +627,7 @@ def _differences(answers: dict[Vendor, Access | Refusal], topics: list[str]) -> 
             )
             yield f"{f'{verb.value} {topic}'.strip()} ({answers_text})"
             if verb is AccessVerb.JOIN:
-                return  # everything else differs, too
+                return  # then every other access differs too
 
 
 def _topics_to_ask(enclave: CheckedEnclave) -> list[str]:
