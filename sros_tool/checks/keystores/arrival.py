@@ -1,4 +1,4 @@
-"""The state of enclaves on a robot: whether and until when each can be used, and every problem."""
+"""The state of enclaves on a robot: whether and until when each can be used, and its findings."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ArrivedEnclave:
 
 @dataclass(frozen=True, slots=True)
 class Arrival:
-    """The enclaves of a robot's folder, or a single one, and all findings about them.
+    """The enclaves in a robot's folder, or a single one, and the warnings and errors about them.
 
     ``root`` is the folder that contains the enclaves folder; ``kind`` is keystore or enclave.
     """
@@ -94,9 +94,10 @@ class Arrival:
 def verify_arrival(
     path: Path, *, now: datetime, domain: int | None = None, zone: tzinfo = UTC
 ) -> Arrival:
-    """Return the state of the enclaves in a robot's folder, or of one enclave, and all findings.
+    """Return the state of the enclaves in a robot's folder, or of one enclave, with findings.
 
-    A signing request without an answer is reported too: without it the enclave does not work.
+    The findings are the warnings and errors, and signing requests without an answer: without it the
+    enclave does not work.
 
     Args:
         path: a folder with enclaves, or the folder of an enclave.

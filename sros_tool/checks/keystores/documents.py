@@ -177,7 +177,7 @@ _DIRECTIONS = ("publish", "subscribe")
 
 
 def check_documents(enclave: CheckedEnclave) -> Iterator[Finding]:
-    """Yield findings about an enclave's permissions, even if the signature is not valid."""
+    """Yield findings about an enclave's permissions, if they can be verified and read."""
     permissions = enclave.state.permissions
     if permissions is None:
         return
