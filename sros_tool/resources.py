@@ -26,5 +26,5 @@ def templates_dir() -> Path:
 
 
 def unpacked_dds_dir() -> Path:
-    """Return the folder of a checkout in which ``./dev demo`` unpacks DDS packages without apt."""
+    """Return the folder of a checkout for the Cyclone DDS that ``./dev`` unpacks without apt."""
     return _PACKAGE.parent / ".dds"
