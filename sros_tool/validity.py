@@ -79,7 +79,9 @@ def window(now: datetime, span: Span) -> Window:
     begin = span.start or moment
     end = span.end or begin + (span.length or timedelta(0))
     if end <= moment:
-        raise UsageError(f"the validity expired at {iso(end)} already")
+        raise UsageError(
+            f"the chosen validity has expired already, at {iso(end)}", "", "Choose a later expiry."
+        )
     return Window(span.start or moment - BACKDATE, end)
 
 

@@ -79,7 +79,7 @@ def parse(data: bytes, name: str) -> etree._Element:
         root = etree.fromstring(data, _parser())
     except (etree.XMLSyntaxError, ValueError) as error:
         why = getattr(error, "msg", "") or str(error)
-        raise DocumentError(f"{name} is not well-formed XML", f"{why}.".capitalize()) from error
+        raise DocumentError(f"{name} is not well-formed XML", f"{why}.") from error
     if root is None:
         raise DocumentError(f"{name} has no element", "An XML document was expected.")
     if root.getroottree().docinfo.doctype:

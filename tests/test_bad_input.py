@@ -137,6 +137,7 @@ POLICIES: dict[str, tuple[str, str]] = {
     "another root": ("<robot/>", "not a policy"),
     "a fragment": ("<profile/>", "fragment"),
     "cut short": (GOOD[:-20], "not well-formed"),
+    "end tag of another case": ("<Policy></policy>", "mismatch: Policy line 1 and policy"),
     "two roots": (GOOD + GOOD, "not well-formed"),
     "too deep": (_DEEP, "not well-formed"),
     "DOCTYPE": ("<!DOCTYPE policy>" + GOOD, "document type"),

@@ -373,7 +373,10 @@ class _Secrets:
         if not value and sys.stdin.isatty():
             confirm = self._new and not is_pin
             value = click.prompt(
-                what.capitalize(), hide_input=True, err=True, confirmation_prompt=confirm
+                f"{what[:1].upper()}{what[1:]}",
+                hide_input=True,
+                err=True,
+                confirmation_prompt=confirm,
             )
         if not value:
             names = _PIN if is_pin else f"{_PASSPHRASE} or {_PASSPHRASE_FILE}"

@@ -83,8 +83,9 @@ def read_template(path: Path) -> Template:
         text = data.decode()
         return parse_template(text, path.stem)
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        why = str(error)
         raise DocumentError(
-            f"the template '{path}' is not valid TOML", f"{error}.".capitalize()
+            f"the template '{path}' is not valid TOML", f"{why[:1].upper()}{why[1:]}."
         ) from error
     except _TemplateError as error:
         raise DocumentError(f"the template '{path}' is not valid", f"{error}.") from error

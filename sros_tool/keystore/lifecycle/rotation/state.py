@@ -230,8 +230,8 @@ def _expiry_remarks(states: Sequence[AuthorityStatus], now: datetime) -> list[st
             )
         elif each.roles == (IDENTITY,):
             remarks.append(
-                f"The {name} expires at {end}: extend it with --same-key, which needs no restart; "
-                "or begin to replace it with --next."
+                f"The {name} expires at {end}: extend it with --same-key, which interrupts no "
+                "process; or begin to replace it with --next."
             )
         else:
             remarks.append(
