@@ -91,11 +91,6 @@ def parse(data: bytes, name: str) -> etree._Element:
     return root
 
 
-def _text_of(element: etree._Element) -> str:
-    """Return the text of an element up to its first child element, unchanged."""
-    return element.text or ""
-
-
 def serialize(root: etree._Element, *, indent: bool = True) -> bytes:
     """Return the XML document of ``root`` in UTF-8, with an XML declaration.
 

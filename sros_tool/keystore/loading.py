@@ -17,7 +17,6 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
 from sros_tool.dds.decision.vendors import MEASURED, Hashes, Keys, Signers, Vendor, VendorTraits
-from sros_tool.dds.permissions import MAX_SIGNED_BYTES
 from sros_tool.errors import PkiError
 from sros_tool.faults import Fault
 from sros_tool.keystore.layout import (
@@ -97,7 +96,7 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
             yield Problem(file, text, Fault.SIGNATURE)
     largest = traits.largest_document
     if largest is not None and state.permissions_bytes > largest:
-        text = f"it has {state.permissions_bytes} bytes, and from {MAX_SIGNED_BYTES} on the "
+        text = f"it has {state.permissions_bytes} bytes, and from {largest + 1} on the "
         yield Problem(PERMISSIONS_FILE, f"{text}handshake never finishes", Fault.DOCUMENT_SIZE)
 
 
