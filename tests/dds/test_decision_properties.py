@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lxml import etree
 
 from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import REASONS, Decision, Outcome, Refusal
+from sros_tool.dds.decision.answers import _REASONS, Decision, Outcome, Refusal
 from sros_tool.dds.decision.documents import read_governance_as, read_permissions_as
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
@@ -42,7 +42,7 @@ def decisions(vendor: Vendor, case: Case) -> list[Decision]:
 @given(cases(), st.sampled_from(Vendor))
 def test_every_question_has_an_answer_with_its_reason(case: Case, vendor: Vendor) -> None:
     for answer in decisions(vendor, case):
-        assert answer.reason in REASONS
+        assert answer.reason in _REASONS
         assert answer.text.startswith(vendor.title)
         assert answer.text.endswith(".")
         if answer.reason in ("allow-rule", "deny-rule") and answer.expression is not None:

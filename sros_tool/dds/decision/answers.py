@@ -39,7 +39,7 @@ class Outcome(StrEnum):
 class Decision:
     """An outcome and what decided it.
 
-    ``reason`` is a stable word for programs (one of `REASONS`), ``text`` a sentence for people.
+    ``reason`` is a stable word for programs (one of `_REASONS`), ``text`` a sentence for people.
     ``grant`` is an index in the permissions, ``rule`` an index in the grant, ``expression`` the
     ``<topic>`` that matched, ``topic_rule`` the rule of the governance for the topic.
     """
@@ -53,7 +53,7 @@ class Decision:
     topic_rule: TopicRule | None = None
 
 
-REASONS = {
+_REASONS = {
     "allow-rule": "an allow rule matches",
     "deny-rule": "a deny rule matches",
     "partition": "the rule that decides does not name the partitions",
