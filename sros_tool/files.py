@@ -1,58 +1,158 @@
-"""Atomic replacement of a file, and a TOML parser with limits."""
+"""Atomic replacement of single files in folders that others may write to; TOML with limits."""
 
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import logging
 import os
 import secrets
 import stat
 import tomllib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+from sros_tool.folders import Folder, write_all
+
 _LOG = logging.getLogger(__name__)
+
+_MOST_LINKS = 40
+
+
+@contextlib.contextmanager
+def staged_file(
+    target: Path, data: bytes, *, mode: int = 0o600, like: os.stat_result | None = None
+) -> Iterator[Callable[[], None]]:
+    """Write a temporary file next to ``target``; yield a function that moves it there atomically.
+
+    The file is flushed to disk before the move.  A symbolic link at ``target`` is replaced, not
+    followed.  Temporary files that killed processes of this user left for the same target are
+    removed.
+
+    Args:
+        target: the path of the file.
+        data: its content.
+        mode: its permission bits from the first byte on, less those of the umask.
+        like: a file whose permission bits and, if permitted, owner it gets.
+
+    Raises:
+        OSError: the file cannot be written; what is at ``target`` stays.
+    """
+    with Folder(target.parent) as folder:
+        prefix = f".{target.name[:200]}.sros-"
+        _remove_stale(folder, prefix)
+        spare, handle = _locked_file(folder, prefix, mode)
+
+        def put_in_place() -> None:
+            folder.replace(spare, target.name)
+            folder.flush()
+
+        try:
+            if like:
+                with contextlib.suppress(PermissionError):
+                    os.fchown(handle, like.st_uid, like.st_gid)
+                os.fchmod(handle, stat.S_IMODE(like.st_mode))
+            write_all(handle, data)
+            os.fsync(handle)
+            yield put_in_place
+        finally:
+            folder.unlink(spare, missing_ok=True)
+            os.close(handle)
+
+
+def _locked_file(folder: Folder, prefix: str, mode: int) -> tuple[str, int]:
+    """Make and lock a file; return its name and a descriptor that the caller closes."""
+    while True:
+        name = f"{prefix}{secrets.token_hex(4)}"
+        handle = folder.create(name, mode)
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        if folder.state(name):
+            return name, handle
+        os.close(handle)  # another process took it for a stale one before it was locked
+
+
+def _remove_stale(folder: Folder, prefix: str) -> None:
+    for name in folder.names():
+        state = folder.state(name) if name.startswith(prefix) else None
+        if not state or not stat.S_ISREG(state.st_mode) or state.st_uid != os.geteuid():
+            continue
+        with contextlib.suppress(OSError):
+            handle = folder.open_private(name)
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                folder.unlink(name)
+            finally:
+                os.close(handle)
+
+
+def write_new_file(path: Path, data: bytes) -> None:
+    """Write a file that only its owner can read, and flush it to disk.
+
+    Raises:
+        FileExistsError: something is at ``path`` already, be it a link that leads nowhere.
+    """
+    with Folder(path.parent) as folder:
+        handle = folder.create(path.name, 0o600)
+        try:
+            write_all(handle, data)
+            os.fsync(handle)
+        finally:
+            os.close(handle)
 
 
 def replace_file(path: Path, data: bytes) -> None:
     """Atomically replace the content of the file at ``path`` with ``data``, and flush it to disk.
 
-    Other processes read either the old content or the new one.  An existing file keeps its mode
-    and, if permitted, its owner.  If ``path`` is a symbolic link, its target is replaced.  A device
-    or a pipe (``/dev/null``) is written to, not replaced.
+    Other processes read either the old content or the new one.  An existing file of this user keeps
+    its mode and its owner; of another user, only where nobody else can write to the folder.  A
+    symbolic link is followed if it belongs to this user or to root, as ``/dev/stdout`` does, and
+    replaced otherwise: in a folder such as ``/tmp`` others could lead the output to any file.  A
+    device or a pipe of this user or of root is written to, not replaced.
 
     Raises:
         OSError: the file cannot be written; the old content stays.
     """
-    target = Path(os.path.realpath(path))
-    spare = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
-    try:
-        present = target.stat()
-    except FileNotFoundError:
-        present = None
-    if present and not stat.S_ISREG(present.st_mode) and not stat.S_ISDIR(present.st_mode):
-        target.write_bytes(data)
+    target, own = _follow_own_links(path)
+    state = _state(path, follow=own)
+    if state and own and not stat.S_ISREG(state.st_mode) and not stat.S_ISDIR(state.st_mode):
+        if stat.S_ISFIFO(state.st_mode) and not _trusted(state) and _is_shared(target.parent):
+            raise PermissionError(errno.EACCES, "it is a pipe of another user", str(path))
+        path.write_bytes(data)
         return
-    handle = os.open(spare, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+    keep = state and own and (_trusted(state) or not _is_shared(target.parent))
+    with staged_file(target, data, mode=0o666, like=state if keep else None) as put_in_place:
+        put_in_place()
+    _LOG.info("%s '%s', %d bytes", "replaced" if state else "wrote", target, len(data))
+
+
+def _follow_own_links(path: Path) -> tuple[Path, bool]:
+    """Return where links of this user or of root lead, and whether no link of others was met."""
+    for _ in range(_MOST_LINKS):
+        state = _state(path, follow=False)
+        if not state or not stat.S_ISLNK(state.st_mode):
+            return path, True
+        if not _trusted(state):
+            return path, False
+        path = path.parent / path.readlink()
+    raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
+
+
+def _state(path: Path, *, follow: bool) -> os.stat_result | None:
     try:
-        with os.fdopen(handle, "wb") as file:
-            if present:
-                with contextlib.suppress(PermissionError):
-                    os.fchown(handle, present.st_uid, present.st_gid)
-                os.fchmod(handle, present.st_mode & 0o7777)
-            file.write(data)
-            file.flush()
-            os.fsync(handle)
-        spare.replace(target)
-    except BaseException:
-        spare.unlink(missing_ok=True)
-        raise
-    folder = os.open(target.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
-    _LOG.info("%s '%s', %d bytes", "replaced" if present else "wrote", target, len(data))
+        return path.stat(follow_symlinks=follow)
+    except FileNotFoundError:
+        return None
+
+
+def _trusted(state: os.stat_result) -> bool:
+    return state.st_uid in (0, os.geteuid())
+
+
+def _is_shared(folder: Path) -> bool:
+    """Return whether other users can make files in a folder, as in ``/tmp``."""
+    return bool(folder.stat().st_mode & (stat.S_IWGRP | stat.S_IWOTH))
 
 
 _LONGEST_LINE = 4000  # characters: the parser takes quadratic time for a key with many dots

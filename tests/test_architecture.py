@@ -17,7 +17,7 @@ PACKAGE = PROJECT / "sros_tool"
 
 LAYERS = {
     1: {"errors", "faults", "names", "validity", "values"}
-    | {"xml", "files", "parallel", "resources"},
+    | {"xml", "files", "folders", "parallel", "resources"},
     2: {"pki", "policy", "dds"},
     3: {"translate"},
     4: {"keystore", "graph", "runtime"},

@@ -31,6 +31,8 @@ RETIRED = "retired"
 """The folder for certificates and keys of replaced CAs."""
 STAGE = ".sros-transaction"
 """The folder of a transaction that is in progress, or was interrupted."""
+LOCK = ".sros-lock"
+"""The file that the writing process has locked; it exists only meanwhile."""
 
 GOVERNANCE_XML = f"{ENCLAVES}/governance.xml"
 GOVERNANCE_P7S = f"{ENCLAVES}/governance.p7s"
@@ -85,6 +87,23 @@ def enclave_path(root: Path, name: str) -> Path:
 def folder_mode(path: str) -> int:
     """Return the permission bits of a folder: closed to others if it may hold keys."""
     return 0o755 if path in ("", PUBLIC) else 0o700
+
+
+_TOP_FILES = frozenset((SETTINGS, LEDGER, ROTATION))
+_FILE_TYPES = (".pem", ".p7s", ".xml")
+_TOP_FOLDERS = frozenset((ENCLAVES, PUBLIC, PRIVATE, REVOKED, RETIRED))
+
+
+def is_layout_path(path: str) -> bool:
+    """Return whether sros may put a file at ``path``, which is relative to a keystore."""
+    top, *rest = path.split("/")
+    if not rest:
+        return top in _TOP_FILES
+    return (
+        top in _TOP_FOLDERS
+        and all(part and not part.startswith(".") and part.isprintable() for part in rest)
+        and rest[-1].endswith(_FILE_TYPES)
+    )
 
 
 def is_keystore(root: Path) -> bool:

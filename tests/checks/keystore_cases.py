@@ -45,7 +45,8 @@ CASES |= {
     "keystore.world-writable": lambda b: b.path("public/identity_ca.cert.pem").chmod(0o646),
     "keystore.folder-open": lambda b: b.path("private").chmod(0o755),
     "keystore.link-dangling": lambda b: b.path("public/old.cert.pem").symlink_to("gone.pem"),
-    "keystore.transaction-left": lambda b: b.path(".sros-transaction").mkdir(),
+    "keystore.transaction-left": lambda b: b.path(".sros-transaction").mkdir(0o700),
+    "keystore.transaction-not-ours": lambda b: b.path(".sros-transaction").mkdir(0o755),
     "keystore.unknown-file": lambda b: b.path("notes.txt").write_text("call Bob"),
     "keystore.stray-key": lambda b: shutil.copy(
         b.path("enclaves/base/key.pem"), b.path("enclaves/base/key.pem.bak")

@@ -222,7 +222,7 @@ MISUSE: dict[str, tuple[str, int, str]] = {
     "a policy that is missing": ("sign_request ks r.pem -p no.xml", 1, "no.xml"),
     "nothing to renew": ("sign_request ks r.pem --renew", 1, "Leave --renew out"),
     "a certificate for a request": ("sign_request ks ks/enclaves/a/cert.pem", 1, "cannot be read"),
-    "the answer in a missing folder": ("sign_request ks r.pem -o no/a.tgz", 1, "no/"),
+    "the answer in a missing folder": ("sign_request ks r.pem -o no/a.tgz", 1, "'no': No such"),
     "a name that is none": ("create_request camera robot", 1, "not a valid enclave name"),
     "a key that is there": ("create_request /arm/camera robot", 1, "has a key in 'robot'"),
     "a request in a keystore": ("create_request /c ks", 1, "is a keystore with CAs"),

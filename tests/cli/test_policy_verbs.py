@@ -127,7 +127,7 @@ def failing_step(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
     def fail(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(Path if name == "replace" else os, name, fail)
+    monkeypatch.setattr(os, name, fail)
     yield
     monkeypatch.undo()
 

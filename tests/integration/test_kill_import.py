@@ -19,7 +19,6 @@ from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction import filesystem
 from tests.integration.kills import Moments, Server, server
 from tests.integration.test_kill_life import DIED, copy, in_child, to_try
 from tests.support.harness import remains, snapshot
@@ -72,7 +71,7 @@ def settled(robot: Path) -> dict[str, tuple[int, bytes]]:
 def test_death_at_every_step(
     robot: tuple[Path, bytes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(filesystem, "flush_file_system", lambda _: None)
+    monkeypatch.setattr("sros_tool.folders.flush_file_system", lambda _: None)
     folder, answer = robot
     work = tmp_path / "work" / "robot"
     work.parent.mkdir()

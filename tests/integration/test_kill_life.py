@@ -20,7 +20,6 @@ from sros_tool.keystore.lifecycle.create import create_enclaves
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import open_enclave, read_crl
-from sros_tool.keystore.transaction import filesystem
 from tests.integration.kills import Moments, Server, server
 from tests.support.harness import check_whole, remains
 
@@ -172,7 +171,7 @@ def copy(source: Path, target: Path) -> Path:
 def test_death_at_every_step(
     verb: str, life: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(filesystem, "flush_file_system", lambda _: None)
+    monkeypatch.setattr("sros_tool.folders.flush_file_system", lambda _: None)
     before = settled(life)
     work = tmp_path / "work" / "ks"
     work.parent.mkdir()

@@ -20,7 +20,6 @@ from sros_tool.keystore.lifecycle.rotation.state import (
 )
 from sros_tool.keystore.reader import open_enclave, read_lists
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction import filesystem
 from tests.integration.kills import Moments, Server, server
 from tests.integration.test_kill_life import DIED, copy, in_child, to_try
 from tests.support.harness import check_enclave_whole, remains
@@ -81,7 +80,7 @@ def test_death_at_every_step_of_revoking_between_stages(
     stage: RotationStage, life: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two lists change, and the file of the CAs: all at one moment."""
-    monkeypatch.setattr(filesystem, "flush_file_system", lambda _: None)
+    monkeypatch.setattr("sros_tool.folders.flush_file_system", lambda _: None)
     for each in STAGES[: STAGES.index(stage) + 1]:
         rotate_ca(life, each, now=NOW)
     before = settled(life)

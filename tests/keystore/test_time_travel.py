@@ -28,7 +28,6 @@ from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
 from sros_tool.keystore.reader import certificates_of, open_enclave, read_crl, read_lists
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction import filesystem
 from sros_tool.parallel import map_slices
 from sros_tool.pki.certificates import issued_by, validity_of
 from sros_tool.pki.crl import load_crl, signed_by
@@ -260,7 +259,7 @@ def permit(root: Path, names: list[str], version: int, now: datetime) -> None:
 
 def test_ten_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Nobody pulls the plug here, and 500 flushes of the disk would wait for everybody's files.
-    monkeypatch.setattr(filesystem, "flush_file_system", lambda _: None)
+    monkeypatch.setattr("sros_tool.folders.flush_file_system", lambda _: None)
     remember_digests(monkeypatch)
     chance = random.Random(11)
     root = tmp_path / "ks"

@@ -16,7 +16,9 @@ from typing import Any, NoReturn
 
 import pytest
 
+from sros_tool import folders
 from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.export import distribute
 from sros_tool.keystore.layout import REQUIRED_FILES, STAGE, enclave_folder, is_keystore
 from sros_tool.keystore.lifecycle import create
@@ -27,7 +29,8 @@ from sros_tool.keystore.lifecycle.create import (
     generate_artifacts,
 )
 from sros_tool.keystore.template import load_template
-from sros_tool.keystore.transaction import filesystem, recovery
+from sros_tool.keystore.transaction import lock as locking
+from sros_tool.keystore.transaction import recovery
 from sros_tool.keystore.transaction import stage as stage_of
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.policy.document import read_policy
@@ -41,6 +44,7 @@ DISCOVERY = "ros_discovery_info"
 # Every way in which the keystore's code changes a file system, and waits for it.
 PRIMITIVES = (
     "chmod",
+    "fchmod",
     "fsync",
     "link",
     "mkdir",
@@ -58,7 +62,7 @@ DIED, REFUSED = 99, 98
 @pytest.fixture(autouse=True)
 def no_waiting_for_the_disk(monkeypatch: pytest.MonkeyPatch) -> None:
     """A process that dies takes nothing with it that the system was given."""
-    monkeypatch.setattr(filesystem, "flush_file_system", lambda _: None)
+    monkeypatch.setattr(folders, "flush_file_system", lambda _: None)
     monkeypatch.setattr(os, "fsync", lambda _: None)
 
 
@@ -74,8 +78,8 @@ class Steps:
     def install(self) -> None:
         for name in PRIMITIVES:
             setattr(os, name, self._counting(name, getattr(os, name)))
-        filesystem.flush_file_system = self._counting("flush", filesystem.flush_file_system)
-        filesystem.exchange = self._counting("exchange", filesystem.exchange)
+        folders.flush_file_system = self._counting("flush", folders.flush_file_system)
+        folders.exchange = self._counting("exchange", folders.exchange)
 
     def _counting(self, name: str, real: Callable[..., Any]) -> Callable[..., Any]:
         def primitive(*arguments: Any, **options: Any) -> Any:
@@ -402,7 +406,7 @@ def cannot_exchange(monkeypatch: pytest.MonkeyPatch, *, hard_links: bool) -> lis
         asked.append(str(source))
         raise PermissionError(errno.EPERM, "Operation not permitted")
 
-    monkeypatch.setattr(filesystem, "exchange", lambda *_: False)
+    monkeypatch.setattr(folders, "exchange", lambda *_: False)
     if not hard_links:
         monkeypatch.setattr(os, "link", refuse)
     return asked
@@ -510,18 +514,18 @@ def test_a_transaction_waits_for_another(keystore: Path) -> None:
 
     child = fork(follow)
     with Transaction(keystore) as held:
-        held.write("enclaves/x.txt", b"x")
+        held.write("enclaves/x.pem", b"x")
         os.write(go, b".")
         time.sleep(0.1)
         assert os.waitpid(child, os.WNOHANG) == (0, 0)
         held.commit()
     assert join([child]) == [0]
-    assert (keystore / "enclaves/x.txt").read_bytes() == b"x"
+    assert (keystore / "enclaves/x.pem").read_bytes() == b"x"
     assert (keystore / "enclaves/late/key.pem").exists()
 
 
 def test_a_busy_keystore_is_told(keystore: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(filesystem, "_LOCK_SECONDS", 0.05)
+    monkeypatch.setattr(locking, "_LOCK_SECONDS", 0.05)
     with Transaction(keystore):
         before = snapshot(keystore)
         with pytest.raises(KeystoreError, match="is busy"), Transaction(keystore):
@@ -539,29 +543,27 @@ def test_stale_stages_beside_a_keystore_are_removed_and_those_in_use_are_not(
         (folder / "private/ca.key.pem").write_text("secret")
     used = tmp_path / ".k[s]*.sros-87654321"
     used.mkdir()
-    lock = filesystem.lock_folder(used)
-    create_keystore(tmp_path / "k[s]*", template=TEMPLATE, now=NOW)
-    os.close(lock)
+    with Folder(used) as in_use:
+        assert locking.lock_new(in_use)
+        create_keystore(tmp_path / "k[s]*", template=TEMPLATE, now=NOW)
     assert not stale.exists()
     assert used.exists()
     assert other.exists(), "the name of a keystore is not a pattern"
 
 
-@pytest.mark.parametrize("opened", [False, True])
-def test_a_stage_that_was_removed_before_it_was_locked_is_made_anew(
-    opened: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_stage_that_was_removed_before_it_was_locked_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    lock = filesystem.lock_folder
+    lock = locking.lock_new
     removed: list[Path] = []
 
-    def lose_the_first(folder: Path, wait: float | None = None) -> int:
-        handle = lock(folder, wait) if opened else -1
+    def lose_the_first(folder: Folder) -> bool:
         if not removed:
-            removed.append(folder)
-            folder.rmdir()
-        return handle if opened else lock(folder, wait)
+            removed.append(folder.path)
+            folder.path.rmdir()
+        return lock(folder)
 
-    monkeypatch.setattr(filesystem, "lock_folder", lose_the_first)
+    monkeypatch.setattr("sros_tool.keystore.transaction.transaction.lock_new", lose_the_first)
     create_keystore(tmp_path / "ks", template=TEMPLATE, now=NOW)
     assert removed
     check_whole(tmp_path / "ks")
@@ -644,7 +646,7 @@ def test_an_interrupted_transaction_of_a_stranger_writes_nowhere_else(
     made_up_stage(keystore, "after", [])
     staged = keystore / STAGE / "added/enclaves"
     staged.mkdir()
-    (staged / "authorized_keys").write_text("mine")
+    (staged / "cert.pem").write_text("mine")
     before = snapshot(tmp_path)
     with pytest.raises(KeystoreError, match="symbolic link"):
         create_enclaves(keystore, ["/new"], now=NOW)
@@ -652,12 +654,21 @@ def test_an_interrupted_transaction_of_a_stranger_writes_nowhere_else(
     (keystore / "enclaves").unlink()
     outside.rename(keystore / "enclaves")
     create_enclaves(keystore, ["/new"], now=NOW)
-    assert (keystore / "enclaves/authorized_keys").exists(), "it is completed where it may be"
+    assert (keystore / "enclaves/cert.pem").exists(), "it is completed where it may be"
 
 
 @pytest.mark.parametrize(
     "path",
-    ["../outside", "/etc/outside", "enclaves/../../x", "enclaves//a", f"{STAGE}/x", ""],
+    [
+        "../outside.pem",
+        "/etc/outside.pem",
+        "enclaves/../../x.pem",
+        "enclaves//a.pem",
+        "enclaves/authorized_keys",
+        ".ssh/a.pem",
+        f"{STAGE}/x.pem",
+        "",
+    ],
 )
 @pytest.mark.parametrize("live", ["before", "after"])
 def test_a_list_of_files_that_a_stranger_made_up_moves_nothing(
@@ -666,7 +677,7 @@ def test_a_list_of_files_that_a_stranger_made_up_moves_nothing(
     made_up_stage(keystore, live, [[path, "", ""]])
     (keystore / STAGE / live / stage_of.staged_name(path)).write_text("mine")
     before = snapshot(keystore.parent)
-    with pytest.raises(KeystoreError, match=r"not a path in a keystore.*restore"):
+    with pytest.raises(KeystoreError, match=r"not a file of a keystore.*restore"):
         create_enclaves(keystore, ["/new"], now=NOW)
     assert snapshot(keystore.parent) == before
 
@@ -675,8 +686,8 @@ def test_a_list_of_files_leads_through_no_link(keystore: Path, tmp_path: Path) -
     outside = tmp_path / "outside"
     (keystore / "enclaves/a").rename(outside)
     (keystore / "enclaves/a").symlink_to(outside)
-    made_up_stage(keystore, "after", [["enclaves/a/authorized_keys", None, ""]])
-    number = stage_of.staged_name("enclaves/a/authorized_keys")
+    made_up_stage(keystore, "after", [["enclaves/a/new.pem", None, ""]])
+    number = stage_of.staged_name("enclaves/a/new.pem")
     (keystore / STAGE / "after" / number).write_text("mine")
     before = snapshot(tmp_path)
     with pytest.raises(KeystoreError, match="symbolic link"):
@@ -697,6 +708,7 @@ def test_a_list_of_files_that_cannot_be_read_is_told(text: str, keystore: Path) 
 def made_up_stage(keystore: Path, live: str, moves: list[list[str | None]]) -> None:
     for name in ("before", "after", "added"):
         (keystore / STAGE / name).mkdir(parents=True)
+    (keystore / STAGE).chmod(0o700)
     (keystore / STAGE / "live").symlink_to(live)
     text = json.dumps({"version": 2, "moves": moves})
     (keystore / STAGE / stage_of.MANIFEST).write_text(text)
@@ -710,7 +722,7 @@ def test_a_stage_of_an_unknown_format_is_refused_and_not_touched(
     live: str | None, folder: str | None, keystore: Path
 ) -> None:
     stage = keystore / STAGE
-    stage.mkdir()
+    stage.mkdir(mode=0o700)
     if folder:
         (stage / folder / "enclaves/a").mkdir(parents=True)
         (stage / folder / "enclaves/a/cert.pem").write_bytes(b"another")
@@ -721,7 +733,7 @@ def test_a_stage_of_an_unknown_format_is_refused_and_not_touched(
         lambda: create_enclaves(keystore, ["/new"], now=NOW),
         lambda: recovery.tidy(keystore),
     ):
-        with pytest.raises(KeystoreError, match=r"does not know the format.*version of sros that"):
+        with pytest.raises(KeystoreError, match=r"this version of sros.*version of sros that"):
             verb()
         assert snapshot(keystore) == before
 
@@ -748,15 +760,17 @@ def test_content_is_on_the_disk_before_its_name(
         real = getattr(module, name)
 
         def noting(*arguments: Any, **options: Any) -> Any:
-            calls.append(f"{name} {arguments[0]}")
+            first = arguments[0]  # a name, or the descriptor of a folder
+            where = os.readlink(f"/proc/self/fd/{first}") if isinstance(first, int) else first
+            calls.append(f"{name} {where}")
             return real(*arguments, **options)
 
         monkeypatch.setattr(module, name, noting)
 
     if verb == "without hard links":
         cannot_exchange(monkeypatch, hard_links=False)
-    note(filesystem, "flush_file_system")
-    note(filesystem, "exchange")
+    note(folders, "flush_file_system")
+    note(folders, "exchange")
     for name in ("rename", "replace"):
         note(os, name)
     if verb == "create_keystore":
@@ -768,6 +782,6 @@ def test_content_is_on_the_disk_before_its_name(
     assert ("rename" if verb == "create_keystore" else "replace") in moved
     if verb == "without hard links":
         copies = calls.index(f"flush_file_system {keystore / STAGE / 'before'}")
-        link = f"replace {keystore / STAGE}/spare"
+        link = "replace spare"
         assert not [call for call in calls[:copies] if call.startswith(link)]
         assert [call for call in calls[copies:] if call.startswith(link)]

@@ -21,7 +21,7 @@ from cryptography.hazmat.primitives import serialization
 
 from sros_tool.cli import main
 from sros_tool.dds.permissions import parse_permissions
-from sros_tool.keystore.layout import REQUIRED_FILES
+from sros_tool.keystore.layout import LOCK, REQUIRED_FILES
 from sros_tool.pki import smime
 
 STAGES = (".sros-transaction", ".sros-")
@@ -181,6 +181,8 @@ def check_whole(keystore: Path) -> None:
         folders[:] = [name for name in folders if name != STAGES[0]]
         for name in files:
             path = os.path.join(parent, name)
+            if name == LOCK:
+                continue
             assert not os.path.exists(path) or os.stat(path).st_size, f"{path} is empty"
         if all(os.path.exists(os.path.join(parent, name)) for name in REQUIRED_FILES):
             check_enclave_whole(Path(parent))

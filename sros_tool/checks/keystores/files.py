@@ -10,6 +10,8 @@ from pathlib import Path
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
+from sros_tool.errors import KeystoreError
+from sros_tool.folders import Folder
 from sros_tool.keystore.layout import (
     ENCLAVES,
     LEDGER,
@@ -25,6 +27,7 @@ from sros_tool.keystore.layout import (
     STAGE,
     enclave_folder,
 )
+from sros_tool.keystore.transaction.stage import check_interrupted
 
 KEY_READABLE = FindingKind(
     "keystore.key-readable",
@@ -84,6 +87,15 @@ INTERRUPTED = FindingKind(
     "undoes the change.",
     "sros: keystore/transaction.py.",
     "Run any verb of sros that writes, such as `sros create_enclave`.",
+)
+FOREIGN_STAGE = FindingKind(
+    "keystore.transaction-not-ours",
+    ERROR,
+    "an interrupted write that sros cannot have left",
+    "Somebody else may have made it up, in the keystore or in the archive that it came from, to "
+    "have files moved in your name. Every verb that writes refuses to go on.",
+    "sros: keystore/transaction/stage.py; CWE-59.",
+    "Find out who can write to the keystore, look at what is in the folder, and remove it.",
 )
 STRAY_KEY = FindingKind(
     "keystore.stray-key",
@@ -145,8 +157,7 @@ def _below(start: str, keystore: CheckedKeystore, links: _Links) -> Iterator[Fin
         folders.sort()
         if STAGE in folders:
             folders.remove(STAGE)
-            text = "an interrupted change is neither completed nor undone"
-            yield INTERRUPTED.found(root, text, os.path.join(parent, STAGE))
+            yield _interrupted(Path(parent), root)
         for name in folders:
             yield from _folder(os.path.join(parent, name), root, home, links)
         inside = os.path.relpath(parent, root)
@@ -163,6 +174,19 @@ def _below(start: str, keystore: CheckedKeystore, links: _Links) -> Iterator[Fin
                 continue
             else:
                 yield from _other(path, inside, info, home)
+
+
+def _interrupted(parent: Path, root: str) -> Finding:
+    try:
+        with Folder(parent) as folder:
+            check_interrupted(folder)
+    except KeystoreError as error:
+        return FOREIGN_STAGE.found(root, f"{error.what}. {error.why}", str(parent / STAGE))
+    except OSError as error:
+        text = f"an interrupted change cannot be read: {error.strerror}"
+    else:
+        text = "an interrupted change is neither completed nor undone"
+    return INTERRUPTED.found(root, text, str(parent / STAGE))
 
 
 def _folder(path: str, root: str, home: bool, links: _Links) -> Iterator[Finding]:

@@ -6,13 +6,13 @@ The library never prompts for a secret: it calls the secrets handler of its call
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from sros_tool.errors import KeystoreError, PkiError, UsageError
+from sros_tool.files import write_new_file
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
@@ -156,14 +156,10 @@ def _path(place: str, root: Path) -> Path:
 
 def _write_outside(path: Path, pem: bytes, transaction: Transaction) -> None:
     """Write a key file outside the keystore; remove it if the transaction fails."""
-    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    write_new_file(path, pem)
 
     def undo() -> None:
         with suppress(OSError):
             path.unlink()
 
     transaction.on_failure(undo)
-    with os.fdopen(handle, "wb") as file:
-        file.write(pem)
-        file.flush()
-        os.fsync(file.fileno())

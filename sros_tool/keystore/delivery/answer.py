@@ -12,6 +12,7 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
+from sros_tool.files import write_new_file
 from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.trust import check_same_authority, refuse_ca_keystore, trusted_in
@@ -131,7 +132,7 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
     """
     with tempfile.TemporaryDirectory(prefix="sros-") as folder:
         for path, data in answer.files.items():
-            Path(folder, path.rpartition("/")[2]).write_bytes(data)
+            write_new_file(Path(folder, path.rpartition("/")[2]), data)
         state = open_enclave(Path(folder), now=now)
     problems = [str(each) for each in state.problems if each.file != _KEY]
     certificate = state.certificate

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import gzip
 import io
-import os
-import secrets
 import tarfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
-from pathlib import Path, PurePosixPath
+from collections.abc import Iterator, Mapping
+from pathlib import PurePosixPath
 
 from sros_tool.errors import DocumentError
 from sros_tool.keystore.layout import folder_mode
@@ -107,22 +104,3 @@ def _members(tar: tarfile.TarFile) -> Iterator[tuple[str, bytes]]:
         if len(read) != entry.size:
             raise EOFError
         yield name, read
-
-
-@contextmanager
-def staged_file(target: Path, data: bytes) -> Iterator[Callable[[], None]]:
-    """Write a temporary file next to ``target``; yield a function that moves it there atomically.
-
-    Only the owner can read the file, and it is flushed to disk before the move.
-    """
-    spare = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}")
-    handle = os.open(spare, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        yield lambda: os.replace(spare, target)  # noqa: PTH105
-    finally:
-        with suppress(FileNotFoundError):
-            spare.unlink()

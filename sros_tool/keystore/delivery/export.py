@@ -10,7 +10,8 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack, staged_file
+from sros_tool.files import staged_file
+from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack
 from sros_tool.keystore.delivery.trust import check_same_authority
 from sros_tool.keystore.layout import (
     OPTIONAL_FILES,

@@ -11,10 +11,11 @@ from cryptography import x509
 
 from sros_tool.dds.portable import name_notes
 from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
+from sros_tool.files import staged_file
 from sros_tool.keystore.authorities.authority import load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.delivery.answer import SEAL, RequestAnswer, check_answer, seal
-from sros_tool.keystore.delivery.archive import pack, staged_file
+from sros_tool.keystore.delivery.archive import pack
 from sros_tool.keystore.issuing.enclave import (
     EarlierRights,
     EnclaveWriter,

@@ -15,13 +15,15 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
+import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple
 
 from sros_tool.errors import KeystoreError
-from sros_tool.keystore.layout import STAGE
+from sros_tool.folders import Folder
+from sros_tool.keystore.layout import STAGE, is_layout_path
 
 BEFORE, AFTER, LIVE, ADDED, MANIFEST = "before", "after", "live", "added", "manifest.json"
 _VERSION = 2
@@ -73,44 +75,142 @@ def relocated_target(path: str, text: str) -> str:
     return text if text.startswith("/") else f"../../{path.rpartition('/')[0]}/{text}"
 
 
-def point_live(stage: Path, to: str) -> None:
-    """Atomically point the ``live`` symlink at ``to``, which is ``before`` or ``after``."""
-    spare = f"{stage}/{LIVE}.next"
-    os.symlink(to, spare)
-    os.replace(spare, f"{stage}/{LIVE}")
+def point_live(folder: Folder, to: str) -> None:
+    """Atomically point the ``live`` symlink of the stage at ``to``: ``before`` or ``after``."""
+    folder.symlink(to, f"{STAGE}/{LIVE}.next")
+    folder.replace(f"{STAGE}/{LIVE}.next", f"{STAGE}/{LIVE}")
 
 
-def write_manifest(stage: Path, moves: Sequence[Move]) -> None:
+def write_manifest(folder: Folder, moves: Sequence[Move]) -> None:
     """Write the manifest; the caller flushes it to disk before the first move."""
-    with open(stage / MANIFEST, "x", encoding="utf-8") as file:
-        file.write(json.dumps({"version": _VERSION, "moves": moves}))
+    text = json.dumps({"version": _VERSION, "moves": moves})
+    folder.write(f"{STAGE}/{MANIFEST}", text.encode(), 0o600)
 
 
-def read_manifest(stage: Path) -> tuple[Move, ...]:
+def _read_manifest(folder: Folder) -> tuple[Move, ...]:
     """Return the moves in the manifest.
 
     Raises:
         KeystoreError: the manifest is damaged, or another version of sros wrote it.
     """
     try:
-        read = json.loads((stage / MANIFEST).read_bytes())
+        read = json.loads(folder.read(f"{STAGE}/{MANIFEST}"))
         if read["version"] != _VERSION:
             raise ValueError(f"its version is not {_VERSION}")
         return tuple(_move(*each) for each in read["moves"])
-    except (OSError, ValueError, TypeError, KeyError) as error:
-        raise KeystoreError(
-            f"the interrupted change in '{stage}' can be neither completed nor undone",
-            f"Its list of files, {MANIFEST}, cannot be read: {error}.",
-            "Complete it with the version of sros that began it, or restore the keystore from a "
-            "backup.",
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise _unknown(
+            folder, f"Its list of files, {MANIFEST}, cannot be read: {error}."
         ) from error
 
 
 def _move(path: str, before: str | None, after: str | None) -> Move:
-    # A keystore may come from an archive with a forged stage.
     for each in (before, after):
         if each is not None and not isinstance(each, str):
             raise ValueError(f"{each!r} is not the state of a path")
-    if not path or not set(path.split("/")).isdisjoint({"", ".", "..", STAGE}):
-        raise ValueError(f"{path!r} is not a path in a keystore")
+    if not isinstance(path, str) or not is_layout_path(path):
+        raise ValueError(f"{path!r} is not a file of a keystore")
+    if after and not _stays_inside(path, after):
+        raise ValueError(f"the link {path!r} would lead out of the keystore, to {after!r}")
     return Move(path, before, after)
+
+
+def _stays_inside(path: str, target: str) -> bool:
+    """Return whether a link at ``path`` with the text ``target`` stays in the keystore."""
+    whole = os.path.normpath(f"{os.path.dirname(path)}/{target}")
+    return not target.startswith("/") and not whole.startswith("..")
+
+
+_KNOWN = re.compile(
+    rf"{BEFORE}|{AFTER}|{ADDED}|{re.escape(MANIFEST)}|{LIVE}(\.next)?|spare(\.\d+)?"
+)
+_STAGED_NAME = re.compile(r"[0-9a-f]{16}")
+
+
+def _check_stage(folder: Folder) -> str | None:
+    """Return the target of the link ``live``: BEFORE, AFTER, or None if nothing was changed yet.
+
+    A stage may have been made up, by somebody who can write to the keystore or who packed it into
+    an archive, to have the next verb of another user move files.  It is only accepted if sros, run
+    by this user or by the owner of the keystore, can have made all of it.
+
+    Raises:
+        KeystoreError: somebody else made the stage, or it is not of this version's format.
+    """
+    if not folder.is_folder(STAGE):
+        return None
+    _check_owner(folder, STAGE)
+    if folder.mode(STAGE) & 0o077:
+        raise _foreign(folder, "Other users may open it.")
+    for name in folder.names(STAGE):
+        if not _KNOWN.fullmatch(name):
+            raise _unknown(folder, f"{name!r} is not part of the format of this version of sros.")
+        path = f"{STAGE}/{name}"
+        _check_owner(folder, path)
+        if name == ADDED:
+            _check_added(folder, "")
+        elif name in (BEFORE, AFTER):
+            folder.is_folder(path)
+            for staged in folder.names(path):
+                if not _STAGED_NAME.fullmatch(staged):
+                    raise _unknown(folder, f"{staged!r} is not a file of a transaction.")
+                _check_file(folder, f"{path}/{staged}")
+    to = folder.link_target(f"{STAGE}/{LIVE}")
+    if to not in (None, BEFORE, AFTER) or (
+        to is None and folder.state(f"{STAGE}/{LIVE}") is not None
+    ):
+        raise _unknown(folder, f"{LIVE!r} is not part of the format of this version of sros.")
+    return to
+
+
+def check_interrupted(folder: Folder) -> tuple[str | None, tuple[Move, ...]]:
+    """Return what a stage holds: the target of ``live``, and the moves to complete or to undo.
+
+    Raises:
+        KeystoreError: as `_check_stage` and `_read_manifest`.
+    """
+    to = _check_stage(folder)
+    return to, _read_manifest(folder) if to else ()
+
+
+def _check_added(folder: Folder, path: str) -> None:
+    """Raise `KeystoreError` unless every file below an added folder is one of a keystore."""
+    whole = f"{STAGE}/{ADDED}/{path}".rstrip("/")
+    if stat.S_ISDIR(folder.mode(whole)):
+        _check_owner(folder, whole)
+        for name in folder.names(whole):
+            _check_added(folder, f"{path}/{name}".lstrip("/"))
+        return
+    if not is_layout_path(path):
+        raise _unknown(folder, f"{ADDED}/{path} is not a file of a keystore.")
+    _check_file(folder, whole)
+
+
+def _check_file(folder: Folder, path: str) -> None:
+    _check_owner(folder, path)
+    mode = folder.mode(path)
+    if not stat.S_ISREG(mode) and not stat.S_ISLNK(mode):
+        raise _unknown(folder, f"{path} is neither a file nor a link.")
+
+
+def _check_owner(folder: Folder, path: str) -> None:
+    state = folder.state(path)
+    if state and state.st_uid not in (0, os.geteuid(), folder.owner[0]):
+        raise _foreign(folder, f"{path} belongs to user {state.st_uid}.")
+
+
+def _unknown(folder: Folder, why: str) -> KeystoreError:
+    return KeystoreError(
+        f"the interrupted change in '{folder.path / STAGE}' can be neither completed nor undone",
+        why,
+        "Complete it with the version of sros that began it, or restore the keystore from a "
+        "backup.",
+    )
+
+
+def _foreign(folder: Folder, why: str) -> KeystoreError:
+    return KeystoreError(
+        f"'{folder.path / STAGE}' is not an interrupted change of yours",
+        f"{why} Somebody else may have put it there, so that files are moved in your name.",
+        "Find out who can write to the keystore, look at what is in it, and remove it.",
+    )

@@ -14,11 +14,9 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import glob
 import logging
 import os
 import secrets
-import shutil
 import stat
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -26,10 +24,10 @@ from types import TracebackType
 from typing import Self
 
 from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.folders import Folder
 from sros_tool.keystore.layout import STAGE, folder_mode
-from sros_tool.keystore.transaction import filesystem
-from sros_tool.keystore.transaction.filesystem import is_folder
-from sros_tool.keystore.transaction.recovery import recover
+from sros_tool.keystore.transaction.lock import KeystoreLock, lock_new
+from sros_tool.keystore.transaction.recovery import complete, recover
 from sros_tool.keystore.transaction.stage import (
     ADDED,
     AFTER,
@@ -63,13 +61,25 @@ class Transaction:
         self.dry_run = dry_run
         self._new_root = fresh and not root.exists()
         self._made_parents: list[Path] = []
-        self._lock = -1
-        self._stage = root / STAGE
-        self._added = f"{self._stage}/{ADDED}"
+        self._folder: Folder | None = None
+        self._lock: KeystoreLock | None = None
+        self._sibling = ""
         self._staged: set[str] = set()
         self._folders: dict[str, bool] = {}  # whether the folder exists in the keystore
         self._moves: list[Move] = []
         self._undo: list[Callable[[], None]] = []
+
+    @property
+    def _in(self) -> Folder:
+        """The keystore's folder; of a new keystore, the folder next to its path."""
+        if self._folder is None:
+            self._folder = Folder(self.root, for_owner=True)
+        return self._folder
+
+    @property
+    def _added(self) -> str:
+        """The folder, in `_in`, of what is in a new folder; with a "/" at its end."""
+        return "" if self._new_root else f"{STAGE}/{ADDED}/"
 
     def on_failure(self, undo: Callable[[], None]) -> None:
         """Have ``undo`` called if the transaction ends without a commit."""
@@ -89,16 +99,16 @@ class Transaction:
 
     def _begin(self) -> None:
         if self._new_root:
-            self._remove_stale_siblings()
             self._make_parents()
-            self._make_sibling()
+            with Folder(self.root.parent) as parent:
+                self._remove_stale_siblings(parent)
+                self._make_sibling(parent)
             _LOG.info("began to create the keystore '%s'", self.root)
             return
-        self._lock = filesystem.lock_folder(self.root)
-        recover(self.root)
-        self._stage.mkdir(mode=0o700)
-        os.mkdir(self._added, 0o700)
-        os.mkdir(f"{self._stage}/{AFTER}", 0o700)
+        self._lock = KeystoreLock(self._in)
+        recover(self._in)
+        for path in (STAGE, f"{STAGE}/{ADDED}", f"{STAGE}/{AFTER}"):
+            self._in.mkdir(path, 0o700)
         _LOG.info("began a transaction in the keystore '%s'", self.root)
 
     def __exit__(
@@ -107,22 +117,27 @@ class Transaction:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if not self.dry_run:
-            self._end()
+        self._end()
         for undo in self._undo:
             undo()
 
     def _end(self) -> None:
-        if self._stage != self.root / STAGE:
-            shutil.rmtree(self._stage, ignore_errors=True)
-        elif self._lock >= 0:
-            recover(self.root)
-        if self._lock >= 0:
-            os.close(self._lock)
-            self._lock = -1
-        for parent in self._made_parents:
-            with contextlib.suppress(OSError):
-                parent.rmdir()
+        try:
+            if self._sibling:
+                with Folder(self.root.parent) as parent, contextlib.suppress(OSError):
+                    parent.remove_tree(self._sibling)
+            elif self._lock:
+                recover(self._in)
+        finally:
+            if self._lock:
+                self._lock.release()
+                self._lock = None
+            if self._folder:
+                self._folder.close()
+                self._folder = None
+            for path in self._made_parents:
+                with contextlib.suppress(OSError):
+                    path.rmdir()
 
     def _make_parents(self) -> None:
         missing = []
@@ -135,25 +150,33 @@ class Transaction:
                 each.mkdir()
                 self._made_parents.insert(0, each)
 
-    def _make_sibling(self) -> None:
-        while self._lock < 0:
-            self._stage = self.root.parent / f".{self.root.name}.sros-{secrets.token_hex(4)}"
-            self._added = f"{self._stage}"
-            self._stage.mkdir(mode=0o700)
+    def _make_sibling(self, parent: Folder) -> None:
+        while not self._folder:
+            self._sibling = f"{self._sibling_prefix}{secrets.token_hex(4)}"
+            parent.mkdir(self._sibling, 0o700)
             # Until the folder is locked, another process may take it for a stale one and remove it.
             with contextlib.suppress(FileNotFoundError):
-                lock = filesystem.lock_folder(self._stage)
-                if self._stage.exists():
-                    self._lock = lock
+                folder = Folder(parent.path / self._sibling)
+                if lock_new(folder) and parent.state(self._sibling):
+                    self._folder = folder
                 else:
-                    os.close(lock)
+                    folder.close()
 
-    def _remove_stale_siblings(self) -> None:
-        for stale in self.root.parent.glob(f".{glob.escape(self.root.name)}.sros-*"):
-            with contextlib.suppress(KeystoreError, OSError):
-                lock = filesystem.lock_folder(stale, wait=0.0)
-                shutil.rmtree(stale, ignore_errors=True)
-                os.close(lock)
+    def _remove_stale_siblings(self, parent: Folder) -> None:
+        """Remove what processes of this user left that were killed as they made this keystore."""
+        for name in parent.names():
+            if not name.startswith(self._sibling_prefix):
+                continue
+            state = parent.state(name)
+            if not state or not stat.S_ISDIR(state.st_mode) or state.st_uid != os.geteuid():
+                continue
+            with contextlib.suppress(KeystoreError, OSError), Folder(parent.path / name) as stale:
+                if lock_new(stale):
+                    parent.remove_tree(name)
+
+    @property
+    def _sibling_prefix(self) -> str:
+        return f".{self.root.name}.sros-"
 
     # ── staging ──────────────────────────────────────────────────────────────────
 
@@ -162,24 +185,18 @@ class Transaction:
         staged = self._prepare(path, "")
         if staged is None:
             return
-        mode = 0o600 if private else 0o644
-        handle = os.open(staged, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
         try:
-            view = memoryview(data)
-            while view:
-                view = view[os.write(handle, view) :]
+            self._in.write(staged, data, 0o600 if private else 0o644)
         except OSError as error:
             error.filename = f"{self.root}/{path}"
             raise
-        finally:
-            os.close(handle)
 
     def link(self, path: str, target: str) -> None:
         """Stage a symbolic link to ``target``, which is relative to the folder of ``path``."""
         staged = self._prepare(path, target)
         if staged is not None:
             flat = self._folders[path.rpartition("/")[0]]
-            os.symlink(relocated_target(path, target) if flat else target, staged)
+            self._in.symlink(relocated_target(path, target) if flat else target, staged)
 
     def remove(self, path: str) -> None:
         """Stage the removal of a file or link, and of folders that become empty."""
@@ -191,7 +208,7 @@ class Transaction:
         self._moves.append(Move(path, before, None))
 
     def _prepare(self, path: str, after: str) -> str | None:
-        """Record a change of ``path``, and return the path of its staged file.
+        """Record a change of ``path``, and return the path of its staged file in `_in`.
 
         ``after`` is as in `Move`.  Return None in a dry run.
         """
@@ -202,7 +219,7 @@ class Transaction:
             self._moves.append(Move(path, before, after))
         if self.dry_run:
             return None
-        return f"{self._stage}/{AFTER}/{staged_name(path)}" if exists else f"{self._added}/{path}"
+        return f"{STAGE}/{AFTER}/{staged_name(path)}" if exists else f"{self._added}{path}"
 
     def _begin_change(self, path: str, action: str) -> None:
         if path in self._staged:
@@ -212,14 +229,14 @@ class Transaction:
 
     def _at(self, path: str) -> str | None:
         """Return the present state of a path, as in `Move.before`."""
-        real = f"{self.root}/{path}"
-        try:
-            mode = os.lstat(real).st_mode
-        except FileNotFoundError:
+        state = self._in.state(path)
+        if state is None:
             return None
-        if stat.S_ISDIR(mode):
-            raise KeystoreError(f"'{real}' is in the way", "It is a folder.", "Move it away.")
-        return os.readlink(real) if stat.S_ISLNK(mode) else ""
+        if stat.S_ISDIR(state.st_mode):
+            raise KeystoreError(
+                f"'{self.root}/{path}' is in the way", "It is a folder.", "Move it away."
+            )
+        return self._in.link_target(path) or "" if stat.S_ISLNK(state.st_mode) else ""
 
     def _prepare_folder(self, path: str, *, wanted: bool = True) -> bool:
         """Return whether a folder exists in the keystore; if not and ``wanted``, stage it."""
@@ -227,9 +244,8 @@ class Transaction:
             return self._folders[path]
         exists = not self._new_root
         if path:
-            exists = self._prepare_folder(path.rpartition("/")[0], wanted=wanted) and is_folder(
-                f"{self.root}/{path}"
-            )
+            above = self._prepare_folder(path.rpartition("/")[0], wanted=wanted)
+            exists = above and self._in.is_folder(path)
             if not wanted and not exists:
                 return False
             if not exists and not self.dry_run:
@@ -238,12 +254,14 @@ class Transaction:
         return exists
 
     def _stage_folder(self, path: str) -> None:
-        staged, mode = f"{self._added}/{path}", folder_mode(path)
-        os.makedirs(os.path.dirname(staged), 0o700, exist_ok=True)
-        with contextlib.suppress(FileExistsError):  # by another worker
-            os.mkdir(staged, mode)
-        if mode != 0o700:
-            os.chmod(staged, mode)
+        parts = path.split("/")
+        for length in range(1, len(parts)):
+            self._make_folder(self._added + "/".join(parts[:length]), 0o700)
+        self._make_folder(f"{self._added}{path}", folder_mode(path))
+
+    def _make_folder(self, path: str, mode: int) -> None:
+        with contextlib.suppress(FileExistsError):  # made before, or by another worker
+            self._in.mkdir(path, mode)
 
     # ── by forked workers ───────────────────────────────────────────────────────────────
 
@@ -271,19 +289,20 @@ class Transaction:
         """
         if self.dry_run or not self.changes:
             return
+        folder = self._in
         if self._new_root:
-            filesystem.flush_file_system(self._stage)
+            folder.flush_file_system()
             self._appear()
             self._report_commit()
             return
-        write_manifest(self._stage, self._moves)
-        filesystem.flush_file_system(self._stage)
-        _bridge(self.root, self._stage, self._moves)
-        point_live(self._stage, AFTER)
+        write_manifest(folder, self._moves)
+        folder.flush_file_system(STAGE)
+        _bridge(folder, self._moves)
+        point_live(folder, AFTER)
         self._undo.clear()
         self._report_commit()
         with contextlib.suppress(OSError, SrosError):  # already committed; `_end` tries again
-            recover(self.root)
+            complete(folder, self._moves)
 
     def _report_commit(self) -> None:
         _LOG.info("committed %d changes to the keystore '%s'", len(self.changes), self.root)
@@ -292,9 +311,10 @@ class Transaction:
                 _LOG.debug("%s %s", change.action, change.path)
 
     def _appear(self) -> None:
-        os.chmod(self._stage, folder_mode(""))
+        os.fchmod(self._in.handle(""), folder_mode(""))
         try:
-            os.rename(self._stage, self.root)
+            with Folder(self.root.parent) as parent:
+                parent.rename(self._sibling, self.root.name)
         except OSError as error:
             if error.errno in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
                 raise KeystoreError(
@@ -303,37 +323,38 @@ class Transaction:
                     "Choose another path.",
                 ) from error
             raise
+        self._sibling = ""
         self._made_parents.clear()
         self._undo.clear()
-        with contextlib.suppress(OSError):  # already in place; the system flushes it soon
-            filesystem.flush_folder(self.root.parent)
+        with contextlib.suppress(OSError), Folder(self.root.parent) as parent:
+            parent.flush()  # already in place; otherwise the system flushes it soon
 
 
 # ── links through the stage ────────────────────────────────────────────────────────────────
 
 
-def _bridge(root: Path, stage: Path, moves: Sequence[Move]) -> None:
+def _bridge(folder: Folder, moves: Sequence[Move]) -> None:
     """Replace each path with a link through ``live`` to its old content, now in ``before``."""
     if not moves:
         return
-    os.mkdir(stage / BEFORE, 0o700)
-    point_live(stage, BEFORE)
-    work = _Bridge(f"{root}", f"{stage}")
-    if _can_exchange(stage):
+    folder.mkdir(f"{STAGE}/{BEFORE}", 0o700)
+    point_live(folder, BEFORE)
+    work = _Bridge(folder)
+    if _can_exchange(folder):
         map_slices(moves, work.by_exchange)
         return
     # A file system that cannot exchange two names: make hard links or copies first.
     if any(copied for _, copied in map_slices(moves, work.keep)):
-        filesystem.flush_file_system(stage / BEFORE)
+        folder.flush_file_system(f"{STAGE}/{BEFORE}")
     map_slices(moves, work.by_replacement)
 
 
-def _can_exchange(stage: Path) -> bool:
+def _can_exchange(folder: Folder) -> bool:
     """Return whether the file system can exchange two names, by trying it."""
-    spare = f"{stage}/spare"
-    os.symlink(BEFORE, spare)  # the same as `live`, so that exchanging them changes nothing
-    can = filesystem.exchange(spare, f"{stage}/{LIVE}")
-    os.unlink(spare)
+    spare = f"{STAGE}/spare"
+    folder.symlink(BEFORE, spare)  # the same as `live`, so that exchanging them changes nothing
+    can = folder.exchange(spare, f"{STAGE}/{LIVE}")
+    folder.unlink(spare)
     return can
 
 
@@ -343,22 +364,21 @@ class _Bridge:
     One is `by_exchange`; the other is `keep`, followed by `by_replacement`.
     """
 
-    def __init__(self, root: str, stage: str) -> None:
-        self._root = root
-        self._stage = stage
+    def __init__(self, folder: Folder) -> None:
+        self._folder = folder
 
     def by_exchange(self, moves: Sequence[Move]) -> None:
         """Exchange each file with a link created in ``before``."""
-        root, before = self._root, f"{self._stage}/{BEFORE}"
         for move in moves:
             if move.before != "":
                 self._keep_link(move)
                 self._place(move)
                 continue
-            kept = f"{before}/{staged_name(move.path)}"
-            os.symlink(stage_link_target(move.path), kept)
-            if not filesystem.exchange(kept, f"{root}/{move.path}"):
-                raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP), f"{root}/{move.path}")
+            kept = _kept(move)
+            self._folder.symlink(stage_link_target(move.path), kept)
+            if not self._folder.exchange(kept, move.path):
+                whole = str(self._folder.path / move.path)
+                raise OSError(errno.ENOTSUP, os.strerror(errno.ENOTSUP), whole)
 
     def keep(self, moves: Sequence[Move]) -> bool:
         """Hard-link or copy each old file into ``before``; return whether a file was copied."""
@@ -367,14 +387,10 @@ class _Bridge:
             if move.before != "":
                 self._keep_link(move)
                 continue
-            real, kept = (
-                f"{self._root}/{move.path}",
-                f"{self._stage}/{BEFORE}/{staged_name(move.path)}",
-            )
             try:
-                os.link(real, kept, follow_symlinks=False)
+                self._folder.link(move.path, _kept(move))
             except OSError:  # a file system, or an owner, that allows no hard links
-                shutil.copy2(real, kept, follow_symlinks=False)
+                self._folder.copy(move.path, _kept(move))
                 copied = True
         return copied
 
@@ -385,14 +401,17 @@ class _Bridge:
 
     def _keep_link(self, move: Move) -> None:
         if move.before:
-            kept = f"{self._stage}/{BEFORE}/{staged_name(move.path)}"
-            os.symlink(relocated_target(move.path, move.before), kept)
+            self._folder.symlink(relocated_target(move.path, move.before), _kept(move))
 
     def _place(self, move: Move) -> None:
-        real = f"{self._root}/{move.path}"
         if move.before is None:
-            os.symlink(stage_link_target(move.path), real)
+            self._folder.symlink(stage_link_target(move.path), move.path)
             return
-        spare = f"{self._stage}/spare.{os.getpid()}"
-        os.symlink(stage_link_target(move.path), spare)
-        os.replace(spare, real)
+        spare = f"{STAGE}/spare.{os.getpid()}"
+        self._folder.symlink(stage_link_target(move.path), spare)
+        self._folder.replace(spare, move.path)
+
+
+def _kept(move: Move) -> str:
+    """Return where the old content of a path is during the change."""
+    return f"{STAGE}/{BEFORE}/{staged_name(move.path)}"

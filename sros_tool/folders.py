@@ -1,0 +1,344 @@
+"""File operations below an open folder that follow no symbolic link.
+
+A folder that others wrote, or can write, is hostile input: a link in it could lead a program of
+root to any other file.  `Folder` opens one part of a path at a time, relative to the part before
+it (openat(2) with O_NOFOLLOW), so that neither a link that is there nor one that appears meanwhile
+leads out of the folder.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import os
+import shutil
+import stat
+import sys
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from sros_tool.errors import KeystoreError
+
+_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
+_NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_OLD_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+_MOST_OPEN = 64
+_RENAME_EXCHANGE = 2
+_NOT_SUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
+
+
+class Folder:
+    """An open folder; its methods take paths relative to it, with "/" between their parts.
+
+    Use it as a context manager, or `close` it.  A path is never absolute and has no part ``..``.
+    Every method raises `KeystoreError` if a folder on the way is a symbolic link or no folder, and
+    OSError, with the whole path, where the system refuses the operation.
+    """
+
+    def __init__(self, path: Path, *, for_owner: bool = False) -> None:
+        """Open the folder at ``path``, which may itself be a symbolic link: the user named it.
+
+        With ``for_owner``, what root makes in it belongs to the owner of the folder.
+        """
+        self.path = path
+        self._handles = {"": os.open(path, _FOLDER)}
+        state = os.fstat(self._handles[""])
+        self._owner = (state.st_uid, state.st_gid)
+        self._hand_over = for_owner and os.geteuid() == 0 and self._owner != (0, os.getegid())
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the folder; it cannot be used afterwards."""
+        self.forget()
+        with contextlib.suppress(KeyError):
+            os.close(self._handles.pop(""))
+
+    @property
+    def owner(self) -> tuple[int, int]:
+        """The user id and the group id of the folder."""
+        return self._owner
+
+    def forget(self) -> None:
+        """Close the folders below it that were kept open, since their paths have changed."""
+        for path in [each for each in self._handles if each]:
+            os.close(self._handles.pop(path))
+
+    # ── looking ────────────────────────────────────────────────────────────────────────────
+
+    def state(self, path: str) -> os.stat_result | None:
+        """Return the state of what is at ``path``, of a link itself; None if nothing is there."""
+        try:
+            parent, name = self._at(path)
+            return os.stat(name, dir_fd=parent, follow_symlinks=False)
+        except FileNotFoundError:
+            return None
+
+    def mode(self, path: str) -> int:
+        """Return the type and permission bits of what is at ``path``; 0 if nothing is there."""
+        state = self.state(path)
+        return state.st_mode if state else 0
+
+    def is_folder(self, path: str) -> bool:
+        """Return whether a folder is at ``path``.
+
+        Raises:
+            KeystoreError: ``path`` is a file or a symbolic link.
+        """
+        state = self.state(path)
+        if state is not None and not stat.S_ISDIR(state.st_mode):
+            raise self._in_the_way(path, link=stat.S_ISLNK(state.st_mode))
+        return state is not None
+
+    def link_target(self, path: str) -> str | None:
+        """Return the target text of the link at ``path``; None if there is no link."""
+        try:
+            parent, name = self._at(path)
+            return os.readlink(name, dir_fd=parent)
+        except OSError as error:
+            if error.errno in (errno.EINVAL, errno.ENOENT):
+                return None
+            raise
+
+    def names(self, path: str = "") -> list[str]:
+        """Return the sorted names in the folder at ``path``."""
+        return sorted(os.listdir(self.handle(path)))
+
+    def read(self, path: str) -> bytes:
+        """Return the content of the regular file at ``path``."""
+        parent, name = self._at(path)
+        with self._naming(path), open(os.open(name, _OLD_FILE, dir_fd=parent), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise OSError(errno.EINVAL, "it is not a regular file", str(self.path / path))
+            return file.read()
+
+    # ── making ─────────────────────────────────────────────────────────────────────────────
+
+    def create(self, path: str, mode: int) -> int:
+        """Make the new file ``path``; ``mode`` are its permission bits, less those of the umask.
+
+        Returns:
+            A descriptor for writing, which the caller closes.
+        """
+        parent, name = self._at(path)
+        with self._naming(path):
+            handle = os.open(name, _NEW_FILE, mode, dir_fd=parent)
+            if self._hand_over:
+                os.fchown(handle, *self._owner)
+        return handle
+
+    def write(self, path: str, data: bytes, mode: int) -> None:
+        """Write the new file ``path``, with permission bits as in `create`."""
+        handle = self.create(path, mode)
+        try:
+            with self._naming(path):
+                write_all(handle, data)
+        finally:
+            os.close(handle)
+
+    def open_private(self, path: str) -> int:
+        """Open the file ``path``, and make it if it is missing; only its owner can open it.
+
+        Returns:
+            A descriptor, which the caller closes.
+        """
+        try:
+            return self.create(path, 0o600)
+        except FileExistsError:
+            parent, name = self._at(path)
+            with self._naming(path):
+                return os.open(name, _OLD_FILE, dir_fd=parent)
+
+    def symlink(self, target: str, path: str) -> None:
+        """Make the symbolic link ``path`` with the text ``target``."""
+        parent, name = self._at(path)
+        with self._naming(path):
+            os.symlink(target, name, dir_fd=parent)
+            if self._hand_over:
+                os.chown(name, *self._owner, dir_fd=parent, follow_symlinks=False)
+
+    def mkdir(self, path: str, mode: int) -> None:
+        """Make the folder ``path``; its permission bits are ``mode`` whatever the umask is."""
+        parent, name = self._at(path)
+        with self._naming(path):
+            os.mkdir(name, 0o700, dir_fd=parent)
+        if mode != 0o700 or self._hand_over:
+            handle = self.handle(path)
+            if self._hand_over:
+                os.fchown(handle, *self._owner)
+            os.fchmod(handle, mode)
+
+    def copy(self, source: str, target: str) -> None:
+        """Copy the regular file ``source`` with its permission bits and times to a new file."""
+        parent, name = self._at(source)
+        old = os.stat(name, dir_fd=parent, follow_symlinks=False)
+        self.write(target, self.read(source), stat.S_IMODE(old.st_mode) & 0o777)
+        parent, name = self._at(target)
+        os.utime(name, ns=(old.st_atime_ns, old.st_mtime_ns), dir_fd=parent, follow_symlinks=False)
+
+    # ── moving and removing ────────────────────────────────────────────────────────────────
+
+    def replace(self, source: str, target: str) -> None:
+        """Rename ``source`` to ``target``, and replace a file or link that is there."""
+        here, name, there, new = self._pair(source, target)
+        with self._naming(target):
+            os.replace(name, new, src_dir_fd=here, dst_dir_fd=there)
+
+    def rename(self, source: str, target: str) -> None:
+        """Rename the folder ``source`` to ``target``, where at most an empty folder is."""
+        here, name, there, new = self._pair(source, target)
+        with self._naming(target):
+            os.rename(name, new, src_dir_fd=here, dst_dir_fd=there)
+        self.forget()
+
+    def link(self, source: str, target: str) -> None:
+        """Make ``target`` a second name (a hard link) of the file ``source``."""
+        here, name, there, new = self._pair(source, target)
+        with self._naming(target):
+            os.link(name, new, src_dir_fd=here, dst_dir_fd=there, follow_symlinks=False)
+
+    def exchange(self, one: str, other: str) -> bool:
+        """Atomically exchange two names (renameat2(2)).
+
+        Return False, without a change, if the kernel, the C library or the file system does not
+        support it.
+        """
+        return exchange(*self._pair(one, other))
+
+    def unlink(self, path: str, *, missing_ok: bool = False) -> None:
+        """Remove the file or link at ``path``."""
+        with contextlib.ExitStack() as stack:
+            if missing_ok:
+                stack.enter_context(contextlib.suppress(FileNotFoundError))
+            parent, name = self._at(path)
+            with self._naming(path):
+                os.unlink(name, dir_fd=parent)
+
+    def rmdir(self, path: str) -> None:
+        """Remove the empty folder at ``path``."""
+        if path in self._handles:
+            self.forget()
+        parent, name = self._at(path)
+        with self._naming(path):
+            os.rmdir(name, dir_fd=parent)
+
+    def remove_tree(self, path: str) -> None:
+        """Remove the folder at ``path`` with everything in it; links in it are not followed."""
+        self.forget()
+        parent, name = self._at(path)
+        shutil.rmtree(name, dir_fd=parent)
+
+    # ── the disk ───────────────────────────────────────────────────────────────────────────
+
+    def flush(self, path: str = "") -> None:
+        """Flush the names in the folder at ``path`` to the disk, not the contents of its files."""
+        os.fsync(self.handle(path))
+
+    def flush_file_system(self, path: str = "") -> None:
+        """Flush the file system of the folder at ``path``: one flush for each file costs more."""
+        flush_file_system(self.handle(path))
+
+    # ── the way to a path ──────────────────────────────────────────────────────────────────
+
+    def handle(self, path: str) -> int:
+        """Return the descriptor of the folder at ``path``, which this object closes."""
+        handle = self._handles.get(path)
+        if handle is not None:
+            return handle
+        parent, name = self._find(path)
+        try:
+            handle = os.open(name, _FOLDER | os.O_NOFOLLOW, dir_fd=parent)
+        except OSError as error:
+            if error.errno in (errno.ELOOP, errno.ENOTDIR):
+                link = self.link_target(path) is not None
+                raise self._in_the_way(path, link=link) from error
+            error.filename = str(self.path / path)
+            raise
+        self._handles[path] = handle
+        return handle
+
+    def _at(self, path: str) -> tuple[int, str]:
+        """Return the descriptor of the folder that ``path`` is in, and its last part."""
+        if len(self._handles) > _MOST_OPEN:
+            self.forget()
+        return self._find(path)
+
+    def _pair(self, one: str, other: str) -> tuple[int, str, int, str]:
+        """Return what `_at` returns for two paths; looking for the second keeps the first open."""
+        return (*self._at(one), *self._find(other))
+
+    def _find(self, path: str) -> tuple[int, str]:
+        folder, _, name = path.rpartition("/")
+        if name in ("", ".", ".."):
+            raise ValueError(f"{path!r} is not a path below a folder")
+        return self.handle(folder), name
+
+    @contextlib.contextmanager
+    def _naming(self, path: str) -> Iterator[None]:
+        """Give an error of the system the whole path."""
+        try:
+            yield
+        except OSError as error:
+            error.filename, error.filename2 = str(self.path / path), None
+            raise
+
+    def _in_the_way(self, path: str, *, link: bool) -> KeystoreError:
+        whole = self.path / path
+        if link:
+            return KeystoreError(
+                f"'{whole}' is a symbolic link",
+                "Files written below it would be stored elsewhere, outside of the keystore.",
+                "Replace the link with a real folder.",
+            )
+        return KeystoreError(f"'{whole}' is in the way", "It is not a folder.", "Move it away.")
+
+
+def write_all(handle: int, data: bytes) -> None:
+    """Write all of ``data`` to a descriptor."""
+    view = memoryview(data)
+    while view:
+        view = view[os.write(handle, view) :]
+
+
+def exchange(here: int, one: str, there: int, other: str) -> bool:
+    """Exchange two names in two open folders, as `Folder.exchange`."""
+    try:
+        rename = _c_library().renameat2
+    except AttributeError:
+        return False
+    sys.audit("os.rename", one, other, here, there)
+    names = os.fsencode(one), os.fsencode(other)
+    if rename(here, names[0], there, names[1], _RENAME_EXCHANGE) == 0:
+        return True
+    number = ctypes.get_errno()
+    if number in _NOT_SUPPORTED:
+        return False
+    raise OSError(number, os.strerror(number), one, None, other)
+
+
+def flush_file_system(handle: int) -> None:
+    """Flush the file system that an open folder is on."""
+    try:
+        if _c_library().syncfs(handle) != 0:
+            number = ctypes.get_errno()
+            raise OSError(number, os.strerror(number))
+    except AttributeError:  # a C library without syncfs
+        os.sync()
+
+
+@lru_cache(maxsize=1)
+def _c_library() -> ctypes.CDLL:
+    return ctypes.CDLL(None, use_errno=True)

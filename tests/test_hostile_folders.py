@@ -1,0 +1,398 @@
+"""Folders that others wrote, or can write: nothing in them leads a verb of root elsewhere.
+
+Run as root, these tests act as three parties: root, the owner of the folder, and a stranger.  Run
+as another user, they act as that user alone.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.files import replace_file, staged_file
+from sros_tool.folders import Folder
+from sros_tool.keystore.layout import LOCK, STAGE
+from sros_tool.keystore.lifecycle.create import create_enclaves
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.transaction import lock as locking
+from sros_tool.keystore.transaction.stage import staged_name
+from tests.support.harness import snapshot, sros
+
+NOW = datetime.now(UTC)
+OWNER, STRANGER = 65533, 65532
+
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as several users")
+
+
+def give(path: Path, user: int) -> None:
+    """Make a user the owner of a folder and of everything in it."""
+    os.chown(path, user, user, follow_symlinks=False)
+    if path.is_dir() and not path.is_symlink():
+        for each in path.iterdir():
+            give(each, user)
+
+
+def in_process_of(user: int, work: Callable[[], object]) -> str:
+    """Do work in a process of another user; return the text of its SrosError or OSError, or ""."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        said = "a defect"
+        try:
+            os.setgroups([])
+            os.setgid(user)
+            os.setuid(user)
+            work()
+            said = ""
+        except (SrosError, OSError) as error:
+            said = str(error)
+        finally:
+            os.write(writer, said.encode())
+            os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader) as pipe:
+        said = pipe.read()
+    os.waitpid(child, 0)
+    return said
+
+
+@pytest.fixture
+def outside(tmp_path: Path) -> Path:
+    """Files that nothing in a keystore may reach."""
+    folder = tmp_path / "outside"
+    folder.mkdir()
+    for name in ("shadow", staged_name("enclaves/a/cert.pem"), "enclaves"):
+        (folder / name).write_text("precious")
+    return folder
+
+
+# ── the stage of a transaction ─────────────────────────────────────────────────────────────
+
+
+def stage(keystore: Path, live: str = "after") -> Path:
+    folder = keystore / STAGE
+    folder.mkdir(mode=0o700)
+    for name in ("before", "after", "added"):
+        (folder / name).mkdir()
+    (folder / "live").symlink_to(live)
+    (folder / "manifest.json").write_text('{"version": 2, "moves": []}')
+    return folder
+
+
+def to_link(folder: Path, target: Path) -> None:
+    folder.rmdir()
+    folder.symlink_to(target)
+
+
+def manifest(folder: Path, *moves: list[str | None]) -> None:
+    (folder / "manifest.json").write_text(json.dumps({"version": 2, "moves": moves}))
+
+
+def replace_by_link(path: Path, target: str | Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        path.rmdir()
+    else:
+        path.unlink()
+    path.symlink_to(target)
+
+
+def earlier_format(folder: Path, outside: Path) -> None:
+    replace_by_link(folder / "added", outside)
+    (folder / "added").rename(folder / "new")
+    (folder / "removed").write_text(f"{outside}/shadow\n../../outside/shadow\n")
+
+
+def after_as_link(folder: Path, outside: Path) -> None:
+    replace_by_link(folder / "after", outside)
+    manifest(folder, ["enclaves/a/cert.pem", None, ""])
+
+
+def before_as_link(folder: Path, outside: Path) -> None:
+    replace_by_link(folder / "before", outside)
+    replace_by_link(folder / "live", "before")
+    manifest(folder, ["enclaves/a/cert.pem", "", None])
+
+
+def list_as_pipe(folder: Path, outside: Path) -> None:
+    (folder / "manifest.json").unlink()
+    os.mkfifo(folder / "manifest.json")
+
+
+def added(path: str) -> Callable[[Path, Path], None]:
+    def make(folder: Path, outside: Path) -> None:
+        (folder / "added" / path).parent.mkdir()
+        (folder / "added" / path).write_text("mine")
+
+    return make
+
+
+MADE_UP: dict[str, Callable[[Path, Path], None]] = {
+    "the format of an earlier version": earlier_format,
+    "added is a link": lambda s, o: replace_by_link(s / "added", o),
+    "added leads to a link": lambda s, o: (s / "added/enclaves").symlink_to(o),
+    "after is a link": after_as_link,
+    "before is a link": before_as_link,
+    "live leads elsewhere": lambda s, o: replace_by_link(s / "live", o),
+    "the list is a link": lambda s, o: replace_by_link(s / "manifest.json", o / "shadow"),
+    "the list is a pipe": list_as_pipe,
+    "a path out of the keystore": lambda s, o: manifest(s, ["../outside/shadow", "", None]),
+    "an absolute path": lambda s, o: manifest(s, [f"{o}/shadow", "", None]),
+    "a file that no keystore has": added("enclaves/authorized_keys"),
+    "a folder that no keystore has": added(".ssh/id.pem"),
+    "a link out of the keystore": lambda s, o: manifest(
+        s, ["enclaves/a/key.pem", None, f"{o}/shadow"]
+    ),
+    "a pipe": lambda s, o: os.mkfifo(s / "after" / staged_name("enclaves/a/cert.pem")),
+}
+
+
+@pytest.mark.parametrize("name", MADE_UP)
+def test_a_made_up_stage_moves_and_deletes_nothing(
+    name: str, keystore: Path, outside: Path, tmp_path: Path
+) -> None:
+    MADE_UP[name](stage(keystore), outside)
+    before = snapshot(tmp_path)
+    for verb in (
+        lambda: create_enclaves(keystore, ["/new"], now=NOW),
+        lambda: renew(keystore, ["/a"], now=NOW),
+        lambda: revoke(keystore, ["/a"], now=NOW),
+    ):
+        with pytest.raises(KeystoreError):
+            verb()
+        assert snapshot(tmp_path) == before
+
+
+@pytest.mark.parametrize("name", MADE_UP)
+def test_no_verb_is_recommended_over_a_made_up_stage(
+    name: str, keystore: Path, outside: Path
+) -> None:
+    MADE_UP[name](stage(keystore), outside)
+    found = keystore_findings(keystore, now=NOW)
+    (of_stage,) = [each for each in found if Path(each.file).name == STAGE]
+    assert of_stage.kind.id == "keystore.transaction-not-ours"
+    assert "create_enclave" not in of_stage.kind.remedy
+
+
+@as_root
+@pytest.mark.parametrize("part", ["", "added", "after", "added/enclaves/x.pem"])
+def test_a_stage_of_another_user_is_refused(part: str, keystore: Path, tmp_path: Path) -> None:
+    folder = stage(keystore)
+    (folder / "added/enclaves").mkdir()
+    (folder / "added/enclaves/x.pem").write_text("mine")
+    os.chown(folder / part, STRANGER, STRANGER)
+    before = snapshot(tmp_path)
+    with pytest.raises(KeystoreError, match=f"belongs to user {STRANGER}"):
+        create_enclaves(keystore, ["/new"], now=NOW)
+    assert snapshot(tmp_path) == before
+
+
+def test_a_stage_that_others_can_open_is_refused(keystore: Path) -> None:
+    stage(keystore).chmod(0o755)
+    with pytest.raises(KeystoreError, match="Other users"):
+        create_enclaves(keystore, ["/new"], now=NOW)
+
+
+# ── root in the folder of somebody else ────────────────────────────────────────────────────
+
+
+@as_root
+def test_what_root_makes_belongs_to_the_owner_of_the_keystore(keystore: Path) -> None:
+    give(keystore, OWNER)
+    create_enclaves(keystore, ["/by_root/inner"], now=NOW)
+    renew(keystore, ["/a"], now=NOW, new_key=True)
+    revoke(keystore, ["/b"], now=NOW)
+    for parent, folders, files in os.walk(keystore):
+        for name in (*folders, *files):
+            state = os.lstat(os.path.join(parent, name))
+            assert (state.st_uid, state.st_gid) == (OWNER, OWNER), name
+    keystore.parent.chmod(0o755)
+    with traversable(keystore.parent):
+        assert not in_process_of(OWNER, lambda: create_enclaves(keystore, ["/own"], now=NOW))
+    assert (keystore / "enclaves/own/key.pem").stat().st_uid == OWNER
+
+
+@as_root
+def test_root_completes_what_the_owner_was_killed_in(keystore: Path) -> None:
+    folder = stage(keystore)
+    (folder / "added/enclaves/x").mkdir(parents=True)
+    (folder / "added/enclaves/x/request.pem").write_text("staged")
+    give(keystore, OWNER)
+    create_enclaves(keystore, ["/new"], now=NOW)
+    assert (keystore / "enclaves/x/request.pem").read_text() == "staged"
+    assert not (keystore / STAGE).exists()
+
+
+@contextmanager
+def traversable(folder: Path) -> Iterator[None]:
+    """Let every user reach a folder for the time of a test."""
+    modes = {}
+    for each in (folder, *folder.parents):
+        mode = stat.S_IMODE(each.stat().st_mode)
+        if not mode & 0o001:
+            modes[each] = mode
+            each.chmod(mode | 0o011)
+    try:
+        yield
+    finally:
+        for each, mode in modes.items():
+            each.chmod(mode)
+
+
+# ── the lock ───────────────────────────────────────────────────────────────────────────────
+
+
+@as_root
+def test_nobody_else_can_block_the_writers(keystore: Path) -> None:
+    """The reader of a keystore locks all that he can open, and its owner writes on."""
+    keystore.chmod(0o755)
+    ready, go = os.pipe()
+    done, end = os.pipe()
+
+    def block() -> None:
+        import fcntl
+
+        for name in (".", LOCK, "private", "public", "enclaves"):
+            with suppress(OSError):
+                fcntl.flock(os.open(keystore / name, os.O_RDONLY), fcntl.LOCK_EX)
+        os.write(go, b".")
+        os.close(end)
+        os.read(done, 1)
+
+    with traversable(keystore.parent):
+        child = os.fork()
+        if child == 0:
+            with suppress(BaseException):
+                os.setgid(STRANGER)
+                os.setuid(STRANGER)
+                block()
+            os._exit(0)
+        os.read(ready, 1)
+        create_enclaves(keystore, ["/new"], now=NOW)  # is not busy
+        os.close(end)
+        os.waitpid(child, 0)
+    assert (keystore / "enclaves/new/key.pem").exists()
+    assert not (keystore / LOCK).exists()
+
+
+def test_a_lock_file_that_is_a_link_is_not_followed(keystore: Path, outside: Path) -> None:
+    (keystore / LOCK).symlink_to(outside / "new")
+    with pytest.raises(OSError, match="symbolic link"):
+        create_enclaves(keystore, ["/new"], now=NOW)
+    assert not (outside / "new").exists()
+
+
+@as_root
+def test_a_lock_file_with_two_names_changes_no_owner(keystore: Path, outside: Path) -> None:
+    os.link(outside / "shadow", keystore / LOCK)
+    give(keystore, OWNER)
+    os.chown(outside / "shadow", 0, 0)
+    create_enclaves(keystore, ["/new"], now=NOW)
+    assert (outside / "shadow").stat().st_uid == 0
+    assert (outside / "shadow").read_text() == "precious"
+
+
+def test_the_lock_is_of_one_holder_at_a_time(keystore: Path) -> None:
+    with Folder(keystore) as one, Folder(keystore) as two:
+        first = locking.KeystoreLock(one)
+        with pytest.raises(KeystoreError, match="is busy"):
+            locking.KeystoreLock(two, wait=0.0)
+        first.release()
+        locking.KeystoreLock(two, wait=0.0).release()
+    assert not (keystore / LOCK).exists()
+
+
+# ── outputs in a sticky folder ─────────────────────────────────────────────────────────────
+
+
+@pytest.fixture
+def sticky(tmp_path: Path) -> Path:
+    """A folder like /tmp."""
+    folder = tmp_path / "sticky"
+    folder.mkdir()
+    folder.chmod(0o1777)
+    return folder
+
+
+@as_root
+def test_an_output_does_not_follow_the_link_of_another_user(sticky: Path, outside: Path) -> None:
+    (sticky / "out.xml").symlink_to(outside / "shadow")
+    os.chown(sticky / "out.xml", STRANGER, STRANGER, follow_symlinks=False)
+    replace_file(sticky / "out.xml", b"new")
+    assert (outside / "shadow").read_text() == "precious"
+    assert not (sticky / "out.xml").is_symlink()
+    assert (sticky / "out.xml").read_bytes() == b"new"
+
+
+@as_root
+def test_an_output_does_not_follow_a_chain_to_the_link_of_another_user(
+    sticky: Path, outside: Path, tmp_path: Path
+) -> None:
+    (sticky / "evil").symlink_to(outside / "shadow")
+    os.chown(sticky / "evil", STRANGER, STRANGER, follow_symlinks=False)
+    (tmp_path / "own").symlink_to(sticky / "evil")
+    replace_file(tmp_path / "own", b"new")
+    assert (outside / "shadow").read_text() == "precious"
+
+
+@as_root
+def test_an_output_is_not_left_to_the_owner_of_a_file_that_waited_there(sticky: Path) -> None:
+    waiting = sticky / "out.xml"
+    waiting.write_text("")
+    waiting.chmod(0o666)
+    os.chown(waiting, STRANGER, STRANGER)
+    replace_file(waiting, b"new")
+    assert waiting.stat().st_uid == 0
+    assert not waiting.stat().st_mode & 0o022
+
+
+@as_root
+def test_an_output_is_not_written_to_the_pipe_of_another_user(sticky: Path) -> None:
+    os.mkfifo(sticky / "out.xml")
+    os.chown(sticky / "out.xml", STRANGER, STRANGER)
+    with pytest.raises(PermissionError, match="pipe of another user"):
+        replace_file(sticky / "out.xml", b"new")
+
+
+def test_an_output_follows_a_link_of_ones_own(tmp_path: Path) -> None:
+    (tmp_path / "real.xml").write_text("old")
+    (tmp_path / "link.xml").symlink_to("real.xml")
+    replace_file(tmp_path / "link.xml", b"new")
+    assert (tmp_path / "link.xml").is_symlink()
+    assert (tmp_path / "real.xml").read_bytes() == b"new"
+
+
+def test_an_output_goes_to_the_standard_output(keystore: Path) -> None:
+    ended = sros("list_enclaves", keystore, "--json")
+    assert ended.status == 0
+    replace_file(Path("/dev/null"), b"new")
+    assert stat.S_ISCHR(os.stat("/dev/null").st_mode)
+
+
+def test_a_file_with_a_key_that_a_killed_process_left_is_removed_by_the_next(
+    tmp_path: Path,
+) -> None:
+    child = os.fork()
+    if child == 0:
+        with staged_file(tmp_path / "robot.tar.gz", b"PRIVATE KEY"):
+            os._exit(0)
+    os.waitpid(child, 0)
+    assert len(list(tmp_path.iterdir())) == 1
+    (tmp_path / ".robot.tar.gz.sros-of.somebody").symlink_to("nowhere")
+    with staged_file(tmp_path / "robot.tar.gz", b"in use"):
+        with staged_file(tmp_path / "robot.tar.gz", b"new") as put_in_place:
+            put_in_place()
+        assert len(list(tmp_path.iterdir())) == 3, "the one in use, the link, and the new one"
+    assert sorted(each.name for each in tmp_path.iterdir()) == [
+        ".robot.tar.gz.sros-of.somebody",
+        "robot.tar.gz",
+    ]
