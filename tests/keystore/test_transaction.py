@@ -738,6 +738,12 @@ def test_a_stage_of_an_unknown_format_is_refused_and_not_touched(
         assert snapshot(keystore) == before
 
 
+def test_a_keystore_is_not_made_at_a_path_that_ends_in_the_parent(tmp_path: Path) -> None:
+    with pytest.raises(KeystoreError, match=r"ends in '\.\.'"):
+        create_keystore(tmp_path / "missing/..", template=TEMPLATE, now=NOW)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_file_that_is_a_link_is_replaced_and_not_followed(keystore: Path, tmp_path: Path) -> None:
     outside = tmp_path / "elsewhere.p7s"
     (keystore / "enclaves/a/permissions.p7s").rename(outside)

@@ -99,6 +99,10 @@ class Transaction:
 
     def _begin(self) -> None:
         if self._new_root:
+            if self.root.name == "..":
+                raise KeystoreError(
+                    f"'{self.root}' names no new folder", "It ends in '..'.", "Name the folder."
+                )
             self._make_parents()
             with Folder(self.root.parent) as parent:
                 self._remove_stale_siblings(parent)
