@@ -927,18 +927,32 @@ def _show_log(
         read_log(log), find, lambda enclave: options.context(enclave.domains), str(root or "")
     )
     if as_json:
-        print_json({"log": log, "findings": [_finding_json(each) for each in findings]})
+        notes = as_plain(_LOG_NOTES if findings else ())
+        shown = [_finding_json(each) for each in findings]
+        print_json({"log": log, "findings": shown, "notes": notes})
     else:
         for finding in findings:
             _echo(_finding_lines(finding))
-        if not findings:
+        if findings:
+            print_notes(_LOG_NOTES)
+        else:
             click.echo("the log reports no refusal by DDS Security", err=True)
     return 1 if findings else 0
 
 
+_LOG_NOTES = (
+    Note(
+        "log.only-text",
+        "a process can print any line: only what is shown after 'found' was examined in the "
+        "enclave",
+    ),
+)
+
+
 def _finding_lines(finding: LogFinding) -> Iterator[str]:
     times = f"  ({finding.count} times)" if finding.count > 1 else ""
-    yield f"line {finding.line}: {finding.text[:160]}{times}"
+    by = f" of {finding.process}" if finding.process else ""
+    yield f"line {finding.line}{by}: {finding.text[:160]}{times}"
     of = f" [{finding.enclave}]" if finding.enclave else ""
     source = finding.vendor.title.split()[0] + " DDS" if finding.vendor else "ROS 2"
     yield f"  means     {source}{of}: {finding.cause}"
@@ -953,6 +967,7 @@ def _finding_json(finding: LogFinding) -> dict[str, Any]:
         "line": finding.line,
         "count": finding.count,
         "text": finding.text,
+        "process": finding.process or None,
         "enclave": finding.enclave or None,
         "cause": finding.cause,
         "checked": finding.checked,

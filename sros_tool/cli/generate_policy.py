@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -22,6 +22,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     read_log,
+    visible,
 )
 from sros_tool.errors import SrosError, UnavailableError, UsageError
 from sros_tool.values import as_plain
@@ -74,9 +75,11 @@ Example:
   new: /talker (/talker_listener/talker) publish /chatter
   ...
   $ sros generate_policy robot.xml --enclave /talker_listener/talker \\
-        --from-log talker.log
+        --from-log talker.log --accept
   added 1 right to 'robot.xml'
     /talker_listener/talker ALLOW publish topic /nope
+  these lines of logs ask for it; a process can print any line:
+    talker.log:7: talker-1: publish rt/nope in /talker_listener/talker
 
 On a secured robot, observe in a separate enclave. Create it with `sros generate_artifacts -k ROOT
 -p observer.xml`: policies/observer.xml (see `sros policies`) has the few rights it needs. Observe
@@ -115,6 +118,11 @@ with --keystore ROOT --enclave /sros_observer.""",
 )
 @click.option("--node", metavar="/NS/NAME", help="The node whose profile --from-log adds to.")
 @click.option(
+    "--accept",
+    is_flag=True,
+    help="Write the rights that --from-log proposes; without it, they are only shown.",
+)
+@click.option(
     "-s", "--use-sim-time", is_flag=True, help="Accepted and ignored: observing needs no clock."
 )
 @click.option(
@@ -132,6 +140,7 @@ def generate_policy(
     keystore: Path | None,
     logs: tuple[Path, ...],
     node: str | None,
+    accept: bool,
     use_sim_time: bool,
     no_daemon: bool,
     dry_run: bool,
@@ -142,10 +151,19 @@ def generate_policy(
     Observes the running nodes until the ROS graph stops changing, about four seconds. An existing
     FILE keeps its content; new rights are added to it. Read the result before you enforce it: on a
     robot that is not secured yet, an attacker's nodes are observed, too.
+
+    A log proves less: a process can print any line, and so ask for rights. Rights from a log are
+    shown with the lines that ask for them, and are written only with --accept; the exit status is 1
+    if that is missing. Without FILE, the rights are printed as a policy, for merge_policy.
     """
     present = _present_policy(file)
     if logs:
-        return _from_logs(file, logs, enclave, node, present, dry_run, as_json, flat=flat)
+        if accept and file is None:
+            raise UsageError("--accept is given without FILE", "", "Name the policy to change.")
+        learned, lines = _learned_from_logs(logs, file, enclave, node, present)
+        return _propose(learned.flat() if flat else learned, lines, file, accept, dry_run, as_json)
+    if accept:
+        raise UsageError("--accept is for --from-log only")
     if file is None:
         raise UsageError("no file is named", "", "Name the policy FILE to write.")
     if node is not None:
@@ -168,7 +186,10 @@ def generate_policy(
     plan = draft(file, learned, None if flat else common)
     if not dry_run:
         write(plan)
-    _show(plan, learned, snapshot.observation, dry_run, as_json)
+    if as_json:
+        print_json(_json(plan, learned, snapshot.observation, dry_run))
+    else:
+        _show(plan, learned, written=not dry_run)
     if not snapshot.settled:
         click.echo(
             f"the ROS graph kept changing for {snapshot.seconds:.0f} s; use --watch to collect "
@@ -194,44 +215,45 @@ def _present_policy(file: Path | None) -> Policy | None:
     return None
 
 
-def _show(
-    plan: Draft, learned: Learned, observation: Observation, dry_run: bool, as_json: bool
-) -> None:
+def _json(plan: Draft, learned: Learned, observation: Observation, dry_run: bool) -> dict[str, Any]:
     from sros_tool.graph.observation import to_json
     from sros_tool.policy.merge import merge_notes
 
-    notes = (*merge_notes(plan.contradictions), *learned.notes)
-    if as_json:
-        print_json(
-            {
-                "file": str(plan.path),
-                "created": plan.before is None,
-                "changed": plan.changes,
-                "dry_run": dry_run,
-                **to_json(observation),
-                "added": as_plain(plan.added),
-                "copied": sorted(plan.copies),
-                "notes": as_plain(notes),
-            }
-        )
-        return
-    would = "would have " if dry_run else ""
+    return {
+        "file": str(plan.path),
+        "source": "log" if learned.from_log else "graph",
+        "created": plan.before is None,
+        "changed": plan.changes,
+        "dry_run": dry_run,
+        **to_json(observation),
+        "added": as_plain(plan.added),
+        "copied": sorted(plan.copies),
+        "notes": as_plain((*merge_notes(plan.contradictions), *learned.notes)),
+    }
+
+
+def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
+    from sros_tool.policy.merge import merge_notes
+
+    would = "" if written else "would have "
     if plan.before is None:
         enclaves = {each.enclave for each in learned.profiles}
         click.echo(
-            f"{would}{'written' if dry_run else 'wrote'} '{plan.path}': "
+            f"{would}{'wrote' if written else 'written'} '{plan.path}': "
             f"{_count(len(enclaves), 'enclave')}, {_count(len(learned.profiles), 'node')}, "
             f"{_count(len(plan.added), 'right')}"
         )
     elif plan.added:
         click.echo(f"{would}added {_count(len(plan.added), 'right')} to '{plan.path}'")
+    else:
+        known = "denied" if learned.from_log else "observed"
+        click.echo(f"nothing to add: '{plan.path}' already covers everything that was {known}")
+    if plan.before is not None or learned.from_log:
         for each in plan.added:
             click.echo(f"  {each}")
-    else:
-        click.echo(f"nothing to add: '{plan.path}' already covers everything that was observed")
     if plan.copies:
         click.echo(f"{would}copied {', '.join(sorted(plan.copies))} next to it")
-    print_notes(notes)
+    print_notes((*merge_notes(plan.contradictions), *learned.notes))
 
 
 def _count(number: int, thing: str) -> str:
@@ -432,52 +454,106 @@ def _why_empty(environment: dict[str, str], seconds: float, rmw: str, enclave: s
 # ── from logs ───────────────────────────────────────────────────────────────────────────
 
 
-def _from_logs(
-    file: Path | None,
+def _learned_from_logs(
     logs: Sequence[Path],
+    file: Path | None,
     enclave: str | None,
     node: str | None,
     present: Policy | None,
+) -> tuple[Learned, list[dict[str, Any]]]:
+    """Return the rights that logs ask for, and the lines that ask for them, as JSON objects."""
+    from sros_tool.explain.denials import as_learned, propose, read_denials
+    from sros_tool.graph.learn import common_parts
+    from sros_tool.resources import policies_dir
+    from sros_tool.runtime.vendor_log import plain_text
+
+    denials = {log: read_denials(plain_text(_log_text(log))) for log in logs}
+    missing = propose(each for found in denials.values() for each in found)
+    common = common_parts(file.parent if file else policies_dir(), policies_dir())
+    learned = as_learned(missing, enclave or "", _place(node), present, common)
+    asked = {profile.enclave for profile in learned.profiles}
+    lines = [
+        {
+            "log": str(log),
+            "line": each.line,
+            "process": each.process or None,
+            "enclave": each.enclave or enclave,
+            "direction": each.direction,
+            "topic": each.topic,
+        }
+        for log, found in denials.items()
+        for each in found
+        if propose([each]).rights and (each.enclave or enclave) in asked
+    ]
+    if not learned.profiles:
+        print_notes(learned.notes)
+        click.echo(
+            "No right can be proposed for the denials in the logs."
+            if any(denials.values())
+            else "The logs report no denial.",
+            err=True,
+        )
+    return learned, lines
+
+
+def _propose(
+    learned: Learned,
+    lines: Sequence[Mapping[str, Any]],
+    file: Path | None,
+    accept: bool,
     dry_run: bool,
     as_json: bool,
-    *,
-    flat: bool,
 ) -> int:
-    from sros_tool.explain.denials import as_learned, propose, read_denials
+    """Show the rights that logs ask for, and the lines; write the rights if they are accepted.
+
+    Raises:
+        SrosError: there is something to write that was not accepted.
+    """
     from sros_tool.graph.document import draft, render, write
     from sros_tool.graph.learn import common_parts
     from sros_tool.graph.observation import Observation
     from sros_tool.policy.rights import order, policy_rights
     from sros_tool.resources import policies_dir
-    from sros_tool.runtime.vendor_log import plain_text
 
-    denials = [each for log in logs for each in read_denials(plain_text(_log_text(log)))]
-    common = common_parts(file.parent if file else policies_dir(), policies_dir())
-    learned = as_learned(propose(denials), enclave or "", _place(node), present, common)
-    if flat:
-        learned = learned.flat()
     if not learned.profiles:
-        print_notes(learned.notes)
-        click.echo(
-            "No right can be proposed for the denials in the logs."
-            if denials
-            else "The logs report no denial.",
-            err=True,
-        )
         return 1
-    if file is None and as_json:
-        rights = sorted(policy_rights(learned.policy()), key=order)
-        print_json({"added": as_plain(rights), "notes": as_plain(learned.notes)})
-        return 0
     if file is None:
-        print_notes(learned.notes)
-        click.echo(render(learned.profiles).decode(), nl=False)
+        if as_json:
+            added = as_plain(sorted(policy_rights(learned.policy()), key=order))
+            notes = as_plain(learned.notes)
+            print_json({"source": "log", "added": added, "denials": lines, "notes": notes})
+        else:
+            print_notes(learned.notes)
+            click.echo(render(learned).decode(), nl=False)
+            _show_lines(lines, err=True)
         return 0
-    plan = draft(file, learned, None if flat else common)
-    if not dry_run:
+    common = common_parts(file.parent, policies_dir()) if learned.includes else None
+    plan = draft(file, learned, common)
+    written = accept and not dry_run
+    if written:
         write(plan)
-    _show(plan, learned, Observation(), dry_run, as_json)
+    if as_json:
+        value = _json(plan, learned, Observation(), dry_run)
+        print_json({**value, "accepted": accept, "denials": lines})
+    else:
+        _show(plan, learned, written=written)
+        _show_lines(lines if plan.changes else ())
+    if plan.changes and not accept and not dry_run:
+        raise SrosError(
+            f"the rights were not written to '{file}'",
+            "They come from a log, and a process can print any line.",
+            "Check which process needs each right, and add --accept.",
+        )
     return 0
+
+
+def _show_lines(lines: Sequence[Mapping[str, Any]], *, err: bool = False) -> None:
+    if lines:
+        click.echo("these lines of logs ask for it; a process can print any line:", err=err)
+    for each in lines:
+        by = each["process"] or "a process without a label"
+        what = f"{each['direction']} {each['topic']} in {each['enclave']}"
+        click.echo(visible(f"  {each['log']}:{each['line']}: {by}: {what}"), err=err)
 
 
 def _log_text(log: Path) -> str:

@@ -4,6 +4,9 @@ The texts are in `sros_tool.runtime.vendor_log`.  Fast DDS names the topic and, 
 whether it was a writer or a reader.  Cyclone DDS first checks whether a topic may be used at all;
 the direction of such a denial is only in the next message of rcl.  Cyclone DDS logs nothing if the
 governance protects the discovery of the topic.
+
+A log is no proof: a process can print any line, also one that looks like a denial, and so ask for
+rights that it should not have.  So each denial says which process printed it, and a person decides.
 """
 
 from __future__ import annotations
@@ -32,9 +35,10 @@ from sros_tool.policy.rights import profile_rights
 from sros_tool.runtime.vendor_log import (
     DIRECTIONS,
     PEER,
-    PROCESS_LABEL,
     SECURITY_DIRECTORY,
     denied_topic,
+    labelled_line,
+    log_lines,
 )
 from sros_tool.translate import service_of
 
@@ -48,6 +52,8 @@ class Denial:
 
     ``by_rule`` says that a rule denies it, so that a rule to allow it would not help; ``remote``
     says that a peer's permissions deny it.  ``enclave`` is "" if the log does not name it.
+    ``process`` is the label of the process that printed the denial, "" without a label, and
+    ``line`` the number of its line, from 1.
     """
 
     topic: str
@@ -56,6 +62,8 @@ class Denial:
     by_rule: bool = False
     remote: bool = False
     vendor: Vendor = field(default=Vendor.FAST, compare=False)
+    process: str = ""
+    line: int = field(default=0, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,32 +82,33 @@ class MissingRights:
 
 
 def read_denials(text: str) -> tuple[Denial, ...]:
-    """Return each denied topic in a log without colours once, in the order of the log.
+    """Return each denied topic of each process in a log without colours once.
 
     The labels that ros2 launch, journald or Docker Compose put before lines distinguish the
     processes in a log; the enclave named by one process is not used for another one.
     """
-    processes: dict[str, list[str]] = {}
-    for line in text.splitlines():
-        label = PROCESS_LABEL.match(line)
-        processes.setdefault(label[0].strip() if label else "", []).append(line)
-    found = {each: None for lines in processes.values() for each in _denials_of(lines)}
+    processes: dict[str, list[tuple[int, str]]] = {}
+    for number, line in enumerate(log_lines(text), 1):
+        process, rest = labelled_line(line)
+        processes.setdefault(process, []).append((number, rest))
+    found = {each: None for item in processes.items() for each in _denials_of(*item)}
     known = {replace(each, direction="") for each in found if each.direction}
     return tuple(each for each in found if each.direction or each not in known)
 
 
-def _denials_of(lines: list[str]) -> Iterator[Denial]:
-    """Yield the denials in the lines of one process."""
+def _denials_of(process: str, numbered: list[tuple[int, str]]) -> Iterator[Denial]:
+    """Yield the denials in the lines of one process, which have numbers and no label."""
     enclave = ""
-    for number, line in enumerate(lines):
+    lines = [line for _, line in numbered]
+    for index, (number, line) in enumerate(numbered):
         if named := SECURITY_DIRECTORY.search(line):
             enclave = named["enclave"] or "/"
         if found := denied_topic(line):
             vendor, match = found
             topic = match["topic"]
-            remote, direction = _direction(lines[number : number + 1 + _NEAR_LINES], topic)
+            remote, direction = _direction(lines[index : index + 1 + _NEAR_LINES], topic)
             by_rule = "deny" in match["how"].lower()
-            yield Denial(topic, direction, enclave, by_rule, remote, vendor)
+            yield Denial(topic, direction, enclave, by_rule, remote, vendor, process, number)
 
 
 def _direction(lines: list[str], topic: str) -> tuple[bool, str]:
@@ -207,6 +216,7 @@ _WHOLE = (
     "the profile has none of the rights that every node needs, so all of them are proposed "
     "together, instead of one after each restart: {}"
 )
+_ELSEWHERE = "not proposed, because the log names another enclave than --enclave: {}"
 _SEVERAL = Note(
     "log.several-enclaves",
     "the log names several enclaves, and each denial counts for the enclave that its process "
@@ -226,11 +236,12 @@ def as_learned(
 ) -> Learned:
     """Return the proposed rights as profiles.
 
-    ``enclave`` is used for denials whose enclave the log does not name.  ``node`` (namespace and
-    name) names the profile.  Without it, the rights go to the node whose standard services were
-    denied, else to the only profile of the enclave in ``policy``, else to a profile for any node:
-    DDS checks only the enclave.  A node that is not in the policy gets a note instead of rights.
-    With ``common``, a node that has none of the rights that every node needs gets all of them.
+    With ``enclave``, only that enclave gets rights: those of denials that name it, and of denials
+    that name none.  ``node`` (namespace and name) names the profile.  Without it, the rights go to
+    the node whose standard services were denied, else to the only profile of the enclave in
+    ``policy``, else to a profile for any node: DDS checks only the enclave.  A node that is not in
+    the policy gets a note instead of rights.  With ``common``, a node that has none of the rights
+    that every node needs gets all of them.
 
     Raises:
         UsageError: The log does not name the enclave of a denial, and ``enclave`` is "".
@@ -250,21 +261,29 @@ def as_learned(
                 wholes[_fqn(place)] = ", ".join(parts)
             groups = groups_of(denied - given, *place)
             profiles.append(LearnedProfile(path, *place, denied | given, parts, groups))
+    elsewhere = {
+        path: f"{len(rights)} right{'s' * (len(rights) > 1)}"
+        for path, rights in sorted(missing.rights.items())
+        if enclave and path not in ("", enclave)
+    }
     notes = [
         Note(name, text.format("; ".join(f"{who}: {what}" for who, what in found.items())))
         for name, text, found in (
             ("log.other-node", _OTHER, others),
             ("log.common-part", _WHOLE, wholes),
+            ("log.other-enclave", _ELSEWHERE, elsewhere),
         )
         if found
     ]
-    return Learned(tuple(profiles), (*_notes(missing), *notes))
+    return Learned(tuple(profiles), (*_notes(missing), *notes), from_log=True)
 
 
 def _by_enclave(missing: MissingRights, enclave: str) -> dict[str, frozenset[NodeRight]]:
-    """Return the rights by enclave, with ``enclave`` for denials that name none."""
+    """Return the rights by enclave; if ``enclave`` is not "", of that one alone."""
     found: dict[str, frozenset[NodeRight]] = {}
     for named, rights in missing.rights.items():
+        if enclave and named not in ("", enclave):
+            continue
         if not (named or enclave):
             raise UsageError(
                 "the log does not say in which enclave the node ran",

@@ -7,6 +7,7 @@ and may contain colours and tracebacks.
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from shlex import quote
@@ -25,11 +26,12 @@ from sros_tool.policy.patterns import covers
 from sros_tool.runtime.vendor_log import (
     CONTINUED,
     DOMAIN_OF_LINE,
-    PROCESS_LABEL,
     SECURITY_DIRECTORY,
     UNKNOWN,
     LogText,
     denied_topic,
+    labelled_line,
+    log_lines,
     log_text,
     plain_refusal,
     plain_text,
@@ -48,7 +50,8 @@ class LogFinding:
     """A message with its cause and remedy, and the causes found in the enclave.
 
     ``line`` is the line number (from 1) of the first of ``count`` messages; ``vendor`` is None for
-    messages of rcl.  ``enclave`` is "" if the log does not name it.  ``checked`` says whether an
+    messages of rcl.  ``process`` is the label of the process that printed them, "" without a label.
+    ``enclave`` is "" if the log does not name it.  ``checked`` says whether an
     enclave was examined, and ``found`` are the true causes found in it.
     """
 
@@ -57,6 +60,7 @@ class LogFinding:
     line: int
     count: int
     text: str
+    process: str
     enclave: str
     cause: str
     remedy: str
@@ -80,11 +84,11 @@ def explain_log(
     """
     plain = plain_text(text)
     examiner = _Examiner(find, context, root)
-    lines = plain.splitlines()
+    lines = log_lines(plain)
     denied = read_denials(plain)
     naming = _lines_naming(lines, {each.topic for each in denied})
-    denials = [(each, naming[each.topic]) for each in denied]
-    reported = {_process(line) for _, named in denials for _, line in named}
+    denials = [(each, naming[each.process, each.topic]) for each in denied]
+    reported = {each.process for each in denied}
     hits = _strongest(_hits(_joined(lines)), reported)
     found = [examiner.message(group) for group in _grouped(hits)]
     found += [examiner.denial(each, named) for each, named in denials]
@@ -140,11 +144,11 @@ def _joined(lines: list[str]) -> Iterator[tuple[int, str]]:
 def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
     enclaves: dict[str, str] = {}
     for number, line in lines:
-        process = _process(line)
+        process, rest = labelled_line(line)
         if named := SECURITY_DIRECTORY.search(line):
             enclaves[process] = named["enclave"] or "/"
             continue
-        text = _without_label(line)
+        text = " ".join(rest.split())
         meaning, match = _meaning_of(line, text)
         if match:
             fields = {name: found or "" for name, found in match.groupdict().items()}
@@ -158,16 +162,6 @@ def _meaning_of(line: str, text: str) -> tuple[LogText, re.Match[str] | None]:
     if found := log_text(line):
         return found
     return UNKNOWN, None if denied_topic(line) else UNKNOWN.pattern.search(text)
-
-
-def _process(line: str) -> str:
-    label = PROCESS_LABEL.match(line)
-    return label[0].strip() if label else ""
-
-
-def _without_label(line: str) -> str:
-    label = PROCESS_LABEL.match(line)
-    return " ".join(line[label.end() if label else 0 :].split())
 
 
 def _strongest(hits: Iterable[_Hit], reported: set[str]) -> Iterator[_Hit]:
@@ -190,13 +184,16 @@ def _grouped(hits: Iterable[_Hit]) -> Iterator[list[_Hit]]:
     return iter(groups.values())
 
 
-def _lines_naming(lines: list[str], topics: set[str]) -> dict[str, list[tuple[int, str]]]:
-    """Return, for each topic, the lines that name it, with line numbers."""
-    found: dict[str, list[tuple[int, str]]] = {topic: [] for topic in topics}
+def _lines_naming(
+    lines: list[str], topics: set[str]
+) -> Mapping[tuple[str, str], list[tuple[int, str]]]:
+    """Return, for each process and topic, the lines that name it: their numbers and texts."""
+    found = defaultdict[tuple[str, str], list[tuple[int, str]]](list)
     for number, line in enumerate(lines, 1):
-        words = (word for pattern in _WORDS for word in pattern.findall(line))
+        process, text = labelled_line(line)
+        words = (word for pattern in _WORDS for word in pattern.findall(text))
         for topic in topics.intersection(words):
-            found[topic].append((number, line))
+            found[process, topic].append((number, text))
     return found
 
 
@@ -223,6 +220,7 @@ class _Examiner:
             first.line,
             len(hits),
             first.text,
+            first.process,
             first.enclave,
             first.cause,
             meaning.remedy.format(**first.quoted),
@@ -248,7 +246,7 @@ class _Examiner:
 
     def denial(self, denial: Denial, named: list[tuple[int, str]]) -> LogFinding:
         """Return the finding for a denied topic; ``named`` are the lines that name it."""
-        line, text = named[0][0], _without_label(named[0][1])
+        line, text = named[0][0], " ".join(named[0][1].split())
         right, name = _in_ros_terms(denial)
         who = "a peer" if denial.remote else denial.enclave or "the process"
         by = "a rule of the policy denies it" if denial.by_rule else "no rule allows it"
@@ -260,10 +258,11 @@ class _Examiner:
             line,
             len(named),
             text,
+            denial.process,
             denial.enclave,
             f"{who} may not {right} {name}: {by}",
-            f"`sros explain {self._root or 'KEYSTORE'} {denial.enclave or 'ENCLAVE'} {right} "
-            f"{name}` shows what is missing in the policy.",
+            f"`sros explain {self._root or 'KEYSTORE'} {quote(denial.enclave or 'ENCLAVE')} "
+            f"{right} {quote(name)}` shows what is missing in the policy.",
         )
         enclave = None if denial.remote else self._find(denial.enclave)
         if enclave is None or not denial.direction:
@@ -345,7 +344,8 @@ def _other_node(denial: Denial, answer: Answer) -> tuple[list[str], str]:
     if node and nodes and not any(covers(each, node) for each in nodes):
         ns, _, name = nodes[0].rpartition("/")
         return [f"the permissions are for {_listed(nodes)}, and this is the node {node}"], (
-            f"Start it under that name (`--ros-args -r __node:={name} -r __ns:={ns or '/'}`); or, "
+            f"Start it under that name (`--ros-args -r __node:={quote(name)} "
+            f"-r __ns:={quote(ns or '/')}`); or, "
             f"if {node} is right, give it a profile in the policy of ENCLAVE, with common/node.xml."
         )
     if not nodes and (node or denial.topic in _TOPICS_OF_EVERY_NODE):

@@ -24,11 +24,16 @@ from sros_tool.xml import read_bytes
 
 _XINCLUDE = "http://www.w3.org/2001/XInclude"
 _UNIT = "  "
-_HEADER = """\
-<?xml version="1.0" encoding="UTF-8"?>
-<!-- Written by sros generate_policy: rights that the robot was observed to use, or was denied.
+_DECLARATION = """<?xml version="1.0" encoding="UTF-8"?>\n"""
+_OBSERVED = """\
+<!-- Written by sros generate_policy: rights that the robot was observed to use.
      Review it before you enforce it: rights that were not observed are not allowed, and rights
      that were observed may be unwanted. -->
+"""
+_FROM_LOG = """\
+<!-- Written by sros generate_policy: rights that were denied, by the lines of logs.
+     Review it before you enforce it: a process can print any line, also one that looks like a
+     denial, to get a right that it should not have. -->
 """
 
 
@@ -68,7 +73,7 @@ def draft(path: Path, learned: Learned, common: CommonParts | None) -> Draft:
     if not os.path.lexists(path):
         copies = common.to_copy(learned.includes) if common else {}
         added = tuple(sorted(rights, key=order))
-        return Draft(path, None, render(learned.profiles), copies, added, (), rights, rights)
+        return Draft(path, None, render(learned), copies, added, (), rights, rights)
     before = read_bytes(path, "policy file")
     merged = merge_into(path, additions)
     document, included = merged.document, tuple[str, ...]()
@@ -164,12 +169,11 @@ def _put_new(path: Path, data: bytes) -> list[Path]:
 # ── text ────────────────────────────────────────────────────────────────────────────────
 
 
-def render(profiles: Iterable[LearnedProfile]) -> bytes:
-    """Return a policy file with these sorted profiles; the same profiles give the same bytes."""
-    profiles = tuple(profiles)
-    declared = f' xmlns:xi="{_XINCLUDE}"' if any(each.includes for each in profiles) else ""
+def render(learned: Learned) -> bytes:
+    """Return a policy file with the learned profiles; the same profiles give the same bytes."""
+    declared = f' xmlns:xi="{_XINCLUDE}"' if learned.includes else ""
     lines = [f'<policy version="{VERSION}"{declared}>', "  <enclaves>"]
-    for path, found in groupby(profiles, key=lambda each: each.enclave):
+    for path, found in groupby(learned.profiles, key=lambda each: each.enclave):
         lines += [f'    <enclave path="{path}">', "      <profiles>"]
         for each in found:
             lines.append(f'        <profile ns="{each.ns}" node="{each.node}">')
@@ -177,7 +181,8 @@ def render(profiles: Iterable[LearnedProfile]) -> bytes:
             lines.append("        </profile>")
         lines += ["      </profiles>", "    </enclave>"]
     lines += ["  </enclaves>", "</policy>", ""]
-    return (_HEADER + "\n".join(lines)).encode()
+    header = _DECLARATION + (_FROM_LOG if learned.from_log else _OBSERVED)
+    return (header + "\n".join(lines)).encode()
 
 
 def _content(profile: LearnedProfile, include: str, unit: str) -> Iterator[str]:

@@ -54,10 +54,14 @@ class LearnedProfile:
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """The result of learning: profiles sorted by enclave and node, and notes."""
+    """The result of learning: profiles sorted by enclave and node, and notes.
+
+    ``from_log`` says that the rights come from lines of logs, not from the ROS graph.
+    """
 
     profiles: tuple[LearnedProfile, ...]
     notes: tuple[Note, ...] = ()
+    from_log: bool = False
 
     @property
     def includes(self) -> tuple[str, ...]:

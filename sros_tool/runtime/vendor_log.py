@@ -485,10 +485,10 @@ SECURITY_DIRECTORY = re.compile(
 )
 """The line in which rcl names the enclave of a process (group ``enclave``)."""
 
-PROCESS_LABEL = re.compile(
-    r"\[[\w.-]+-\d+\] "  # ros2 launch: [talker-1]
-    r"|(?:\S+ +){3,4}[\w.@-]+\[\d+\]: "  # journald: Nov 21 06:00:00 robot talker[12]:
-    r"|[\w.-]+ +\| "  # Docker Compose: talker-1  |
+_PROCESS_LABEL = re.compile(
+    r"\[(?P<launch>[\w.-]+-\d+)\] "  # ros2 launch: [talker-1]
+    r"|(?:\S+ +){2,4}?(?P<journald>[\w.@-]+\[\d+\]): "  # Nov 21 06:00:00 robot talker[12]:
+    r"|(?P<compose>[\w.-]+) +\| "  # Docker Compose: talker-1  |
 )
 """The label at the start of a line that distinguishes the processes in one log."""
 
@@ -516,6 +516,21 @@ DIRECTIONS: Mapping[str, re.Pattern[str]] = {
 """The words in lines near a denied topic that show the kind of the denied endpoint."""
 
 # ── reading ────────────────────────────────────────────────────────────────────────────────
+
+
+def log_lines(text: str) -> list[str]:
+    r"""Return the lines of a log, which only ``\n`` ends.
+
+    A process can print every other separator of lines, such as ``\r``, in the middle of a line,
+    with the label of another process behind it.
+    """
+    return [line.removesuffix("\r") for line in text.split("\n")]
+
+
+def labelled_line(line: str) -> tuple[str, str]:
+    """Return the process in the label of a line, and the line after it; ("", line) without one."""
+    label = _PROCESS_LABEL.match(line)
+    return (label[label.lastgroup or 0], line[label.end() :]) if label else ("", line)
 
 
 def missing_security(text: str) -> str:

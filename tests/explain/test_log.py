@@ -427,7 +427,8 @@ def test_json(tmp_path: Path) -> None:
     found = sros("explain", "--log", LOGS / "fastdds_2.9.1.revoked.log", "--json")
     (finding,) = json.loads(found.out)["findings"]
     assert set(finding) == {
-        "id", "vendor", "line", "count", "text", "enclave", "cause", "checked", "found", "remedy",
+        "id", "vendor", "line", "count", "text", "process", "enclave", "cause", "checked",
+        "found", "remedy",
     }  # fmt: skip
     assert (finding["id"], finding["vendor"], finding["checked"]) == ("identity", "fastdds", False)
 
@@ -439,5 +440,11 @@ def test_wrong_usage(tmp_path: Path) -> None:
 
 def test_what_a_log_says_does_not_become_a_command() -> None:
     line = "[SECURITY Error] Cannot read file file:///tmp/x;rm${IFS}-rf${IFS}~ (a.cpp:1)"
-    (found,) = explain_log(line, lambda _: None, lambda _: pytest.fail("nothing to look at"))
+    (found,) = explained(line)
     assert "'/tmp/x;rm${IFS}-rf${IFS}~'" in found.remedy
+    denied = (
+        "[rcl]: Found security directory: /ks/enclaves/a;reboot\n"
+        "rt/x;reboot topic not found in allow rule. -> check_create_datawriter"
+    )
+    (found,) = explained(denied)
+    assert "explain KEYSTORE '/a;reboot' publish '/x;reboot'`" in found.remedy

@@ -57,6 +57,7 @@ def test_json_has_a_stable_shape(program: Program) -> None:
     ended = program(graph(TALKER), *SHORT, "--json").ok()
     assert json.loads(ended.out) == {
         "file": "robot.xml",
+        "source": "graph",
         "created": True,
         "changed": True,
         "dry_run": False,

@@ -584,7 +584,15 @@ def test_what_cyclone_denied_is_proposed_and_then_allowed(tmp_path: Path) -> Non
     asked = json.dumps(sorted(wrong | never))
     done = python("-c", _REFUSALS, folder, DOMAIN + 3, said=asked)
     (tmp_path / "arm.log").write_text(done.stdout)
-    words = ["generate_policy", "robot.xml", "--enclave", enclave, "--from-log", "arm.log"]
+    words = [
+        "generate_policy",
+        "robot.xml",
+        "--enclave",
+        enclave,
+        "--from-log",
+        "arm.log",
+        "--accept",
+    ]
     ended = python("-m", "sros_tool", *words, cwd=tmp_path)
     assert "note [log.unclear]" in ended.stderr and "rt/never" in ended.stderr
     assert "added 2 rights" in ended.stdout
