@@ -276,7 +276,7 @@ class WireCount:
 
 @dataclass(frozen=True)
 class Injection:
-    """The number of packets sent again or changed, and the start of sending (CLOCK_MONOTONIC)."""
+    """The number of packets sent again or changed, and when sending began (CLOCK_MONOTONIC, s)."""
 
     packets: int
     time: float

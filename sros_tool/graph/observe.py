@@ -399,7 +399,10 @@ _DEFAULT_ENCLAVE = ("/",)
 
 
 def identity_of(subject: bytes) -> str:
-    """Return the first 6 bytes (hex) of the participant identifier for a subject name (DER)."""
+    """Return the first 6 bytes (hex) of a secured participant's GUID, from its subject name (DER).
+
+    Source: DDS-Security 1.1, 9.3.3.
+    """
     digest = int(sha256(subject).hexdigest()[:_DIGITS], 16)
     return f"{_FIRST_BIT | digest >> 1:x}"
 

@@ -126,8 +126,9 @@ _PYTHON = re.compile(r"python[\d.]*\Z")
 def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
     """Return the command with ``--ros-args --enclave`` added, if it certainly starts a ROS node.
 
-    These are ``ros2 run``, an executable or Python script of a ROS package (``lib/PACKAGE/NAME``),
-    and commands with ``--ros-args``.  A command that names an enclave is returned unchanged.
+    It does if it is ``ros2 run``, runs an executable or Python script of a ROS package
+    (``lib/PACKAGE/NAME``), or has ``--ros-args``.  Other commands, and commands that already name
+    an enclave, are returned unchanged.
     """
     command = tuple(command)
     if Path(command[0]).name == "ros2" and not _is_ros2_run(command):

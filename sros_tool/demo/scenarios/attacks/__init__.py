@@ -27,7 +27,7 @@ _ROWS: tuple[Row, ...] = (
 
 ATTACKS = Scenario(
     "attacks",
-    "every known attack, and each again without the defence that stops it",
+    "all attacks that sros knows, also without the defences that stop them",
     _ROWS,
     {
         "talker": "/talker_listener/talker",
