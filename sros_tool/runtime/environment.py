@@ -90,7 +90,11 @@ def render_environment(variables: Mapping[str, str], form: str) -> str:
     if form == "json":
         return json.dumps(dict(variables), indent=2) + "\n"
     if form in ("docker", "systemd") and any("\n" in value for value in variables.values()):
-        raise UsageError(f"the form {form} does not allow a path with a line break")
+        raise UsageError(
+            f"the form {form} does not allow a path with a line break",
+            "",
+            "Use the form sh, fish or json, or move the keystore.",
+        )
     return "".join(_LINES[form](name, value) for name, value in variables.items())
 
 

@@ -82,7 +82,7 @@ INTERRUPTED = FindingKind(
     "a write that was interrupted",
     "DDS still loads a complete set of files, old or new. The next verb that writes completes or "
     "undoes the change.",
-    "sros: keystore/transaction.py.",
+    "sros: sros_tool/keystore/transaction/transaction.py.",
     "Run any verb of sros that writes, such as `sros create_enclave`.",
 )
 STRAY_KEY = FindingKind(
