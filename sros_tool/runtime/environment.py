@@ -1,7 +1,7 @@
 """The environment variables and arguments that make a process run secured, as rcl reads them.
 
-ROS_SECURITY_ENCLAVE_OVERRIDE decides which enclave secures a process.  The ROS graph does not show
-it, but the enclave of ``--ros-args --enclave``.
+ROS_SECURITY_ENCLAVE_OVERRIDE decides which enclave secures a process.  The ROS graph shows the
+enclave of ``--ros-args --enclave`` instead, even if it is a different one.
 
 Source: rcl 9.x ``security.c``, ``context.c`` and ``domain_id.c``.
 """
