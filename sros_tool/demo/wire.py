@@ -27,7 +27,7 @@ _PROTECTED_SUBMESSAGES = range(0x30, 0x35)
 
 
 class _CapturedPacket(NamedTuple):
-    """A captured IPv4 packet, the time it was read (CLOCK_MONOTONIC, s), and its UDP source port."""
+    """A captured IPv4 packet, when it was read (CLOCK_MONOTONIC, s), and its UDP source port."""
 
     time: float
     source: int
