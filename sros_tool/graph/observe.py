@@ -200,7 +200,7 @@ _TICK = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Settling:
-    """The rule when an observed graph counts as complete, in seconds.
+    """The times after which an observed graph counts as complete, in seconds.
 
     It is complete once ``least`` has passed and it has not changed for ``still``, but at the latest
     after ``most``.  Fast DDS announces its participants in a first burst, and then every 3 s.  With

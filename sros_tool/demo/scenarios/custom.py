@@ -282,7 +282,7 @@ class _Reader:
                     place,
                     "claim",
                     f"no claim or control shows that {who} meanwhile: a crash would look the same",
-                    "Add a control, such as the rightful listener that hears the same talker.",
+                    "Add a control, such as a permitted listener that hears the same talker.",
                 )
 
     # ── tables and lines ───────────────────────────────────────────────────────────────────
