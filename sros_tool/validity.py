@@ -36,7 +36,9 @@ class Window:
         if self.not_after <= self.not_before:
             raise UsageError(
                 f"the validity expires at {iso(self.not_after)}, before it begins at "
-                f"{iso(self.not_before)}"
+                f"{iso(self.not_before)}",
+                "",
+                "Choose a later expiry.",
             )
 
     def contains(self, moment: datetime) -> bool:

@@ -161,7 +161,7 @@ MIXED_VENDORS = FindingKind(
     "In these versions, secured nodes on different DDS vendors do not communicate, and do not "
     "report it.",
     "Fast DDS 2.9.1 and 2.14.5, Cyclone DDS 0.10.2; measured.",
-    "Use one RMW per robot.",
+    "Use the same RMW for all secured nodes that communicate.",
 )
 
 _NOT_DDS = ("rmw_zenoh", "rmw_email", "rmw_iceoryx")

@@ -259,7 +259,7 @@ def moment_of(text: str | None) -> datetime:
     raise UsageError(
         f"--at {text!r} is not a date",
         f"It is neither a date from {_YEARS[0]} to {_YEARS[1]} nor a duration.",
-        "Write 2027-06-01, 2027-06-01T12:00:00Z, or 90d from now.",
+        "Write 2027-06-01, 2027-06-01T12:00:00Z, or 90d for 90 days from now.",
     )
 
 

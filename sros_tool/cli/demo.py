@@ -51,8 +51,8 @@ Example:
   $ sros demo --scenario governance --plot cost.svg
   $ sros demo --scenario all
 
-Exit status: 0 if every row is as expected or was skipped for a stated reason, else 1. In a
-row that is known to be open, the attack is expected to succeed.""",
+Exit status: 0 if every row is as expected or was skipped for a stated reason, else 1.
+A row marked "open" shows an attack that is known to succeed, and counts as expected.""",
 )
 @click.option(
     "--backend",
@@ -146,11 +146,11 @@ def demo(
     force: bool,
     as_json: bool,
 ) -> None:
-    """Show on a real DDS that nobody reads from or joins secured nodes without permission.
+    """Show on a real DDS that nodes without permission cannot communicate with secured nodes.
 
     Creates keystores, starts nodes with and without them, and compares expected and observed
     results. The scenario `isolation` takes about 10 s on Cyclone DDS and 20 s on rclpy. The
-    scenario `attacks` tries every known attack, and repeats it without the defence that stops it;
+    scenario `attacks` tries all attacks that sros knows, also without the defences that stop them;
     it takes about 30 s on Cyclone DDS and 60 s on rclpy.
     """
     from sros_tool.demo.program import DemoOptions, run_demo

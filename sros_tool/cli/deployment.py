@@ -263,10 +263,10 @@ def sign_request(
 ) -> None:
     """At the keystore: certify the key in REQUEST (or -), and sign the enclave's permissions.
 
-    The answer is one .tar.gz for `sros import` on the robot.  It contains no secret: certificate,
-    permissions, governance, the certificates of the CAs, and revocation lists.  The keystore then
-    contains the enclave, without its private key.  Compare the key's SHA-256 with the one that
-    the robot printed.
+    The answer is one .tar.gz for `sros import` on the robot.  It contains certificate,
+    permissions, governance, the certificates of the CAs and revocation lists, and no secret.  The
+    keystore then contains the enclave, without its private key.  Compare the key's SHA-256 with the
+    one that the robot printed.
     """
     from sros_tool.keystore.delivery.signing import sign_request as sign
     from sros_tool.keystore.layout import PERMISSIONS

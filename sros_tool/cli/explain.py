@@ -222,7 +222,9 @@ def _split(
     from sros_tool.keystore.layout import is_keystore
 
     if keystore is not None and words and is_keystore(Path(words[0])):
-        raise UsageError(f"two keystores are named, '{words[0]}' and '{keystore}'")
+        raise UsageError(
+            f"two keystores are named, '{words[0]}' and '{keystore}'", "", "Leave one of them out."
+        )
     if keystore is not None or not words or _is_word(words, verb):
         return keystore, words
     if _is_word(words, verb + 1) or Path(words[0]).is_dir():

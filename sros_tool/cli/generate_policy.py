@@ -559,7 +559,9 @@ def _show_lines(lines: Sequence[Mapping[str, Any]], *, err: bool = False) -> Non
 def _log_text(log: Path) -> str:
     if str(log) != "-" and not log.exists():
         raise UsageError(
-            f"the log '{log}' does not exist", "", "Write the policy FILE before --from-log."
+            f"the log '{log}' does not exist",
+            "--from-log takes all file names that follow it.",
+            "Correct the name; if it is the policy FILE, write it before --from-log.",
         )
     return read_log(str(log))
 

@@ -147,7 +147,7 @@ def generate_artifacts(
     template_name: str,
     dry_run: bool,
 ) -> None:
-    """Create enclaves, and the permissions that policies state for them: all or none.
+    """Create enclaves, with the permissions that policies state for them: all or nothing.
 
     The permissions in a policy replace the current permissions of an enclave.
     """

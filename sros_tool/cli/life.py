@@ -366,7 +366,8 @@ def rotate_ca(
 
     With Fast DDS (2.9.1), all processes can talk to each other at every moment of a rotation.
     Cyclone DDS (0.10.2) trusts one CA at a time: after stage 2, restart all its processes
-    together. If the identity CA only expires soon, use --same-key, which does not need this.
+    together. To only extend the validity of the identity CA, use --same-key: it has no stages and
+    needs no common restart.
     """
     from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca
     from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca as work

@@ -304,7 +304,11 @@ def minimize_policy(
     measured = _measure(given, result, seen)
     document = write_policy(result.policy)
     if output and read_policy(output, document) != result.policy:
-        raise PolicyError("the narrowed policy changes when it is written and read again")
+        raise PolicyError(
+            "the narrowed policy changes when it is written and read again",
+            "Nothing was written.",
+            "This is a defect of sros: please report it with the policy.",
+        )
     saved = save(output, document) if output and not dry_run else ""
     if as_json:
         value = _minimized_json(policy, result, measured, output if not dry_run else None)

@@ -193,5 +193,7 @@ def completion(shell: str) -> None:
 
     kind = get_completion_class(shell)
     if kind is None:
-        raise UnavailableError(f"there is no completion for {shell}")
+        raise UnavailableError(
+            f"there is no completion for {shell}", "", "Choose bash, zsh or fish."
+        )
     click.echo(kind(program, {}, "sros", "_SROS_COMPLETE").source())

@@ -226,7 +226,8 @@ def enclave_grant(root: Path, enclave: str) -> Grant | None:
 def allows(grant: Grant, verb: str, topic: str) -> bool:
     """Return whether a grant allows ``verb`` (publish or subscribe) on a DDS topic.
 
-    The first rule that names the topic decides, as with the vendors; without one, it is denied.
+    The first rule that names the topic decides, as with the vendors.  A topic that no rule
+    names is denied.
     """
     for rule in grant.rules:
         if any(matches(expression, topic) for expression in _expressions(rule, verb)):
@@ -294,7 +295,7 @@ def node_names(role: Role, grant: Grant | None) -> tuple[str, ...]:
     """Return the absolute names of a role's nodes under a grant (None: without security).
 
     A node keeps its default name if the grant allows it.  Otherwise it gets the most similar node
-    name in the grant; without any, it keeps its default name.
+    name in the grant; if there is no such name, it keeps its default name.
     """
     wanted = [f"/{name}" for name in DEFAULT_NODE_NAMES[role]]
     if grant is None:

@@ -93,7 +93,10 @@ class KeystoreCopy:
             KeystoreError: no enclave plays the part.
         """
         if part not in self.cast:
-            raise KeystoreError(f"the keystore has no enclave that can be the {part}")
+            raise KeystoreError(
+                f"the keystore has no enclave that can be the {part}",
+                "None has the permissions that this part of the attack needs.",
+            )
         return self.cast[part]
 
     def folder(self, part: str) -> Path:
@@ -480,7 +483,11 @@ def _revocation_not_delivered(copy: KeystoreCopy, part: str) -> None:
 
 
 def identity_copied_by_another_user(copy: KeystoreCopy) -> None:
-    """Remove the talker's files that another user of the machine cannot read."""
+    """Keep only the files of the talker that another user of the machine can read.
+
+    Raises:
+        UnavailableError: this process does not run as root.
+    """
     if os.geteuid() != 0:
         raise UnavailableError("only root can try to read the files as another user of the machine")
     folder = copy.folder("talker")

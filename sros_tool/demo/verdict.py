@@ -53,7 +53,7 @@ class PartyRecord:
 class RowRecord:
     """The record of a row after its end.
 
-    ``window`` has start and end of the observation (CLOCK_MONOTONIC), or None if a party was not
+    ``window`` has start and end of the observation (CLOCK_MONOTONIC, s), or None if a party was not
     ready in time.  ``injected`` counts the packets that were sent again or changed; ``skipped`` is
     why the row was not run, or "".
     """

@@ -27,7 +27,7 @@ _PROTECTED_SUBMESSAGES = range(0x30, 0x35)
 
 
 class _CapturedPacket(NamedTuple):
-    """A captured IPv4 packet, the time (CLOCK_MONOTONIC) it was read, and its UDP source port."""
+    """A captured IPv4 packet, when it was read (CLOCK_MONOTONIC, s), and its UDP source port."""
 
     time: float
     source: int
@@ -276,7 +276,7 @@ class WireCount:
 
 @dataclass(frozen=True)
 class Injection:
-    """The number of packets sent again or changed, and the start of sending (CLOCK_MONOTONIC)."""
+    """The number of packets sent again or changed, and when sending began (CLOCK_MONOTONIC, s)."""
 
     packets: int
     time: float

@@ -220,7 +220,8 @@ _ELSEWHERE = "not proposed, because the log names another enclave than --enclave
 _SEVERAL = Note(
     "log.several-enclaves",
     "the log names several enclaves, and each denial counts for the enclave that its process "
-    "named last; check that no two processes without a label wrote to the log at the same time",
+    "named last; check that no two processes wrote to the log at the same time without a label, "
+    "such as the [talker-1] of ros2 launch",
 )
 
 _NODE_PARTS = ("common/node.xml", "common/node/parameters.xml")

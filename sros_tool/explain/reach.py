@@ -144,7 +144,10 @@ class _Direction:
         self._prefixes = sorted(self._wild)
 
     def meeting(self, topic: str) -> Iterator[_Access]:
-        """Yield the accesses that may share a name with a topic or wildcard."""
+        """Yield the accesses whose topics may overlap ``topic``, which can be a wildcard.
+
+        Only the text before the first wildcard is compared, so some of them do not overlap.
+        """
         prefix = literal_prefix(topic)
         if prefix == topic:
             yield from self._exact.get(topic, ())

@@ -200,7 +200,7 @@ _TICK = 0.2
 
 @dataclass(frozen=True, slots=True)
 class Settling:
-    """The rule when an observed graph counts as complete, in seconds.
+    """The times after which an observed graph counts as complete, in seconds.
 
     It is complete once ``least`` has passed and it has not changed for ``still``, but at the latest
     after ``most``.  Fast DDS announces its participants in a first burst, and then every 3 s.  With
@@ -399,7 +399,10 @@ _DEFAULT_ENCLAVE = ("/",)
 
 
 def identity_of(subject: bytes) -> str:
-    """Return the first 6 bytes (hex) of the participant identifier for a subject name (DER)."""
+    """Return the first 6 bytes (hex) of a secured participant's GUID, from its subject name (DER).
+
+    Source: DDS-Security 1.1, 9.3.3.
+    """
     digest = int(sha256(subject).hexdigest()[:_DIGITS], 16)
     return f"{_FIRST_BIT | digest >> 1:x}"
 

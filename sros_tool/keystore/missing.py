@@ -65,7 +65,7 @@ def likely_names(name: str, there: Collection[str]) -> tuple[str, ...]:
     """Return at most three enclaves that a mistyped ``name`` may mean.
 
     These are the enclaves whose names end with ``name``, because people leave out the namespace;
-    without any, the enclaves whose last part is spelled alike.
+    if there are none, the enclaves whose last part is spelled almost alike.
     """
     end = "/" + name.strip("/")
     if end == "/":

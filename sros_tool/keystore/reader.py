@@ -255,7 +255,10 @@ def read_crl(root: Path) -> RevocationList | None:
 
 
 def read_lists(root: Path) -> tuple[RevocationList, ...]:
-    """Return the revocation lists that DDS reads: of the issuing identity CA, and of a second."""
+    """Return the revocation lists that DDS reads: of the issuing identity CA, and of the other one.
+
+    Only during a rotation is there another identity CA.
+    """
     file = identity_file(root)
     found = (read_crl(root), embedded_crl(root, file) if file else None)
     return tuple(each for each in found if each)

@@ -195,11 +195,11 @@ def _left_out(grants: Iterable[Grant]) -> Iterator[Note]:
             text = "<default> allows all topics that no rule names, except with Fast DDS."
             yield Note("rights.default-allow", text)
         if any(c.partitions for r in grant.rules for c in (*r.publish, *r.subscribe)):
-            yield Note("rights.partitions", "its partitions are ignored.")
+            yield Note("rights.partitions", "its partitions are not taken into account here.")
         if len({rule.domains for rule in grant.rules}) > 1:
-            text = "its rules are for different domains, and the domains are ignored."
+            text = "its rules are for different domains, which are not taken into account here."
             yield Note("rights.domains", text)
         kinds = [rule.allow for rule in grant.rules]
         if False in kinds[kinds.index(True) if True in kinds else len(kinds) :]:
-            text = "a deny_rule follows an allow_rule, and the first rule that matches decides."
+            text = "a deny_rule after an allow_rule may have no effect: the first match decides."
             yield Note("rights.rule-order", text)

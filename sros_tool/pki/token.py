@@ -167,7 +167,11 @@ def _open(uri: str, secrets: Secrets, *, create: bool) -> TokenKey:
         assert isinstance(public, pkcs11.PublicKey)
         loaded = load_der_public_key(encode_ec_public_key(public))
     except pkcs11.NoSuchKey as error:
-        raise PkiError(f"the token {parsed.token!r} has no key {parsed.object!r}") from error
+        raise PkiError(
+            f"the token {parsed.token!r} has no key {parsed.object!r}",
+            "",
+            "Name a key of the token in the PKCS#11 URI (object=LABEL).",
+        ) from error
     except (pkcs11.PKCS11Error, RuntimeError, OSError) as error:
         raise _unusable(parsed, error) from error
     if not isinstance(loaded, ec.EllipticCurvePublicKey) or loaded.curve.name != "secp256r1":

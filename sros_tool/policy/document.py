@@ -353,7 +353,7 @@ class _Reader:
     ) -> tuple[etree._Element, IncludedFile]:
         if element.tag != tag:
             raise PolicyError(
-                f"{self._where(element, place)}: <{tag_of(element)}> stands in place of <{tag}>"
+                f"{self._where(element, place)}: <{tag_of(element)}> found, but <{tag}> expected"
             )
         return element, place
 

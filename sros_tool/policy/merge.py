@@ -195,7 +195,7 @@ _COMMENTS_OF_THE_LINE = re.compile(r"(?:[ \t]*<!--.*?-->)+(?=[ \t]*(?:\r?\n|\Z))
 class PlacedElement:
     """An element and its positions in the text, in characters from the start of the document.
 
-    ``inner`` is the begin of its content, ``close`` the begin of its end tag.  An element without
+    ``inner`` is the start of its content, ``close`` the start of its end tag.  An element without
     end tag (``<a/>``) has ``inner == close == end``.
     """
 

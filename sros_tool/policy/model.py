@@ -104,7 +104,7 @@ class Enclave:
 
 @dataclass(frozen=True, slots=True)
 class Policy:
-    """A policy file after its includes: enclaves with distinct paths."""
+    """A policy with its includes resolved; each enclave path occurs once."""
 
     enclaves: tuple[Enclave, ...]
     version: str = VERSION

@@ -78,8 +78,8 @@ class Scene:
     """Cards and the links between them.
 
     ``shown`` is the number of names that are drawn, or counted on the card of their only enclave;
-    ``hidden`` is the number of names that only have rights that every node needs, which this scene
-    leaves out.
+    ``hidden`` is the number of names that this scene leaves out, because enclaves have only such
+    rights for them as every node needs.
     """
 
     id: str

@@ -503,7 +503,7 @@ def plugins_next_to(path: Path) -> Path | None:
 
 
 class TopicDescriptor(ctypes.Structure):
-    """``dds_topic_descriptor_t``."""
+    """The C struct ``dds_topic_descriptor_t`` of Cyclone DDS."""
 
     _fields_ = [
         ("size", ctypes.c_uint32),
@@ -524,7 +524,7 @@ class TopicDescriptor(ctypes.Structure):
 
 
 class SampleInfo(ctypes.Structure):
-    """``dds_sample_info_t``."""
+    """The C struct ``dds_sample_info_t`` of Cyclone DDS."""
 
     _fields_ = [
         ("sample_state", ctypes.c_int),
@@ -549,7 +549,7 @@ class StringSample(ctypes.Structure):
 
 
 class _EndpointSample(ctypes.Structure):
-    """``dds_builtintopic_endpoint_t``: a discovered writer or reader."""
+    """The C struct ``dds_builtintopic_endpoint_t``: a discovered writer or reader."""
 
     _fields_ = [
         ("key", ctypes.c_uint8 * 16),
@@ -562,7 +562,7 @@ class _EndpointSample(ctypes.Structure):
 
 
 class _LogLine(ctypes.Structure):
-    """``dds_log_data_t``."""
+    """The C struct ``dds_log_data_t`` of Cyclone DDS."""
 
     _fields_ = [
         ("priority", ctypes.c_uint32),

@@ -1,7 +1,7 @@
 """The environment variables and arguments that make a process run secured, as rcl reads them.
 
-ROS_SECURITY_ENCLAVE_OVERRIDE decides which enclave secures a process.  The ROS graph does not show
-it, but the enclave of ``--ros-args --enclave``.
+ROS_SECURITY_ENCLAVE_OVERRIDE decides which enclave secures a process.  The ROS graph shows the
+enclave of ``--ros-args --enclave`` instead, even if it is a different one.
 
 Source: rcl 9.x ``security.c``, ``context.c`` and ``domain_id.c``.
 """
@@ -90,7 +90,11 @@ def render_environment(variables: Mapping[str, str], form: str) -> str:
     if form == "json":
         return json.dumps(dict(variables), indent=2) + "\n"
     if form in ("docker", "systemd") and any("\n" in value for value in variables.values()):
-        raise UsageError(f"the form {form} does not allow a path with a line break")
+        raise UsageError(
+            f"the form {form} does not allow a path with a line break",
+            "",
+            "Use the form sh, fish or json, or move the keystore.",
+        )
     return "".join(_LINES[form](name, value) for name, value in variables.items())
 
 
@@ -126,8 +130,9 @@ _PYTHON = re.compile(r"python[\d.]*\Z")
 def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
     """Return the command with ``--ros-args --enclave`` added, if it certainly starts a ROS node.
 
-    These are ``ros2 run``, an executable or Python script of a ROS package (``lib/PACKAGE/NAME``),
-    and commands with ``--ros-args``.  A command that names an enclave is returned unchanged.
+    It does if it is ``ros2 run``, runs an executable or Python script of a ROS package
+    (``lib/PACKAGE/NAME``), or has ``--ros-args``.  Other commands, and commands that already name
+    an enclave, are returned unchanged.
     """
     command = tuple(command)
     if Path(command[0]).name == "ros2" and not _is_ros2_run(command):

@@ -36,7 +36,7 @@ _TRIAL_SECONDS = 60
 
 
 class _RouteEntry(ctypes.Structure):
-    """``struct rtentry`` of <net/route.h>."""
+    """The C struct ``rtentry`` of <net/route.h>."""
 
     _fields_ = [
         ("pad1", ctypes.c_ulong),

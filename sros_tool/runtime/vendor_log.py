@@ -24,7 +24,7 @@ from sros_tool.faults import Fault
 
 
 class Refused(Enum):
-    """What a message says is refused."""
+    """The entity that a log message reports as refused."""
 
     ALL_SECURITY = auto()
     """Every secured participant: DDS Security is not built in."""

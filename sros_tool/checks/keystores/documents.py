@@ -1,6 +1,6 @@
 """Checks of an enclave's signed permissions and governance, and of the vendors' decisions on them.
 
-Vendors read documents outside of the portable profile, or decide on them, differently.
+Vendors differ in how they read documents outside of the portable profile, and decide on them.
 """
 
 from __future__ import annotations

@@ -36,7 +36,8 @@ KEY_READABLE = FindingKind(
     "Anyone who can read it can act as that enclave, or with a CA key as any enclave. Neither rcl "
     "nor DDS checks modes, and ros2/sros2 creates keys with mode 0644.",
     "ros2/sros2 0.13; rcl 9, Fast DDS 2.14.5 and Cyclone DDS 0.10.2 check no modes.",
-    "Run `chmod 600` on the key. If others had access, revoke the enclave.",
+    "Run `chmod 600` on the key. If others had access, revoke the enclave, or "
+    "replace the CA (`sros rotate_ca`).",
 )
 WORLD_WRITABLE = FindingKind(
     "keystore.world-writable",
@@ -85,7 +86,7 @@ INTERRUPTED = FindingKind(
     "a write that was interrupted",
     "DDS still loads a complete set of files, old or new. The next verb that writes completes or "
     "undoes the change.",
-    "sros: keystore/transaction.py.",
+    "sros: sros_tool/keystore/transaction/transaction.py.",
     "Run any verb of sros that writes, such as `sros create_enclave`.",
 )
 FOREIGN_STAGE = FindingKind(

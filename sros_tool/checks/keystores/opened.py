@@ -63,7 +63,7 @@ class CheckedKeystore:
     is_home: bool = True
 
     def accepts(self, chosen: Callable[[Template], bool]) -> str:
-        """Return what accepts a weakness (template or exporting keystore), or "" if nothing does.
+        """Return text naming the template or keystore that accepts a weakness; "" if none does.
 
         ``chosen`` returns whether the settings chose the weakness.  Without settings (ros2/sros2)
         nothing accepts it.

@@ -267,7 +267,7 @@ class _GovernedDomain:
         )
 
     def topic_rule(self, topic: str) -> TopicRule | None:
-        """Return the first rule that matches, or None; one without text may crash the vendor."""
+        """Return the first topic rule that matches; None if no rule does."""
         position = self._topics.first(topic)
         return None if position is None else self._topic_rules[position]
 

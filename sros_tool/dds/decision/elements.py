@@ -25,7 +25,7 @@ class UnreadableError(Exception):
         self.outcome = outcome
 
     def refusal(self, title: str, document: str) -> Refusal:
-        """Return this error as a value; ``title`` names the vendor."""
+        """Return this error as a `Refusal`; ``title`` names the vendor."""
         how = "crashes on" if self.outcome is Outcome.CRASHES else "refuses"
         return Refusal("malformed", f"{title} {how} the {document}: {self}.", self.outcome)
 

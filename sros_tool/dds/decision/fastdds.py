@@ -317,7 +317,9 @@ def _value(element: XmlElement, attribute: Attribute) -> Value:
     if text not in list(ProtectionKind):
         raise UnreadableError(f"<{element.name}> holds {text!r}, which is not a protection kind")
     if text not in attribute.values:
-        raise UnreadableError(f"<{element.name}> holds {text}, which is for metadata only")
+        raise UnreadableError(
+            f"<{element.name}> holds {text}, but a payload has no origin authentication"
+        )
     return ProtectionKind(text)
 
 

@@ -78,10 +78,10 @@ def matches(style: Style, expression: str, name: str) -> bool:
 
 
 class ExpressionIndex:
-    """Ordered expressions, and a fast answer to the question which of them match a name.
+    """An index of ordered expressions, to find fast those that match a name.
 
-    Plain ones are looked up by the name, wildcards by the text before the first wildcard,
-    so that thousands of them cost little more than one.
+    Expressions without wildcards are looked up by name, the others by the text before the first
+    wildcard, so that a query on thousands of expressions costs little more than on one.
     """
 
     def __init__(self, style: Style, texts: Iterable[str], *, both_ways: bool = False) -> None:

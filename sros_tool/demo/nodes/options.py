@@ -19,8 +19,8 @@ class NodeOptions:
     """The options of a node.
 
     ``topic`` is the ROS name of the role's topic, service or action.  ``period`` is in seconds.
-    ``server`` is the text of the only action server ("": unknown), for an action client; ``also``
-    are further topics for an observer.
+    ``text`` is sent in messages, and identifies a server.  ``server`` is the text of the action
+    server that an action client uses ("": unknown).  ``also`` are further topics for an observer.
     """
 
     role: str

@@ -62,7 +62,9 @@ def _rclpy_channel(sends: str, hears: str) -> Iterator[_Channel]:
         from rclpy.executors import SingleThreadedExecutor
         from std_msgs.msg import String
     except ImportError as error:
-        raise UnavailableError("rclpy cannot be loaded", f"{error}.", "Source ROS 2.") from error
+        raise UnavailableError(
+            "rclpy cannot be loaded", f"{error}.", "Source the setup file of ROS 2."
+        ) from error
     rclpy.init(args=[])
     node = rclpy.create_node("cost")
     heard: list[str] = []

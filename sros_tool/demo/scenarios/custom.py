@@ -30,8 +30,8 @@
     talker = "camera"
     expected = "heard"
 
-``expected`` is a status as in the table of the demo; it decides by which keys a claim names its
-parties (`_PARTIES`).
+``expected`` is a status of the demo's table; the keys for the parties of a claim depend on it
+(`_PARTIES`).
 ``keystore = "foreign"`` gives a party the identity of another CA; ``variables`` is a table of
 environment variables.  A claim that something does not happen needs another claim or a control
 that something does happen.
@@ -282,7 +282,7 @@ class _Reader:
                     place,
                     "claim",
                     f"no claim or control shows that {who} meanwhile: a crash would look the same",
-                    "Add a control, such as the rightful listener that hears the same talker.",
+                    "Add a control, such as a permitted listener that hears the same talker.",
                 )
 
     # ── tables and lines ───────────────────────────────────────────────────────────────────

@@ -1,4 +1,4 @@
-"""The scenarios services and actions: who may call, and who may serve; both have the same rows."""
+"""The scenarios `services` and `actions`: who may call, and who may serve, in the same rows."""
 
 from __future__ import annotations
 

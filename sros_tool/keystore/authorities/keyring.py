@@ -27,7 +27,7 @@ Secrets = Callable[[str], str]
 
 
 def no_secrets(what: str) -> str:
-    """Raise `PkiError`; the secrets handler of a keyring that is given none."""
+    """Raise `PkiError`: the default secrets handler of a keyring, which cannot ask the user."""
     raise PkiError(
         f"{what} is needed",
         "The keyring has no secrets handler to ask for it.",

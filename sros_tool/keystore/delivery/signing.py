@@ -189,7 +189,7 @@ def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
         raise KeystoreError(
             f"enclave {name} exists already in keystore '{root}'",
             "The sender of the request would get the rights of this enclave.",
-            "If that is intended, add --renew; otherwise have the request made for another name.",
+            "If that is intended, add --renew; otherwise create the request for another name.",
         )
     if renew and not exists:
         raise KeystoreError(
@@ -208,7 +208,7 @@ def _check_key(root: Path, request: SigningRequest) -> None:
                 f"the key of the request for {request.name} was revoked",
                 f"It is the key of certificate {certificate.serial_number:x} of "
                 f"{text_of(certificate.subject)}.",
-                "Have a new key made on the robot, in another folder.",
+                "Create a new key on the robot, with `sros create_request` in another folder.",
             )
     path = enclave_path(root, request.name) / KEY_FILE
     if path.exists():

@@ -165,7 +165,7 @@ def stated_expressions(policy: Enclave) -> ExpressionSets:
 def signed_expressions(permissions: Permissions, domains: DomainSet) -> ExpressionSets | None:
     """Return the expressions that permissions allow and deny.
 
-    Return None if the permissions do not have the form that the module text describes.
+    Return None if the permissions do not have the form that the module docstring describes.
     """
     if len(permissions.grants) != 1 or permissions.grants[0].default_allow:
         return None

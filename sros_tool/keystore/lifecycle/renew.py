@@ -42,7 +42,7 @@ from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
 from sros_tool.parallel import Progress
-from sros_tool.pki.certificates import enclave_subject, issued_by, validity_of
+from sros_tool.pki.certificates import enclave_subject, issued_by, subject_text, validity_of
 from sros_tool.pki.crl import Revoked
 from sros_tool.pki.keys import PrivateKey, PublicKey, generate_key
 from sros_tool.validity import iso
@@ -232,7 +232,9 @@ class _Renewer:
         if not issued_by(state.certificate, self._authorities.identity.certificate):
             raise KeystoreError(
                 f"the certificate of enclave {name} was not issued by the identity CA of this "
-                "keystore"
+                "keystore",
+                f"It names the issuer {subject_text(state.certificate.issuer)}.",
+                "Restore the certificate, or remove the enclave's folder and create it again.",
             )
         state.signed.verify(self._authorities.permissions.certificate)
         subject = enclave_subject(name, unique=self._template.unique_subject)

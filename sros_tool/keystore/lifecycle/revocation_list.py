@@ -216,7 +216,12 @@ class RevocationListSigner:
         keyring = replace(self._keyring, places={})
         key = keyring.open(self._root, IDENTITY, replace(self._template, identity_key=place))
         if not same_key(certificate, key):
-            raise KeystoreError(f"the key at '{place}' belongs to another CA")
+            name = subject_text(certificate.subject)
+            raise KeystoreError(
+                f"the key at '{place}' does not belong to the CA {name}",
+                "A revocation list signed with it would not verify.",
+                "Restore the key from a backup.",
+            )
         return Authority(certificate, key)
 
     def _handle_missing_key(

@@ -175,6 +175,7 @@ def _move_away(transaction: Transaction, authority: Authority, name: str) -> tup
         raise KeystoreError(
             f"the certificate of enclave {name} was not issued by the identity CA of this keystore",
             "Only the CA that issued it can revoke it.",
+            "Revoke it in the keystore of that CA, or restore the right certificate.",
         )
     serial = certificate.serial_number
     target = f"{REVOKED}/{serial:x}"

@@ -1,8 +1,8 @@
 """The scenario of all known attacks, each with a control, and again without its defence.
 
 The attacker is the intruder of the row.  A row that expects the attack to fail has a control: the
-same listener must hear the rightful talker at the same time.  A row with ``removed`` shows that the
-same attack succeeds without that defence: an attack that never works would prove nothing.
+same listener must hear the permitted talker at the same time.  A row with ``removed`` shows that
+the same attack succeeds without that defence: an attack that never works would prove nothing.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _ROWS: tuple[Row, ...] = (
 
 ATTACKS = Scenario(
     "attacks",
-    "every known attack, and each again without the defence that stops it",
+    "all attacks that sros knows, also without the defences that stop them",
     _ROWS,
     {
         "talker": "/talker_listener/talker",

@@ -60,7 +60,7 @@ def injection(
     """Return a row that shows whether the attacker is heard on the topic.
 
     With ``tampered``, the files of the listener were changed: it may fail to start, and the control
-    is another listener with unchanged files.  Otherwise, the control is a rightful talker; a row
+    is another listener with unchanged files.  Otherwise, the control is a permitted talker; a row
     with ``removed`` has no control.
     """
     listener = Party("listener", Role.LISTENER, Identity(victims, "listener"), intruder=tampered)

@@ -503,7 +503,7 @@ def _issuance(
     permissions: _Successor | None,
     policies: dict[str, str],
 ) -> Issuance | None:
-    """Return what the new CAs issue for an enclave; None if it has no certificate yet.
+    """Return the `Issuance` of the new CAs for an enclave; None if it has no certificate yet.
 
     Raises:
         KeystoreError: the old CA did not issue its certificate or sign its permissions.
