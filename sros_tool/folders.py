@@ -166,9 +166,7 @@ class Folder:
         """Make the symbolic link ``path`` with the text ``target``."""
         parent, name = self._at(path)
         with self._naming(path):
-            os.symlink(target, name, dir_fd=parent)
-            if self._hand_over:
-                os.chown(name, *self._owner, dir_fd=parent, follow_symlinks=False)
+            os.symlink(target, name, dir_fd=parent)  # its owner grants nothing, so it stays
 
     def mkdir(self, path: str, mode: int) -> None:
         """Make the folder ``path``; its permission bits are ``mode`` whatever the umask is."""

@@ -214,6 +214,8 @@ def test_what_root_makes_belongs_to_the_owner_of_the_keystore(keystore: Path) ->
     for parent, folders, files in os.walk(keystore):
         for name in (*folders, *files):
             state = os.lstat(os.path.join(parent, name))
+            if stat.S_ISLNK(state.st_mode):
+                continue  # who owns a link may do nothing with it that others may not
             assert (state.st_uid, state.st_gid) == (OWNER, OWNER), name
     keystore.parent.chmod(0o755)
     with traversable(keystore.parent):
