@@ -16,7 +16,7 @@ PROJECT = Path(__file__).parents[1]
 PACKAGE = PROJECT / "sros_tool"
 
 LAYERS = {
-    1: {"errors", "faults", "names", "validity", "values"}
+    1: {"errors", "faults", "names", "owners", "validity", "values"}
     | {"xml", "files", "folders", "parallel", "resources"},
     2: {"pki", "policy", "dds"},
     3: {"translate"},

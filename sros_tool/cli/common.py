@@ -347,7 +347,9 @@ def keyring(
 
 
 def _absolute(place: str) -> str:
-    if place.startswith("pkcs11:"):
+    from sros_tool.pki.token_uri import is_token_uri
+
+    if is_token_uri(place):
         return place
     return f"file:{Path(place.removeprefix('file:')).absolute()}"
 

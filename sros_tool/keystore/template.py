@@ -15,6 +15,7 @@ from typing import Any
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.files import parse_toml
 from sros_tool.names import expression_problem
+from sros_tool.pki.token_uri import refuse_pin
 from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.resources import templates_dir
 from sros_tool.validity import Span, duration_text, parse_duration, parse_span, span_text
@@ -117,8 +118,8 @@ def parse_template(text: str, name: str) -> Template:
         permissions_validity=permissions.span("validity"),
         default_permissions=permissions.one_of("default", (EVERYTHING, NODE_BASICS)),
         protection=_protection(table.table("protection")),
-        identity_key=authorities.text("identity_key", ""),
-        permissions_key=authorities.text("permissions_key", ""),
+        identity_key=_key_place(authorities, "identity_key"),
+        permissions_key=_key_place(authorities, "permissions_key"),
         unique_subject=certificates.flag("unique_subject", False),
         revocation_validity=revocation.duration("validity", "10y"),
     )
@@ -170,6 +171,15 @@ def _authority_name(table: _Table) -> str:
             "characters"
         )
     return name
+
+
+def _key_place(table: _Table, key: str) -> str:
+    place = table.text(key, "")
+    try:
+        refuse_pin(place)
+    except SrosError as error:
+        raise _TemplateError(f"{table.path}.{key}: {error}".removesuffix(".")) from error
+    return place
 
 
 def _topic_lines(protection: TopicProtection) -> list[str]:

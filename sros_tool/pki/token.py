@@ -1,13 +1,13 @@
-"""Keys on PKCS#11 tokens, named by URI (RFC 7512); the token signs, and keys never leave it."""
+"""Keys on PKCS#11 tokens, named by URI; the token signs, and keys never leave it."""
 
 from __future__ import annotations
 
 import importlib.util
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qsl, unquote
 
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -15,54 +15,42 @@ from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, encode_ds
 from cryptography.hazmat.primitives.serialization import load_der_public_key
 
 from sros_tool.errors import PkiError, UnavailableError, UsageError
+from sros_tool.owners import belongs_to_root
+from sros_tool.pki.token_uri import TokenUri, parse_token_uri
+from sros_tool.xml import read_bytes
 
-SCHEME = "pkcs11:"
 _MODULE_VARIABLE = "PKCS11_MODULE_PATH"
 Secrets = Callable[[str], str]
 """Function that returns the secret that its argument names, such as "the PIN of the token X"."""
 
 
-@dataclass(frozen=True, slots=True)
-class TokenUri:
-    """The parts of a ``pkcs11:`` URI that sros uses.
+def _module_of(parsed: TokenUri, *, named: bool) -> str:
+    """Return the path of the library to load into this process; ``named``: the user gave the URI.
 
-    ``object`` is the label of the key, ``module`` the path of the PKCS#11 library, and
-    ``pin_source`` the path of a file with the PIN, or "".
-    """
-
-    token: str
-    object: str
-    module: str
-    pin_source: str = ""
-
-
-def _parse_uri(uri: str) -> TokenUri:
-    """Parse ``pkcs11:token=NAME;object=LABEL?module-path=FILE``.
-
-    Without ``module-path``, $PKCS11_MODULE_PATH names the module.
+    A library named by anybody else, as in the settings of a keystore that was received, is
+    loaded only if it is root's: loading runs its code.
 
     Raises:
-        UsageError: a part is missing, or there is a ``pin-value``: a secret does not belong in a
-            settings file or on a command line.
+        UsageError: no library is named, or it is not one to be loaded.
     """
-    path, _, query = uri.removeprefix(SCHEME).partition("?")
-    parts = dict(part.partition("=")[::2] for part in path.split(";") if part)
-    options = dict(parse_qsl(query))
-    if "pin-value" in options:
+    own = os.environ.get(_MODULE_VARIABLE, "")
+    path = Path(parsed.module)
+    if parsed.module and (named or (path.is_absolute() and belongs_to_root(path))):
+        return parsed.module
+    if own:
+        return own
+    if parsed.module:
         raise UsageError(
-            "a PKCS#11 URI with pin-value is not accepted",
-            "The PIN would be written into the keystore's settings.",
-            "Remove pin-value, and give the PIN by SROS_PKCS11_PIN or pin-source=FILE.",
+            f"the PKCS#11 module '{parsed.module}' is not loaded",
+            "Only the keystore names it, and users other than root could have put it there; its "
+            "code would run in this process.",
+            f"If you trust it, set {_MODULE_VARIABLE} to its path.",
         )
-    module = options.get("module-path", os.environ.get(_MODULE_VARIABLE, ""))
-    token, label = unquote(parts.get("token", "")), unquote(parts.get("object", ""))
-    if not uri.startswith(SCHEME) or not token or not label or not module:
-        raise UsageError(
-            f"{uri!r} does not name a key on a token",
-            "The URI has to name a token, an object and a module.",
-            f"Write pkcs11:token=NAME;object=LABEL?module-path=FILE, or set {_MODULE_VARIABLE}.",
-        )
-    return TokenUri(token, label, module, options.get("pin-source", "").removeprefix("file:"))
+    raise UsageError(
+        f"no PKCS#11 module is named for the token {parsed.token!r}",
+        "",
+        f"Add ?module-path=FILE to the URI, or set {_MODULE_VARIABLE}.",
+    )
 
 
 class TokenKey(ec.EllipticCurvePrivateKey):
@@ -125,16 +113,22 @@ class TokenKey(ec.EllipticCurvePrivateKey):
         return self
 
 
-def holds_token_key(uri: str, secrets: Secrets) -> bool:
+def holds_token_key(uri: str, secrets: Secrets, *, named: bool) -> bool:
     """Return whether the token has the key that ``uri`` names.
 
+    Args:
+        uri: the URI of the key.
+        secrets: called for the PIN.
+        named: whether the user of this process gave the URI, who may name any module; the module
+            of another URI, as of a keystore's settings, is loaded only if it is root's.
+
     Raises:
+        UsageError: the URI is not valid, or its module is not one to be loaded.
         PkiError: the token cannot be used.
     """
-    _need_package()
+    parsed = _usable_uri(uri, named=named)
     import pkcs11
 
-    parsed = _parse_uri(uri)
     try:
         session = _session(parsed, secrets, write=False)
         return any(True for _ in session.get_objects({pkcs11.Attribute.LABEL: parsed.object}))
@@ -142,19 +136,30 @@ def holds_token_key(uri: str, secrets: Secrets) -> bool:
         raise _unusable(parsed, error) from error
 
 
-def open_token_key(uri: str, secrets: Secrets) -> TokenKey:
-    """Return the key that ``uri`` names; raise `PkiError` if the token does not have it."""
-    return _open(uri, secrets, create=False)
+def open_token_key(uri: str, secrets: Secrets, *, named: bool) -> TokenKey:
+    """Return the key that ``uri`` names; arguments and errors as of `holds_token_key`."""
+    return _open(_usable_uri(uri, named=named), secrets, create=False)
 
 
-def create_token_key(uri: str, secrets: Secrets) -> TokenKey:
+def create_token_key(uri: str, secrets: Secrets, *, named: bool) -> TokenKey:
     """Generate a key pair on the token; raise `PkiError` if the token has one of this label."""
-    return _open(uri, secrets, create=True)
+    return _open(_usable_uri(uri, named=named), secrets, create=True)
 
 
-def _open(uri: str, secrets: Secrets, *, create: bool) -> TokenKey:
-    parsed = _parse_uri(uri)
-    _need_package()
+def _usable_uri(uri: str, *, named: bool) -> TokenUri:
+    """Return the parts of a URI with the module to load, once tokens can be used at all."""
+    parsed = parse_token_uri(uri)
+    parsed = replace(parsed, module=_module_of(parsed, named=named))
+    if importlib.util.find_spec("pkcs11") is None:
+        raise UnavailableError(
+            "keys on PKCS#11 tokens need the Python package python-pkcs11",
+            "",
+            "Install it with `pip install 'sros_tool[pkcs11]'`.",
+        )
+    return parsed
+
+
+def _open(parsed: TokenUri, secrets: Secrets, *, create: bool) -> TokenKey:
     import pkcs11
     from pkcs11.util.ec import encode_ec_public_key
 
@@ -181,16 +186,6 @@ def _open(uri: str, secrets: Secrets, *, create: bool) -> TokenKey:
             "Name another object of the token.",
         )
     return TokenKey(private, loaded)
-
-
-def _need_package() -> None:
-    """Raise `UnavailableError` if the Python package python-pkcs11 is not installed."""
-    if importlib.util.find_spec("pkcs11") is None:
-        raise UnavailableError(
-            "keys on PKCS#11 tokens need the Python package python-pkcs11",
-            "",
-            "Install it with `pip install 'sros_tool[pkcs11]'`.",
-        )
 
 
 def _unusable(parsed: TokenUri, error: Exception) -> PkiError:
@@ -241,6 +236,6 @@ def _create(session: Any, parsed: TokenUri) -> None:
 
 def _pin(parsed: TokenUri, secrets: Secrets) -> str:
     if parsed.pin_source:
-        with open(parsed.pin_source, encoding="utf-8") as file:
-            return file.readline().rstrip("\n")
+        data = read_bytes(Path(parsed.pin_source), "file with the PIN")
+        return data.decode(errors="replace").partition("\n")[0]
     return secrets(f"the PIN of the token {parsed.token}")

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.keystore.layout import ROLES
 from tests.support.children import run
-from tests.support.harness import forked
+from tests.support.harness import forked, snapshot
 
 MODULES = ("/usr/lib/softhsm/libsofthsm2.so", "/usr/lib/x86_64-linux-gnu/softhsm/libsofthsm2.so")
 MODULE = next((path for path in MODULES if Path(path).exists()), "")
@@ -172,3 +173,43 @@ def test_without_the_token_nothing_is_renewed_or_revoked(
         ("inspect", root, "--history"),
     ):
         assert sros(without, *reading).returncode == 0, reading
+
+
+def test_the_module_of_a_received_keystore_is_not_loaded(
+    token: dict[str, str], tmp_path: Path
+) -> None:
+    """Its code would run; a module of root (the other tests), or one that the user names, may."""
+    root, module = tmp_path / "ks", tmp_path / "module.so"
+    shutil.copy(MODULE, module)
+    module.chmod(0o755)
+    tmp_path.chmod(0o777)
+    places = {
+        f"SROS_{role.upper()}_KEY": uri(role).replace(MODULE, str(module))
+        for role in ("identity", "permissions")
+    }
+    assert sros(token | places, "create_keystore", root).returncode == 0
+    before = snapshot(root)
+    for words in (
+        ("create_enclave", root, "/a"),
+        ("create_enclave", root, "/a", "--dry-run"),
+        ("crl", root, "--refresh"),
+    ):
+        refused = sros(token, *words)
+        assert refused.returncode == 2, (words, refused.stderr)
+        assert "PKCS11_MODULE_PATH" in refused.stderr
+        assert "is not loaded" in refused.stderr
+        assert snapshot(root) == before
+    template = tmp_path / "template.toml"
+    template.write_text((root / "sros.toml").read_text())
+    refused = sros(token, "create_keystore", tmp_path / "new", "--template", template)
+    assert (refused.returncode, "is not loaded" in refused.stderr) == (2, True)
+    for named in ({"PKCS11_MODULE_PATH": str(module)}, {"PKCS11_MODULE_PATH": MODULE}, places):
+        done = sros(token | named, "create_enclave", root, "/a")
+        assert done.returncode == 0, done.stderr
+
+
+def test_a_dry_run_of_a_new_keystore_opens_no_token(token: dict[str, str], tmp_path: Path) -> None:
+    broken = [f"--{role}-key=pkcs11:token=robot;object=o?module-path=/gone.so" for role in ROLES]
+    planned = sros(token, "create_keystore", tmp_path / "ks", *broken, "--dry-run")
+    assert planned.returncode == 0, planned.stderr
+    assert sros(token, "create_keystore", tmp_path / "ks", *broken).returncode == 1

@@ -121,7 +121,8 @@ def create_authorities(
     notes: list[Note] = []
 
     def make(file: str, role: str, name: str) -> Authority:
-        key = keyring.make(transaction, f"{PRIVATE}/{file}.key.pem", role, template)
+        at = f"{PRIVATE}/{file}.key.pem"
+        key = keyring.make(transaction, at, role, template, compared=role in imported)
         if role in imported:
             found = check_imported(role, imported[role], key, now)
             certificate, bundle = found.certificate, found.bundle

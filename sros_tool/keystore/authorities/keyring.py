@@ -17,7 +17,8 @@ from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
-from sros_tool.pki.token import SCHEME, create_token_key, holds_token_key, open_token_key
+from sros_tool.pki.token import create_token_key, holds_token_key, open_token_key
+from sros_tool.pki.token_uri import is_token_uri, parse_token_uri, refuse_pin
 from sros_tool.xml import read_bytes
 
 _LOG = logging.getLogger(__name__)
@@ -40,13 +41,21 @@ class Keyring:
     """The places of the CA keys, and the secrets handler that opens them.
 
     ``places`` maps a role ("identity", "permissions") to the URI of its key, ``file:PATH`` or
-    ``pkcs11:...``.  For a role without an entry, the keystore's settings name the place.
+    ``pkcs11:...``, as the user named it.  For a role without an entry, the keystore's settings name
+    the place.
     ``secrets`` returns passphrases and PINs.  With ``encrypt``, new key files get a passphrase.
     """
 
     secrets: Secrets = no_secrets
     places: dict[str, str] = field(default_factory=dict)
     encrypt: bool = False
+
+    def __post_init__(self) -> None:
+        """Raise `UsageError` for a place that is not a valid URI, before it is written anywhere."""
+        for place in self.places.values():
+            refuse_pin(place)
+            if is_token_uri(place):
+                parse_token_uri(place)
 
     def place(self, role: str, template: Template) -> str:
         """Return the URI of a CA's key, or its path relative to the keystore."""
@@ -61,8 +70,8 @@ class Keyring:
         """
         place = self.place(role, template)
         try:
-            if place.startswith(SCHEME):
-                token_key = open_token_key(place, self.secrets)
+            if is_token_uri(place):
+                token_key = open_token_key(place, self.secrets, named=self._is_named(role))
                 _LOG.info("opened the key of the %s CA, on the token at %s", role, place)
                 return token_key
             path = _path(place, root)
@@ -81,21 +90,31 @@ class Keyring:
             raise KeystoreError(error.what, error.why, error.remedy) from error
 
     def make(
-        self, transaction: Transaction, file: str, role: str, template: Template
+        self,
+        transaction: Transaction,
+        file: str,
+        role: str,
+        template: Template,
+        *,
+        compared: bool = False,
     ) -> PrivateKey:
         """Return the key for a new CA: the key already at its place, or a new key created there.
 
-        ``file`` is the path in the keystore for a new key that has no other place.
+        ``file`` is the path in the keystore for a new key that has no other place.  A dry run opens
+        a token only if the key is ``compared`` with a certificate; otherwise any key will do.
         """
         place = self.places.get(role) or (
             template.identity_key if role == IDENTITY else template.permissions_key
         )
-        if place.startswith(SCHEME):
-            if holds_token_key(place, self.secrets):
-                return open_token_key(place, self.secrets)
+        if is_token_uri(place):
+            if transaction.dry_run and not compared:
+                return generate_key()
+            named = self._is_named(role)
+            if holds_token_key(place, self.secrets, named=named):
+                return open_token_key(place, self.secrets, named=named)
             if transaction.dry_run:
                 return generate_key()
-            return create_token_key(place, self.secrets)
+            return create_token_key(place, self.secrets, named=named)
         if place and _path(place, transaction.root).exists():
             return self.open(transaction.root, role, template)
         key = generate_key()
@@ -113,6 +132,10 @@ class Keyring:
         if not template.separate_authorities:
             permissions = identity
         return replace(template, identity_key=identity, permissions_key=permissions)
+
+    def _is_named(self, role: str) -> bool:
+        """Return whether the user named the place, not a file that may come from others."""
+        return bool(self.places.get(role))
 
     def _passphrase(self, role: str) -> Callable[[], str]:
         return lambda: self.secrets(f"the passphrase of the {role} CA key")

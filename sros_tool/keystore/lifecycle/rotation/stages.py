@@ -627,9 +627,8 @@ def _make_successor(
     encrypted = present.is_file() and b"ENCRYPTED" in read_bytes(present, "CA key")
     new_keys = replace(new_keys, encrypt=new_keys.encrypt or encrypted)
     place = new_keys.places.get(roles[0], "")
-    key = new_keys.make(
-        transaction, at, roles[0], replace(template, identity_key="", permissions_key="")
-    )
+    elsewhere = replace(template, identity_key="", permissions_key="")
+    key = new_keys.make(transaction, at, roles[0], elsewhere, compared=True)
     if same_key(old[0], key):
         raise KeystoreError(
             f"the key at '{place}' belongs to the present {roles[0]} CA",

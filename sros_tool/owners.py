@@ -1,0 +1,103 @@
+"""Which users, besides those who are trusted, can change a file or put another in its place.
+
+Only owners and permission bits are looked at, not access control lists (acl(5)).
+"""
+
+from __future__ import annotations
+
+import grp
+import os
+import pwd
+import stat
+from collections.abc import Iterator, Set
+from contextlib import suppress
+from pathlib import Path
+
+_ROOT = frozenset({0})
+_MOST_LINKS = 40
+
+
+def other_writers(state: os.stat_result, trusted: Set[int]) -> str:
+    """Return why users besides ``trusted`` (user ids) can change a file or folder, or "".
+
+    The group counts unless it is the private group of a trusted user, which Debian and others give
+    to each user and write with (umask 002).
+    """
+    if state.st_uid not in trusted:
+        return f"it belongs to {_user_name(state.st_uid)}"
+    if stat.S_ISLNK(state.st_mode):
+        return ""
+    mode = f"its mode is {stat.S_IMODE(state.st_mode):04o}"
+    if state.st_mode & stat.S_IWOTH:
+        return f"{mode}, so everybody can write"
+    if state.st_mode & stat.S_IWGRP and not _is_private(state.st_gid, trusted):
+        return f"{mode}, so the group {_group_name(state.st_gid)} can write"
+    return ""
+
+
+def belongs_to_root(path: Path) -> bool:
+    """Return whether only root can change ``path``, and every folder and link on the way to it."""
+    try:
+        if other_writers(path.stat(), _ROOT):
+            return False
+    except OSError:
+        return False
+    return not any(other_writers(state, _ROOT) for _, state in _way(path))
+
+
+def _way(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
+    """Yield the folders and links that the system passes on the way to ``path``, with their states.
+
+    ``path`` itself is not among them, unless it is a link.
+    """
+    here, rest, links = Path("/"), list(reversed(path.absolute().parts[1:])), 0
+    yield here, here.lstat()
+    while rest:
+        part = rest.pop()
+        if part == "..":
+            here = here.parent
+            continue
+        each = here / part
+        try:
+            state = each.lstat()
+        except OSError:
+            return
+        if stat.S_ISLNK(state.st_mode):
+            links += 1
+            if links > _MOST_LINKS:
+                return
+            yield each, state
+            target = each.readlink()
+            here = Path("/") if target.is_absolute() else here
+            rest += reversed(target.parts[1:] if target.is_absolute() else target.parts)
+        elif rest:
+            yield each, state
+            here = each
+
+
+def _is_private(group: int, trusted: Set[int]) -> bool:
+    """Return whether a group is the private group of a trusted user, without other members."""
+    users = []
+    for each in trusted:
+        with suppress(KeyError):
+            users.append(pwd.getpwuid(each))
+    try:
+        name, _, _, members = grp.getgrgid(group)
+    except KeyError:
+        return False
+    own = any(each.pw_gid == group and each.pw_name == name for each in users)
+    return own and {each.pw_name for each in users}.issuperset(members)
+
+
+def _user_name(user: int) -> str:
+    try:
+        return f"user {pwd.getpwuid(user).pw_name}"
+    except KeyError:
+        return f"user {user}"
+
+
+def _group_name(group: int) -> str:
+    try:
+        return grp.getgrgid(group).gr_name
+    except KeyError:
+        return str(group)
