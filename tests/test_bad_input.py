@@ -750,7 +750,8 @@ def test_target(case: str, keystore: Path, tmp_path: Path) -> None:
 # ── wrong usage ────────────────────────────────────────────────────────────────────────────
 
 MISUSE: dict[str, tuple[str, str]] = {
-    "no such verb": ("create_keystor x", "No such command"),
+    "no such verb": ("fly x", "No such command"),
+    "a mistyped verb": ("create-keystor x", "Did you mean 'create_keystore'?"),
     "no such option": ("create_keystore new --frobnicate", "No such option"),
     "no keystore": ("create_enclave", ""),
     "empty keystore": ("create_keystore ''", "empty"),

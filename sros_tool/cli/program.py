@@ -147,7 +147,13 @@ class _Program(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Resolve a verb as click does, but return the verb's name for an alias."""
+        """Resolve a verb as click does; return the name for an alias, and suggest one for a typo."""
+        word = args[0].replace("-", "_")
+        if word not in _NAMES:
+            from difflib import get_close_matches
+
+            if similar := get_close_matches(word, _NAMES, n=1):
+                ctx.fail(f"No such command '{args[0]}'. Did you mean '{similar[0]}'?")
         name, command, rest = super().resolve_command(ctx, args)
         return (command.name if command else name), command, rest
 
