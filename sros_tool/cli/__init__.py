@@ -18,10 +18,12 @@ def main(arguments: list[str] | None = None) -> None:
         sys.stdout.reconfigure(errors="surrogateescape")  # a path need not be valid UTF-8
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # warnings of libraries are not for users
+    from sros_tool.cli.common import secrets_taken
     from sros_tool.cli.program import program, report_error
 
     try:
-        status = program.main(arguments, prog_name="sros", standalone_mode=False)
+        with secrets_taken():
+            status = program.main(arguments, prog_name="sros", standalone_mode=False)
         if sys.stdout:  # None where it was closed
             sys.stdout.flush()
     except BrokenPipeError:

@@ -324,7 +324,24 @@ def domain_of(text: str | None) -> int | None:
 
 _PASSPHRASE, _PASSPHRASE_FILE = "SROS_CA_PASSPHRASE", "SROS_CA_PASSPHRASE_FILE"
 _PIN = "SROS_PKCS11_PIN"
+_taken: dict[str, str] = {}
 _KEY_PLACES = {"identity": "SROS_IDENTITY_KEY", "permissions": "SROS_PERMISSIONS_KEY"}
+
+
+@contextmanager
+def secrets_taken() -> Iterator[None]:
+    """Keep the variables with secrets for this process alone: no process that it starts gets them.
+
+    Neither do commands that replace this process, as of ``sros run``.
+    """
+    for name in (_PASSPHRASE, _PASSPHRASE_FILE, _PIN):
+        if name in os.environ:
+            _taken[name] = os.environ.pop(name)
+    try:
+        yield
+    finally:
+        os.environ.update(_taken)
+        _taken.clear()
 
 
 def keyring(
@@ -368,8 +385,8 @@ class _Secrets:
 
     def _find(self, what: str) -> str:
         is_pin = " PIN " in f" {what} "
-        value = os.environ.get(_PIN if is_pin else _PASSPHRASE, "")
-        file = "" if is_pin else os.environ.get(_PASSPHRASE_FILE, "")
+        value = _taken.get(_PIN if is_pin else _PASSPHRASE, "")
+        file = "" if is_pin else _taken.get(_PASSPHRASE_FILE, "")
         if not value and file:
             value = Path(file).read_text(encoding="utf-8").partition("\n")[0]
         if not value and sys.stdin.isatty():
