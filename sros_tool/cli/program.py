@@ -147,7 +147,7 @@ class _Program(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """Resolve a verb as click does; return the name for an alias, and suggest one for a typo."""
+        """Resolve a verb as click does, also by an alias; suggest a verb for a mistyped one."""
         word = args[0].replace("-", "_")
         if word not in _NAMES:
             from difflib import get_close_matches
