@@ -21,13 +21,14 @@ from sros_tool.keystore.layout import (
     is_keystore,
     permissions_ca_for,
 )
-from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_enclave, read_certificate
+from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_enclave
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     load_certificates,
     subject_text,
     validity_of,
 )
+from sros_tool.pki.chains import chain_fault
 from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl
 from sros_tool.pki.keys import algorithm, load_key
 from sros_tool.translate import RosRight, ros_rights
@@ -204,12 +205,13 @@ def _signed(path: Path, data: bytes, now: datetime, authority: Path | None) -> D
     reason = "no permissions CA certificate is next to it; name one with --ca"
     verified: bool | None = None
     if found:
-        certificate = read_certificate(found)
+        certificates = load_certificates(read_bytes(found, "certificate"), f"'{found}'")
         try:
-            signed.verify(certificate)
-            verified, reason = True, ""
+            signed.verify(certificates[0])
+            reason = chain_fault(certificates[0], certificates, at=now, for_documents=True)
         except SrosError as error:
-            verified, reason = False, str(error)
+            reason = str(error)
+        verified = not reason
     return {
         **_document(signed.document, now),
         "signed": True,

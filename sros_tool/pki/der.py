@@ -11,6 +11,7 @@ from typing import NamedTuple
 from sros_tool.errors import PkiError
 
 INTEGER, OCTET_STRING, OID, SEQUENCE, SET = 0x02, 0x04, 0x06, 0x30, 0x31
+UTC_TIME, GENERALIZED_TIME = 0x17, 0x18
 CONTEXT_0 = 0xA0
 
 
@@ -42,7 +43,9 @@ def children(data: bytes) -> list[Value]:
                 raise PkiError("a DER value has a form that is not supported")
             length = int.from_bytes(data[position : position + size], "big")
             position += size
-        if tag & 0x1F == 0x1F:
+            if length < 0x80 or length >> 8 * (size - 1) == 0:
+                raise PkiError("a DER value has a longer length than it needs")
+        if tag & 0x1F == 0x1F or tag == 0:
             raise PkiError("a DER value has a form that is not supported")
         if position + length > end:
             raise PkiError("a DER value is cut short")
@@ -59,6 +62,14 @@ def first(data: bytes) -> Value:
     if not values:
         raise PkiError("a DER value is missing")
     return values[0]
+
+
+def integer(value: Value) -> int:
+    """Return the number in an INTEGER; raise `PkiError` unless it has the shortest form."""
+    number = int.from_bytes(value.content, "big", signed=True)
+    if (number if number >= 0 else ~number).bit_length() // 8 + 1 != len(value.content):
+        raise PkiError("a DER number is empty, or longer than it needs to be")
+    return number
 
 
 def encode_oid(dotted: str) -> bytes:

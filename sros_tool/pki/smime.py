@@ -4,17 +4,20 @@ Every DDS vendor reads this form: CRLF line ends, a first part whose signed byte
 header ``Content-Type: text/plain``, SHA-256, and the embedded certificate of the signer
 (DDS-Security 1.1, 9.4.1.1; OpenSSL ``smime -sign -text``).  Opaque messages, which have the content
 inside the signature (``-nodetach``), are read as well, because every vendor accepts them.
+
+What OpenSSL rejects is never accepted: of MIME, only headers and boundaries that all programs read
+in the same way are read, and of CMS, only DER (tests/integration/forged_signatures.py).
 """
 
 from __future__ import annotations
 
 import base64
-import binascii
 import re
 import secrets
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -29,24 +32,50 @@ from sros_tool.pki.keys import PrivateKey
 
 _TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"
 _OPTIONS = (pkcs7.PKCS7Options.DetachedSignature, pkcs7.PKCS7Options.Binary)
-_TEXT = re.compile(rb"(?i)content-type:[ \t]*text/plain\b")
-_MULTIPART = re.compile(
-    rb"(?im)^content-type:[ \t]*multipart/signed"
-    rb"""((?:;[ \t]*(?:\n[ \t]+)?[\w-]+=(?:"[^"\x00-\x1f]+"|[^\s;"]+))+)$"""
+
+# The grammar of the MIME headers that are read: what OpenSSL's reader (asn_mime.c) and RFC 2045
+# understand in the same way.  A longer line is read by OpenSSL as several lines.
+_FOLD = re.compile(rb";[ \t]{0,9}\n[ \t]{1,9}(?=\S)")
+_FIELD = re.compile(rb"([A-Za-z][A-Za-z-]*):[ \t]{0,9}([!-~](?:[ -~]{0,900}[!-~])?)")
+_PARAMETER = rb"""; {0,9}([\w-]+)=("[ !#-'*-\[\]-~]+"|[\w'+,./:=?-]+)"""
+_TYPE = re.compile(rb"([\w-]+/[\w-]+)((?:" + _PARAMETER + rb")*)")
+_PARAMETERS = re.compile(_PARAMETER)
+_BOUNDARY = re.compile(rb"[\w'+,./:=?-]{2,200}")  # OpenSSL reads no boundary of one character
+_BASE64 = re.compile(
+    rb"(?:(?:[A-Za-z0-9+/]{4}){1,19}\n)*"
+    rb"(?:[A-Za-z0-9+/]{4}){0,18}[A-Za-z0-9+/]{2}(?:[A-Za-z0-9+/]{2}|[A-Za-z0-9+/]=|==)\n*"
 )
-_OPAQUE = re.compile(rb"(?im)^content-type:[ \t]*application/(?:x-)?pkcs7-mime(?:;|$)")
-_BOUNDARY = re.compile(rb"""(?i);\s*boundary=("([^"]{1,200})"|([^\s;"]{1,200}))""")
-_PKCS7 = re.compile(rb"(?im)^content-type:[ \t]*application/(?:x-)?pkcs7-signature(?:;|$)")
+_OPAQUE = (b"application/pkcs7-mime", b"application/x-pkcs7-mime")
+_SIGNATURE = (b"application/pkcs7-signature", b"application/x-pkcs7-signature")
 
 _VERSION = b"\x02\x01\x01"
+_NULL = b"\x05\x00"
 _SIGNED_DATA = der.encode_oid("1.2.840.113549.1.7.2")
 _DATA = der.encode_oid("1.2.840.113549.1.7.1")
+_CONTENT_TYPE = der.encode_oid("1.2.840.113549.1.9.3")
 _MESSAGE_DIGEST = der.encode_oid("1.2.840.113549.1.9.4")
-_DIGESTS: dict[bytes, hashes.HashAlgorithm] = {
-    der.encode_oid("2.16.840.1.101.3.4.2.1"): hashes.SHA256(),
-    der.encode_oid("2.16.840.1.101.3.4.2.2"): hashes.SHA384(),
-    der.encode_oid("2.16.840.1.101.3.4.2.3"): hashes.SHA512(),
-    der.encode_oid("1.3.14.3.2.26"): hashes.SHA1(),  # noqa: S303 - read, never written
+_RSA = der.encode_oid("1.2.840.113549.1.1.1")
+_ATTRIBUTE_VALUES = (der.SEQUENCE, der.OCTET_STRING, der.OID, der.UTC_TIME, der.GENERALIZED_TIME)
+_OID = re.compile(rb"(?:(?:[\x81-\xff][\x80-\xff]*)?[\x00-\x7f])+")
+
+
+class _Digest(NamedTuple):
+    """A hash algorithm, and the OIDs of the signatures with it by RSA and by ECDSA keys."""
+
+    algorithm: hashes.HashAlgorithm
+    rsa: bytes
+    ecdsa: bytes
+
+
+_DIGESTS = {
+    der.encode_oid(digest): _Digest(algorithm, der.encode_oid(by_rsa), der.encode_oid(by_ecdsa))
+    for digest, algorithm, by_rsa, by_ecdsa in (
+        ("2.16.840.1.101.3.4.2.1", hashes.SHA256(), "1.2.840.113549.1.1.11", "1.2.840.10045.4.3.2"),
+        ("2.16.840.1.101.3.4.2.2", hashes.SHA384(), "1.2.840.113549.1.1.12", "1.2.840.10045.4.3.3"),
+        ("2.16.840.1.101.3.4.2.3", hashes.SHA512(), "1.2.840.113549.1.1.13", "1.2.840.10045.4.3.4"),
+        # Read, never written.
+        ("1.3.14.3.2.26", hashes.SHA1(), "1.2.840.113549.1.1.5", "1.2.840.10045.4.1"),  # noqa: S303
+    )
 }
 
 
@@ -89,7 +118,8 @@ class SignedDocument:
     document: bytes
     certificates: tuple[x509.Certificate, ...]
     digest: str
-    _digest_algorithm: hashes.HashAlgorithm
+    _digest_algorithm: _Digest
+    _signature_algorithm: der.Value
     _signed_attributes: bytes
     _message_digest: bytes
     _signature: bytes
@@ -100,12 +130,16 @@ class SignedDocument:
         return self.signer_among(self.certificates)
 
     def signer_among(self, certificates: Iterable[x509.Certificate]) -> x509.Certificate | None:
-        """Return the signer's certificate by issuer and serial number, or None."""
+        """Return the signer's certificate by issuer and serial number, or None.
+
+        OpenSSL compares the issuers' names in a looser way, and takes the first that fits: where
+        several certificates have the serial number, none is the signer's.
+        """
         issuer, serial = self._issuer_and_serial
-        for certificate in certificates:
-            if certificate.serial_number == serial and certificate.issuer.public_bytes() == issuer:
-                return certificate
-        return None
+        found = {each for each in certificates if each.serial_number == serial}
+        if len(found) != 1 or (signer := found.pop()).issuer.public_bytes() != issuer:
+            return None
+        return signer
 
     def verify(self, authority: x509.Certificate) -> None:
         """Verify that ``authority`` itself signed this document.
@@ -135,7 +169,7 @@ class SignedDocument:
 
     def digest_matches(self) -> bool:
         """Return whether the messageDigest attribute is the digest of the content."""
-        digest = hashes.Hash(self._digest_algorithm)
+        digest = hashes.Hash(self._digest_algorithm.algorithm)
         digest.update(self.content)
         return digest.finalize() == self._message_digest
 
@@ -144,12 +178,16 @@ class SignedDocument:
         if self._signed_attributes and not self.digest_matches():
             return False
         signed = self._signed_attributes or self.content
-        key = signer.public_key()
+        key, digest = signer.public_key(), self._digest_algorithm
         try:
             if isinstance(key, ec.EllipticCurvePublicKey):
-                key.verify(self._signature, signed, ec.ECDSA(self._digest_algorithm))
+                if _algorithm(self._signature_algorithm) != digest.ecdsa:
+                    return False
+                key.verify(self._signature, signed, ec.ECDSA(digest.algorithm))
             elif isinstance(key, rsa.RSAPublicKey):
-                key.verify(self._signature, signed, padding.PKCS1v15(), self._digest_algorithm)
+                if _algorithm(self._signature_algorithm) not in (_RSA, digest.rsa):
+                    return False
+                key.verify(self._signature, signed, padding.PKCS1v15(), digest.algorithm)
             else:
                 return False
         except (InvalidSignature, UnsupportedAlgorithm):
@@ -169,7 +207,8 @@ def parse(message: bytes) -> SignedDocument:
 
 def _document(content: bytes) -> bytes:
     header, separator, document = content.partition(b"\r\n\r\n")
-    if not separator or not _TEXT.match(header):
+    kind, _ = _media_type(header.replace(b"\r\n", b"\n"))
+    if not separator or kind != b"text/plain":
         raise PkiError(
             "its signed part has no MIME header text/plain",
             "DDS vendors accept only documents that are signed with this header "
@@ -178,39 +217,60 @@ def _document(content: bytes) -> bytes:
     return document
 
 
+def _media_type(header: bytes) -> tuple[bytes, dict[bytes, bytes]]:
+    """Return the type in a MIME header, in lower case, and its parameters.
+
+    Return an empty type if the header has none or several, or if any of its lines has a form that
+    programs read in different ways.
+    """
+    fields = [_FIELD.fullmatch(line) for line in _FOLD.sub(b"; ", header).split(b"\n")]
+    named = [found[2] for found in fields if found and found[1].lower() == b"content-type"]
+    kind = _TYPE.fullmatch(named[0]) if len(named) == 1 and all(fields) else None
+    if not kind:
+        return b"", {}
+    pairs = _PARAMETERS.findall(kind[2])
+    parameters = {name.lower(): value.strip(b'"') for name, value in pairs}
+    return (kind[1].lower(), parameters) if len(parameters) == len(pairs) else (b"", {})
+
+
 def _split(message: bytes) -> tuple[bytes | None, bytes]:
     """Return the signed part, with CRLF line ends, and the signature in DER.
 
     The signed part is None for an opaque message, which has it inside the signature.
     """
-    head, _, body = message.replace(b"\r\n", b"\n").partition(b"\n\n")
-    if _OPAQUE.search(head):
+    text = message.replace(b"\r\n", b"\n")
+    if b"\r" in text or b"\0" in text:
+        raise PkiError(
+            "it has a line end, or a zero byte, that programs read in different ways",
+            "The lines of a signed document end with CR and LF, or with LF.",
+        )
+    head, _, body = text.partition(b"\n\n")
+    kind, parameters = _media_type(head)
+    if kind in _OPAQUE:
         return None, _decoded(body)
-    multipart = _MULTIPART.search(head)
-    boundary = _BOUNDARY.search(multipart[1]) if multipart else None
-    if not boundary:
+    boundary = parameters.get(b"boundary", b"")
+    if kind != b"multipart/signed" or not _BOUNDARY.fullmatch(boundary):
         raise PkiError(
             "it is not an S/MIME signed message",
             "A signed document begins with MIME headers of the type multipart/signed; "
             "this may be the unsigned XML.",
         )
-    mark = b"\n--" + (boundary[2] or boundary[3])
-    parts = (b"\n" + body).split(mark)
-    if len(parts) != 4 or not parts[3].startswith(b"--"):
+    mark, lines = b"--" + boundary, body.split(b"\n")
+    # Also inside of lines: OpenSSL reads a long line in pieces, each of which may begin a part.
+    marks = [number for number, line in enumerate(lines) if mark in line]
+    if [lines[number] for number in marks] != [mark, mark, mark + b"--"]:
         raise PkiError("it is not one signed part followed by one signature")
-    content = parts[1].removeprefix(b"\n").replace(b"\n", b"\r\n")
-    header, _, encoded = parts[2].removeprefix(b"\n").partition(b"\n\n")
-    signature = _decoded(encoded)
-    if not _PKCS7.search(header) or not signature:
+    begin, middle, end = marks
+    header, _, encoded = b"\n".join(lines[middle + 1 : end]).partition(b"\n\n")
+    if _media_type(header)[0] not in _SIGNATURE or not encoded:
         raise PkiError("it has no signature")
-    return content, signature
+    return b"\r\n".join(lines[begin + 1 : middle]), _decoded(encoded)
 
 
 def _decoded(encoded: bytes) -> bytes:
-    try:
-        return base64.b64decode(b"".join(encoded.split()), validate=True)
-    except binascii.Error as error:
-        raise PkiError("its signature is not valid base64") from error
+    if not _BASE64.fullmatch(encoded):
+        raise PkiError("its signature is not valid base64")
+    return base64.b64decode(encoded.replace(b"\n", b""), validate=True)
 
 
 @lru_cache(maxsize=16)
@@ -220,76 +280,102 @@ def _certificate(data: bytes) -> x509.Certificate:
 
 
 def _parts(value: der.Value, *tags: int) -> list[der.Value]:
-    """Return the values in a constructed value; raise `ValueError` if their tags do not fit."""
+    """Return the values in a constructed value; raise `ValueError` unless they have the tags."""
     parts = der.children(value.content)
-    if [part.tag for part in parts[: len(tags)]] != list(tags):
+    if tuple(part.tag for part in parts) != tags:
         raise ValueError("not the structure of a CMS signature")
     return parts
+
+
+def _optional(values: list[der.Value], place: int, tag: int) -> list[der.Value]:
+    """Remove the value at a place if it has the tag, and return it in a list."""
+    return [values.pop(place)] if len(values) > place and values[place].tag == tag else []
+
+
+def _algorithm(value: der.Value) -> bytes:
+    """Return the OID of an AlgorithmIdentifier that has no parameters, or NULL as parameters."""
+    oid, *parameters = der.children(value.content)
+    if oid.tag != der.OID or [each.whole for each in parameters] not in ([], [_NULL]):
+        raise ValueError("not a known algorithm")
+    return oid.content
 
 
 def _parse_cms(signature: bytes, content: bytes | None) -> SignedDocument:
     """Parse a ContentInfo with SignedData and one SignerInfo (RFC 5652, 3, 5.1 and 5.3).
 
-    Without ``content``, the signed part is taken from the SignedData.
+    Only DER is read, and only the fields that a signature of one signer needs: of anything else,
+    OpenSSL and sros might think differently.  Without ``content``, the signed part is taken from
+    the SignedData.
     """
-    message = der.first(signature)
-    content_type, wrapped = _parts(message, der.OID, der.CONTEXT_0)[:2]
+    (message,) = der.children(signature)
+    content_type, wrapped = _parts(message, der.OID, der.CONTEXT_0)
     (signed_data,) = _parts(wrapped, der.SEQUENCE)
     if message.tag != der.SEQUENCE or content_type.content != _SIGNED_DATA:
         raise ValueError("not SignedData")
-    fields = _parts(signed_data, der.INTEGER, der.SET, der.SEQUENCE)
-    version, digests, encapsulated = fields[:3]
-    kind, *contained = _parts(encapsulated, der.OID)
-    if version.whole != _VERSION or kind.content != _DATA:
+    fields = der.children(signed_data.content)
+    bags = _optional(fields, 3, der.CONTEXT_0)
+    if [each.tag for each in fields] != [der.INTEGER, der.SET, der.SEQUENCE, der.SET]:
+        raise ValueError("not the fields of SignedData")
+    version, digests, encapsulated, signers = fields
+    kind, *contained = der.children(encapsulated.content)
+    if version.whole != _VERSION or (kind.tag, kind.content) != (der.OID, _DATA):
         raise ValueError("not a signature of data")
+    if (content is None) != bool(contained):
+        raise ValueError("two contents, or none")
     if content is None:
-        (octets,) = _parts(contained[0], der.OCTET_STRING)
+        (wrapped,) = contained
+        (octets,) = _parts(wrapped, der.OCTET_STRING)
+        if wrapped.tag != der.CONTEXT_0:
+            raise ValueError("no content")
         content = octets.content
-    certificates = tuple(
-        _certificate(value.whole)
-        for field in fields[3:]
-        if field.tag == der.CONTEXT_0
-        for value in der.children(field.content)
-        if value.tag == der.SEQUENCE
-    )
-    (signer,) = _parts(fields[-1], der.SEQUENCE)
-    info = _parts(signer, der.INTEGER, der.SEQUENCE, der.SEQUENCE)
-    issuer, serial = _parts(info[1], der.SEQUENCE, der.INTEGER)
-    digest = _parts(info[2], der.OID)[0].content
-    algorithm = _DIGESTS.get(digest)
+    embedded = [value for bag in bags for value in der.children(bag.content)]
+    (signer,) = _parts(signers, der.SEQUENCE)
+    info = der.children(signer.content)
+    attributes = _optional(info, 3, der.CONTEXT_0)
+    if [each.tag for each in info] != [
+        *(der.INTEGER, der.SEQUENCE, der.SEQUENCE, der.SEQUENCE, der.OCTET_STRING)
+    ]:
+        raise ValueError("not the fields of SignerInfo")
+    version, identifier, digest, signature_algorithm, signature_value = info
+    issuer, serial = _parts(identifier, der.SEQUENCE, der.INTEGER)
     (listed,) = _parts(digests, der.SEQUENCE)
-    if _parts(listed, der.OID)[0].content != digest or info[0].whole != _VERSION:
+    algorithm = _DIGESTS.get(_algorithm(digest))
+    if _algorithm(listed) != _algorithm(digest) or version.whole != _VERSION:
         raise ValueError("another digest or version than announced")
-    if algorithm is None or fields[-1].tag != der.SET:
-        raise ValueError("unknown digest, or no signers")
-    attributes, message_digest = b"", b""
-    if info[3].tag == der.CONTEXT_0:
-        # The signature covers the attributes with the tag SET, not with their tag in SignerInfo.
-        attributes = b"\x31" + info[3].whole[1:]
-        message_digest = _message_digest(info[3].content)
-    signature_algorithm, signature_value = info[4:6] if attributes else info[3:5]
-    if (
-        signature_value.tag != der.OCTET_STRING
-        or signature_algorithm.tag != der.SEQUENCE
-        or not _parts(signature_algorithm, der.OID)
-    ):
-        raise ValueError("no signature value")
+    if algorithm is None:
+        raise ValueError("unknown digest")
+    _algorithm(signature_algorithm)
     return SignedDocument(
         content=content,
         document=_document(content),
-        certificates=certificates,
-        digest=algorithm.name,
+        certificates=tuple(_certificate(each.whole) for each in embedded),
+        digest=algorithm.algorithm.name,
         _digest_algorithm=algorithm,
-        _signed_attributes=attributes,
-        _message_digest=message_digest,
+        _signature_algorithm=signature_algorithm,
+        # The signature covers the attributes with the tag SET, not with their tag in SignerInfo.
+        _signed_attributes=b"".join(b"\x31" + each.whole[1:] for each in attributes),
+        _message_digest=b"".join(_message_digest(each.content) for each in attributes),
         _signature=signature_value.content,
-        _issuer_and_serial=(issuer.whole, int.from_bytes(serial.content, "big", signed=True)),
+        _issuer_and_serial=(issuer.whole, der.integer(serial)),
     )
 
 
 def _message_digest(attributes: bytes) -> bytes:
+    """Return the digest in the signed attributes, after checking their form (RFC 5652, 11)."""
+    found: dict[bytes, der.Value] = {}
     for attribute in der.children(attributes):
-        name, values = der.children(attribute.content)
-        if name.content == _MESSAGE_DIGEST:
-            return der.first(values.content).content
-    raise ValueError("no message digest")
+        name, values = _parts(attribute, der.OID, der.SET)
+        (value,) = der.children(values.content)
+        if attribute.tag != der.SEQUENCE or value.tag not in _ATTRIBUTE_VALUES:
+            raise ValueError("not a signed attribute")
+        if not all(_OID.fullmatch(each.content) for each in (name, value) if each.tag == der.OID):
+            raise ValueError("not an object identifier")
+        if name.content in found:
+            raise ValueError("an attribute appears twice")
+        found[name.content] = value
+    kind, digest = found.get(_CONTENT_TYPE), found.get(_MESSAGE_DIGEST)
+    if kind is None or (kind.tag, kind.content) != (der.OID, _DATA):
+        raise ValueError("not a signature of data")
+    if digest is None or digest.tag != der.OCTET_STRING:
+        raise ValueError("no message digest")
+    return digest.content

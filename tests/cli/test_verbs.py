@@ -10,13 +10,18 @@ import stat
 import subprocess
 import sys
 import time
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
 from sros_tool.cli.program import FAMILIES
 from sros_tool.keystore.layout import PRIVATE, REQUIRED_FILES
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import common_name, issue_ca, pem
+from sros_tool.pki.keys import generate_key
 from sros_tool.resources import policies_dir
+from sros_tool.validity import Window
 from tests.support.children import finish, python, run, wait_for
 from tests.support.harness import (
     check_whole,
@@ -365,6 +370,20 @@ def test_inspect_shows_trouble(keystore: Path, tmp_path: Path) -> None:
     assert sros("inspect", keystore / "enclaves/b/permissions.p7s", "--ca", other).status == 1
     shutil.copy(keystore / "enclaves/b/permissions.p7s", tmp_path)
     assert "not verified" in sros("inspect", tmp_path / "permissions.p7s").ok().out
+
+
+@pytest.mark.parametrize("ends", [timedelta(days=1), timedelta(days=-1)])
+def test_inspect_with_a_ca_that_has_expired(
+    ends: timedelta, keystore: Path, tmp_path: Path
+) -> None:
+    now, key = datetime.now(UTC), generate_key()
+    ca = issue_ca(key, common_name("CA"), Window(now - timedelta(days=9), now + ends))
+    document = (keystore / "enclaves/governance.xml").read_bytes()
+    (tmp_path / "ca.pem").write_bytes(pem(ca))
+    (tmp_path / "governance.p7s").write_bytes(smime.sign(document, ca, key))
+    ended = sros("inspect", tmp_path / "governance.p7s", "--ca", tmp_path / "ca.pem")
+    assert ended.status == (0 if ends > timedelta() else 1), ended
+    assert ("CN=CA expired at" in ended.out) is (ends < timedelta())
 
 
 @pytest.mark.parametrize(

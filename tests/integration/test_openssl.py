@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import random
+import re
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -135,6 +137,25 @@ def openssl_verdict(message: bytes, authority: Path, *options: object) -> bytes 
     return ended.stdout if ended.returncode == 0 else None
 
 
+ECDSA_WITH_SHA = bytes.fromhex("2a8648ce3d0403")
+
+
+def algorithm(message: bytes, digest: bytes) -> bytes:
+    """The message, whose SignerInfo names ECDSA with another digest: the last byte of an OID."""
+    encoded = re.search(rb"(?<=\n\n)(?:[A-Za-z0-9+/=]+\r?\n){5,}", message)
+    assert encoded
+    before, oid, after = base64.b64decode(encoded[0]).rpartition(ECDSA_WITH_SHA)
+    return message.replace(encoded[0], base64.encodebytes(before + oid + digest + after[1:]))
+
+
+def ended_early(message: bytes) -> bytes:
+    """The message, with the end boundary also in place of the one before the signature."""
+    mark = re.search(rb"\n------[0-9A-F]+", message)
+    assert mark
+    before, content, signature, _ = message.split(mark[0])
+    return mark[0].join((before, content, b"--" + signature, b"--\n"))
+
+
 Make = Callable[[Path], bytes]
 
 # How a message is made; whether OpenSSL accepts it, and whether sros does.
@@ -167,10 +188,20 @@ MESSAGES: dict[str, tuple[Make, bool, bool]] = {
     ),
     "cut short": (lambda f: signed(f, "-text")[:-200], False, False),
     "garbage": (lambda f: b"MIME-Version: 1.0\n\n" + bytes(range(256)), False, False),
+    "an OID that does not end": (lambda f: algorithm(signed(f, "-text"), b"\x82"), False, False),
+    "two types": (
+        lambda f: signed(f, "-text").replace(
+            b"Content-Type:", b"Content-Type: text/x\nContent-Type:", 1
+        ),
+        False,
+        False,
+    ),
+    "ended before the signature": (lambda f: ended_early(signed(f, "-text")), False, False),
     "without the signer": (lambda f: signed(f, "-text", "-nocerts"), False, False),
     "nothing": (lambda f: b"", False, False),
     # Stricter than OpenSSL, on purpose: the first is the hole of CVE-2023-24011.
     "by an enclave of the authority": (lambda f: signed(f, "-text", signer="leaf"), True, False),
+    "another algorithm": (lambda f: algorithm(signed(f, "-text"), b"\x03"), True, False),
     "opaque": (lambda f: signed(f, "-text", "-nodetach"), True, True),
     "by key identifier": (lambda f: signed(f, "-text", "-keyid", command="cms"), False, False),
     "by two": (

@@ -107,11 +107,36 @@ def test_any_bytes_are_der_or_an_error(data: bytes) -> None:
 
 @pytest.mark.parametrize(
     "data",
-    ["30", "3001", "3080", "3085000000000100", "1f0100", "bf0100", "30820001", "3003020100ff"],
+    [
+        "30",
+        "3001",
+        "3080",
+        "3085000000000100",
+        "1f0100",
+        "bf0100",
+        "30820001",
+        "3003020100ff",
+        "308100",
+        "30810100",
+    ],
 )
 def test_der_that_is_cut_short_or_of_another_form(data: str) -> None:
     with pytest.raises(PkiError):
         der.children(bytes.fromhex(data))
+
+
+@pytest.mark.parametrize(
+    ("content", "number"),
+    [("00", 0), ("7f", 127), ("80", -128), ("0080", 128), ("ff", -1), ("", None), ("0001", None),
+     ("ff80", None)],
+)  # fmt: skip
+def test_numbers_have_one_form(content: str, number: int | None) -> None:
+    value = der.Value(der.INTEGER, bytes.fromhex(content), b"")
+    if number is not None:
+        assert der.integer(value) == number
+        return
+    with pytest.raises(PkiError):
+        der.integer(value)
 
 
 @pytest.mark.parametrize(
