@@ -142,7 +142,7 @@ def test_an_encrypted_key_is_asked_for(tmp_path: Path) -> None:
 
     def secrets(what: str) -> str:
         asked.append(what)
-        return "swordfish"
+        return "swordfish swordfish"
 
     made = sros_tool.create_keystore(
         tmp_path / "ks",

@@ -350,7 +350,7 @@ def keyring(
     """Return a keyring for the CA keys at these URIs.
 
     The defaults are $SROS_IDENTITY_KEY and $SROS_PERMISSIONS_KEY. ``encrypt`` protects new keys
-    with a passphrase.
+    with a passphrase, which may be short with $SROS_SHORT_PASSPHRASE.
     """
     from sros_tool.keystore.authorities.keyring import Keyring
 
@@ -360,6 +360,7 @@ def keyring(
         _Secrets(encrypt),
         {role: _absolute(place) for role, place in places.items() if place},
         encrypt,
+        bool(os.environ.get("SROS_SHORT_PASSPHRASE")),
     )
 
 

@@ -301,7 +301,8 @@ def create_keystore(
     """Create a keystore in the folder ROOT, with the settings of a template.
 
     Passphrases of CA keys come from a prompt, from $SROS_CA_PASSPHRASE or from the file
-    $SROS_CA_PASSPHRASE_FILE; the PIN of a token from a prompt or $SROS_PKCS11_PIN.
+    $SROS_CA_PASSPHRASE_FILE; the PIN of a token from a prompt or $SROS_PKCS11_PIN. A new
+    passphrase has at least 12 characters, unless you set SROS_SHORT_PASSPHRASE=1.
     """
     from sros_tool.dds.domains import DomainSet
     from sros_tool.keystore.lifecycle.create import create_keystore as create

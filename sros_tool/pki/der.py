@@ -1,7 +1,7 @@
-"""A minimal DER (X.690) reader for CMS signatures.
+"""The little of DER (X.690) that `cryptography` leaves to its users.
 
-`cryptography` creates CMS signatures but cannot yet verify them; this reader extracts the parts
-that its verification primitives need.
+`cryptography` creates CMS signatures but cannot yet verify them: the reader extracts the parts that
+its verification primitives need.  The writer is for keys that are encrypted by scrypt.
 """
 
 from __future__ import annotations
@@ -70,6 +70,20 @@ def integer(value: Value) -> int:
     if (number if number >= 0 else ~number).bit_length() // 8 + 1 != len(value.content):
         raise PkiError("a DER number is empty, or longer than it needs to be")
     return number
+
+
+def encode(tag: int, *parts: bytes) -> bytes:
+    """Encode a value, whose content is all ``parts``."""
+    content = b"".join(parts)
+    length = len(content).to_bytes((len(content).bit_length() + 7) // 8 or 1, "big")
+    if len(content) >= 0x80:
+        length = bytes([0x80 | len(length)]) + length
+    return bytes([tag]) + length + content
+
+
+def encode_integer(number: int) -> bytes:
+    """Encode an integer that is not negative."""
+    return encode(INTEGER, number.to_bytes(number.bit_length() // 8 + 1, "big"))
 
 
 def encode_oid(dotted: str) -> bytes:

@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from sros_tool.pki.certificates import load_certificate, pem
 from sros_tool.pki.crl import Revoked, sign_crl
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 
-SECRET = "open sesame"
+SECRET = "open, sesame"
 DAY = timedelta(days=1)
 
 
@@ -45,8 +46,7 @@ class Bench:
     # ── CAs ────────────────────────────────────────────────────────────────────────────────
 
     def key(self, role: str) -> PrivateKey:
-        data = self.path(f"private/{role}_ca.key.pem").read_bytes()
-        return load_key(data, role, lambda: SECRET)
+        return _unlocked(self.path(f"private/{role}_ca.key.pem").read_bytes())
 
     def authority(self, role: str) -> x509.Certificate:
         return load_certificate(self.path(f"public/{role}_ca.cert.pem").read_bytes(), role)
@@ -175,6 +175,11 @@ class Bench:
             (target / "enclaves" / name / "permissions.xml").unlink()
         self.checked = target
         return target
+
+
+@cache
+def _unlocked(data: bytes) -> PrivateKey:
+    return load_key(data, "a CA key", lambda: SECRET)
 
 
 def _changed(text: str, changes: tuple[tuple[str, str], ...]) -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.errors import KeystoreError
+from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
@@ -16,6 +16,7 @@ from sros_tool.keystore.template import load_template
 from tests.support.harness import sros
 
 NOW = datetime.now(UTC)
+RIGHT = "the right passphrase"
 
 
 def answers(secret: str) -> Keyring:
@@ -24,7 +25,7 @@ def answers(secret: str) -> Keyring:
 
 def test_an_encrypted_key_signs_with_its_passphrase_only(tmp_path: Path) -> None:
     root = tmp_path / "ks"
-    create_keystore(root, template=load_template("production"), now=NOW, keyring=answers("right"))
+    create_keystore(root, template=load_template("production"), now=NOW, keyring=answers(RIGHT))
     for key in root.glob("private/*.pem"):
         assert key.read_bytes().startswith(b"-----BEGIN ENCRYPTED PRIVATE KEY-----")
         assert key.stat().st_mode & 0o777 == 0o600
@@ -33,7 +34,7 @@ def test_an_encrypted_key_signs_with_its_passphrase_only(tmp_path: Path) -> None
     with pytest.raises(KeystoreError, match="passphrase of the identity CA key is needed"):
         create_enclaves(root, ["/a"], now=NOW)
     assert list_enclaves(root) == ()
-    create_enclaves(root, ["/a"], now=NOW, keyring=answers("right"))
+    create_enclaves(root, ["/a"], now=NOW, keyring=answers(RIGHT))
     assert list_enclaves(root) == ("/a",)
 
 
@@ -42,7 +43,7 @@ def test_a_passphrase_is_asked_for_once_per_key(tmp_path: Path) -> None:
 
     def handler(what: str) -> str:
         asked.append(what)
-        return "secret"
+        return RIGHT
 
     root = tmp_path / "ks"
     keyring = Keyring(handler, encrypt=True)
@@ -112,12 +113,41 @@ def test_a_single_ca_has_one_key_place(tmp_path: Path) -> None:
 
 def test_the_program_takes_secrets_from_the_environment_or_a_file(tmp_path: Path) -> None:
     root, file = tmp_path / "ks", tmp_path / "passphrase"
-    file.write_text("secret\nsecond line\n")
+    file.write_text(f"{RIGHT}\nsecond line\n")
     none = {"SROS_CA_PASSPHRASE": None, "SROS_CA_PASSPHRASE_FILE": None}
-    by_value = none | {"SROS_CA_PASSPHRASE": "secret"}
+    by_value = none | {"SROS_CA_PASSPHRASE": RIGHT}
     sros("create_keystore", root, "--encrypt-ca-keys", env=by_value).ok()
     refused = sros("create_enclave", root, "/a", env=none)
     assert refused.status == 1
     assert "SROS_CA_PASSPHRASE" in refused.err
     by_file = none | {"SROS_CA_PASSPHRASE_FILE": str(file)}
     sros("create_enclave", root, "/a", env=by_file).ok()
+
+
+@pytest.mark.parametrize(
+    ("secret", "insisted", "accepted"),
+    [
+        ("twelve chars", False, True),
+        ("eleven char", False, False),
+        ("eleven char ", False, False),
+        ("x", False, False),
+        ("x", True, True),
+        ("", False, False),
+    ],
+)
+def test_a_short_passphrase_needs_insisting(
+    secret: str, insisted: bool, accepted: bool, tmp_path: Path
+) -> None:
+    env = {"SROS_CA_PASSPHRASE": secret, "SROS_SHORT_PASSPHRASE": "1" if insisted else None}
+    made = sros("create_keystore", tmp_path / "ks", "--encrypt-ca-keys", env=env)
+    assert (made.status == 0) is accepted, made
+    assert (tmp_path / "ks").exists() is accepted
+    if accepted:
+        sros("create_enclave", tmp_path / "ks", "/a", env=env).ok()
+
+
+def test_an_empty_passphrase_never_leaves_a_key_in_clear(tmp_path: Path) -> None:
+    keyring = Keyring(lambda _: "", encrypt=True, short_passphrase=True)
+    with pytest.raises(UsageError, match="too short"):
+        create_keystore(tmp_path / "ks", template=load_template("sros2"), now=NOW, keyring=keyring)
+    assert list(tmp_path.iterdir()) == []

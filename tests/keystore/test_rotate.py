@@ -313,7 +313,7 @@ def test_from_the_keystore_to_elsewhere(tmp_path: Path) -> None:
 
 def test_an_encrypted_key_has_an_encrypted_successor(tmp_path: Path) -> None:
     root = tmp_path / "ks"
-    locked = Keyring(secrets=lambda what: "secret", encrypt=True)
+    locked = Keyring(secrets=lambda what: "open, sesame", encrypt=True)
     create_keystore(root, template=load_template("development"), now=NOW, keyring=locked)
     opened = replace(locked, encrypt=False)
     create_enclaves(root, NAMES, now=NOW, keyring=opened)

@@ -21,6 +21,8 @@ from sros_tool.pki.token import create_token_key, holds_token_key, open_token_ke
 from sros_tool.pki.token_uri import is_token_uri, parse_token_uri, refuse_pin
 from sros_tool.xml import read_bytes
 
+_SHORTEST_PASSPHRASE = 12  # characters; OWASP ASVS 4.0.3, 2.1.1
+
 _LOG = logging.getLogger(__name__)
 
 Secrets = Callable[[str], str]
@@ -43,12 +45,14 @@ class Keyring:
     ``places`` maps a role ("identity", "permissions") to the URI of its key, ``file:PATH`` or
     ``pkcs11:...``, as the user named it.  For a role without an entry, the keystore's settings name
     the place.
-    ``secrets`` returns passphrases and PINs.  With ``encrypt``, new key files get a passphrase.
+    ``secrets`` returns passphrases and PINs.  With ``encrypt``, new key files get a passphrase,
+    which may be short only with ``short_passphrase``.
     """
 
     secrets: Secrets = no_secrets
     places: dict[str, str] = field(default_factory=dict)
     encrypt: bool = False
+    short_passphrase: bool = False
 
     def __post_init__(self) -> None:
         """Raise `UsageError` for a place that is not a valid URI, before it is written anywhere."""
@@ -118,7 +122,7 @@ class Keyring:
         if place and _path(place, transaction.root).exists():
             return self.open(transaction.root, role, template)
         key = generate_key()
-        pem = key_pem(key, self._passphrase(role)() if self.encrypt else None)
+        pem = key_pem(key, self._new_passphrase(role) if self.encrypt else None)
         if not place:
             transaction.write(file, pem, private=True)
         elif not transaction.dry_run:
@@ -136,6 +140,19 @@ class Keyring:
     def _is_named(self, role: str) -> bool:
         """Return whether the user named the place, not a file that may come from others."""
         return bool(self.places.get(role))
+
+    def _new_passphrase(self, role: str) -> str:
+        passphrase = self._passphrase(role)()
+        length = len(passphrase.strip())
+        if length < (1 if self.short_passphrase else _SHORTEST_PASSPHRASE):
+            raise UsageError(
+                f"the passphrase of the new {role} CA key is too short",
+                f"It has {length} characters. Whoever copies the key can try passphrases without "
+                "limit, and short ones are found.",
+                f"Choose one of at least {_SHORTEST_PASSPHRASE} characters, or insist with "
+                "SROS_SHORT_PASSPHRASE=1.",
+            )
+        return passphrase
 
     def _passphrase(self, role: str) -> Callable[[], str]:
         return lambda: self.secrets(f"the passphrase of the {role} CA key")

@@ -1,0 +1,78 @@
+"""Encrypted keys, written so that guessing is slow, and read in every form that OpenSSL writes."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+import pytest
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import rsa
+
+from sros_tool.errors import PkiError
+from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
+
+PASSPHRASE = "Öffne dich, Sesam"
+KEYS: dict[str, PrivateKey] = {"EC": generate_key(), "RSA": rsa.generate_private_key(65537, 2048)}
+
+
+def openssl(*words: object, data: bytes = b"", accept: bool = True) -> bytes:
+    ended = subprocess.run(["openssl", *map(str, words)], input=data, capture_output=True)
+    assert (ended.returncode == 0) is accept, ended.stderr
+    return ended.stdout
+
+
+def plain(key: PrivateKey) -> bytes:
+    return key.private_bytes(
+        serialization.Encoding.DER,
+        serialization.PrivateFormat.PKCS8,
+        serialization.NoEncryption(),
+    )
+
+
+@pytest.mark.parametrize("key", KEYS.values(), ids=KEYS)
+def test_openssl_reads_an_encrypted_key(key: PrivateKey, tmp_path: Path) -> None:
+    pem = key_pem(key, PASSPHRASE)
+    right, wrong = (("-passin", f"pass:{word}") for word in (PASSPHRASE, "another"))
+    read = openssl("pkcs8", "-topk8", "-nocrypt", "-outform", "DER", *right, data=pem)
+    assert read == plain(key)
+    openssl("pkey", "-noout", *wrong, data=pem, accept=False)
+    said = openssl("asn1parse", data=pem).decode()
+    # scrypt with N = 2^14, r = 8, p = 5, and AES-256
+    for part in (":scrypt\n", "INTEGER           :4000\n", ":05\n", ":aes-256-cbc\n"):
+        assert part in said
+    assert max(map(len, pem.splitlines())) == 64
+
+
+def test_sros_reads_it_with_its_passphrase_alone() -> None:
+    key = KEYS["EC"]
+    pem = key_pem(key, PASSPHRASE)
+    assert plain(load_key(pem, "k", lambda: PASSPHRASE)) == plain(key)
+    with pytest.raises(PkiError, match="passphrase is wrong"):
+        load_key(pem, "k", lambda: "another")
+    assert key_pem(key, PASSPHRASE) != pem  # salt and initialization vector are drawn
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "pkcs8 -topk8 -v2 aes-256-cbc -iter 2048",
+        "pkcs8 -topk8 -v2 aes-128-cbc -v2prf hmacWithSHA1",
+        "pkcs8 -topk8 -scrypt",
+        "ec -aes256",
+        "pkey -aes256",
+    ],
+)
+def test_keys_that_others_encrypted_are_read(words: str) -> None:
+    key = KEYS["EC"]
+    pem = openssl(*words.split(), "-passout", f"pass:{PASSPHRASE}", data=key_pem(key))
+    assert b"ENCRYPTED" in pem
+    assert plain(load_key(pem, "k", lambda: PASSPHRASE)) == plain(key)
+
+
+def test_keys_that_earlier_versions_encrypted_are_read() -> None:
+    key = KEYS["EC"]
+    before = serialization.BestAvailableEncryption(PASSPHRASE.encode())
+    form = serialization.PrivateFormat.PKCS8
+    pem = key.private_bytes(serialization.Encoding.PEM, form, before)
+    assert plain(load_key(pem, "k", lambda: PASSPHRASE)) == plain(key)
