@@ -18,6 +18,7 @@ from sros_tool.cli.common import (
     json_option,
     now,
     print_json,
+    visible,
 )
 from sros_tool.errors import UsageError
 
@@ -52,7 +53,9 @@ Example:
   $ sros demo --scenario all
 
 Exit status: 0 if every row is as expected or was skipped for a stated reason, else 1.
-A row marked "open" shows an attack that is known to succeed, and counts as expected.""",
+A row marked "open" shows an attack that is known to succeed, and counts as expected. OPEN
+marks an attack that succeeds because of your own keystore (--keystore), and would fail with
+the template production: the exit status is 1 unless --accept-open names the row.""",
 )
 @click.option(
     "--backend",
@@ -81,6 +84,12 @@ A row marked "open" shows an attack that is known to succeed, and counts as expe
     type=PATH,
     metavar="ROOT",
     help="Attack a copy of this keystore (with --scenario attacks); it is only read.",
+)
+@click.option(
+    "--accept-open",
+    multiple=True,
+    metavar="ROW",
+    help="Accept that this attack succeeds in the keystore; can be repeated.",
 )
 @click.option("--topic", help="ROS topic of talkers and listeners.  [default: /chatter]")
 @click.option(
@@ -135,6 +144,7 @@ def demo(
     list_them: bool,
     only: tuple[str, ...],
     keystore: Path | None,
+    accept_open: tuple[str, ...],
     topic: str | None,
     domain: int,
     template: str,
@@ -166,6 +176,7 @@ def demo(
         scenarios=choose_scenarios(scenarios),
         only=only,
         keystore=keystore,
+        accept_open=accept_open,
         template=load_template(template) if template else None,
         backend=backend,
         topic=topic,
@@ -199,7 +210,7 @@ def demo(
     if as_json:
         print_json(result.as_json())
     else:
-        click.echo(demo_table(result))
+        click.echo(visible(demo_table(result)))
     if not result.as_expected:
         sys.exit(1)
 
@@ -225,4 +236,4 @@ def _write_report(report: Path, result: dict[str, Any], keep: Path | None) -> No
 
 def _progress(line: str) -> None:
     if sys.stderr.isatty():
-        click.echo(line, err=True)
+        click.echo(visible(line), err=True)

@@ -46,7 +46,8 @@ class DemoOptions:
 
     ``keystore`` is a keystore of the user, a copy of which is attacked.  The default ``template``
     is the template of that keystore, or production; the default ``topic`` is one that the cast may
-    use.  ``only`` selects the rows whose names contain one of its words.
+    use.  ``only`` selects the rows whose names contain one of its words.  ``accept_open`` names the
+    rows of attacks that may succeed because of the user's keystore.
     """
 
     template: Template | None = None
@@ -58,6 +59,7 @@ class DemoOptions:
     scenarios: tuple[Scenario, ...] = (ISOLATION,)
     keystore: Path | None = None
     only: tuple[str, ...] = ()
+    accept_open: tuple[str, ...] = ()
     limits: Limits = field(default_factory=Limits)
     effort: Effort = field(default_factory=Effort)
 
@@ -70,6 +72,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
         UnavailableError: no DDS enforces security here.
         SrosError: a keystore could not be made.
     """
+    _check_accepted(options)
     user = _user_keystore(options)
     template = options.template or (user.template if user else load_template(_DEFAULT_TEMPLATE))
     topic = options.topic
@@ -87,10 +90,13 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
                 user.domains if user else DomainSet.of((row_domains[0], row_domains[-1]))
             )
             spec = KeystoreSpec(topic, keystore_domains, template, now)
-            rows = tuple(
-                row.under(conditions(backend, template, _dds_topic(row, topic)))
-                for row in scenario.rows
-            )
+            rows = tuple(_expected(row, backend, template, topic) for row in scenario.rows)
+            if user:
+                strong = load_template(_DEFAULT_TEMPLATE)
+                rows = tuple(
+                    _gated(row, _expected(same, backend, strong, topic), options)
+                    for row, same in zip(rows, scenario.rows, strict=True)
+                )
             scenario = replace(scenario, rows=rows)
             keystores = create_keystores(scenario_folder, scenario, spec, user)
             progress(
@@ -123,6 +129,37 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             text = json.dumps(result.as_json(), indent=2) + "\n"
             (folder / "result.json").write_text(text, encoding="utf-8")
     return result
+
+
+def _expected(row: Row, backend: Backend, template: Template, topic: str) -> Row:
+    """Return the row with the status that is expected of a keystore from a template."""
+    return row.under(conditions(backend, template, _dds_topic(row, topic)))
+
+
+def _gated(row: Row, strong: Row, options: DemoOptions) -> Row:
+    """Mark a row as unaccepted if it is open, and ``strong``, with the default template, is not."""
+    opened = bool(row.open_because) and not strong.open_because
+    return replace(row, unaccepted=opened and row.name not in options.accept_open)
+
+
+def _check_accepted(options: DemoOptions) -> None:
+    """Check the names of the rows that may be open.
+
+    Raises:
+        UsageError: there is no keystore of the user, or no row with such a name.
+    """
+    if options.accept_open and options.keystore is None:
+        raise UsageError(
+            "--accept-open is given without --keystore",
+            "Only what a keystore of yours opens needs to be accepted.",
+            "Leave it out, or name the keystore.",
+        )
+    rows = {row.name for scenario in options.scenarios for row in scenario.rows}
+    for name in options.accept_open:
+        if name not in rows:
+            raise UsageError(
+                f"no row is named {name!r}", "", "Take the whole name from the demo's table."
+            )
 
 
 def _find_backend(wish: str, folder: Path, topic: str, now: datetime) -> Backend:

@@ -63,7 +63,7 @@ def _scenario(scenario: ScenarioResult) -> list[str]:
             _line(_mark(row), (row.name, row.expected, row.observed), widths),
             f"{_INDENT}{row.detail}",
         ]
-        if row.known_open:
+        if row.known_open or row.open_here:
             lines.append(f"{_INDENT}{row.open_because}; to do: {row.remedy}")
     return lines if scenario.cost is None else [*lines, "", *cost_table(scenario.cost)]
 
@@ -76,12 +76,15 @@ def _line(mark: str, cells: Sequence[str], widths: Sequence[int]) -> str:
 def _mark(row: RowResult) -> str:
     if row.observed is RowStatus.SKIPPED:
         return "skip"
+    if row.open_here:
+        return "OPEN"
     if row.known_open:
         return "open"
     return "ok" if row.as_expected else "FAIL"
 
 
 def _summary(rows: Sequence[RowResult]) -> str:
+    opened = sum(1 for row in rows if row.open_here)
     wrong = sum(1 for row in rows if not row.as_expected)
     skipped = sum(1 for row in rows if row.observed is RowStatus.SKIPPED)
     known = sum(1 for row in rows if row.known_open)
@@ -91,8 +94,10 @@ def _summary(rows: Sequence[RowResult]) -> str:
         parts.append(f"{known} of them known to be open")
     if skipped:
         parts.append(f"{skipped} skipped")
-    if wrong:
-        parts.append(f"{wrong} not as expected")
+    if opened:
+        parts.append(f"{opened} open in this keystore (accept each with --accept-open NAME)")
+    if wrong > opened:
+        parts.append(f"{wrong - opened} not as expected")
     return ", ".join(parts) + "."
 
 
@@ -113,7 +118,9 @@ def summary_page(result: DemoResult, now: datetime) -> str:
     if wrong:
         lines += ["## Not as expected", ""]
         lines += [
-            f"- **{row.name}**: expected {row.expected}, observed {row.observed}. {row.detail}"
+            f"- **{row.name}**: open in this keystore: {row.open_because}; to do: {row.remedy}."
+            if row.open_here
+            else f"- **{row.name}**: expected {row.expected}, observed {row.observed}. {row.detail}"
             for row in wrong
         ]
         lines.append("")

@@ -82,16 +82,22 @@ class RowResult:
     removed: str = ""
     open_because: str = ""
     remedy: str = ""
+    unaccepted: bool = False
 
     @property
     def as_expected(self) -> bool:
-        """Whether the observed status is the expected one, or the row was skipped."""
-        return self.observed in (self.expected, RowStatus.SKIPPED)
+        """Whether the row was skipped, or has the expected status and is not `open_here`."""
+        return self.observed in (self.expected, RowStatus.SKIPPED) and not self.open_here
 
     @property
     def known_open(self) -> bool:
-        """Whether the row shows an attack that is known to succeed."""
-        return bool(self.open_because) and self.observed is self.expected
+        """Whether the row shows an attack that is known to succeed, or accepted by the user."""
+        return bool(self.open_because) and self.observed is self.expected and not self.open_here
+
+    @property
+    def open_here(self) -> bool:
+        """Whether the attack succeeds because of the user's keystore, and was not accepted."""
+        return self.unaccepted and self.observed is self.expected
 
     def as_json(self) -> dict[str, Any]:
         """Return the row as `sros demo --json` shows it."""
@@ -108,6 +114,7 @@ class RowResult:
             "defence_removed": self.removed,
             "open_because": self.open_because,
             "remedy": self.remedy,
+            "open_here": self.open_here,
         }
 
 
@@ -136,6 +143,7 @@ def judge_row(record: RowRecord) -> RowResult:
         row.removed,
         row.open_because,
         row.remedy,
+        row.unaccepted,
     )
 
 

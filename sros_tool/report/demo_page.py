@@ -46,7 +46,8 @@ def _head(result: Json) -> str:
     rows = result["rows"]
     good = sum(bool(row["as_expected"]) for row in rows)
     skipped = sum(row["observed"] == _SKIPPED for row in rows)
-    opened = sum(bool(row.get("open_because")) for row in rows)
+    opened = sum(bool(row.get("open_because")) and not row.get("open_here") for row in rows)
+    here = sum(bool(row.get("open_here")) for row in rows)
     where = (
         "in a separate network namespace"
         if result["own_network"]
@@ -62,6 +63,7 @@ def _head(result: Json) -> str:
         ("good" if good == len(rows) else "error", f"{good} of {len(rows)}", "rows as expected"),
         ("", str(sum(bool(row.get("defence_removed")) for row in rows)), "with a defence removed"),
         ("warning" if opened else "", str(opened), "known to be open"),
+        ("error", str(here), "open in this keystore"),
         ("", str(skipped), "skipped"),
     ]
     shown = "".join(
@@ -117,14 +119,15 @@ def _row(row: Json) -> Iterator[str]:
     elif row["as_expected"]:
         mark = '<span class="chip good">ok</span>'
     else:
-        mark = '<span class="chip error">differs</span>'
+        mark = f'<span class="chip error">{"open" if row.get("open_here") else "differs"}</span>'
     tried = escape(row["name"])
     if removed := row.get("defence_removed"):
         tried += f' <span class="chip">without {escape(removed)}</span>'
     mechanism = escape(row["mechanism"])
     if because := row.get("open_because"):
+        opened = "open in this keystore" if row.get("open_here") else "known to be open"
         mechanism += (
-            f'<p><span class="chip warning">known to be open</span> {_sentence(because)} '
+            f'<p><span class="chip warning">{opened}</span> {_sentence(because)} '
             f"{_sentence(row.get('remedy', ''))}</p>"
         )
     seconds = f" ({row['seconds']:g} s)" if row.get("seconds") else ""

@@ -196,6 +196,11 @@ def test_rows_that_nobody_has_are_refused() -> None:
         (("--plot", "x.svg"), "nothing to plot"),
         (("--keystore", "x"), "isolation cannot run in a keystore of yours"),
         (("--topic", ""), "not a topic name"),
+        (("--accept-open", "x"), "--accept-open is given without --keystore"),
+        (
+            ("--scenario", "attacks", "--keystore", "x", "--accept-open", "wire"),
+            "no row is named 'wire'",
+        ),
     ],
 )
 def test_wrong_usage_is_told_before_anything_runs(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from datetime import UTC, datetime
 from xml.etree import ElementTree
 
@@ -13,6 +14,7 @@ from sros_tool.demo.scenarios.model import RowStatus
 from sros_tool.demo.show import cost_table, demo_table, payload_text, summary_page
 from sros_tool.demo.verdict import RowResult
 from sros_tool.report import cost_plot
+from sros_tool.report.demo_page import render_demo_page
 from sros_tool.runtime.netns import Isolation
 
 NOW = datetime(2026, 1, 2, 3, 4, 5, tzinfo=UTC)
@@ -87,6 +89,20 @@ def test_a_known_open_door_is_named_and_no_failure() -> None:
     assert "open  put back" in text
     assert "nothing revokes it; to do: renew" in text
     assert text.endswith("3 of 3 rows as expected, 1 of them known to be open.")
+
+
+def test_a_door_that_only_this_keystore_opens_is_a_failure_until_it_is_accepted() -> None:
+    shown = result(replace(OPEN, unaccepted=True), CLOSED)
+    text = demo_table(shown)
+    assert not shown.as_expected
+    assert "OPEN  put back" in text and "nothing revokes it; to do: renew" in text
+    assert "1 of 2 rows as expected, 1 open in this keystore (accept each with" in text
+    assert [row["open_here"] for row in shown.as_json()["rows"]] == [True, False]
+    assert "- **put back**: open in this keystore: nothing" in summary_page(shown, NOW)
+    page = render_demo_page(shown.as_json())
+    assert "<b>1</b> open in this keystore" in page and "known to be open" not in page
+    skipped = replace(OPEN, unaccepted=True, observed=RowStatus.SKIPPED)
+    assert result(skipped).as_expected
 
 
 def test_a_door_that_is_open_and_should_not_be_is_a_failure() -> None:

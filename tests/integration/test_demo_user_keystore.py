@@ -102,10 +102,12 @@ def test_a_row_that_nobody_in_the_keystore_can_show_is_skipped(tmp_path: Path) -
     assert opened["observed"] == "heard"
 
 
-def make_keystore(folder: Path, rights: dict[str, str]) -> Path:
+def make_keystore(
+    folder: Path, rights: dict[str, str], template: str | Path = "production"
+) -> Path:
     root = folder / "ks"
     (folder / "policy.xml").write_text(policy_text(rights))
-    sros("create_keystore", root, "--template", "production").ok()
+    sros("create_keystore", root, "--template", template).ok()
     sros("generate_artifacts", "-k", root, "-p", folder / "policy.xml").ok()
     return root
 
@@ -130,6 +132,49 @@ def test_a_robot_without_the_keys_of_its_authorities(robot: Path) -> None:
     assert skipped["observed"] == "skipped"
     assert "the key of the" in skipped["detail"]
     assert all(row["as_expected"] for row in rows.values())
+
+
+OFF = """description = "nothing is protected"
+[authorities]
+layout = "separate"
+validity = "1y"
+[certificates]
+validity = "1y"
+[permissions]
+validity = "1y"
+default = "node_basics"
+[protection]
+rtps = "NONE"
+discovery = "NONE"
+liveliness = "NONE"
+allow_unauthenticated_participants = true
+join_access_control = false
+[protection.default]
+data = "NONE"
+metadata = "NONE"
+read_access_control = false
+write_access_control = false
+discovery = false
+liveliness = false
+"""
+
+
+@needs_isolation
+def test_what_a_keystore_opens_by_itself_fails_until_it_is_accepted_by_name(
+    tmp_path: Path,
+) -> None:
+    rights = {"/a": publish("/image"), "/b": HEARS, "/c": publish("/x")}
+    (tmp_path / "off.toml").write_text(OFF)
+    weak = make_keystore(tmp_path, rights, tmp_path / "off.toml")
+    wire, spy = "payload read on the wire", "an unsecured node listens"
+    words = ("--only", wire, "--only", spy, "--only", "topic names read")
+    attack = ("demo", "--backend", "cyclone", "--scenario", "attacks", *words, "--keystore")
+
+    ended = sros(*attack, weak, "--accept-open", wire)
+    assert ended.status == 1, ended
+    assert f"open  {wire} " in ended.out and f"OPEN  {spy} " in ended.out
+    assert "open  topic names read in the handshake" in ended.out
+    sros(*attack, weak, "--accept-open", wire, "--accept-open", spy).ok()
 
 
 SCENARIO = """policy = "robot.xml"

@@ -229,7 +229,7 @@ class Row:
     as soon as it is decided.  The first of ``variants`` whose conditions hold replaces the expected
     status.  ``attack`` names the attack to which the row belongs; with ``removed`` it shows that
     attack without the defence that ``removed`` names.  ``open_because`` and ``remedy`` are as in
-    `Variant`.
+    `Variant`; ``unaccepted`` says that the user's keystore opens it, and the user accepts that not.
     """
 
     name: str
@@ -247,6 +247,7 @@ class Row:
     removed: str = ""
     open_because: str = ""
     remedy: str = ""
+    unaccepted: bool = False
 
     @property
     def tapped(self) -> bool:
