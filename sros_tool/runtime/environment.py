@@ -12,7 +12,7 @@ import json
 import re
 import shlex
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
@@ -82,19 +82,20 @@ def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
 def render_environment(variables: Mapping[str, str], form: str) -> str:
     """Return the variables as text in a form: sh, fish, json, systemd or docker.
 
-    ``docker`` is an env-file, ``systemd`` the lines of a unit; neither may contain a line break.
+    ``docker`` is an env-file, ``systemd`` the lines of a unit.
 
     Raises:
-        UsageError: A value has a line break, which the form does not allow.
+        UsageError: The form cannot express a value so that everything that reads it finds the same.
     """
+    for name, value in variables.items():
+        if form in _UNREADABLE and _UNREADABLE[form](value):
+            raise UsageError(
+                f"{name} cannot be written in the form {form}: {value!r}",
+                "What reads that form would find another value, or more than a value.",
+                "Move the keystore to a path of letters, digits and /._- only, or use `sros run`.",
+            )
     if form == "json":
         return json.dumps(dict(variables), indent=2) + "\n"
-    if form in ("docker", "systemd") and any("\n" in value for value in variables.values()):
-        raise UsageError(
-            f"the form {form} does not allow a path with a line break",
-            "",
-            "Use the form sh, fish or json, or move the keystore.",
-        )
     return "".join(_LINES[form](name, value) for name, value in variables.items())
 
 
@@ -118,7 +119,29 @@ def _docker(name: str, value: str) -> str:
 
 
 _LINES = {"sh": _sh, "fish": _fish, "systemd": _systemd, "docker": _docker}
-_FORMS = ("sh", "fish", "json", "systemd", "docker")
+
+
+def _is_not_unicode(value: str) -> bool:
+    return any("\ud800" <= each <= "\udfff" for each in value)
+
+
+def _is_not_printable(value: str) -> bool:
+    # systemd also ends a line at a carriage return (read_line in fileio.c), and ignores a line
+    # that is not UTF-8.
+    return not value.isprintable()
+
+
+def _is_interpreted(value: str) -> bool:
+    # `docker run` takes a value as it is; Compose replaces variables, and cuts comments and spaces.
+    return not value.isprintable() or "$" in value or " #" in value or value != value.strip()
+
+
+_UNREADABLE: dict[str, Callable[[str], bool]] = {
+    "json": _is_not_unicode,
+    "systemd": _is_not_printable,
+    "docker": _is_interpreted,
+}
+"""Whether a form cannot express a value; sh and fish quote every value."""
 
 # ── the command line of a node ─────────────────────────────────────────────────────────────
 

@@ -1,13 +1,23 @@
-"""Only what is known to start a ROS node gets the enclave on its command line."""
+"""Variables in every form, and the command lines that get the enclave.
+
+Only what is known to start a ROS node gets the enclave on its command line.
+"""
 
 from __future__ import annotations
 
+import json
+import os
+import re
+import shutil
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from sros_tool.runtime.environment import with_enclave
+from sros_tool.errors import UsageError
+from sros_tool.runtime.environment import render_environment, with_enclave
+from tests.support.children import run
 
 ADDED = ("--ros-args", "--enclave", "/arm")
 
@@ -69,3 +79,74 @@ def test_anything_else_stays_as_it_is(command: str, prefix: Path) -> None:
 def test_the_program_under_test_is_no_node() -> None:
     words = (sys.executable, "-m", "sros_tool")
     assert with_enclave(words, "/arm") == words
+
+
+PATHS = {
+    "plain": "/srv/ks",
+    "spaces": "/srv/two  words",
+    "quotes": """/srv/it's "so\"""",
+    "percent": "/srv/%h %% %n",
+    "dollar": "/srv/$HOME ${HOME} $(id) `id`",
+    "backslash": "/srv/a\\nb\\\\",
+    "comment": "/srv/a #b;c",
+    "umlaut": "/srv/ä",
+    "newline": "/srv/a\nROS_SECURITY_ENABLE=false",
+    "carriage return": "/srv/a\rEnvironment=ROS_SECURITY_ENABLE=false\r",
+    "escape": "/srv/a\x1b[2J\x7f\x0b\x85",
+    "line separator": "/srv/a\u2028b",
+    "ends with a space": "/srv/a ",
+    "not UTF-8": "/srv/a\udcff",
+}
+CONTROLS = {"newline", "carriage return", "escape", "line separator", "not UTF-8"}
+INTERPRETED = {"dollar", "comment", "ends with a space"}
+
+
+def test_a_shell_reads_every_path() -> None:
+    for name, path in PATHS.items():
+        text = render_environment({"A": path, "B": "end"}, "sh")
+        script = 'eval "$1"; printf %s "$A|$B"'
+        for shell in filter(shutil.which, ("dash", "bash", "zsh")):
+            words = map(os.fsencode, (shell, "-c", script, shell, text))
+            done = subprocess.run(list(words), capture_output=True, check=True)
+            assert done.stdout == os.fsencode(f"{path}|end"), (name, shell)
+
+
+@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="there is no systemd")
+def test_systemd_reads_what_it_gets(tmp_path: Path) -> None:
+    unit = tmp_path / "node.service"
+    places = {f"A{number}": name for number, name in enumerate(PATHS) if name not in CONTROLS}
+    text = "".join(
+        render_environment({key: PATHS[name]}, "systemd") for key, name in places.items()
+    )
+    bare = 'Environment="BARE=/srv/a\rInjected=yes"\n'  # what the control characters would do
+    unit.write_text(f"[Service]\nType=oneshot\nExecStart=/bin/true\n{text}{bare}")
+    env = {**os.environ, "SYSTEMD_LOG_LEVEL": "debug", "LC_ALL": "C.UTF-8"}
+    done = run(["systemd-analyze", "verify", "--man=no", unit], status=None, env=env)
+    said = done.stdout + done.stderr
+    found = dict(re.findall(r"\tEnvironment: (A\d+)=(.*)", said))
+    assert found == {key: PATHS[name] for key, name in places.items()}
+    assert "Unknown key 'Injected'" in said
+
+
+def test_docker_reads_what_it_gets() -> None:
+    for name in PATHS.keys() - CONTROLS - INTERPRETED:
+        assert render_environment({"A": PATHS[name]}, "docker") == f"A={PATHS[name]}\n"
+
+
+def test_a_program_reads_what_it_gets() -> None:
+    for name in PATHS.keys() - {"not UTF-8"}:
+        assert json.loads(render_environment({"A": PATHS[name]}, "json")) == {"A": PATHS[name]}
+
+
+@pytest.mark.parametrize(
+    ("form", "names"),
+    [
+        ("json", {"not UTF-8"}),
+        ("systemd", CONTROLS),
+        ("docker", CONTROLS | INTERPRETED),
+    ],
+)
+def test_a_form_that_cannot_hold_a_path_refuses_it(form: str, names: set[str]) -> None:
+    for name in names:
+        with pytest.raises(UsageError):
+            render_environment({"A": PATHS[name], "B": "end"}, form)
