@@ -51,6 +51,7 @@ _EXPRESSION = re.compile(
     r"(?:~(?=/|\Z))?(?:[A-Za-z0-9_/*?]|\[!?[A-Za-z0-9_/]+(?:-[A-Za-z0-9_]+)*\])*\Z"
 )
 _RANGE = re.compile(r"(.)-(.)")
+_MAX_EXPRESSION = 2000  # characters; the names that an expression can match have at most 255
 
 
 def check_enclave_name(name: str) -> str:
@@ -104,6 +105,8 @@ def expression_problem(text: str) -> str:
     Relative, private (``~``, ``~/x``) and absolute ROS names are valid, with the wildcards ``*``,
     ``?``, ``[abc]``, ``[a-c]`` and ``[!a-c]``, which all DDS vendors interpret alike.
     """
+    if len(text) > _MAX_EXPRESSION:
+        return f"It has {len(text)} characters, more than {_MAX_EXPRESSION}."
     if _PLAIN.match(text):
         return ""
     if not text:

@@ -17,6 +17,8 @@ _LOG = logging.getLogger(__name__)
 
 _MAX_BYTES = 16 * 1024 * 1024
 """Largest document that is read, in bytes."""
+_MAX_MARKUP = 400_000
+"""Most tags and attributes that are read: even a short one takes libxml2 over 100 bytes."""
 
 
 @cache
@@ -70,11 +72,15 @@ def parse(data: bytes, name: str) -> etree._Element:
     ``name`` names the document in errors.
 
     Raises:
-        DocumentError: the document is not well-formed, or has a document type declaration
-            (entities could read other files).
+        DocumentError: the document is not well-formed, too large, or has a document type
+            declaration (entities could read other files).
     """
     if not data.strip():
         raise DocumentError(f"{name} is empty", "An XML document was expected.")
+    if data.count(b"<") + (data.count(b'"') + data.count(b"'")) // 2 > _MAX_MARKUP:
+        raise DocumentError(
+            f"{name} is too large", f"It has more than {_MAX_MARKUP} tags and attributes."
+        )
     try:
         root = etree.fromstring(data, _parser())
     except (etree.XMLSyntaxError, ValueError) as error:

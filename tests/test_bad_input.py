@@ -128,6 +128,7 @@ def _include(attributes: str, content: str = "") -> str:
     return with_includes(_groups(f"<xi:include {attributes}>{content}</xi:include>"))
 
 
+_PARTS = 'xpointer="xpointer(/profile/*)"'
 _LAUGHS = "".join(
     f'<!ENTITY l{n} "{f"&l{n - 1};" * 10}">' if n else '<!ENTITY l0 "ha">' for n in range(10)
 )
@@ -249,8 +250,30 @@ POLICIES: dict[str, tuple[str, str]] = {
     "include of links in a circle": (_include('href="circle"'), "does not exist"),
     "include of a long name": (_include(f'href="{"x" * 300}"'), ""),
     "include of text": (_include('href="part.xml" parse="text"'), "plain text"),
-    "include of itself": (_include('xpointer="xpointer(//xi:include)"'), "is not valid"),
+    "include of itself": (
+        _include('xpointer="xpointer(/policy/enclaves/enclave/profiles/profile/*)"'),
+        "back to itself",
+    ),
     "include of its root": (_include('href=""'), "<policy>"),
+    "include below xml:base": (_include('href="part.xml" xml:base="x/"'), "is below an xml:base"),
+    "include of an xml:base": (
+        _include(f'href="base.xml" {_PARTS}'),
+        "base.xml:1: the include of 'part.xml'",
+    ),
+    "include from a link": (_include(f'href="inner.xml" {_PARTS}'), "included by a link"),
+    "include up and down": (_include('href="x/../part.xml"'), "Write the shortest path"),
+    "include of a fragment": (_include('href="part.xml#x"'), "is not a plain path"),
+    "include of a long path": (_include(f'href="{"a/" * 1_000_000}"'), "is not a valid path"),
+    "include with more in it": (
+        _include('href="part.xml"', "<xi:fallback/><xi:fallback/>"),
+        "only one <fallback>",
+    ),
+    "includes of one file": (
+        with_includes(_groups(f'<xi:include href="many.xml" {_PARTS}/>' * 30)),
+        "too large",
+    ),
+    "a name without end": (_topic("a/" * 1_000_000 + "a"), "has 2000001 characters"),
+    "many elements": (GOOD.replace("<topics", "<a/>" * 400_000 + "<topics"), "too large"),
     "include in a circle": (
         _include('href="round.xml" xpointer="xpointer(/profile/*)"'),
         "back to itself",
@@ -275,6 +298,9 @@ POLICIES: dict[str, tuple[str, str]] = {
             "xpointer(/nothing)",
             "xpointer(document('/etc/passwd'))",
             "xpointer(unknown())",
+            "xpointer(//topics)",
+            "xpointer(/profile/*[count(//*[count(//*[count(//*)>1])>1])>1])",
+            "xpointer(/profile/*" + "/*" * 1_000_000 + ")",
             "xpointer($x)",
             "xpointer(x:y)",
         )
@@ -296,6 +322,13 @@ def includes(tmp_path: Path) -> Path:
         '<profile xmlns:xi="http://www.w3.org/2001/XInclude">'
         '<xi:include href="round.xml" xpointer="xpointer(/profile/*)"/></profile>'
     )
+    (folder / "base.xml").write_text(
+        '<profile xmlns:xi="http://www.w3.org/2001/XInclude" xml:base="x/">'
+        '<xi:include href="part.xml"/></profile>'
+    )
+    (folder / "inner.xml").symlink_to("round.xml")
+    many = "".join(f"<topic>t{number}</topic>" for number in range(8000))
+    (folder / "many.xml").write_text(f'<profile><topics publish="ALLOW">{many}</topics></profile>')
     os.mkfifo(folder / "fifo")
     (folder / "circle").symlink_to("circle")
     return folder

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from urllib.parse import unquote
 
 from lxml import etree
 
@@ -19,7 +18,7 @@ from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.permissions import MAX_SIGNED_BYTES, Permissions
 from sros_tool.dds.portable import mistaken_names, outside, some_pairs
-from sros_tool.errors import SrosError
+from sros_tool.errors import DocumentError, PolicyError, SrosError
 from sros_tool.keystore.issuing.size import SizeEstimator, right_bytes
 from sros_tool.names import (
     ACTION_SERVICES,
@@ -31,7 +30,7 @@ from sros_tool.names import (
     is_expression,
 )
 from sros_tool.pki.certificates import common_name, subject_text
-from sros_tool.policy.document import read_policy
+from sros_tool.policy.document import IncludedFile, Includer, read_policy
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Policy, Profile, Source
 from sros_tool.policy.patterns import covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import GOAL, WHOLE, Right, Rules, parts, policy_rights
@@ -597,7 +596,7 @@ REDUNDANT_INCLUDE = FindingKind(
 _CHECKS = (_check_rules, _check_nodes, _check_names, _check_counterparts, _check_portability)
 _PLACE = re.compile(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
 _SYNTAX = re.compile(r", line (?P<line>\d+), column \d+")  # in messages of libxml2
-_INCLUDE = re.compile(r"\{http://www\.w3\.org/200[13]/XInclude\}include\Z")
+_INCLUDES = tuple(f"{{http://www.w3.org/{year}/XInclude}}include" for year in (2001, 2003))
 _MANY = 1000
 
 
@@ -652,41 +651,62 @@ def _duplicates(path: Path) -> Iterator[tuple[str, int]]:
 
 def _includes(path: Path) -> Iterator[Finding]:
     """Yield findings about the includes of a file; each included file is read once."""
-    root = parse(read_bytes(path, "policy file"), str(path))
-    below: dict[Path, frozenset[Path]] = {}
-    for parent in root.iter():
-        includes = [child for child in parent if _INCLUDE.match(str(child.tag))]
-        files = [_target(path, child) for child in includes]
-        for index, (element, file) in enumerate(zip(includes, files, strict=True)):
-            href = element.get("href", "")
-            line = element.sourceline
+    graph = _IncludeGraph(Path(os.path.realpath(path)))
+    for includes in graph.by_parent():
+        reached = {each for file in {file for _, file in includes} for each in graph.reached(file)}
+        seen: set[tuple[Path, str]] = set()
+        for element, file in includes:
+            href, line = element.get("href", ""), element.sourceline
+            step = (file, element.get("xpointer", ""))
             if not file.exists():
                 yield FALLBACK.found(str(path), f"'{href}' does not exist", str(path), line)
-                continue
-            others = [each for number, each in enumerate(files) if number != index]
-            twice = file in files[:index] and element.get("xpointer") in (
-                each.get("xpointer") for each in includes[:index]
-            )
-            if twice or any(file != o and file in _reached(o, below) for o in others):
+            elif step in seen or file in reached:
                 text = f"'{href}' is already included in the same profile by another include"
                 yield REDUNDANT_INCLUDE.found(str(path), text, str(path), line)
+            seen.add(step)
 
 
-def _target(path: Path, element: etree._Element) -> Path:
-    return Path(os.path.realpath(path.parent / unquote(element.get("href", ""))))
+class _IncludeGraph:
+    """The includes of a policy file that can be read, and the files that they lead to."""
 
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._includer = Includer(file.parent)
+        self._direct: dict[Path, frozenset[Path]] = {}
+        self._reached: dict[Path, frozenset[Path]] = {}
 
-def _reached(file: Path, known: dict[Path, frozenset[Path]]) -> frozenset[Path]:
-    """Return the files that a file includes, directly or through others."""
-    if file in known:
-        return known[file]
-    known[file] = frozenset()  # ends circular includes
-    reached: set[Path] = set()
-    if file.exists() and len(known) < _MANY:
-        root = parse(read_bytes(file, "policy file"), str(file))
-        for element in root.iter():
-            if _INCLUDE.match(str(element.tag)):
-                target = _target(file, element)
-                reached |= {target, *_reached(target, known)}
-    known[file] = frozenset(reached)
-    return known[file]
+    def by_parent(self) -> Iterator[list[tuple[etree._Element, Path]]]:
+        """Yield the includes next to each other, each with its file, in the policy file."""
+        for parent in self._includer.load(self._file).iter():
+            includes = list(parent.iterchildren(*_INCLUDES))
+            if len(includes) <= _MANY:
+                found = ((each, self._target(self._file, each)) for each in includes)
+                yield [(each, file) for each, file in found if file]
+
+    def reached(self, file: Path) -> frozenset[Path]:
+        """Return the other files that a file includes, directly or through others."""
+        if file not in self._reached:
+            found: set[Path] = set()
+            waiting = [file]
+            while waiting and len(found) < _MANY:
+                new = self._included(waiting.pop()) - found
+                found |= new
+                waiting += new
+            self._reached[file] = frozenset(found - {file})
+        return self._reached[file]
+
+    def _included(self, file: Path) -> frozenset[Path]:
+        if file not in self._direct:
+            try:
+                includes = list(self._includer.load(file).iter(*_INCLUDES))
+            except DocumentError:
+                includes = []  # it stands in a fallback that was not needed, or does not exist
+            targets = (self._target(file, each) for each in includes)
+            self._direct[file] = frozenset(each for each in targets if each)
+        return self._direct[file]
+
+    def _target(self, file: Path, element: etree._Element) -> Path | None:
+        try:
+            return self._includer.target(element, IncludedFile(file))
+        except PolicyError:
+            return None  # it stands in <metadata>, or in a fallback that was not needed

@@ -391,7 +391,7 @@ def _needed_files(root: Path, part: str) -> dict[str, bytes]:
             continue
         found[path] = read_bytes(file, "policy file")
         waiting += [
-            (file.parent / each.get("href", "")).resolve()
+            includer.target(each, IncludedFile(file))
             for each in includer.load(file)
             if tag_of(each).endswith("}include")
         ]

@@ -3,8 +3,9 @@
 The grammar follows the schema of ros2/sros2.  In addition every name is checked: a name that ROS
 does not allow is an error, because its author relies on that right or denial.
 
-Includes (``xi:include``) are read only from the folder of the policy and the folders below.  Nodes
-of included documents are never moved into another document: a moved lxml node can crash Python.
+Includes (``xi:include``) are read only from the folder of the policy and the folders below.  They
+give what the XInclude of libxml2 gives, or are refused.  Nodes of included documents are never
+moved into another document: a moved lxml node can crash Python.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from urllib.parse import unquote
@@ -37,27 +38,45 @@ from sros_tool.xml import parse, read_bytes, serialize, tag_of
 _NAMESPACES = ("http://www.w3.org/2001/XInclude", "http://www.w3.org/2003/XInclude")
 _INCLUDES = frozenset(f"{{{ns}}}include" for ns in _NAMESPACES)
 _FALLBACKS = frozenset(f"{{{ns}}}fallback" for ns in _NAMESPACES)
-_XPOINTER = re.compile(r"xpointer\((.+)\)\Z", re.DOTALL)
+_XML_BASE = "{http://www.w3.org/XML/1998/namespace}base"
+# libxml2 evaluates any XPath, for minutes if it is made for that, and no signal ends it.
+_STEP = re.compile(
+    r"/(?P<tag>\*|[A-Za-z_][\w.-]*)"
+    r"(?:\[@(?P<attribute>[A-Za-z_][\w.-]*)(?:=(?P<value>'[^']*'|\"[^\"]*\"))?\])?",
+    re.ASCII,
+)
+_SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*:")
 _MAX_INCLUDES = 10_000
 _MAX_DEPTH = 32
-_MAX_BYTES = 64 * 1024 * 1024
+_MAX_ELEMENTS = 200_000
+_MAX_BYTES = 32 * 1024 * 1024
+_MAX_LENGTH = 1000  # characters of a href or an xpointer
 
 
 @dataclass(frozen=True, slots=True)
 class IncludedFile:
-    """A document, and the includes that lead to it, each with file and xpointer."""
+    """A document, and the includes that lead to it, each with file and xpointer.
+
+    ``linked`` says that the last include names the file by a symbolic link.
+    """
 
     file: Path
     trail: tuple[tuple[Path, str], ...] = ()
+    linked: bool = False
 
 
 @dataclass(slots=True)
 class Includer:
-    """A reader of the policy files in ``root`` and below; each file is read once."""
+    """A reader of the policy files in ``root`` and below; each file is read once.
+
+    What is included counts each time: a few small files can stand for gigabytes.
+    """
 
     root: Path
     _documents: dict[Path, etree._Element] = field(default_factory=dict)
-    _count: int = 0
+    _sizes: dict[Path, int] = field(default_factory=dict)
+    _includes: int = 0
+    _elements: int = 0
     _bytes: int = 0
     _digests: list[bytes] = field(default_factory=list)
 
@@ -69,37 +88,89 @@ class Includer:
         """Return the root element of the document at ``file``, which is a real path."""
         if file not in self._documents:
             self.use_content(file, read_bytes(file, "policy file"))
+        self._bytes += self._sizes[file]
+        if self._bytes > _MAX_BYTES:
+            raise _too_large(f"'{file}'", f"{_MAX_BYTES // 1024**2} MiB")
         return self._documents[file]
 
     def use_content(self, file: Path, content: bytes) -> None:
         """Use ``content`` in place of the file with this real path, wherever it is included."""
-        self._bytes += len(content)
-        if self._bytes > _MAX_BYTES:
-            raise PolicyError(
-                f"the policy and its includes are too large at '{file}'",
-                f"Together they have more than {_MAX_BYTES // 1024**2} MiB.",
-            )
         self._documents[file] = parse(content, f"the policy file '{file}'")
+        self._sizes[file] = len(content)
         self._digests.append(hashlib.sha256(content).digest())
 
     def children(
         self, parent: etree._Element, place: IncludedFile
     ) -> Iterator[tuple[etree._Element, IncludedFile]]:
-        """Yield the child elements of ``parent`` with includes replaced by their elements."""
-        for child in parent:
-            if child.tag in _INCLUDES:
-                yield from self._included(child, place)
-            else:
-                yield child, place
+        """Return the child elements of ``parent`` with includes replaced by their elements."""
+        return self._expanded(parent, place)
+
+    def target(self, element: etree._Element, place: IncludedFile) -> Path:
+        """Return the real path of the file that an include names; it need not exist.
+
+        Raises:
+            PolicyError: the file is outside of the policy's folder, or other XInclude processors
+                would look for it elsewhere.
+        """
+        where = _line(element, place)
+        href = element.get("href", "")
+        path = unquote(href, errors="surrogateescape")
+        if "\0" in path or len(href) > _MAX_LENGTH:
+            raise PolicyError(f"{where}: the include of {_short(href)} is not a valid path")
+        if any(each.get(_XML_BASE) is not None for each in (element, *element.iterancestors())):
+            raise PolicyError(
+                f"{where}: the include of {_short(href)} is below an xml:base",
+                "sros resolves includes from the file in which they stand.",
+                f"Remove the xml:base, and write the path from '{place.file.parent}'.",
+            )
+        if place.linked and href:
+            raise PolicyError(
+                f"{where}: the include of {_short(href)} is in a file that is included by a link",
+                "It is unclear whether it starts at the link or at the file.",
+                f"Include '{place.file}' itself instead of the link.",
+            )
+        names = path.split("/")
+        up = next((index for index, name in enumerate(names) if name not in ("..", ".")), 0)
+        if "#" in href or "?" in href or ".." in names[up:]:
+            raise PolicyError(
+                f"{where}: the include of {_short(href)} is not a plain path",
+                "'#', '?', and '..' after the name of a folder can be understood in two ways.",
+                "Write the shortest path to the file, with %23 and %3F for '#' and '?' in names.",
+            )
+        if not href:
+            return place.file
+        # Unlike Path.resolve, realpath does not fail on circular links.
+        file = Path(os.path.realpath(place.file.parent / path))
+        if _SCHEME.match(href) or not file.is_relative_to(self.root):
+            raise PolicyError(
+                f"{where}: the include of {_short(href)} leaves the folder of the policy",
+                f"Includes are read only from '{self.root}' and the folders below it.",
+                "Copy the file there, or move the policy to a folder above both files.",
+            )
+        return file
+
+    def _expanded(
+        self, elements: Iterable[etree._Element], place: IncludedFile
+    ) -> Iterator[tuple[etree._Element, IncludedFile]]:
+        for each in elements:
+            if each.tag in _INCLUDES:
+                yield from self._included(each, place)
+                continue
+            self._elements += 1
+            if self._elements > _MAX_ELEMENTS:
+                raise _too_large(_line(each, place), f"{_MAX_ELEMENTS} elements")
+            yield each, place
 
     def _included(
         self, element: etree._Element, place: IncludedFile
     ) -> Iterator[tuple[etree._Element, IncludedFile]]:
-        where = f"{place.file}:{element.sourceline}"
-        self._count += 1
-        if self._count > _MAX_INCLUDES or len(place.trail) >= _MAX_DEPTH:
+        where = _line(element, place)
+        self._includes += 1
+        if self._includes > _MAX_INCLUDES or len(place.trail) >= _MAX_DEPTH:
             raise PolicyError(
-                f"{where}: there are too many includes, or they are nested too deeply"
+                f"{where}: there are too many includes, or they are nested too deeply",
+                f"At most {_MAX_INCLUDES} are read, at most {_MAX_DEPTH} within each other.",
+                "Write the rights themselves in place of some includes.",
             )
         if element.get("parse", "xml") != "xml":
             raise PolicyError(
@@ -107,64 +178,76 @@ class Includer:
                 "It would put any readable file into a signed document.",
                 "Include policy XML, without parse=.",
             )
+        if len(element) > 1 or (len(element) and element[0].tag not in _FALLBACKS):
+            raise PolicyError(
+                f"{where}: an include can contain only one <fallback>", "", "Remove the rest."
+            )
         href, pointer = element.get("href", ""), element.get("xpointer", "")
-        fallback = next((each for each in element if each.tag in _FALLBACKS), None)
-        file = self._resolve(href, place, where)
-        if fallback is not None and not file.exists():
-            yield from self.children(fallback, place)
+        file = self.target(element, place)
+        if len(element) and not file.exists():
+            yield from self.children(element[0], place)
             return
         step = (file, pointer)
         if step in place.trail:
-            raise PolicyError(f"{where}: the include of '{href}' leads back to itself")
+            raise PolicyError(f"{where}: the include of {_short(href)} leads back to itself")
         try:
             target = self.load(file)
         except DocumentError as error:
             raise PolicyError(f"{where}: {error.what}", error.why, error.remedy) from error
-        inner = IncludedFile(file, (*place.trail, step))
-        found = [target] if not pointer else _point(target, pointer, where)
-        for each in found:
-            # An element that an xpointer selects may be an include itself.
-            if each.tag in _INCLUDES:
-                yield from self._included(each, inner)
-            else:
-                yield each, inner
+        linked = bool(href) and Path(os.path.normpath(place.file.parent / unquote(href))) != file
+        inner = IncludedFile(file, (*place.trail, step), linked)
+        found = self._expanded([target], inner)
+        yield from self._selected(found, pointer, where) if pointer else found
 
-    def _resolve(self, href: str, place: IncludedFile, where: str) -> Path:
-        if not href:
-            return place.file
-        path = Path(unquote(href))
-        try:
-            # Unlike Path.resolve, realpath does not fail on circular links.
-            file = Path(os.path.realpath(place.file.parent / path))
-        except (OSError, ValueError) as error:
-            raise PolicyError(f"{where}: the include of {href!r} is not a valid path") from error
-        if "://" in href or href.startswith("file:") or not file.is_relative_to(self.root):
+    def _selected(
+        self, roots: Iterator[tuple[etree._Element, IncludedFile]], pointer: str, where: str
+    ) -> list[tuple[etree._Element, IncludedFile]]:
+        """Return what an xpointer selects in a document after its includes were replaced."""
+        path = pointer.removeprefix("xpointer(").removesuffix(")")
+        steps = list(_STEP.finditer(path[:_MAX_LENGTH]))
+        if f"xpointer({''.join(step[0] for step in steps)})" != pointer or not steps:
             raise PolicyError(
-                f"{where}: the include of '{href}' leaves the folder of the policy",
-                f"Includes are read only from '{self.root}' and the folders below it.",
-                "Copy the file there, or move the policy to a folder above both files.",
+                f"{where}: the xpointer {_short(pointer)} is not accepted",
+                "It can be a path of elements, each a name or *, with [@attribute] or "
+                "[@attribute='value'] behind it.",
+                "Write for example xpointer(/profile/*), xpointer(/policy/enclaves/*) or "
+                "xpointer(/policy/enclaves/enclave[@path='/talker']).",
             )
-        return file
+        found: Iterable[tuple[etree._Element, IncludedFile]] = roots
+        for depth, step in enumerate(steps):
+            if depth:
+                found = (each for parent in found for each in self.children(*parent))
+            found = [each for each in found if _fits(each[0], step)]
+        if not found:
+            raise PolicyError(
+                f"{where}: the xpointer {_short(pointer)} selects nothing",
+                "The included file has no element at this path.",
+                "Write the path from the root element of the included file.",
+            )
+        return list(found)
 
 
-def _point(target: etree._Element, pointer: str, where: str) -> list[etree._Element]:
-    match = _XPOINTER.match(pointer)
-    try:
-        found = target.getroottree().xpath(match[1]) if match else None
-    except etree.XPathError:
-        found = None
-    if not isinstance(found, list) or not all(isinstance(e, etree._Element) for e in found):
-        raise PolicyError(
-            f"{where}: the xpointer {pointer!r} is not valid",
-            "It must select elements by an XPath.",
-            'Write for example xpointer="xpointer(/profile/*)".',
-        )
-    if not found:
-        raise PolicyError(
-            f"{where}: the xpointer {pointer!r} selects nothing",
-            f"The root element of the included file is <{tag_of(target)}>.",
-        )
-    return found
+def _fits(element: etree._Element, step: re.Match[str]) -> bool:
+    if step["tag"] not in ("*", element.tag):
+        return False
+    value = element.get(step["attribute"]) if step["attribute"] else ""
+    return value is not None and step["value"] in (None, f"'{value}'", f'"{value}"')
+
+
+def _line(element: etree._Element, place: IncludedFile) -> str:
+    return f"{place.file}:{element.sourceline}"
+
+
+def _short(text: str) -> str:
+    return repr(text if len(text) <= 80 else f"{text[:80]}...")
+
+
+def _too_large(where: str, limit: str) -> PolicyError:
+    return PolicyError(
+        f"{where}: the policy and its includes are too large",
+        f"They have more than {limit}; what is included again counts again.",
+        "Divide the policy, or include smaller files.",
+    )
 
 
 _XML_ATTRIBUTES = ("{http://www.w3.org/XML/1998/namespace}",)
@@ -208,7 +291,7 @@ class _Reader:
         version = root.get("version", "")
         if not _VERSION.match(version):
             raise PolicyError(
-                f"{where}: the policy has version {version!r}",
+                f"{where}: the policy has version {_short(version)}",
                 f"sros reads version {VERSION} of the SROS2 policy format.",
                 "Version 0.1.0 writes <contexts> and <context> for <enclaves> and <enclave>."
                 if version.startswith("0.1")
@@ -278,7 +361,7 @@ class _Reader:
             ) from error
         if node and ("/" in node or "~" in node or expression_problem(node)):
             raise PolicyError(
-                f"{self._where(element, place)}: {node!r} is not a valid node name",
+                f"{self._where(element, place)}: {_short(node)} is not a valid node name",
                 expression_problem(node)
                 or "A node name has no '/' and no '~'; its namespace goes into ns=.",
             )
@@ -300,7 +383,7 @@ class _Reader:
                 continue
             if value not in _QUALIFIERS:
                 raise PolicyError(
-                    f"{self._where(element, place)}: {right}={value!r} is not valid",
+                    f"{self._where(element, place)}: {right}={_short(value)} is not valid",
                     "A right is ALLOW or DENY.",
                 )
             rights.append((right, _QUALIFIERS[value]))
@@ -330,9 +413,9 @@ class _Reader:
         if not problem and len(element):
             problem = "It contains other elements."
         if problem:
+            where = self._where(element, place)
             raise PolicyError(
-                f"{self._where(element, place)}: {name!r} is not a valid {tag_of(element)} name",
-                problem,
+                f"{where}: {_short(name)} is not a valid {tag_of(element)} name", problem
             )
         self._attributes(element, place)
         return name
@@ -372,9 +455,8 @@ class _Reader:
                 and name not in optional
                 and not name.startswith(_XML_ATTRIBUTES)
             ):
-                raise PolicyError(
-                    f"{self._where(element, place)}: <{tag_of(element)}> has no attribute {name!r}"
-                )
+                where = self._where(element, place)
+                raise PolicyError(f"{where}: <{tag_of(element)}> has no attribute {_short(name)}")
         for name in required:
             if name not in present:
                 raise PolicyError(

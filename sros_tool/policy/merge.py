@@ -188,7 +188,7 @@ _MARKUP = re.compile(
     r"|<(?P<open>[^\s/>!?]+)(?:[^>\"']|\"[^\"]*\"|'[^']*')*?(?P<empty>/?)>",
     re.DOTALL,
 )
-_COMMENTS_OF_THE_LINE = re.compile(r"(?:[ \t]*<!--.*?-->)+(?=[ \t]*(?:\r?\n|\Z))", re.DOTALL)
+_COMMENTS_OF_THE_LINE = re.compile(r"(?>[ \t]*<!--.*?-->)++(?=[ \t]*(?:\r?\n|\Z))", re.DOTALL)
 
 
 @dataclass(slots=True)
