@@ -24,7 +24,7 @@ def other_writers(state: os.stat_result, trusted: Set[int]) -> str:
     to each user and write with (umask 002).
     """
     if state.st_uid not in trusted:
-        return f"it belongs to {_user_name(state.st_uid)}"
+        return f"it belongs to {user_name(state.st_uid)}"
     if stat.S_ISLNK(state.st_mode):
         return ""
     mode = f"its mode is {stat.S_IMODE(state.st_mode):04o}"
@@ -33,6 +33,18 @@ def other_writers(state: os.stat_result, trusted: Set[int]) -> str:
     if state.st_mode & stat.S_IWGRP and not _is_private(state.st_gid, trusted):
         return f"{mode}, so the group {_group_name(state.st_gid)} can write"
     return ""
+
+
+def replaceable_on_the_way(path: Path, trusted: Set[int]) -> Iterator[tuple[Path, str]]:
+    """Yield each folder and link on the way to ``path`` by which others can replace it, and why.
+
+    A folder in which only the owner of a file can rename it (sticky, as ``/tmp``) counts only if
+    others own what is in it on the way.
+    """
+    for each, state in _way(path):
+        kept = state.st_mode & stat.S_ISVTX and state.st_uid in trusted
+        if not kept and (why := other_writers(state, trusted)):
+            yield each, why
 
 
 def belongs_to_root(path: Path) -> bool:
@@ -89,7 +101,8 @@ def _is_private(group: int, trusted: Set[int]) -> bool:
     return own and {each.pw_name for each in users}.issuperset(members)
 
 
-def _user_name(user: int) -> str:
+def user_name(user: int) -> str:
+    """Return the name of a user in words, or the number of a user without a name."""
     try:
         return f"user {pwd.getpwuid(user).pw_name}"
     except KeyError:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.owners import belongs_to_root, other_writers
+from sros_tool.owners import belongs_to_root, other_writers, replaceable_on_the_way
 
 STRANGER = 65532
 US = frozenset({0, os.geteuid()})
@@ -23,6 +23,35 @@ def file(tmp_path: Path) -> Path:
     (folder / "file").write_text("content")
     (tmp_path / "link").symlink_to("real/../real/inner")
     return tmp_path / "link/file"
+
+
+KEEP = -1
+
+
+@as_root
+@pytest.mark.parametrize(
+    ("name", "user", "group", "mode", "found"),
+    [
+        ("real", KEEP, KEEP, 0o755, False),
+        ("real", KEEP, KEEP, 0o777, True),
+        ("real/inner", KEEP, KEEP, 0o777, True),
+        ("real", KEEP, STRANGER, 0o775, True),
+        ("real", KEEP, 0, 0o775, False),  # the private group of root
+        ("real", KEEP, KEEP, 0o1777, False),
+        ("real", STRANGER, KEEP, 0o1777, True),
+        ("real", STRANGER, KEEP, 0o755, True),
+        ("link", STRANGER, KEEP, None, True),
+    ],
+)
+def test_the_way_to_a_file(
+    name: str, user: int, group: int, mode: int | None, found: bool, file: Path
+) -> None:
+    top = file.parent.parent
+    os.chown(top / name, user, group, follow_symlinks=False)
+    if mode is not None:
+        (top / name).chmod(mode)
+    names = {str(path.relative_to(top)) for path, _ in replaceable_on_the_way(file, US)}
+    assert names == ({name} if found else set())
 
 
 @as_root
@@ -41,3 +70,8 @@ def test_who_can_write_a_file(file: Path) -> None:
     os.chown(file, STRANGER, -1)
     assert other_writers(file.stat(), US) == f"it belongs to user {STRANGER}"
     assert other_writers(file.stat(), US | {STRANGER}).startswith("its mode is 0666")
+
+
+def test_a_loop_of_links_ends(tmp_path: Path) -> None:
+    (tmp_path / "loop").symlink_to("loop/loop")
+    assert list(replaceable_on_the_way(tmp_path / "loop/file", US)) == []

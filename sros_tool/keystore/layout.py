@@ -84,6 +84,11 @@ def enclave_path(root: Path, name: str) -> Path:
     return root / enclave_folder(name)
 
 
+def key_path(root: Path, place: str) -> Path:
+    """Return the path of a CA key's file; ``place`` is ``file:PATH``, or a path in ``root``."""
+    return root / place.removeprefix("file:").removeprefix("//")
+
+
 def folder_mode(path: str) -> int:
     """Return the permission bits of a folder: closed to others if it may hold keys."""
     return 0o755 if path in ("", PUBLIC) else 0o700

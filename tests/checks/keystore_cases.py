@@ -7,7 +7,9 @@ import os
 import shutil
 from collections.abc import Callable
 from datetime import timedelta, timezone
+from pathlib import Path
 
+import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -20,6 +22,7 @@ from tests.checks.bench import DAY, Bench, name_of, new_key
 
 Break = Callable[[Bench], object]
 CASES: dict[str, Break] = {}
+STRANGER = 65532
 
 
 def case(*ids: str) -> Callable[[Break], Break]:
@@ -36,6 +39,12 @@ def at(bench: Bench, days: float) -> None:
     bench.options["now"] = bench.now + days * DAY
 
 
+def give_away(path: Path) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("only root can give a folder to another user")
+    os.chown(path, STRANGER, STRANGER, follow_symlinks=False)
+
+
 IS_CA = (x509.BasicConstraints(True, None), True)
 
 # ── files ──────────────────────────────────────────────────────────────────────────────────
@@ -43,6 +52,9 @@ IS_CA = (x509.BasicConstraints(True, None), True)
 CASES |= {
     "keystore.key-readable": lambda b: b.path("enclaves/base/key.pem").chmod(0o640),
     "keystore.world-writable": lambda b: b.path("public/identity_ca.cert.pem").chmod(0o646),
+    "keystore.others-write": lambda b: give_away(b.path("public")),
+    "keystore.replaceable": lambda b: b.root.parent.chmod(0o777),
+    "keystore.foreign-owner": lambda b: give_away(b.root),
     "keystore.folder-open": lambda b: b.path("private").chmod(0o755),
     "keystore.link-dangling": lambda b: b.path("public/old.cert.pem").symlink_to("gone.pem"),
     "keystore.transaction-left": lambda b: b.path(".sros-transaction").mkdir(0o700),

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.keystore.authorities.keyring import Keyring
+from sros_tool.keystore.lifecycle.create import create_keystore
+from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import pem
 from sros_tool.policy.document import read_policy
 from tests.checks.bench import Bench
-from tests.checks.keystore_cases import CASES
+from tests.checks.keystore_cases import CASES, STRANGER, give_away
+from tests.checks.sound_keystore import NOW
+from tests.support.harness import sros
 
 pytest_plugins = ["tests.checks.sound_keystore"]
+
+
+as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as several users")
 
 
 def ids(bench: Bench) -> set[str]:
@@ -53,6 +64,91 @@ def test_found(expected: str, bench: Bench) -> None:
     assert expected not in ids(bench)
     CASES[expected](bench)
     assert expected in ids(bench)
+
+
+# ── who can replace a keystore ─────────────────────────────────────────────────────────────
+
+INNER = ("enclaves", "enclaves/base", "public", "private", "public/identity_ca.cert.pem")
+
+
+@pytest.mark.parametrize("name", INNER)
+@pytest.mark.parametrize("group", [STRANGER, None])
+def test_what_a_group_can_change(name: str, group: int | None, bench: Bench) -> None:
+    """Twin: a folder that only the private group of its owner can change."""
+    path = bench.path(name)
+    if group is not None:
+        if os.geteuid() != 0:
+            pytest.skip("only root can give a folder to another group")
+        os.chown(path, -1, group)
+    path.chmod(path.stat().st_mode | 0o020)
+    assert ("keystore.others-write" in ids(bench)) is (group is not None)
+
+
+@pytest.mark.parametrize(
+    ("name", "mode", "found"),
+    [
+        ("..", 0o777, {"keystore.replaceable"}),
+        ("../..", 0o777, {"keystore.replaceable"}),
+        ("..", 0o1777, set()),  # as /tmp: only the owner of the keystore can rename it
+        ("..", 0o755, set()),
+        (".", 0o777, {"keystore.world-writable"}),
+        (".", 0o1777, {"keystore.world-writable"}),
+        ("enclaves", 0o1777, {"keystore.world-writable"}),
+        ("enclaves/base", 0o1777, {"keystore.world-writable"}),
+    ],
+)
+def test_what_everybody_can_change(
+    name: str, mode: int, found: set[str], bench: Bench, tmp_path: Path
+) -> None:
+    bench.path(name).chmod(mode)
+    for only in (None, ["base"]):
+        bench.options["only"] = only and ["/base"]
+        assert {each for each in ids(bench) if each != "keystore.folder-open"} == found
+    tmp_path.chmod(0o700)
+
+
+@as_root
+def test_a_keystore_of_another_user_is_one_finding(bench: Bench) -> None:
+    for parent, folders, files in os.walk(bench.root):
+        for each in (parent, *(os.path.join(parent, name) for name in (*folders, *files))):
+            os.chown(each, STRANGER, STRANGER, follow_symlinks=False)
+    assert ids(bench) == {"keystore.foreign-owner"}
+    os.chown(bench.path("public"), 65531, -1)
+    assert ids(bench) == {"keystore.foreign-owner", "keystore.others-write"}
+
+
+def test_a_link_to_the_keystore_that_others_own(bench: Bench) -> None:
+    bench.checked = bench.root.with_name("link")
+    bench.checked.symlink_to(bench.root)
+    assert ids(bench) == set()
+    give_away(bench.checked)
+    assert ids(bench) == {"keystore.replaceable"}
+
+
+@pytest.mark.parametrize(("mode", "found"), [(0o600, False), (0o640, True), (0o604, True)])
+def test_a_ca_key_elsewhere_that_others_can_read(mode: int, found: bool, tmp_path: Path) -> None:
+    places = {role: f"file:{tmp_path / role}.pem" for role in ("identity", "permissions")}
+    template = load_template("production")
+    root = tmp_path / "ks"
+    create_keystore(root, template=template, now=NOW, keyring=Keyring(places=places))
+    (tmp_path / "permissions.pem").chmod(mode)
+    shown = {(each.id, each.file) for each in keystore_findings(root, now=NOW)}
+    wanted = {("keystore.key-readable", str(tmp_path / "permissions.pem"))}
+    assert shown == (wanted if found else set())
+
+
+@pytest.mark.parametrize(("mode", "noted"), [(0o755, False), (0o1777, False), (0o777, True)])
+def test_a_new_keystore_that_others_can_replace_is_noted(
+    mode: int, noted: bool, tmp_path: Path
+) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    folder.chmod(mode)
+    for words in (("create_keystore", "a"), ("generate_artifacts", "-e", "/x", "-k", "other")):
+        made = sros(*words, cwd=folder).ok()
+        assert ("keystore.replaceable" in made.err) is noted, made
+        assert (str(folder) in made.err) is noted
+    assert ("keystore.replaceable" in sros("verify", folder / "other").out) is noted
 
 
 @pytest.mark.parametrize(

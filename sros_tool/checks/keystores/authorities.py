@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import suppress
 from datetime import datetime, timedelta
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
+from sros_tool.checks.keystores.files import key_mode_findings
 from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
@@ -21,12 +23,14 @@ from sros_tool.keystore.layout import (
     SETTINGS,
     ca_certificate,
     ca_key,
+    key_path,
 )
 from sros_tool.keystore.loading import authority_refusals, refusals_text
 from sros_tool.pki.certificates import same_key, subject_text, validity_of
 from sros_tool.pki.chains import purpose_faults
 from sros_tool.pki.crl import signed_by
 from sros_tool.pki.keys import algorithm, load_key
+from sros_tool.pki.token_uri import is_token_uri
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
@@ -287,7 +291,8 @@ def _authority(
 def _key(keystore: CheckedKeystore, role: str, certificate: x509.Certificate) -> Iterator[Finding]:
     path = keystore.root / ca_key(role)
     if not path.exists():
-        return  # the key is kept elsewhere
+        yield from _key_elsewhere(keystore, role)
+        return
     try:
         key = load_key(read_bytes(path, "key"), f"'{path}'", _locked)
     except _LockedError:
@@ -299,6 +304,17 @@ def _key(keystore: CheckedKeystore, role: str, certificate: x509.Certificate) ->
     if not same_key(certificate, key):
         text = f"'{path.name}' is not the key of '{ca_certificate(role)}'"
         yield CA_MISMATCH.found(f"{role} CA", text, str(path))
+
+
+def _key_elsewhere(keystore: CheckedKeystore, role: str) -> Iterator[Finding]:
+    settings = keystore.settings
+    place = (
+        {IDENTITY: settings.identity_key}.get(role, settings.permissions_key) if settings else ""
+    )
+    if place and not is_token_uri(place):
+        path = key_path(keystore.root, place)
+        with suppress(OSError):  # it may be on a medium that is not there now
+            yield from key_mode_findings(str(path), path.stat().st_mode)
 
 
 class _LockedError(Exception):

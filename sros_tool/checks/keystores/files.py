@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Sequence, Set
 from pathlib import Path
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
@@ -28,6 +28,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
 )
 from sros_tool.keystore.transaction.stage import check_interrupted
+from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
 
 KEY_READABLE = FindingKind(
     "keystore.key-readable",
@@ -46,6 +47,35 @@ WORLD_WRITABLE = FindingKind(
     "Whoever can replace CA certificates, links or documents decides whom a node trusts.",
     "POSIX modes; CWE-732.",
     "Run `chmod o-w` on the file or folder.",
+)
+OTHERS_WRITE = FindingKind(
+    "keystore.others-write",
+    ERROR,
+    "a file or folder that other users can change",
+    "Whoever can replace CA certificates, links or documents decides whom a node trusts. Access "
+    "control lists are not looked at.",
+    "POSIX owners and modes; CWE-732.",
+    "Run `chown` with the owner of the keystore, and `chmod g-w`, on the file or folder.",
+)
+REPLACEABLE = FindingKind(
+    "keystore.replaceable",
+    ERROR,
+    "a folder above the keystore that other users can change",
+    "They can put another keystore in its place, and so decide whom a node trusts. Access control "
+    "lists are not looked at.",
+    "POSIX owners and modes; CWE-732; rcl 9 checks neither.",
+    "Run `chmod go-w` on the folder, or move the keystore to a folder that only its owner and root "
+    "can change.",
+)
+FOREIGN_OWNER = FindingKind(
+    "keystore.foreign-owner",
+    WARNING,
+    "a keystore of another user",
+    "The owner can replace everything in it, and so decides whom your nodes trust. An archive that "
+    "root unpacks may belong to whoever has that number on this machine.",
+    "POSIX owners; CWE-283.",
+    "Run the check as the user that runs the nodes, or make that user the owner: "
+    "`chown -R USER ROOT`.",
 )
 FOLDER_OPEN = FindingKind(
     "keystore.folder-open",
@@ -141,15 +171,30 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
         names: the enclaves whose folders are checked; None for the whole keystore.
     """
     root = os.fspath(keystore.root)
+    state = keystore.root.stat()
+    if state.st_uid not in (0, os.geteuid()):
+        yield FOREIGN_OWNER.found(root, f"it belongs to {user_name(state.st_uid)}", root)
+    trusted = frozenset({0, os.geteuid(), state.st_uid})
+    for folder, why in replaceable_on_the_way(keystore.root, trusted):
+        yield REPLACEABLE.found(str(folder), why, str(folder))
+    yield from _writers(root, state, trusted)
     links = _Links(root)
     if names is None:
-        yield from _below(root, keystore, links)
+        yield from _below(root, keystore, links, trusted)
         return
+    passed: set[Path] = set()
     for name in names:
-        yield from _below(os.path.join(root, enclave_folder(name)), keystore, links)
+        folder = Path(enclave_folder(name))
+        passed |= {folder, *folder.parents} - {Path()}
+        yield from _below(os.path.join(root, folder), keystore, links, trusted)
+    for folder in sorted(passed):
+        path = os.path.join(root, folder)
+        yield from _writers(path, Path(path).stat(), trusted)
 
 
-def _below(start: str, keystore: CheckedKeystore, links: _Links) -> Iterator[Finding]:
+def _below(
+    start: str, keystore: CheckedKeystore, links: _Links, trusted: Set[int]
+) -> Iterator[Finding]:
     root = os.fspath(keystore.root)
     keys = {os.path.join(root, ENCLAVES, name[1:], "key.pem") for name in keystore.names}
     keys |= {os.path.join(root, ENCLAVES, "key.pem")}
@@ -160,7 +205,13 @@ def _below(start: str, keystore: CheckedKeystore, links: _Links) -> Iterator[Fin
             folders.remove(STAGE)
             yield _interrupted(Path(parent), root)
         for name in folders:
-            yield from _folder(os.path.join(parent, name), root, home, links)
+            path = os.path.join(parent, name)
+            info = os.lstat(path)
+            if stat.S_ISLNK(info.st_mode):
+                yield from links.check(Path(path))
+                continue
+            yield from _writers(path, info, trusted)
+            yield from _openness(path, root, info.st_mode, home)
         inside = os.path.relpath(parent, root)
         for name in sorted(files):
             path = os.path.join(parent, name)
@@ -168,9 +219,9 @@ def _below(start: str, keystore: CheckedKeystore, links: _Links) -> Iterator[Fin
             if stat.S_ISLNK(info.st_mode):
                 yield from links.check(Path(path))
                 continue
-            yield from _mode(path, info.st_mode)
+            yield from _writers(path, info, trusted)
             if path in keys:
-                yield from _key_mode(path, info.st_mode)
+                yield from key_mode_findings(path, info.st_mode)
             elif name in _KNOWN and inside.startswith(ENCLAVES) and name != "key.pem":
                 continue
             else:
@@ -190,12 +241,7 @@ def _interrupted(parent: Path, root: str) -> Finding:
     return INTERRUPTED.found(root, text, str(parent / STAGE))
 
 
-def _folder(path: str, root: str, home: bool, links: _Links) -> Iterator[Finding]:
-    mode = os.lstat(path).st_mode
-    if stat.S_ISLNK(mode):
-        yield from links.check(Path(path))
-        return
-    yield from _mode(path, mode)
+def _openness(path: str, root: str, mode: int, home: bool) -> Iterator[Finding]:
     inside = Path(path).relative_to(root)
     # Others cannot enter what is below a closed top folder.
     asked = inside.parts[0] in _KEY_FOLDERS and (len(inside.parts) == 1 or not home)
@@ -203,12 +249,15 @@ def _folder(path: str, root: str, home: bool, links: _Links) -> Iterator[Finding
         yield FOLDER_OPEN.found(path, f"its mode is {stat.S_IMODE(mode):04o}", path)
 
 
-def _mode(path: str, mode: int) -> Iterator[Finding]:
-    if mode & stat.S_IWOTH and not mode & stat.S_ISVTX:
-        yield WORLD_WRITABLE.found(path, f"its mode is {stat.S_IMODE(mode):04o}", path)
+def _writers(path: str, info: os.stat_result, trusted: Set[int]) -> Iterator[Finding]:
+    if info.st_mode & stat.S_IWOTH:
+        yield WORLD_WRITABLE.found(path, f"its mode is {stat.S_IMODE(info.st_mode):04o}", path)
+    elif why := other_writers(info, trusted):
+        yield OTHERS_WRITE.found(path, why, path)
 
 
-def _key_mode(path: str, mode: int) -> Iterator[Finding]:
+def key_mode_findings(path: str, mode: int) -> Iterator[Finding]:
+    """Yield a finding if others can read a private key."""
     if mode & 0o077:
         text = f"its mode is {stat.S_IMODE(mode):04o}"
         yield KEY_READABLE.found(path, text, path, remedy=f"Run `chmod 600 '{path}'`.")
@@ -252,7 +301,7 @@ def _other(path: str, inside: str, info: os.stat_result, home: bool) -> Iterator
     """Yield findings about a file that is not one of an enclave, such as a misplaced key."""
     place = inside.partition(os.sep)[0]
     if info.st_size <= _MOST_READ and _holds_key(path):
-        yield from _key_mode(path, info.st_mode)
+        yield from key_mode_findings(path, info.st_mode)
         if place in (PRIVATE, REVOKED, RETIRED) and home:
             return
         if place == PRIVATE or not home:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from sros_tool.errors import KeystoreError, PkiError, UsageError
 from sros_tool.files import write_new_file
-from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key
+from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key, key_path
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
@@ -78,7 +78,7 @@ class Keyring:
                 token_key = open_token_key(place, self.secrets, named=self._is_named(role))
                 _LOG.info("opened the key of the %s CA, on the token at %s", role, place)
                 return token_key
-            path = _path(place, root)
+            path = key_path(root, place)
             if not path.exists():
                 raise KeystoreError(
                     f"the key of the {role} CA is not at '{path}'",
@@ -119,14 +119,14 @@ class Keyring:
             if transaction.dry_run:
                 return generate_key()
             return create_token_key(place, self.secrets, named=named)
-        if place and _path(place, transaction.root).exists():
+        if place and key_path(transaction.root, place).exists():
             return self.open(transaction.root, role, template)
         key = generate_key()
         pem = key_pem(key, self._new_passphrase(role) if self.encrypt else None)
         if not place:
             transaction.write(file, pem, private=True)
         elif not transaction.dry_run:
-            _write_outside(_path(place, transaction.root), pem, transaction)
+            _write_outside(key_path(transaction.root, place), pem, transaction)
         return key
 
     def settings_with_places(self, template: Template) -> Template:
@@ -188,10 +188,6 @@ def check_imported_keys(roles: Iterable[str], keyring: Keyring, template: Templa
                 "",
                 "Give --identity-ca alone, or add --ca-layout separate.",
             )
-
-
-def _path(place: str, root: Path) -> Path:
-    return root / place.removeprefix("file:").removeprefix("//")
 
 
 def _write_outside(path: Path, pem: bytes, transaction: Transaction) -> None:

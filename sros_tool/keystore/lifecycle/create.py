@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
@@ -59,6 +59,7 @@ from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
+from sros_tool.owners import other_writers, replaceable_on_the_way
 from sros_tool.parallel import Progress
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
@@ -131,7 +132,7 @@ def create_keystore(
         domains,
         True,
         changes=tuple(transaction.changes),
-        notes=keystore.authorities.notes,
+        notes=(*keystore.authorities.notes, *_place_notes(root)),
     )
 
 
@@ -217,7 +218,8 @@ def generate_artifacts(
     check_domain(domains, domain, root)
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
         keystore = _write_keystore(transaction, create, domains, keyring, now, _NONE_IMPORTED)
-        return _write_enclaves(transaction, keystore, wanted, now, progress)
+        creation = _write_enclaves(transaction, keystore, wanted, now, progress)
+    return replace(creation, notes=(*creation.notes, *_place_notes(root)))
 
 
 def _rights_by_enclave(
@@ -318,6 +320,21 @@ def _check_free(root: Path) -> None:
             f"It has {', '.join(remains)}; with a new CA, every enclave that trusts the old CA "
             "would be locked out.",
             "Restore the missing files, or choose another path.",
+        )
+
+
+def _place_notes(root: Path) -> Iterator[Note]:
+    """Note that users other than this one and root can replace a new keystore."""
+    trusted = frozenset({0, os.geteuid()})
+    found = list(replaceable_on_the_way(root, trusted))
+    if root.exists() and (why := other_writers(root.stat(), trusted)):
+        found.append((root, why))
+    for folder, why in found[-1:]:
+        yield Note(
+            "keystore.replaceable",
+            f"other users can put another keystore in the place of '{root}', because they can "
+            f"change '{folder}': {why}. Run `chmod go-w '{folder}'`, or move the keystore to a "
+            "folder that only you and root can change.",
         )
 
 
