@@ -10,11 +10,11 @@ import os
 import secrets
 import stat
 import tomllib
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path, PurePosixPath
 from typing import Any
 
-from sros_tool.folders import Folder, write_all
+from sros_tool.folders import Folder, make_folders, remove_folders, write_all
 
 _LOG = logging.getLogger(__name__)
 
@@ -100,6 +100,64 @@ def write_new_file(path: Path, data: bytes) -> None:
             os.fsync(handle)
         finally:
             os.close(handle)
+
+
+@contextlib.contextmanager
+def new_files(root: Path, files: Mapping[str, bytes]) -> Iterator[Folder]:
+    """Write new files below the folder ``root``; if the body fails, nothing is left of them.
+
+    Args:
+        root: an existing folder, which is yielded.
+        files: the contents by path relative to ``root``; missing folders on the way are made.
+
+    Raises:
+        FileExistsError: one of the files exists.
+        KeystoreError: a folder on the way is a symbolic link or no folder.
+    """
+    made: list[str] = []
+    with Folder(root) as folder:
+        try:
+            for path, data in files.items():
+                for parent in reversed(PurePosixPath(path).parents[:-1]):
+                    if not folder.is_folder(str(parent)):
+                        folder.mkdir(str(parent), 0o755)
+                        made.append(str(parent))
+                handle = folder.create(path, 0o666)
+                made.append(path)
+                try:
+                    write_all(handle, data)
+                finally:
+                    os.close(handle)
+            folder.flush_file_system()
+            yield folder
+        except BaseException:
+            for path in reversed(made):
+                with contextlib.suppress(OSError):
+                    is_folder = stat.S_ISDIR(folder.mode(path))
+                    folder.rmdir(path) if is_folder else folder.unlink(path)
+            raise
+
+
+def write_new_folder(path: Path, files: Mapping[str, bytes]) -> None:
+    """Make the folder ``path`` with these files, as in `new_files`, whole or not at all.
+
+    Raises:
+        OSError: it cannot be made, or something other than an empty folder is there.
+    """
+    made = make_folders(path.parent)
+    spare = f".{path.name[:200]}.sros-{secrets.token_hex(4)}"
+    try:
+        with new_files(path.parent, {f"{spare}/{each}": files[each] for each in files}) as parent:
+            parent.rename(spare, path.name)
+    except BaseException:
+        remove_folders(made)
+        raise
+
+
+def remove_file(path: Path) -> None:
+    """Remove the file or link at ``path``, if there is one."""
+    with Folder(path.parent) as folder:
+        folder.unlink(path.name, missing_ok=True)
 
 
 def replace_file(path: Path, data: bytes) -> None:

@@ -298,10 +298,36 @@ class Folder:
         if link:
             return KeystoreError(
                 f"'{whole}' is a symbolic link",
-                "Files written below it would be stored elsewhere, outside of the keystore.",
+                f"Files written below it would be stored elsewhere, outside of '{self.path}'.",
                 "Replace the link with a real folder.",
             )
         return KeystoreError(f"'{whole}' is in the way", "It is not a folder.", "Move it away.")
+
+
+def make_folders(path: Path) -> list[Path]:
+    """Make the folder at ``path`` and those above it; return those that were missing, inner first.
+
+    Raises:
+        OSError: one of them cannot be made; nothing is left of the others.
+    """
+    made: list[Path] = []
+    missing = [each for each in (path, *path.parents) if not each.exists()]
+    try:
+        for each in reversed(missing):
+            with contextlib.suppress(FileExistsError):  # another process created it meanwhile
+                each.mkdir()
+                made.insert(0, each)
+    except BaseException:
+        remove_folders(made)
+        raise
+    return made
+
+
+def remove_folders(paths: list[Path]) -> None:
+    """Remove each folder that is empty, in this order."""
+    for each in paths:
+        with contextlib.suppress(OSError):
+            each.rmdir()
 
 
 def write_all(handle: int, data: bytes) -> None:

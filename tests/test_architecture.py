@@ -238,6 +238,114 @@ def test_a_circle_is_seen_where_it_would_stop_an_import_and_only_there() -> None
     assert found("x = 1", package="from p.a import x") == set()
 
 
+# ── every file is written by two modules ───────────────────────────────────────────────────
+
+WRITERS = {"files.py", "folders.py"}
+"""They follow no link of another user, and leave the whole file or nothing."""
+
+OTHER_WRITERS = {
+    "cli/__init__.py": "opens /dev/null",
+    "parallel.py": "opens a pipe",
+    "runtime/netns.py": "writes to /proc",
+    "runtime/stacks.py": "logs of probes, in a temporary folder of its own",
+    "runtime/events.py": "reports of the demo's processes, in the demo's folder",
+    "demo/": "a temporary folder of its own, or the new folder of --keep",
+}
+
+_OS = {
+    *("mkdir", "makedirs", "mkfifo", "mknod", "link", "symlink", "replace", "rename", "renames"),
+    *("unlink", "remove", "rmdir", "removedirs", "truncate"),
+    *("chmod", "lchmod", "chown", "lchown", "utime"),
+}
+_SHUTIL = {
+    *("copy", "copy2", "copyfile", "copymode", "copystat", "copytree", "move", "rmtree", "chown"),
+    *("make_archive", "unpack_archive"),
+}
+_PATH = {
+    **dict.fromkeys(("write_text", "write_bytes", "touch", "symlink_to", "hardlink_to"), range(9)),
+    **dict.fromkeys(("unlink", "rmdir"), range(1)),
+    **dict.fromkeys(("mkdir", "chmod", "lchmod"), range(2)),
+    **dict.fromkeys(("rename", "replace"), range(1, 2)),
+}
+"""Methods of a path, with their numbers of positional arguments: those of a `Folder` and of a
+text have others."""
+
+_READING = {"O_RDONLY", "O_DIRECTORY", "O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK", "O_PATH"}
+
+
+def is_writing(call: ast.Call) -> bool:
+    """Return whether a call changes what is at a path."""
+    owner, _, name = ast.unparse(call.func).rpartition(".")
+    keywords = {each.arg for each in call.keywords}
+    if (owner, name) == ("os", "open"):
+        flags = {each.attr for each in ast.walk(call.args[1]) if isinstance(each, ast.Attribute)}
+        return not flags or not flags <= _READING
+    if owner in ("os", "shutil"):
+        return name in (_OS if owner == "os" else _SHUTIL)
+    if name == "open" and "fileobj" not in keywords:
+        given = [*call.args, *(each.value for each in call.keywords)]
+        modes = [each.value for each in given if isinstance(each, ast.Constant)]
+        return any(re.fullmatch(r"(?=.*[wax+])[rwaxbt+:|gz]+", str(each)) for each in modes)
+    return bool(owner) and len(call.args) in _PATH.get(name, ())
+
+
+def writing(source: str) -> list[int]:
+    """The lines that change what is at a path, or import a function that can under a new name."""
+    return sorted(
+        node.lineno
+        for node in ast.walk(ast.parse(source))
+        if (isinstance(node, ast.Call) and is_writing(node))
+        or (
+            isinstance(node, ast.ImportFrom)
+            and node.module in ("os", "shutil")
+            and {alias.name for alias in node.names} & {*_OS, *_SHUTIL, "open", "*"}
+        )
+    )
+
+
+def test_everything_is_written_by_two_modules() -> None:
+    found = {module for module in MODULES if writing((PACKAGE / module).read_text())}
+    assert found >= WRITERS
+    others = {each for each in OTHER_WRITERS if any(module.startswith(each) for module in found)}
+    assert others == set(OTHER_WRITERS)
+    assert [each for each in found - WRITERS if not each.startswith(tuple(OTHER_WRITERS))] == []
+
+
+@pytest.mark.parametrize(
+    ("source", "seen"),
+    [
+        ("path.write_text(x)", True),
+        ("(folder / name).write_bytes(x)", True),
+        ("path.open('w')", True),
+        ("open(path, mode='a')", True),
+        ("path.open('r+b')", True),
+        ("open(path, 'rb')", False),
+        ("path.open()", False),
+        ("keyring.open(root, 'identity')", False),
+        ("tarfile.open(fileobj=packed, mode='w')", False),
+        ("tarfile.open(path, 'w:gz')", True),
+        ("os.open(path, os.O_RDONLY | os.O_NOFOLLOW)", False),
+        ("os.open(path, os.O_RDONLY | os.O_CREAT)", True),
+        ("os.open(path, flags)", True),
+        ("os.replace(a, b)", True),
+        ("text.replace(a, b)", False),
+        ("path.replace(b)", True),
+        ("folder.replace(a, b)", False),
+        ("moment.replace(microsecond=0)", False),
+        ("folder.mkdir('a', 0o700)", False),
+        ("path.mkdir(parents=True)", True),
+        ("folder.unlink('a')", False),
+        ("path.unlink(missing_ok=True)", True),
+        ("shutil.copytree(a, b)", True),
+        ("shutil.which(a)", False),
+        ("from shutil import rmtree", True),
+        ("from os import fspath", False),
+    ],
+)  # fmt: skip
+def test_writing_is_seen_and_nothing_else(source: str, seen: bool) -> None:
+    assert bool(writing(source)) is seen
+
+
 # ── a public class has one name, and the name one meaning ──────────────────────────────────
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.files import replace_file
+from sros_tool.errors import KeystoreError
+from sros_tool.files import new_files, replace_file, write_new_folder
 
 
 def test_a_file_keeps_its_mode_and_a_link_its_target(tmp_path: Path) -> None:
@@ -47,3 +48,45 @@ def test_a_device_is_never_replaced(tmp_path: Path) -> None:
         pytest.skip(f"devices do not work here: {error}")
     replace_file(nothing, b"anything")
     assert stat.S_ISCHR(nothing.lstat().st_mode)
+
+
+FILES = {"a.xml": b"a", "common/node/b.xml": b"b"}
+
+
+def tree(folder: Path) -> dict[str, bytes]:
+    return {str(f.relative_to(folder)): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
+
+
+def test_a_new_folder_is_whole_or_not_there(tmp_path: Path) -> None:
+    write_new_folder(tmp_path / "x/new", FILES)
+    assert tree(tmp_path / "x/new") == FILES
+    assert [each.name for each in (tmp_path / "x").iterdir()] == ["new"]
+    with pytest.raises(OSError):
+        write_new_folder(tmp_path / "x/new", FILES)
+    with pytest.raises(KeystoreError, match="in the way"):
+        write_new_folder(tmp_path / "y/new", {**FILES, "a.xml/c": b""})
+    assert [each.name for each in tmp_path.iterdir()] == ["x"]
+    assert [each.name for each in (tmp_path / "x").iterdir()] == ["new"]
+
+
+def test_new_files_replace_nothing_follow_no_link_and_go_when_the_rest_fails(
+    tmp_path: Path,
+) -> None:
+    inside, outside = tmp_path / "in", tmp_path / "out"
+    inside.mkdir()
+    outside.mkdir()
+    with pytest.raises(ZeroDivisionError), new_files(inside, FILES):
+        assert tree(inside) == FILES
+        raise ZeroDivisionError
+    assert list(inside.iterdir()) == []
+    (inside / "common").symlink_to(outside)
+    with pytest.raises(KeystoreError, match="symbolic link"), new_files(inside, FILES):
+        pass
+    (inside / "common").unlink()
+    (inside / "a.xml").write_bytes(b"mine")
+    with pytest.raises(FileExistsError), new_files(inside, FILES):
+        pass
+    assert (tree(inside), list(outside.iterdir())) == ({"a.xml": b"mine"}, [])
+    with new_files(inside, {"b/c": b"c"}):
+        pass
+    assert tree(inside) == {"a.xml": b"mine", "b/c": b"c"}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -478,17 +478,20 @@ Example:
 @dry_run_option
 def policies(target: Path | None, as_json: bool, dry_run: bool) -> None:
     """List the policies that ship with sros and their enclaves, or copy the policies."""
+    from sros_tool.files import write_new_folder
     from sros_tool.policy.document import read_policy
     from sros_tool.resources import policies_dir
 
     source = policies_dir()
     if target is not None:
-        if target.exists():
+        if os.path.lexists(target):
             raise UsageError(f"'{target}' already exists", "", "Name a new folder.")
         if dry_run:
             click.echo(f"would copy the policies to '{target}'")
             return
-        shutil.copytree(source, target)
+        found_files = (each for each in sorted(source.rglob("*")) if each.is_file())
+        files = {str(each.relative_to(source)): each.read_bytes() for each in found_files}
+        write_new_folder(target, files)
         click.echo(f"copied the policies to '{target}'")
         return
     found = {path: read_policy(path) for path in sorted(source.glob("*.xml"))}

@@ -5,7 +5,6 @@ Names need no escaping: only plain ROS names are learned, and those contain no m
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -13,7 +12,7 @@ from itertools import groupby
 from pathlib import Path
 
 from sros_tool.errors import DocumentError, PolicyError
-from sros_tool.files import replace_file
+from sros_tool.files import new_files, replace_file
 from sros_tool.graph.learn import CommonParts, Learned, LearnedProfile
 from sros_tool.names import check_namespace
 from sros_tool.policy.document import read_policy
@@ -132,17 +131,9 @@ def write(plan: Draft) -> None:
     """
     if not plan.changes:
         return
-    copied: list[Path] = []
-    try:
-        for path, data in plan.copies.items():
-            copied += _put_new(plan.path.parent / path, data)
+    with new_files(plan.path.parent, plan.copies):
         _check(plan)
         replace_file(plan.path, plan.document)
-    except BaseException:
-        for made in reversed(copied):
-            with contextlib.suppress(OSError):
-                made.rmdir() if made.is_dir() else made.unlink()
-        raise
 
 
 def _check(plan: Draft) -> None:
@@ -156,14 +147,6 @@ def _check(plan: Draft) -> None:
     raise PolicyError(
         f"the learned rights cannot be written to '{plan.path}'", why, "Add --flat: no includes."
     )
-
-
-def _put_new(path: Path, data: bytes) -> list[Path]:
-    """Create a file with its missing folders; return the created paths, folders first."""
-    made = [each for each in reversed(path.parents) if not each.exists()]
-    path.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(path, data)
-    return [*made, path]
 
 
 # ── text ────────────────────────────────────────────────────────────────────────────────

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from sros_tool.errors import KeystoreError, PkiError, UsageError
-from sros_tool.files import write_new_file
+from sros_tool.files import remove_file, write_new_file
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key, key_path
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
@@ -196,6 +196,6 @@ def _write_outside(path: Path, pem: bytes, transaction: Transaction) -> None:
 
     def undo() -> None:
         with suppress(OSError):
-            path.unlink()
+            remove_file(path)
 
     transaction.on_failure(undo)

@@ -24,7 +24,7 @@ from types import TracebackType
 from typing import Self
 
 from sros_tool.errors import KeystoreError, SrosError
-from sros_tool.folders import Folder
+from sros_tool.folders import Folder, make_folders, remove_folders
 from sros_tool.keystore.layout import STAGE, folder_mode
 from sros_tool.keystore.transaction.lock import KeystoreLock, lock_new
 from sros_tool.keystore.transaction.recovery import complete, recover
@@ -103,7 +103,7 @@ class Transaction:
                 raise KeystoreError(
                     f"'{self.root}' names no new folder", "It ends in '..'.", "Name the folder."
                 )
-            self._make_parents()
+            self._made_parents = make_folders(self.root.parent)
             with Folder(self.root.parent) as parent:
                 self._remove_stale_siblings(parent)
                 self._make_sibling(parent)
@@ -139,20 +139,7 @@ class Transaction:
             if self._folder:
                 self._folder.close()
                 self._folder = None
-            for path in self._made_parents:
-                with contextlib.suppress(OSError):
-                    path.rmdir()
-
-    def _make_parents(self) -> None:
-        missing = []
-        parent = self.root.parent
-        while not parent.exists():
-            missing.append(parent)
-            parent = parent.parent
-        for each in reversed(missing):
-            with contextlib.suppress(FileExistsError):  # another process created it meanwhile
-                each.mkdir()
-                self._made_parents.insert(0, each)
+            remove_folders(self._made_parents)
 
     def _make_sibling(self, parent: Folder) -> None:
         while not self._folder:
