@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -56,6 +56,7 @@ from sros_tool.pki.certificates import (
     same_key,
     subject_text,
     validity_of,
+    weakness,
 )
 from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl, signed_by
 from sros_tool.pki.keys import load_key
@@ -373,6 +374,19 @@ class OpenedEnclave:
         return min(moments)
 
 
+def weaknesses(state: OpenedEnclave) -> Iterator[tuple[str, str]]:
+    """Yield weak cryptography in an enclave's files: the name of the file, and a clause."""
+    for file in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, CERTIFICATE_FILE):
+        with suppress(SrosError):
+            for each in _load_certificates(state.files.get(file, b""), file):
+                if text := weakness(each):
+                    yield file, text
+    for file in (GOVERNANCE_FILE, PERMISSIONS_FILE):
+        with suppress(SrosError):
+            if text := smime.parse(state.files.get(file, b"")).weakness():
+                yield file, text
+
+
 def open_enclave(folder: Path, *, now: datetime, domain: int | None = None) -> OpenedEnclave:
     """Return the content of an enclave's files, and their problems at the time ``now``.
 
@@ -390,6 +404,7 @@ _SIGNED = re.compile(rb"(?i)multipart/signed|application/(?:x-)?pkcs7-mime")
 
 # The enclaves of a keystore share some files, which are parsed only once.
 _load_certificate = lru_cache(maxsize=8)(load_certificate)
+_load_certificates = lru_cache(maxsize=8)(load_certificates)
 _parse_governance = lru_cache(maxsize=8)(parse_governance)
 
 

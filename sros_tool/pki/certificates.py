@@ -12,7 +12,7 @@ from cryptography.x509.oid import NameOID
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
-from sros_tool.pki.keys import PrivateKey, PublicKey
+from sros_tool.pki.keys import PrivateKey, PublicKey, algorithm, is_weak
 from sros_tool.validity import Window
 
 _CA_USAGE = x509.KeyUsage(
@@ -233,6 +233,20 @@ def read_in_full(certificate: x509.Certificate) -> x509.Certificate:
 def same_key(certificate: x509.Certificate, key: PrivateKey) -> bool:
     """Return whether ``key`` is the private key of ``certificate``."""
     return certificate.public_key() == key.public_key()
+
+
+def weakness(certificate: x509.Certificate) -> str:
+    """Return the weak cryptography of a certificate as a clause, or "".
+
+    A hash under 256 bits is weak, because it signs what others chose: SHA-1, MD5.
+    """
+    key, digest = certificate.public_key(), certificate.signature_hash_algorithm
+    if is_weak(key):
+        return f"{subject_text(certificate.subject)} has a weak key, {algorithm(key)}"
+    if digest and digest.digest_size < hashes.SHA256.digest_size:
+        name = subject_text(certificate.subject)
+        return f"{name} has a weak signature, with {digest.name.upper()}"
+    return ""
 
 
 def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:

@@ -117,6 +117,16 @@ def _decrypted(pem: bytes, name: str, passphrase: str) -> PrivateKeyTypes:
         ) from error
 
 
+def is_weak(key: object) -> bool:
+    """Return whether a key is weak: an RSA key under 2048 bits, an EC key under 256 bits.
+
+    Source: NIST SP 800-57 part 1, 5.6; DDS-Security 1.1, 9.3.1.
+    """
+    if isinstance(key, rsa.RSAPublicKey):
+        return key.key_size < 2048
+    return isinstance(key, ec.EllipticCurvePublicKey) and key.key_size < 256
+
+
 def algorithm(key: object) -> str:
     """Return the algorithm of a key as text, such as ``EC secp256r1`` or ``RSA 2048``."""
     if isinstance(key, (ec.EllipticCurvePrivateKey, ec.EllipticCurvePublicKey)):

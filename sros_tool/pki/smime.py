@@ -167,6 +167,11 @@ class SignedDocument:
                 "The document was changed after it was signed, or its signature is damaged.",
             )
 
+    def weakness(self) -> str:
+        """Return the weak hash of the signature as a clause, or ""."""
+        weak = self._digest_algorithm.algorithm.digest_size < hashes.SHA256.digest_size
+        return f"it has a weak signature, with {self.digest.upper()}" if weak else ""
+
     def digest_matches(self) -> bool:
         """Return whether the messageDigest attribute is the digest of the content."""
         digest = hashes.Hash(self._digest_algorithm.algorithm)

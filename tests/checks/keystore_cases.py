@@ -111,6 +111,9 @@ CASES |= {
     "portable.key-algorithm": lambda b: b.trust(
         "identity", b.new_authority(IS_CA, curve=ec.SECP384R1())[0]
     ),
+    "keystore.weak-cryptography": lambda b: b.trust(
+        "identity", b.new_authority(IS_CA, curve=ec.SECP224R1())[0]
+    ),
     "portable.signature-hash": lambda b: b.trust(
         "identity", b.new_authority(IS_CA, digest=hashes.SHA384())[0]
     ),

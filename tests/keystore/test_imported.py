@@ -38,6 +38,11 @@ def pki(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("permissions", curve, ()),
         ("sha384", curve, ("-sha384",)),
         ("rsa3072", ("-newkey", "rsa:3072", "-nodes"), ()),
+        ("rsa1024", ("-newkey", "rsa:1024", "-nodes"), ()),
+        ("p192", (*curve[:3], "ec_paramgen_curve:prime192v1", "-nodes"), ()),
+        ("p224", (*curve[:3], "ec_paramgen_curve:secp224r1", "-nodes"), ()),
+        ("sha1", curve, ("-sha1",)),
+        ("sha224", curve, ("-sha224",)),
     ):
         out = ("-keyout", f"{name}.key", "-out", f"{name}.pem", "-subj", f"/CN=corp {name}")
         openssl(folder, "req", *kind, *root, *extra, *out)
@@ -111,6 +116,25 @@ def test_a_ca_that_cannot_be_imported_changes_nothing(
     assert words in ended.err
     assert list(tmp_path.iterdir()) == []
     assert sorted(pki.iterdir()) == before
+
+
+@pytest.mark.parametrize("role", ["identity", "permissions"])
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("rsa1024", "a weak key, RSA 1024"),
+        ("p192", "a weak key, EC secp192r1"),
+        ("p224", "a weak key, EC secp224r1"),
+        ("sha1", "a weak signature, with SHA1"),
+        ("sha224", "a weak signature, with SHA224"),
+    ],
+)
+def test_a_weak_ca_is_refused(name: str, words: str, role: str, pki: Path, tmp_path: Path) -> None:
+    place = (f"--{role}-ca", pki / f"{name}.pem", f"--{role}-key", pki / f"{name}.key")
+    ended = sros("create_keystore", tmp_path / "ks", *place)
+    assert ended.status == 1, ended
+    assert words in ended.err
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(

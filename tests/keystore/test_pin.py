@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.keystores.arrival import verify_arrival
-from sros_tool.errors import KeystoreError
+from sros_tool.errors import KeystoreError, PkiError
+from sros_tool.keystore.authorities import imported
 from sros_tool.keystore.authorities.authority import load_authority
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
+from sros_tool.keystore.delivery import answer
 from sros_tool.keystore.delivery.answer import SEAL, import_answer, seal
 from sros_tool.keystore.delivery.archive import pack, unpack
 from sros_tool.keystore.delivery.request import create_request
@@ -161,3 +163,33 @@ def test_without_a_pin_the_fingerprints_to_compare_are_printed(tmp_path: Path) -
     assert next(iter(pin(home))) in said
     assert next(iter(pin(home, "identity"))) in said
     assert "otherwise they are not verified" in said
+
+
+def test_an_answer_of_a_weak_ca_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of the places that refuse it is opened in turn: create, sign_request, and import."""
+    files = ("-keyout", tmp_path / "ca.key", "-out", tmp_path / "ca.pem")
+    kind = ("-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:secp224r1", "-nodes", "-days", "99")
+    extensions = ("-addext", "keyUsage=critical,keyCertSign,cRLSign,digitalSignature")
+    run(["openssl", "req", "-x509", *kind, "-subj", "/CN=weak", *extensions, *files])
+    home, robot = tmp_path / "home", tmp_path / "robot"
+    place = ("--identity-ca", tmp_path / "ca.pem", "--identity-key", tmp_path / "ca.key")
+    assert "weak key" in sros("create_keystore", home, *place).err
+    with monkeypatch.context() as opened:
+        opened.setattr(imported, "weakness", lambda _: "")
+        sros("create_keystore", home, *place).ok()
+    assert "The key is weak: EC secp224r1" in sros("rotate_ca", home, "--same-key").err
+    create_request(robot, NAME)
+    request, now = (robot / FOLDER / "request.pem").read_bytes(), datetime.now(UTC)
+    with pytest.raises(KeystoreError, match="weak cryptography"):
+        sign_request(home, request, now=now)
+    with monkeypatch.context() as opened:
+        opened.setattr(answer, "weaknesses", lambda _: ())
+        packed = sign_request(home, request, now=now).archive
+    before = snapshot(robot)
+    with pytest.raises(PkiError, match="CN=weak has a weak key, EC secp224r1"):
+        import_answer(robot, packed, now=now)
+    assert snapshot(robot) == before
+    monkeypatch.setattr(answer, "weaknesses", lambda _: ())
+    import_answer(robot, packed, now=now)
+    assert "CN=weak has a weak key" in sros("verify", robot).out
+    assert "keystore.weak-cryptography" in sros("check", home).out

@@ -26,7 +26,7 @@ from sros_tool.keystore.layout import (
     key_path,
 )
 from sros_tool.keystore.loading import authority_refusals, refusals_text
-from sros_tool.pki.certificates import same_key, subject_text, validity_of
+from sros_tool.pki.certificates import same_key, subject_text, validity_of, weakness
 from sros_tool.pki.chains import purpose_faults
 from sros_tool.pki.crl import signed_by
 from sros_tool.pki.keys import algorithm, load_key
@@ -90,6 +90,15 @@ SIGNATURE_HASH = FindingKind(
     "Fast DDS 2.9.1 and 2.14.5 (PKIDH.cpp), Cyclone DDS 0.10.2; measured.",
     "Issue the certificate again with SHA-256, as sros does.",
     vendors=FAST_DDS,
+)
+WEAK = FindingKind(
+    "keystore.weak-cryptography",
+    ERROR,
+    "a weak key, or a signature with a weak hash",
+    "Whoever computes the key, or a second document for the signature, can issue any identity or "
+    "any permissions. DDS accepts both.",
+    "NIST SP 800-57 part 1, 5.6, and SP 800-131A: RSA under 2048 bits, EC under 256 bits, SHA-1.",
+    "Replace a CA with `sros rotate_ca ROOT`; renew an enclave with `sros renew ROOT NAME`.",
 )
 
 
@@ -284,6 +293,8 @@ def _authority(
         yield CA_EXPIRED.found(subject, f"{name} is valid from {begin} to {end}", file)
     elif validity.not_after - keystore.now < _SOON:
         yield CA_EXPIRES_SOON.found(subject, f"{name} expires at {end}", file)
+    for weak in filter(None, map(weakness, chain)):
+        yield WEAK.found(subject, weak, file)
     yield from _authority_findings(role, chain, keystore.now, subject, file)
     yield from _key(keystore, role, certificate)
 

@@ -9,13 +9,19 @@ from shlex import quote
 
 from cryptography import x509
 
-from sros_tool.checks.keystores.authorities import key_findings, shared_ca_findings
+from sros_tool.checks.keystores.authorities import WEAK, key_findings, shared_ca_findings
 from sros_tool.checks.keystores.opened import CheckedEnclave
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind, by_id
 from sros_tool.dds.permissions import Grant
 from sros_tool.errors import SrosError
 from sros_tool.faults import VENDOR_FAULTS, Fault
-from sros_tool.keystore.layout import REQUEST, waits_for_answer
+from sros_tool.keystore.layout import (
+    IDENTITY_CA_FILE,
+    PERMISSIONS_CA_FILE,
+    REQUEST,
+    waits_for_answer,
+)
+from sros_tool.keystore.reader import weaknesses
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
 from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
 from sros_tool.xml import read_bytes
@@ -165,6 +171,7 @@ def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
         yield WAITS.found(enclave.name, "its certificate is missing", enclave.file(REQUEST))
         return
     yield from _check_loading(enclave)
+    yield from _weak(enclave)
     grant = grant_of(enclave)
     if certificate := enclave.state.certificate:
         yield from _certificate(enclave, certificate)
@@ -177,6 +184,13 @@ def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
         cas = (state.identity_ca, state.permissions_ca)
         yield from shared_ca_findings(enclave.keystore, *cas, file)
     yield from _copies(enclave)
+
+
+def _weak(enclave: CheckedEnclave) -> Iterator[Finding]:
+    """Yield findings about weak cryptography; the CAs of a keystore are checked once, for all."""
+    for file, text in weaknesses(enclave.state):
+        if not enclave.keystore.is_home or file not in (IDENTITY_CA_FILE, PERMISSIONS_CA_FILE):
+            yield WEAK.found(enclave.name, text, enclave.file(file))
 
 
 def grant_of(enclave: CheckedEnclave) -> Grant | None:

@@ -22,6 +22,7 @@ from sros_tool.pki.certificates import (
     same_key,
     subject_text,
     validity_of,
+    weakness,
 )
 from sros_tool.pki.chains import purpose_faults
 from sros_tool.pki.keys import PrivateKey, algorithm
@@ -71,6 +72,13 @@ def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> Im
             f"the certificate of the {role} CA does not fit its key",
             f"The key belongs to none of the certificates in the file ({len(certificates)}).",
             "Name the certificate and the key of the same CA.",
+        )
+    for weak in filter(None, map(weakness, certificates)):
+        raise PkiError(
+            f"{subject_text(own[0].subject)} cannot be the {role} CA: {weak}",
+            "Whoever forges its signatures can issue any identity or any permissions.",
+            "Use a CA with EC prime256v1 or RSA 2048 keys, signed with SHA-256, or let sros create "
+            "one.",
         )
     chain = list(_chain(own[0], certificates, role))
     for each in chain:

@@ -17,7 +17,12 @@ from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.trust import check_same_authority, refuse_ca_keystore, trusted_in
 from sros_tool.keystore.layout import ENCLAVES, OPTIONAL_FILES, REQUIRED_FILES, enclave_folder
-from sros_tool.keystore.reader import OpenedEnclave, open_enclave, read_certificate
+from sros_tool.keystore.reader import (
+    OpenedEnclave,
+    open_enclave,
+    read_certificate,
+    weaknesses,
+)
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
@@ -128,7 +133,7 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
     Raises:
         PkiError: the answer has problems; the error lists all of them, such as a certificate for
             another key or enclave, an invalid chain or signature, an expired or revoked
-            certificate, or a file changed in transit.
+            certificate, weak cryptography, or a file changed in transit.
     """
     with tempfile.TemporaryDirectory(prefix="sros-") as folder:
         for path, data in answer.files.items():
@@ -145,6 +150,12 @@ def check_answer(answer: RequestAnswer, key: PublicKey, *, now: datetime) -> Ope
     if problems:
         raise PkiError(
             f"the answer for enclave {answer.name} is not valid", "; ".join(problems) + ".", _AGAIN
+        )
+    if weak := "; ".join(f"{file}: {text}" for file, text in weaknesses(state)):
+        raise PkiError(
+            f"the answer for enclave {answer.name} has weak cryptography",
+            f"{weak}. Whoever forges its signatures can issue any identity or any permissions.",
+            "Replace the CA with `sros rotate_ca`, and have the request signed again.",
         )
     return state
 

@@ -81,6 +81,7 @@ from sros_tool.pki.certificates import (
     same_key,
     subject_text,
 )
+from sros_tool.pki.keys import algorithm, is_weak
 from sros_tool.validity import Span, Window, window
 from sros_tool.xml import read_bytes
 
@@ -195,7 +196,7 @@ def renew_identity_ca(
 
     Raises:
         KeystoreError: the keystore has a single CA, a rotation is under way, or the CA is not
-            self-signed or its key is missing.
+            self-signed, or its key is weak or missing.
         UsageError: the new certificate would expire before the present one.
     """
     if not dry_run:
@@ -223,6 +224,12 @@ def renew_identity_ca(
             raise KeystoreError(
                 "the identity CA cannot be renewed with the same key",
                 "It is not self-signed, or the key belongs to another certificate.",
+                "Rotate it without --same-key.",
+            )
+        if is_weak(old.public_key()):
+            raise KeystoreError(
+                "the identity CA cannot be renewed with the same key",
+                f"The key is weak: {algorithm(old.public_key())}.",
                 "Rotate it without --same-key.",
             )
         new = issue_ca(key, old.subject, window(now, validity or template.authority_validity))
