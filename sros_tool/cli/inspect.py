@@ -48,7 +48,8 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
 
     PATH is a keystore, an enclave's folder, a file of certificates, a revocation list, a private
     key or a signed document (.p7s). The exit status is 1 if an enclave cannot run, a signature
-    does not verify, or a certificate or signed document is missing from the keystore's ledger.
+    does not verify, a certificate or signed document is missing from the keystore's ledger, or
+    lines of the ledger are missing or were changed.
     """
     from sros_tool.errors import DocumentError
     from sros_tool.keystore.describe import describe
@@ -81,6 +82,7 @@ def _show_history(root: Path, as_json: bool) -> int:
                     for item in found.items
                 ],
                 "unexplained": list(found.unexplained),
+                "gaps": list(found.gaps),
             }
         )
     else:
@@ -93,7 +95,9 @@ def _show_history(root: Path, as_json: bool) -> int:
             click.echo(shown.rstrip())
         for name in found.unexplained:
             click.echo(visible(f"NOT IN THE LEDGER  {name}"))
-    return 1 if found.unexplained else 0
+        for gap in found.gaps:
+            click.echo(visible(f"LEDGER DAMAGED  {gap}"))
+    return 1 if found.unexplained or found.gaps else 0
 
 
 def _keystore(d: dict[str, Any]) -> Iterator[str]:
@@ -122,6 +126,8 @@ def _keystore(d: dict[str, Any]) -> Iterator[str]:
             yield f"  governance: {d['governance']['error']}"
         else:
             yield from _indented(_governance(d["governance"]))
+    if d["ledger"]:
+        yield f"  LEDGER DAMAGED: {'; '.join(d['ledger'])}"
     yield f"  {len(d['enclaves'])} enclave{'' if len(d['enclaves']) == 1 else 's'}"
     for enclave in d["enclaves"]:
         until = enclave["valid_until"]

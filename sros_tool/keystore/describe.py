@@ -117,10 +117,16 @@ def _keystore(root: Path, now: datetime) -> Description:
     problems += [f"{role} CA: {a['error']}" for role, a in authorities.items() if "error" in a]
     if governance and "error" in governance:
         problems.append(f"governance: {governance['error']}")
+    try:
+        gaps = list(keystore.ledger.gaps)
+    except SrosError as error:
+        gaps = [str(error)]
+    problems += [f"ledger: {gap}" for gap in gaps]
     return {
         "kind": "keystore",
         "path": str(root),
         "template": settings.name if settings else None,
+        "ledger": gaps,
         "authorities": authorities,
         "governance": governance,
         "enclaves": enclaves,

@@ -22,7 +22,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     list_enclaves,
 )
-from sros_tool.keystore.ledger import Entry, read_ledger
+from sros_tool.keystore.ledger import GAP, Entry, read_ledger
 from sros_tool.keystore.reader import read_lists
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
@@ -42,6 +42,8 @@ class HistoryStatus(StrEnum):
     RETIRED = "retired"
     """A CA that was replaced, and is no longer trusted."""
     EXPIRED = "expired"
+    DAMAGED = "damaged"
+    """Lines of the ledger were missing or changed when the entry was made."""
     SENT = "sent"
     """It went to a robot; the keystore keeps no copy."""
 
@@ -57,17 +59,22 @@ class HistoryItem:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """All entries of the ledger, oldest first, and the paths of files without an entry."""
+    """All entries of the ledger, oldest first, and the paths of files without an entry.
+
+    ``gaps`` are sentences about lines of the ledger that are missing, changed or unreadable.
+    """
 
     items: tuple[HistoryItem, ...]
     unexplained: tuple[str, ...]
+    gaps: tuple[str, ...]
 
 
 def history(root: Path, *, now: datetime) -> History:
     """Return the ledger of a keystore, compared with its certificates and signed documents."""
     issued, revoked_files = _files(root, _active_paths(root)), _files(root, _revoked_paths(root))
     retired = _files(root, _retired_paths(root))
-    entries = read_ledger(root)
+    ledger = read_ledger(root)
+    entries = ledger.entries
     # A new CA starts with an empty revocation list, and lists drop expired certificates, so the
     # ledger is asked too.
     revoked = {each.serial for each in entries if each.what == "revocation"}
@@ -75,6 +82,8 @@ def history(root: Path, *, now: datetime) -> History:
     moment = iso(now)
 
     def status(entry: Entry) -> HistoryStatus:
+        if entry.what == GAP:
+            return HistoryStatus.DAMAGED
         if entry.what == "answer":
             return HistoryStatus.SENT
         if entry.what == "revocation" or entry.serial in revoked or entry.sha256 in revoked_files:
@@ -95,6 +104,7 @@ def history(root: Path, *, now: datetime) -> History:
         tuple(
             sorted(path for digest, paths in found.items() if digest not in known for path in paths)
         ),
+        ledger.gaps,
     )
 
 

@@ -16,6 +16,8 @@ SETTINGS = "sros.toml"
 """The settings of the keystore; keystores of ros2/sros2 do not have this file."""
 LEDGER = "ledger.jsonl"
 """The log of issued certificates and documents; keystores of ros2/sros2 do not have it."""
+LEDGER_HEAD = "ledger.p7s"
+"""The number of lines of the ledger and the digest of the last one, signed by a CA."""
 
 IDENTITY, PERMISSIONS = "identity", "permissions"
 ROLES = (IDENTITY, PERMISSIONS)
@@ -55,6 +57,12 @@ OPTIONAL_FILES = (CRL_FILE,)
 
 REQUEST = "request.pem"
 """The signing request of an enclave whose key was made on its robot and stays there."""
+SEAL = "answer.p7s"
+"""The list of all files of an answer with their digests, signed by the permissions CA.
+
+Without it, anyone who transports an answer could put an older governance or another CA into it.
+On the robot it stays next to the files, because its number says which answer they came from.
+"""
 
 
 def ca_certificate(role: str) -> str:
@@ -94,7 +102,7 @@ def folder_mode(path: str) -> int:
     return 0o755 if path in ("", PUBLIC) else 0o700
 
 
-_TOP_FILES = frozenset((SETTINGS, LEDGER, ROTATION))
+_TOP_FILES = frozenset((SETTINGS, LEDGER, LEDGER_HEAD, ROTATION))
 _FILE_TYPES = (".pem", ".p7s", ".xml")
 _TOP_FOLDERS = frozenset((ENCLAVES, PUBLIC, PRIVATE, REVOKED, RETIRED))
 

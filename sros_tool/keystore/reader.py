@@ -65,7 +65,7 @@ from sros_tool.values import shows
 from sros_tool.xml import read_bytes
 
 if TYPE_CHECKING:
-    from sros_tool.keystore.ledger import Entry
+    from sros_tool.keystore.ledger import Ledger
     from sros_tool.keystore.template import Template
 
 _Parsed = TypeVar("_Parsed")
@@ -115,8 +115,8 @@ class OpenedKeystore:
         return read_crl(self.root)
 
     @cached_property
-    def ledger(self) -> tuple[Entry, ...]:
-        """The ledger entries of all issued files, oldest first; empty without a ledger."""
+    def ledger(self) -> Ledger:
+        """The ledger of all issued files; empty without a ledger."""
         from sros_tool.keystore.ledger import read_ledger
 
         return read_ledger(self.root)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import shutil
 from collections.abc import Callable
 from datetime import timedelta, timezone
@@ -83,7 +84,8 @@ def _(bench: Bench) -> None:
 # ── authorities ────────────────────────────────────────────────────────────────────────────
 
 CASES |= {
-    "keystore.file-unreadable": lambda b: b.path("ledger.jsonl").write_text("nonsense\n"),
+    "keystore.file-unreadable": lambda b: b.path("sros.toml").write_text("nonsense\n"),
+    "keystore.ledger-damaged": lambda b: b.path("ledger.jsonl").write_text("nonsense\n"),
     "keystore.settings-missing": lambda b: b.unlink("sros.toml"),
     "keystore.ledger-missing": lambda b: b.unlink("ledger.jsonl"),
     "keystore.one-authority": lambda b: b.trust("permissions", b.authority("identity")),
@@ -322,6 +324,13 @@ def _(bench: Bench) -> None:
     bench.governance(("ENCRYPT", "SIGN"))
     own.unlink()
     own.write_bytes(data)
+
+
+@case("keystore.ledger-unchained")
+def _(bench: Bench) -> None:
+    bench.unlink("ledger.p7s")
+    ledger = bench.path("ledger.jsonl")
+    ledger.write_text(re.sub(r',"previous":"[0-9a-f]+"', "", ledger.read_text()))
 
 
 # ── the ledger, and policies ───────────────────────────────────────────────────────────────

@@ -56,7 +56,9 @@ def test_revoking_another_drops_it_too_and_the_ledger_keeps_it(tmp_path: Path) -
     revoke(root, ["/late"], now=late)
     assert serial not in listed(root)
     assert other in listed(root)
-    assert f"{serial:x}" in {each.serial for each in read_ledger(root) if each.what == "revocation"}
+    assert f"{serial:x}" in {
+        each.serial for each in read_ledger(root).entries if each.what == "revocation"
+    }
     (found,) = [
         item
         for item in history(root, now=late).items

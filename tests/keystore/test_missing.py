@@ -61,7 +61,9 @@ def test_of_a_revoked_enclave_it_says_since_when(tmp_path: Path) -> None:
     serial = _serial(root, "/camera")
     assert serial != first
     sros("revoke", root, "/camera", "--reason", "keyCompromise").ok()
-    (entry, *_) = (e for e in read_ledger(root) if e.what == "revocation" and e.serial == serial)
+    (entry, *_) = (
+        e for e in read_ledger(root).entries if e.what == "revocation" and e.serial == serial
+    )
     said = (
         f"enclave /camera of keystore '{root}' was revoked at {entry.time} (keyCompromise). Its "
         f"files are in '{root}/revoked/{serial}'. To use it again, create it with "

@@ -15,12 +15,12 @@ from sros_tool.keystore.authorities import imported
 from sros_tool.keystore.authorities.authority import load_authority
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
 from sros_tool.keystore.delivery import answer
-from sros_tool.keystore.delivery.answer import SEAL, import_answer, seal
+from sros_tool.keystore.delivery.answer import import_answer, seal
 from sros_tool.keystore.delivery.archive import pack, unpack
 from sros_tool.keystore.delivery.request import create_request
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.delivery.trust import read_pin
-from sros_tool.keystore.layout import PERMISSIONS
+from sros_tool.keystore.layout import PERMISSIONS, SEAL
 from sros_tool.keystore.lifecycle.create import create_keystore
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage
@@ -83,7 +83,7 @@ def test_the_identity_ca_does_not_vouch_for_the_permissions(robot: Path, tmp_pat
     subject = certificate(home / FOLDER / "cert.pem").subject.rfc4514_string()
     files = resigned(evil, files, subject)
     authority = load_authority(evil, PERMISSIONS, load_settings(evil), IN_KEYSTORE, NOW)
-    archive = pack({SEAL: seal(files, authority), **files})
+    archive = pack({SEAL: seal(files, 1, authority), **files})
     before = snapshot(robot)
     with pytest.raises(KeystoreError, match="vouches for the certificate only"):
         import_answer(robot, archive, now=NOW, pinned=pin(home, "identity"))

@@ -21,12 +21,12 @@ from cryptography.x509.oid import NameOID
 
 from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.errors import KeystoreError, PkiError, PolicyError, SrosError
-from sros_tool.keystore.delivery.answer import SEAL, import_answer
+from sros_tool.keystore.delivery.answer import import_answer
 from sros_tool.keystore.delivery.archive import MAX_MEMBER, MAX_UNPACKED, pack, unpack
 from sros_tool.keystore.delivery.request import create_request
 from sros_tool.keystore.delivery.signing import Signed, sign_request
 from sros_tool.keystore.history import history
-from sros_tool.keystore.layout import list_enclaves
+from sros_tool.keystore.layout import SEAL, list_enclaves
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
 from sros_tool.keystore.lifecycle.renew import renew
@@ -46,6 +46,7 @@ SENT = {"cert.pem", "identity_ca.cert.pem", "permissions_ca.cert.pem"} | {
     "governance.p7s",
     "permissions.p7s",
 }
+INSTALLED = SENT | {SEAL}
 
 
 @pytest.fixture(scope="session")
@@ -172,7 +173,7 @@ def test_signing_records_everything_but_the_key(home: Path, robot: Path) -> None
     subject = issued.subject
     assert len(subject.get_attributes_for_oid(NameOID.ORGANIZATIONAL_UNIT_NAME)) == 1
     assert key_digest(issued.public_key()) == signed.key  # type: ignore[arg-type]
-    entries = [entry for entry in read_ledger(home) if entry.enclave == NAME]
+    entries = [entry for entry in read_ledger(home).entries if entry.enclave == NAME]
     assert [entry.what for entry in entries] == ["certificate", "permissions", "answer"]
     assert not history(home, now=NOW).unexplained
     with tarfile.open(fileobj=io.BytesIO(signed.archive)) as tar:
@@ -196,7 +197,7 @@ def test_the_rights_are_those_of_the_policy_and_a_renewal_keeps_them(
     second = certificate(home / FOLDER / "cert.pem")
     assert second.not_valid_after_utc - first.not_valid_after_utc == timedelta(days=30)
     assert second.public_key() == first.public_key()
-    entries = [entry for entry in read_ledger(home) if entry.what == "permissions"]
+    entries = [entry for entry in read_ledger(home).entries if entry.what == "permissions"]
     assert entries[-1].policy == entries[-2].policy != ""
 
 
@@ -376,13 +377,14 @@ def test_an_answer_completes_the_enclave(home: Path, robot: Path, free_umask: No
     signed = sign(home, robot)
     before = snapshot(robot)
     planned = import_answer(robot, signed.archive, now=NOW, dry_run=True)
-    assert {each.path for each in planned.changes} == {f"{FOLDER}/{file}" for file in SENT}
+    assert {each.path for each in planned.changes} == {f"{FOLDER}/{file}" for file in INSTALLED}
     assert snapshot(robot) == before
     done = import_answer(robot, signed.archive, now=NOW)
     assert done.changes == planned.changes
     assert done.first
     assert (robot / FOLDER / "key.pem").read_bytes() == key
-    assert {path.name for path in (robot / FOLDER).iterdir()} == SENT | {"key.pem", "request.pem"}
+    present = {path.name for path in (robot / FOLDER).iterdir()}
+    assert present == INSTALLED | {"key.pem", "request.pem"}
     arrival = verify_arrival(robot, now=NOW)
     assert not arrival.findings
     assert arrival.enclaves[0].until == done.until

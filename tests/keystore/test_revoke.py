@@ -106,7 +106,7 @@ def test_earlier_certificates_are_revoked_too(tmp_path: Path) -> None:
     revoke(root, ["/a"], now=NOW + 30 * DAY)
     assert {each.serial for each in crl_of(root).revoked} == set(serials)
     assert not crl_of(root).revokes(other)
-    told = [int(each.serial, 16) for each in read_ledger(root) if each.what == "revocation"]
+    told = [int(each.serial, 16) for each in read_ledger(root).entries if each.what == "revocation"]
     assert sorted(told) == sorted(serials)
 
 

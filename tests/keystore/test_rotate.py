@@ -138,7 +138,7 @@ def test_the_keystore_can_be_used_at_every_stage(root: Path) -> None:
 def test_the_ledger_has_everything(separate: Path) -> None:
     for _ in STAGES:
         rotate_ca(separate, now=NOW)
-    entries = read_ledger(separate)
+    entries = read_ledger(separate).entries
     assert [e.what for e in entries].count("ca") == 4
     known = {entry.sha256 for entry in entries}
     for file in ("identity_ca", "permissions_ca"):
@@ -499,7 +499,7 @@ def shape(root: Path) -> tuple[object, ...]:
     """What a keystore is, apart from keys and signatures, which are never the same."""
     files = {path for path in snapshot(root) if not path.startswith("retired/")}
     kept = sorted(path.name.split(".", 1)[1] for path in root.glob("retired/*"))
-    return frozenset(files), tuple(kept), tuple(states(root)), len(read_ledger(root))
+    return frozenset(files), tuple(kept), tuple(states(root)), len(read_ledger(root).entries)
 
 
 @pytest.mark.parametrize("stage", [*STAGES, None])

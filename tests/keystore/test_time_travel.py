@@ -325,7 +325,7 @@ def test_ten_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert renewed > ENCLAVES * 12
     assert len(thieves) == 23
     # The list lost what had ended; the ledger has it all.
-    known = {each.serial for each in read_ledger(root) if each.what == "revocation"}
+    known = {each.serial for each in read_ledger(root).entries if each.what == "revocation"}
     assert {f"{thief.certificate.serial_number:x}" for thief in thieves} <= known
     assert longest < len(known) / 2
     assert verified.in_full > ENCLAVES * 14, verified.in_full

@@ -229,6 +229,28 @@ LEDGER_MISSING = FindingKind(
     "sros: ledger.jsonl lists everything that was issued.",
     "Restore ledger.jsonl from a backup.",
 )
+LEDGER_DAMAGED = FindingKind(
+    "keystore.ledger-damaged",
+    ERROR,
+    "a ledger with lines that are missing or were changed",
+    "It may lack certificates that `sros revoke` should revoke, and permissions that replaced the "
+    "present ones.",
+    "sros: each line of ledger.jsonl has the digest of the line before, ledger.p7s that of the "
+    "last.",
+    "Restore ledger.jsonl and ledger.p7s from the same backup. Without one, state all rights again "
+    "with `sros generate_artifacts -k ROOT -p POLICY_FILE`, and replace the CAs with `sros "
+    "rotate_ca ROOT --next`, so that nothing that the ledger lacks is valid.",
+)
+LEDGER_UNCHAINED = FindingKind(
+    "keystore.ledger-unchained",
+    NOTE,
+    "a ledger with lines that another version wrote, without a chain",
+    "If one of these lines was removed, nothing shows it.",
+    "sros: each line of ledger.jsonl has the digest of the line before, ledger.p7s that of the "
+    "last.",
+    "New lines are chained. Once the CAs are replaced (`sros rotate_ca ROOT --next`), the earlier "
+    "lines no longer matter.",
+)
 CRL_EXPIRES_SOON = FindingKind(
     "keystore.revocation-list-ends",
     ERROR,
@@ -274,12 +296,18 @@ def check_authorities(keystore: CheckedKeystore) -> Iterator[Finding]:
 
 
 def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
-    """Yield a finding if only one of settings and ledger exists: ros2/sros2 makes neither."""
+    """Yield findings about the settings and the ledger: ros2/sros2 makes neither."""
     settings, ledger = ((keystore.root / name).exists() for name in (SETTINGS, LEDGER))
     if ledger and not settings:
         yield SETTINGS_MISSING.found("settings", f"there is no {SETTINGS}", str(keystore.root))
     if settings and not ledger:
         yield LEDGER_MISSING.found("ledger", f"there is no {LEDGER}", str(keystore.root))
+        return
+    file = keystore.shown(LEDGER)
+    for gap in keystore.ledger.gaps:
+        yield LEDGER_DAMAGED.found("ledger", gap, file)
+    if count := keystore.ledger.unchained:
+        yield LEDGER_UNCHAINED.found("ledger", f"{count} lines have no chain", file)
 
 
 def _authority(

@@ -15,6 +15,7 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.layout import (
     ENCLAVES,
     LEDGER,
+    LEDGER_HEAD,
     OPTIONAL_FILES,
     PRIVATE,
     PUBLIC,
@@ -23,6 +24,7 @@ from sros_tool.keystore.layout import (
     RETIRED,
     REVOKED,
     ROTATION,
+    SEAL,
     SETTINGS,
     STAGE,
     enclave_folder,
@@ -156,8 +158,8 @@ UNKNOWN_FILE = FindingKind(
 _KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
 _KEY_MARK = b"PRIVATE KEY-----"
 _MOST_READ = 65536
-_KNOWN = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml", REQUEST, "governance.xml")
-_TOP = (SETTINGS, LEDGER, ROTATION)
+_KNOWN = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml", REQUEST, SEAL, "governance.xml")
+_TOP = (SETTINGS, LEDGER, LEDGER_HEAD, ROTATION)
 _KNOWN_ANYWHERE = re.compile(
     r".*\.(?:cert|key|crl)\.pem\Z|.*\.p11\Z|.*\.srl\Z|index\.txt.*|serial.*"
 )

@@ -45,8 +45,8 @@ UNEXPLAINED = FindingKind(
     "a certificate or document that the keystore never issued",
     "It came from another source, or the ledger was reset to an earlier state.",
     "sros: ledger.jsonl.",
-    "Find out where it comes from; `sros renew ROOT NAME` issues certificate and permissions "
-    "again.",
+    "Find out where it comes from. Then state the rights with `sros create_permission ROOT NAME "
+    "POLICY_FILE`, and issue the certificate again with `sros renew ROOT NAME --revoke-old`.",
 )
 OLD_PERMISSIONS = FindingKind(
     "enclave.old-permissions",
@@ -55,8 +55,8 @@ OLD_PERMISSIONS = FindingKind(
     "Their signature is valid, and if the subject stays the same DDS accepts them until they "
     "expire. Perhaps a backup was restored, or someone tries to get back a removed right.",
     "ros2/sros2 issue 275; sros: ledger.jsonl.",
-    "Sign the intended permissions with `sros create_permission ROOT NAME POLICY_FILE` or `sros "
-    "renew`.",
+    "Sign the intended permissions with `sros create_permission ROOT NAME POLICY_FILE`. `sros "
+    "renew` refuses to sign these again.",
 )
 STALE = FindingKind(
     "enclave.stale-permissions",
@@ -217,11 +217,12 @@ def _exported_governance(
 
 
 def _ledger(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:
-    if not keystore.ledger:
+    entries = keystore.ledger.entries
+    if not entries:
         return
-    known = {entry.sha256 for entry in keystore.ledger}
+    known = {entry.sha256 for entry in entries}
     signed: dict[str, list[str]] = defaultdict(list)
-    for entry in keystore.ledger:
+    for entry in entries:
         if entry.what == "permissions":
             signed[entry.enclave].append(entry.sha256)
     for each in summaries:

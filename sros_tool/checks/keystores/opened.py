@@ -21,7 +21,7 @@ from sros_tool.keystore.layout import (
     ca_certificate,
     enclave_path,
 )
-from sros_tool.keystore.ledger import Entry
+from sros_tool.keystore.ledger import Ledger
 from sros_tool.keystore.reader import OpenedEnclave, open_keystore
 from sros_tool.keystore.template import Template
 from sros_tool.pki.crl import RevocationList
@@ -55,7 +55,7 @@ class CheckedKeystore:
     settings: Template | None
     authorities: dict[str, tuple[x509.Certificate, ...]]
     crl: RevocationList | None
-    ledger: tuple[Entry, ...]
+    ledger: Ledger
     governance: bytes = b""
     unread: tuple[UnreadablePart, ...] = ()
     policies: tuple[Policy, ...] = ()
@@ -133,7 +133,7 @@ def read_keystore(
 
     governance = root / GOVERNANCE_P7S
     settings = part(SETTINGS, lambda: keystore.settings, None)
-    ledger: tuple[Entry, ...] = part(LEDGER, lambda: keystore.ledger, ())
+    ledger = part(LEDGER, lambda: keystore.ledger, Ledger())
     crl = part(CRL, lambda: keystore.revocation_list, None)
     authorities = {role: chain for role in ROLES if (chain := authority(role))}
     return CheckedKeystore(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 import tempfile
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from sros_tool.files import write_new_file
 from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.trust import check_same_authority, refuse_ca_keystore, trusted_in
-from sros_tool.keystore.layout import ENCLAVES, OPTIONAL_FILES, REQUIRED_FILES, enclave_folder
+from sros_tool.keystore.layout import ENCLAVES, OPTIONAL_FILES, REQUIRED_FILES, SEAL, enclave_folder
 from sros_tool.keystore.reader import (
     OpenedEnclave,
     open_enclave,
@@ -42,18 +43,16 @@ from sros_tool.xml import read_bytes
 _KEY = "key.pem"
 _REQUIRED = tuple(file for file in REQUIRED_FILES if file != _KEY)
 _AGAIN = "Have the request signed again, and import the new answer."
-SEAL = "answer.p7s"
-"""The list of all files of an answer with their digests, signed by the permissions CA.
-
-Without it, anyone who transports an answer could put an older governance or another CA into it.
-"""
+_SEALED = re.compile(rb"sros answer (?:1|2\nnumber ([1-9][0-9]{0,12}))\n")
+"""The first lines of a seal; earlier versions wrote no number."""
 
 
 @dataclass(frozen=True, slots=True)
 class RequestAnswer:
     """The answer to a request: the files of one enclave by their paths, without its key.
 
-    ``seal`` is the signed list of the files (`SEAL`).
+    ``seal`` is the signed list of the files (`SEAL`).  The list begins with a number, which is
+    higher than those of all answers that the keystore gave before.
     """
 
     name: str
@@ -81,15 +80,25 @@ class ImportedEnclave:
     changes: tuple[Change, ...]
 
 
-def seal(files: dict[str, bytes], authority: Authority) -> bytes:
-    """Return the file list of an answer as an S/MIME message that ``authority`` signed."""
-    return authority.sign(_listed(files), "the file list of the answer")
+def seal(files: dict[str, bytes], number: int, authority: Authority) -> bytes:
+    """Return the file list of an answer as an S/MIME message that ``authority`` signed.
+
+    ``number`` is from `sros_tool.keystore.ledger.Ledger.next_number`.
+    """
+    head = f"sros answer 2\nnumber {number}\n".encode()
+    return authority.sign(head + _listed(files), "the file list of the answer")
 
 
 def _listed(files: dict[str, bytes]) -> bytes:
     """Return the list of files that is signed: one SHA-256 and path per line, sorted."""
     digests = (f"{hashlib.sha256(data).hexdigest()}  {path}" for path, data in files.items())
-    return "\n".join(["sros answer 1", *sorted(digests), ""]).encode()
+    return "\n".join([*sorted(digests), ""]).encode()
+
+
+def _number_of(message: bytes) -> int:
+    """Return the number in a seal, or 0 if an earlier version of sros made it."""
+    head = _SEALED.match(_with_lf(smime.parse(message).document))
+    return int(head[1] or 0) if head else 0
 
 
 def _with_lf(document: bytes) -> bytes:
@@ -166,7 +175,8 @@ def _broken_seal(answer: RequestAnswer, authorities: Iterable[x509.Certificate])
         signed = smime.parse(answer.seal)
     except SrosError as error:
         return str(error)
-    if _with_lf(signed.document) != _listed(answer.files):
+    head = _SEALED.match(document := _with_lf(signed.document))
+    if not head or document[head.end() :] != _listed(answer.files):
         return "the files differ from the signed list"
     problem = ""
     for authority in authorities:
@@ -223,7 +233,8 @@ def import_answer(
         if not force:
             _check_known(folder, answer, known)
             _check_newer(place, answer, state.certificate)
-        for path, content in answer.files.items():
+        seal_path = f"{enclave_folder(name)}/{SEAL}"
+        for path, content in {**answer.files, seal_path: answer.seal}.items():
             present = folder / path
             if not present.is_file() or read_bytes(present, "file") != content:
                 transaction.write(path, content)
@@ -284,7 +295,8 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
     """Refuse an answer that is older than the installed files: it may be replayed."""
     remedy = "Have the request signed again, or add --force to go back to the older answer."
     path = place / "cert.pem"
-    if path.exists():
+    numbered = _check_number(place / SEAL, answer, remedy)
+    if path.exists() and not numbered:
         old = validity_of(read_certificate(path))
         new = validity_of(certificate)
         if new.not_before < old.not_before:
@@ -305,3 +317,28 @@ def _check_newer(place: Path, answer: RequestAnswer, certificate: x509.Certifica
                 "would be trusted again.",
                 remedy,
             )
+
+
+def _check_number(path: Path, answer: RequestAnswer, remedy: str) -> bool:
+    """Refuse an answer with a lower number than the installed one, or with the same number.
+
+    ``path`` is the seal of the installed answer.  Return whether both have a number, so that no
+    clock has to tell which is newer.
+    """
+    if not path.exists():
+        return False
+    present = read_bytes(path, "file list of the installed answer")
+    old, new = _number_of(present), _number_of(answer.seal)
+    if not old or present == answer.seal:
+        return bool(old)
+    if not new:
+        why = f"It has no number, the installed one has {old}: an earlier version of sros made it."
+    elif new < old:
+        why = f"It has the number {new}, the installed one has {old}."
+    elif new == old:
+        why = f"Both have the number {old}, so the keystore's ledger was set back in between."
+    else:
+        return True
+    raise KeystoreError(
+        f"the answer for enclave {answer.name} is older than the installed one", why, remedy
+    )

@@ -14,7 +14,7 @@ from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
 from sros_tool.files import staged_file
 from sros_tool.keystore.authorities.authority import load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
-from sros_tool.keystore.delivery.answer import SEAL, RequestAnswer, check_answer, seal
+from sros_tool.keystore.delivery.answer import RequestAnswer, check_answer, seal
 from sros_tool.keystore.delivery.archive import pack
 from sros_tool.keystore.issuing.enclave import (
     EarlierRights,
@@ -22,10 +22,10 @@ from sros_tool.keystore.issuing.enclave import (
     Issuance,
     Issued,
     NewIdentity,
+    RecordedRights,
     StatedRights,
     default_rights,
     link_shared_files,
-    policies_of,
     present_files,
     shared_files,
     stated_enclave,
@@ -38,11 +38,12 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
     REQUEST,
     REVOKED,
+    SEAL,
     enclave_folder,
     enclave_path,
     list_enclaves,
 )
-from sros_tool.keystore.ledger import append, document_entry
+from sros_tool.keystore.ledger import append, document_entry, read_ledger
 from sros_tool.keystore.reader import (
     check_domain,
     load_governance,
@@ -146,11 +147,12 @@ def sign_request(
         link_shared_files(transaction, name, present_files(root, name))
         notes += [*issued.notes(), *writer.notes]
         files = _answer_files(root, issued)
-        sealed = seal(files, authorities.permissions)
+        number = read_ledger(root).next_number()
+        sealed = seal(files, number, authorities.permissions)
         _check_result(RequestAnswer(name, files, sealed), request, now)
         archive = pack({SEAL: sealed, **files})
-        sent = document_entry(now, "answer", sealed, enclave=name)
-        append(transaction, [*writer.entries, sent])
+        sent = document_entry(now, "answer", sealed, enclave=name, number=number)
+        append(transaction, [*writer.entries, sent], authorities.identity, now)
         staged = staged_file(answer, archive) if answer and not dry_run else nullcontext()
         with staged as put_in_place:
             transaction.commit()
@@ -259,7 +261,7 @@ def _earlier_rights(root: Path, name: str, authority: x509.Certificate) -> Earli
             "They belong to another certificate.",
             "State the rights with -p POLICY_FILE.",
         )
-    return EarlierRights(old.grant, policies_of(root).get(old.digest, ""))
+    return RecordedRights(root).of(name, old.digest, old.grant)
 
 
 def _present_certificate(root: Path, name: str) -> x509.Certificate:

@@ -34,6 +34,7 @@ from sros_tool.keystore.layout import (
     KEY_FILE,
     PERMISSIONS_FILE,
     ROLES,
+    SETTINGS,
     ca_certificate,
     enclave_folder,
     enclave_path,
@@ -317,9 +318,51 @@ def default_rights(template: Template, name: str) -> Enclave:
     return replace(_default_policy(template.default_permissions), path=name)
 
 
-def policies_of(root: Path) -> dict[str, str]:
-    """Map the SHA-256 of each signed document in the ledger to its policy's SHA-256."""
-    return {each.sha256: each.policy for each in read_ledger(root)}
+class RecordedRights:
+    """The rights that the ledger says were last signed for each enclave.
+
+    The signature of older permissions is as valid as ever, so whoever puts them back could have
+    their rights signed again, with a new date.
+    """
+
+    def __init__(self, root: Path) -> None:
+        ledger = read_ledger(root)
+        self._root = root
+        self._gaps = ledger.gaps
+        # A keystore of ros2/sros2 has enclaves that no ledger records.
+        self._complete = (root / SETTINGS).exists()
+        self._last = {each.enclave: each for each in ledger.entries if each.what == "permissions"}
+        self._certain = {each.enclave for each in ledger.certain if each.what == "permissions"}
+
+    def of(self, name: str, digest: str, grant: Grant) -> EarlierRights:
+        """Return the rights in the permissions of an enclave, to sign them again.
+
+        Args:
+            name: the enclave.
+            digest: the SHA-256 of its present permissions document, in hexadecimal.
+            grant: the rights in it.
+
+        Raises:
+            KeystoreError: it is not the last document that the ledger has for the enclave.
+        """
+        last = self._last.get(name)
+        if last and last.sha256 != digest:
+            why = (
+                f"The ledger has others, signed at {last.time}. Perhaps older ones were put back, "
+                "with rights that were taken away since."
+            )
+        elif self._gaps and name not in self._certain:
+            why = f"The ledger has gaps ({'; '.join(self._gaps)}), so later ones may be missing."
+        elif not last and self._complete:
+            why = "The ledger has none for this enclave."
+        else:
+            return EarlierRights(grant, last.policy if last else "")
+        raise KeystoreError(
+            f"it is not certain that the permissions of enclave {name} are its latest",
+            why,
+            f"State its rights with `sros create_permission {self._root} {name} POLICY_FILE`, and "
+            "try again.",
+        )
 
 
 def present_files(root: Path, name: str) -> set[str]:

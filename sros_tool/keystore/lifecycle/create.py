@@ -124,7 +124,7 @@ def create_keystore(
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
         domains = domains or DomainSet.of((0, 0))
         keystore = _write_keystore(transaction, template, domains, keyring, now, imported)
-        append(transaction, keystore.entries)
+        append(transaction, keystore.entries, keystore.authorities.identity, now)
         transaction.commit()
     return Creation(
         root,
@@ -394,7 +394,8 @@ def _write_enclaves(
         return _write_enclave(writer, transaction, keystore, name, wanted[name], now)
 
     done = writer.for_each(list(wanted), write, progress)
-    append(transaction, [*keystore.entries, *writer.entries])
+    entries = [*keystore.entries, *writer.entries]
+    append(transaction, entries, keystore.authorities.identity, now)
     transaction.commit()
     outcomes = {name: outcome for name, (outcome, _) in done.items()}
     created = _names_with(outcomes, _Outcome.CREATED)

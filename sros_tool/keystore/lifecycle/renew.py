@@ -18,11 +18,10 @@ from sros_tool.keystore.expiry import (
     refuse_unreadable,
 )
 from sros_tool.keystore.issuing.enclave import (
-    EarlierRights,
     EnclaveWriter,
     Issuance,
     NewIdentity,
-    policies_of,
+    RecordedRights,
 )
 from sros_tool.keystore.layout import (
     KEY_FILE,
@@ -33,7 +32,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, append, read_ledger
 from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
-from sros_tool.keystore.lifecycle.revoke import link_everywhere, still_valid
+from sros_tool.keystore.lifecycle.revoke import link_everywhere, remarks_on_lack, still_valid
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import load_settings
 from sros_tool.keystore.template import Template
@@ -137,16 +136,18 @@ def renew(
         if revoke_old and replaced:
             ledger = read_ledger(root)
             lists = RevocationListSigner(
-                transaction, authorities.identity, template, keyring, ledger, now
+                transaction, authorities.identity, template, keyring, ledger.entries, now
             )
-            revocations = _superseded(replaced, ledger, lists, now)
+            revocations = _superseded(root, replaced, ledger.entries, lists, now)
+            present = {each.serial: each.name for each in replaced}
+            lists.remarks += remarks_on_lack(root, ledger, present)
             count = len(revocations)
             date = now.replace(microsecond=0)
             new_entries = [Revoked(int(each.serial, 16), date, _REASON) for each in revocations]
             _, signed = lists.sign(new_entries, existing, incomplete=False)
             entries += [*revocations, *signed]
             link_everywhere(transaction, existing)
-        append(transaction, entries)
+        append(transaction, entries, authorities.identity, now)
         transaction.commit()
     return Renewal(
         root,
@@ -161,6 +162,7 @@ def renew(
 
 
 def _superseded(
+    root: Path,
     replaced: Sequence[_Replaced],
     ledger: Sequence[Entry],
     lists: RevocationListSigner,
@@ -168,14 +170,11 @@ def _superseded(
 ) -> list[Entry]:
     """Return the ledger entries for revoking all earlier certificates that have not expired."""
     listed = {each.serial for each in lists.present.revoked} if lists.present else set()
-    issued: dict[str, list[Entry]] = {each.name: [] for each in replaced}
-    for entry in ledger:
-        if entry.enclave in issued:
-            issued[entry.enclave].append(entry)
+    known = still_valid(root, ledger, [each.name for each in replaced], now)
     found = []
     for each in replaced:
         # The ledger lacks certificates that ros2/sros2 issued.
-        subjects = still_valid(issued[each.name], each.name, now)
+        subjects = known[each.name]
         if each.not_after >= now:
             subjects[each.serial] = each.subject
         found += [
@@ -205,7 +204,7 @@ class _Renewer:
         self._template = template
         self._now = now
         self._new_key = new_key
-        self._policies = policies_of(transaction.root)
+        self._recorded = RecordedRights(transaction.root)
 
     def renew_if_due(
         self, name: str, threshold: Threshold | None
@@ -237,6 +236,7 @@ class _Renewer:
                 "Restore the certificate, or remove the enclave's folder and create it again.",
             )
         state.signed.verify(self._authorities.permissions.certificate)
+        rights = self._recorded.of(name, state.digest, state.grant)
         subject = enclave_subject(name, unique=self._template.unique_subject)
         if self._new_key:
             key = self._generate_key(name)
@@ -244,8 +244,7 @@ class _Renewer:
         else:
             public: PublicKey = state.certificate.public_key()  # type: ignore[assignment]
             identity = NewIdentity(subject, public)
-        policy = self._policies.get(state.digest, "")
-        return Issuance(name, identity, EarlierRights(state.grant, policy))
+        return Issuance(name, identity, rights)
 
     def _generate_key(self, name: str) -> PrivateKey:
         if not (enclave_path(self._root, name) / KEY_FILE).exists():

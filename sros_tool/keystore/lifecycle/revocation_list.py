@@ -9,12 +9,13 @@ issuing CA alone (all measured).
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 
 from cryptography import x509
 
-from sros_tool.errors import KeystoreError
+from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.authorities.authority import Authority, write_bundle
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.layout import CRL, IDENTITY, REVOKED
@@ -157,15 +158,17 @@ class RevocationListSigner:
 
     def _expiries(self) -> dict[int, str]:
         """Map serial numbers to expiries, from the ledger and the files in ``revoked``."""
-        expiries = {
-            int(each.serial, 16): each.not_after
+        recorded = {
+            each.serial: each.not_after
             for each in self._ledger
-            if each.what == "certificate"
+            if each.what == "certificate" and each.serial and each.not_after
         }
+        expiries = {int(serial, 16): not_after for serial, not_after in recorded.items()}
         for path in (self._root / REVOKED).glob("*/cert.pem"):
-            if int(path.parent.name, 16) not in expiries:
-                found = read_certificate(path)
-                expiries.setdefault(found.serial_number, iso(validity_of(found).not_after))
+            if path.parent.name not in recorded:
+                with suppress(SrosError):  # without its expiry, it stays on the list
+                    found = read_certificate(path)
+                    expiries.setdefault(found.serial_number, iso(validity_of(found).not_after))
         return expiries
 
     # ── the second CA during a rotation ────────────────────────────────────────────────────

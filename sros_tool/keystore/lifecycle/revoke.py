@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from sros_tool.errors import KeystoreError, UsageError
+from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.authorities.authority import Authority, load_authority
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
@@ -20,7 +21,7 @@ from sros_tool.keystore.layout import (
     enclave_folder,
     list_enclaves,
 )
-from sros_tool.keystore.ledger import Entry, append, read_ledger
+from sros_tool.keystore.ledger import Entry, Ledger, append, read_ledger
 from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import load_settings, read_certificate
@@ -28,7 +29,7 @@ from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
-from sros_tool.pki.certificates import issued_by, subject_text
+from sros_tool.pki.certificates import common_name_of, issued_by, subject_text, validity_of
 from sros_tool.pki.crl import REASONS, Revoked
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
@@ -66,8 +67,9 @@ def revoke(
 ) -> Revocation:
     """Revoke the certificates of enclaves and move their files to ``revoked`` in the keystore.
 
-    All certificates of an enclave that are in the ledger and have not expired are revoked: an
-    attacker with the key could use an earlier certificate, too.  The other enclaves get
+    All certificates of an enclave that have not expired are revoked, if its folder, the ledger or
+    the folder ``revoked`` has them: an attacker with the key could use an earlier certificate, too.
+    If the ledger may lack some, a remark says so.  The other enclaves get
     ``crl.pem``, a link to the list.  During a rotation of the identity CA, both CAs sign a list; if
     the key of the old CA is missing, ``until_retired`` accepts that Fast DDS trusts its
     certificates until it is retired.
@@ -88,14 +90,18 @@ def revoke(
         existing = _check_names(root, names)  # another process may have revoked it meanwhile
         template = load_settings(root)
         authority = load_authority(root, IDENTITY, template, keyring, now)
-        issued = read_ledger(root)
+        ledger = read_ledger(root)
+        issued = ledger.entries
         lists = RevocationListSigner(transaction, authority, template, keyring, issued, now)
         listed = {each.serial for each in lists.present.revoked} if lists.present else set()
         revoked: list[Revoked] = []
         entries: list[Entry] = []
-        for name in dict.fromkeys(names):
-            subjects = still_valid(issued, name, now)
-            subjects.update([_move_away(transaction, authority, name)])
+        present: dict[int, str] = {}
+        known = still_valid(root, issued, names, now)
+        for name, subjects in known.items():
+            serial, subject = _move_away(transaction, authority, name)
+            present[serial] = name
+            subjects[serial] = subject
             for serial, subject in subjects.items():
                 if serial not in listed:
                     listed.add(serial)
@@ -107,7 +113,7 @@ def revoke(
         next_update, signed = lists.sign(revoked, remaining, incomplete=until_retired)
         entries += signed
         link_everywhere(transaction, remaining)
-        append(transaction, entries)
+        append(transaction, entries, authority, now)
         transaction.commit()
     return Revocation(
         root,
@@ -115,7 +121,7 @@ def revoke(
         remaining,
         next_update,
         tuple(transaction.changes),
-        tuple(lists.remarks),
+        (*lists.remarks, *remarks_on_lack(root, ledger, present)),
     )
 
 
@@ -134,11 +140,11 @@ def refresh_crl(
         template = load_settings(root)
         authority = load_authority(root, IDENTITY, template, keyring, now)
         lists = RevocationListSigner(
-            transaction, authority, template, keyring, read_ledger(root), now
+            transaction, authority, template, keyring, read_ledger(root).entries, now
         )
         next_update, entries = lists.sign((), existing, incomplete=True)
         link_everywhere(transaction, existing)
-        append(transaction, entries)
+        append(transaction, entries, authority, now)
         transaction.commit()
     changes, remarks = tuple(transaction.changes), tuple(lists.remarks)
     return Revocation(root, (), existing, next_update, changes, remarks)
@@ -154,13 +160,46 @@ def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
     return existing
 
 
-def still_valid(issued: Sequence[Entry], name: str, now: datetime) -> dict[int, str]:
-    """Map serial numbers to subjects, for the certificates of ``name`` that have not expired."""
-    return {
-        int(each.serial, 16): each.subject
-        for each in issued
-        if each.what == "certificate" and each.enclave == name and each.not_after >= iso(now)
-    }
+def still_valid(
+    root: Path, issued: Iterable[Entry], names: Iterable[str], now: datetime
+) -> dict[str, dict[int, str]]:
+    """Map each of the enclaves ``names`` to its earlier certificates that have not expired.
+
+    They are serial numbers with subjects, from the ledger's entries ``issued`` and from the files
+    in ``revoked``: a list that was lost no longer has those.
+    """
+    found: dict[str, dict[int, str]] = {name: {} for name in names}
+    moment = iso(now)
+    for each in issued:
+        expired = each.not_after and each.not_after < moment
+        if each.what == "certificate" and each.enclave in found and each.serial and not expired:
+            found[each.enclave][int(each.serial, 16)] = each.subject
+    for path in sorted((root / REVOKED).glob("*/cert.pem")):
+        with suppress(SrosError):  # it was revoked when it was put there
+            certificate = read_certificate(path)
+            name = common_name_of(certificate.subject)
+            if name in found and validity_of(certificate).not_after >= now:
+                found[name][certificate.serial_number] = subject_text(certificate.subject)
+    return found
+
+
+def remarks_on_lack(root: Path, ledger: Ledger, present: Mapping[int, str]) -> tuple[str, ...]:
+    """Return a remark if the ledger may lack earlier certificates of revoked enclaves.
+
+    ``present`` maps the serial numbers of their last certificates to their names.
+    """
+    why = list(ledger.gaps)
+    if ledger.unchained:
+        why.append(f"nothing shows whether a line was removed from its first {ledger.unchained}")
+    recorded = {int(each.serial, 16) for each in ledger.entries if each.serial}
+    if unknown := sorted(name for serial, name in present.items() if serial not in recorded):
+        why.append(f"it does not have the present certificate of {', '.join(unknown)}")
+    if not why:
+        return ()
+    return (
+        f"The ledger of '{root}' may lack earlier certificates: {'; '.join(why)}. Those that it "
+        "lacks stay valid until they expire or their CA is replaced: see `sros rotate_ca`.",
+    )
 
 
 def _move_away(transaction: Transaction, authority: Authority, name: str) -> tuple[int, str]:

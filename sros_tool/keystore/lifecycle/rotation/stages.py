@@ -24,7 +24,7 @@ from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
     NewIdentity,
-    policies_of,
+    RecordedRights,
 )
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -46,7 +46,13 @@ from sros_tool.keystore.layout import (
     enclave_path,
     list_enclaves,
 )
-from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
+from sros_tool.keystore.ledger import (
+    SAME_KEY,
+    Entry,
+    append,
+    certificate_entry,
+    document_entry,
+)
 from sros_tool.keystore.lifecycle.revocation_list import sign_list
 from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
@@ -236,7 +242,8 @@ def renew_identity_ca(
         _check_later(old, new)
         write_bundle(transaction, "identity_ca", (IDENTITY,), pem(new), names)
         transaction.write(f"{RETIRED}/{old.serial_number:x}.cert.pem", pem(old))
-        append(transaction, [certificate_entry(now, "ca", new)])
+        entry = certificate_entry(now, "ca", new, reason=SAME_KEY)
+        append(transaction, [entry], Authority(new, key), now)
         transaction.commit()
     return RotationStep(
         root, RotationStage.NONE, ("identity_ca",), names, tuple(transaction.changes)
@@ -289,7 +296,8 @@ class _Rotator:
         """
         if self._rotation.stage is RotationStage.REISSUE:
             self._retire()
-        elif self._rotation.stage is RotationStage.NONE:
+            return stage
+        if self._rotation.stage is RotationStage.NONE:
             successors = self._begin(
                 roles, new_keys, validity, next_to=stage is RotationStage.DISTRIBUTE
             )
@@ -304,7 +312,7 @@ class _Rotator:
                 self._distribute(successors)
             else:
                 self._reissue(successors, stage, progress)
-        append(self._transaction, self._entries)
+        append(self._transaction, self._entries, successors[0].new, self._now)
         return stage
 
     # ── the stages ─────────────────────────────────────────────────────────────────────────
@@ -401,11 +409,11 @@ class _Rotator:
             identity=identity.new if identity else None,
             permissions=permissions.new if permissions else None,
         )
-        policies = policies_of(self._root)
+        recorded = RecordedRights(self._root)
 
         def reissue(name: str) -> None:
             try:
-                if issuance := _issuance(self._root, name, identity, permissions, policies):
+                if issuance := _issuance(self._root, name, identity, permissions, recorded):
                     writer.write(issuance)
             except SrosError as error:
                 folder = enclave_path(self._root, name)
@@ -508,7 +516,7 @@ def _issuance(
     name: str,
     identity: _Successor | None,
     permissions: _Successor | None,
-    policies: dict[str, str],
+    recorded: RecordedRights,
 ) -> Issuance | None:
     """Return the `Issuance` of the new CAs for an enclave; None if it has no certificate yet.
 
@@ -530,12 +538,12 @@ def _issuance(
         certificate = NewIdentity(kept.subject, kept.public_key())  # type: ignore[arg-type]
     rights = None
     if permissions and (folder / PERMISSIONS_FILE).exists():
-        rights = _verified_rights(root, name, subject_text(kept.subject), permissions, policies)
+        rights = _verified_rights(root, name, subject_text(kept.subject), permissions, recorded)
     return Issuance(name, certificate, rights)
 
 
 def _verified_rights(
-    root: Path, name: str, subject: str, permissions: _Successor, policies: dict[str, str]
+    root: Path, name: str, subject: str, permissions: _Successor, recorded: RecordedRights
 ) -> EarlierRights:
     old = read_signed_grant(enclave_path(root, name) / PERMISSIONS_FILE, subject)
     old.signed.verify(permissions.old[0])
@@ -545,7 +553,7 @@ def _verified_rights(
             "They belong to another certificate.",
             f"Sign them again with `sros create_permission {root} {name} POLICY_FILE`.",
         )
-    return EarlierRights(old.grant, policies.get(old.digest, ""))
+    return recorded.of(name, old.digest, old.grant)
 
 
 # ── new CAs ────────────────────────────────────────────────────────────────────────────────

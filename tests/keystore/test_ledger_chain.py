@@ -1,0 +1,202 @@
+"""Lines of the ledger that are missing or changed are noticed, and never stop a revocation."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD
+from sros_tool.keystore.ledger import read_ledger
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
+from sros_tool.keystore.reader import read_crl
+from sros_tool.keystore.template import load_template
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import load_certificate
+from sros_tool.pki.keys import load_key
+from tests.support.children import run
+from tests.support.harness import certificate, sros
+
+NOW = datetime.now(UTC)
+FIRST = 4  # the lines before the first certificate: two CAs, governance; it is the fourth
+
+
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A keystore whose enclave /a was renewed, so that its ledger alone has the first one."""
+    root = tmp_path_factory.mktemp("chain") / "ks"
+    create_keystore(root, template=load_template("production"), now=NOW)
+    create_enclaves(root, ["/a", "/b"], now=NOW)
+    renew(root, ["/a"], now=NOW)
+    return root
+
+
+@pytest.fixture
+def root(made_once: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made_once, tmp_path / "ks", symlinks=True))
+
+
+def lines_of(root: Path) -> list[bytes]:
+    return (root / LEDGER).read_bytes().splitlines()
+
+
+def put(root: Path, lines: list[bytes]) -> None:
+    (root / LEDGER).write_bytes(b"".join(line + b"\n" for line in lines))
+
+
+def revoked(root: Path) -> set[int]:
+    found = read_crl(root)
+    return {each.serial for each in found.revoked} if found else set()
+
+
+def without_chain(root: Path) -> None:
+    """Leave the ledger as a version of sros without a chain wrote it."""
+    put(root, [re.sub(rb',"previous":"[0-9a-f]+"', b"", line) for line in lines_of(root)])
+    (root / LEDGER_HEAD).unlink()
+
+
+def _edit(lines: list[bytes]) -> list[bytes]:
+    lines[FIRST - 1] = lines[FIRST - 1].replace(b'"/a"', b'"/x"')
+    return lines
+
+
+def _edit_and_chain_again(lines: list[bytes]) -> list[bytes]:
+    from sros_tool.keystore.ledger import _digest
+
+    lines = _edit(lines)
+    for index in range(FIRST, len(lines)):
+        entry = json.loads(lines[index])
+        entry["previous"] = _digest(lines[index - 1])
+        lines[index] = json.dumps(entry, separators=(",", ":")).encode()
+    return lines
+
+
+TAMPERED: dict[str, Callable[[list[bytes]], list[bytes]]] = {
+    "a line edited": _edit,
+    "a line edited, and all after it chained again": _edit_and_chain_again,
+    "a line removed": lambda lines: lines[: FIRST - 1] + lines[FIRST:],
+    "the first line removed": lambda lines: lines[1:],
+    "the last line cut off": lambda lines: lines[:-1],
+    "all but one cut off": lambda lines: lines[:1],
+    "all cut off": lambda _: [],
+    "two lines exchanged": lambda lines: [lines[1], lines[0], *lines[2:]],
+    "a line repeated": lambda lines: [*lines, lines[-1]],
+    "a line added": lambda lines: [*lines, b'{"time":"x","what":"certificate"}'],
+    "not text": lambda lines: [*lines[: FIRST - 1], b"\xff{", *lines[FIRST:]],
+    "an empty line": lambda lines: [*lines[:FIRST], b"", *lines[FIRST:]],
+    "a number for a name": lambda lines: [*lines, b'{"time":"x","what":"ca","enclave":3}'],
+    "no serial number": lambda lines: [*lines, b'{"time":"x","what":"certificate","serial":"z"}'],
+    "a long serial number": lambda lines: [
+        *lines, b'{"time":"x","what":"certificate","enclave":"/a","serial":"' + b"f" * 41 + b'"}'
+    ],
+    "deep": lambda lines: [*lines, b"[" * 100_000],
+    "the chain taken out": lambda lines: [re.sub(rb',"previous":"\w+"', b"", x) for x in lines],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", TAMPERED)
+def test_a_changed_ledger_is_noticed_and_revoking_goes_on(case: str, root: Path) -> None:
+    ledger = read_ledger(root)
+    assert (ledger.gaps, ledger.unchained, len(ledger.certain)) == ((), 0, ledger.lines)
+    put(root, TAMPERED[case](lines_of(root)))
+    gaps = read_ledger(root).gaps
+    assert gaps
+    present = certificate(root / "enclaves/a/cert.pem").serial_number
+    done = revoke(root, ["/a"], now=NOW)
+    assert present in revoked(root)
+    assert any(gaps[0] in remark and "stay valid" in remark for remark in done.remarks)
+    # What the new head signs hides nothing of it.
+    assert gaps[0] in read_ledger(root).gaps
+    renew(root, ["/b"], now=NOW, new_key=True) if "/b" in certain(root) else None
+    assert gaps[0] in read_ledger(root).gaps
+
+
+def certain(root: Path) -> set[str]:
+    return {each.enclave for each in read_ledger(root).certain if each.what == "permissions"}
+
+
+def test_what_sros_says_of_a_changed_ledger(root: Path) -> None:
+    quiet = sros("check", root, "--include", "keystore.ledger-*").ok()
+    assert "ledger" not in quiet.out
+    put(root, lines_of(root)[:-1])
+    text = "1 line is missing at its end"
+    for words in (("inspect", root), ("inspect", root, "--history"), ("check", root)):
+        ended = sros(*words)
+        assert (ended.status, text in ended.out) == (1, True), ended
+    ended = sros("revoke", root, "/a").ok()
+    assert text in ended.err
+    assert "rotate_ca" in ended.err
+
+
+def test_a_whole_ledger_revokes_everything_and_says_nothing(root: Path) -> None:
+    issued = [each for each in read_ledger(root).entries if each.what == "certificate"]
+    wanted = {int(each.serial, 16) for each in issued if each.enclave == "/a"}
+    assert len(wanted) == 2
+    assert revoke(root, ["/a"], now=NOW).remarks == ()
+    assert revoked(root) == wanted
+
+
+def test_the_head_is_signed_by_a_ca(root: Path, tmp_path: Path) -> None:
+    """OpenSSL agrees, and neither another key nor another text is accepted."""
+    authority = root / "public/identity_ca.cert.pem"
+    words = ["openssl", "smime", "-verify", "-in", root / LEDGER_HEAD, "-CAfile", authority]
+    assert f"lines {len(lines_of(root))}" in run([*map(str, words), "-text"]).stdout
+    folder = root / "enclaves/b"
+    own = load_certificate((folder / "cert.pem").read_bytes(), "")
+    key = load_key((folder / "key.pem").read_bytes(), "")
+    document = smime.parse((root / LEDGER_HEAD).read_bytes()).document
+    (root / LEDGER_HEAD).write_bytes(smime.sign(document, own, key))
+    assert "no CA of this keystore signed it" in read_ledger(root).gaps[0]
+    shutil.copy(root / "enclaves/governance.p7s", root / LEDGER_HEAD)
+    assert "is not the signed end" in read_ledger(root).gaps[0]
+    (root / LEDGER_HEAD).unlink()
+    assert "is missing" in read_ledger(root).gaps[0]
+
+
+def test_a_ledger_without_a_chain_is_read_and_chained_from_then_on(root: Path) -> None:
+    before = [each.sha256 for each in read_ledger(root).entries]
+    without_chain(root)
+    ledger = read_ledger(root)
+    assert [each.sha256 for each in ledger.entries] == before
+    assert (ledger.gaps, ledger.unchained) == ((), len(before))
+    renew(root, ["/a"], now=NOW)
+    ledger = read_ledger(root)
+    assert (ledger.gaps, ledger.unchained) == ((), len(before))
+    (remark,) = revoke(root, ["/a"], now=NOW).remarks
+    assert f"whether a line was removed from its first {len(before)}" in remark
+    put(root, lines_of(root)[1:])
+    assert read_ledger(root).gaps
+
+
+def test_new_cas_leave_the_gaps_behind(root: Path) -> None:
+    put(root, _edit(lines_of(root)))
+    assert read_ledger(root).gaps
+    renew_identity_ca(root, now=NOW)  # with the same key, what was issued before stays valid
+    assert read_ledger(root).gaps
+    rotate_ca(root, now=NOW, finish=True)
+    ledger = read_ledger(root)
+    assert ledger.gaps == ()
+    assert {each.enclave for each in ledger.certain if each.what == "certificate"} == {"/a", "/b"}
+    put(root, lines_of(root)[:-1])
+    assert read_ledger(root).gaps
+
+
+def test_a_revoked_certificate_that_the_ledger_lost_is_revoked_again(root: Path) -> None:
+    first = certificate(root / "enclaves/a/cert.pem").serial_number
+    revoke(root, ["/a"], now=NOW)
+    for path in (root / LEDGER, root / "public/identity_ca.crl.pem"):
+        path.unlink()
+    (root / "revoked/not a number").mkdir()
+    (root / "revoked/not a number/cert.pem").write_text("no certificate")
+    create_enclaves(root, ["/a"], now=NOW)
+    second = certificate(root / "enclaves/a/cert.pem").serial_number
+    revoke(root, ["/a"], now=NOW)
+    assert revoked(root) >= {first, second}

@@ -1,0 +1,185 @@
+"""Older permissions that were put back are never signed again, whatever the clocks say."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from sros_tool.errors import KeystoreError
+from sros_tool.keystore.authorities.authority import load_authorities
+from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
+from sros_tool.keystore.delivery.answer import import_answer
+from sros_tool.keystore.delivery.archive import pack, unpack
+from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.signing import Signed, sign_request
+from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, SEAL
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, create_permission
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
+from sros_tool.keystore.reader import load_settings
+from sros_tool.keystore.template import load_template
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import Policy
+from tests.support.harness import policy_text, publish, snapshot, topics_of
+
+NOW = datetime.now(UTC)
+FILES = ("permissions.p7s", "permissions.xml")
+
+
+def policy(tmp_path: Path, *topics: str) -> Policy:
+    file = tmp_path / "policy.xml"
+    file.write_text(policy_text({"/a": publish(*topics)}))
+    return read_policy(file)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A keystore in which the enclave /a lost the topic /wide, and no subject tells."""
+    root = tmp_path / "ks"
+    create_keystore(root, template=load_template("development"), now=NOW)
+    create_enclaves(root, ["/a"], now=NOW)
+    create_permission(root, "/a", policy(tmp_path, "rosout", "wide"), now=NOW)
+    for file in FILES:
+        (tmp_path / file).write_bytes((root / "enclaves/a" / file).read_bytes())
+    create_permission(root, "/a", policy(tmp_path, "rosout"), now=NOW)
+    return root
+
+
+def put_back(root: Path) -> None:
+    for file in FILES:
+        (root / "enclaves/a" / file).write_bytes((root.parent / file).read_bytes())
+
+
+def _renew(root: Path) -> object:
+    return renew(root, ["/a"], now=NOW)
+
+
+def _rotate(root: Path) -> object:
+    return rotate_ca(root, now=NOW, finish=True)
+
+
+def _answer(root: Path) -> object:
+    robot = root.parent / "robot"
+    create_request(robot, "/a")
+    (root / "enclaves/a/key.pem").unlink()
+    request = (robot / "enclaves/a/request.pem").read_bytes()
+    return sign_request(root, request, now=NOW, renew=True)
+
+
+@pytest.mark.parametrize("work", [_renew, _rotate, _answer])
+def test_older_permissions_are_not_signed_again(work: Callable[[Path], object], root: Path) -> None:
+    put_back(root)
+    before = snapshot(root / "public"), (root / "enclaves/a/cert.pem").read_bytes()
+    with pytest.raises(KeystoreError, match="not certain that") as caught:
+        work(root)
+    assert "older ones were put back" in caught.value.why
+    assert "create_permission" in caught.value.remedy
+    assert before == (snapshot(root / "public"), (root / "enclaves/a/cert.pem").read_bytes())
+
+
+@pytest.mark.parametrize("work", [_renew, _rotate, _answer])
+def test_the_latest_permissions_are_signed_again(
+    work: Callable[[Path], object], root: Path
+) -> None:
+    work(root)
+    assert "wide" not in str(topics_of(root / "enclaves/a"))
+
+
+def _cut(root: Path) -> None:
+    ledger = root / LEDGER
+    ledger.write_bytes(b"".join(ledger.read_bytes().splitlines(keepends=True)[:-1]))
+
+
+def _cut_with_head(root: Path) -> None:
+    _cut(root)
+    (root / LEDGER_HEAD).unlink()
+
+
+def _no_ledger(root: Path) -> None:
+    (root / LEDGER).unlink()
+    (root / LEDGER_HEAD).unlink()
+
+
+@pytest.mark.parametrize("hide", [_cut, _cut_with_head, _no_ledger])
+def test_a_cut_ledger_does_not_vouch_for_them(
+    hide: Callable[[Path], None], root: Path, tmp_path: Path
+) -> None:
+    put_back(root)
+    hide(root)
+    with pytest.raises(KeystoreError, match="not certain that"):
+        renew(root, ["/a"], now=NOW)
+    # The way out that the error names.
+    create_permission(root, "/a", policy(tmp_path, "rosout"), now=NOW)
+    renew(root, ["/a"], now=NOW)
+    assert "wide" not in str(topics_of(root / "enclaves/a"))
+
+
+# ── answers ────────────────────────────────────────────────────────────────────────────────
+
+
+def answer(root: Path, tmp_path: Path, *topics: str, now: datetime = NOW) -> Signed:
+    request = (tmp_path / "robot/enclaves/arm/request.pem").read_bytes()
+    file = tmp_path / "arm.xml"
+    file.write_text(policy_text({"/arm": publish(*topics)}))
+    again = (root / "enclaves/arm").exists()
+    return sign_request(root, request, now=now, policy=read_policy(file), renew=again)
+
+
+@pytest.mark.parametrize("later", [timedelta(0), timedelta(days=-1)], ids=["same", "clock back"])
+def test_the_number_of_an_answer_orders_it(later: timedelta, root: Path, tmp_path: Path) -> None:
+    robot = tmp_path / "robot"
+    create_request(robot, "/arm")
+    older = answer(root, tmp_path, "rosout", "wide").archive
+    newer = answer(root, tmp_path, "rosout", now=NOW + later).archive
+    import_answer(robot, older, now=NOW)
+    import_answer(robot, newer, now=NOW)
+    before = snapshot(robot)
+    with pytest.raises(KeystoreError, match="older than the installed one"):
+        import_answer(robot, older, now=NOW)
+    assert not import_answer(robot, newer, now=NOW).changes
+    assert snapshot(robot) == before
+    import_answer(robot, older, now=NOW, force=True)
+
+
+def without_number(root: Path, archive: bytes) -> bytes:
+    """Return an answer as an earlier version of sros sealed it."""
+    files = {path: data for path, data in unpack(archive).items() if path != SEAL}
+    digests = sorted(f"{hashlib.sha256(data).hexdigest()}  {path}" for path, data in files.items())
+    listed = "\n".join(["sros answer 1", *digests, ""]).encode()
+    signer = load_authorities(root, load_settings(root), IN_KEYSTORE, NOW).permissions
+    return pack({SEAL: signer.sign(listed, "the list"), **files})
+
+
+def test_answers_without_a_number(root: Path, tmp_path: Path) -> None:
+    robot = tmp_path / "robot"
+    create_request(robot, "/arm")
+    first = without_number(root, answer(root, tmp_path, "rosout", "wide").archive)
+    second = without_number(
+        root, answer(root, tmp_path, "rosout", now=NOW + timedelta(hours=1)).archive
+    )
+    import_answer(robot, first, now=NOW)
+    import_answer(robot, second, now=NOW)
+    with pytest.raises(KeystoreError, match="older than the installed one"):
+        import_answer(robot, first, now=NOW)
+    import_answer(robot, answer(root, tmp_path, "x", now=NOW + timedelta(hours=2)).archive, now=NOW)
+    with pytest.raises(KeystoreError, match="older than the installed one") as caught:
+        import_answer(robot, second, now=NOW)
+    assert "no number" in caught.value.why
+
+
+def test_a_number_is_never_given_twice(root: Path, tmp_path: Path) -> None:
+    """Two answers with one number are the sign of a ledger that was set back."""
+    robot = tmp_path / "robot"
+    create_request(robot, "/arm")
+    kept = {file: (root / file).read_bytes() for file in (LEDGER, LEDGER_HEAD)}
+    import_answer(robot, answer(root, tmp_path, "rosout").archive, now=NOW)
+    for file, data in kept.items():
+        (root / file).write_bytes(data)
+    again = answer(root, tmp_path, "rosout", "wide").archive
+    with pytest.raises(KeystoreError, match="older than the installed one") as caught:
+        import_answer(robot, again, now=NOW)
+    assert "set back" in caught.value.why
