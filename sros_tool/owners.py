@@ -9,15 +9,16 @@ import grp
 import os
 import pwd
 import stat
-from collections.abc import Iterator, Set
+from collections.abc import Iterator
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 
 _ROOT = frozenset({0})
 _MOST_LINKS = 40
 
 
-def other_writers(state: os.stat_result, trusted: Set[int]) -> str:
+def other_writers(state: os.stat_result, trusted: frozenset[int]) -> str:
     """Return why users besides ``trusted`` (user ids) can change a file or folder, or "".
 
     The group counts unless it is the private group of a trusted user, which Debian and others give
@@ -35,7 +36,7 @@ def other_writers(state: os.stat_result, trusted: Set[int]) -> str:
     return ""
 
 
-def replaceable_on_the_way(path: Path, trusted: Set[int]) -> Iterator[tuple[Path, str]]:
+def replaceable_on_the_way(path: Path, trusted: frozenset[int]) -> Iterator[tuple[Path, str]]:
     """Yield each folder and link on the way to ``path`` by which others can replace it, and why.
 
     A folder in which only the owner of a file can rename it (sticky, as ``/tmp``) counts only if
@@ -47,14 +48,16 @@ def replaceable_on_the_way(path: Path, trusted: Set[int]) -> Iterator[tuple[Path
             yield each, why
 
 
-def belongs_to_root(path: Path) -> bool:
-    """Return whether only root can change ``path``, and every folder and link on the way to it."""
+def file_of_root(path: Path) -> Path | None:
+    """Return the real path of a regular file that only root can change or replace, else None."""
     try:
-        if other_writers(path.stat(), _ROOT):
-            return False
-    except OSError:
-        return False
-    return not any(other_writers(state, _ROOT) for _, state in _way(path))
+        real = path.resolve(strict=True)
+        state = real.lstat()
+    except (OSError, RuntimeError, ValueError):  # a loop of links, or a NUL byte
+        return None
+    ways = [state, *(each for _, each in _way(real))]
+    ours = stat.S_ISREG(state.st_mode) and not any(other_writers(each, _ROOT) for each in ways)
+    return real if ours else None
 
 
 def _way(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
@@ -87,7 +90,8 @@ def _way(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
             here = each
 
 
-def _is_private(group: int, trusted: Set[int]) -> bool:
+@lru_cache
+def _is_private(group: int, trusted: frozenset[int]) -> bool:
     """Return whether a group is the private group of a trusted user, without other members."""
     users = []
     for each in trusted:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sros_tool.owners import belongs_to_root, other_writers, replaceable_on_the_way
+from sros_tool.owners import file_of_root, other_writers, replaceable_on_the_way
 
 STRANGER = 65532
 US = frozenset({0, os.geteuid()})
@@ -54,12 +54,23 @@ def test_the_way_to_a_file(
     assert names == ({name} if found else set())
 
 
-@as_root
-def test_what_belongs_to_root(file: Path) -> None:
-    # Everybody can add files to /tmp, so nothing in it counts; below / nothing is in the way.
-    assert not belongs_to_root(file)
-    assert belongs_to_root(Path("/etc/passwd"))
-    assert not belongs_to_root(Path("/etc/there is no such file"))
+def test_a_file_of_root(file: Path) -> None:
+    # Everybody can add files to the temporary folder, so nothing below it counts.
+    assert file_of_root(file) is None
+    link = file.with_name("link")
+    for target, found in (
+        ("/etc/passwd", True),
+        ("/etc/../etc/passwd", True),
+        ("/etc", False),
+        ("/dev/null", False),
+        ("/etc/there is no such file", False),
+        ("link", False),
+    ):
+        link.unlink(missing_ok=True)
+        link.symlink_to(target)
+        for path in (Path(target), link):
+            assert file_of_root(path) == (Path("/etc/passwd") if found else None)
+    assert file_of_root(Path("/etc/\0")) is None
 
 
 @as_root

@@ -15,7 +15,7 @@ from cryptography.hazmat.primitives.asymmetric.utils import Prehashed, encode_ds
 from cryptography.hazmat.primitives.serialization import load_der_public_key
 
 from sros_tool.errors import PkiError, UnavailableError, UsageError
-from sros_tool.owners import belongs_to_root
+from sros_tool.owners import file_of_root
 from sros_tool.pki.token_uri import TokenUri, parse_token_uri
 from sros_tool.xml import read_bytes
 
@@ -35,8 +35,10 @@ def _module_of(parsed: TokenUri, *, named: bool) -> str:
     """
     own = os.environ.get(_MODULE_VARIABLE, "")
     path = Path(parsed.module)
-    if parsed.module and (named or (path.is_absolute() and belongs_to_root(path))):
+    if parsed.module and named:
         return parsed.module
+    if path.is_absolute() and (real := file_of_root(path)):
+        return str(real)
     if own:
         return own
     if parsed.module:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -15,10 +16,11 @@ from sros_tool.pki.certificates import pem
 from sros_tool.policy.document import read_policy
 from tests.checks.bench import Bench
 from tests.checks.keystore_cases import CASES, STRANGER, give_away
-from tests.checks.sound_keystore import NOW
 from tests.support.harness import sros
 
 pytest_plugins = ["tests.checks.sound_keystore"]
+
+NOW = datetime.now(UTC)
 
 
 as_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can act as several users")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import stat
-from collections.abc import Iterator, Sequence, Set
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
@@ -195,7 +195,7 @@ def check_files(keystore: CheckedKeystore, names: Sequence[str] | None = None) -
 
 
 def _below(
-    start: str, keystore: CheckedKeystore, links: _Links, trusted: Set[int]
+    start: str, keystore: CheckedKeystore, links: _Links, trusted: frozenset[int]
 ) -> Iterator[Finding]:
     root = os.fspath(keystore.root)
     keys = {os.path.join(root, ENCLAVES, name[1:], "key.pem") for name in keystore.names}
@@ -251,7 +251,7 @@ def _openness(path: str, root: str, mode: int, home: bool) -> Iterator[Finding]:
         yield FOLDER_OPEN.found(path, f"its mode is {stat.S_IMODE(mode):04o}", path)
 
 
-def _writers(path: str, info: os.stat_result, trusted: Set[int]) -> Iterator[Finding]:
+def _writers(path: str, info: os.stat_result, trusted: frozenset[int]) -> Iterator[Finding]:
     if info.st_mode & stat.S_IWOTH:
         yield WORLD_WRITABLE.found(path, f"its mode is {stat.S_IMODE(info.st_mode):04o}", path)
     elif why := other_writers(info, trusted):

@@ -111,6 +111,7 @@ class Keyring:
             template.identity_key if role == IDENTITY else template.permissions_key
         )
         if is_token_uri(place):
+            parse_token_uri(place)
             if transaction.dry_run and not compared:
                 return generate_key()
             named = self._is_named(role)
