@@ -63,6 +63,18 @@ def test_every_attack_is_in_the_table_of_attacks() -> None:
     assert [name for name in rows if f"| {name} |" not in text] == []
 
 
+def test_every_line_of_the_threat_model_has_tests_that_are_there() -> None:
+    text = read("docs/security.md")
+    lines = re.findall(r"^\| (?!---|the attacker \|).+", text, re.MULTILINE)
+    assert len(lines) > 40
+    assert [line for line in lines if "::test_" not in line] == []
+    named = re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", text)
+    assert len(named) == text.count("::test_")
+    assert [
+        f"{path}::{name}" for path, name in named if f"\ndef {name}(" not in f"\n{read(path)}"
+    ] == []
+
+
 def test_every_name_of_the_public_face_is_in_its_document() -> None:
     text = read("docs/python.md")
     assert [name for name in sros_tool.__all__ if f"`{name}" not in text] == []
