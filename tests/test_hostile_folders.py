@@ -288,9 +288,28 @@ def test_nobody_else_can_block_the_writers(keystore: Path) -> None:
 
 def test_a_lock_file_that_is_a_link_is_not_followed(keystore: Path, outside: Path) -> None:
     (keystore / LOCK).symlink_to(outside / "new")
-    with pytest.raises(OSError, match="symbolic link"):
+    with pytest.raises(KeystoreError, match="is in the way"):
         create_enclaves(keystore, ["/new"], now=NOW)
     assert not (outside / "new").exists()
+
+
+@pytest.mark.parametrize("kind", ["link", "folder", "pipe", "socket"])
+def test_what_is_in_the_way_of_the_lock_is_named(kind: str, keystore: Path) -> None:
+    before = snapshot(keystore)
+    path = keystore / LOCK
+    if kind == "link":
+        path.symlink_to("gone")
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "pipe":
+        os.mkfifo(path)
+    else:
+        os.mknod(path, stat.S_IFSOCK | 0o600)
+    with pytest.raises(KeystoreError, match=r"is in the way.* remove it"):
+        create_enclaves(keystore, ["/new"], now=NOW)
+    path.rmdir() if kind == "folder" else path.unlink()
+    assert snapshot(keystore) == before
+    create_enclaves(keystore, ["/new"], now=NOW)
 
 
 @as_root

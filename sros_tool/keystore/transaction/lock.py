@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
+import stat
 import time
 from collections.abc import Callable
 
@@ -47,10 +49,24 @@ class KeystoreLock:
             if self._folder.state(LOCK) is None:
                 raise  # this user cannot write to the folder
             return -1  # root made the file just now, and hands it over to the owner
+        except OSError as error:
+            if error.errno not in (errno.ELOOP, errno.ENXIO):  # a link, a socket
+                raise
+            raise self._in_the_way() from error
+        if not stat.S_ISREG(os.fstat(handle).st_mode):
+            os.close(handle)
+            raise self._in_the_way()
         if _locked(handle) and self._is_there(handle):
             return handle
         os.close(handle)
         return -1
+
+    def _in_the_way(self) -> KeystoreError:
+        return KeystoreError(
+            f"'{self._folder.path / LOCK}' is in the way",
+            "It is not a file that sros made.",
+            "Find out who can write to the keystore, and remove it.",
+        )
 
     def _is_there(self, handle: int) -> bool:
         """Return whether the locked file is still in the folder: who unlocks it removes it."""
