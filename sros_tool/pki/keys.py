@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import base64
+import math
 import os
+import re
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
-from cryptography.exceptions import UnsupportedAlgorithm
+from cryptography.exceptions import InternalError, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
@@ -78,11 +80,17 @@ def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None)
     ``passphrase`` is called if the key is encrypted.
 
     Raises:
-        PkiError: the key cannot be read, is encrypted and ``passphrase`` is None or wrong, or is
-            neither an EC nor an RSA key.
+        PkiError: the key cannot be read, is encrypted and ``passphrase`` is None or wrong, is
+            neither an EC nor an RSA key, or would take OpenSSL long, which no signal ends.
     """
+    if len(pem) > _MAX_BYTES:
+        raise PkiError(
+            f"the private key {name} is too large",
+            f"Its file has more than {_MAX_BYTES // 1024} KiB; an RSA key of 4096 bits has 4 KiB.",
+            "Use an EC prime256v1 key, or an RSA key of 2048 bits.",
+        )
     try:
-        key = serialization.load_pem_private_key(pem, None)
+        key = serialization.load_pem_private_key(pem, None, unsafe_skip_rsa_key_validation=True)
     except TypeError as error:
         if passphrase is None:
             raise PkiError(
@@ -90,25 +98,90 @@ def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None)
                 "It is encrypted, so it cannot be used without the passphrase.",
                 "Decrypt it with `openssl pkey -in KEY -out KEY.plain`.",
             ) from error
+        _check_derivation(pem, name)
         key = _decrypted(pem, name, passphrase())
-    except (ValueError, UnsupportedAlgorithm) as error:
-        raise PkiError(
-            f"the private key {name} cannot be read",
-            "It is not a PEM private key, or it is damaged.",
-            "Restore it from a backup.",
-        ) from error
+    except (ValueError, UnsupportedAlgorithm, InternalError) as error:
+        raise _unreadable(name) from error
     if not isinstance(key, (ec.EllipticCurvePrivateKey, rsa.RSAPrivateKey)):
         raise PkiError(
             f"the private key {name} is neither an elliptic-curve nor an RSA key",
             "DDS Security accepts EC prime256v1 and RSA 2048.",
             "Use a key of one of these kinds.",
         )
-    return key
+    return _validated(key, name) if isinstance(key, rsa.RSAPrivateKey) else key
+
+
+def _unreadable(name: str) -> PkiError:
+    return PkiError(
+        f"the private key {name} cannot be read",
+        "It is not a PEM private key, or it is damaged.",
+        "Restore it from a backup.",
+    )
+
+
+_MAX_BYTES = 16 * 1024
+_MAX_RSA_BITS = 4096
+_MAX_ROUNDS = 2_000_000
+_MAX_SCRYPT_MEMORY, _MAX_SCRYPT_WORK = 2**19, 2**22  # N * r, of 128 bytes each; N * r * p
+_ENCRYPTED = re.compile(rb"-----BEGIN ENCRYPTED PRIVATE KEY-----([^-]*)")
+
+
+def _validated(key: rsa.RSAPrivateKey, name: str) -> rsa.RSAPrivateKey:
+    """Return an RSA key that was loaded without validation, which takes minutes for huge ones."""
+    if key.key_size > _MAX_RSA_BITS:
+        raise PkiError(
+            f"the private key {name} has {key.key_size} bits",
+            f"sros uses RSA keys of at most {_MAX_RSA_BITS} bits.",
+            "Use an EC prime256v1 key, or an RSA key of 2048 bits.",
+        )
+    try:
+        return key.private_numbers().private_key()
+    except ValueError as error:
+        raise _unreadable(name) from error
+
+
+def _check_derivation(pem: bytes, name: str) -> None:
+    """Refuse an encrypted key whose file demands hours or gigabytes to try a passphrase.
+
+    Source: RFC 5958, 3; RFC 8018, A; RFC 7914, 7.
+    """
+    for block in _ENCRYPTED.findall(pem):
+        try:
+            content = base64.b64decode(block)
+            scheme = der.first(der.first(content).content)
+            scrypt = der.encode(der.OID, der.encode_oid(_SCRYPT)) in scheme.content
+            numbers = list(_integers(scheme.content))
+        except (ValueError, PkiError) as error:
+            raise _unreadable(name) from error
+        if scrypt:
+            allowed = (
+                math.prod(numbers[:2]) <= _MAX_SCRYPT_MEMORY
+                and math.prod(numbers[:3]) <= _MAX_SCRYPT_WORK
+            )
+        else:
+            allowed = all(number <= _MAX_ROUNDS for number in numbers)
+        if not allowed or min(numbers, default=0) < 0:
+            raise PkiError(
+                f"the private key {name} takes too long to decrypt",
+                f"Its file asks for {max(numbers)} rounds to try a passphrase.",
+                "Encrypt it again with `openssl pkcs8 -topk8 -scrypt -in KEY -out KEY.new`.",
+            )
+
+
+def _integers(data: bytes, depth: int = 3) -> Iterator[int]:
+    """Yield the integers in ``data``, in order, also those in sequences."""
+    for value in der.children(data):
+        if value.tag == der.INTEGER:
+            yield der.integer(value)
+        elif value.tag == der.SEQUENCE and depth:
+            yield from _integers(value.content, depth - 1)
 
 
 def _decrypted(pem: bytes, name: str, passphrase: str) -> PrivateKeyTypes:
     try:
-        return serialization.load_pem_private_key(pem, passphrase.encode())
+        return serialization.load_pem_private_key(
+            pem, passphrase.encode(), unsafe_skip_rsa_key_validation=True
+        )
     except (ValueError, TypeError) as error:
         raise PkiError(
             f"the private key {name} cannot be decrypted",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import subprocess
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import rsa
 
 from sros_tool.errors import PkiError
+from sros_tool.pki import der
 from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
 
 PASSPHRASE = "Öffne dich, Sesam"
@@ -76,3 +78,53 @@ def test_keys_that_earlier_versions_encrypted_are_read() -> None:
     form = serialization.PrivateFormat.PKCS8
     pem = key.private_bytes(serialization.Encoding.PEM, form, before)
     assert plain(load_key(pem, "k", lambda: PASSPHRASE)) == plain(key)
+
+
+# ── keys that OpenSSL would read for minutes, deaf to signals ──────────────────────────────
+
+
+def pem_of(kind: str, *parts: bytes) -> bytes:
+    body = base64.encodebytes(der.encode(der.SEQUENCE, *parts))
+    return f"-----BEGIN {kind}-----\n".encode() + body + f"-----END {kind}-----\n".encode()
+
+
+def rsa_key_of(bits: int) -> bytes:
+    return pem_of(
+        "RSA PRIVATE KEY", *map(der.encode_integer, (0, 1 << bits - 1, 3, 1, 1, 1, 1, 1, 1))
+    )
+
+
+def demanding(before: int, after: int, *words: str) -> bytes:
+    """A key that openssl encrypted, with one number of its derivation replaced."""
+    made = openssl("pkcs8", "-topk8", *words, "-passout", "pass:abc", data=key_pem(KEYS["EC"]))
+    content = der.first(base64.b64decode(b"".join(made.splitlines()[1:-1]))).content
+    scheme, data = der.children(content)
+
+    def replaced(value: der.Value) -> bytes:
+        if value.tag == der.SEQUENCE:
+            return der.encode(der.SEQUENCE, *map(replaced, der.children(value.content)))
+        same = value.whole != der.encode_integer(before)
+        return value.whole if same else der.encode_integer(after)
+
+    return pem_of("ENCRYPTED PRIVATE KEY", replaced(scheme), data.whole)
+
+
+@pytest.mark.parametrize(
+    ("pem", "why"),
+    [
+        (rsa_key_of(16384), "has 16384 bits"),
+        (rsa_key_of(1_000_000), "more than 16 KiB"),
+        (demanding(2048, 2**31 - 1, "-iter", "2048"), "takes too long"),
+        (demanding(16384, 2**30, "-scrypt"), "takes too long"),
+        (demanding(1, 2**30, "-scrypt"), "takes too long"),
+        (demanding(2048, 2**31 - 1, "-v1", "PBE-SHA1-3DES", "-iter", "2048"), "takes too long"),
+    ],
+)
+def test_a_key_that_takes_long_is_refused(pem: bytes, why: str) -> None:
+    with pytest.raises(PkiError, match=why):
+        load_key(pem, "k", lambda: "abc")
+
+
+@pytest.mark.parametrize("words", ["-iter 2048", "-scrypt", "-v1 PBE-SHA1-3DES -iter 2048"])
+def test_the_same_key_with_its_own_numbers_is_read(words: str) -> None:
+    load_key(demanding(2048, 2048, *words.split()), "k", lambda: "abc")
