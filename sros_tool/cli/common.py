@@ -389,11 +389,12 @@ class _Secrets:
         value = _taken.get(_PIN if is_pin else _PASSPHRASE, "")
         file = "" if is_pin else _taken.get(_PASSPHRASE_FILE, "")
         if not value and file:
-            value = Path(file).read_text(encoding="utf-8").partition("\n")[0]
+            text = Path(file).read_text(encoding="utf-8", errors="surrogateescape")
+            value = text.partition("\n")[0]
         if not value and sys.stdin.isatty():
             confirm = self._new and not is_pin
             value = click.prompt(
-                f"{what[:1].upper()}{what[1:]}",
+                visible(f"{what[:1].upper()}{what[1:]}"),  # a keystore may name the token
                 hide_input=True,
                 err=True,
                 confirmation_prompt=confirm,
@@ -403,6 +404,10 @@ class _Secrets:
             raise PkiError(
                 f"{what} is needed", "There is no terminal to prompt on.", f"Set {names}."
             )
+        try:
+            value.encode()
+        except UnicodeEncodeError:
+            raise PkiError(f"{what} is not UTF-8 text", "", "Choose another one.") from None
         return value
 
 

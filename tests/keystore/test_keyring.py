@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
+from sros_tool.cli.common import keyring
 from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.layout import list_enclaves
@@ -151,3 +154,33 @@ def test_an_empty_passphrase_never_leaves_a_key_in_clear(tmp_path: Path) -> None
     with pytest.raises(UsageError, match="too short"):
         create_keystore(tmp_path / "ks", template=load_template("sros2"), now=NOW, keyring=keyring)
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("where", ["variable", "file"])
+def test_a_passphrase_that_is_no_text_is_refused_in_one_line(where: str, tmp_path: Path) -> None:
+    secret = b"correct horse \xff battery"
+    (tmp_path / "file").write_bytes(secret + b"\n")
+    env = {"SROS_CA_PASSPHRASE": os.fsdecode(secret)}
+    if where == "file":
+        env = {"SROS_CA_PASSPHRASE_FILE": str(tmp_path / "file")}
+    refused = sros("create_keystore", tmp_path / "ks", "--encrypt-ca-keys", env=env)
+    assert (refused.status, refused.err.count("\n")) == (1, 1), refused
+    assert "is not UTF-8 text" in refused.err
+    assert "horse" not in refused.err
+
+
+def test_the_name_of_a_token_cannot_control_the_terminal(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A keystore from somebody else names the token, in the prompt for its PIN."""
+    asked: list[str] = []
+
+    def prompt(text: str, **_: object) -> str:
+        asked.append(text)
+        return "1234"
+
+    monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
+    monkeypatch.setattr("click.prompt", prompt)
+    monkeypatch.delenv("SROS_PKCS11_PIN", raising=False)
+    assert keyring().secrets("the PIN of the token \x1b[2Jx") == "1234"
+    assert asked == ["The PIN of the token \\x1b[2Jx"]

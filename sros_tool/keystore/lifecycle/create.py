@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
+from shlex import quote
 from types import MappingProxyType
 
 from cryptography import x509
@@ -333,8 +334,8 @@ def _place_notes(root: Path) -> Iterator[Note]:
         yield Note(
             "keystore.replaceable",
             f"other users can put another keystore in the place of '{root}', because they can "
-            f"change '{folder}': {why}. Run `chmod go-w '{folder}'`, or move the keystore to a "
-            "folder that only you and root can change.",
+            f"change '{folder}': {why}. Run `chmod go-w {quote(str(folder))}`, or move the "
+            "keystore to a folder that only you and root can change.",
         )
 
 
