@@ -18,8 +18,12 @@ def main(arguments: list[str] | None = None) -> None:
         sys.stdout.reconfigure(errors="surrogateescape")  # a path need not be valid UTF-8
     if not sys.warnoptions:
         warnings.simplefilter("ignore")  # warnings of libraries are not for users
-    from sros_tool.cli.common import secrets_taken
-    from sros_tool.cli.program import program, report_error
+    try:
+        from sros_tool.cli.common import secrets_taken
+        from sros_tool.cli.program import program, report_error
+    except KeyboardInterrupt:
+        print("sros: interrupted", file=sys.stderr)
+        sys.exit(130)
 
     try:
         with secrets_taken():

@@ -262,6 +262,17 @@ def test_a_part_that_is_included_again_is_not_changed(file: Path) -> None:
         merge_into(file, asking(topics("q")))
 
 
+def test_many_comments_in_a_line_take_no_time(file: Path) -> None:
+    """Each could begin or go on another one: 2^60 ways to find that the line goes on."""
+    comments = "<!--c-->" * 60
+    text = POLICY.replace("</topics>", f"</topics>{comments}<!-- end --><topics publish='DENY'>"
+                          "<topic>never</topic></topics>", 1)  # fmt: skip
+    assert text != POLICY
+    file.write_text(text)
+    merged = merge_into(file, asking(topics("q"))).document.decode()
+    assert comments in merged
+
+
 def test_a_fallback_is_not_the_file_itself(file: Path) -> None:
     fallback = f'<xi:include href="none.xml"><xi:fallback>{topics("k")}</xi:fallback></xi:include>'
     text = re.sub(r"<topics p.*?</topics>", fallback, POLICY, flags=re.DOTALL)
