@@ -270,6 +270,8 @@ _PATH = {
 """Methods of a path, with their numbers of positional arguments: those of a `Folder` and of a
 text have others."""
 
+_CLASSES = {"FileHandler", "ZipFile", "TarFile", "extract", "extractall"}
+
 _READING = {"O_RDONLY", "O_DIRECTORY", "O_CLOEXEC", "O_NOFOLLOW", "O_NONBLOCK", "O_PATH"}
 
 
@@ -285,7 +287,13 @@ def is_writing(call: ast.Call) -> bool:
     if name == "open" and "fileobj" not in keywords:
         given = [*call.args, *(each.value for each in call.keywords)]
         modes = [each.value for each in given if isinstance(each, ast.Constant)]
-        return any(re.fullmatch(r"(?=.*[wax+])[rwaxbt+:|gz]+", str(each)) for each in modes)
+        chosen = [each.value for each in call.keywords if each.arg == "mode"]
+        chosen += call.args[1:2] if not owner else []
+        return any(re.fullmatch(r"(?=.*[wax+])[rwaxbt+:|gz]+", str(each)) for each in modes) or any(
+            not isinstance(each, ast.Constant) for each in chosen
+        )
+    if name in _CLASSES:
+        return True
     return bool(owner) and len(call.args) in _PATH.get(name, ())
 
 
@@ -299,6 +307,10 @@ def writing(source: str) -> list[int]:
             isinstance(node, ast.ImportFrom)
             and node.module in ("os", "shutil")
             and {alias.name for alias in node.names} & {*_OS, *_SHUTIL, "open", "*"}
+        )
+        or (
+            isinstance(node, ast.Import)
+            and any(alias.asname and alias.name in ("os", "shutil") for alias in node.names)
         )
     )
 
@@ -320,6 +332,8 @@ def test_everything_is_written_by_two_modules() -> None:
         ("open(path, mode='a')", True),
         ("path.open('r+b')", True),
         ("open(path, 'rb')", False),
+        ("open(path, mode)", True),
+        ("path.open(mode=mode)", True),
         ("path.open()", False),
         ("keyring.open(root, 'identity')", False),
         ("tarfile.open(fileobj=packed, mode='w')", False),
@@ -340,6 +354,8 @@ def test_everything_is_written_by_two_modules() -> None:
         ("shutil.which(a)", False),
         ("from shutil import rmtree", True),
         ("from os import fspath", False),
+        ("import os as system", True),
+        ("archive.extractall(path)", True),
     ],
 )  # fmt: skip
 def test_writing_is_seen_and_nothing_else(source: str, seen: bool) -> None:
