@@ -137,9 +137,10 @@ def _expected(row: Row, backend: Backend, template: Template, topic: str) -> Row
 
 
 def _gated(row: Row, strong: Row, options: DemoOptions) -> Row:
-    """Mark a row as unaccepted if it is open, and ``strong``, with the default template, is not."""
+    """Mark a row that is accepted, or open while ``strong``, with the default template, is not."""
     opened = bool(row.open_because) and not strong.open_because
-    return replace(row, unaccepted=opened and row.name not in options.accept_open)
+    accepted = row.name in options.accept_open
+    return replace(row, accepted=accepted, unaccepted=opened and not accepted)
 
 
 def _check_accepted(options: DemoOptions) -> None:
@@ -154,11 +155,13 @@ def _check_accepted(options: DemoOptions) -> None:
             "Only what a keystore of yours opens needs to be accepted.",
             "Leave it out, or name the keystore.",
         )
-    rows = {row.name for scenario in options.scenarios for row in scenario.rows}
+    rows = {row.name for scenario in options.scenarios for row in scenario.rows if not row.removed}
     for name in options.accept_open:
         if name not in rows:
             raise UsageError(
-                f"no row is named {name!r}", "", "Take the whole name from the demo's table."
+                f"no row of an attack is named {name!r}",
+                "",
+                "Take the whole name from the demo's table.",
             )
 
 

@@ -15,8 +15,8 @@ A row has ``name``, ``expected`` and ``observed`` (values of `RowStatus`), ``as_
 ``domain``, ``seconds`` (the length of the window), ``attack`` (the name of the attack; "" if the
 row is not an attack), ``defence_removed`` ("" for the attack itself; otherwise the row shows that
 the attack works without the named defence), ``open_because`` (why an attack is known to succeed,
-or ""), ``remedy``, and ``open_here`` (the attack succeeds because of the user's keystore, and was
-not accepted: the row is not as expected).
+or ""), ``remedy``, ``accepted`` (the user accepts that the attack succeeds) and ``open_here`` (it
+succeeds because of the user's keystore, and was not accepted: the row is not as expected).
 
 ``cast`` has the enclave of each part in a user's keystore (empty without ``--keystore``): a list
 of ``{"part", "enclave", "nodes"}``; ``nodes`` are the absolute names of the ROS nodes that ran in

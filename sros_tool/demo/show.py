@@ -64,8 +64,13 @@ def _scenario(scenario: ScenarioResult) -> list[str]:
             f"{_INDENT}{row.detail}",
         ]
         if row.known_open or row.open_here:
-            lines.append(f"{_INDENT}{row.open_because}; to do: {row.remedy}")
+            lines.append(f"{_INDENT}{_why_open(row)}")
     return lines if scenario.cost is None else [*lines, "", *cost_table(scenario.cost)]
+
+
+def _why_open(row: RowResult) -> str:
+    why = f"{row.open_because}; to do: {row.remedy}" if row.open_because else ""
+    return "; ".join(filter(None, (why, "accepted with --accept-open" if row.accepted else "")))
 
 
 def _line(mark: str, cells: Sequence[str], widths: Sequence[int]) -> str:

@@ -14,6 +14,7 @@ from typing import Any
 
 from sros_tool.demo.scenarios.model import (
     STATUS_OF,
+    SUCCESSES,
     Claim,
     Party,
     Relation,
@@ -82,16 +83,20 @@ class RowResult:
     removed: str = ""
     open_because: str = ""
     remedy: str = ""
+    accepted: bool = False
     unaccepted: bool = False
 
     @property
     def as_expected(self) -> bool:
-        """Whether the row was skipped, or has the expected status and is not `open_here`."""
-        return self.observed in (self.expected, RowStatus.SKIPPED) and not self.open_here
+        """Whether the row was skipped, has the expected status, or is open and was accepted."""
+        expected = self.observed in (self.expected, RowStatus.SKIPPED) and not self.open_here
+        return expected or self.known_open
 
     @property
     def known_open(self) -> bool:
         """Whether the row shows an attack that is known to succeed, or accepted by the user."""
+        if self.accepted and self.observed in SUCCESSES:
+            return True
         return bool(self.open_because) and self.observed is self.expected and not self.open_here
 
     @property
@@ -114,6 +119,7 @@ class RowResult:
             "defence_removed": self.removed,
             "open_because": self.open_because,
             "remedy": self.remedy,
+            "accepted": self.accepted,
             "open_here": self.open_here,
         }
 
@@ -143,6 +149,7 @@ def judge_row(record: RowRecord) -> RowResult:
         row.removed,
         row.open_because,
         row.remedy,
+        row.accepted,
         row.unaccepted,
     )
 

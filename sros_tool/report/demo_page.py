@@ -124,8 +124,10 @@ def _row(row: Json) -> Iterator[str]:
     if removed := row.get("defence_removed"):
         tried += f' <span class="chip">without {escape(removed)}</span>'
     mechanism = escape(row["mechanism"])
-    if because := row.get("open_because"):
-        opened = "open in this keystore" if row.get("open_here") else "known to be open"
+    because, accepted = row.get("open_because", ""), row.get("accepted")
+    if because or accepted:
+        known = "accepted if it is open" if accepted else "known to be open"
+        opened = "open in this keystore" if row.get("open_here") else known
         mechanism += (
             f'<p><span class="chip warning">{opened}</span> {_sentence(because)} '
             f"{_sentence(row.get('remedy', ''))}</p>"

@@ -199,7 +199,7 @@ def test_rows_that_nobody_has_are_refused() -> None:
         (("--accept-open", "x"), "--accept-open is given without --keystore"),
         (
             ("--scenario", "attacks", "--keystore", "x", "--accept-open", "wire"),
-            "no row is named 'wire'",
+            "no row of an attack is named 'wire'",
         ),
     ],
 )

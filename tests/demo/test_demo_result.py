@@ -7,6 +7,8 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from xml.etree import ElementTree
 
+import pytest
+
 from sros_tool.demo.backend import Backend
 from sros_tool.demo.cost import CostResult, Measurement
 from sros_tool.demo.result import DemoResult, ScenarioResult
@@ -103,6 +105,27 @@ def test_a_door_that_only_this_keystore_opens_is_a_failure_until_it_is_accepted(
     assert "<b>1</b> open in this keystore" in page and "known to be open" not in page
     skipped = replace(OPEN, unaccepted=True, observed=RowStatus.SKIPPED)
     assert result(skipped).as_expected
+
+
+@pytest.mark.parametrize(
+    ("row", "observed", "good"),
+    [
+        (OPEN, RowStatus.HEARD, True),
+        (CLOSED, RowStatus.HEARD, True),
+        (CLOSED, RowStatus.NOT_LET_IN, True),
+        (CLOSED, RowStatus.CRASHED, False),
+        (CLOSED, RowStatus.UNDECIDED, False),
+        (OPEN, RowStatus.NOT_HEARD, False),
+    ],
+)
+def test_what_is_accepted_may_succeed_and_nothing_else(
+    row: RowResult, observed: RowStatus, good: bool
+) -> None:
+    shown = result(replace(row, observed=observed, accepted=True))
+    assert shown.as_expected is good
+    opened = observed is RowStatus.HEARD
+    assert ("accepted with --accept-open" in demo_table(shown)) is opened
+    assert ("open  " in demo_table(shown)) is opened
 
 
 def test_a_door_that_is_open_and_should_not_be_is_a_failure() -> None:

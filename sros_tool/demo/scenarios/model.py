@@ -95,6 +95,14 @@ STATUS_OF: dict[tuple[Relation, bool], RowStatus] = {
 }
 
 
+SUCCESSES = frozenset(
+    status
+    for (relation, holds), status in STATUS_OF.items()
+    if holds and relation not in (Relation.IS_REFUSED, Relation.STARTS)
+)
+"""The statuses of an attack that succeeded."""
+
+
 class Wire(StrEnum):
     """A text to look for in the packets of a party."""
 
@@ -229,7 +237,8 @@ class Row:
     as soon as it is decided.  The first of ``variants`` whose conditions hold replaces the expected
     status.  ``attack`` names the attack to which the row belongs; with ``removed`` it shows that
     attack without the defence that ``removed`` names.  ``open_because`` and ``remedy`` are as in
-    `Variant`; ``unaccepted`` says that the user's keystore opens it, and the user accepts that not.
+    `Variant`.  ``accepted`` says that the user accepts that the attack succeeds, ``unaccepted``
+    that it succeeds because of the user's keystore, and the user did not accept that.
     """
 
     name: str
@@ -247,6 +256,7 @@ class Row:
     removed: str = ""
     open_because: str = ""
     remedy: str = ""
+    accepted: bool = False
     unaccepted: bool = False
 
     @property
