@@ -58,6 +58,7 @@ from sros_tool.pki.certificates import (
     validity_of,
     weakness,
 )
+from sros_tool.pki.chains import chain_fault
 from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl, signed_by
 from sros_tool.pki.keys import load_key
 from sros_tool.validity import Window, iso
@@ -438,7 +439,7 @@ class _EnclaveFiles:
         identity_ca = self._certificate(IDENTITY_CA_FILE, files)
         permissions_ca = self._certificate(PERMISSIONS_CA_FILE, files)
         certificate = self._certificate(CERTIFICATE_FILE, files)
-        self._check_identity(certificate, identity_ca, files[KEY_FILE])
+        self._check_identity(certificate, identity_ca, files)
         self._check_revocation(certificate, identity_ca)
         governance = permissions = None
         document = self._signed(GOVERNANCE_FILE, files, permissions_ca)
@@ -513,8 +514,12 @@ class _EnclaveFiles:
             self._add(name, f"it is not valid before {iso(validity.not_before)}", not_yet_valid)
 
     def _check_identity(
-        self, certificate: x509.Certificate | None, ca: x509.Certificate | None, key: bytes | None
+        self,
+        certificate: x509.Certificate | None,
+        ca: x509.Certificate | None,
+        files: Mapping[str, bytes | None],
     ) -> None:
+        key, authorities = files[KEY_FILE], files[IDENTITY_CA_FILE]
         if certificate and ca and not issued_by(certificate, ca):
             self._add(
                 CERTIFICATE_FILE,
@@ -522,6 +527,10 @@ class _EnclaveFiles:
                 f"but by {subject_text(certificate.issuer)}",
                 Fault.CERTIFICATE_ISSUER,
             )
+        elif certificate and ca and authorities and not self._problems:
+            at = self._now
+            if refusal := chain_fault(certificate, _load_certificates(authorities, ""), at=at):
+                self._add(CERTIFICATE_FILE, f"it is refused: {refusal}", Fault.CERTIFICATE_ISSUER)
         if key is None:
             return
         try:

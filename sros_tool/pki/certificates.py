@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import secrets
+from typing import TypeVar
 
 from cryptography import x509
 from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
@@ -37,6 +38,8 @@ _LEAF_USAGE = x509.KeyUsage(
     encipher_only=False,
     decipher_only=False,
 )
+Extension = TypeVar("Extension", bound=x509.ExtensionType)
+
 UNREADABLE = (ValueError, UnsupportedAlgorithm, x509.DuplicateExtension, x509.InvalidVersion)
 """The exceptions of `cryptography` for a certificate that is damaged or not supported."""
 
@@ -250,12 +253,36 @@ def weakness(certificate: x509.Certificate) -> str:
 
 
 def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> bool:
-    """Return whether ``authority`` issued and signed ``certificate``; ignore their validity."""
+    """Return whether ``authority`` issued and signed ``certificate``; ignore their validity.
+
+    As OpenSSL (``X509_check_issued``), also compare the key identifiers where both have one.
+    """
     try:
         certificate.verify_directly_issued_by(authority)
     except (InvalidSignature, ValueError, TypeError):
         return False
-    return True
+    named = extension(certificate, x509.AuthorityKeyIdentifier)
+    if named is None:
+        return True
+    own = extension(authority, x509.SubjectKeyIdentifier)
+    issuers = [
+        each.value
+        for each in named.authority_cert_issuer or ()
+        if isinstance(each, x509.DirectoryName)
+    ]
+    return (
+        (not own or named.key_identifier in (None, own.digest))
+        and named.authority_cert_serial_number in (None, authority.serial_number)
+        and (not issuers or issuers[0] == authority.issuer)
+    )
+
+
+def extension(certificate: x509.Certificate, kind: type[Extension]) -> Extension | None:
+    """Return an extension of a certificate, or None."""
+    try:
+        return certificate.extensions.get_extension_for_class(kind).value
+    except x509.ExtensionNotFound:
+        return None
 
 
 def digest(certificate: x509.Certificate) -> str:

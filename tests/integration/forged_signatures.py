@@ -268,17 +268,16 @@ def swap(root: Node, _: Original, dice: random.Random) -> None:
 
 def insert(root: Node, _: Original, dice: random.Random) -> None:
     node = _any_parent(root, dice)
-    raw = dice.choice(VALUES)
-    node.children.insert(dice.randrange(len(node.children) + 1), _raw(raw))
+    node.children.insert(dice.randrange(len(node.children) + 1), raw(dice.choice(VALUES)))
 
 
-def _raw(data: bytes) -> Node:
+def raw(data: bytes) -> Node:
     return Node(data[0], data[2:]) if data[1] == len(data) - 2 else Node(0x04, data)
 
 
 def replace(root: Node, _: Original, dice: random.Random) -> None:
     node = _any_parent(root, dice)
-    node.children[dice.randrange(len(node.children))] = _raw(dice.choice(VALUES))
+    node.children[dice.randrange(len(node.children))] = raw(dice.choice(VALUES))
 
 
 def retag(root: Node, _: Original, dice: random.Random) -> None:
@@ -305,7 +304,7 @@ def other_algorithm(root: Node, _: Original, dice: random.Random) -> None:
 def parameters(root: Node, _: Original, dice: random.Random) -> None:
     info = _info(root).children
     node = dice.choice((_signed_data(root).children[1].children[0], info[2], info[-2]))
-    node.children[1:] = [_raw(dice.choice(VALUES)) for _ in range(dice.choice((0, 1, 1, 2)))]
+    node.children[1:] = [raw(dice.choice(VALUES)) for _ in range(dice.choice((0, 1, 1, 2)))]
 
 
 def more_digests(root: Node, _: Original, dice: random.Random) -> None:
@@ -353,22 +352,22 @@ def trailing(root: Node, _: Original, dice: random.Random) -> None:
 def attribute(root: Node, _: Original, dice: random.Random) -> None:
     """Add a signed attribute: another, or one that is there already with another value."""
     attributes = _info(root).children[3].children
-    values = [_raw(dice.choice(VALUES)) for _ in range(dice.choice((0, 1, 1, 1, 2)))]
+    values = [raw(dice.choice(VALUES)) for _ in range(dice.choice((0, 1, 1, 1, 2)))]
     made = value(0x30, [value(6, dice.choice((*OIDS[:5], OIDS[-1]))), value(0x31, values)])
     attributes.insert(dice.randrange(len(attributes) + 1), made)
 
 
 def attribute_value(root: Node, _: Original, dice: random.Random) -> None:
     values = dice.choice(_info(root).children[3].children).children[1]
-    values.children.insert(dice.randrange(2), _raw(dice.choice(VALUES)))
+    values.children.insert(dice.randrange(2), raw(dice.choice(VALUES)))
     if dice.random() < 0.5:
         values.children.pop()
 
 
 def unsigned_attribute(root: Node, _: Original, dice: random.Random) -> None:
-    values = [_raw(dice.choice(VALUES))]
+    values = [raw(dice.choice(VALUES))]
     made = value(0x30, [value(6, dice.choice(OIDS)), value(0x31, values)])
-    _info(root).children.append(value(0xA1, dice.choice(([made], [], [_raw(dice.choice(VALUES))]))))
+    _info(root).children.append(value(0xA1, dice.choice(([made], [], [raw(dice.choice(VALUES))]))))
 
 
 def no_attributes(root: Node, _: Original, dice: random.Random) -> None:
@@ -386,7 +385,7 @@ def certificate(root: Node, original: Original, dice: random.Random) -> None:
     bag = next(each for each in _signed_data(root).children if each.tag == 0xA0)
     made = Node.read(dice.choice(original.others).public_bytes(Encoding.DER))[0]
     if dice.random() < 0.3:
-        made = dice.choice((_raw(dice.choice(VALUES)), value(0xA1, made.children)))
+        made = dice.choice((raw(dice.choice(VALUES)), value(0xA1, made.children)))
     bag.children.insert(dice.randrange(len(bag.children) + 1), made)
     if dice.random() < 0.2:
         bag.children.pop()
@@ -407,7 +406,7 @@ def damaged_certificate(root: Node, _: Original, dice: random.Random) -> None:
 
 def revocation_lists(root: Node, _: Original, dice: random.Random) -> None:
     fields = _signed_data(root).children
-    fields.insert(len(fields) - dice.choice((1, 1, 2)), value(0xA1, [_raw(dice.choice(VALUES))]))
+    fields.insert(len(fields) - dice.choice((1, 1, 2)), value(0xA1, [raw(dice.choice(VALUES))]))
 
 
 def no_revocation_lists(root: Node, _: Original, dice: random.Random) -> None:

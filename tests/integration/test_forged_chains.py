@@ -1,0 +1,223 @@
+"""Of many forged certificates, sros accepts no chain that OpenSSL rejects."""
+
+from __future__ import annotations
+
+import ctypes
+import random
+from collections import Counter
+from datetime import UTC, datetime, timedelta
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.hazmat.primitives.serialization import Encoding
+
+from sros_tool.pki.certificates import UNREADABLE, common_name, read_in_full
+from sros_tool.pki.chains import chain_fault
+from tests.integration.forged_signatures import VALUES, Node, raw
+from tests.support.children import LONG
+
+DRAWN = 20_000 if LONG else 500
+NOW = datetime.now(UTC).replace(microsecond=0)
+DAY = timedelta(days=1)
+STRICT = 0x20
+KEYS = [ec.generate_private_key(ec.SECP256R1()) for _ in range(4)]
+
+# By an OID, values as DER: sound ones first.
+EXTENSIONS = {
+    "2.5.29.19": ["30030101ff", "3000", "30060101ff020100", "30060101ff020101", "3003020100",
+                  "30060101ff0201ff", "3003010101", "30030101ff00", "0400"],
+    "2.5.29.15": ["03020106", "03020186", "03020780", "03020700", "030100", "0303070080",
+                  "03020106ff", "0400"],
+    "2.5.29.37": ["300a06082b06010505070304", "300a06082b06010505070301", "3000",
+                  "30060604551d2500", "0400"],
+    "2.5.29.17": ["3006820461622e63", "3000", "30038201ff", "0400", "300681046140622e"],
+    "2.5.29.30": ["3000", "300ea00c300a8208726f626f742e6363",
+                  "300aa008300682046f2e6f72", "0400", "a000"],
+    "2.5.29.36": ["3003800100", "3000", "0400"],
+    "2.5.29.54": ["020100", "0400"],
+    "2.5.29.32": ["3006300406022a03", "3000", "0400",
+                  "300c300406022a03300406022a03"],
+    "2.5.29.31": ["3000", "0400", "300c300aa008a006860461623a63"],
+    "2.16.840.1.113730.1.1": ["03020106", "03020520", "0400"],
+    "1.3.6.1.5.5.7.1.14": ["300c300a06082b06010505071501", "0400"],
+    "1.3.6.1.5.5.7.1.7": ["3000", "300e300c04020001300603040001ff00", "0400"],
+    "1.3.6.1.5.5.7.1.8": ["3000", "a0023000", "0400"],
+    "1.3.6.1.5.5.7.1.1": ["3000", "0400"],
+    "1.3.6.1.5.5.7.48.1.5": ["0500"],
+    "1.2.3.4": ["0500"],
+}  # fmt: skip
+
+
+def extension(oid: str, data: bytes) -> x509.UnrecognizedExtension:
+    return x509.UnrecognizedExtension(x509.ObjectIdentifier(oid), data)
+
+
+def draw(
+    dice: random.Random, name: str, above: tuple[str, int], own: int, *, ca: bool
+) -> bytes | None:
+    """A certificate in DER: sound, except for what is drawn; None if it cannot be made."""
+    issuer, signing = above
+    odd = dice.random
+    subject = x509.Name([]) if odd() < 0.03 else common_name(name)
+    begin, end = dice.choice([(-9, 9)] * 30 + [(-9, -1), (1, 9)])
+    builder = x509.CertificateBuilder(
+        x509.Name([]) if odd() < 0.02 else common_name(issuer),
+        subject, KEYS[own].public_key(), dice.randrange(1, 99), NOW + begin * DAY, NOW + end * DAY,
+    )  # fmt: skip
+    chosen: dict[str, tuple[bytes, bool]] = {
+        "2.5.29.19": (bytes.fromhex("30030101ff" if ca else "3000"), odd() < 0.9)
+    }
+    if odd() < 0.9:
+        chosen["2.5.29.15"] = (bytes.fromhex("03020186" if ca else "03020780"), odd() < 0.8)
+    for oid in dice.sample(sorted(EXTENSIONS), dice.choice((0, 0, 0, 1, 1, 2))):
+        if odd() < 0.2:
+            chosen.pop(oid, None)
+        else:
+            chosen[oid] = (bytes.fromhex(dice.choice(EXTENSIONS[oid])), odd() < 0.4)
+    for oid, (data, critical) in chosen.items():
+        builder = builder.add_extension(extension(oid, data), critical)
+    if odd() < 0.9:
+        key = KEYS[own if odd() < 0.9 else dice.randrange(4)].public_key()
+        identifier = x509.SubjectKeyIdentifier.from_public_key(key)
+        builder = builder.add_extension(identifier, odd() < 0.05)
+    if odd() < 0.9:
+        key = KEYS[signing if odd() < 0.9 else dice.randrange(4)].public_key()
+        authority = x509.AuthorityKeyIdentifier.from_issuer_public_key(key)
+        if odd() < 0.2:
+            names = [x509.DirectoryName(common_name(dice.choice((issuer, name, "x"))))]
+            authority = x509.AuthorityKeyIdentifier(
+                dice.choice((authority.key_identifier, None)), names, dice.randrange(1, 4)
+            )
+        builder = builder.add_extension(authority, odd() < 0.05)
+    made = builder.sign(KEYS[signing], hashes.SHA256()).public_bytes(Encoding.DER)
+    return alter(made, signing, dice) if odd() < 0.25 else made
+
+
+def alter(made: bytes, signing: int, dice: random.Random) -> bytes | None:
+    """Alter a value of the certificate, and sign it again."""
+    (root,) = Node.read(made)
+    try:
+        node = dice.choice([each for each in root.below() if each.tag])
+        how = dice.randrange(6)
+        if how == 0 and node.content:
+            content = bytearray(node.content)
+            content[dice.randrange(len(content))] = dice.randrange(256)
+            node.content = bytes(content)
+        elif how == 1:
+            node.length = dice.choice(("long", "indefinite" if node.children else "long"))
+        elif how == 2 and node.children:
+            node.children.insert(dice.randrange(len(node.children)), raw(dice.choice(VALUES)))
+        elif how == 3 and node.children:
+            node.children.append(Node.read(dice.choice(node.children).write())[0])
+        elif how == 4 and node.children:
+            node.children.pop(dice.randrange(len(node.children)))
+        else:
+            node.tag = dice.choice((0x0C, 0x13, 0x14, 0x16, 0x17, 0x18, 0x1E, 0x30, 0x31, 0x02))
+        if dice.random() < 0.9:
+            signature = KEYS[signing].sign(root.children[0].write(), ec.ECDSA(hashes.SHA256()))
+            root.children[2].content = b"\0" + signature
+        return root.write()
+    except (IndexError, ValueError):
+        return None
+
+
+class Verifier:
+    """``openssl verify`` without a process: the same calls of libcrypto."""
+
+    def __init__(self) -> None:
+        self._library = library = ctypes.CDLL("libcrypto.so.3")
+        pointer = ctypes.c_void_p
+        for name in (
+            "X509_STORE_new",
+            "X509_STORE_CTX_new",
+            "d2i_X509",
+            "X509_new",
+            "OPENSSL_sk_new_null",
+        ):
+            getattr(library, name).restype = pointer
+        library.d2i_X509.argtypes = [pointer, pointer, ctypes.c_long]
+        library.X509_STORE_set_flags.argtypes = [pointer, ctypes.c_ulong]
+        for name in ("X509_STORE_add_cert", "OPENSSL_sk_push"):
+            getattr(library, name).argtypes = [pointer, pointer]
+        library.X509_STORE_CTX_init.argtypes = [pointer] * 4
+        for name in ("X509_verify_cert", "X509_STORE_CTX_get_error", "X509_STORE_CTX_free",
+                     "X509_STORE_free", "X509_free", "OPENSSL_sk_free"):  # fmt: skip
+            getattr(library, name).argtypes = [pointer]
+
+    def fault(
+        self, start: bytes, trusted: list[bytes], others: list[bytes], *, strict: bool
+    ) -> int:
+        """Return the error of OpenSSL, or 0 if it accepts the chain; -1 for no certificate."""
+        library = self._library
+        loaded = [self._load(each) for each in (start, *trusted, *others)]
+        try:
+            if not all(loaded):
+                return -1
+            store, context = library.X509_STORE_new(), library.X509_STORE_CTX_new()
+            library.X509_STORE_set_flags(store, STRICT if strict else 0)
+            untrusted = library.OPENSSL_sk_new_null()
+            for place, each in enumerate(loaded[1:]):
+                if place < len(trusted):
+                    library.X509_STORE_add_cert(store, each)
+                else:
+                    library.OPENSSL_sk_push(untrusted, each)
+            library.X509_STORE_CTX_init(context, store, loaded[0], untrusted)
+            accepted = library.X509_verify_cert(context) == 1
+            error = library.X509_STORE_CTX_get_error(context)
+            library.X509_STORE_CTX_free(context)
+            library.X509_STORE_free(store)
+            library.OPENSSL_sk_free(untrusted)
+            return 0 if accepted else int(error) or -2
+        finally:
+            for each in filter(None, loaded):
+                library.X509_free(each)
+            library.ERR_clear_error()
+
+    def _load(self, data: bytes) -> int | None:
+        at = ctypes.cast(ctypes.create_string_buffer(data, len(data)), ctypes.c_void_p)
+        loaded: int | None = self._library.d2i_X509(None, ctypes.byref(at), len(data))
+        return loaded
+
+
+def our_fault(start: bytes, trusted: list[bytes], others: list[bytes], *, strict: bool) -> str:
+    try:
+        first, *rest = (
+            read_in_full(x509.load_der_x509_certificate(each))
+            for each in (start, *trusted, *others)
+        )
+    except UNREADABLE:
+        return "it cannot be read"
+    split = len(trusted)
+    return chain_fault(first, rest[:split], rest[split:], at=NOW, strict=strict)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("strict", [False, True])
+def test_no_chain_is_accepted_that_openssl_rejects(strict: bool) -> None:
+    try:
+        verifier = Verifier()
+    except OSError:
+        pytest.skip("there is no libcrypto.so.3")
+    dice, count, wrong = random.Random(5), Counter[str](), []
+    for _ in range(DRAWN):
+        root = draw(dice, "root", ("root", 0), 0, ca=True)
+        middle = draw(dice, "middle", ("root", 0), 1, ca=True)
+        issuer = dice.choice((("root", 0), ("middle", 1)))
+        leaf = draw(dice, "leaf", issuer, 2, ca=False)
+        if not (root and middle and leaf):
+            continue
+        start = dice.choice((leaf, leaf, leaf, root, middle))
+        trusted, others = dice.choice((
+            ([root], [middle]), ([root, middle], []), ([middle, root], []), ([root], []),
+        ))  # fmt: skip
+        theirs = verifier.fault(start, trusted, others, strict=strict)
+        ours = our_fault(start, trusted, others, strict=strict)
+        count[f"sros {not ours}, OpenSSL {not theirs}"] += 1
+        if theirs and not ours:
+            wrong.append((theirs, [start.hex(), *(each.hex() for each in trusted + others)]))
+    print(f"strict {strict}: {dict(count)}; {Counter(error for error, _ in wrong)}")
+    assert not wrong, f"{len(wrong)} chains accepted by sros alone, the first: {wrong[0]}"
+    assert count["sros True, OpenSSL True"] > DRAWN / 20
+    assert count["sros False, OpenSSL False"] > DRAWN / 5
