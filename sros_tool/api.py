@@ -295,7 +295,7 @@ def explain_access(
     from sros_tool.dds.decision.vendors import Vendor
     from sros_tool.explain.evaluator import Evaluator, JoinContext, load_enclave
     from sros_tool.explain.question import ask
-    from sros_tool.keystore.layout import enclave_path, list_enclaves
+    from sros_tool.keystore.layout import check_keystore, enclave_path, has_enclave, list_enclaves
     from sros_tool.keystore.missing import no_such_enclave
     from sros_tool.runtime.environment import choose_domain
 
@@ -304,9 +304,9 @@ def explain_access(
     if vendor not in vendors:
         raise UsageError(f"unknown vendor {vendor!r}", "", f"Choose {', '.join(vendors)}.")
     root = Path(keystore)
-    names = list_enclaves(root)
-    if enclave not in names:
-        raise no_such_enclave(root, enclave, names)
+    check_keystore(root)
+    if not has_enclave(root, enclave):
+        raise no_such_enclave(root, enclave, list_enclaves(root))
     at = _moment(now)
     own = _policy(policy).enclave(enclave) if policy is not None else None
     loaded = replace(

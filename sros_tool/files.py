@@ -87,8 +87,10 @@ def _remove_stale(folder: Folder, prefix: str) -> None:
                 os.close(handle)
 
 
-def write_new_file(path: Path, data: bytes) -> None:
+def write_new_file(path: Path, data: bytes, *, for_user: int | None = None) -> None:
     """Write a file that only its owner can read, and flush it to disk.
+
+    If root writes it into a folder of the user ``for_user``, that user becomes its owner.
 
     Raises:
         FileExistsError: something is at ``path`` already, be it a link that leads nowhere.
@@ -96,6 +98,8 @@ def write_new_file(path: Path, data: bytes) -> None:
     with Folder(path.parent) as folder:
         handle = folder.create(path.name, 0o600)
         try:
+            if os.geteuid() == 0 and folder.owner[0] == for_user:
+                os.fchown(handle, *folder.owner)
             write_all(handle, data)
             os.fsync(handle)
         finally:

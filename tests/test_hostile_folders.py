@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -26,6 +27,7 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.transaction import lock as locking
 from sros_tool.keystore.transaction.stage import staged_name
+from tests.conftest import POLICY
 from tests.support.harness import snapshot, sros
 
 NOW = datetime.now(UTC)
@@ -221,6 +223,47 @@ def test_what_root_makes_belongs_to_the_owner_of_the_keystore(keystore: Path) ->
     with traversable(keystore.parent):
         assert not in_process_of(OWNER, lambda: create_enclaves(keystore, ["/own"], now=NOW))
     assert (keystore / "enclaves/own/key.pem").stat().st_uid == OWNER
+
+
+@as_root
+def test_what_each_verb_of_root_makes_belongs_to_the_owner(keystore: Path, tmp_path: Path) -> None:
+    keys, robot, request = tmp_path / "keys", tmp_path / "robot", tmp_path / "request.pem"
+    for folder in (keys, robot):
+        folder.mkdir()
+    (tmp_path / "policy.xml").write_text(POLICY)
+    give(tmp_path, OWNER)
+    sros("create_request", "/r", robot).ok()
+    shutil.copy(robot / "enclaves/r/request.pem", request)
+    for verb in (
+        "create_permission ks /b policy.xml",
+        "generate_artifacts -k ks -p policy.xml",
+        "renew ks /a --revoke-old",
+        "crl ks --refresh",
+        "rotate_ca ks --same-key",
+        "sign_request ks request.pem -o answer.tar.gz",
+        "import answer.tar.gz robot",
+        "distribute_key ks /a robot",
+        f"rotate_ca ks --next --identity-key file:{keys}/i.pem --permissions-key file:{keys}/p.pem",
+        "rotate_ca ks --next",
+        "rotate_ca ks --next",
+        f"rotate_ca ks --finish --identity-key file:{keys}/2.pem --permissions-key "
+        f"file:{keys}/3.pem",
+    ):
+        sros(*verb.split(), cwd=tmp_path).ok()
+        for folder in (keystore, robot, keys):
+            for path in (folder, *folder.rglob("*")):
+                state = path.lstat()
+                assert (state.st_uid, state.st_gid) == (OWNER, OWNER), (verb, path)
+    assert len(list(keys.iterdir())) == 4
+
+
+@as_root
+def test_a_ca_key_is_not_left_to_the_owner_of_another_folder(keystore: Path, sticky: Path) -> None:
+    give(keystore, OWNER)
+    os.chown(sticky, STRANGER, STRANGER)
+    place = f"file:{sticky}/key.pem"
+    sros("rotate_ca", keystore, "--next", "--identity", "--identity-key", place).ok()
+    assert (sticky / "key.pem").stat().st_uid == 0
 
 
 @as_root

@@ -20,9 +20,9 @@ from sros_tool.keystore.layout import (
     IDENTITY,
     PERMISSIONS,
     ca_key,
-    enclave_names,
     enclave_path,
     is_keystore,
+    search_enclaves,
 )
 from sros_tool.pki import smime
 from sros_tool.runtime.environment import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
@@ -472,7 +472,7 @@ def _spelling(environment: Mapping[str, str]) -> Iterator[Finding]:
 
 
 def _enclave(state: RuntimeState, root: Path, domain: int | None) -> Iterator[Finding]:
-    names, wanted = set(enclave_names(root)), state.environment.get(ENCLAVE, "")
+    names, wanted = set(search_enclaves(root)[0]), state.environment.get(ENCLAVE, "")
     governed = _governed(root)
     if governed and domain is not None and domain not in governed:
         text = f"the governance of '{root}' is for domain {governed}, not for {domain}"

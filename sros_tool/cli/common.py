@@ -124,12 +124,12 @@ def complete_keystore_and_enclave(
     """Complete folders first, then the enclaves of the given keystore."""
     from click.shell_completion import CompletionItem
 
-    from sros_tool.keystore.layout import enclave_names, is_keystore
+    from sros_tool.keystore.layout import is_keystore, search_enclaves
 
     given = ctx.params.get("words") or ()
     root = Path(given[0]) if given else Path(os.environ.get(KEYSTORE_VARIABLE, ""))
     if given or (os.environ.get(KEYSTORE_VARIABLE) and incomplete.startswith("/")):
-        names = enclave_names(root) if is_keystore(root) else ()
+        names = search_enclaves(root)[0] if is_keystore(root) else ()
         return [name for name in names if name.startswith(incomplete)]
     return [CompletionItem(incomplete, type="dir")]
 

@@ -73,14 +73,14 @@ def _complete_enclave(
     ctx: click.Context, _parameter: click.Parameter, incomplete: str
 ) -> list[CompletionItem | str]:
     """Complete the enclaves of the keystore in the arguments, or else in the environment."""
-    from sros_tool.keystore.layout import enclave_names, is_keystore
+    from sros_tool.keystore.layout import is_keystore, search_enclaves
 
     given = (
         ctx.params.get("words") or ctx.args
     )  # click fills only args if an option lacks its value
     named = ctx.params.get("keystore") or (given[0] if given else "")
     root = Path(named or os.environ.get(KEYSTORE_VARIABLE, ""))
-    names = enclave_names(root) if is_keystore(root) else ()
+    names = search_enclaves(root)[0] if is_keystore(root) else ()
     return [name for name in names if name.startswith(incomplete)]
 
 
@@ -372,7 +372,7 @@ def _signed_enclave(
     not have the enclave yet.
     """
     from sros_tool.explain.evaluator import load_enclave
-    from sros_tool.keystore.layout import enclave_path, list_enclaves
+    from sros_tool.keystore.layout import check_keystore, enclave_path, has_enclave, list_enclaves
 
     if root is None:
         folder = Path(name)
@@ -384,14 +384,14 @@ def _signed_enclave(
         if own != name:
             raise KeystoreError(f"'{root}' is the folder of {own or 'no enclave'}, not of {name}")
         return load_enclave(own, root, at=options.at)
-    names = list_enclaves(root)
-    if name in names:
+    check_keystore(root)
+    if has_enclave(root, name):
         return load_enclave(name, enclave_path(root, name), at=options.at)
     if planned:
         return None
     from sros_tool.keystore.missing import no_such_enclave
 
-    raise no_such_enclave(root, name, names)
+    raise no_such_enclave(root, name, list_enclaves(root))
 
 
 def _is_enclave(folder: Path) -> bool:
@@ -831,7 +831,7 @@ def _check_there(root: Path, enclave: str) -> None:
     from sros_tool.keystore.layout import enclave_names
     from sros_tool.keystore.missing import no_such_enclave
 
-    there = tuple(enclave_names(root))
+    there = enclave_names(root)
     if enclave not in there:
         raise no_such_enclave(root, enclave, there)
 

@@ -137,6 +137,8 @@ def _keystore(d: dict[str, Any]) -> Iterator[str]:
         yield f"    {enclave['name']}  {state}, certificate until {until or 'unknown'}"
         for problem in enclave["problems"]:
             yield f"      {problem}"
+    for problem in d["unreadable"]:
+        yield f"    {problem}"
 
 
 def _enclave(d: dict[str, Any]) -> Iterator[str]:

@@ -215,7 +215,7 @@ def list_enclaves(root: Path | None, as_json: bool) -> None:
     root = root or keystore_from_environment()
     if not is_keystore(root):
         raise KeystoreError(f"'{root}' is not a valid keystore")
-    names = list(enclave_names(root))
+    names = enclave_names(root)
     if as_json:
         print_json({"keystore": str(root), "enclaves": names})
         return

@@ -146,7 +146,7 @@ def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict
         UsageError: the domain or the enclave's name is invalid.
         KeystoreError: the enclave does not exist, or a process cannot run in it.
     """
-    from sros_tool.keystore.layout import enclave_path, list_enclaves
+    from sros_tool.keystore.layout import check_keystore, enclave_path, has_enclave, list_enclaves
     from sros_tool.keystore.missing import no_such_enclave
     from sros_tool.keystore.reader import open_enclave
     from sros_tool.names import check_enclave_name
@@ -161,9 +161,9 @@ def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict
         raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
     wanted = domain_from(os.environ if domain_text is None else {DOMAIN: domain_text})
     check_enclave_name(name)
-    names = list_enclaves(root)
-    if name not in names:
-        raise no_such_enclave(root, name, names)
+    check_keystore(root)
+    if not has_enclave(root, name):
+        raise no_such_enclave(root, name, list_enclaves(root))
     folder = enclave_path(root, name)
     state = open_enclave(folder, now=now())
     domains = state.domains()

@@ -58,5 +58,5 @@ def who(
             name, answer.outcome, decision.reason, decision.text, decision.expression or ""
         )
 
-    found = [each for _, part in map_slices(list(enclave_names(root)), work) for each in part]
+    found = [each for _, part in map_slices(enclave_names(root), work) for each in part]
     return tuple(sorted(found, key=lambda each: each.enclave))

@@ -20,6 +20,7 @@ from sros_tool.keystore.layout import (
     ca_key,
     is_keystore,
     permissions_ca_for,
+    search_enclaves,
 )
 from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_enclave
 from sros_tool.pki import smime
@@ -106,7 +107,8 @@ def _keystore(root: Path, now: datetime) -> Description:
             }
         except SrosError as error:
             authorities[role] = {"error": str(error)}
-    enclaves = [_enclave(name, keystore.enclave(name, now=now)) for name in keystore.names]
+    names, unread = search_enclaves(root)
+    enclaves = [_enclave(name, keystore.enclave(name, now=now)) for name in names]
     governance = None
     if (root / GOVERNANCE_P7S).exists():
         try:
@@ -114,6 +116,8 @@ def _keystore(root: Path, now: datetime) -> Description:
         except SrosError as error:
             governance = {"error": str(error)}
     problems = [f"{e['name']}: {problem}" for e in enclaves for problem in e["problems"]]
+    unreadable = [f"'{each.path}' cannot be read: {each.why}" for each in unread]
+    problems += unreadable
     problems += [f"{role} CA: {a['error']}" for role, a in authorities.items() if "error" in a]
     if governance and "error" in governance:
         problems.append(f"governance: {governance['error']}")
@@ -130,6 +134,7 @@ def _keystore(root: Path, now: datetime) -> Description:
         "authorities": authorities,
         "governance": governance,
         "enclaves": enclaves,
+        "unreadable": unreadable,
         "problems": problems,
     }
 

@@ -21,6 +21,7 @@ from sros_tool.keystore.layout import (
     REVOKED,
     enclave_folder,
     list_enclaves,
+    revoked_certificates,
 )
 from sros_tool.keystore.ledger import GAP, Entry, read_ledger
 from sros_tool.keystore.reader import read_lists
@@ -117,8 +118,8 @@ def _active_paths(root: Path) -> Iterator[str]:
 
 
 def _revoked_paths(root: Path) -> Iterator[str]:
-    for folder in sorted((root / REVOKED).glob("*")):
-        yield from (f"{REVOKED}/{folder.name}/{file}" for file in _ISSUED)
+    for path in revoked_certificates(root):
+        yield from (f"{REVOKED}/{path.parent.name}/{file}" for file in _ISSUED)
 
 
 def _retired_paths(root: Path) -> Iterator[str]:

@@ -5,9 +5,12 @@ Paths are relative to the keystore, with "/" between their parts.
 
 from __future__ import annotations
 
+import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.errors import DocumentError, KeystoreError
 
@@ -120,13 +123,20 @@ def is_layout_path(path: str) -> bool:
 
 
 def is_keystore(root: Path) -> bool:
-    """Return whether ``root`` is a keystore, with its CAs or exported without them."""
+    """Return whether ``root`` is a keystore, with its CAs or exported without them.
+
+    Raises:
+        KeystoreError: this user may not look into the folders of ``root``.
+    """
     folder = root / ENCLAVES
-    return folder.is_dir() and (
-        (root / GOVERNANCE_P7S).is_file()
-        or (root / ca_certificate(IDENTITY)).is_file()
-        or any(True for _ in enclave_names(root))
-    )
+    try:
+        return folder.is_dir() and (
+            (root / GOVERNANCE_P7S).is_file()
+            or (root / ca_certificate(IDENTITY)).is_file()
+            or any(search_enclaves(root))
+        )
+    except PermissionError as error:
+        raise _unreadable(root, [UnreadPath.of(error)], "Its enclaves cannot be listed.") from error
 
 
 def is_enclave(folder: Path) -> bool:
@@ -149,25 +159,137 @@ def waits_for_answer(folder: Path) -> bool:
     return (folder / REQUEST).exists() and not (folder / CERTIFICATE_FILE).exists()
 
 
-def enclave_names(root: Path) -> Iterator[str]:
-    """Yield the names of the enclaves, sorted: every folder that has a certificate or a key."""
+_FOLDER_ELSEWHERE = "It is a link to a folder elsewhere, which sros does not follow"
+
+
+@dataclass(frozen=True, slots=True)
+class UnreadPath:
+    """A file or folder of a keystore that sros does not read, and ``why``, as a clause."""
+
+    path: str
+    why: str
+
+    @classmethod
+    def of(cls, error: OSError) -> UnreadPath:
+        """Return the path that the system refuses to read."""
+        return cls(os.fsdecode(error.filename), error.strerror or str(error))
+
+    def remedy(self, root: Path) -> str:
+        """Return what to do, as a sentence; ``root`` is the keystore."""
+        if self.why == _FOLDER_ELSEWHERE:
+            return "Replace the link with a real folder."
+        return (
+            "Run sros as the user who owns it, or give the keystore to one user: `sudo chown -R "
+            f"USER {quote(str(root))}`."
+        )
+
+
+def search_enclaves(root: Path) -> tuple[tuple[str, ...], tuple[UnreadPath, ...]]:
+    """Return the sorted names of the enclaves, and the folders that may hold others.
+
+    An enclave is a folder that has a certificate or a key.  A link to a folder elsewhere is not
+    followed.
+    """
     top = os.fspath(root / ENCLAVES)
-    found = []
-    for folder, folders, files in os.walk(top):
-        folders[:] = [each for each in folders if not each.startswith(".")]
+    found: list[str] = []
+    unread: list[UnreadPath] = []
+    for folder, files in _walk(top, unread):
         if KEY_FILE in files or CERTIFICATE_FILE in files:
             found.append(folder[len(top) :].replace(os.sep, "/") or "/")
-    yield from sorted(found)
+    return tuple(sorted(found)), tuple(unread)
+
+
+def _walk(top: str, unread: list[UnreadPath]) -> Iterator[tuple[str, list[str]]]:
+    """Yield each folder that can hold an enclave, with its files; add the others to ``unread``."""
+
+    def report(error: OSError) -> None:
+        if error.errno not in (errno.ENOENT, errno.ENOTDIR):
+            unread.append(UnreadPath.of(error))
+
+    for folder, folders, files in os.walk(top, onerror=report):
+        folders[:] = [each for each in folders if not each.startswith(".")]
+        for each in folders:
+            path = os.path.join(folder, each)
+            if Path(path).is_symlink() and not _is_inside(path, top):
+                unread.append(UnreadPath(path, _FOLDER_ELSEWHERE))
+        yield folder, files
+
+
+def _is_inside(path: str, top: str) -> bool:
+    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(top))
+
+
+def enclave_names(root: Path) -> tuple[str, ...]:
+    """Return the sorted names of the enclaves: every folder that has a certificate or a key.
+
+    Raises:
+        KeystoreError: an enclave may be missing, because a folder cannot be read.
+    """
+    names, unread = search_enclaves(root)
+    if unread:
+        raise _unreadable(root, unread, "Enclaves in it would be missing from the result.")
+    return names
+
+
+def check_readable(root: Path) -> None:
+    """Raise `KeystoreError` if this user cannot read every file of every enclave.
+
+    A verb that writes would otherwise leave an enclave behind, such as with a replaced CA.
+    """
+    unread: list[UnreadPath] = []
+    for folder, files in _walk(os.fspath(root / ENCLAVES), unread):
+        for name in files:
+            path = f"{folder}/{name}"
+            if name.endswith(_FILE_TYPES) and not os.access(path, os.R_OK):
+                unread += _refused(path)
+    if unread:
+        raise _unreadable(root, unread, "Enclaves would keep their old files. Nothing was changed.")
+
+
+def revoked_certificates(root: Path) -> tuple[Path, ...]:
+    """Return the sorted paths of the certificates in the folder of revoked enclaves.
+
+    Raises:
+        KeystoreError: the folder cannot be read.
+    """
+    folder = root / REVOKED
+    try:
+        places = sorted(os.listdir(folder))
+    except (FileNotFoundError, NotADirectoryError):
+        return ()
+    except OSError as error:
+        effect = "Revoked certificates would be left out."
+        raise _unreadable(root, [UnreadPath.of(error)], effect) from error
+    files = (folder / each / CERTIFICATE_FILE for each in places)
+    return tuple(each for each in files if os.path.lexists(each))
+
+
+def _refused(path: str) -> Iterator[UnreadPath]:
+    """Yield the path if the system refuses to read it; a broken link counts as missing."""
+    try:
+        os.close(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC))
+    except OSError as error:
+        if error.errno not in (errno.ENOENT, errno.ELOOP, errno.ENOTDIR):
+            yield UnreadPath.of(error)
+
+
+def _unreadable(root: Path, unread: Sequence[UnreadPath], effect: str) -> KeystoreError:
+    first, more = unread[0], len(unread) - 1
+    return KeystoreError(
+        f"'{first.path}'{f' and {more} more' if more else ''} in keystore '{root}' cannot be read",
+        f"{first.why}. {effect}",
+        first.remedy(root),
+    )
 
 
 def list_enclaves(root: Path) -> tuple[str, ...]:
     """Return the names of the enclaves of a keystore, sorted.
 
     Raises:
-        KeystoreError: ``root`` is no keystore.
+        KeystoreError: ``root`` is no keystore, or a folder of it cannot be read.
     """
     check_keystore(root)
-    return tuple(enclave_names(root))
+    return enclave_names(root)
 
 
 def check_keystore(root: Path) -> None:

@@ -92,8 +92,8 @@ class OpenedKeystore:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The sorted names of the enclaves."""
-        return tuple(enclave_names(self.root))
+        """The sorted names of the enclaves; raises `KeystoreError` if one may be missing."""
+        return enclave_names(self.root)
 
     @cached_property
     def settings(self) -> Template | None:
@@ -549,8 +549,14 @@ class _EnclaveFiles:
         if not path.exists():
             return
         try:
-            crl, authentic = _load_crl(read_bytes(path, "revocation list"), ca)
-        except (SrosError, ValueError):
+            data = read_bytes(path, "revocation list")
+        except SrosError as error:
+            text = f"it cannot be read: {error.why.rstrip('.') or error.what}"
+            self._add(CRL_FILE, text, Fault.FILE_UNREADABLE)
+            return
+        try:
+            crl, authentic = _load_crl(data, ca)
+        except ValueError:
             text = "it is not a revocation list, so DDS refuses every participant"
             self._add(CRL_FILE, text, Fault.CRL_MALFORMED)
             return

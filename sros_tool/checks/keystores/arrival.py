@@ -16,11 +16,11 @@ from sros_tool.errors import DocumentError
 from sros_tool.keystore.layout import (
     OPTIONAL_FILES,
     REQUIRED_FILES,
-    enclave_names,
     enclave_path,
     is_enclave,
     is_keystore,
     locate_enclave,
+    search_enclaves,
     waits_for_answer,
 )
 from sros_tool.keystore.reader import open_enclave
@@ -109,7 +109,7 @@ def verify_arrival(
         DocumentError: ``path`` is neither of them.
     """
     if is_keystore(path):
-        root, names, only = path, tuple(enclave_names(path)), None
+        root, names, only = path, search_enclaves(path)[0], None
     elif path.is_dir() and is_enclave(path):
         root, name = locate_enclave(path)
         names = only = (name,)

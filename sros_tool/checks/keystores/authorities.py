@@ -10,7 +10,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 
-from sros_tool.checks.keystores.files import key_mode_findings
+from sros_tool.checks.keystores.files import UNREADABLE, key_mode_findings
 from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.decision.vendors import FAST_DDS, Vendor
@@ -151,14 +151,6 @@ def _extensions(
         yield CA_EXTENSIONS.found(subject, f"{name} lacks {', '.join(missing)}", file)
 
 
-UNREADABLE = FindingKind(
-    "keystore.file-unreadable",
-    ERROR,
-    "a file of the keystore that cannot be read",
-    "Verbs that need the file fail.",
-    "sros keystore layout.",
-    "Restore it from a backup.",
-)
 ONE_AUTHORITY = FindingKind(
     "keystore.one-authority",
     WARNING,

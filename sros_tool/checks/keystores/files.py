@@ -27,6 +27,7 @@ from sros_tool.keystore.layout import (
     SEAL,
     SETTINGS,
     STAGE,
+    UnreadPath,
     enclave_folder,
 )
 from sros_tool.keystore.transaction.stage import check_interrupted
@@ -146,6 +147,14 @@ CA_KEY_ON_ROBOT = FindingKind(
     "ROS 2 design, ROS 2 Security Enclaves; NIST SP 800-57 part 1, 6 (protection of keys).",
     "Delete the key there; if others had access, replace the CA (`sros rotate_ca`).",
 )
+UNREADABLE = FindingKind(
+    "keystore.file-unreadable",
+    ERROR,
+    "a file or folder of the keystore that cannot be read",
+    "Verbs that need it fail, and nothing in it was checked.",
+    "sros keystore layout.",
+    "Restore it from a backup.",
+)
 UNKNOWN_FILE = FindingKind(
     "keystore.unknown-file",
     NOTE,
@@ -201,7 +210,8 @@ def _below(
     keys = {os.path.join(root, ENCLAVES, name[1:], "key.pem") for name in keystore.names}
     keys |= {os.path.join(root, ENCLAVES, "key.pem")}
     home = keystore.is_home
-    for parent, folders, files in os.walk(start):
+    unread: list[OSError] = []
+    for parent, folders, files in os.walk(start, onerror=unread.append):
         folders.sort()
         if STAGE in folders:
             folders.remove(STAGE)
@@ -227,7 +237,15 @@ def _below(
             elif name in _KNOWN and inside.startswith(ENCLAVES) and name != "key.pem":
                 continue
             else:
-                yield from _other(path, inside, info, home)
+                yield from _other(path, root, info, home)
+    for error in unread:
+        yield _unread(error, root)
+
+
+def _unread(error: OSError, root: str) -> Finding:
+    path = os.fsdecode(error.filename)
+    remedy = UnreadPath.of(error).remedy(Path(root))
+    return UNREADABLE.found(path, str(error.strerror), path, remedy=remedy)
 
 
 def _interrupted(parent: Path, root: str) -> Finding:
@@ -299,10 +317,17 @@ class _Links:
         return f"{self._folders[end.parent]}/{end.name}"
 
 
-def _other(path: str, inside: str, info: os.stat_result, home: bool) -> Iterator[Finding]:
+def _other(path: str, root: str, info: os.stat_result, home: bool) -> Iterator[Finding]:
     """Yield findings about a file that is not one of an enclave, such as a misplaced key."""
+    inside = os.path.relpath(Path(path).parent, root)
     place = inside.partition(os.sep)[0]
-    if info.st_size <= _MOST_READ and _holds_key(path):
+    try:
+        small = stat.S_ISREG(info.st_mode) and info.st_size <= _MOST_READ
+        holds_key = small and _KEY_MARK in Path(path).read_bytes()
+    except OSError as error:
+        yield _unread(error, root)
+        return
+    if holds_key:
         yield from key_mode_findings(path, info.st_mode)
         if place in (PRIVATE, REVOKED, RETIRED) and home:
             return
@@ -321,10 +346,3 @@ def _other(path: str, inside: str, info: os.stat_result, home: bool) -> Iterator
     )
     if not known:
         yield UNKNOWN_FILE.found(path, "neither ROS 2 nor sros uses this name there", path)
-
-
-def _holds_key(path: str) -> bool:
-    try:
-        return _KEY_MARK in Path(path).read_bytes()
-    except OSError:
-        return False

@@ -20,6 +20,7 @@ from sros_tool.keystore.layout import (
     SETTINGS,
     ca_certificate,
     enclave_path,
+    search_enclaves,
 )
 from sros_tool.keystore.ledger import Ledger
 from sros_tool.keystore.reader import OpenedEnclave, open_keystore
@@ -33,7 +34,7 @@ _Part = TypeVar("_Part")
 
 @dataclass(frozen=True, slots=True)
 class UnreadablePart:
-    """A file that exists but cannot be parsed; ``path`` is relative to the root."""
+    """A file that exists but cannot be read; ``path`` is relative to the root."""
 
     path: str
     error: SrosError
@@ -131,20 +132,25 @@ def read_keystore(
     def authority(role: str) -> tuple[x509.Certificate, ...]:
         return part(ca_certificate(role), lambda: keystore.authority(role), ())
 
-    governance = root / GOVERNANCE_P7S
     settings = part(SETTINGS, lambda: keystore.settings, None)
     ledger = part(LEDGER, lambda: keystore.ledger, Ledger())
     crl = part(CRL, lambda: keystore.revocation_list, None)
     authorities = {role: chain for role in ROLES if (chain := authority(role))}
+    signed = root / GOVERNANCE_P7S
+    governance = part(
+        GOVERNANCE_P7S,
+        lambda: read_bytes(signed, "governance document") if signed.is_file() else b"",
+        b"",
+    )
     return CheckedKeystore(
         root,
         now,
-        keystore.names,
+        search_enclaves(root)[0],  # `check_files` reports folders that cannot be read
         settings,
         authorities,
         crl,
         ledger,
-        read_bytes(governance, "governance document") if governance.is_file() else b"",
+        governance,
         tuple(unread),
         policies,
         zone,

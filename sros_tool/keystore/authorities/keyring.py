@@ -192,8 +192,12 @@ def check_imported_keys(roles: Iterable[str], keyring: Keyring, template: Templa
 
 
 def _write_outside(path: Path, pem: bytes, transaction: Transaction) -> None:
-    """Write a key file outside the keystore; remove it if the transaction fails."""
-    write_new_file(path, pem)
+    """Write a key file outside the keystore; remove it if the transaction fails.
+
+    It belongs to the owner of the keystore, who needs it, if the folder does, too.
+    """
+    root = transaction.root
+    write_new_file(path, pem, for_user=root.stat().st_uid if root.exists() else None)
 
     def undo() -> None:
         with suppress(OSError):

@@ -17,6 +17,7 @@ from sros_tool.keystore.layout import (
     OPTIONAL_FILES,
     PRIVATE,
     REQUIRED_FILES,
+    check_readable,
     enclave_folder,
     enclave_path,
     key_on_robot,
@@ -139,6 +140,7 @@ def pack_enclaves(root: Path, names: Sequence[str], *, now: datetime) -> PackedE
 def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes]:
     """Map the paths of the exported files to their content; refuse an enclave that cannot run."""
     existing = set(list_enclaves(root))
+    check_readable(root)
     files: dict[str, bytes] = {}
     for name in names:
         check_enclave_name(name)

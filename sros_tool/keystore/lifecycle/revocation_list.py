@@ -18,7 +18,7 @@ from cryptography import x509
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.authorities.authority import Authority, write_bundle
 from sros_tool.keystore.authorities.keyring import Keyring
-from sros_tool.keystore.layout import CRL, IDENTITY, REVOKED
+from sros_tool.keystore.layout import CRL, IDENTITY, revoked_certificates
 from sros_tool.keystore.ledger import Entry, document_entry
 from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
@@ -164,7 +164,7 @@ class RevocationListSigner:
             if each.what == "certificate" and each.serial and each.not_after
         }
         expiries = {int(serial, 16): not_after for serial, not_after in recorded.items()}
-        for path in (self._root / REVOKED).glob("*/cert.pem"):
+        for path in revoked_certificates(self._root):
             if path.parent.name not in recorded:
                 with suppress(SrosError):  # without its expiry, it stays on the list
                     found = read_certificate(path)

@@ -25,7 +25,7 @@ from typing import Self
 
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder, make_folders, remove_folders
-from sros_tool.keystore.layout import STAGE, folder_mode
+from sros_tool.keystore.layout import STAGE, check_readable, folder_mode
 from sros_tool.keystore.transaction.lock import KeystoreLock, lock_new
 from sros_tool.keystore.transaction.recovery import complete, recover
 from sros_tool.keystore.transaction.stage import (
@@ -88,7 +88,13 @@ class Transaction:
     # ── begin and end ──────────────────────────────────────────────────────────────────────
 
     def __enter__(self) -> Self:
+        """Begin the transaction.
+
+        Raises:
+            KeystoreError: this user cannot read all enclaves, or the keystore is busy.
+        """
         if self.dry_run:
+            check_readable(self.root)
             return self
         try:
             self._begin()
@@ -111,6 +117,7 @@ class Transaction:
             return
         self._lock = KeystoreLock(self._in)
         recover(self._in)
+        check_readable(self.root)
         for path in (STAGE, f"{STAGE}/{ADDED}", f"{STAGE}/{AFTER}"):
             self._in.mkdir(path, 0o700)
         _LOG.info("began a transaction in the keystore '%s'", self.root)
