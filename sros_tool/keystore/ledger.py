@@ -30,6 +30,7 @@ from sros_tool.folders import Folder
 from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, ROLES, SETTINGS, ca_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import digest, load_certificates, subject_text, validity_of
+from sros_tool.pki.requests import key_digest
 from sros_tool.validity import Window, iso
 from sros_tool.xml import read_bytes
 
@@ -51,7 +52,9 @@ class Entry:
     ``number``).
     ``sha256`` is the hash of a certificate's DER or of a document's bytes; ``serial`` is
     hexadecimal; ``policy`` is the SHA-256 of the policy file, with its includes, that permissions
-    were made from; the ``number`` of an answer orders it.  Times are ISO 8601 in UTC.
+    were made from; the ``number`` of an answer orders it.  ``key`` is the SHA-256 of the public key
+    of a certificate (its DER SubjectPublicKeyInfo), or of the key that was revoked with a
+    certificate.  Times are ISO 8601 in UTC.
     """
 
     time: str
@@ -64,6 +67,7 @@ class Entry:
     not_after: str = ""
     policy: str = ""
     reason: str = ""
+    key: str = ""
     number: int = 0
     previous: str = ""
 
@@ -124,6 +128,7 @@ def certificate_entry(
         not_before=iso(validity.not_before),
         not_after=iso(validity.not_after),
         reason=reason,
+        key=key_digest(certificate.public_key()),  # type: ignore[arg-type]
     )
 
 

@@ -24,6 +24,9 @@ REASONS = tuple(
 )
 """The reasons for a revocation, as RFC 5280 names them."""
 
+SUPERSEDED = x509.ReasonFlags.superseded.value
+"""The reason for a certificate that was renewed: its key may still be in use."""
+
 
 @dataclass(frozen=True, slots=True)
 class Revoked:

@@ -17,6 +17,7 @@ from sros_tool.files import write_new_file
 from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.trust import check_same_authority, refuse_ca_keystore, trusted_in
+from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import ENCLAVES, OPTIONAL_FILES, REQUIRED_FILES, SEAL, enclave_folder
 from sros_tool.keystore.reader import (
     OpenedEnclave,
@@ -35,7 +36,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
-from sros_tool.pki.crl import load_crl
+from sros_tool.pki.crl import SUPERSEDED, load_crl
 from sros_tool.pki.keys import PublicKey, load_key
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
@@ -208,7 +209,8 @@ def import_answer(
     Raises:
         DocumentError: ``data`` is not an answer.
         PkiError: the answer is not valid, see `check_answer`.
-        KeystoreError: the key is missing, or the answer is refused without ``force``.
+        KeystoreError: the key is missing, was revoked or is the key of another enclave, or the
+            answer is refused without ``force``.
     """
     answer = _read_answer(data)
     name = answer.name
@@ -229,6 +231,7 @@ def import_answer(
         assert state.certificate and state.identity_ca and state.permissions_ca
         assert state.permissions
         _check_pinned(answer, state.identity_ca, state.permissions_ca, pinned)
+        _check_key(folder, answer, key.public_key())
         known = trusted_in(folder, "permissions_ca.cert.pem")
         if not force:
             _check_known(folder, answer, known)
@@ -278,6 +281,24 @@ def _check_pinned(
     raise KeystoreError(
         f"the answer for enclave {answer.name} is not signed by the pinned CA", why, remedy
     )
+
+
+def _check_key(folder: Path, answer: RequestAnswer, key: PublicKey) -> None:
+    """Refuse an answer for a revoked key, or for the key of another enclave of this folder."""
+    remedy = f"Make a new key with `sros create_request {answer.name}` in another folder."
+    path = folder / enclave_folder(answer.name) / "cert.pem"
+    present = read_certificate(path) if path.exists() else None
+    if not present or present.public_key() != key:
+        KnownKeys(folder).refuse_second(key, answer.name, remedy)
+        return
+    crl = answer.file("crl.pem")
+    for each in load_crl(crl, "of the answer").revoked if crl else ():
+        if each.serial == present.serial_number and each.reason != SUPERSEDED:
+            raise KeystoreError(
+                f"the key of enclave {answer.name} was revoked",
+                f"The answer certifies it again, and its list revokes '{path}'.",
+                remedy,
+            )
 
 
 def _check_known(folder: Path, answer: RequestAnswer, known: list[x509.Certificate]) -> None:

@@ -30,6 +30,7 @@ from sros_tool.keystore.issuing.enclave import (
     shared_files,
     stated_enclave,
 )
+from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     GOVERNANCE_FILE,
@@ -37,7 +38,6 @@ from sros_tool.keystore.layout import (
     KEY_FILE,
     PERMISSIONS_FILE,
     REQUEST,
-    REVOKED,
     SEAL,
     enclave_folder,
     enclave_path,
@@ -109,7 +109,7 @@ def sign_request(
     Raises:
         PkiError: the request is not valid.
         KeystoreError: the enclave exists (without ``renew``) or does not (with it), its key was
-            revoked, ``answer`` exists, or the keystore cannot issue.
+            revoked or belongs to another enclave, ``answer`` exists, or the keystore cannot issue.
     """
     request = load_request(data, "that was given")
     name = check_enclave_name(request.name)
@@ -122,12 +122,13 @@ def sign_request(
     with Transaction(root, dry_run=dry_run) as transaction:
         existing = list_enclaves(root)
         _check_name(root, name, renew, name in existing)
-        _check_key(root, request)
+        known = KnownKeys(root)
+        _check_key(root, request, known, renew)
         template = load_settings(root)
         authorities = load_authorities(root, template, keyring, now)
         domains = load_governance(root, authorities.permissions.certificate).domains().closed()
         check_domain(domains, domain, root)
-        notes = _new_key_note(root, request) if renew else []
+        notes = _new_key_note(root, request) or [*known.shared_notes([name])] if renew else []
         rights: EarlierRights | StatedRights
         if renew and stated is None:
             rights = _earlier_rights(root, name, authorities.permissions.certificate)
@@ -201,17 +202,17 @@ def _check_name(root: Path, name: str, renew: bool, exists: bool) -> None:
         )
 
 
-def _check_key(root: Path, request: SigningRequest) -> None:
-    """Refuse a revoked key, and a key other than the one that the keystore has for the enclave."""
-    for path in sorted((root / REVOKED).glob(f"*/{CERTIFICATE_FILE}")):
-        certificate = read_certificate(path)
-        if certificate.public_key() == request.public_key:
-            raise KeystoreError(
-                f"the key of the request for {request.name} was revoked",
-                f"It is the key of certificate {certificate.serial_number:x} of "
-                f"{text_of(certificate.subject)}.",
-                "Create a new key on the robot, with `sros create_request` in another folder.",
-            )
+def _check_key(root: Path, request: SigningRequest, known: KnownKeys, renew: bool) -> None:
+    """Refuse a revoked key, the key of another enclave, and a key that does not fit the keystore.
+
+    An enclave that already shares its key with another one is renewed with a note.
+    """
+    remedy = "Create a new key on the robot, with `sros create_request` in another folder."
+    present = _present_certificate(root, request.name) if renew else None
+    same = present if present and present.public_key() == request.public_key else None
+    known.refuse_revoked(request.public_key, f"the request for {request.name}", remedy, same)
+    if not same:
+        known.refuse_second(request.public_key, request.name, remedy)
     path = enclave_path(root, request.name) / KEY_FILE
     if path.exists():
         key = load_key(read_bytes(path, "private key"), f"'{path}'")

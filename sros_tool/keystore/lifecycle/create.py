@@ -36,6 +36,7 @@ from sros_tool.keystore.issuing.enclave import (
     present_files,
     stated_enclave,
 )
+from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     ENCLAVES,
@@ -248,12 +249,13 @@ def _rights_by_enclave(
 class _Keystore:
     """A keystore that enclaves are added to; ``names`` are the existing enclaves.
 
-    ``entries`` are the ledger entries of a new keystore.
+    ``known`` are its keys.  ``entries`` are the ledger entries of a new keystore.
     """
 
     authorities: Authorities
     template: Template
     domains: DomainSet
+    known: KnownKeys
     names: tuple[str, ...] = ()
     entries: tuple[Entry, ...] = ()
 
@@ -266,7 +268,7 @@ def _open_keystore(
     authorities = load_authorities(root, template, keyring, now)
     domains = load_governance(root, authorities.permissions.certificate).domains().closed()
     check_domain(domains, domain, root)
-    return _Keystore(authorities, template, domains, tuple(enclave_names(root)))
+    return _Keystore(authorities, template, domains, KnownKeys(root), enclave_names(root))
 
 
 def _write_keystore(
@@ -297,7 +299,8 @@ def _write_keystore(
         b"# The settings of this keystore; sros uses them for each enclave that is added.\n"
         + render_template(keyring.settings_with_places(template)).encode(),
     )
-    return _Keystore(authorities, template, domains, entries=tuple(entries))
+    known = KnownKeys(transaction.root)
+    return _Keystore(authorities, template, domains, known, entries=tuple(entries))
 
 
 def _check_free(root: Path) -> None:
@@ -473,8 +476,11 @@ def _identity(
         subject = next((each for each in signed_for if common_name_of(each) == own), subject)
     if KEY_FILE in present:
         path = folder / KEY_FILE
-        key = load_key(read_bytes(path, "private key"), f"'{path}'")
-        return NewIdentity(subject, key.public_key())
+        public = load_key(read_bytes(path, "private key"), f"'{path}'").public_key()
+        remedy = f"Move '{path}' away, and a new key is created."
+        keystore.known.refuse_revoked(public, f"enclave {name}", remedy)
+        keystore.known.refuse_second(public, name, remedy)
+        return NewIdentity(subject, public)
     new_key = generate_key()
     return NewIdentity(subject, new_key.public_key(), new_key)
 

@@ -23,6 +23,7 @@ from sros_tool.keystore.issuing.enclave import (
     NewIdentity,
     RecordedRights,
 )
+from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     KEY_FILE,
     check_keystore,
@@ -30,9 +31,14 @@ from sros_tool.keystore.layout import (
     has_enclave,
     list_enclaves,
 )
-from sros_tool.keystore.ledger import Entry, append, read_ledger
+from sros_tool.keystore.ledger import Entry, append, certificate_entry, read_ledger
 from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
-from sros_tool.keystore.lifecycle.revoke import link_everywhere, remarks_on_lack, still_valid
+from sros_tool.keystore.lifecycle.revoke import (
+    link_everywhere,
+    remarks_on_lack,
+    revocation_entry,
+    still_valid,
+)
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import load_settings
 from sros_tool.keystore.template import Template
@@ -42,11 +48,9 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
 from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import enclave_subject, issued_by, subject_text, validity_of
-from sros_tool.pki.crl import Revoked
+from sros_tool.pki.crl import SUPERSEDED, Revoked
 from sros_tool.pki.keys import PrivateKey, PublicKey, generate_key
-from sros_tool.validity import iso
-
-_REASON = "superseded"
+from sros_tool.pki.requests import key_digest
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +75,12 @@ class Renewal:
 
 @dataclass(frozen=True, slots=True)
 class _Replaced:
-    """A certificate that was replaced."""
+    """A certificate that was replaced, and the digest of the key of the new certificate."""
 
     name: str
-    serial: int
-    subject: str
+    old: Entry
     not_after: datetime
+    new_key: str
 
 
 def renew(
@@ -117,7 +121,10 @@ def renew(
             identity=authorities.identity,
             permissions=authorities.permissions,
         )
-        renewer = _Renewer(transaction, writer, authorities, template, now, new_key=new_key)
+        known = KnownKeys(root)
+        renewer = _Renewer(
+            transaction, writer, authorities, template, now, known=known, new_key=new_key
+        )
         existing = list_enclaves(root) if expiring or revoke_old else ()
         thresholds: dict[str, Threshold | None] = dict.fromkeys(names)
         if expiring is not None:
@@ -131,6 +138,10 @@ def renew(
             tuple(each for each in done.values() if isinstance(each, UnreadableEnclave)), "renewed"
         )
         replaced = [each for each in done.values() if isinstance(each, _Replaced)]
+        renewed = tuple(each.name for each in replaced)
+        notes = writer.notes if replaced else ()
+        if not new_key:
+            notes += tuple(known.shared_notes(renewed))
         valid = [each for each in replaced if each.not_after >= now]
         entries, lists, count = writer.entries, None, 0
         if revoke_old and replaced:
@@ -139,11 +150,11 @@ def renew(
                 transaction, authorities.identity, template, keyring, ledger.entries, now
             )
             revocations = _superseded(root, replaced, ledger.entries, lists, now)
-            present = {each.serial: each.name for each in replaced}
+            present = {int(each.old.serial, 16): each.name for each in replaced}
             lists.remarks += remarks_on_lack(root, ledger, present)
             count = len(revocations)
             date = now.replace(microsecond=0)
-            new_entries = [Revoked(int(each.serial, 16), date, _REASON) for each in revocations]
+            new_entries = [Revoked(int(each.serial, 16), date, SUPERSEDED) for each in revocations]
             _, signed = lists.sign(new_entries, existing, incomplete=False)
             entries += [*revocations, *signed]
             link_everywhere(transaction, existing)
@@ -151,9 +162,9 @@ def renew(
         transaction.commit()
     return Renewal(
         root,
-        tuple(each.name for each in replaced),
+        renewed,
         tuple(transaction.changes),
-        writer.notes if replaced else (),
+        notes,
         max((each.not_after for each in valid), default=None) if lists is None else None,
         count,
         existing if lists else (),
@@ -174,12 +185,12 @@ def _superseded(
     found = []
     for each in replaced:
         # The ledger lacks certificates that ros2/sros2 issued.
-        subjects = known[each.name]
+        valid = known[each.name]
         if each.not_after >= now:
-            subjects[each.serial] = each.subject
+            valid[int(each.old.serial, 16)] = each.old
         found += [
-            Entry(iso(now), "revocation", each.name, subject, f"{serial:x}", reason=_REASON)
-            for serial, subject in subjects.items()
+            revocation_entry(one, now, SUPERSEDED, key="" if one.key == each.new_key else one.key)
+            for serial, one in valid.items()
             if serial not in listed
         ]
     return found
@@ -196,6 +207,7 @@ class _Renewer:
         template: Template,
         now: datetime,
         *,
+        known: KnownKeys,
         new_key: bool,
     ) -> None:
         self._root = transaction.root
@@ -203,6 +215,7 @@ class _Renewer:
         self._authorities = authorities
         self._template = template
         self._now = now
+        self._known = known
         self._new_key = new_key
         self._recorded = RecordedRights(transaction.root)
 
@@ -217,13 +230,13 @@ class _Renewer:
             state = read_credentials(self._root, name)
             if threshold and not state.lifetime().due(threshold, self._now):
                 return None
-            self._writer.write(self._issuance(state))
+            issued = self._writer.write(self._issuance(state))
         except SrosError as error:
             return UnreadableEnclave(name, error)
         old = state.certificate
-        # The grant that DDS reads has the subject of the certificate.
-        until = validity_of(old).not_after
-        return _Replaced(name, old.serial_number, state.grant.subject, until)
+        entry = certificate_entry(self._now, "certificate", old, name)
+        new_key = key_digest(issued.certificate.public_key())  # type: ignore[arg-type]
+        return _Replaced(name, entry, validity_of(old).not_after, new_key)
 
     def _issuance(self, state: Credentials) -> Issuance:
         """Verify the files of an enclave, and return what to issue in their place."""
@@ -243,6 +256,8 @@ class _Renewer:
             identity = NewIdentity(subject, key.public_key(), key)
         else:
             public: PublicKey = state.certificate.public_key()  # type: ignore[assignment]
+            remedy = f"Give it another key with `sros renew {self._root} {name} --new-key`."
+            self._known.refuse_revoked(public, f"enclave {name}", remedy, state.certificate)
             identity = NewIdentity(subject, public)
         return Issuance(name, identity, rights)
 

@@ -20,8 +20,9 @@ from sros_tool.keystore.layout import (
     REVOKED,
     enclave_folder,
     list_enclaves,
+    revoked_certificates,
 )
-from sros_tool.keystore.ledger import Entry, Ledger, append, read_ledger
+from sros_tool.keystore.ledger import Entry, Ledger, append, certificate_entry, read_ledger
 from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import load_settings, read_certificate
@@ -29,7 +30,7 @@ from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
-from sros_tool.pki.certificates import common_name_of, issued_by, subject_text, validity_of
+from sros_tool.pki.certificates import common_name_of, issued_by, validity_of
 from sros_tool.pki.crl import REASONS, Revoked
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
@@ -98,17 +99,15 @@ def revoke(
         entries: list[Entry] = []
         present: dict[int, str] = {}
         known = still_valid(root, issued, names, now)
-        for name, subjects in known.items():
-            serial, subject = _move_away(transaction, authority, name)
-            present[serial] = name
-            subjects[serial] = subject
-            for serial, subject in subjects.items():
+        for name, valid in known.items():
+            last = _move_away(transaction, authority, name, now)
+            present[int(last.serial, 16)] = name
+            valid[int(last.serial, 16)] = last
+            for serial, each in valid.items():
                 if serial not in listed:
                     listed.add(serial)
                     revoked.append(Revoked(serial, now.replace(microsecond=0), reason))
-                    entries.append(
-                        Entry(iso(now), "revocation", name, subject, f"{serial:x}", reason=reason)
-                    )
+                    entries.append(revocation_entry(each, now, reason, key=each.key))
         remaining = tuple(name for name in existing if name not in names)
         next_update, signed = lists.sign(revoked, remaining, incomplete=until_retired)
         entries += signed
@@ -162,24 +161,25 @@ def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
 
 def still_valid(
     root: Path, issued: Iterable[Entry], names: Iterable[str], now: datetime
-) -> dict[str, dict[int, str]]:
+) -> dict[str, dict[int, Entry]]:
     """Map each of the enclaves ``names`` to its earlier certificates that have not expired.
 
-    They are serial numbers with subjects, from the ledger's entries ``issued`` and from the files
-    in ``revoked``: a list that was lost no longer has those.
+    They are serial numbers with entries, from the ledger (``issued``) and from the files in
+    ``revoked``: a list that was lost no longer has those.
     """
-    found: dict[str, dict[int, str]] = {name: {} for name in names}
+    found: dict[str, dict[int, Entry]] = {name: {} for name in names}
     moment = iso(now)
     for each in issued:
         expired = each.not_after and each.not_after < moment
         if each.what == "certificate" and each.enclave in found and each.serial and not expired:
-            found[each.enclave][int(each.serial, 16)] = each.subject
-    for path in sorted((root / REVOKED).glob("*/cert.pem")):
+            found[each.enclave][int(each.serial, 16)] = each
+    for path in revoked_certificates(root):
         with suppress(SrosError):  # it was revoked when it was put there
             certificate = read_certificate(path)
             name = common_name_of(certificate.subject)
             if name in found and validity_of(certificate).not_after >= now:
-                found[name][certificate.serial_number] = subject_text(certificate.subject)
+                entry = certificate_entry(now, "certificate", certificate, name)
+                found[name][certificate.serial_number] = entry
     return found
 
 
@@ -202,11 +202,21 @@ def remarks_on_lack(root: Path, ledger: Ledger, present: Mapping[int, str]) -> t
     )
 
 
-def _move_away(transaction: Transaction, authority: Authority, name: str) -> tuple[int, str]:
-    """Stage the move of an enclave's files to ``revoked``.
+def revocation_entry(certificate: Entry, now: datetime, reason: str, *, key: str) -> Entry:
+    """Return the entry of a revocation; ``key`` is the digest of the revoked key, or ""."""
+    return Entry(
+        iso(now),
+        "revocation",
+        certificate.enclave,
+        certificate.subject,
+        certificate.serial,
+        reason=reason,
+        key=key,
+    )
 
-    Return the serial number and the subject of its certificate.
-    """
+
+def _move_away(transaction: Transaction, authority: Authority, name: str, now: datetime) -> Entry:
+    """Stage the move of an enclave's files to ``revoked``; return the entry of its certificate."""
     folder = enclave_folder(name)
     path = transaction.root / folder / "cert.pem"
     certificate = read_certificate(path)
@@ -216,8 +226,7 @@ def _move_away(transaction: Transaction, authority: Authority, name: str) -> tup
             "Only the CA that issued it can revoke it.",
             "Revoke it in the keystore of that CA, or restore the right certificate.",
         )
-    serial = certificate.serial_number
-    target = f"{REVOKED}/{serial:x}"
+    target = f"{REVOKED}/{certificate.serial_number:x}"
     for file in _FILES:
         source = transaction.root / folder / file
         if name == "/" and file == "governance.p7s":
@@ -228,7 +237,7 @@ def _move_away(transaction: Transaction, authority: Authority, name: str) -> tup
             data = read_bytes(source, "file")
             transaction.write(f"{target}/{file}", data, private=file == _PRIVATE)
         transaction.remove(f"{folder}/{file}")
-    return serial, subject_text(certificate.subject)
+    return certificate_entry(now, "certificate", certificate, name)
 
 
 def link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:

@@ -26,6 +26,7 @@ from sros_tool.keystore.issuing.enclave import (
     NewIdentity,
     RecordedRights,
 )
+from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     CRL,
@@ -87,7 +88,7 @@ from sros_tool.pki.certificates import (
     same_key,
     subject_text,
 )
-from sros_tool.pki.keys import algorithm, is_weak
+from sros_tool.pki.keys import PublicKey, algorithm, is_weak
 from sros_tool.validity import Span, Window, window
 from sros_tool.xml import read_bytes
 
@@ -409,11 +410,11 @@ class _Rotator:
             identity=identity.new if identity else None,
             permissions=permissions.new if permissions else None,
         )
-        recorded = RecordedRights(self._root)
+        recorded, known = RecordedRights(self._root), KnownKeys(self._root)
 
         def reissue(name: str) -> None:
             try:
-                if issuance := _issuance(self._root, name, identity, permissions, recorded):
+                if issuance := _issuance(self._root, name, identity, permissions, recorded, known):
                     writer.write(issuance)
             except SrosError as error:
                 folder = enclave_path(self._root, name)
@@ -426,6 +427,8 @@ class _Rotator:
         writer.for_each(self._names, reissue, progress)
         self._entries += writer.entries
         self.notes = writer.notes
+        if identity:
+            self.notes += tuple(known.shared_notes(self._names))
 
     def _sign_governance(self, permissions: _Successor) -> None:
         """Sign the governance of the keystore and its copies in enclaves again, unchanged."""
@@ -517,11 +520,13 @@ def _issuance(
     identity: _Successor | None,
     permissions: _Successor | None,
     recorded: RecordedRights,
+    known: KnownKeys,
 ) -> Issuance | None:
     """Return the `Issuance` of the new CAs for an enclave; None if it has no certificate yet.
 
     Raises:
-        KeystoreError: the old CA did not issue its certificate or sign its permissions.
+        KeystoreError: the old CA did not issue its certificate or sign its permissions, or its key
+            was revoked.
     """
     folder = enclave_path(root, name)
     path = folder / CERTIFICATE_FILE
@@ -535,7 +540,10 @@ def _issuance(
                 f"its certificate was issued by {subject_text(kept.issuer)}, not by the identity "
                 "CA of this keystore"
             )
-        certificate = NewIdentity(kept.subject, kept.public_key())  # type: ignore[arg-type]
+        key: PublicKey = kept.public_key()  # type: ignore[assignment]
+        remedy = f"Renew it with `sros renew {root} {name} --new-key`, or revoke it."
+        known.refuse_revoked(key, f"enclave {name}", remedy, kept)
+        certificate = NewIdentity(kept.subject, key)
     rights = None
     if permissions and (folder / PERMISSIONS_FILE).exists():
         rights = _verified_rights(root, name, subject_text(kept.subject), permissions, recorded)

@@ -1,0 +1,149 @@
+"""The public keys that a keystore knows: those of its enclaves, and the revoked ones.
+
+A revocation list names certificates, so whoever certifies a revoked key again undoes its
+revocation.  Two enclaves with one key are one identity: each can act as the other.  Keys are
+compared by the SHA-256 of their SubjectPublicKeyInfo (DER).
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+
+from cryptography import x509
+
+from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
+from sros_tool.keystore.layout import (
+    CERTIFICATE_FILE,
+    KEY_FILE,
+    enclave_names,
+    enclave_path,
+    revoked_certificates,
+)
+from sros_tool.keystore.ledger import read_ledger
+from sros_tool.keystore.reader import read_certificate, read_lists
+from sros_tool.parallel import map_slices
+from sros_tool.pki.certificates import subject_text
+from sros_tool.pki.crl import SUPERSEDED
+from sros_tool.pki.keys import PublicKey, load_key
+from sros_tool.pki.requests import key_digest
+from sros_tool.xml import read_bytes
+
+
+class KnownKeys:
+    """The keys of a keystore, to compare with a key that is about to be certified."""
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    @cached_property
+    def _revoked(self) -> Mapping[str, str]:
+        """Map the digests of revoked keys to a description of the revoked certificate."""
+        recorded = [
+            each
+            for each in read_ledger(self._root).entries
+            if each.what == "revocation" and each.key
+        ]
+        found = {each.key: f"certificate {each.serial} of {each.subject}" for each in recorded}
+        serials = {each.serial for each in recorded}
+        for path in revoked_certificates(self._root):
+            try:
+                found.update([_described(read_certificate(path))])
+            except SrosError:
+                if path.parent.name not in serials:
+                    raise
+        return found
+
+    @cached_property
+    def _revoked_serials(self) -> Collection[int]:
+        """The serial numbers of certificates that were revoked together with their keys."""
+        found = {
+            int(each.serial, 16)
+            for each in read_ledger(self._root).entries
+            if each.what == "revocation" and each.reason != SUPERSEDED
+        }
+        lists = (entry for crl in read_lists(self._root) for entry in crl.revoked)
+        return found | {entry.serial for entry in lists if entry.reason != SUPERSEDED}
+
+    @cached_property
+    def _enclaves(self) -> Mapping[str, Sequence[str]]:
+        """Map the digest of each key to the enclaves that have it."""
+
+        def read(names: Sequence[str]) -> list[tuple[str, str]]:
+            return [(digest, name) for name in names for digest in _digests(self._root, name)]
+
+        found: dict[str, list[str]] = defaultdict(list)
+        for _, part in map_slices(enclave_names(self._root), read):
+            for digest, name in part:
+                found[digest].append(name)
+        return found
+
+    def refuse_revoked(
+        self, key: PublicKey, whose: str, remedy: str, certificate: x509.Certificate | None = None
+    ) -> None:
+        """Raise `KeystoreError` if ``key`` was revoked; ``whose`` names its holder in the error.
+
+        ``certificate`` is the present certificate for the key: a revoked one may have been put
+        back from a backup.
+        """
+        revoked = self._revoked.get(key_digest(key))
+        if certificate and certificate.serial_number in self._revoked_serials:
+            revoked = _described(certificate)[1]
+        if revoked:
+            raise KeystoreError(
+                f"the key of {whose} was revoked", f"It is the key of {revoked}.", remedy
+            )
+
+    def refuse_second(self, key: PublicKey, name: str, remedy: str) -> None:
+        """Raise `KeystoreError` if another enclave than ``name`` has ``key``."""
+        if others := self._others(key, name):
+            raise KeystoreError(
+                f"the key for enclave {name} is the key of enclave {others[0]}",
+                "Two enclaves with one key are one identity: each can act as the other.",
+                remedy,
+            )
+
+    def shared_notes(self, names: Sequence[str]) -> Iterator[Note]:
+        """Yield a note for each of the enclaves that has its key together with others."""
+        shared = {
+            name: others
+            for enclaves in self._enclaves.values()
+            if len(enclaves) > 1
+            for name in enclaves
+            if (others := [each for each in enclaves if each != name])
+        }
+        for name in names:
+            if name in shared:
+                yield Note(
+                    "keystore.key-twice",
+                    f"{name} has the same key as {', '.join(shared[name])}: each can act as the "
+                    "other. Renew one of them with a new key.",
+                )
+
+    def _others(self, key: PublicKey, name: str) -> list[str]:
+        return [each for each in self._enclaves.get(key_digest(key), ()) if each != name]
+
+
+def _described(certificate: x509.Certificate) -> tuple[str, str]:
+    """Return the digest of a certificate's key, and a description of the certificate."""
+    subject = subject_text(certificate.subject)
+    return _digest_of(certificate), f"certificate {certificate.serial_number:x} of {subject}"
+
+
+def _digest_of(certificate: x509.Certificate) -> str:
+    return key_digest(certificate.public_key())  # type: ignore[arg-type]
+
+
+def _digests(root: Path, name: str) -> Iterator[str]:
+    """Yield the digest of an enclave's key, from its certificate, or else from its key file."""
+    folder = enclave_path(root, name)
+    try:
+        if (folder / CERTIFICATE_FILE).exists():
+            yield _digest_of(read_certificate(folder / CERTIFICATE_FILE))
+        else:
+            path = folder / KEY_FILE
+            yield key_digest(load_key(read_bytes(path, "private key"), f"'{path}'").public_key())
+    except PkiError:
+        return  # a damaged file, which no DDS loads; `sros check` reports it
