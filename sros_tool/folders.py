@@ -27,6 +27,7 @@ _FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC
 _NEW_FILE = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _OLD_FILE = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 _MOST_OPEN = 64
+_MOST_BYTES = 128 * 1024 * 1024
 _RENAME_EXCHANGE = 2
 _NOT_SUPPORTED = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
 
@@ -118,11 +119,14 @@ class Folder:
         return sorted(os.listdir(self.handle(path)))
 
     def read(self, path: str) -> bytes:
-        """Return the content of the regular file at ``path``."""
+        """Return the content of the regular file at ``path``, of at most 128 MiB."""
         parent, name = self._at(path)
         with self._naming(path), open(os.open(name, _OLD_FILE, dir_fd=parent), "rb") as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            state = os.fstat(file.fileno())
+            if not stat.S_ISREG(state.st_mode):
                 raise OSError(errno.EINVAL, "it is not a regular file", str(self.path / path))
+            if state.st_size > _MOST_BYTES:
+                raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(self.path / path))
             return file.read()
 
     # ── making ─────────────────────────────────────────────────────────────────────────────

@@ -20,6 +20,8 @@ Fast DDS 2.14.5 reads the dates of permissions in the host's local time, so a do
 valid at least 14 hours before its creation in UTC to work in every time zone.
 """
 
+_FIRST_YEAR = 1950
+
 _DURATION = re.compile(r"(\d{1,10})([smhdwy])\Z", re.ASCII)
 _SECONDS = {"s": 1, "m": 60, "h": 3600, "d": 86400, "w": 604800, "y": 365 * 86400}
 _LONGEST = 100 * _SECONDS["y"]
@@ -73,18 +75,28 @@ def window(now: datetime, span: Span) -> Window:
     Without a fixed start it begins `BACKDATE` before ``now``.
 
     Raises:
-        UsageError: the validity has expired already.
+        UsageError: the validity has expired already, or is not within the years that a certificate
+            can name (1950 to 9999; RFC 5280, 4.1.2.5).
     """
     moment = now.astimezone(UTC).replace(microsecond=0)
-    if isinstance(span, timedelta):
-        return Window(moment - BACKDATE, moment + span)
-    begin = span.start or moment
-    end = span.end or begin + (span.length or timedelta(0))
+    chosen = Lifespan(length=span) if isinstance(span, timedelta) else span
+    try:
+        end = chosen.end or (chosen.start or moment) + (chosen.length or timedelta(0))
+        begin = chosen.start or moment - BACKDATE
+    except OverflowError:
+        end = begin = datetime.min.replace(tzinfo=UTC)
+    if begin.year < _FIRST_YEAR:
+        raise UsageError(
+            f"the validity of what is signed at {iso(now)} is not within the years {_FIRST_YEAR} "
+            "to 9999",
+            "A certificate cannot name other years.",
+            "Set the clock of this machine, or choose a shorter validity.",
+        )
     if end <= moment:
         raise UsageError(
             f"the chosen validity has expired already, at {iso(end)}", "", "Choose a later expiry."
         )
-    return Window(span.start or moment - BACKDATE, end)
+    return Window(begin, end)
 
 
 def parse_span(text: str) -> Span:
@@ -148,7 +160,8 @@ def duration_text(duration: timedelta) -> str:
 @lru_cache(maxsize=64)  # files that are created together have equal times
 def iso(moment: datetime) -> str:
     """Return ``moment`` as CCYY-MM-DDThh:mm:ssZ, in UTC."""
-    return moment.astimezone(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+    plain = moment.astimezone(UTC).replace(tzinfo=None, microsecond=0)
+    return f"{plain.isoformat()}Z"  # strftime("%Y") writes the year 1 without zeros
 
 
 def parse_iso(text: str) -> datetime:

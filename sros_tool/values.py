@@ -1,7 +1,8 @@
-"""Conversion of dataclasses and other values to JSON types, for all JSON output."""
+"""Reading JSON, and conversion of dataclasses and other values to JSON types."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from datetime import datetime
@@ -14,6 +15,14 @@ from sros_tool.validity import iso
 _Value = TypeVar("_Value")
 _SHOWN: dict[type, tuple[str, ...]] = {}
 """The attributes of each class that its JSON object has."""
+
+
+def parse_json(data: bytes) -> Any:
+    """Return the value of a JSON document; raise `ValueError` if it is none."""
+    try:
+        return json.loads(data)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
 
 
 def as_plain(value: object) -> Any:

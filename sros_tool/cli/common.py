@@ -389,8 +389,7 @@ class _Secrets:
         value = _taken.get(_PIN if is_pin else _PASSPHRASE, "")
         file = "" if is_pin else _taken.get(_PASSPHRASE_FILE, "")
         if not value and file:
-            text = Path(file).read_text(encoding="utf-8", errors="surrogateescape")
-            value = text.partition("\n")[0]
+            value = _first_line(Path(file))
         if not value and sys.stdin.isatty():
             confirm = self._new and not is_pin
             value = click.prompt(
@@ -409,6 +408,21 @@ class _Secrets:
         except UnicodeEncodeError:
             raise PkiError(f"{what} is not UTF-8 text", "", "Choose another one.") from None
         return value
+
+
+def _first_line(path: Path) -> str:
+    """Return the first line of a passphrase file, or of a pipe such as ``<(pass show ca)``."""
+    from sros_tool.pki.keys import LONGEST_PASSPHRASE
+
+    with path.open("rb") as file:
+        line = re.split(rb"[\r\n]", file.read(LONGEST_PASSPHRASE + 1))[0]
+    if len(line) > LONGEST_PASSPHRASE:
+        raise PkiError(
+            f"the passphrase file '{path}' cannot be used",
+            f"Its first line is longer than {LONGEST_PASSPHRASE} bytes.",
+            f"Write the passphrase into it, or set {_PASSPHRASE}.",
+        )
+    return line.decode("utf-8", "surrogateescape")
 
 
 # ── logs ────────────────────────────────────────────────────────────────────────────────

@@ -114,17 +114,27 @@ def to_json(observation: Observation) -> dict[str, Any]:
 
 
 def from_json(value: Mapping[str, Any]) -> Observation:
-    """Return the observation in JSON that `to_json` has made."""
+    """Return the observation in JSON that `to_json` has made.
+
+    Raises:
+        ValueError, TypeError, KeyError: ``value`` is of another form.
+    """
     return make_observation(
         ObservedNode(
-            tuple(node["enclaves"]),
-            node["namespace"],
-            node["name"],
-            node["participant"],
-            frozenset(Endpoint(t, way) for way in (PUBLISH, SUBSCRIBE) for t in node[way]),
+            tuple(map(_text, node["enclaves"])),
+            _text(node["namespace"]),
+            _text(node["name"]),
+            _text(node["participant"]),
+            frozenset(Endpoint(_text(t), way) for way in (PUBLISH, SUBSCRIBE) for t in node[way]),
         )
         for node in value["nodes"]
     )
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise TypeError(f"{value!r} is not a text")
+    return value
 
 
 def _topics(node: ObservedNode, direction: str) -> list[str]:

@@ -59,7 +59,7 @@ from sros_tool.pki.certificates import (
     weakness,
 )
 from sros_tool.pki.chains import chain_fault
-from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl, signed_by
+from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl, read_list, signed_by
 from sros_tool.pki.keys import load_key
 from sros_tool.validity import Window, iso
 from sros_tool.values import shows
@@ -422,7 +422,7 @@ def _load_crl(
     data: bytes, authority: x509.Certificate | None
 ) -> tuple[x509.CertificateRevocationList, bool]:
     """Return a revocation list, and whether ``authority`` signed it (True without one)."""
-    crl = x509.load_pem_x509_crl(data)
+    crl = read_list(data, CRL_FILE)
     return crl, authority is None or signed_by(crl, authority)
 
 
@@ -485,7 +485,8 @@ class _EnclaveFiles:
         try:
             data = read_bytes(path, "file")
         except SrosError as error:
-            self._add(name, f"it cannot be read: {error.why.rstrip('.')}", Fault.FILE_UNREADABLE)
+            why = error.why.rstrip(".") or error.what
+            self._add(name, f"it cannot be read: {why}", Fault.FILE_UNREADABLE)
             return None
         if not data:
             self._add(name, "it is empty", Fault.FILE_EMPTY)
@@ -556,7 +557,7 @@ class _EnclaveFiles:
             return
         try:
             crl, authentic = _load_crl(data, ca)
-        except ValueError:
+        except SrosError:
             text = "it is not a revocation list, so DDS refuses every participant"
             self._add(CRL_FILE, text, Fault.CRL_MALFORMED)
             return

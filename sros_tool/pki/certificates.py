@@ -11,9 +11,9 @@ from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.x509.oid import NameOID
 
-from sros_tool.errors import PkiError
 from sros_tool.pki import der
 from sros_tool.pki.keys import PrivateKey, PublicKey, algorithm, is_weak
+from sros_tool.pki.reading import read_name, reading
 from sros_tool.validity import Window
 
 _CA_USAGE = x509.KeyUsage(
@@ -39,9 +39,6 @@ _LEAF_USAGE = x509.KeyUsage(
     decipher_only=False,
 )
 Extension = TypeVar("Extension", bound=x509.ExtensionType)
-
-UNREADABLE = (ValueError, UnsupportedAlgorithm, x509.DuplicateExtension, x509.InvalidVersion)
-"""The exceptions of `cryptography` for a certificate that is damaged or not supported."""
 
 _SHORT_NAMES = {
     oid.dotted_string: name
@@ -190,14 +187,12 @@ def load_certificate(data: bytes, name: str) -> x509.Certificate:
     Raises:
         PkiError: the certificate cannot be read.
     """
-    try:
-        return read_in_full(x509.load_pem_x509_certificate(data))
-    except UNREADABLE as error:
-        raise PkiError(
-            f"the certificate {name} cannot be read",
-            "It is not a PEM certificate, it is damaged, or its key algorithm is unknown.",
-            "Restore it from a backup, or issue it again.",
-        ) from error
+    with reading(
+        f"the certificate {name} cannot be read",
+        "It is not a PEM certificate, it is damaged, or its key algorithm is unknown.",
+        "Restore it from a backup, or issue it again.",
+    ):
+        return _read_in_full(x509.load_pem_x509_certificate(data))
 
 
 def load_certificates(data: bytes, name: str) -> tuple[x509.Certificate, ...]:
@@ -207,27 +202,33 @@ def load_certificates(data: bytes, name: str) -> tuple[x509.Certificate, ...]:
         PkiError: the file has no certificate, or one of them cannot be read.
     """
     first = load_certificate(data, name)
-    try:
-        others = [read_in_full(each) for each in x509.load_pem_x509_certificates(data)[1:]]
-    except UNREADABLE as error:
-        raise PkiError(
-            f"the certificates {name} cannot be read",
-            "A certificate after the first one is damaged.",
-            "Restore the file from a backup, or remove the damaged certificate.",
-        ) from error
-    return (first, *others)
+    with reading(
+        f"the certificates {name} cannot be read",
+        "A certificate after the first one is damaged.",
+        "Restore the file from a backup, or remove the damaged certificate.",
+    ):
+        others = [_read_in_full(each) for each in x509.load_pem_x509_certificates(data)[1:]]
+        return (first, *others)
 
 
-def read_in_full(certificate: x509.Certificate) -> x509.Certificate:
-    """Return ``certificate`` after parsing every part that sros uses.
+def load_der_certificate(data: bytes) -> x509.Certificate:
+    """Return the certificate in DER that a signed document embeds.
 
-    `cryptography` parses a part at its first use, so a damaged part would otherwise raise an error
-    later.  Raises one of `UNREADABLE`.
+    Raises:
+        PkiError: the certificate cannot be read.
     """
+    with reading("a certificate in it cannot be read", "It is damaged."):
+        return _read_in_full(x509.load_der_x509_certificate(data))
+
+
+def _read_in_full(certificate: x509.Certificate) -> x509.Certificate:
+    """Return ``certificate`` after parsing every part that sros uses."""
     for name in (certificate.subject, certificate.issuer):
-        name.rfc4514_string()
+        read_name(name)
+        subject_text(name)
     certificate.public_key()
-    _ = certificate.extensions, certificate.signature_hash_algorithm, certificate.serial_number
+    authority_identifier(certificate)
+    _ = certificate.signature_hash_algorithm, certificate.serial_number
     if certificate.not_valid_after_utc <= certificate.not_valid_before_utc:
         raise ValueError("it expires before its validity begins")
     return certificate
@@ -259,7 +260,7 @@ def issued_by(certificate: x509.Certificate, authority: x509.Certificate) -> boo
     """
     try:
         certificate.verify_directly_issued_by(authority)
-    except (InvalidSignature, ValueError, TypeError):
+    except (InvalidSignature, UnsupportedAlgorithm, ValueError, TypeError):
         return False
     named = extension(certificate, x509.AuthorityKeyIdentifier)
     if named is None:

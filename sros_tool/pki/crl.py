@@ -11,8 +11,9 @@ from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
 
 from sros_tool.errors import PkiError
-from sros_tool.pki.certificates import authority_identifier
+from sros_tool.pki.certificates import authority_identifier, subject_text
 from sros_tool.pki.keys import PrivateKey
+from sros_tool.pki.reading import read_name, reading
 
 CRL_MARK = b"-----BEGIN X509 CRL-----"
 """The first line of a PEM revocation list."""
@@ -23,6 +24,7 @@ REASONS = tuple(
     if flag not in (x509.ReasonFlags.remove_from_crl,)
 )
 """The reasons for a revocation, as RFC 5280 names them."""
+_RESTORE = "Restore it from a backup."
 
 SUPERSEDED = x509.ReasonFlags.superseded.value
 """The reason for a certificate that was renewed: its key may still be in use."""
@@ -88,18 +90,32 @@ def load_crl(pem: bytes, name: str) -> RevocationList:
     Raises:
         PkiError: the list cannot be read, or does not say when it expires.
     """
-    try:
+    crl = read_list(pem, name)
+    next_update = crl.next_update_utc
+    if next_update is None:
+        raise PkiError(f"the revocation list {name} does not say when it expires", "", _RESTORE)
+    revoked = tuple(map(_revoked, crl))
+    return RevocationList(_number(crl), crl.last_update_utc, next_update, revoked, crl)
+
+
+def read_list(pem: bytes, name: str) -> x509.CertificateRevocationList:
+    """Return the first revocation list of a PEM file, with or without the time of its expiry.
+
+    Raises:
+        PkiError: the list cannot be read; ``name`` names the file.
+    """
+    with reading(
+        f"the revocation list {name} cannot be read",
+        "It is not a PEM revocation list, or it is damaged; DDS refuses every participant.",
+        _RESTORE,
+    ):
         crl = x509.load_pem_x509_crl(pem)
-        revoked = tuple(_revoked(entry) for entry in crl)
-        next_update = crl.next_update_utc
-        if next_update is None:
-            raise ValueError("no next update")
-        return RevocationList(_number(crl), crl.last_update_utc, next_update, revoked, crl)
-    except ValueError as error:
-        raise PkiError(
-            f"the revocation list {name} cannot be read",
-            "It is not a PEM revocation list, or it is damaged; DDS refuses every participant.",
-        ) from error
+        read_name(crl.issuer)
+        subject_text(crl.issuer)
+        _ = crl.last_update_utc, crl.next_update_utc, crl.signature_hash_algorithm, _number(crl)
+        for entry in crl:
+            _revoked(entry)
+        return crl
 
 
 def signed_by(crl: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:

@@ -9,7 +9,6 @@ import re
 import textwrap
 from collections.abc import Callable, Iterator
 
-from cryptography.exceptions import InternalError, UnsupportedAlgorithm
 from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
@@ -21,9 +20,13 @@ from cryptography.hazmat.primitives.padding import PKCS7
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
+from sros_tool.pki.reading import reading
 
 PrivateKey = ec.EllipticCurvePrivateKey | rsa.RSAPrivateKey
 PublicKey = ec.EllipticCurvePublicKey | rsa.RSAPublicKey
+
+LONGEST_PASSPHRASE = 1023
+"""Longest passphrase of a private key, in bytes."""
 
 
 def generate_key() -> ec.EllipticCurvePrivateKey:
@@ -55,7 +58,7 @@ def _encrypted(key: bytes, passphrase: str) -> bytes:
     Source: RFC 5958, 3; RFC 8018, 6.2 and A.4; RFC 7914, 7.
     """
     salt, start = os.urandom(16), os.urandom(16)
-    secret = Scrypt(salt, 32, _N, _R, _P).derive(passphrase.encode())
+    secret = Scrypt(salt, 32, _N, _R, _P).derive(_as_bytes(passphrase))
     padder, encryptor = PKCS7(128).padder(), Cipher(AES(secret), CBC(start)).encryptor()
     content = encryptor.update(padder.update(key) + padder.finalize()) + encryptor.finalize()
     numbers = map(der.encode_integer, (_N, _R, _P))
@@ -100,7 +103,7 @@ def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None)
             ) from error
         _check_derivation(pem, name)
         key = _decrypted(pem, name, passphrase())
-    except (ValueError, UnsupportedAlgorithm, InternalError) as error:
+    except Exception as error:  # of many classes: see `reading`
         raise _unreadable(name) from error
     if not isinstance(key, (ec.EllipticCurvePrivateKey, rsa.RSAPrivateKey)):
         raise PkiError(
@@ -178,16 +181,25 @@ def _integers(data: bytes, depth: int = 3) -> Iterator[int]:
 
 
 def _decrypted(pem: bytes, name: str, passphrase: str) -> PrivateKeyTypes:
-    try:
-        return serialization.load_pem_private_key(
-            pem, passphrase.encode(), unsafe_skip_rsa_key_validation=True
-        )
-    except (ValueError, TypeError) as error:
+    secret = _as_bytes(passphrase)
+    with reading(
+        f"the private key {name} cannot be decrypted",
+        "The passphrase is wrong.",
+        "Try again with the right passphrase.",
+    ):
+        return serialization.load_pem_private_key(pem, secret, unsafe_skip_rsa_key_validation=True)
+
+
+def _as_bytes(passphrase: str) -> bytes:
+    """Return the bytes of a passphrase; in the environment they need not be valid UTF-8."""
+    secret = passphrase.encode("utf-8", "surrogateescape")
+    if len(secret) > LONGEST_PASSPHRASE:
         raise PkiError(
-            f"the private key {name} cannot be decrypted",
-            "The passphrase is wrong.",
-            "Try again with the right passphrase.",
-        ) from error
+            "the passphrase is too long",
+            f"It has {len(secret)} bytes, and OpenSSL accepts {LONGEST_PASSPHRASE}.",
+            "Choose a shorter one.",
+        )
+    return secret
 
 
 def is_weak(key: object) -> bool:

@@ -13,6 +13,7 @@ from cryptography.hazmat.primitives.asymmetric import ec, rsa
 from sros_tool.errors import PkiError
 from sros_tool.pki.certificates import common_name, common_name_of, subject_text
 from sros_tool.pki.keys import PrivateKey, PublicKey, algorithm
+from sros_tool.pki.reading import reading
 
 _MAX_BYTES = 64 * 1024
 """Largest request that is read, in bytes."""
@@ -44,7 +45,11 @@ def load_request(data: bytes, what: str) -> SigningRequest:
         PkiError: the request cannot be read, its signature does not verify, its key is of another
             kind, or its subject is not exactly one common name.
     """
-    try:
+    with reading(
+        f"the request {what} cannot be read",
+        "It is not a PEM certificate request, or it is damaged.",
+        "Create it with `sros create_request` on the robot, and send its request.pem.",
+    ):
         if len(data) > _MAX_BYTES:
             raise ValueError("too large")
         request = x509.load_pem_x509_csr(data)
@@ -54,12 +59,6 @@ def load_request(data: bytes, what: str) -> SigningRequest:
             request.signature_hash_algorithm,
         )
         said = subject_text(subject)
-    except (ValueError, UnsupportedAlgorithm, x509.InvalidVersion) as error:
-        raise PkiError(
-            f"the request {what} cannot be read",
-            "It is not a PEM certificate request, or it is damaged.",
-            "Create it with `sros create_request` on the robot, and send its request.pem.",
-        ) from error
     if not (
         isinstance(public, ec.EllipticCurvePublicKey) and public.curve.name == "secp256r1"
     ) and (not (isinstance(public, rsa.RSAPublicKey) and public.key_size == 2048)):
@@ -90,7 +89,7 @@ def load_request(data: bytes, what: str) -> SigningRequest:
 def _has_valid_signature(request: x509.CertificateSigningRequest) -> bool:
     try:
         return request.is_signature_valid
-    except (ValueError, UnsupportedAlgorithm):
+    except (ValueError, TypeError, UnsupportedAlgorithm):
         return False
 
 

@@ -27,7 +27,7 @@ from cryptography.hazmat.primitives.serialization import Encoding, pkcs7
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
-from sros_tool.pki.certificates import UNREADABLE, read_in_full
+from sros_tool.pki.certificates import load_der_certificate
 from sros_tool.pki.keys import PrivateKey
 
 _TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"
@@ -195,7 +195,7 @@ class SignedDocument:
                 key.verify(self._signature, signed, padding.PKCS1v15(), digest.algorithm)
             else:
                 return False
-        except (InvalidSignature, UnsupportedAlgorithm):
+        except (InvalidSignature, UnsupportedAlgorithm, ValueError):
             return False
         return True
 
@@ -206,7 +206,7 @@ def parse(message: bytes) -> SignedDocument:
     content, signature = _split(message)
     try:
         return _parse_cms(signature, content)
-    except (IndexError, *UNREADABLE) as error:
+    except (IndexError, ValueError) as error:
         raise PkiError("its signature is not a readable CMS signature") from error
 
 
@@ -278,10 +278,8 @@ def _decoded(encoded: bytes) -> bytes:
     return base64.b64decode(encoded.replace(b"\n", b""), validate=True)
 
 
-@lru_cache(maxsize=16)
-def _certificate(data: bytes) -> x509.Certificate:
-    # All documents of a keystore embed the certificate of the permissions CA.
-    return read_in_full(x509.load_der_x509_certificate(data))
+# All documents of a keystore embed the certificate of the permissions CA.
+_certificate = lru_cache(maxsize=16)(load_der_certificate)
 
 
 def _parts(value: der.Value, *tags: int) -> list[der.Value]:

@@ -6,7 +6,6 @@ Enclave keys are read only to report faults such as a key that does not fit its 
 
 from __future__ import annotations
 
-import json
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Set
@@ -41,6 +40,7 @@ from sros_tool.report.picture import PicturedEnclave, PicturedFinding, SourceTit
 from sros_tool.resources import policies_dir
 from sros_tool.translate import governance_for
 from sros_tool.validity import iso
+from sros_tool.values import parse_json
 from sros_tool.xml import read_bytes
 
 _LINK = re.compile(r"(it is a broken link) \([^)]*\)")
@@ -122,7 +122,7 @@ def _nodes(policy: Policy) -> dict[str, tuple[str, ...]]:
 
 def _observation(path: Path) -> PictureSource:
     try:
-        observed = from_json(json.loads(read_bytes(path, "file")))
+        observed = from_json(parse_json(read_bytes(path, "file")))
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise DocumentError(
             f"'{path}' is not an observation",

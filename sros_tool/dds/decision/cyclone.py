@@ -196,6 +196,8 @@ _SCHEMA_ATTRIBUTES = ("xmlns:xsi", "xsi:nonamespaceschemalocation")
 _IGNORED = ("relay", "value", "name", "tag", "data_tags")
 _NOTHING = "["
 """An expression that matches nothing: a set that is never closed."""
+_LONGEST_NUMBER = 4000
+"""Digits of a number that Python converts; without leading zeros, 64 bits have 20."""
 _INTEGER = re.compile(r"[+-]?(?:0[xX][0-9a-fA-F]+|0[0-7]*|[1-9]\d*)\Z", re.ASCII)
 
 
@@ -316,6 +318,8 @@ def _number(node: _Node) -> int:
     if not _INTEGER.match(node.text):
         raise UnreadableError(f"<{node.tag}> holds {node.text!r}, which is not a number")
     sign, digits = ("-", node.text[1:]) if node.text[0] == "-" else ("", node.text.lstrip("+"))
+    if len(digits) > _LONGEST_NUMBER:
+        raise UnreadableError(f"<{node.tag}> holds a number of {len(digits)} digits")
     octal = len(digits) > 1 and digits[0] == "0" and digits[1] not in "xX"
     number = int(sign + digits, 8 if octal else 0)
     if not -(2**63) <= number < 2**63:

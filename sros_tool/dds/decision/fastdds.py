@@ -175,7 +175,7 @@ def _referred(found: re.Match[str]) -> str | None:
     digits = found[1].rpartition(mark)[2]
     if not re.fullmatch("[0-9a-fA-F]*" if base == 16 else "[0-9]*", digits):
         return None
-    return _utf8(int(digits or "0", base))
+    return _utf8(int(digits.lstrip("0")[:30] or "0", base))  # the longer ones are as far too large
 
 
 def _utf8(number: int) -> str:
@@ -298,13 +298,22 @@ def _number(element: XmlElement) -> int:
     found = _INTEGER.match(_first_text(element))
     if not found:
         raise UnreadableError(f"<{element.name}> does not hold a number")
-    return (int(found[1], 16) if found[1] else int(found[2])) % 2**32
+    return _integer(found) % 2**32
+
+
+def _integer(found: re.Match[str]) -> int:
+    """Return the number that sscanf reads: one that 64 bits cannot hold is their largest."""
+    if found[1]:
+        return min(int(found[1], 16), 2**64 - 1)
+    digits = found[2].lstrip("+-").lstrip("0")
+    number = int(digits or "0") if len(digits) <= 20 else 2**64
+    return min(number, 2**64 - 1) if found[2][0] != "-" or number >= 2**64 else -number
 
 
 def _flag(element: XmlElement) -> bool:
     text = _first_text(element)
     if found := _INTEGER.match(text):
-        return int(found[1], 16) != 0 if found[1] else int(found[2]) != 0
+        return _integer(found) != 0
     if text not in _TRUE + _FALSE:
         raise UnreadableError(f"<{element.name}> holds {text!r} instead of true or false")
     return text in _TRUE

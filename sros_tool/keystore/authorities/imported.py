@@ -15,10 +15,9 @@ from sros_tool.errors import Note, PkiError
 from sros_tool.keystore.layout import PERMISSIONS
 from sros_tool.keystore.loading import authority_refusals, refusals_text
 from sros_tool.pki.certificates import (
-    UNREADABLE,
     issued_by,
+    load_certificates,
     pem,
-    read_in_full,
     same_key,
     subject_text,
     validity_of,
@@ -52,14 +51,7 @@ def check_imported(role: str, data: bytes, key: PrivateKey, now: datetime) -> Im
     Raises:
         PkiError: the CA cannot be the ``role`` CA.
     """
-    try:
-        certificates = [read_in_full(each) for each in x509.load_pem_x509_certificates(data)]
-    except UNREADABLE as error:
-        raise PkiError(
-            f"the certificate of the {role} CA cannot be read",
-            "It is not PEM, or it is damaged.",
-            "Name a PEM file with the certificates of the CA and its issuers.",
-        ) from error
+    certificates = list(load_certificates(data, f"of the {role} CA"))
     own = [each for each in certificates if same_key(each, key)]
     if len(certificates) > _MOST_CERTIFICATES:
         raise PkiError(

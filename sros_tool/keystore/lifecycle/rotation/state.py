@@ -34,7 +34,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.validity import Window, iso
-from sros_tool.values import as_plain
+from sros_tool.values import as_plain, parse_json
 from sros_tool.xml import read_bytes
 
 _SOON = timedelta(days=90)
@@ -130,21 +130,28 @@ def read_rotation(root: Path) -> Rotation:
     if not path.exists():
         return Rotation()
     try:
-        read = json.loads(path.read_bytes())
-        replacements = tuple(Replacement(**each) for each in read["replacements"])
+        read = parse_json(read_bytes(path, "file of the rotation"))
+        replacements = tuple(_replacement(each) for each in read["replacements"])
         rotation = Rotation(RotationStage(read["stage"]), replacements)
         for each in replacements:
             issuing = each.old if rotation.stage is RotationStage.DISTRIBUTE else each.new
             there = [digest(found) for found in certificates_of(root, each.file)]
             if there[0] != issuing or not {each.old, each.new} <= set(there):
                 raise ValueError
-    except (ValueError, TypeError, KeyError, IndexError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise KeystoreError(
             f"the rotation of keystore '{root}' cannot be continued",
             f"'{path}' does not fit the CA certificates, or is damaged.",
             "Restore the folders 'public' and 'private' and this file from one backup.",
         ) from error
     return rotation
+
+
+def _replacement(read: dict[str, str]) -> Replacement:
+    """Return the replacement in its JSON form; raise ValueError or TypeError if it is none."""
+    if not all(isinstance(each, str) for each in read.values()) or "/" in read.get("file", ""):
+        raise ValueError
+    return Replacement(**read)
 
 
 def render_rotation(rotation: Rotation) -> bytes:
