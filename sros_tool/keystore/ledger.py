@@ -178,8 +178,17 @@ class _Reading(NamedTuple):
     unrecorded: Sequence[_Fault] = ()
 
 
-def _read(root: Path) -> _Reading:
-    lines = _lines(root)
+def _read(root: Path, *, follow_link: bool = True) -> _Reading:
+    while True:
+        lines = _lines(root, follow_link)
+        reading = _compare(root, lines)
+        # A transaction of another process may have ended between the reading of the two files.
+        if not reading.unrecorded or _lines(root, follow_link) == lines:
+            return reading
+
+
+def _compare(root: Path, lines: list[bytes] | None) -> _Reading:
+    """Return the ledger with these lines, compared with its head."""
     if not lines:
         if lines is None and not any((root / file).exists() for file in (SETTINGS, LEDGER_HEAD)):
             return _Reading(Ledger())
@@ -223,19 +232,30 @@ def _read(root: Path) -> _Reading:
         0 if start > unchained else unchained,
         len(lines),
     )
-    unrecorded = [each for each in faults if each.line > last_recorded]
+    unrecorded = [each for each in faults if each.line >= last_recorded]
     return _Reading(ledger, lines, chained, unrecorded)
 
 
-def _lines(root: Path) -> list[bytes] | None:
+def _lines(root: Path, follow_link: bool) -> list[bytes] | None:
+    """Return the lines, or None without a ledger.
+
+    While a transaction is being committed, the file is a link.  Whoever holds the lock of the
+    keystore does not follow it: another link could lead to a file that is not of the keystore.
+    """
+    path = root / LEDGER
     try:
-        with Folder(root) as folder:
-            data = folder.read(LEDGER)
+        if not follow_link:
+            with Folder(root) as folder:
+                data = folder.read(LEDGER)
+        elif path.is_file() or not path.exists():
+            data = path.read_bytes()
+        else:
+            raise KeystoreError("it is not a regular file")
     except FileNotFoundError:
         return None
     except (OSError, KeystoreError) as error:
         raise KeystoreError(
-            f"the ledger '{root / LEDGER}' cannot be read",
+            f"the ledger '{path}' cannot be read",
             f"{error.strerror if isinstance(error, OSError) else error.what}.",
             "Restore it from a backup.",
         ) from error
@@ -333,7 +353,7 @@ def append(
     added = list(entries)
     if not added:
         return
-    present = _read(transaction.root)
+    present = _read(transaction.root, follow_link=transaction.dry_run)
     lines = list(present.lines)
     before = lines[-1:] if present.chained else lines
     gaps = (Entry(iso(now), GAP, reason=e.text, number=e.line) for e in present.unrecorded)

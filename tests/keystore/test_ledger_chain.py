@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.errors import KeystoreError
 from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
-from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
 from sros_tool.keystore.reader import read_crl
 from sros_tool.keystore.template import load_template
@@ -176,6 +177,15 @@ def test_a_ledger_without_a_chain_is_read_and_chained_from_then_on(root: Path) -
     assert read_ledger(root).gaps
 
 
+def test_a_reader_during_a_commit_and_a_link_in_the_way(root: Path, tmp_path: Path) -> None:
+    """While a transaction ends the file is a link; a writer, which holds the lock, follows none."""
+    (root / LEDGER).rename(tmp_path / "moved")
+    (root / LEDGER).symlink_to(tmp_path / "moved")
+    assert read_ledger(root).gaps == ()
+    with pytest.raises(KeystoreError, match="cannot be read"):
+        renew(root, ["/a"], now=NOW)
+
+
 def test_new_cas_leave_the_gaps_behind(root: Path) -> None:
     put(root, _edit(lines_of(root)))
     assert read_ledger(root).gaps
@@ -187,6 +197,22 @@ def test_new_cas_leave_the_gaps_behind(root: Path) -> None:
     assert {each.enclave for each in ledger.certain if each.what == "certificate"} == {"/a", "/b"}
     put(root, lines_of(root)[:-1])
     assert read_ledger(root).gaps
+
+
+@pytest.mark.parametrize("put_back", [True, False], ids=["older", "none"])
+def test_an_older_revocation_list_brings_nothing_back(put_back: bool, root: Path) -> None:
+    file = root / "public/identity_ca.crl.pem"
+    refresh_crl(root, now=NOW)
+    older = file.read_bytes()
+    done = revoke(root, ["/a"], now=NOW)
+    assert done.remarks == ()
+    wanted = revoked(root)
+    assert len(wanted) == 2
+    assert refresh_crl(root, now=NOW).remarks == ()
+    file.write_bytes(older) if put_back else file.unlink()
+    (remark,) = refresh_crl(root, now=NOW).remarks
+    assert "2 revocations are in it again" in remark
+    assert revoked(root) == wanted
 
 
 def test_a_revoked_certificate_that_the_ledger_lost_is_revoked_again(root: Path) -> None:

@@ -118,6 +118,25 @@ def test_a_cut_ledger_does_not_vouch_for_them(
     assert "wide" not in str(topics_of(root / "enclaves/a"))
 
 
+def test_no_new_certificate_is_made_for_older_permissions(tmp_path: Path) -> None:
+    """Where subjects are unique, older permissions need a certificate of their subject."""
+    root = tmp_path / "unique"
+    create_keystore(root, template=load_template("production"), now=NOW)
+    create_enclaves(root, ["/a"], now=NOW)
+    message, certificate = (root / "enclaves/a" / file for file in (FILES[0], "cert.pem"))
+    older = message.read_bytes()
+    renew(root, ["/a"], now=NOW)
+    latest = message.read_bytes()
+    certificate.unlink()
+    message.write_bytes(older)
+    with pytest.raises(KeystoreError, match="not certain that"):
+        create_enclaves(root, ["/a"], now=NOW)
+    assert not certificate.exists()
+    message.write_bytes(latest)
+    create_enclaves(root, ["/a"], now=NOW)
+    assert certificate.exists()
+
+
 # ── answers ────────────────────────────────────────────────────────────────────────────────
 
 

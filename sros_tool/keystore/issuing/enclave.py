@@ -337,10 +337,16 @@ class RecordedRights:
     def of(self, name: str, digest: str, grant: Grant) -> EarlierRights:
         """Return the rights in the permissions of an enclave, to sign them again.
 
+        ``grant`` are the rights; otherwise as `policy`.
+        """
+        return EarlierRights(grant, self.policy(name, digest))
+
+    def policy(self, name: str, digest: str) -> str:
+        """Return the SHA-256 of the policy of an enclave's permissions, or "".
+
         Args:
             name: the enclave.
             digest: the SHA-256 of its present permissions document, in hexadecimal.
-            grant: the rights in it.
 
         Raises:
             KeystoreError: it is not the last document that the ledger has for the enclave.
@@ -356,7 +362,7 @@ class RecordedRights:
         elif not last and self._complete:
             why = "The ledger has none for this enclave."
         else:
-            return EarlierRights(grant, last.policy if last else "")
+            return last.policy if last else ""
         raise KeystoreError(
             f"it is not certain that the permissions of enclave {name} are its latest",
             why,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import hashlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -30,6 +31,7 @@ from sros_tool.keystore.issuing.enclave import (
     EnclaveWriter,
     Issuance,
     NewIdentity,
+    RecordedRights,
     StatedRights,
     default_rights,
     link_shared_files,
@@ -436,7 +438,7 @@ def _write_enclave(
     """Stage the missing files of an enclave, and new permissions if ``policy`` is given."""
     present = present_files(transaction.root, name)
     before = len(transaction.changes)
-    identity = _identity(transaction.root, keystore, name, present, now)
+    identity = _identity(transaction.root, keystore, name, present, now, replaced=bool(policy))
     rights = None
     if policy or PERMISSIONS_FILE not in present:
         enclave = policy or default_rights(keystore.template, name)
@@ -453,11 +455,22 @@ def _write_enclave(
 
 
 def _identity(
-    root: Path, keystore: _Keystore, name: str, present: set[str], now: datetime
+    root: Path,
+    keystore: _Keystore,
+    name: str,
+    present: set[str],
+    now: datetime,
+    *,
+    replaced: bool,
 ) -> NewIdentity | x509.Certificate:
     """Return the certificate of an enclave, or the subject and key for a new certificate.
 
-    If the enclave has signed permissions, the new certificate gets their subject.
+    If the enclave has signed permissions, the new certificate gets their subject; if they are
+    ``replaced`` in this step, it may have its own.
+
+    Raises:
+        KeystoreError: the certificate is not usable, or a new one would fit permissions that are
+            not the latest ones.
     """
     folder = enclave_path(root, name)
     if CERTIFICATE_FILE in present:
@@ -469,11 +482,14 @@ def _identity(
             )
         return _usable_certificate(root, keystore, name, now)
     subject = enclave_subject(name, unique=keystore.template.unique_subject)
-    if PERMISSIONS_FILE in present:
+    if PERMISSIONS_FILE in present and not replaced:
         authority = keystore.authorities.permissions.certificate
         own = common_name_of(subject)
         signed_for = _permissions_subjects(folder / PERMISSIONS_FILE, authority)
-        subject = next((each for each in signed_for if common_name_of(each) == own), subject)
+        if found := next((each for each in signed_for if common_name_of(each) == own), None):
+            message = read_bytes(folder / PERMISSIONS_FILE, "permissions document")
+            RecordedRights(root).policy(name, hashlib.sha256(message).hexdigest())
+            subject = found
     if KEY_FILE in present:
         path = folder / KEY_FILE
         public = load_key(read_bytes(path, "private key"), f"'{path}'").public_key()

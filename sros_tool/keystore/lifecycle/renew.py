@@ -147,7 +147,7 @@ def renew(
         if revoke_old and replaced:
             ledger = read_ledger(root)
             lists = RevocationListSigner(
-                transaction, authorities.identity, template, keyring, ledger.entries, now
+                transaction, authorities.identity, template, keyring, ledger, now
             )
             revocations = _superseded(root, replaced, ledger.entries, lists, now)
             present = {int(each.old.serial, 16): each.name for each in replaced}

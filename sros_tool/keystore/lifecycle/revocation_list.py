@@ -8,10 +8,12 @@ issuing CA alone (all measured).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import hashlib
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
+from pathlib import Path
 
 from cryptography import x509
 
@@ -19,7 +21,7 @@ from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.authorities.authority import Authority, write_bundle
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.layout import CRL, IDENTITY, revoked_certificates
-from sros_tool.keystore.ledger import Entry, document_entry
+from sros_tool.keystore.ledger import Entry, Ledger, document_entry
 from sros_tool.keystore.lifecycle.rotation.state import (
     Replacement,
     RotationStage,
@@ -38,13 +40,15 @@ from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.certificates import (
     digest,
+    issued_by,
     pem,
     same_key,
     subject_text,
     validity_of,
 )
-from sros_tool.pki.crl import RevocationList, Revoked, sign_crl
+from sros_tool.pki.crl import REASONS, RevocationList, Revoked, sign_crl
 from sros_tool.validity import BACKDATE, Window, iso
+from sros_tool.xml import read_bytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +99,21 @@ def _carried_over(old: RevocationList | None, expiries: Mapping[int, str]) -> li
     return [each for each in old.revoked if expiries.get(each.serial, issued) >= issued]
 
 
+def put_away(root: Path, known: Container[str] = ()) -> Iterator[x509.Certificate]:
+    """Yield the certificates in ``revoked`` that a trusted identity CA issued.
+
+    Those whose serial number in hexadecimal is in ``known`` are not read.
+    """
+    file = identity_file(root)
+    trusted = certificates_of(root, file) if file else ()
+    for path in revoked_certificates(root):
+        if path.parent.name not in known:
+            with suppress(SrosError):  # a file that is no certificate
+                found = read_certificate(path)
+                if any(issued_by(found, each) for each in trusted):
+                    yield found
+
+
 class RevocationListSigner:
     """Signer of the revocation lists of all trusted identity CAs, within a transaction.
 
@@ -108,7 +127,7 @@ class RevocationListSigner:
         authority: Authority,
         template: Template,
         keyring: Keyring,
-        ledger: Sequence[Entry],
+        ledger: Ledger,
         now: datetime,
     ) -> None:
         self._transaction = transaction
@@ -135,6 +154,12 @@ class RevocationListSigner:
                 ``incomplete`` is not set.
         """
         expiries = self._expiries()
+        if lost := self._lost(expiries):
+            new_entries = [*new_entries, *lost]
+            self.remarks.append(
+                f"The revocation list was not the last one that this keystore signed: {len(lost)} "
+                "revocations are in it again."
+            )
         signed = self._sign(self._authority, self.present, new_entries, expiries, 0)
         self._transaction.write(CRL, signed.document)
         found = [signed]
@@ -156,19 +181,41 @@ class RevocationListSigner:
         number = max(old.number + 1 if old else 1, least)
         return sign_list(authority, kept, number=number, template=self._template, now=self._now)
 
+    def _lost(self, expiries: Mapping[int, str]) -> list[Revoked]:
+        """Return the revocations in the ledger, if the present list is older than the last one."""
+        entries = self._ledger.entries
+        count = max(
+            (i for i, each in enumerate(entries, 1) if each.what == "revocation"), default=0
+        )
+        path = self._root / CRL
+        present = read_bytes(path, "revocation list") if path.exists() else b""
+        sha256 = hashlib.sha256(present).hexdigest()
+        if any(each.what == "crl" and each.sha256 == sha256 for each in entries[count:]):
+            return []
+        listed = {each.serial for each in self.present.revoked} if self.present else set()
+        moment = iso(self._now)
+        return [
+            Revoked(serial, self._now.replace(microsecond=0), reason)
+            for each in entries[:count]
+            if each.what == "revocation" and each.serial
+            if (serial := int(each.serial, 16)) not in listed
+            if expiries.get(serial, moment) >= moment
+            for reason in (each.reason if each.reason in REASONS else "unspecified",)
+        ]
+
     def _expiries(self) -> dict[int, str]:
-        """Map serial numbers to expiries, from the ledger and the files in ``revoked``."""
+        """Map serial numbers to expiries, from the ledger and the files in ``revoked``.
+
+        What is not certain has no expiry, and so stays on the list.
+        """
         recorded = {
             each.serial: each.not_after
-            for each in self._ledger
+            for each in self._ledger.certain
             if each.what == "certificate" and each.serial and each.not_after
         }
         expiries = {int(serial, 16): not_after for serial, not_after in recorded.items()}
-        for path in revoked_certificates(self._root):
-            if path.parent.name not in recorded:
-                with suppress(SrosError):  # without its expiry, it stays on the list
-                    found = read_certificate(path)
-                    expiries.setdefault(found.serial_number, iso(validity_of(found).not_after))
+        for found in put_away(self._root, recorded):
+            expiries.setdefault(found.serial_number, iso(validity_of(found).not_after))
         return expiries
 
     # ── the second CA during a rotation ────────────────────────────────────────────────────

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.errors import KeystoreError, UsageError
 from sros_tool.keystore.authorities.authority import Authority, load_authority
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
@@ -20,10 +19,9 @@ from sros_tool.keystore.layout import (
     REVOKED,
     enclave_folder,
     list_enclaves,
-    revoked_certificates,
 )
 from sros_tool.keystore.ledger import Entry, Ledger, append, certificate_entry, read_ledger
-from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
+from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner, put_away
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import load_settings, read_certificate
 from sros_tool.keystore.transaction.recovery import tidy
@@ -93,7 +91,7 @@ def revoke(
         authority = load_authority(root, IDENTITY, template, keyring, now)
         ledger = read_ledger(root)
         issued = ledger.entries
-        lists = RevocationListSigner(transaction, authority, template, keyring, issued, now)
+        lists = RevocationListSigner(transaction, authority, template, keyring, ledger, now)
         listed = {each.serial for each in lists.present.revoked} if lists.present else set()
         revoked: list[Revoked] = []
         entries: list[Entry] = []
@@ -139,7 +137,7 @@ def refresh_crl(
         template = load_settings(root)
         authority = load_authority(root, IDENTITY, template, keyring, now)
         lists = RevocationListSigner(
-            transaction, authority, template, keyring, read_ledger(root).entries, now
+            transaction, authority, template, keyring, read_ledger(root), now
         )
         next_update, entries = lists.sign((), existing, incomplete=True)
         link_everywhere(transaction, existing)
@@ -173,13 +171,11 @@ def still_valid(
         expired = each.not_after and each.not_after < moment
         if each.what == "certificate" and each.enclave in found and each.serial and not expired:
             found[each.enclave][int(each.serial, 16)] = each
-    for path in revoked_certificates(root):
-        with suppress(SrosError):  # it was revoked when it was put there
-            certificate = read_certificate(path)
-            name = common_name_of(certificate.subject)
-            if name in found and validity_of(certificate).not_after >= now:
-                entry = certificate_entry(now, "certificate", certificate, name)
-                found[name][certificate.serial_number] = entry
+    for certificate in put_away(root):
+        name = common_name_of(certificate.subject)
+        if name in found and validity_of(certificate).not_after >= now:
+            entry = certificate_entry(now, "certificate", certificate, name)
+            found[name][certificate.serial_number] = entry
     return found
 
 
