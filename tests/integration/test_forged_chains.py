@@ -13,7 +13,8 @@ from cryptography.hazmat.primitives import hashes
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding
 
-from sros_tool.pki.certificates import UNREADABLE, common_name, read_in_full
+from sros_tool.errors import PkiError
+from sros_tool.pki.certificates import common_name, load_der_certificate
 from sros_tool.pki.chains import chain_fault
 from tests.integration.forged_signatures import VALUES, Node, raw
 from tests.support.children import LONG
@@ -183,11 +184,8 @@ class Verifier:
 
 def our_fault(start: bytes, trusted: list[bytes], others: list[bytes], *, strict: bool) -> str:
     try:
-        first, *rest = (
-            read_in_full(x509.load_der_x509_certificate(each))
-            for each in (start, *trusted, *others)
-        )
-    except UNREADABLE:
+        first, *rest = (load_der_certificate(each) for each in (start, *trusted, *others))
+    except PkiError:
         return "it cannot be read"
     split = len(trusted)
     return chain_fault(first, rest[:split], rest[split:], at=NOW, strict=strict)
