@@ -159,7 +159,7 @@ def waits_for_answer(folder: Path) -> bool:
     return (folder / REQUEST).exists() and not (folder / CERTIFICATE_FILE).exists()
 
 
-_FOLDER_ELSEWHERE = "It is a link to a folder elsewhere, which sros does not follow"
+_FOLDER_ELSEWHERE = "It is a symbolic link to a folder elsewhere, which sros does not follow"
 
 
 @dataclass(frozen=True, slots=True)
