@@ -650,12 +650,12 @@ KEYSTORES: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "garbage for governance": (
         lambda ks: (ks / "enclaves/governance.p7s").write_bytes(os.urandom(999)),
-        "not an S/MIME",
+        "cannot be used",
     ),
     "no governance": (lambda ks: (ks / "enclaves/governance.p7s").unlink(), "does not exist"),
     "garbage for sros.toml": (lambda ks: (ks / "sros.toml").write_bytes(b"\xff="), "TOML"),
     "sros.toml is a folder": (lambda ks: _replace(ks / "sros.toml", Path.mkdir), "regular file"),
-    "an enclave outside": (_link_out, "symbolic link"),
+    "an enclave outside": (_link_out, "does not follow"),
     "a file for an enclave": (lambda ks: _replace(ks / "enclaves/b", Path.touch), ""),
     "an enclave's key is lost": (lambda ks: (ks / "enclaves/b/key.pem").unlink(), "no key"),
     "an enclave's certificate is garbage": (

@@ -10,8 +10,8 @@ import json
 import os
 import shutil
 import stat
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -220,8 +220,8 @@ def test_what_root_makes_belongs_to_the_owner_of_the_keystore(keystore: Path) ->
                 continue  # who owns a link may do nothing with it that others may not
             assert (state.st_uid, state.st_gid) == (OWNER, OWNER), name
     keystore.parent.chmod(0o755)
-    with traversable(keystore.parent):
-        assert not in_process_of(OWNER, lambda: create_enclaves(keystore, ["/own"], now=NOW))
+    make_reachable(keystore.parent)
+    assert not in_process_of(OWNER, lambda: create_enclaves(keystore, ["/own"], now=NOW))
     assert (keystore / "enclaves/own/key.pem").stat().st_uid == OWNER
 
 
@@ -277,20 +277,12 @@ def test_root_completes_what_the_owner_was_killed_in(keystore: Path) -> None:
     assert not (keystore / STAGE).exists()
 
 
-@contextmanager
-def traversable(folder: Path) -> Iterator[None]:
-    """Let every user reach a folder for the time of a test."""
-    modes = {}
+def make_reachable(folder: Path) -> None:
+    """Let every user reach a folder; for good, since tests at the same time share its parents."""
     for each in (folder, *folder.parents):
         mode = stat.S_IMODE(each.stat().st_mode)
         if not mode & 0o001:
-            modes[each] = mode
             each.chmod(mode | 0o011)
-    try:
-        yield
-    finally:
-        for each, mode in modes.items():
-            each.chmod(mode)
 
 
 # ── the lock ───────────────────────────────────────────────────────────────────────────────
@@ -313,18 +305,18 @@ def test_nobody_else_can_block_the_writers(keystore: Path) -> None:
         os.close(end)
         os.read(done, 1)
 
-    with traversable(keystore.parent):
-        child = os.fork()
-        if child == 0:
-            with suppress(BaseException):
-                os.setgid(STRANGER)
-                os.setuid(STRANGER)
-                block()
-            os._exit(0)
-        os.read(ready, 1)
-        create_enclaves(keystore, ["/new"], now=NOW)  # is not busy
-        os.close(end)
-        os.waitpid(child, 0)
+    make_reachable(keystore.parent)
+    child = os.fork()
+    if child == 0:
+        with suppress(BaseException):
+            os.setgid(STRANGER)
+            os.setuid(STRANGER)
+            block()
+        os._exit(0)
+    os.read(ready, 1)
+    create_enclaves(keystore, ["/new"], now=NOW)  # is not busy
+    os.close(end)
+    os.waitpid(child, 0)
     assert (keystore / "enclaves/new/key.pem").exists()
     assert not (keystore / LOCK).exists()
 
