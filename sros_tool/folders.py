@@ -127,7 +127,7 @@ class Folder:
                 raise OSError(errno.EINVAL, "it is not a regular file", str(self.path / path))
             if state.st_size > _MOST_BYTES:
                 raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(self.path / path))
-            return file.read()
+            return file.read(state.st_size)
 
     # ── making ─────────────────────────────────────────────────────────────────────────────
 

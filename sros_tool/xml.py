@@ -37,19 +37,19 @@ def _parser() -> etree.XMLParser:
 def read_bytes(path: Path, what: str) -> bytes:
     """Return the content of a regular file of at most 16 MiB.
 
-    ``what`` describes the file in errors, such as "policy".
+    ``what`` describes the file in errors, such as "policy".  A file without a size is empty, also
+    one of the kernel (proc(5)), which may have no end, or wait for its next line.
 
     Raises:
         DocumentError: the file does not exist, cannot be read, is too large or not a regular file.
     """
     try:
-        there = path.stat()  # checked first, because opening a pipe would wait for its writer
+        # Looked at first, because opening a pipe would wait for its writer.
+        there, data = path.stat(), b""
+        if stat.S_ISREG(there.st_mode) and 0 < there.st_size <= _MAX_BYTES:
+            there, data = _read_open(path)
         if not stat.S_ISREG(there.st_mode):
             raise DocumentError(f"the {what} '{path}' is not a regular file")
-        data = b""
-        if there.st_size <= _MAX_BYTES:
-            with path.open("rb", buffering=0) as file:
-                data = file.readall()
     except (OSError, ValueError) as error:
         number = getattr(error, "errno", errno.ENOENT)  # ValueError: the path contains a NUL
         if number in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP):
@@ -64,6 +64,16 @@ def read_bytes(path: Path, what: str) -> bytes:
         )
     _LOG.debug("read the %s '%s', %d bytes", what, path, len(data))
     return data
+
+
+def _read_open(path: Path) -> tuple[os.stat_result, bytes]:
+    """Return the state of a file and at most one byte more of it than `read_bytes` allows.
+
+    Without its content if it is not a regular file, as one that has just been exchanged.
+    """
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        state = os.fstat(file.fileno())
+        return state, file.read(_MAX_BYTES + 1) if stat.S_ISREG(state.st_mode) else b""
 
 
 def parse(data: bytes, name: str) -> etree._Element:

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from sros_tool.checks.keystores.keystore import keystore_findings
-from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.files import replace_file, staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.layout import LOCK, STAGE
@@ -27,6 +27,7 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.transaction import lock as locking
 from sros_tool.keystore.transaction.stage import staged_name
+from sros_tool.xml import read_bytes
 from tests.conftest import POLICY
 from tests.support.harness import snapshot, sros
 
@@ -452,3 +453,27 @@ def test_a_file_with_a_key_that_a_killed_process_left_is_removed_by_the_next(
         ".robot.tar.gz.sros-of.somebody",
         "robot.tar.gz",
     ]
+
+
+# ── files that grow, wait, or have no end ──────────────────────────────────────────────────
+
+
+def test_a_file_of_the_kernel_is_not_read(keystore: Path) -> None:
+    """Some of them, such as /proc/kmsg, wait for their next line; all of them have no size."""
+    assert Path("/proc/self/environ").read_bytes()
+    assert read_bytes(Path("/proc/self/environ"), "file") == b""
+    certificate = keystore / "enclaves/a/cert.pem"
+    certificate.unlink()
+    certificate.symlink_to("/proc/kmsg")
+    found = {each.kind.id for each in keystore_findings(keystore, now=NOW)}
+    assert {"enclave.file-empty", "enclave.file-unreadable"} & found
+
+
+def test_a_file_that_became_a_pipe_meanwhile_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.mkfifo(tmp_path / "file")
+    (tmp_path / "before").write_text("a regular file")
+    monkeypatch.setattr(Path, "stat", lambda _self: os.stat(tmp_path / "before"))
+    with pytest.raises(DocumentError, match="is not a regular file"):
+        read_bytes(tmp_path / "file", "policy")
