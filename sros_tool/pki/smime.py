@@ -30,6 +30,7 @@ from sros_tool.pki import der
 from sros_tool.pki.certificates import load_der_certificate
 from sros_tool.pki.keys import PrivateKey
 
+_BOM = "\ufeff".encode()
 _TEXT_HEADER = b"Content-Type: text/plain\r\n\r\n"
 _OPTIONS = (pkcs7.PKCS7Options.DetachedSignature, pkcs7.PKCS7Options.Binary)
 
@@ -250,6 +251,8 @@ def _split(message: bytes) -> tuple[bytes | None, bytes]:
             "The lines of a signed document end with CR and LF, or with LF.",
         )
     head, _, body = text.partition(b"\n\n")
+    if head.startswith(_BOM) and not head[len(_BOM) :].lower().startswith(b"content-type"):
+        head = head[len(_BOM) :]  # OpenSSL reads it as a part of the first header's name
     kind, parameters = _media_type(head)
     if kind in _OPAQUE:
         return None, _decoded(body)

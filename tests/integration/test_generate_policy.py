@@ -78,7 +78,7 @@ ROBOT = [
 
 EXPECTED = """\
 <?xml version="1.0" encoding="UTF-8"?>
-<!-- Written by sros generate_policy: rights that the robot was observed to use, or was denied.
+<!-- Written by sros generate_policy: rights that the robot was observed to use.
      Review it before you enforce it: rights that were not observed are not allowed, and rights
      that were observed may be unwanted. -->
 <policy version="0.2.0" xmlns:xi="http://www.w3.org/2001/XInclude">
