@@ -168,7 +168,7 @@ def test_a_ledger_without_a_chain_is_read_and_chained_from_then_on(root: Path) -
     ledger = read_ledger(root)
     assert [each.sha256 for each in ledger.entries] == before
     assert (ledger.gaps, ledger.unchained) == ((), len(before))
-    renew(root, ["/a"], now=NOW)
+    create_enclaves(root, ["/new"], now=NOW)
     ledger = read_ledger(root)
     assert (ledger.gaps, ledger.unchained) == ((), len(before))
     (remark,) = revoke(root, ["/a"], now=NOW).remarks

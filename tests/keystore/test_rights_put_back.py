@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -202,3 +203,21 @@ def test_a_number_is_never_given_twice(root: Path, tmp_path: Path) -> None:
     with pytest.raises(KeystoreError, match="older than the installed one") as caught:
         import_answer(robot, again, now=NOW)
     assert "set back" in caught.value.why
+
+
+def test_a_ledger_from_before_the_chain_vouches_for_no_rights(root: Path, tmp_path: Path) -> None:
+    """Whoever takes the chain away can take out the line of the latest permissions, too."""
+    lines = [json.loads(line) for line in (root / LEDGER).read_text().splitlines()]
+    last = max(number for number, line in enumerate(lines) if line["what"] == "permissions")
+    del lines[last]
+    for line in lines:
+        line.pop("previous", "")
+    (root / LEDGER).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (root / LEDGER_HEAD).unlink()
+    put_back(root)
+    create_enclaves(root, ["/b"], now=NOW)  # the lines that follow are chained
+    with pytest.raises(KeystoreError, match="not certain that") as caught:
+        renew(root, ["/a"], now=NOW)
+    assert "whether a line was removed" in caught.value.why
+    create_permission(root, "/a", policy(tmp_path, "rosout"), now=NOW)
+    renew(root, ["/a"], now=NOW)

@@ -329,6 +329,9 @@ class RecordedRights:
         ledger = read_ledger(root)
         self._root = root
         self._gaps = ledger.gaps
+        self._unchained = ledger.unchained
+        chained = ledger.entries[ledger.unchained :]
+        self._chained = {each.enclave for each in chained if each.what == "permissions"}
         # A keystore of ros2/sros2 has enclaves that no ledger records.
         self._complete = (root / SETTINGS).exists()
         self._last = {each.enclave: each for each in ledger.entries if each.what == "permissions"}
@@ -359,6 +362,11 @@ class RecordedRights:
             )
         elif self._gaps and name not in self._certain:
             why = f"The ledger has gaps ({'; '.join(self._gaps)}), so later ones may be missing."
+        elif self._unchained and name not in self._chained:
+            why = (
+                f"Nothing shows whether a line was removed from the first {self._unchained} of the "
+                "ledger, so later ones may be missing."
+            )
         elif not last and self._complete:
             why = "The ledger has none for this enclave."
         else:
