@@ -129,6 +129,21 @@ class Folder:
                 raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(self.path / path))
             return file.read(state.st_size)
 
+    def read_inside(self, path: str) -> bytes:
+        """Return the content of a file, as `read`, also through links that stay in the folder.
+
+        Raises:
+            KeystoreError: a link leads out of the folder.
+        """
+        real, top = (os.path.realpath(each) for each in (self.path / path, self.path))
+        if not Path(real).is_relative_to(top):
+            raise KeystoreError(
+                f"'{self.path / path}' is a link out of '{self.path}'",
+                f"It leads to '{real}'.",
+                "Replace the link with the file itself.",
+            )
+        return self.read(os.path.relpath(real, top))
+
     # ── making ─────────────────────────────────────────────────────────────────────────────
 
     def create(self, path: str, mode: int) -> int:

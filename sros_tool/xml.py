@@ -34,11 +34,12 @@ def _parser() -> etree.XMLParser:
     )
 
 
-def read_bytes(path: Path, what: str) -> bytes:
+def read_bytes(path: Path, what: str, *, owner: int | None = None) -> bytes:
     """Return the content of a regular file of at most 16 MiB.
 
     ``what`` describes the file in errors, such as "policy".  A file without a size is empty, also
-    one of the kernel (proc(5)), which may have no end, or wait for its next line.
+    one of the kernel (proc(5)), which may have no end, or wait for its next line.  With ``owner``,
+    a user id, the file has to belong to that user.
 
     Raises:
         DocumentError: the file does not exist, cannot be read, is too large or not a regular file.
@@ -50,6 +51,11 @@ def read_bytes(path: Path, what: str) -> bytes:
             there, data = _read_open(path)
         if not stat.S_ISREG(there.st_mode):
             raise DocumentError(f"the {what} '{path}' is not a regular file")
+        if owner not in (None, there.st_uid):
+            raise DocumentError(
+                f"the {what} '{path}' belongs to another user",
+                f"It belongs to user {there.st_uid}, not to user {owner}.",
+            )
     except (OSError, ValueError) as error:
         number = getattr(error, "errno", errno.ENOENT)  # ValueError: the path contains a NUL
         if number in (errno.ENOENT, errno.ENOTDIR, errno.ELOOP):

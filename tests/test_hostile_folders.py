@@ -14,17 +14,26 @@ from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
 from sros_tool.files import replace_file, staged_file
 from sros_tool.folders import Folder
+from sros_tool.keystore.authorities.keyring import Keyring
+from sros_tool.keystore.delivery import export
+from sros_tool.keystore.delivery.export import distribute
+from sros_tool.keystore.delivery.request import create_request
+from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.layout import LOCK, STAGE
-from sros_tool.keystore.lifecycle.create import create_enclaves
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import lock as locking
 from sros_tool.keystore.transaction.stage import staged_name
 from sros_tool.xml import read_bytes
@@ -453,6 +462,114 @@ def test_a_file_with_a_key_that_a_killed_process_left_is_removed_by_the_next(
         ".robot.tar.gz.sros-of.somebody",
         "robot.tar.gz",
     ]
+
+
+# ── keys that only root can read ───────────────────────────────────────────────────────────
+
+
+def _named_in_settings(keystore: Path, role: str, key: Path) -> None:
+    text = (keystore / "sros.toml").read_text()
+    place = f'{role}_key = "file:{key}"'
+    (keystore / "sros.toml").write_text(text.replace("[authorities]", f"[authorities]\n{place}"))
+
+
+def _linked(keystore: Path, role: str, key: Path) -> None:
+    (keystore / f"private/{role}_ca.key.pem").unlink()
+    (keystore / f"private/{role}_ca.key.pem").symlink_to(key)
+
+
+@as_root
+@pytest.mark.parametrize("lead", [_named_in_settings, _linked])
+@pytest.mark.parametrize("role", ["identity", "permissions"])
+def test_the_keystore_of_another_user_does_not_sign_with_a_key_of_root(
+    lead: Callable[[Path, str, Path], None], role: str, keystore: Path, tmp_path: Path
+) -> None:
+    own = tmp_path / "of root"
+    shutil.copytree(keystore, own, symlinks=True)
+    key = own / f"private/{role}_ca.key.pem"
+    lead(keystore, role, key)
+    give(keystore, OWNER)
+    before = snapshot(tmp_path)
+    with pytest.raises(KeystoreError, match="belongs to another user") as caught:
+        create_enclaves(keystore, ["/new"], now=NOW)
+    assert f"SROS_{role.upper()}_KEY" in caught.value.remedy
+    assert snapshot(tmp_path) == before
+    named = Keyring(places={role: f"file:{key}"})
+    create_enclaves(keystore, ["/new"], now=NOW, keyring=named)
+
+
+@pytest.mark.parametrize("file", ["key.pem", "identity_ca.cert.pem", "governance.p7s"])
+@pytest.mark.parametrize("name", ["robot", "robot.tar.gz"])
+def test_an_export_follows_no_link_out_of_the_keystore(
+    file: str, name: str, keystore: Path, tmp_path: Path
+) -> None:
+    path = keystore / "enclaves/a" / file
+    shutil.copy(path, tmp_path / file)
+    path.unlink()
+    path.symlink_to(tmp_path / file)
+    with pytest.raises(KeystoreError, match="is a link out of"):
+        distribute(keystore, ["/a"], tmp_path / name, now=NOW)
+    assert not (tmp_path / name).exists()
+    path.unlink()
+    shutil.copy(tmp_path / file, path)
+    distribute(keystore, ["/a"], tmp_path / name, now=NOW)
+
+
+def test_an_export_reads_no_file_that_a_link_leads_to_meanwhile(
+    keystore: Path, outside: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = keystore / "enclaves/a/permissions.p7s"
+
+    def opened(*words: Any, **options: Any) -> Any:
+        state = open_enclave(*words, **options)
+        path.unlink()
+        path.symlink_to(outside / "shadow")
+        return state
+
+    monkeypatch.setattr(export, "open_enclave", opened)
+    with pytest.raises(KeystoreError, match="is a link out of"):
+        distribute(keystore, ["/a"], tmp_path / "robot", now=NOW)
+
+
+def test_a_ca_key_in_the_file_of_its_certificate_does_not_leave(
+    keystore: Path, tmp_path: Path
+) -> None:
+    key = (keystore / "private/identity_ca.key.pem").read_bytes()
+    distribute(keystore, ["/a"], tmp_path / "robot", now=NOW)
+    with (keystore / "public/identity_ca.cert.pem").open("ab") as file:
+        file.write(key)
+    with pytest.raises(KeystoreError, match="holds a private key"):
+        distribute(keystore, ["/a"], tmp_path / "other", now=NOW)
+    assert not (tmp_path / "other").exists()
+    request = create_request(tmp_path / "born", "/born").file.read_bytes()
+    with pytest.raises(KeystoreError, match="holds a private key"):
+        sign_request(keystore, request, now=NOW)
+    robot = tmp_path / "robot"
+    assert not verify_arrival(robot, now=NOW).findings
+    with (robot / "enclaves/a/identity_ca.cert.pem").open("ab") as file:
+        file.write(key)
+    found = {each.kind.id for each in verify_arrival(robot, now=NOW).findings}
+    assert "keystore.ca-key-on-robot" in found
+
+
+@as_root
+@pytest.mark.parametrize("verb", ["create_keystore", "create_request", "distribute"])
+def test_no_key_is_left_to_the_owner_of_a_folder_that_waited_there(
+    verb: str, keystore: Path, sticky: Path
+) -> None:
+    waiting = sticky / "waiting"
+    waiting.mkdir()
+    os.chown(waiting, STRANGER, STRANGER)
+    with pytest.raises(KeystoreError, match=f"belongs to user {STRANGER}"):
+        if verb == "create_keystore":
+            create_keystore(waiting, template=load_template("development"), now=NOW)
+        elif verb == "create_request":
+            create_request(waiting, "/a")
+        else:
+            distribute(keystore, ["/a"], waiting, now=NOW)
+    assert not list(waiting.iterdir())
+    sticky.chmod(0o755)  # only root can make a folder there, so it is meant for its owner
+    distribute(keystore, ["/a"], waiting, now=NOW)
 
 
 # ── files that grow, wait, or have no end ──────────────────────────────────────────────────

@@ -6,6 +6,7 @@ import os
 import re
 import stat
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
@@ -235,7 +236,10 @@ def _below(
             if path in keys:
                 yield from key_mode_findings(path, info.st_mode)
             elif name in _KNOWN and inside.startswith(ENCLAVES) and name != "key.pem":
-                continue
+                if name.endswith("_ca.cert.pem"):
+                    with suppress(OSError):  # `check_enclave` reports an unreadable one
+                        if _holds_key(path, info):
+                            yield from _other(path, root, info, home)
             else:
                 yield from _other(path, root, info, home)
     for error in unread:
@@ -317,13 +321,17 @@ class _Links:
         return f"{self._folders[end.parent]}/{end.name}"
 
 
+def _holds_key(path: str, info: os.stat_result) -> bool:
+    small = stat.S_ISREG(info.st_mode) and info.st_size <= _MOST_READ
+    return small and _KEY_MARK in Path(path).read_bytes()
+
+
 def _other(path: str, root: str, info: os.stat_result, home: bool) -> Iterator[Finding]:
     """Yield findings about a file that is not one of an enclave, such as a misplaced key."""
     inside = os.path.relpath(Path(path).parent, root)
     place = inside.partition(os.sep)[0]
     try:
-        small = stat.S_ISREG(info.st_mode) and info.st_size <= _MOST_READ
-        holds_key = small and _KEY_MARK in Path(path).read_bytes()
+        holds_key = _holds_key(path, info)
     except OSError as error:
         yield _unread(error, root)
         return

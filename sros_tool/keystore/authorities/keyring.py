@@ -6,12 +6,13 @@ The library never prompts for a secret: it calls the secrets handler of its call
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from sros_tool.errors import KeystoreError, PkiError, UsageError
+from sros_tool.errors import DocumentError, KeystoreError, PkiError, UsageError
 from sros_tool.files import remove_file, write_new_file
 from sros_tool.keystore.layout import IDENTITY, PERMISSIONS, ROLES, ca_key, key_path
 from sros_tool.keystore.template import Template
@@ -86,7 +87,7 @@ class Keyring:
                     f"Put it back for this command, or set SROS_{role.upper()}_KEY to its place. "
                     "No new CA is created, because it would lock out every existing enclave.",
                 )
-            pem = read_bytes(path, f"{role} CA key")
+            pem = self._read(root, path, role)
             key = load_key(pem, f"'{path}'", self._passphrase(role))
             _LOG.info("opened the key of the %s CA, '%s'", role, path)
             return key
@@ -137,6 +138,26 @@ class Keyring:
         if not template.separate_authorities:
             permissions = identity
         return replace(template, identity_key=identity, permissions_key=permissions)
+
+    def _read(self, root: Path, path: Path, role: str) -> bytes:
+        """Return the PEM of a CA key.
+
+        By its settings or a link, the keystore of another user could have a CA sign that only this
+        user can read.  So its key has to belong to the owner of the keystore, too, unless the user
+        named the place.
+        """
+        what, owner = f"{role} CA key", root.stat().st_uid
+        if self._is_named(role) or owner in (0, os.geteuid()):
+            return read_bytes(path, what)
+        try:
+            return read_bytes(path, what, owner=owner)
+        except DocumentError as error:
+            raise KeystoreError(
+                error.what,
+                error.why,
+                f"The keystore '{root}' of user {owner} names it. If that CA shall sign for it, "
+                f"set SROS_{role.upper()}_KEY=file:{path}; otherwise find out who changed it.",
+            ) from error
 
     def _is_named(self, role: str) -> bool:
         """Return whether the user named the place, not a file that may come from others."""

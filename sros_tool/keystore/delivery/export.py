@@ -11,9 +11,11 @@ from pathlib import Path
 
 from sros_tool.errors import KeystoreError
 from sros_tool.files import staged_file
+from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack
 from sros_tool.keystore.delivery.trust import check_same_authority
 from sros_tool.keystore.layout import (
+    KEY_FILE,
     OPTIONAL_FILES,
     PRIVATE,
     REQUIRED_FILES,
@@ -31,6 +33,7 @@ from sros_tool.names import check_enclave_name
 from sros_tool.xml import read_bytes
 
 _ARCHIVE_SUFFIXES = SUFFIXES
+_KEY_MARK = b"PRIVATE KEY-----"
 _ANSWER_AGAIN = (
     "Sign the request.pem in the enclave's folder with `sros sign_request --renew`, and send the "
     "answer to the robot."
@@ -160,10 +163,28 @@ def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes
                 "; ".join(map(str, state.problems)) + ".",
                 f"See `sros inspect {folder}`.",
             )
-        for file in (*REQUIRED_FILES, *OPTIONAL_FILES):
-            if (folder / file).exists():
-                files[f"{enclave_folder(name)}/{file}"] = read_bytes(folder / file, "file")
+        authorities = (state.identity_ca, state.permissions_ca)
+        if any(
+            each and state.certificate and each.public_key() == state.certificate.public_key()
+            for each in authorities
+        ):
+            raise _holds_ca_key(folder / KEY_FILE)
+        with Folder(root) as opened:
+            for file in (*REQUIRED_FILES, *OPTIONAL_FILES):
+                path = f"{enclave_folder(name)}/{file}"
+                if (folder / file).exists():
+                    files[path] = opened.read_inside(path)
+                    if file != KEY_FILE and _KEY_MARK in files[path]:
+                        raise _holds_ca_key(folder / file)
     return dict(sorted(files.items()))
+
+
+def _holds_ca_key(path: Path) -> KeystoreError:
+    return KeystoreError(
+        f"'{path}' holds a private key that is not the one of an enclave",
+        "A CA key would get to the robot, and whoever has the robot could issue any identity.",
+        "Remove the key from the file, or make the enclave again with a key of its own.",
+    )
 
 
 def _real(path: Path) -> Path:

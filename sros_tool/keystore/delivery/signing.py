@@ -12,6 +12,7 @@ from cryptography import x509
 from sros_tool.dds.portable import name_notes
 from sros_tool.errors import KeystoreError, Note, PkiError, SrosError
 from sros_tool.files import staged_file
+from sros_tool.folders import Folder
 from sros_tool.keystore.authorities.authority import load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.delivery.answer import RequestAnswer, check_answer, seal
@@ -277,8 +278,15 @@ def _answer_files(root: Path, issued: Issued) -> dict[str, bytes]:
     files = {
         f"{folder}/{CERTIFICATE_FILE}": pem(issued.certificate),
         f"{folder}/{PERMISSIONS_FILE}": issued.document,
-        f"{folder}/{GOVERNANCE_FILE}": read_bytes(root / GOVERNANCE_P7S, "governance document"),
     }
-    for file, source in shared_files(root, name).items():
-        files[f"{folder}/{file}"] = read_bytes(root / source, "file")
+    shared = {GOVERNANCE_FILE: GOVERNANCE_P7S, **shared_files(root, name)}
+    with Folder(root) as opened:
+        for file, source in shared.items():
+            files[f"{folder}/{file}"] = data = opened.read_inside(source)
+            if b"PRIVATE KEY-----" in data:
+                raise KeystoreError(
+                    f"'{root / source}' holds a private key",
+                    "It would get into the answer, and so to the robot.",
+                    "Remove the key from the file.",
+                )
     return dict(sorted(files.items()))

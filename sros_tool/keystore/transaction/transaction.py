@@ -59,6 +59,7 @@ class Transaction:
         self.root = root
         self.changes: list[Change] = []
         self.dry_run = dry_run
+        self._fresh = fresh
         self._new_root = fresh and not root.exists()
         self._made_parents: list[Path] = []
         self._folder: Folder | None = None
@@ -115,12 +116,25 @@ class Transaction:
                 self._make_sibling(parent)
             _LOG.info("began to create the keystore '%s'", self.root)
             return
+        if self._fresh:
+            self._refuse_folder_of_stranger()
         self._lock = KeystoreLock(self._in)
         recover(self._in)
         check_readable(self.root)
         for path in (STAGE, f"{STAGE}/{ADDED}", f"{STAGE}/{AFTER}"):
             self._in.mkdir(path, 0o700)
         _LOG.info("began a transaction in the keystore '%s'", self.root)
+
+    def _refuse_folder_of_stranger(self) -> None:
+        """Refuse, as root, a folder that anybody may have made to be given the keys in it."""
+        above = Path(os.path.realpath(self.root)).parent.stat()
+        owner = self._in.owner[0]
+        if os.geteuid() == 0 and above.st_mode & stat.S_IWOTH and owner not in (0, above.st_uid):
+            raise KeystoreError(
+                f"'{self.root}' belongs to user {owner}",
+                "Everybody can make such a folder there, and its owner would get the keys in it.",
+                "Choose another folder, or run sros as that user.",
+            )
 
     def __exit__(
         self,
