@@ -5,6 +5,7 @@ A command in a remedy works on a keystore with that fault, and repairs it.
 
 from __future__ import annotations
 
+import hashlib
 from pathlib import Path
 from shlex import quote
 
@@ -18,6 +19,7 @@ from sros_tool.keystore.layout import (
     LEDGER,
     PERMISSIONS,
     PERMISSIONS_CA_FILE,
+    PERMISSIONS_FILE,
     PRIVATE,
     ca_certificate,
     enclave_path,
@@ -27,6 +29,10 @@ from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rota
 _ROTATION = (
     "The CAs of this keystore are being replaced: do the next stage with `sros rotate_ca {root} "
     "--next`, and restart the processes after it."
+)
+_RIGHTS = (
+    "Sign the intended permissions: `sros create_permission {root} {enclave} POLICY`; `sros renew` "
+    "refuses these, because they are not the last ones in the ledger."
 )
 _VENDOR = "Write it as every vendor reads it: `sros create_permission {root} {enclave} POLICY`."
 
@@ -54,6 +60,7 @@ _SHARED = {
 }
 """Files of an enclave that are normally links to files of the keystore."""
 _NOT_IN_THE_FILE = (Fault.CA_NOT_YET_VALID, Fault.FILE_UNREADABLE)
+_OF_VALIDITY = (Fault.PERMISSIONS_EXPIRED, Fault.PERMISSIONS_NOT_YET_VALID)
 _OF_GOVERNANCE = (Fault.GOVERNANCE_MALFORMED, Fault.GOVERNANCE_DOMAIN)
 
 
@@ -84,6 +91,8 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
             return _filled(REPLACE, root, enclave, IDENTITY_CA_FILE)
         if (wrong_issuer or fault is Fault.CA_EXPIRED) and _is_rotating(keystore):
             text = _ROTATION
+        elif fault in _OF_VALIDITY and not _is_latest(keystore, enclave):
+            text = _RIGHTS
         elif fault not in _NOT_IN_THE_FILE and _is_own_copy(keystore, enclave, file):
             text = REPLACE
     return _filled(text, root or "KEYSTORE", enclave, file)
@@ -106,6 +115,20 @@ def _is_rotating(keystore: Path) -> bool:
         return read_rotation(keystore).stage is not RotationStage.NONE
     except SrosError:
         return False
+
+
+def _is_latest(keystore: Path, enclave: str) -> bool:
+    """Return whether an enclave has the permissions that the ledger says were signed last."""
+    from sros_tool.keystore.ledger import read_ledger
+
+    try:
+        signed = (enclave_path(keystore, enclave) / PERMISSIONS_FILE).read_bytes()
+        entries = reversed(read_ledger(keystore).entries)
+    except (SrosError, OSError):
+        return True
+    last = (each for each in entries if (each.what, each.enclave) == ("permissions", enclave))
+    digest = next((each.sha256 for each in last), "")
+    return not digest or digest == hashlib.sha256(signed).hexdigest()
 
 
 def _has_authorities(keystore: Path) -> bool:

@@ -26,11 +26,9 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
 from sros_tool.errors import KeystoreError, PkiError, SrosError
-from sros_tool.folders import Folder
 from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, ROLES, SETTINGS, ca_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import digest, load_certificates, subject_text, validity_of
-from sros_tool.pki.requests import key_digest
 from sros_tool.validity import Window, iso
 from sros_tool.xml import read_bytes
 
@@ -117,6 +115,8 @@ def certificate_entry(
     now: datetime, what: str, certificate: x509.Certificate, enclave: str = "", reason: str = ""
 ) -> Entry:
     """Return the entry of an issued certificate; ``what`` is ca or certificate."""
+    from sros_tool.pki.requests import key_digest  # only writing needs it
+
     validity = validity_of(certificate)
     return Entry(
         time=iso(now),
@@ -245,6 +245,8 @@ def _lines(root: Path, follow_link: bool) -> list[bytes] | None:
     path = root / LEDGER
     try:
         if not follow_link:
+            from sros_tool.folders import Folder  # a question does not load what writes
+
             with Folder(root) as folder:
                 data = folder.read(LEDGER)
         elif path.is_file() or not path.exists():

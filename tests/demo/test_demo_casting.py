@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -29,7 +29,7 @@ NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
 def grant_of(file: Path, enclave: str) -> Grant:
     (found,) = (each for each in read_policy(file).enclaves if each.path == enclave)
-    validity = window(NOW, NOW - NOW)
+    validity = window(NOW, timedelta(days=1))
     return permissions_for(
         found, subject="CN=/x", validity=validity, domains=DomainSet.of((0, 0))
     ).grants[0]
