@@ -32,6 +32,7 @@ from sros_tool.keystore.layout import LOCK, STAGE
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
+from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.template import load_template
 from sros_tool.keystore.transaction import lock as locking
@@ -496,6 +497,39 @@ def test_the_keystore_of_another_user_does_not_sign_with_a_key_of_root(
     assert snapshot(tmp_path) == before
     named = Keyring(places={role: f"file:{key}"})
     create_enclaves(keystore, ["/new"], now=NOW, keyring=named)
+
+
+@pytest.mark.parametrize("finish", [True, False])
+def test_a_rotation_copies_no_file_from_outside(
+    finish: bool, keystore: Path, outside: Path
+) -> None:
+    """The copy of the old key would belong to the owner of the keystore."""
+    key = keystore / "private/identity_ca.key.pem"
+    good = key.read_bytes()
+    if not finish:
+        rotate_ca(keystore, now=NOW, roles=("identity",))
+    key.unlink()
+    key.symlink_to(outside / "shadow")
+    with pytest.raises(SrosError):
+        rotate_ca(keystore, now=NOW, roles=("identity",), finish=finish)
+    assert not (keystore / "retired").exists()
+    key.unlink()
+    key.write_bytes(good)
+    rotate_ca(keystore, now=NOW, roles=("identity",), finish=finish)
+    assert list((keystore / "retired").glob("*.key.pem"))
+
+
+def test_revoking_copies_no_file_that_a_link_leads_to_meanwhile(
+    keystore: Path, outside: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    key = keystore / "enclaves/a/key.pem"
+    key.unlink()
+    key.symlink_to(outside / "shadow")
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "is_symlink", lambda _self: False)  # as it was a moment before
+        with pytest.raises(KeystoreError, match="is a link out of"):
+            revoke(keystore, ["/a"], now=NOW)
+    assert not (keystore / "revoked").exists()
 
 
 @pytest.mark.parametrize("file", ["key.pem", "identity_ca.cert.pem", "governance.p7s"])

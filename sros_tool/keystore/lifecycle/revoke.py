@@ -31,7 +31,6 @@ from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import common_name_of, issued_by, validity_of
 from sros_tool.pki.crl import REASONS, Revoked
 from sros_tool.validity import iso
-from sros_tool.xml import read_bytes
 
 _FILES = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml", REQUEST)
 _PRIVATE = "key.pem"
@@ -230,7 +229,7 @@ def _move_away(transaction: Transaction, authority: Authority, name: str, now: d
         if not source.is_symlink() and not source.exists():
             continue
         if not source.is_symlink():
-            data = read_bytes(source, "file")
+            data = transaction.read(f"{folder}/{file}")
             transaction.write(f"{target}/{file}", data, private=file == _PRIVATE)
         transaction.remove(f"{folder}/{file}")
     return certificate_entry(now, "certificate", certificate, name)

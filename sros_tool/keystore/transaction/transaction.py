@@ -203,6 +203,14 @@ class Transaction:
             error.filename = f"{self.root}/{path}"
             raise
 
+    def read(self, path: str) -> bytes:
+        """Return the content of a file of the keystore, to be moved or copied in it.
+
+        Raises:
+            KeystoreError: a link leads out of the keystore: the copy would be its owner's.
+        """
+        return self._in.read_inside(path)
+
     def link(self, path: str, target: str) -> None:
         """Stage a symbolic link to ``target``, which is relative to the folder of ``path``."""
         staged = self._prepare(path, target)

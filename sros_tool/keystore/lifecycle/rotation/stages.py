@@ -477,13 +477,13 @@ class _Rotator:
         place = f"{PRIVATE}/{each.file}.key.pem"
         if (root / place).is_file():
             if not self._delete:
-                key = read_bytes(root / place, "CA key")
+                key = transaction.read(place)
                 transaction.write(retired_key(each.old[0]), key, private=True)
         else:
             old_key = self._keyring.place(each.roles[0], self._template)
             self.kept_elsewhere.append(old_key)
         if each.key == f"{PRIVATE}/next_{each.file}.key.pem":
-            transaction.write(place, read_bytes(root / each.key, "CA key"), private=True)
+            transaction.write(place, transaction.read(each.key), private=True)
             transaction.remove(each.key)
         elif each.key != place and (root / place).is_file():
             transaction.remove(place)
