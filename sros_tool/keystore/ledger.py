@@ -12,9 +12,12 @@ was noticed when a line was added stays visible as an entry ``gap`` before it.
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import os
 import re
+import stat
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
@@ -99,6 +102,7 @@ class _Fault(NamedTuple):
     text: str
 
 
+_MOST_BYTES = 128 * 1024 * 1024  # as `Folder.read`
 _FIELDS = tuple(each.name for each in fields(Entry))
 _TEXTS = tuple(each.name for each in fields(Entry) if each.type == "str")
 _SERIAL = re.compile(r"[0-9a-f]{1,40}")
@@ -250,7 +254,7 @@ def _lines(root: Path, follow_link: bool) -> list[bytes] | None:
             with Folder(root) as folder:
                 data = folder.read(LEDGER)
         elif path.is_file() or not path.exists():
-            data = path.read_bytes()
+            data = _followed(path)
         else:
             raise KeystoreError("it is not a regular file")
     except FileNotFoundError:
@@ -262,6 +266,21 @@ def _lines(root: Path, follow_link: bool) -> list[bytes] | None:
             "Restore it from a backup.",
         ) from error
     return data.removesuffix(b"\n").split(b"\n") if data else []
+
+
+def _followed(path: Path) -> bytes:
+    """Return the content of the ledger, also behind a link; do not wait for a pipe.
+
+    A sparse file takes no space on the disk, and would take all memory.
+    """
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with open(handle, "rb") as file:
+        state = os.fstat(handle)
+        if not stat.S_ISREG(state.st_mode):
+            raise KeystoreError("it is not a regular file")
+        if state.st_size > _MOST_BYTES:
+            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
+        return file.read(state.st_size)
 
 
 def _parse(line: bytes) -> Entry | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 from collections.abc import Callable
@@ -226,3 +227,15 @@ def test_a_revoked_certificate_that_the_ledger_lost_is_revoked_again(root: Path)
     second = certificate(root / "enclaves/a/cert.pem").serial_number
     revoke(root, ["/a"], now=NOW)
     assert revoked(root) >= {first, second}
+
+
+def test_a_huge_ledger_and_a_pipe_are_refused(tmp_path: Path) -> None:
+    """A sparse file takes no space on the disk, and would take all memory."""
+    (tmp_path / LEDGER).touch()
+    os.truncate(tmp_path / LEDGER, 1 << 40)
+    with pytest.raises(KeystoreError, match="too large"):
+        read_ledger(tmp_path)
+    (tmp_path / LEDGER).unlink()
+    os.mkfifo(tmp_path / LEDGER)
+    with pytest.raises(KeystoreError, match="not a regular file"):
+        read_ledger(tmp_path)

@@ -238,7 +238,7 @@ def _write_archive(
             raise KeystoreError(
                 f"'{target}' is in the way", "It is not a regular file.", "Choose another name."
             )
-        if target.read_bytes() == data:
+        if target.stat().st_size == len(data) and target.read_bytes() == data:
             return ()
         if not force:
             raise KeystoreError(
