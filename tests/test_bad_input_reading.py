@@ -296,3 +296,24 @@ def test_toml(verb: str, case: str, tmp_path: Path) -> None:
     (tmp_path / "policy.xml").write_text(POLICY)
     words = verb.format(tmp_path / "policy.xml").split()
     check_refused(sros(*words, tmp_path / "hostile.toml"), why)
+
+
+@pytest.mark.parametrize("line", ["check NAME", "check NAME --format sarif", "check NAME --json"])
+def test_a_file_name_that_is_not_utf8(line: str, tmp_path: Path) -> None:
+    """Reports name it by visible escapes, and stay valid JSON: byte 0x9b is CSI to terminals."""
+    name = tmp_path / os.fsdecode(b"a\x9b2J\xff.xml")
+    name.write_text(policy_text({"/e": publish("x")}))
+    result = sros(*(str(name) if word == "NAME" else word for word in line.split()))
+    assert "defect" not in result.err, result.err
+    assert not any("\udc80" <= each <= "\udcff" for each in result.out)
+    if line != "check NAME":
+        assert json.loads(result.out)
+
+
+def test_view_of_a_name_that_is_not_utf8(tmp_path: Path) -> None:
+    """It is drawn, with another character in place of the byte."""
+    name = tmp_path / os.fsdecode(b"a\xff.xml")
+    name.write_text(policy_text({"/e": publish("x")}))
+    result = sros("view", str(name), "-o", str(tmp_path / "view.html"))
+    assert result.status == 0, result.err
+    assert (tmp_path / "view.html").read_bytes().decode("utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -61,7 +62,7 @@ def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
             {
                 "physicalLocation": {
                     "artifactLocation": {
-                        "uri": quote(_relative(finding.file, base)),
+                        "uri": quote(os.fsencode(_relative(finding.file, base))),
                         "uriBaseId": _BASE,
                     },
                     "region": {"startLine": finding.line or 1},

@@ -151,8 +151,10 @@ _CONTROLS = [
     *range(0x7F, 0xA0),  # DEL, and C1, which holds CSI as one character
     *(0x061C, 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)),  # bidirectional
 ]
+_BYTES = range(0xDC80, 0xDD00)  # bytes of names that are not UTF-8; 0x9B is CSI to some terminals
 _SHOWN = {code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" for code in _CONTROLS}
-_IN_JSON = {code: f"\\u{code:04x}" for code in _CONTROLS}
+_SHOWN |= {code: f"\\x{code - 0xDC00:02x}" for code in _BYTES}
+_IN_JSON = {code: f"\\u{code:04x}" for code in (*_CONTROLS, *_BYTES)}
 
 
 def visible(text: str) -> str:

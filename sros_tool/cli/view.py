@@ -121,7 +121,7 @@ def view(
     if output is None:
         click.echo(document, nl=False)
         return
-    click.echo(save(output, document.encode()), err=True)
+    click.echo(save(output, document.encode("utf-8", "replace")), err=True)
     if show:
         click.launch(output.absolute().as_uri())
 

@@ -75,7 +75,13 @@ def graphviz_svg(dot: str) -> str:
     """Return the SVG that Graphviz draws from DOT text; `UnavailableError` without Graphviz."""
     try:
         done = subprocess.run(
-            ["dot", "-Tsvg"], input=dot, capture_output=True, text=True, timeout=_WAIT, check=True
+            ["dot", "-Tsvg"],
+            input=dot,
+            capture_output=True,
+            encoding="utf-8",
+            errors="replace",
+            timeout=_WAIT,
+            check=True,
         )
     except FileNotFoundError as error:
         raise UnavailableError(
