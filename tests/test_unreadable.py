@@ -167,3 +167,10 @@ def test_a_link_to_enclaves_elsewhere_is_not_skipped(keystore: Path, tmp_path: P
     (keystore / "enclaves/a").symlink_to("b")
     assert list_enclaves(keystore) == ("/b",)
     assert renew(keystore, ["/b"], now=NOW).renewed == ("/b",)
+
+
+def test_a_link_in_place_of_a_file_hides_no_other_enclave(keystore: Path, tmp_path: Path) -> None:
+    (keystore / "enclaves/a/key.pem").unlink()
+    (keystore / "enclaves/a/key.pem").symlink_to(tmp_path)
+    assert sros("list_enclaves", keystore).ok().out.split() == ["/a", "/b"]
+    assert "/b" in sros("explain", keystore, "--who", "publish", "/old_b").out

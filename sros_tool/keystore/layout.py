@@ -210,6 +210,8 @@ def _walk(top: str, unread: list[UnreadPath]) -> Iterator[tuple[str, list[str]]]
         folders[:] = [each for each in folders if not each.startswith(".")]
         for each in folders:
             path = os.path.join(folder, each)
+            if each in (*REQUIRED_FILES, *OPTIONAL_FILES):
+                continue  # no enclave has such a name: a fault of the enclave in this folder alone
             if Path(path).is_symlink() and not _is_inside(path, top):
                 unread.append(UnreadPath(path, _FOLDER_ELSEWHERE))
         yield folder, files
