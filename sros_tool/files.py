@@ -181,12 +181,23 @@ def replace_file(path: Path, data: bytes) -> None:
     if state and own and not stat.S_ISREG(state.st_mode) and not stat.S_ISDIR(state.st_mode):
         if stat.S_ISFIFO(state.st_mode) and not _trusted(state) and _is_shared(target.parent):
             raise PermissionError(errno.EACCES, "it is a pipe of another user", str(path))
-        path.write_bytes(data)
+        _write_to(path, state, data)
         return
     keep = state and own and (_trusted(state) or not _is_shared(target.parent))
     with staged_file(target, data, mode=0o666, like=state if keep else None) as put_in_place:
         put_in_place()
     _LOG.info("%s '%s', %d bytes", "replaced" if state else "wrote", target, len(data))
+
+
+def _write_to(path: Path, state: os.stat_result, data: bytes) -> None:
+    """Write to the device or pipe with this state; something else may be at ``path`` by now."""
+    handle = os.open(path, os.O_WRONLY | os.O_NOCTTY | os.O_CLOEXEC)
+    try:
+        if not os.path.samestat(os.fstat(handle), state):
+            raise OSError(errno.ESTALE, "it was replaced by another file meanwhile", str(path))
+        write_all(handle, data)
+    finally:
+        os.close(handle)
 
 
 def _follow_own_links(path: Path) -> tuple[Path, bool]:

@@ -21,7 +21,7 @@ import pytest
 from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
-from sros_tool.files import replace_file, staged_file
+from sros_tool.files import _follow_own_links, replace_file, staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.delivery import export
@@ -428,6 +428,34 @@ def test_an_output_is_not_written_to_the_pipe_of_another_user(sticky: Path) -> N
     os.chown(sticky / "out.xml", STRANGER, STRANGER)
     with pytest.raises(PermissionError, match="pipe of another user"):
         replace_file(sticky / "out.xml", b"new")
+
+
+def test_an_output_to_a_pipe_does_not_follow_a_link_that_took_its_place(
+    tmp_path: Path, outside: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "out.xml"
+    os.mkfifo(path)
+    follow = _follow_own_links
+
+    def followed(given: Path) -> tuple[Path, bool]:
+        found = follow(given)
+        looked = given.stat()
+        given.unlink()
+        given.symlink_to(outside / "shadow")
+        monkeypatch.setattr("sros_tool.files._state", lambda _path, follow: looked)
+        return found
+
+    monkeypatch.setattr("sros_tool.files._follow_own_links", followed)
+    with pytest.raises(OSError, match="replaced by another file"):
+        replace_file(path, b"new")
+    assert (outside / "shadow").read_text() == "precious"
+
+
+def test_an_archive_that_waited_there_is_not_read_into_memory(keystore: Path, sticky: Path) -> None:
+    with (sticky / "robot.tar.gz").open("wb") as file:
+        file.truncate(1 << 42)
+    with pytest.raises(KeystoreError, match="already exists and differs"):
+        distribute(keystore, ["/a"], sticky / "robot.tar.gz", now=NOW)
 
 
 def test_an_output_follows_a_link_of_ones_own(tmp_path: Path) -> None:
