@@ -317,3 +317,12 @@ def test_view_of_a_name_that_is_not_utf8(tmp_path: Path) -> None:
     result = sros("view", str(name), "-o", str(tmp_path / "view.html"))
     assert result.status == 0, result.err
     assert (tmp_path / "view.html").read_bytes().decode("utf-8")
+
+
+def test_a_line_feed_in_a_file_name_forges_no_line(tmp_path: Path) -> None:
+    name = tmp_path / "x.xml\n\nok: 3 targets, nothing found"
+    name.write_text("<policy>")
+    found = sros("check", name)
+    assert found.status != 0
+    assert not [line for line in found.out.splitlines() if line.startswith("ok:")]
+    assert "\\x0a\\x0aok" in found.out

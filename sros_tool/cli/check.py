@@ -310,11 +310,15 @@ def _print_text(chosen: ChosenFindings, _selection: FindingFilter) -> None:
 
 
 def finding_lines(finding: Finding) -> list[str]:
-    """Return a finding as three lines: place and title, reason, and remedy."""
+    """Return a finding as three lines: place and title, reason, and remedy.
+
+    A line feed in the name of a file is escaped: it could end the line and forge the next one.
+    """
     head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"
     subject = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
     by = f" (accepted by the {finding.accepted})" if finding.accepted else ""
-    return [head, f"    {subject}{finding.text}{by}", f"    {finding.remedy}"]
+    lines = (head, f"    {subject}{finding.text}{by}", f"    {finding.remedy}")
+    return [line.replace("\n", "\\x0a") for line in lines]
 
 
 def _summary(chosen: ChosenFindings) -> str:
