@@ -146,7 +146,8 @@ class Keyring:
         user can read.  So its key has to belong to the owner of the keystore, too, unless the user
         named the place.
         """
-        what, owner = f"{role} CA key", root.stat().st_uid
+        what = f"{role} CA key"
+        owner = root.stat().st_uid if root.exists() else os.geteuid()
         if self._is_named(role) or owner in (0, os.geteuid()):
             return read_bytes(path, what)
         try:
