@@ -535,15 +535,15 @@ def test_a_rotation_copies_no_file_from_outside(
     key = keystore / "private/identity_ca.key.pem"
     good = key.read_bytes()
     if not finish:
-        rotate_ca(keystore, now=NOW, roles=("identity",))
+        rotate_ca(keystore, now=datetime.now(UTC), roles=("identity",))
     key.unlink()
     key.symlink_to(outside / "shadow")
     with pytest.raises(SrosError):
-        rotate_ca(keystore, now=NOW, roles=("identity",), finish=finish)
+        rotate_ca(keystore, now=datetime.now(UTC), roles=("identity",), finish=finish)
     assert not (keystore / "retired").exists()
     key.unlink()
     key.write_bytes(good)
-    rotate_ca(keystore, now=NOW, roles=("identity",), finish=finish)
+    rotate_ca(keystore, now=datetime.now(UTC), roles=("identity",), finish=finish)
     assert list((keystore / "retired").glob("*.key.pem"))
 
 

@@ -45,6 +45,8 @@ class KeystoreLock:
         """Return the descriptor of the locked file, or -1."""
         try:
             handle = self._folder.open_private(LOCK)
+        except FileNotFoundError:
+            return -1  # another process removed it between two looks at it
         except PermissionError:
             if self._folder.state(LOCK) is None:
                 raise  # this user cannot write to the folder
