@@ -94,6 +94,7 @@ def write_new_file(path: Path, data: bytes, *, for_user: int | None = None) -> N
 
     Raises:
         FileExistsError: something is at ``path`` already, be it a link that leads nowhere.
+        OSError: the file cannot be written; nothing is left of it.
     """
     with Folder(path.parent) as folder:
         handle = folder.create(path.name, 0o600)
@@ -102,6 +103,9 @@ def write_new_file(path: Path, data: bytes, *, for_user: int | None = None) -> N
                 os.fchown(handle, *folder.owner)
             write_all(handle, data)
             os.fsync(handle)
+        except BaseException:
+            folder.unlink(path.name, missing_ok=True)
+            raise
         finally:
             os.close(handle)
 

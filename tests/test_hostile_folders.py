@@ -6,6 +6,7 @@ as another user, they act as that user alone.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import shutil
@@ -378,6 +379,47 @@ def test_the_lock_is_of_one_holder_at_a_time(keystore: Path) -> None:
     assert not (keystore / LOCK).exists()
 
 
+def test_releasing_a_lock_leaves_the_lock_of_the_next_holder(
+    keystore: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process locks as soon as the file of the first is gone."""
+    unlink = Folder.unlink
+    taken: list[locking.KeystoreLock] = []
+
+    def unlink_then_another_locks(folder: Folder, path: str, **options: bool) -> None:
+        unlink(folder, path, **options)
+        if not taken:
+            taken.append(locking.KeystoreLock(two, wait=0.0))
+
+    with Folder(keystore) as one, Folder(keystore) as two:
+        first = locking.KeystoreLock(one)
+        monkeypatch.setattr(Folder, "unlink", unlink_then_another_locks)
+        first.release()
+        assert (keystore / LOCK).exists()
+        taken[0].release()
+    assert not (keystore / LOCK).exists()
+
+
+def test_a_lock_that_a_full_disk_holds_once_is_released(
+    keystore: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    unlink = Folder.unlink
+    refused: list[str] = []
+
+    def refuse_once(folder: Folder, path: str, **options: bool) -> None:
+        if not refused:
+            refused.append(path)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), path)
+        unlink(folder, path, **options)
+
+    with Folder(keystore) as one:
+        first = locking.KeystoreLock(one)
+        monkeypatch.setattr(Folder, "unlink", refuse_once)
+        first.release()
+    assert refused == [LOCK]
+    assert not (keystore / LOCK).exists()
+
+
 # ── outputs in a sticky folder ─────────────────────────────────────────────────────────────
 
 
@@ -615,20 +657,22 @@ def test_a_ca_key_in_the_file_of_its_certificate_does_not_leave(
 
 
 @as_root
+@pytest.mark.parametrize("dry_run", [False, True])
 @pytest.mark.parametrize("verb", ["create_keystore", "create_request", "distribute"])
 def test_no_key_is_left_to_the_owner_of_a_folder_that_waited_there(
-    verb: str, keystore: Path, sticky: Path
+    verb: str, dry_run: bool, keystore: Path, sticky: Path
 ) -> None:
     waiting = sticky / "waiting"
     waiting.mkdir()
     os.chown(waiting, STRANGER, STRANGER)
     with pytest.raises(KeystoreError, match=f"belongs to user {STRANGER}"):
         if verb == "create_keystore":
-            create_keystore(waiting, template=load_template("development"), now=NOW)
+            template = load_template("development")
+            create_keystore(waiting, template=template, now=NOW, dry_run=dry_run)
         elif verb == "create_request":
-            create_request(waiting, "/a")
+            create_request(waiting, "/a", dry_run=dry_run)
         else:
-            distribute(keystore, ["/a"], waiting, now=NOW)
+            distribute(keystore, ["/a"], waiting, now=NOW, dry_run=dry_run)
     assert not list(waiting.iterdir())
     sticky.chmod(0o755)  # only root can make a folder there, so it is meant for its owner
     distribute(keystore, ["/a"], waiting, now=NOW)

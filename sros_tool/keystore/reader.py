@@ -216,7 +216,7 @@ def authority_files(root: Path) -> dict[str, tuple[str, ...]]:
         file = path
         # A link into the stage, left by an interrupted transaction, stands for the file itself.
         if path.is_symlink() and STAGE not in (to := str(path.readlink())):
-            file = path.with_name(to)
+            file = path.parent / to
         if not file.is_file() or file.parent != path.parent:
             raise KeystoreError(
                 f"keystore '{root}' has no {role} CA",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from datetime import UTC, datetime
@@ -91,6 +92,25 @@ def test_a_failed_keystore_leaves_no_key_outside(tmp_path: Path) -> None:
         "permissions": f"file:{tmp_path / 'missing' / 'permissions.pem'}",
     }
     with pytest.raises(OSError, match="missing"):
+        create_keystore(
+            tmp_path / "ks",
+            template=load_template("production"),
+            now=NOW,
+            keyring=Keyring(places=places),
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_leaves_no_part_of_a_key_outside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def write_half(handle: int, data: bytes) -> None:
+        os.write(handle, data[: len(data) // 2])
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("sros_tool.files.write_all", write_half)
+    places = {"identity": f"file:{tmp_path / 'identity.pem'}"}
+    with pytest.raises(OSError, match=os.strerror(errno.ENOSPC)):
         create_keystore(
             tmp_path / "ks",
             template=load_template("production"),

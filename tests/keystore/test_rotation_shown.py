@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.errors import KeystoreError
 from sros_tool.keystore.history import HistoryStatus, history
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.revoke import revoke
@@ -60,6 +61,15 @@ def test_the_history_knows_both_cas_and_their_lists(root: Path) -> None:
     gone = [each for each in history(root, now=NOW).items if each.entry.enclave == "/c"]
     # Its permissions were put away with its certificate; the new CA's list names neither.
     assert Counter(each.status for each in gone) == {HistoryStatus.REVOKED: 3}
+
+
+@pytest.mark.parametrize("target", [".", "..", "../..", "../private", "/", "gone.cert.pem"])
+def test_a_ca_file_that_leads_to_no_file_of_its_folder_is_refused(target: str, root: Path) -> None:
+    path = root / "public/identity_ca.cert.pem"
+    path.unlink()
+    path.symlink_to(target)
+    with pytest.raises(KeystoreError, match=r"has no identity CA.*identity_ca\.cert\.pem"):
+        authority_files(root)
 
 
 def test_a_stranger_in_the_file_of_a_ca_is_named(root: Path, tmp_path: Path) -> None:

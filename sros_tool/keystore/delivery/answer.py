@@ -229,7 +229,8 @@ def import_answer(
         key = load_key(read_bytes(place / _KEY, "private key"), f"'{place / _KEY}'")
         state = check_answer(answer, key.public_key(), now=now)
         assert state.certificate and state.identity_ca and state.permissions_ca
-        assert state.permissions
+        until = state.valid_until()
+        assert until
         _check_pinned(answer, state.identity_ca, state.permissions_ca, pinned)
         _check_key(folder, answer, key.public_key())
         known = trusted_in(folder, "permissions_ca.cert.pem")
@@ -245,9 +246,6 @@ def import_answer(
             if answer.file(file) is None and (place / file).exists():
                 transaction.remove(f"{enclave_folder(name)}/{file}")
         transaction.commit()
-    subject = subject_text(state.certificate.subject)
-    ends = [each.validity.not_after for each in state.permissions.grants if each.subject == subject]
-    until = min(validity_of(state.certificate).not_after, ends[0])
     return ImportedEnclave(
         name,
         state.identity_ca,

@@ -81,6 +81,7 @@ class KeystoreLock:
             for _ in range(2):  # a disk that is full may refuse it once
                 with contextlib.suppress(OSError):
                     self._folder.unlink(LOCK, missing_ok=True)
+                    break  # what is there now is the lock of another process
             os.close(self._handle)
             self._handle = -1
 

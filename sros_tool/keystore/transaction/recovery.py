@@ -162,7 +162,7 @@ def _move_into_place(folder: Folder, source: str, target: str) -> None:
 
 
 def _remove_empty_folders(folder: Folder, paths: Iterable[str]) -> None:
-    """Remove the empty parent folders of ``paths``, except the folders directly in ``root``."""
+    """Remove the empty parent folders of ``paths``, except the folders directly in ``folder``."""
     for path in paths:
         parent = path.rpartition("/")[0]
         with contextlib.suppress(OSError):  # it is not empty

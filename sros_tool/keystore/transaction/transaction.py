@@ -92,13 +92,16 @@ class Transaction:
         """Begin the transaction.
 
         Raises:
-            KeystoreError: this user cannot read all enclaves, or the keystore is busy.
+            KeystoreError: this user cannot read all enclaves, the keystore is busy, or a new one
+                would belong to a stranger.
         """
-        if self.dry_run:
-            check_readable(self.root)
-            return self
         try:
-            self._begin()
+            if self._fresh and not self._new_root:
+                self._refuse_folder_of_stranger()
+            if self.dry_run:
+                check_readable(self.root)
+            else:
+                self._begin()
         except BaseException:
             self._end()
             raise
@@ -116,8 +119,6 @@ class Transaction:
                 self._make_sibling(parent)
             _LOG.info("began to create the keystore '%s'", self.root)
             return
-        if self._fresh:
-            self._refuse_folder_of_stranger()
         self._lock = KeystoreLock(self._in)
         recover(self._in)
         check_readable(self.root)
