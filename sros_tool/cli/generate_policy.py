@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import os
-import re
-import signal
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,30 +13,34 @@ from sros_tool.cli.common import (
     PATH,
     dry_run_option,
     json_option,
-    keystore_from_environment,
     print_json,
     print_notes,
     read_log,
     visible,
 )
-from sros_tool.errors import SrosError, UnavailableError, UsageError
+from sros_tool.cli.observing import (
+    Watching,
+    check_duration,
+    observe,
+    observer_environment,
+    observing_options,
+    why_empty,
+)
+from sros_tool.errors import SrosError, UsageError
 from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
     from sros_tool.graph.document import Draft
-    from sros_tool.graph.learn import CommonParts, Learned
+    from sros_tool.graph.learn import Learned
     from sros_tool.graph.observation import Observation
-    from sros_tool.graph.observe import ObserverError, RosGraph, Snapshot
     from sros_tool.policy.model import Policy
 
 
 _NO_NODES = "No nodes detected in the ROS graph. No policy file was generated."
 """The message of ros2/sros2; scripts look for it."""
-_FOREVER = "until Ctrl-C"
-_DURATION = re.compile(r"\d+[smhdwy]\Z", re.ASCII)
 
 
-class _Words(click.Command):
+class _Words(Watching):
     """A command whose ``--watch`` needs no value, and whose ``--from-log`` takes several values."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
@@ -56,8 +55,6 @@ class _Words(click.Command):
             if in_logs and follows and (follows == "-" or not follows.startswith("-")):
                 continue  # the option is added before each file instead
             words.append(word)
-            if word == "--watch" and not _DURATION.match(follows):
-                words.append(_FOREVER)
         return super().parse_args(ctx, words)
 
 
@@ -86,27 +83,8 @@ On a secured robot, observe in a separate enclave. Create it with `sros generate
 with --keystore ROOT --enclave /sros_observer.""",
 )
 @click.argument("file", type=PATH, required=False)
-@click.option(
-    "--watch",
-    metavar="[DURATION]",
-    help="Collect all observations for DURATION, such as 10m, or until Ctrl-C.",
-)
-@click.option(
-    "--spin-time", type=click.FloatRange(0.1, 86400), metavar="S", help="Observe for S seconds."
-)
+@observing_options("Observe in this enclave; with --from-log, the enclave of the node.")
 @click.option("--flat", is_flag=True, help="Write one file, without includes of common parts.")
-@click.option("--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or 0]")
-@click.option(
-    "--enclave",
-    metavar="NAME",
-    help="Observe in this enclave; with --from-log, the enclave of the node.",
-)
-@click.option(
-    "--keystore",
-    type=PATH,
-    metavar="ROOT",
-    help="The keystore of that enclave. [default: $ROS_SECURITY_KEYSTORE]",
-)
 @click.option(
     "--from-log",
     "logs",
@@ -168,20 +146,32 @@ def generate_policy(
         raise UsageError("no file is named", "", "Name the policy FILE to write.")
     if node is not None:
         raise UsageError("--node is for --from-log only")
-    if watch is not None and spin_time is not None:
-        raise UsageError("--watch and --spin-time exclude each other", "", "Choose one.")
+    check_duration(watch, spin_time)
     from sros_tool.graph.document import draft, write
-    from sros_tool.graph.learn import common_parts, learn
+    from sros_tool.graph.learn import News, common_parts, learn
     from sros_tool.resources import policies_dir
 
     common = common_parts(file.parent, policies_dir())
-    environment = _observer_environment(enclave, keystore, domain)
-    snapshot, rmw = _observe(environment, watch, spin_time, common, secured=enclave is not None)
+    news = News(common)
+
+    def report(observation: Observation) -> None:
+        for line in news.lines(observation):
+            click.echo(line, err=True)
+
+    environment = observer_environment(enclave, keystore, domain)
+    snapshot, rmw = observe(
+        environment,
+        watch,
+        spin_time,
+        report,
+        secured=enclave is not None,
+        then="the policy is written",
+    )
     learned = learn(snapshot.observation, None if flat else common)
     if not learned.profiles:
         click.echo(_NO_NODES, err=True)
         print_notes(learned.notes)
-        click.echo(_why_empty(environment, snapshot.seconds, rmw, enclave), err=True)
+        click.echo(why_empty(environment, snapshot.seconds, rmw, enclave), err=True)
         return 1
     plan = draft(file, learned, None if flat else common)
     if not dry_run:
@@ -258,197 +248,6 @@ def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
 
 def _count(number: int, thing: str) -> str:
     return f"{number} {thing}{'' if number == 1 else 's'}"
-
-
-# ── observing ───────────────────────────────────────────────────────────────────────────
-
-
-def _observer_environment(
-    enclave: str | None, keystore: Path | None, domain: str | None
-) -> dict[str, str]:
-    """Return the environment variables to set for the observer: its domain, its enclave if any."""
-    from sros_tool.runtime.environment import DOMAIN, domain_from
-
-    if enclave is None:
-        if keystore is not None:
-            raise UsageError(
-                "--keystore is given without --enclave", "", "Name the observer's enclave."
-            )
-        if domain is None:
-            domain_from(os.environ)
-            return {}
-        return {DOMAIN: str(domain_from({DOMAIN: domain}) or 0)}
-    from sros_tool.cli.running import loadable_environment
-
-    return loadable_environment(keystore or keystore_from_environment(), enclave, domain)
-
-
-def _observe(
-    environment: dict[str, str],
-    watch: str | None,
-    spin_time: float | None,
-    common: CommonParts,
-    *,
-    secured: bool,
-) -> tuple[Snapshot, str]:
-    """Observe the ROS graph; return the result and the RMW in use.
-
-    ``watch`` is a duration or `_FOREVER`; None observes for ``spin_time`` seconds, or until the
-    graph stops changing.
-    """
-    from sros_tool.graph.observe import (
-        SECURED,
-        ObserverError,
-        RosGraph,
-        Settling,
-        identified,
-        look_for,
-        settle,
-    )
-    from sros_tool.validity import parse_duration
-
-    seconds = None
-    enclaves = _enclaves_by_identity({**os.environ, **environment})
-
-    def identify(observation: Observation) -> Observation:
-        return identified(observation, enclaves)
-
-    if watch not in (None, _FOREVER):
-        seconds = parse_duration(watch).total_seconds()
-    try:
-        with RosGraph(environment) as graph:
-            if watch is not None:
-                snapshot = _watch(graph, seconds, common, identify)
-            elif spin_time is not None:
-                snapshot = look_for(graph, spin_time, time.monotonic)
-            else:
-                settling = SECURED if secured else Settling()
-                snapshot = settle(graph, settling, time.monotonic)
-            return replace(snapshot, observation=identify(snapshot.observation)), graph.rmw
-    except ObserverError as error:
-        raise _explained(error, environment) from error
-
-
-def _enclaves_by_identity(environment: Mapping[str, str]) -> dict[str, str]:
-    """Map `identity_of` each certificate's subject in the observer's keystore to its enclave.
-
-    An enclave whose certificate cannot be read is left out.
-    """
-    from sros_tool.graph.observe import identity_of
-    from sros_tool.keystore.layout import enclave_names, enclave_path, is_keystore
-    from sros_tool.pki.certificates import load_certificate
-    from sros_tool.runtime.environment import ENABLE, KEYSTORE
-    from sros_tool.xml import read_bytes
-
-    root = Path(environment.get(KEYSTORE, ""))
-    if environment.get(ENABLE) != "true" or not is_keystore(root):
-        return {}
-    found = {}
-    for name in enclave_names(root):
-        with suppress(SrosError):
-            data = read_bytes(enclave_path(root, name) / "cert.pem", "certificate")
-            subject = load_certificate(data, name).subject
-            found[identity_of(subject.public_bytes())] = name
-    return found
-
-
-def _watch(
-    graph: RosGraph,
-    seconds: float | None,
-    common: CommonParts,
-    identify: Callable[[Observation], Observation],
-) -> Snapshot:
-    from sros_tool.graph.learn import News
-    from sros_tool.graph.observe import watch
-
-    news = News(common)
-
-    def report(observation: Observation) -> None:
-        for line in news.lines(identify(observation)):
-            click.echo(line, err=True)
-
-    with _until_signalled() as stopped:
-        until = f"for {seconds:.0f} s, or {_FOREVER}" if seconds else _FOREVER
-        click.echo(f"watching {until}; then the policy is written", err=True)
-        return watch(graph, seconds, time.monotonic, stop=stopped, report=report)
-
-
-@contextmanager
-def _until_signalled() -> Iterator[Callable[[], bool]]:
-    """Catch Ctrl-C and SIGTERM; yield a function that returns whether one was received."""
-    came: list[int] = []
-
-    def note(number: int, _frame: object) -> None:
-        came.append(number)
-
-    before = {each: signal.signal(each, note) for each in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(came)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def _explained(error: ObserverError, environment: dict[str, str]) -> SrosError:
-    """Return the observer's failure as the error that its DDS output explains."""
-    from sros_tool.runtime.environment import ENCLAVE
-    from sros_tool.runtime.vendor_log import (
-        endpoint_refusal,
-        missing_security,
-        participant_refusal,
-        plain_text,
-    )
-
-    said = f"{error.output}\n{error.reason}"
-    if line := missing_security(said):
-        return UnavailableError(
-            "the DDS of this rclpy was built without DDS Security, so it cannot observe a secured "
-            "robot",
-            f"DDS says: {line}",
-            "Use a ROS 2 whose DDS has it, such as the packages of Ubuntu; `sros doctor` shows "
-            "which DDS here enforces security.",
-        )
-    name = environment.get(ENCLAVE) or os.environ.get(ENCLAVE) or "/"
-    if line := endpoint_refusal(said):
-        return SrosError(
-            f"the enclave {name} does not permit an observer",
-            f"DDS says: {line}",
-            "The rights that an observer needs are in policies/observer.xml (see `sros "
-            "policies`), for an "
-            "enclave named /sros_observer.",
-        )
-    if line := participant_refusal(said):
-        return SrosError(
-            f"DDS refuses the enclave {name}",
-            f"DDS says: {line}",
-            "Run `sros inspect` on the enclave.",
-        )
-    last = [line for line in plain_text(error.output).splitlines() if line.strip()][-1:]
-    why = error.reason + (f" Its last message: {last[0].strip()}" if last else "")
-    return UnavailableError(error.what, why, "`sros doctor` shows what works here.")
-
-
-def _why_empty(environment: dict[str, str], seconds: float, rmw: str, enclave: str | None) -> str:
-    """Return the likely reasons why no node was observed, and a remedy."""
-    from sros_tool.runtime.environment import DOMAIN, ENABLE, KEYSTORE
-
-    merged = {**os.environ, **environment}
-    looked = f"Observed domain {merged.get(DOMAIN) or 0} for {seconds:.0f} s with {rmw}. "
-    if enclave is not None:
-        return looked + (
-            f"The observer ran secured, in enclave {enclave}: it does not see nodes that are "
-            "unsecured, have a certificate of another CA, or use another DDS."
-        )
-    if merged.get(KEYSTORE) and merged.get(ENABLE) != "true":
-        return looked + (
-            f"{KEYSTORE} is set, so the robot may be secured, and secured nodes are invisible to "
-            "an observer without an enclave. Observe with --enclave /sros_observer, made from "
-            "policies/observer.xml (see `sros policies`)."
-        )
-    return looked + (
-        "Nodes may be in another domain (ROS_DOMAIN_ID, --domain), on another network, or secured: "
-        "secured nodes are invisible to an observer without --enclave and --keystore."
-    )
 
 
 # ── from logs ───────────────────────────────────────────────────────────────────────────
