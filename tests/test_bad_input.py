@@ -12,8 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -879,44 +878,6 @@ def test_files_that_may_not_grow(line: str, size: int, keystore: Path, tmp_path:
     check_refused(program(*words, preexec=limit), os.strerror(errno.EFBIG))
     check_unchanged(tmp_path, before)
     assert program(*words).status == 0
-
-
-needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="mounts a small disk; needs root")
-
-
-@contextmanager
-def small_disk(folder: Path, blocks: int) -> Iterator[None]:
-    folder.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", f"nr_blocks={blocks}", "small", folder], capture_output=True
-    )
-    if mounted.returncode:
-        pytest.skip(f"nothing can be mounted here: {mounted.stderr.decode().strip()}")
-    try:
-        yield
-    finally:
-        subprocess.run(["umount", folder], check=True)
-
-
-@needs_root
-@pytest.mark.parametrize("free", [0, 1, 2, 5, 12, 25])
-def test_full_disk(free: int, made_keystore: Path, tmp_path: Path) -> None:
-    disk = tmp_path / "disk"
-    with small_disk(disk, 120):
-        shutil.copytree(made_keystore, disk / "ks", symlinks=True)
-        (disk / "p.xml").write_text(policy_text({f"/n{n}": publish("x") for n in range(9)}))
-        statistics = os.statvfs(disk)
-        filler = statistics.f_bavail - free
-        (disk / "filler").write_bytes(bytes(max(filler, 0) * statistics.f_bsize))
-        before = snapshot(disk)
-        for words in (
-            ["generate_artifacts", "-k", disk / "ks", "-p", disk / "p.xml"],
-            ["generate_artifacts", "-k", disk / "new", "-p", disk / "p.xml"],
-        ):
-            check_refused(program(*words), os.strerror(errno.ENOSPC))
-            check_unchanged(disk, before)
-        (disk / "filler").unlink()
-        assert program("create_enclave", disk / "ks", "/c").status == 0
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="becomes another user; needs root")
