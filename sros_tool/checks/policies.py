@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import re
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 
 from lxml import etree
@@ -34,6 +34,7 @@ from sros_tool.policy.document import IncludedFile, Includer, read_policy
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Policy, Profile, Source
 from sros_tool.policy.patterns import covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import GOAL, WHOLE, Right, Rules, parts, policy_rights
+from sros_tool.resources import policies_dir
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
 from sros_tool.xml import parse, read_bytes
@@ -419,6 +420,59 @@ _ANY_TIME = Window(datetime(2026, 1, 1, tzinfo=UTC), datetime(2027, 1, 1, tzinfo
 _DOMAINS = DomainSet.of((0, 0))
 
 
+ROOT_ENCLAVE = FindingKind(
+    "policy.root-enclave",
+    WARNING,
+    "an enclave / with the rights of several nodes or enclaves",
+    "Every process that is started without an enclave runs in /, and gets all of its rights; "
+    "without an enclave / in the keystore, it does not start.",
+    "rcl 9 (rcl/src/rcl/security.c, context.c: the enclave is / by default).",
+    "Remove the enclave / from the policy once each process has its own: `sros generate_policy "
+    "--enclave-per-node` learns them so.",
+)
+
+
+def _check_root_enclave(checked: _CheckedPolicy) -> Iterator[Finding]:
+    """Yield a finding about an enclave / that has everybody's rights."""
+    root = checked.policy.enclave("/")
+    if root is None:
+        return
+    nodes = {expand("~", each.ns, each.node) for each in root.all_profiles()}
+    also = within_root(policy_rights(checked.policy))
+    if text := also or (f"/ has the rights of {len(nodes)} nodes" if len(nodes) > 1 else ""):
+        yield ROOT_ENCLAVE.found("/", text, root.source.file, root.source.line)
+
+
+def within_root(rights: Collection[Right]) -> str:
+    """Return which enclaves have no right that the enclave / lacks, in words; "" if none.
+
+    Rights that every node needs do not count.
+    """
+    allowed = [each for each in rights if each.qualifier is ALLOW]
+    root, basics = Rules(each for each in rights if each.enclave == "/"), _basic_rights()
+    own: dict[str, list[Right]] = defaultdict(list)
+    for each in allowed:
+        if each.enclave != "/" and not basics.cover(each._replace(enclave="/")):
+            own[each.enclave].append(each)
+    names = sorted(
+        name
+        for name, found in own.items()
+        if all(root.allow("/", each.right, each.name) for each in found)
+    )
+    more = len(names) - _NAMES_SHOWN
+    some = ", ".join(names[:_NAMES_SHOWN]) + (f" and {more} more" if more > 0 else "")
+    return f"/ has all rights of {some}" if names else ""
+
+
+@cache
+def _basic_rights() -> Rules:
+    """Return the rights that every node needs, as those of the enclave /."""
+    return Rules(policy_rights(read_policy(policies_dir() / "defaults" / "node_basics.xml")))
+
+
+_NAMES_SHOWN = 3
+
+
 def _check_portability(checked: _CheckedPolicy) -> Iterator[Finding]:
     """Yield findings about the permissions that would be signed for each enclave."""
     for enclave in checked.policy.enclaves:
@@ -593,7 +647,14 @@ REDUNDANT_INCLUDE = FindingKind(
     "Remove the include.",
 )
 
-_CHECKS = (_check_rules, _check_nodes, _check_names, _check_counterparts, _check_portability)
+_CHECKS = (
+    _check_rules,
+    _check_nodes,
+    _check_names,
+    _check_counterparts,
+    _check_root_enclave,
+    _check_portability,
+)
 _PLACE = re.compile(r"(?P<file>.+?):(?P<line>\d+): (?P<text>.*)", re.DOTALL)
 _SYNTAX = re.compile(r", line (?P<line>\d+), column \d+")  # in messages of libxml2
 _INCLUDES = tuple(f"{{http://www.w3.org/{year}/XInclude}}include" for year in (2001, 2003))

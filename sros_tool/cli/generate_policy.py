@@ -71,6 +71,8 @@ Example:
   new: /talker (/talker_listener/talker)
   new: /talker (/talker_listener/talker) publish /chatter
   ...
+  $ sros generate_policy unsecured.xml --enclave-per-node
+  wrote 'unsecured.xml': 2 enclaves, 2 nodes, 20 rights
   $ sros generate_policy robot.xml --enclave /talker_listener/talker \\
         --from-log talker.log --accept
   added 1 right to 'robot.xml'
@@ -84,6 +86,11 @@ with --keystore ROOT --enclave /sros_observer.""",
 )
 @click.argument("file", type=PATH, required=False)
 @observing_options("Observe in this enclave; with --from-log, the enclave of the node.")
+@click.option(
+    "--enclave-per-node",
+    is_flag=True,
+    help="Give each process whose enclave the graph does not show one with the name of its node.",
+)
 @click.option("--flat", is_flag=True, help="Write one file, without includes of common parts.")
 @click.option(
     "--from-log",
@@ -112,6 +119,7 @@ def generate_policy(
     file: Path | None,
     watch: str | None,
     spin_time: float | None,
+    enclave_per_node: bool,
     flat: bool,
     domain: str | None,
     enclave: str | None,
@@ -136,6 +144,12 @@ def generate_policy(
     """
     present = _present_policy(file)
     if logs:
+        if enclave_per_node:
+            raise UsageError(
+                "--enclave-per-node is not for --from-log",
+                "A denial in a log is of the enclave that its process ran in.",
+                "Leave it out.",
+            )
         if accept and file is None:
             raise UsageError("--accept is given without FILE", "", "Name the policy to change.")
         learned, lines = _learned_from_logs(logs, file, enclave, node, present)
@@ -148,14 +162,19 @@ def generate_policy(
         raise UsageError("--node is for --from-log only")
     check_duration(watch, spin_time)
     from sros_tool.graph.document import draft, write
+    from sros_tool.graph.enclaves import NamedEnclaves
+    from sros_tool.graph.enclaves import enclave_per_node as name_enclaves
     from sros_tool.graph.learn import News, common_parts, learn
     from sros_tool.resources import policies_dir
 
     common = common_parts(file.parent, policies_dir())
     news = News(common)
 
+    def named(observation: Observation) -> NamedEnclaves:
+        return name_enclaves(observation) if enclave_per_node else NamedEnclaves(observation, ())
+
     def report(observation: Observation) -> None:
-        for line in news.lines(observation):
+        for line in news.lines(named(observation).observation):
             click.echo(line, err=True)
 
     environment = observer_environment(enclave, keystore, domain)
@@ -167,7 +186,8 @@ def generate_policy(
         secured=enclave is not None,
         then="the policy is written",
     )
-    learned = learn(snapshot.observation, None if flat else common)
+    found = named(snapshot.observation)
+    learned = learn(found.observation, None if flat else common).noting(found.notes)
     if not learned.profiles:
         click.echo(_NO_NODES, err=True)
         print_notes(learned.notes)
@@ -177,7 +197,7 @@ def generate_policy(
     if not dry_run:
         write(plan)
     if as_json:
-        print_json(_json(plan, learned, snapshot.observation, dry_run))
+        print_json(_json(plan, learned, found.observation, dry_run))
     else:
         _show(plan, learned, written=not dry_run)
     if not snapshot.settled:

@@ -10,7 +10,7 @@ include never grants more than was observed.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -63,6 +63,10 @@ class Learned:
     notes: tuple[Note, ...] = ()
     from_log: bool = False
 
+    def noting(self, notes: Iterable[Note]) -> Learned:
+        """Return the same with these notes before its own."""
+        return replace(self, notes=(*notes, *self.notes))
+
     @property
     def includes(self) -> tuple[str, ...]:
         """The common parts that the profiles include, sorted."""
@@ -110,8 +114,9 @@ def learn(observation: Observation, common: CommonParts | None = None) -> Learne
             notes.add("silent", f"{ns.rstrip('/')}/{name}")
     for _, endpoint in observation.strays:
         notes.add("stray", endpoint.topic)
-    if len(seen) > 1 and {enclave for enclave, _, _ in seen} == {"/"}:
-        notes.add("root-enclave", str(len(seen)))
+    unshown = sum(enclave == "/" for enclave, _, _ in seen)
+    if unshown and len(seen) > 1:
+        notes.add("root-enclave", f"{'all' if unshown == len(seen) else unshown} of {len(seen)}")
     profiles = []
     for place, found in sorted(seen.items()):
         if not found:
@@ -415,8 +420,11 @@ _TEXTS = {
     "odd-node": "left out, because a policy cannot name these nodes or their enclaves: {}",
     "partial-action": "only parts of an action are used, so they are listed as "
     "topics and services: {}",
-    "root-enclave": "all {} nodes run in the enclave /, and share all rights; start each process "
-    "with `--ros-args --enclave /its/name`, and generate the policy again",
+    "root-enclave": "the ROS graph shows the enclave / for {} nodes, so the policy gives / the "
+    "rights of all of them; either they were started without an enclave, or "
+    "ROS_SECURITY_ENCLAVE_OVERRIDE (as by sros run and sros env) names one, which the graph does "
+    "not show; --enclave-per-node gives each process an enclave of its own, with the name of its "
+    "node",
     "service-event": "service introspection is on: every subscriber of these topics can read the "
     "requests; remove the topics from the policy if introspection is for debugging only: {}",
     "sets-clock": "these nodes may set the clock of every node that uses simulated time; only a "
@@ -444,14 +452,15 @@ class _Notes:
     def notes(self) -> tuple[Note, ...]:
         """Return one note for each kind, in the order of their ids."""
         return tuple(
-            Note(f"graph.{kind}", _TEXTS[kind].format(_listed(sorted(subjects))))
+            Note(f"graph.{kind}", _TEXTS[kind].format(listed(sorted(subjects))))
             for kind, subjects in sorted(self._found.items())
         )
 
 
-def _listed(subjects: list[str]) -> str:
+def listed(subjects: Sequence[str], separator: str = ", ") -> str:
+    """Return the first subjects in words: "a, b, c, d, e and 2 more"."""
     more = len(subjects) - _SHOWN
-    return ", ".join(subjects[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
+    return separator.join(subjects[:_SHOWN]) + (f" and {more} more" if more > 0 else "")
 
 
 _EVERY_NODE = "common/node.xml"

@@ -19,7 +19,8 @@ from cryptography.x509.oid import ExtendedKeyUsageOID
 from sros_tool.pki.certificates import pem
 from sros_tool.pki.keys import key_pem
 from sros_tool.policy.document import read_policy
-from tests.checks.bench import DAY, Bench, name_of, new_key
+from tests.checks.bench import DAY, SECRET, Bench, name_of, new_key
+from tests.support.harness import sros
 
 Break = Callable[[Bench], object]
 CASES: dict[str, Break] = {}
@@ -47,6 +48,18 @@ def give_away(path: Path) -> None:
 
 
 IS_CA = (x509.BasicConstraints(True, None), True)
+
+
+def root_enclave(bench: Bench) -> None:
+    """Leave an enclave / with the rights of /arm behind."""
+    policy = bench.root.with_name("root.xml")
+    text = bench.root.with_name("policy.xml").read_text()
+    policy.write_text(
+        re.sub('<enclave path="/base">.*?</enclave>', "", text).replace('"/arm"', '"/"')
+    )
+    words = ("generate_artifacts", "-k", bench.root, "-p", policy)
+    sros(*words, env={"SROS_CA_PASSPHRASE": SECRET}).ok()
+
 
 # ── files ──────────────────────────────────────────────────────────────────────────────────
 
@@ -89,6 +102,7 @@ CASES |= {
     "keystore.settings-missing": lambda b: b.unlink("sros.toml"),
     "keystore.ledger-missing": lambda b: b.unlink("ledger.jsonl"),
     "keystore.one-authority": lambda b: b.trust("permissions", b.authority("identity")),
+    "keystore.root-enclave": root_enclave,
     "keystore.ca-ends-soon": lambda b: at(b, 5 * 365 - 89),
     "keystore.ca-expired": lambda b: at(b, 5 * 365 + 1),
     "keystore.ca-missing": lambda b: b.unlink("public/permissions_ca.cert.pem"),

@@ -18,6 +18,7 @@ FOUND_OTHERWISE = {
     "policy.include-fallback",
     "policy.redundant-include",
     "portable.enclave-names",
+    "policy.root-enclave",
 }
 """These are about more than the content of one profile; they have tests of their own here."""
 HEAD = 3
@@ -99,6 +100,34 @@ def test_a_node_that_lacks_everything_lacks_its_parameters_too(tmp_path: Path) -
 def test_wildcards_give_what_a_node_needs(tmp_path: Path) -> None:
     every = topics("publish", "/*") + services("reply", "/*")
     assert "policy.no-rosout" not in ids(tmp_path, policy(enclave(every, basics=False)))
+
+
+NARROW, WIDE = topics("publish", "/x/a"), topics("publish", "/x/*")
+
+
+@pytest.mark.parametrize(
+    ("enclaves", "text"),
+    [
+        ({"/": [WIDE], "/b": [NARROW]}, "/ has all rights of /b"),
+        ({"/": [NARROW, ""]}, "/ has the rights of 2 nodes"),
+        ({"/": [NARROW], "/b": [WIDE]}, ""),
+        ({"/": [NARROW], "/b": [""]}, ""),  # rights that every node needs
+        ({"/": [WIDE, deny("publish", "/x/a")], "/b": [NARROW]}, "/ has the rights of 2 nodes"),
+        ({"/": [NARROW]}, ""),
+        ({"/a": [WIDE], "/b": [NARROW]}, ""),
+    ],
+)
+def test_an_enclave_with_everybodys_rights(
+    enclaves: dict[str, list[str]], text: str, tmp_path: Path
+) -> None:
+    def profiles(contents: list[str]) -> str:
+        (first, *rest) = contents
+        more = (f'</profile>\n<profile ns="/" node="m">{BASICS}{each}' for each in rest)
+        return "".join((first, *more))
+
+    written = policy(*(enclave(profiles(found), path) for path, found in enclaves.items()))
+    found = [each for each in findings(tmp_path, written) if each.id == "policy.root-enclave"]
+    assert [each.text for each in found] == ([text] if text else [])
 
 
 def test_enclave_names(tmp_path: Path) -> None:

@@ -100,6 +100,43 @@ def test_twins_get_the_union_and_a_note_where_it_does_not(program: Program, tmp_
     assert (tmp_path / "robot.xml").read_text().count("<topic>") == 4
 
 
+UNSHOWN = (
+    ("/", "/", "talker", "01", ["publish rt/chatter"]),
+    ("/", "/hall", "listener", "02", ["subscribe rt/chatter"]),
+)
+
+
+@pytest.mark.parametrize(
+    ("words", "summary", "enclaves"),
+    [
+        ((), "1 enclave, 2 nodes", ['path="/"']),
+        (("--enclave-per-node",), "2 enclaves, 2 nodes", ['path="/hall/listener"', 'path="/tal']),
+    ],
+)
+def test_an_enclave_for_each_node_of_an_unsecured_robot(
+    program: Program, tmp_path: Path, words: tuple[str, ...], summary: str, enclaves: list[str]
+) -> None:
+    ended = program(graph(*UNSHOWN), *SHORT, *words).ok()
+    assert summary in ended.out
+    assert ("[graph.root-enclave]" in ended.err) == (not words)
+    text = (tmp_path / "robot.xml").read_text()
+    assert text.count("<enclave ") == len(enclaves)
+    assert all(each in text for each in enclaves)
+
+
+def test_a_watch_names_the_enclaves_that_it_gives(program: Program) -> None:
+    words = ("robot.xml", "--watch", "1s", "--enclave-per-node")
+    ended = program(graph(*UNSHOWN), *words).ok()
+    assert "new: /hall/listener (/hall/listener) subscribe /chatter" in ended.err
+
+
+def test_a_log_names_enclaves_itself(program: Program, tmp_path: Path) -> None:
+    (tmp_path / "x.log").write_text("")
+    ended = program(graph(), "robot.xml", "--enclave-per-node", "--from-log", "x.log")
+    assert ended.status == 2
+    assert "--enclave-per-node is not for --from-log" in ended.err
+
+
 @pytest.mark.parametrize(
     ("environment", "why"),
     [

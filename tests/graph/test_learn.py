@@ -153,10 +153,21 @@ def test_a_node_that_changes_its_name_has_one_profile() -> None:
     assert "graph.changing-name" in ids(learned)
 
 
-def test_everything_in_the_root_enclave_is_remarked_on() -> None:
-    both = (node("/a", "publish x", enclave="/"), node("/b", "publish x", enclave="/"))
-    assert "all 2 nodes" in text(learn(graph(*both)), "root-enclave")
-    assert "graph.root-enclave" not in ids(learn(graph(both[0])))
+@pytest.mark.parametrize(
+    ("enclaves", "said"),
+    [(("/", "/"), "all of 2 nodes"), (("/", "/x"), "1 of 2 nodes"), (("/",), ""), (("/x",), "")],
+)
+def test_nodes_whose_enclave_the_graph_does_not_show(enclaves: tuple[str, ...], said: str) -> None:
+    """Whether they share it is not known: `sros run` sets it in a way that the graph hides."""
+    learned = learn(
+        graph(*(node(f"/n{i}", "publish x", enclave=e) for i, e in enumerate(enclaves)))
+    )
+    if not said:
+        assert "graph.root-enclave" not in ids(learned)
+        return
+    note = text(learned, "root-enclave")
+    assert f"shows the enclave / for {said}" in note
+    assert "ROS_SECURITY_ENCLAVE_OVERRIDE" in note and "--enclave-per-node" in note
 
 
 def test_silent_nodes_and_strays_are_said() -> None:

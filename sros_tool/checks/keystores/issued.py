@@ -15,10 +15,17 @@ from sros_tool.checks.keystores.documents import DIFFERS as GOVERNANCE_DIFFERS
 from sros_tool.checks.keystores.enclaves import grant_of
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
-from sros_tool.checks.policies import ENCLAVE_NAMES
+from sros_tool.checks.policies import ENCLAVE_NAMES, within_root
 from sros_tool.dds.portable import mistaken_names, some_pairs
 from sros_tool.errors import SrosError
-from sros_tool.keystore.layout import IDENTITY_CA_FILE, PERMISSIONS_CA_FILE, ROLES, enclave_folder
+from sros_tool.keystore.layout import (
+    IDENTITY_CA_FILE,
+    PERMISSIONS_CA_FILE,
+    ROLES,
+    enclave_folder,
+    enclave_path,
+)
+from sros_tool.keystore.rights import load_rights
 from sros_tool.pki.certificates import fingerprints
 from sros_tool.policy.rights import Right, compare, policy_rights
 from sros_tool.translate import grant_rights
@@ -94,6 +101,17 @@ AUTHORITIES_DIFFER = FindingKind(
     "Export the enclave again from the keystore of the other enclaves, or create it again there.",
 )
 
+ROOT_ENCLAVE = FindingKind(
+    "keystore.root-enclave",
+    WARNING,
+    "an enclave / with all rights of other enclaves",
+    "Every process that is started without an enclave runs in /, and gets all of its rights; "
+    "without an enclave / in the keystore, it does not start.",
+    "rcl 9 (rcl/src/rcl/security.c, context.c: the enclave is / by default).",
+    "Start each process in its enclave, run `sros revoke ROOT /`, and remove the enclave / from "
+    "the policy.",
+)
+
 _Key = TypeVar("_Key")
 
 _RIGHTS_SHOWN = 3
@@ -164,6 +182,8 @@ def check_issued(
     if pairs:
         text = f"Cyclone DDS mistakes {some_pairs(pairs)}"
         yield ENCLAVE_NAMES.found(pairs[0][0], text, str(keystore.root))
+    if "/" in keystore.names and (text := within_root(load_rights(keystore.root).rights)):
+        yield ROOT_ENCLAVE.found("/", text, str(enclave_path(keystore.root, "/")))
     yield from _trust(keystore, summaries)
     yield from _exported_governance(keystore, summaries)
     yield from _ledger(keystore, summaries)
