@@ -59,7 +59,14 @@ from sros_tool.pki.certificates import (
     weakness,
 )
 from sros_tool.pki.chains import chain_fault
-from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl, read_list, signed_by
+from sros_tool.pki.crl import (
+    CRL_MARK,
+    RevocationList,
+    lists_as_revoked,
+    load_crl,
+    read_list,
+    signed_by,
+)
 from sros_tool.pki.keys import load_key
 from sros_tool.validity import Window, iso
 from sros_tool.values import shows
@@ -572,7 +579,7 @@ class _EnclaveFiles:
         if crl.next_update_utc and crl.next_update_utc < self._now:
             text = f"it expired at {iso(crl.next_update_utc)}: every participant is refused"
             self._add(CRL_FILE, text, Fault.CRL_EXPIRED)
-        if certificate and crl.get_revoked_certificate_by_serial_number(certificate.serial_number):
+        if certificate and lists_as_revoked(crl, certificate.serial_number):
             self._add(CERTIFICATE_FILE, "it is revoked by crl.pem", Fault.REVOKED)
 
     def _signed(

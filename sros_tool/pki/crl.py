@@ -41,7 +41,10 @@ class Revoked:
 
 @dataclass(frozen=True, slots=True)
 class RevocationList:
-    """A parsed revocation list; its signature is not verified yet."""
+    """A parsed revocation list; its signature is not verified yet.
+
+    ``revoked`` lacks entries with the reason removeFromCRL: they revoke nothing.
+    """
 
     number: int
     this_update: datetime
@@ -94,7 +97,7 @@ def load_crl(pem: bytes, name: str) -> RevocationList:
     next_update = crl.next_update_utc
     if next_update is None:
         raise PkiError(f"the revocation list {name} does not say when it expires", "", _RESTORE)
-    revoked = tuple(map(_revoked, crl))
+    revoked = tuple(each for each in map(_revoked, crl) if each.reason in REASONS)
     return RevocationList(_number(crl), crl.last_update_utc, next_update, revoked, crl)
 
 
@@ -116,6 +119,15 @@ def read_list(pem: bytes, name: str) -> x509.CertificateRevocationList:
         for entry in crl:
             _revoked(entry)
         return crl
+
+
+def lists_as_revoked(crl: x509.CertificateRevocationList, serial: int) -> bool:
+    """Return whether a list revokes the certificate with the serial number ``serial``.
+
+    An entry with the reason removeFromCRL does not (OpenSSL 3, x509_vfy.c, cert_crl).
+    """
+    entry = crl.get_revoked_certificate_by_serial_number(serial)
+    return entry is not None and _revoked(entry).reason in REASONS
 
 
 def signed_by(crl: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:

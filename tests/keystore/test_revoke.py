@@ -10,6 +10,9 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 
 from sros_tool.errors import KeystoreError, SrosError, UsageError
 from sros_tool.keystore.delivery.export import distribute
@@ -21,6 +24,7 @@ from sros_tool.keystore.lifecycle.revoke import refresh_crl, revoke
 from sros_tool.keystore.reader import open_enclave, read_crl
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.crl import REASONS, RevocationList
+from tests.support.children import run
 from tests.support.harness import certificate, check_whole, snapshot, sros
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
@@ -223,6 +227,63 @@ def test_a_list_of_another_authority_is_seen(tmp_path: Path) -> None:
     (problem,) = problems(roots[0] / "enclaves/b")
     assert "not of the identity CA" in problem
     assert not problems(roots[1] / "enclaves/b")
+
+
+@pytest.mark.parametrize("reason", ["removeFromCRL", "unspecified"])
+def test_a_list_that_no_ca_signed_revokes_nobody_and_keeps_nobody(
+    reason: str, tmp_path: Path
+) -> None:
+    """Whoever can write it, but not sign, decides neither who is revoked nor who is not."""
+    root = made(tmp_path / "ks", "/a", "/b", "/c")
+    revoke(root, ["/c"], now=NOW)
+    victims = {name: root / f"enclaves{name}/cert.pem" for name in ("/a", "/b")}
+    gone, kept = (certificate(path) for path in victims.values())
+    copy = tmp_path / "a.pem"
+    shutil.copy(victims["/a"], copy)
+    earlier = crl_of(root)
+    forged = forged_list(earlier, {gone.serial_number: reason, kept.serial_number: "unspecified"})
+    (root / "public/identity_ca.crl.pem").write_bytes(forged)
+
+    done = revoke(root, ["/a"], now=NOW)
+
+    assert any("signed the revocation list that was there" in each for each in done.remarks)
+    found = crl_of(root)
+    assert {(each.serial, each.reason) for each in found.revoked} == {
+        (earlier.revoked[0].serial, "unspecified"),
+        (gone.serial_number, "unspecified"),
+    }
+    assert found.number > earlier.number
+    assert not problems(root / "enclaves/b")
+    with pytest.raises(AssertionError, match="revoked"):
+        openssl(root, copy)
+    openssl(root, victims["/b"])
+
+
+def forged_list(like: RevocationList, reasons: dict[int, str]) -> bytes:
+    """Return a list with the names and numbers of another one, signed with a key of nobody."""
+    builder = (
+        x509.CertificateRevocationListBuilder()
+        .issuer_name(like.list.issuer)
+        .last_update(like.this_update)
+        .next_update(like.next_update)
+        .add_extension(x509.CRLNumber(like.number + 1000), critical=False)
+    )
+    for number, reason in reasons.items():
+        entry = x509.RevokedCertificateBuilder().serial_number(number)
+        entry = entry.revocation_date(like.this_update)
+        entry = entry.add_extension(x509.CRLReason(x509.ReasonFlags(reason)), critical=False)
+        builder = builder.add_revoked_certificate(entry.build())
+    key = ec.generate_private_key(ec.SECP256R1())
+    return builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
+
+
+def openssl(root: Path, path: Path) -> None:
+    """Have OpenSSL verify a certificate with the list of the keystore."""
+    public = root / "public"
+    command = ["openssl", "verify", "-crl_check", "-attime", str(int(NOW.timestamp()))]
+    command += ["-CAfile", str(public / "identity_ca.cert.pem")]
+    command += ["-CRLfile", str(public / "identity_ca.crl.pem"), str(path)]
+    run(command)
 
 
 def test_refresh_reaches_an_enclave_without_a_list(tmp_path: Path) -> None:

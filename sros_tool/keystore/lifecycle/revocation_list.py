@@ -46,7 +46,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
-from sros_tool.pki.crl import REASONS, RevocationList, Revoked, sign_crl
+from sros_tool.pki.crl import REASONS, RevocationList, Revoked, sign_crl, signed_by
 from sros_tool.validity import BACKDATE, Window, iso
 from sros_tool.xml import read_bytes
 
@@ -117,8 +117,8 @@ def put_away(root: Path, known: Container[str] = ()) -> Iterator[x509.Certificat
 class RevocationListSigner:
     """Signer of the revocation lists of all trusted identity CAs, within a transaction.
 
-    ``present`` is the list before the change.  ``remarks`` are sentences about lists that could not
-    be signed.
+    ``present`` is the list before the change, or None if there is none, or if no trusted identity
+    CA signed it.  ``remarks`` are sentences about lists that could not be signed or used.
     """
 
     def __init__(
@@ -137,8 +137,24 @@ class RevocationListSigner:
         self._keyring = keyring
         self._ledger = ledger
         self._now = now
-        self.present = read_crl(self._root)
         self.remarks: list[str] = []
+        self.present = self._authentic(read_crl(self._root))
+
+    def _authentic(self, found: RevocationList | None) -> RevocationList | None:
+        """Return a list if a trusted identity CA signed it; else None, with a remark.
+
+        Whoever can write the file, but not sign, could have entries signed that revoke others, or
+        that keep a certificate from being revoked.
+        """
+        file = identity_file(self._root)
+        trusted = certificates_of(self._root, file) if file else (self._authority.certificate,)
+        if found is None or any(signed_by(found.list, each) for each in trusted):
+            return found
+        self.remarks.append(
+            "No identity CA of this keystore signed the revocation list that was there, so its "
+            "entries do not count: find out who wrote it."
+        )
+        return None
 
     def sign(
         self, new_entries: Sequence[Revoked], names: Sequence[str], *, incomplete: bool
@@ -178,7 +194,10 @@ class RevocationListSigner:
         kept = _carried_over(old, expiries)
         listed = {each.serial for each in kept}
         kept += [each for each in new_entries if each.serial not in listed]
-        number = max(old.number + 1 if old else 1, least)
+        # Without an earlier list that is authentic: above every number that was used, because each
+        # list that is signed adds an entry to the ledger, and at most 2 to the number.
+        used = 2 * sum(each.what == "crl" for each in self._ledger.entries)
+        number = max(old.number + 1 if old else used + 1, least)
         return sign_list(authority, kept, number=number, template=self._template, now=self._now)
 
     def _lost(self, expiries: Mapping[int, str]) -> list[Revoked]:
@@ -243,7 +262,7 @@ class RevocationListSigner:
         (other,) = [each for each in certificates if digest(each) == wanted]
         if coming and crls_confusable(certificates[0], other):
             return None  # in this case all processes have to be restarted together anyway
-        old = embedded_crl(self._root, file)
+        old = self._authentic(embedded_crl(self._root, file))
         try:
             authority = self._open(other, replaced, coming=coming)
         except KeystoreError as error:
