@@ -116,6 +116,16 @@ def test_a_good_file(folder: Path) -> None:
         ('policy = "robot.xml"\n', "", 1, "no policy"),
         (CLAIM, "", 22, "has no claim"),
         ('name = "the viewer sees"', "name = 3", 22, "3, not a string"),
+        ('name = "viewer"', 'name = "../../viewer"', 11, "'../../viewer' is not the name"),
+        ('name = "viewer"', 'name = "/var/log/viewer"', 11, "is not the name of a party"),
+        ('name = "viewer"', 'name = ".."', 11, "is not the name of a party"),
+        ('enclave = "/arm/viewer"',
+         'enclave = "/arm/viewer"\nvariables = { LD_PRELOAD = "/tmp/x.so" }', 14,
+         "'LD_PRELOAD' is not a variable for a party; use ROS_DOMAIN_ID, ROS_SECURITY_ENABLE,"),
+        ('enclave = "/arm/viewer"', 'enclave = "/arm/viewer"\nvariables.PYTHONPATH = "."', 14,
+         "'PYTHONPATH' is not a variable"),
+        ('enclave = "/arm/viewer"', 'enclave = "/arm/viewer"\nvariables.CYCLONEDDS_URI = "x"', 14,
+         "'CYCLONEDDS_URI' is not a variable"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_reported_with_its_line(
@@ -126,6 +136,21 @@ def test_what_is_wrong_is_reported_with_its_line(
         read_scenario(write(folder, GOOD.replace(old, new)))
     assert f"line {line}: " in str(caught.value)
     assert told in str(caught.value)
+
+
+def test_two_parties_whose_logs_would_be_one_file(folder: Path) -> None:
+    text = GOOD.replace('"camera"', '"a b"').replace('"viewer"', '"a_b"')
+    with pytest.raises(DocumentError, match="line 11: there are two parties 'a_b'"):
+        read_scenario(write(folder, text))
+
+
+def test_the_variables_of_security_can_be_set(folder: Path) -> None:
+    text = GOOD.replace(
+        'enclave = "/arm/camera"',
+        'enclave = "/arm/camera"\nvariables = { ROS_SECURITY_STRATEGY = "Permissive" }',
+    )
+    camera = read_scenario(write(folder, text)).rows[0].parties[0]
+    assert camera.identity.variables == (("ROS_SECURITY_STRATEGY", "Permissive"),)
 
 
 SERVICES = """policy = "robot.xml"

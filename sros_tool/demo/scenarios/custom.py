@@ -33,8 +33,8 @@
 ``expected`` is a status of the demo's table; the keys for the parties of a claim depend on it
 (`_PARTIES`).
 ``keystore = "foreign"`` gives a party the identity of another CA; ``variables`` is a table of
-environment variables.  A claim that something does not happen needs another claim or a control
-that something does happen.
+environment variables, of those in `_VARIABLES`.  The name of a party is also that of its log.  A
+claim that something does not happen needs another claim or a control that something does happen.
 """
 
 from __future__ import annotations
@@ -65,6 +65,7 @@ from sros_tool.errors import DocumentError, SrosError
 from sros_tool.files import parse_toml
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
+from sros_tool.runtime.environment import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY
 from sros_tool.xml import read_bytes
 
 _PARTIES: Mapping[Relation, tuple[str, ...]] = {
@@ -103,6 +104,11 @@ _FITTING: Mapping[str, tuple[Role, ...]] = {
 
 _NAMED = (Role.SERVER, Role.CLIENT, Role.ACTION_SERVER, Role.ACTION_CLIENT)
 """The roles that need the name of their service or action."""
+
+_VARIABLES = (DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY)
+"""The variables that a party can have: others, such as LD_PRELOAD, could run code of the author."""
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._-]{0,63}")
+"""The names of parties: those of files in one folder."""
 
 _KEYS = {
     "": {"title", "policy", "party", "row"},
@@ -145,10 +151,11 @@ class _Reader:
             policy = read_policy(file)
         except (SrosError, ValueError) as error:  # ValueError: NUL in the file name
             raise self._error("", 0, "policy", str(error)) from error
-        parties = {}
+        parties: dict[str, Party] = {}
         for place, table in enumerate(self._tables(data, "party")):
             party = self._party(table, place, policy)
-            if party.name in parties:
+            same = party.name.replace(" ", "_")
+            if any(each.replace(" ", "_") == same for each in parties):
                 raise self._error("party", place, "name", f"there are two parties {party.name!r}")
             parties[party.name] = party
         rows = tuple(
@@ -161,6 +168,10 @@ class _Reader:
     def _party(self, table: Mapping[str, Any], place: int, policy: Policy) -> Party:
         self._check_keys(table, "party", place)
         name = self._text(table, "name", "party", place)
+        if not _NAME.fullmatch(name):
+            problem = f"{name!r} is not the name of a party"
+            remedy = "Use at most 64 letters, digits, blanks, '.', '_' and '-'."
+            raise self._error("party", place, "name", problem, remedy)
         roles = {role.value: role for role in Role}
         word = self._text(table, "role", "party", place)
         if word not in roles:
@@ -202,6 +213,10 @@ class _Reader:
             isinstance(value, str) for value in variables.values()
         ):
             raise self._error("party", place, "variables", "variables is not a table of strings")
+        for variable in variables:
+            if variable not in _VARIABLES:
+                problem = f"{variable!r} is not a variable for a party; use {', '.join(_VARIABLES)}"
+                raise self._error("party", place, "variables", problem)
         return Identity(keystores[word], enclave, tuple(variables.items()))
 
     def _row(self, table: Mapping[str, Any], place: int, parties: Mapping[str, Party]) -> Row:
