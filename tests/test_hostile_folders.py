@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shlex
 import shutil
 import stat
 from collections.abc import Callable
@@ -679,6 +680,22 @@ def test_no_key_is_left_to_the_owner_of_a_folder_that_waited_there(
 
 
 # ── files that grow, wait, or have no end ──────────────────────────────────────────────────
+
+
+def test_the_name_of_a_file_becomes_no_command_in_a_remedy(keystore: Path) -> None:
+    folder = keystore / "private" / "x'; touch owned; '"
+    folder.mkdir()
+    copied = folder / "$(touch owned).pem"
+    shutil.copy(keystore / "private/identity_ca.key.pem", copied)
+    copied.chmod(0o644)
+    findings = verify_arrival(keystore, now=NOW, domain=None, zone=UTC).findings
+    (remedy,) = {
+        each.remedy
+        for each in findings
+        if each.file == str(copied) and each.kind.id == "keystore.key-readable"
+    }
+    command = remedy.removeprefix("Run `").removesuffix("`.")
+    assert shlex.split(command) == ["chmod", "600", str(copied)]
 
 
 def test_a_file_of_the_kernel_is_not_read(keystore: Path) -> None:

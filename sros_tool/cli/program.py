@@ -277,7 +277,7 @@ def _os_problem(error: OSError) -> str:
 
 def _defect(error: BaseException) -> int:
     if os.environ.get("SROS_DEBUG"):
-        traceback.print_exception(error)
+        print(visible("".join(traceback.format_exception(error))), end="", file=sys.stderr)
     return _print_error(
         _prefixed(
             f"this is a defect of sros: {type(error).__name__}: {error}. Please report it; "

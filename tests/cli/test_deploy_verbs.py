@@ -275,7 +275,7 @@ def test_verify_reports_faults_and_sets_its_exit_status(keystore: Path, tmp_path
     assert "In the keystore that has the CA keys: Create the missing file: `sros " in ended.out
     assert "`sros create_enclave KEYSTORE /b`. Then export the enclave again." in ended.out
     assert f"{out}/enclaves/a/key.pem: error: a private key that others can read" in ended.out
-    assert f"chmod 600 '{out}/enclaves/a/key.pem'" in ended.out
+    assert f"chmod 600 {out}/enclaves/a/key.pem`" in ended.out
     said = json.loads(sros("verify", out, "--json", "--at", "2026-12-24", "--domain", "7").out)
     assert (said["ok"], said["kind"], said["domain"]) == (False, "keystore", 7)
     assert said["at"] == "2026-12-24T00:00:00Z"

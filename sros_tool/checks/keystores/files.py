@@ -8,6 +8,7 @@ import stat
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.checks.keystores.opened import CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
@@ -284,7 +285,7 @@ def key_mode_findings(path: str, mode: int) -> Iterator[Finding]:
     """Yield a finding if others can read a private key."""
     if mode & 0o077:
         text = f"its mode is {stat.S_IMODE(mode):04o}"
-        yield KEY_READABLE.found(path, text, path, remedy=f"Run `chmod 600 '{path}'`.")
+        yield KEY_READABLE.found(path, text, path, remedy=f"Run `chmod 600 {quote(path)}`.")
 
 
 class _Links:
