@@ -7,6 +7,8 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -79,6 +81,7 @@ NOT_LOGS: dict[str, tuple[Callable[[Path], object], str]] = {
     "too large": (_huge, "too large"),
     "a link to itself": (lambda path: path.symlink_to(path), ""),
 }
+NOT_LOGS["a pipe without a writer"] = (os.mkfifo, "nobody writes to")
 LOG_VERBS = {
     "explain": ["explain", "--log"],
     "generate_policy": ["generate_policy", "--enclave", "/e", "--node", "/n", "--from-log"],
@@ -87,10 +90,35 @@ LOG_VERBS = {
 
 @pytest.mark.parametrize("verb", LOG_VERBS)
 @pytest.mark.parametrize("kind", NOT_LOGS)
-def test_what_is_no_log(verb: str, kind: str, tmp_path: Path) -> None:
+def test_what_is_no_log(
+    verb: str, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sros_tool.cli.common._WRITER_WITHIN", 0.2)
     make, why = NOT_LOGS[kind]
     make(tmp_path / "log")
     check_refused(sros(*LOG_VERBS[verb], tmp_path / "log"), why)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_named_pipe_whose_writer_comes(
+    late: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The writer opens the pipe after sros, which found nobody; then it may write at once."""
+    monkeypatch.setattr("sros_tool.cli.common._WRITER_WITHIN", PATIENCE)
+    pipe = tmp_path / "log"
+    os.mkfifo(pipe)
+
+    def write() -> None:
+        with pipe.open("wb", buffering=0) as stream:  # waits for the reader
+            if late:
+                time.sleep(0.2)
+            stream.write(DENIED.encode())
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    ended = sros("explain", "--log", pipe)
+    writer.join()
+    assert "secret" in ended.out, ended
 
 
 @pytest.mark.parametrize("log", ["-", "/dev/zero"])

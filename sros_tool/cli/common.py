@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
+import select
 import stat
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
@@ -380,6 +383,7 @@ class _Secrets:
     def __init__(self, new: bool) -> None:
         self._new = new
         self._known: dict[str, str] = {}
+        self._lines: dict[str, str] = {}
 
     def __call__(self, what: str) -> str:
         if what not in self._known:
@@ -391,7 +395,9 @@ class _Secrets:
         value = _taken.get(_PIN if is_pin else _PASSPHRASE, "")
         file = "" if is_pin else _taken.get(_PASSPHRASE_FILE, "")
         if not value and file:
-            value = _first_line(Path(file))
+            if file not in self._lines:  # a pipe can be read once, and there may be two CAs
+                self._lines[file] = _first_line(Path(file))
+            value = self._lines[file]
         if not value and sys.stdin.isatty():
             confirm = self._new and not is_pin
             value = click.prompt(
@@ -416,8 +422,7 @@ def _first_line(path: Path) -> str:
     """Return the first line of a passphrase file, or of a pipe such as ``<(pass show ca)``."""
     from sros_tool.pki.keys import LONGEST_PASSPHRASE
 
-    with path.open("rb") as file:
-        line = re.split(rb"[\r\n]", file.read(LONGEST_PASSPHRASE + 1))[0]
+    line = re.split(rb"[\r\n]", _read_at_most(path, LONGEST_PASSPHRASE + 1))[0]
     if len(line) > LONGEST_PASSPHRASE:
         raise PkiError(
             f"the passphrase file '{path}' cannot be used",
@@ -425,6 +430,47 @@ def _first_line(path: Path) -> str:
             f"Write the passphrase into it, or set {_PASSPHRASE}.",
         )
     return line.decode("utf-8", "surrogateescape")
+
+
+# ── files and pipes that the user names ─────────────────────────────────────────────────────
+
+
+_WRITER_WITHIN = 5.0
+"""How long a writer of a pipe is waited for, in seconds: both may have just been started."""
+
+
+def _read_at_most(path: Path, count: int) -> bytes:
+    """Return the first ``count`` bytes of a file, or of a pipe that somebody writes to.
+
+    Opening a pipe as usual would wait for a writer without end.
+
+    Raises:
+        OSError: it cannot be read, or it is a pipe that nobody writes to.
+    """
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+        handle = file.fileno()
+        begin = _first_of_pipe(handle, path) if stat.S_ISFIFO(os.fstat(handle).st_mode) else b""
+        os.set_blocking(handle, True)
+        return begin + file.read(count - len(begin))
+
+
+def _first_of_pipe(handle: int, path: Path) -> bytes:
+    """Return at most one byte of a pipe, as soon as it has, or had, a writer.
+
+    Raises:
+        OSError: nobody opens it for writing.
+    """
+    poll = select.poll()
+    poll.register(handle, select.POLLIN)
+    deadline = time.monotonic() + _WRITER_WITHIN
+    while time.monotonic() < deadline:
+        with suppress(BlockingIOError):
+            if begin := os.read(handle, 1):
+                return begin
+            if [(handle, select.POLLHUP)] != poll.poll(50):
+                continue  # no writer yet, or one that has just come
+        return b""
+    raise OSError(errno.ENXIO, "it is a pipe that nobody writes to", str(path))
 
 
 # ── logs ────────────────────────────────────────────────────────────────────────────────
@@ -438,7 +484,8 @@ def read_log(log: str) -> str:
     """Return the text of a log file, of a pipe (``<(journalctl ...)``), or of stdin for "-".
 
     Raises:
-        DocumentError: the log cannot be read, is a device, or is larger than ``MAX_LOG``.
+        DocumentError: the log cannot be read, is a device, is a pipe that nobody writes to, or is
+            larger than ``MAX_LOG``.
     """
     try:
         if log == "-":
@@ -447,8 +494,7 @@ def read_log(log: str) -> str:
             kind = Path(log).stat().st_mode
             if not (stat.S_ISREG(kind) or stat.S_ISFIFO(kind) or stat.S_ISDIR(kind)):
                 raise DocumentError(f"the log '{log}' is neither a file nor a pipe")
-            with Path(log).open("rb") as file:
-                data = file.read(MAX_LOG + 1)
+            data = _read_at_most(Path(log), MAX_LOG + 1)
     except FileNotFoundError as error:
         raise DocumentError(f"the log '{log}' does not exist") from error
     except OSError as error:

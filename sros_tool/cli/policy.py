@@ -481,6 +481,7 @@ def policies(target: Path | None, as_json: bool, dry_run: bool) -> None:
     from sros_tool.files import write_new_folder
     from sros_tool.policy.document import read_policy
     from sros_tool.resources import policies_dir
+    from sros_tool.xml import read_bytes
 
     source = policies_dir()
     if target is not None:
@@ -490,7 +491,7 @@ def policies(target: Path | None, as_json: bool, dry_run: bool) -> None:
             click.echo(f"would copy the policies to '{target}'")
             return
         found_files = (each for each in sorted(source.rglob("*")) if each.is_file())
-        files = {str(each.relative_to(source)): each.read_bytes() for each in found_files}
+        files = {str(each.relative_to(source)): read_bytes(each, "file") for each in found_files}
         write_new_folder(target, files)
         click.echo(f"copied the policies to '{target}'")
         return

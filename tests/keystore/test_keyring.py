@@ -176,6 +176,30 @@ def test_an_empty_passphrase_never_leaves_a_key_in_clear(tmp_path: Path) -> None
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_passphrase_from_a_pipe_serves_both_cas(tmp_path: Path) -> None:
+    """As ``SROS_CA_PASSPHRASE_FILE=<(pass show ca)`` gives it: a pipe can be read once."""
+    reading, writing = os.pipe()
+    os.write(writing, RIGHT.encode())
+    os.close(writing)
+    try:
+        env = {"SROS_CA_PASSPHRASE": None, "SROS_CA_PASSPHRASE_FILE": f"/dev/fd/{reading}"}
+        sros("create_keystore", tmp_path / "ks", "--encrypt-ca-keys", env=env).ok()
+    finally:
+        os.close(reading)
+
+
+def test_a_pipe_without_a_writer_is_not_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sros_tool.cli.common._WRITER_WITHIN", 0.2)
+    os.mkfifo(tmp_path / "pipe")
+    env = {"SROS_CA_PASSPHRASE": None, "SROS_CA_PASSPHRASE_FILE": str(tmp_path / "pipe")}
+    refused = sros("create_keystore", tmp_path / "ks", "--encrypt-ca-keys", env=env)
+    assert refused.status != 0
+    assert "nobody writes to" in refused.err
+    assert not (tmp_path / "ks").exists()
+
+
 @pytest.mark.parametrize("where", ["variable", "file"])
 def test_a_passphrase_that_is_no_text_is_refused_in_one_line(where: str, tmp_path: Path) -> None:
     secret = b"correct horse \xff battery"
