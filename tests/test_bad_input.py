@@ -714,7 +714,19 @@ ENCLAVES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda folder: _replace(folder / "cert.pem", lambda path: path.symlink_to("no")),
         "broken link",
     ),
+    "a damaged certificate after that of the CA": (
+        lambda folder: _add_damaged(folder / "identity_ca.cert.pem"),
+        "A certificate after the first one is damaged",
+    ),
 }
+
+
+def _add_damaged(path: Path) -> None:
+    data = path.read_bytes()
+    path.unlink()
+    path.write_bytes(
+        data + b"-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n",
+    )
 
 
 def _sign_own(folder: Path) -> None:
@@ -734,9 +746,17 @@ def test_enclave_that_cannot_run(case: str, keystore: Path, tmp_path: Path) -> N
     check_refused(sros("run", keystore, "/a", "--", "touch", tmp_path / "ran"), why)
     check_refused(sros("distribute_key", keystore, "/a", tmp_path / "out"), why)
     check_unchanged(tmp_path, before)
+    assert '"/b"' in sros("view", keystore, "--json").ok().out
     inspected = sros("inspect", keystore, "--json")
     assert inspected.status == 1
     assert any(why in problem for problem in json.loads(inspected.out)["problems"])
+
+
+@pytest.mark.parametrize("target", [".", "..", "../..", "/", "/etc/hostname", "a/b"])
+@pytest.mark.parametrize("role", ["identity", "permissions"])
+def test_a_link_for_a_ca_certificate(role: str, target: str, keystore: Path) -> None:
+    _replace(keystore / f"public/{role}_ca.cert.pem", lambda path: path.symlink_to(target))
+    check_refused(sros("rotate_ca", keystore), f"has no {role} CA")
 
 
 # ── targets of an export ───────────────────────────────────────────────────────────────────

@@ -536,9 +536,7 @@ class _EnclaveFiles:
                 Fault.CERTIFICATE_ISSUER,
             )
         elif certificate and ca and authorities and not self._problems:
-            at = self._now
-            if refusal := chain_fault(certificate, _load_certificates(authorities, ""), at=at):
-                self._add(CERTIFICATE_FILE, f"it is refused: {refusal}", Fault.CERTIFICATE_ISSUER)
+            self._check_chain(certificate, authorities)
         if key is None:
             return
         try:
@@ -549,6 +547,15 @@ class _EnclaveFiles:
             return
         if certificate and not same_key(certificate, private):
             self._add(KEY_FILE, "it is not the key of cert.pem", Fault.KEY_MISMATCH)
+
+    def _check_chain(self, certificate: x509.Certificate, authorities: bytes) -> None:
+        try:
+            chain = _load_certificates(authorities, "")
+        except SrosError as error:  # in a certificate after the first one
+            self._add(IDENTITY_CA_FILE, error.why.rstrip("."), Fault.CERTIFICATE_MALFORMED)
+            return
+        if refusal := chain_fault(certificate, chain, at=self._now):
+            self._add(CERTIFICATE_FILE, f"it is refused: {refusal}", Fault.CERTIFICATE_ISSUER)
 
     def _check_revocation(
         self, certificate: x509.Certificate | None, ca: x509.Certificate | None
