@@ -31,7 +31,7 @@ from sros_tool.pki.certificates import (
 )
 from sros_tool.pki.chains import chain_fault
 from sros_tool.pki.crl import CRL_MARK, RevocationList, load_crl
-from sros_tool.pki.keys import algorithm, load_key
+from sros_tool.pki.keys import algorithm, holds_private_key, load_key
 from sros_tool.translate import RosRight, ros_rights
 from sros_tool.validity import iso
 from sros_tool.xml import parse, read_bytes
@@ -79,7 +79,7 @@ def _file(path: Path, data: bytes, now: datetime, authority: Path | None) -> Des
         return {"kind": "certificate", **_certificates(data, "in it", now)}
     if CRL_MARK in data:
         return {"kind": "revocation list", **_revocation_list(load_crl(data, "in it"), now)}
-    if b"PRIVATE KEY-----" in data:
+    if holds_private_key(data):
         mode = path.stat().st_mode & 0o777
         key = load_key(data, "in it")
         return {"kind": "private key", "algorithm": algorithm(key), "mode": f"{mode:04o}"}

@@ -77,6 +77,11 @@ def _algorithm(oid: str, parameters: bytes) -> bytes:
     return der.encode(der.SEQUENCE, der.encode(der.OID, der.encode_oid(oid)), parameters)
 
 
+def holds_private_key(data: bytes) -> bool:
+    """Return whether ``data`` has a PEM private key of any kind, encrypted or not (RFC 7468)."""
+    return b"PRIVATE KEY-----" in data
+
+
 def load_key(pem: bytes, name: str, passphrase: Callable[[], str] | None = None) -> PrivateKey:
     """Return the EC or RSA key of a PEM file; ``name`` names the file in errors.
 

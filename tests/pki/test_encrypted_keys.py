@@ -12,7 +12,7 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
-from sros_tool.pki.keys import PrivateKey, generate_key, key_pem, load_key
+from sros_tool.pki.keys import PrivateKey, generate_key, holds_private_key, key_pem, load_key
 
 PASSPHRASE = "Öffne dich, Sesam"
 KEYS: dict[str, PrivateKey] = {"EC": generate_key(), "RSA": rsa.generate_private_key(65537, 2048)}
@@ -128,3 +128,20 @@ def test_a_key_that_takes_long_is_refused(pem: bytes, why: str) -> None:
 @pytest.mark.parametrize("words", ["-iter 2048", "-scrypt", "-v1 PBE-SHA1-3DES -iter 2048"])
 def test_the_same_key_with_its_own_numbers_is_read(words: str) -> None:
     load_key(demanding(2048, 2048, *words.split()), "k", lambda: "abc")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["pkey"],
+        ["pkey", "-traditional"],
+        ["pkcs8", "-topk8", "-passout", "pass:twelve chars"],
+        ["pkey", "-traditional", "-aes256", "-passout", "pass:twelve chars"],
+    ],
+    ids=" ".join,
+)
+@pytest.mark.parametrize("key", KEYS.values(), ids=KEYS)
+def test_a_private_key_is_found_in_every_form_of_openssl(key: PrivateKey, words: list[str]) -> None:
+    pem = key_pem(key)
+    assert holds_private_key(b"other text\n" + openssl(*words, data=pem))
+    assert not holds_private_key(openssl("pkey", "-pubout", data=pem))

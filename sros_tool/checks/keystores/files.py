@@ -34,6 +34,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.transaction.stage import check_interrupted
 from sros_tool.owners import other_writers, replaceable_on_the_way, user_name
+from sros_tool.pki.keys import holds_private_key
 
 KEY_READABLE = FindingKind(
     "keystore.key-readable",
@@ -167,7 +168,6 @@ UNKNOWN_FILE = FindingKind(
 )
 
 _KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
-_KEY_MARK = b"PRIVATE KEY-----"
 _MOST_READ = 65536
 _KNOWN = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml", REQUEST, SEAL, "governance.xml")
 _TOP = (SETTINGS, LEDGER, LEDGER_HEAD, ROTATION)
@@ -324,7 +324,7 @@ class _Links:
 
 def _holds_key(path: str, info: os.stat_result) -> bool:
     small = stat.S_ISREG(info.st_mode) and info.st_size <= _MOST_READ
-    return small and _KEY_MARK in Path(path).read_bytes()
+    return small and holds_private_key(Path(path).read_bytes())
 
 
 def _other(path: str, root: str, info: os.stat_result, home: bool) -> Iterator[Finding]:

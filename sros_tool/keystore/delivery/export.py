@@ -30,10 +30,10 @@ from sros_tool.keystore.reader import open_enclave
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
+from sros_tool.pki.keys import holds_private_key
 from sros_tool.xml import read_bytes
 
 _ARCHIVE_SUFFIXES = SUFFIXES
-_KEY_MARK = b"PRIVATE KEY-----"
 _ANSWER_AGAIN = (
     "Sign the request.pem in the enclave's folder with `sros sign_request --renew`, and send the "
     "answer to the robot."
@@ -174,7 +174,7 @@ def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes
                 path = f"{enclave_folder(name)}/{file}"
                 if (folder / file).exists():
                     files[path] = opened.read_inside(path)
-                    if file != KEY_FILE and _KEY_MARK in files[path]:
+                    if file != KEY_FILE and holds_private_key(files[path]):
                         raise _holds_ca_key(folder / file)
     return dict(sorted(files.items()))
 

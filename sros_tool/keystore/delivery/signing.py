@@ -58,7 +58,7 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import enclave_subject, pem, validity_of
 from sros_tool.pki.certificates import subject_text as text_of
-from sros_tool.pki.keys import load_key
+from sros_tool.pki.keys import holds_private_key, load_key
 from sros_tool.pki.requests import SigningRequest, key_digest, load_request
 from sros_tool.policy.model import Policy
 from sros_tool.validity import iso
@@ -283,7 +283,7 @@ def _answer_files(root: Path, issued: Issued) -> dict[str, bytes]:
     with Folder(root) as opened:
         for file, source in shared.items():
             files[f"{folder}/{file}"] = data = opened.read_inside(source)
-            if b"PRIVATE KEY-----" in data:
+            if holds_private_key(data):
                 raise KeystoreError(
                     f"'{root / source}' holds a private key",
                     "It would get into the answer, and so to the robot.",
