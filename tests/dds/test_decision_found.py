@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sros_tool.dds.decision.access import Access
-from sros_tool.dds.decision.answers import Outcome
+from sros_tool.dds.decision.answers import AccessVerb, Outcome
 from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import (
     NOW,
@@ -22,10 +22,16 @@ EVERYTHING = permissions(grant(allow(publish("*"))))
 ELSEWHERE = permissions(grant(allow(publish("rt/a"), domains="<id>7</id>")))
 
 
-def outcome(vendor: Vendor, perms: bytes, govern: bytes, topic: str) -> Outcome:
+def outcome(
+    vendor: Vendor,
+    perms: bytes,
+    govern: bytes,
+    topic: str,
+    verb: AccessVerb = AccessVerb.PUBLISH,
+) -> Outcome:
     found = Access.of_documents(vendor, govern, perms, SUBJECT, domain=42, at=NOW)
     assert isinstance(found, Access), found
-    return found.publish(topic).outcome
+    return found.decide(verb, topic).outcome
 
 
 @pytest.mark.parametrize(
@@ -46,16 +52,35 @@ def test_cyclone_takes_letters_digits_and_slashes_as_topics(name: str) -> None:
         ("NONE", "NONE", Vendor.FAST_2_9, Outcome.PEER_DENIES),
     ],
 )
+@pytest.mark.parametrize("controlled", ["", "read", "write"])
 def test_what_nothing_protects_is_shared_with_those_that_were_refused(
-    rtps: str, data: str, vendor: Vendor, expected: Outcome
+    rtps: str, data: str, vendor: Vendor, expected: Outcome, controlled: str
 ) -> None:
-    free = topic_rule("rt/open", read=False, write=False, data=data)
+    """What is controlled is the other direction, for which peers do not ask."""
+    free = topic_rule("rt/open", read=controlled == "read", write=controlled == "write", data=data)
     free = free.replace("<metadata_protection_kind>ENCRYPT", "<metadata_protection_kind>NONE")
+    verb = AccessVerb.SUBSCRIBE if controlled == "write" else AccessVerb.PUBLISH
     hidden = governance(free, topic_rule(), rtps=rtps)
-    assert outcome(vendor, ELSEWHERE, hidden, "rt/open") is Outcome.PEER_DENIES
+    assert outcome(vendor, ELSEWHERE, hidden, "rt/open", verb) is Outcome.PEER_DENIES
     free = free.replace("<enable_discovery_protection>true", "<enable_discovery_protection>false")
     govern = governance(free, topic_rule(), rtps=rtps)
-    assert outcome(vendor, ELSEWHERE, govern, "rt/open") is expected
+    assert outcome(vendor, ELSEWHERE, govern, "rt/open", verb) is expected
+
+
+def test_a_grant_without_rules_before_one_that_allows_joining() -> None:
+    """The first grant decides: peers refuse its participant, and share what is unprotected."""
+    perms = permissions(grant(), grant(allow(publish("rt/a"))))
+    free = topic_rule(read=False, data="NONE")
+    free = free.replace("<metadata_protection_kind>ENCRYPT", "<metadata_protection_kind>NONE")
+    free = free.replace("<enable_discovery_protection>true", "<enable_discovery_protection>false")
+    govern = governance(free, rtps="NONE")
+    found = Access.of_documents(Vendor.CYCLONE, govern, perms, SUBJECT, domain=42, at=NOW)
+    assert isinstance(found, Access)
+    assert found.join().outcome is Outcome.PEER_DENIES
+    assert found.publish("rt/a").outcome is Outcome.DENIED
+    decision = found.subscribe("rt/a")
+    assert decision.outcome is Outcome.ALLOWED
+    assert "even peers that refuse the participant exchange it" in decision.text
 
 
 def test_a_date_that_cannot_be_read_in_any_grant() -> None:

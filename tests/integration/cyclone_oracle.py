@@ -89,7 +89,13 @@ def run(library: CycloneLibrary, case: Case) -> Report:
             ["subscribe" if verb == "publish" else "publish", topic, partitions]
             for verb, topic, partitions in (case["questions"][i] for i in wanted)
         ]
-        other = {**case, "identity": identity, "documents": documents, "questions": mirrored}
+        other = {
+            **case,
+            "identity": identity,
+            "documents": documents,
+            "questions": mirrored,
+            "again": True,
+        }
         with Process(lambda say: take_part(library, other, say)) as peer:
             opened, found = peer.report(), peer.report()
             if opened is None or found is None:
@@ -164,7 +170,11 @@ class Process:
 
 
 def take_part(library: CycloneLibrary, case: Case, say: Callable[[Report], None]) -> None:
-    """Join, open what is asked and say so; with a peer, say then which of these has found it."""
+    """Join, open what is asked and say so; with a peer, say then which of these has found it.
+
+    With "again", everything is opened once more when the handshake is over: an endpoint that was
+    discovered before it may stay unmatched although the same one opened later is matched.
+    """
     os.environ["TZ"] = case["zone"]
     time.tzset()
     api = library.api
@@ -183,16 +193,28 @@ def take_part(library: CycloneLibrary, case: Case, say: Callable[[Report], None]
     answers = ["created" if end >= 0 else REFUSALS.get(end, f"error {end}") for _, end in ends]
     say({"end": "joined", "answers": answers, "log": "; ".join(library.log)})
     if case["peer"]:
-        made = [(verb, end) for verb, end in ends if end >= 0]
+        made = [(asked, [end]) for asked, (_, end) in zip(case["questions"], ends, strict=True)]
+        made = [each for each in made if each[1][0] >= 0]
         met = [False] * len(made)
-        until = time.monotonic() + case["seconds"]
-        while not all(met) and time.monotonic() < until:
-            met = [meets(api, *each) or seen for seen, each in zip(met, made, strict=True)]
+        start = time.monotonic()
+        again, said = bool(case.get("again")), False
+        while True:  # also once it said it: the other side may still wait
+            met = [meet(api, *each) or seen for seen, each in zip(met, made, strict=True)]
+            passed = time.monotonic() - start
+            if again and passed > case["seconds"] / 3:
+                again = False
+                for asked, same in made:
+                    same.append(open_end(api, participant, topics, *asked))
+            if not said and (all(met) or passed > case["seconds"]):
+                said = True
+                say({"answers": met})
             time.sleep(0.02)
-        say({"answers": met})
-        while True:  # the reader of the other side may still wait
-            _ = [meets(api, *each) for each in made]
-            time.sleep(0.02)
+
+
+def meet(api: Any, asked: list[Any], ends: list[int]) -> bool:
+    """Whether one of several endpoints that ask the same has found what it needs."""
+    found = [meets(api, asked[0], end) for end in ends]  # every writer has to write
+    return any(found)
 
 
 def properties(library: CycloneLibrary, case: Case) -> dict[str, str]:

@@ -448,8 +448,13 @@ def governances() -> list[Row]:
         return governance(domain_rule("".join(rules), join=join))
 
     elsewhere = permissions(grant(allow(criteria("publish", "rt/x"), domains="<id>7</id>")))
-    free = topic_rule(read=False, write=False, data="NONE")
-    free = free.replace("<metadata_protection_kind>ENCRYPT", "<metadata_protection_kind>NONE")
+    no_rule = permissions(grant(), grant(allow(criteria("publish", "rt/a"))))
+
+    def unprotected(*, read: bool = False, write: bool = False) -> str:
+        rule = topic_rule(read=read, write=write, data="NONE")
+        return rule.replace("<metadata_protection_kind>ENCRYPT", "<metadata_protection_kind>NONE")
+
+    free = unprotected()
     opened = topics(topic_rule("rt/open", read=False, write=False), topic_rule())
     shut = topics(topic_rule(), topic_rule("rt/open", read=False, write=False))
     some = topics(topic_rule("rt/open", read=False, write=False), topic_rule("rt/a"))
@@ -463,6 +468,31 @@ def governances() -> list[Row]:
             "refused by peers, a topic without protection",
             ask(elsewhere, governed=topics(free)),
             PEER_DENIES,
+            YES,
+        ),
+        # Peers ask for rights in the participant's own direction alone.
+        Row(
+            "refused by peers, an unprotected topic that all may write",
+            ask(elsewhere, governed=topics(unprotected(read=True))),
+            PEER_DENIES,
+            YES,
+        ),
+        Row(
+            "refused by peers, an unprotected topic that all may read",
+            ask(elsewhere, verb="subscribe", governed=topics(unprotected(write=True))),
+            PEER_DENIES,
+            YES,
+        ),
+        Row(
+            "refused by peers, an unprotected topic that all may read: writing",
+            ask(elsewhere, governed=topics(unprotected(write=True))),
+            NO,
+            NO,
+        ),
+        Row(
+            "a grant without rules before one for this, an unprotected topic",
+            ask(no_rule, verb="subscribe", governed=topics(unprotected(write=True))),
+            REFUSED,
             YES,
         ),
         Row(

@@ -486,9 +486,11 @@ class Access:
             if not verdict.allowed:
                 return self._verdict(verdict, asked, rule)
         if not (writes if verb is AccessVerb.PUBLISH else reads):
-            if join.outcome is Outcome.PEER_DENIES and not self._in_the_open(rule):
-                return self._peers_refuse(rule)
             text = f"the governance does not control {asked}"
+            if join.outcome is Outcome.PEER_DENIES:
+                if not self._in_the_open(rule):
+                    return self._peers_refuse(rule)
+                text += " or protect it, so that even peers that refuse the participant exchange it"
             return self._answer(Outcome.ALLOWED, "unrestricted", text, topic_rule=rule)
         verdict = self._own[verb].ask(topic, partitions)
         if not verdict.allowed:
@@ -502,13 +504,19 @@ class Access:
         return self._verdict(verdict, asked, rule)
 
     def _in_the_open(self, rule: TopicRule) -> bool:
-        """Return whether participants exchange the topic although they refuse each other."""
+        """Return whether a participant that peers refuse exchanges a topic that it may open freely.
+
+        Peers check only the direction of the refused participant: read access for its readers,
+        write access for its writers.  With access control in the other direction, the refused
+        participant itself checks the rights of its peer, for which it needs the end of the
+        handshake: it finds those endpoints that either side opens later (Cyclone DDS 0.10.2,
+        `q_omg_security_check_remote_writer_permissions` and `.._reader_permissions`).
+        """
         domain = self._governed.rule
         return (
             self._traits.shares_open_topics
             and domain is not None
             and domain.rtps_protection_kind is ProtectionKind.NONE
-            and not (rule.enable_read_access_control or rule.enable_write_access_control)
             and not (
                 rule.enable_discovery_protection
                 and domain.discovery_protection_kind is not ProtectionKind.NONE

@@ -150,7 +150,10 @@ class VendorTraits:
     needs_domain_rule: bool = True
     """On a domain that the governance does not list, the participant does not even start."""
     shares_open_topics: bool = False
-    """Participants that refused each other still exchange unprotected topics (measured)."""
+    """A participant that peers refuse still exchanges unprotected topics with them (measured).
+
+    Only access control in its own direction stops that.
+    """
     refuses_open_rtps: bool = False
     """Unauthenticated participants together with RTPS protection are refused."""
     signers: Signers = Signers.AUTHORITY
