@@ -315,6 +315,23 @@ def writing(source: str) -> list[int]:
     )
 
 
+def unsafe_pythons(source: str) -> list[int]:
+    """Lines that start Python so that it imports modules from the working folder."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        words = [ast.unparse(each) for each in getattr(node, "elts", ())]
+        for place, word in enumerate(words):
+            if word == "sys.executable" and words[place + 1 : place + 2] != ["'-P'"]:
+                found.append(node.lineno)  # type: ignore[attr-defined]
+    return found
+
+
+def test_python_is_started_without_the_working_folder() -> None:
+    found = {module: unsafe_pythons((PACKAGE / module).read_text()) for module in MODULES}
+    assert {module: lines for module, lines in found.items() if lines} == {}
+    assert unsafe_pythons("[sys.executable, '-m', 'x']\n[sys.executable, '-P', '-m', 'x']") == [1]
+
+
 def test_everything_is_written_by_two_modules() -> None:
     found = {module for module in MODULES if writing((PACKAGE / module).read_text())}
     assert found >= WRITERS

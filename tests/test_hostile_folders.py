@@ -12,6 +12,7 @@ import os
 import shlex
 import shutil
 import stat
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -20,6 +21,7 @@ from typing import Any
 
 import pytest
 
+import sros_tool
 from sros_tool.checks.keystores.arrival import verify_arrival
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.errors import DocumentError, KeystoreError, SrosError
@@ -41,6 +43,7 @@ from sros_tool.keystore.transaction import lock as locking
 from sros_tool.keystore.transaction.stage import staged_name
 from sros_tool.xml import read_bytes
 from tests.conftest import POLICY
+from tests.support.children import run
 from tests.support.harness import snapshot, sros
 
 NOW = datetime.now(UTC)
@@ -680,6 +683,21 @@ def test_no_key_is_left_to_the_owner_of_a_folder_that_waited_there(
 
 
 # ── files that grow, wait, or have no end ──────────────────────────────────────────────────
+
+
+def test_no_module_of_the_working_folder_is_run(tmp_path: Path) -> None:
+    """A folder such as /tmp, where others can write, or one that was unpacked."""
+    mark = tmp_path / "ran"
+    for name in ("json", "ctypes"):
+        text = f"import os\nos.close(os.open({str(mark)!r}, os.O_CREAT))\nraise SystemExit(9)\n"
+        (tmp_path / f"{name}.py").write_text(text)
+    env = {k: v for k, v in os.environ.items() if not k.startswith("ROS_")}
+    env["PYTHONPATH"] = str(Path(sros_tool.__file__).parents[1])
+    doctor = ("-m", "sros_tool", "doctor")
+    run([sys.executable, "-P", *doctor], cwd=tmp_path, env=env, status=None)
+    assert not mark.exists()
+    run([sys.executable, *doctor], cwd=tmp_path, env=env, status=None)
+    assert mark.exists()
 
 
 def test_the_name_of_a_file_becomes_no_command_in_a_remedy(keystore: Path) -> None:

@@ -81,10 +81,11 @@ class Backend:
 
         ``names`` are the absolute names of the role's ROS nodes, from `node_names`.
         """
+        # -P: never import modules from the current folder.
         if self.library(role, secured=secured) == RCLPY:
-            program = [sys.executable, "-m", "sros_tool.demo.nodes.ros", role.value]
+            program = [sys.executable, "-P", "-m", "sros_tool.demo.nodes.ros", role.value]
             return [*program, *options, *naming_arguments(role, names)]
-        return [sys.executable, "-m", "sros_tool.demo.nodes.cyclone", role.value, *options]
+        return [sys.executable, "-P", "-m", "sros_tool.demo.nodes.cyclone", role.value, *options]
 
     def environment(
         self, role: Role, *, wire: bool = False, denied: bool = False, secured: bool = False

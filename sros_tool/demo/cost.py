@@ -149,7 +149,8 @@ def _run_pair(
     """Run one pair of processes, and return the JSON that its ping wrote."""
     answer = folder / "answer.json"
     answer.unlink(missing_ok=True)
-    command = [sys.executable, "-m", "sros_tool.demo.nodes.ping_pong", plan.backend.name]
+    # -P: never import modules from the current folder.
+    command = [sys.executable, "-P", "-m", "sros_tool.demo.nodes.ping_pong", plan.backend.name]
     ping = ["ping", "--answer", str(answer), "--seconds", str(effort.seconds)]
     ping += ["--sizes", *map(str, effort.payloads)]
     network = RowNetwork(own=plan.own_networks)

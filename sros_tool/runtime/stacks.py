@@ -220,7 +220,8 @@ def _run_probe(kind: str, probe: ProbeEnclave, extra: Mapping[str, str]) -> Prob
             if not name.startswith("ROS_SECURITY_")
         }
         environment |= {**probe.environment, **extra, "ROS_LOG_DIR": folder}
-        command = [sys.executable, "-m", "sros_tool.runtime.probe_child", kind, str(report)]
+        # -P: never import modules from the current folder.
+        command = [sys.executable, "-P", "-m", "sros_tool.runtime.probe_child", kind, str(report)]
         with log.open("wb") as output:
             process = subprocess.Popen(
                 [*command, probe.allowed, probe.denied],
