@@ -29,6 +29,12 @@ PARAMETER_SERVICES = (
 NODE_SERVICES = (*PARAMETER_SERVICES, "get_type_description")
 """All services that a node of ROS 2 Jazzy offers under its own name, as ``~/NAME``."""
 
+DISTRIBUTIONS = (
+    "ardent", "bouncy", "crystal", "dashing", "eloquent", "foxy", "galactic", "humble", "iron",
+    "jazzy", "kilted", "rolling",
+)  # fmt: skip
+"""The distributions of ROS 2, in the order of their release; rolling is always the latest."""
+
 ACTION_SEPARATOR = "/_action/"
 """Separates the name of an action from the names of its services and topics."""
 
@@ -52,6 +58,16 @@ _EXPRESSION = re.compile(
 )
 _RANGE = re.compile(r"(.)-(.)")
 _MAX_EXPRESSION = 2000  # characters; the names that an expression can match have at most 255
+
+
+def has_type_descriptions(distribution: str) -> bool:
+    """Return whether nodes of a ROS 2 distribution offer ``~/get_type_description``.
+
+    They do since Iron (its update of July 2023: rcl 6.0.3, rclcpp 21.0.2, rclpy 4.1.2), and in a
+    distribution that sros does not know.
+    """
+    known = DISTRIBUTIONS
+    return distribution not in known or known.index(distribution) >= known.index("iron")
 
 
 def check_enclave_name(name: str) -> str:

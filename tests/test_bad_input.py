@@ -151,7 +151,7 @@ POLICIES: dict[str, tuple[str, str]] = {
     "unknown entity": (_topic("&nbsp;"), "not well-formed"),
     "unknown encoding": ('<?xml version="1.0" encoding="klingon"?>' + GOOD, "not well-formed"),
     "no version": (GOOD.replace(' version="0.2.0"', ""), "version"),
-    "version 0.1.0": (GOOD.replace("0.2.0", "0.1.0"), "contexts"),
+    "version 0.1.0": (GOOD.replace("0.2.0", "0.1.0"), "policies --convert"),
     "version 9": (GOOD.replace("0.2.0", "9"), "'9'"),
     "version 0.2.x": (GOOD.replace("0.2.0", "0.2.x"), "'0.2.x'"),
     "version with a space": (GOOD.replace("0.2.0", "0.2.0 "), "'0.2.0 '"),

@@ -27,6 +27,7 @@ from sros_tool.names import (
     PARAMETER_SERVICES,
     action_part,
     expand,
+    has_type_descriptions,
     is_expression,
 )
 from sros_tool.pki.certificates import common_name, subject_text
@@ -66,10 +67,14 @@ class _Statement:
 
 
 class _CheckedPolicy:
-    """A policy, its statements, and its rights in a form that can be queried."""
+    """A policy, its statements, and its rights in a form that can be queried.
 
-    def __init__(self, policy: Policy) -> None:
+    ``distribution`` is the ROS 2 distribution of its nodes, such as ``humble``; "" is the latest.
+    """
+
+    def __init__(self, policy: Policy, distribution: str = "") -> None:
         self.policy = policy
+        self.distribution = distribution
 
     @cached_property
     def rules(self) -> Rules:
@@ -257,8 +262,11 @@ NO_TYPE_DESCRIPTION = FindingKind(
     "policy.no-type-description",
     ERROR,
     "a node that may not offer ~/get_type_description",
-    "Nodes of ROS 2 Jazzy offer this service when they start, and exit if it is denied.",
-    "ROS 2 Jazzy, rclcpp 28 and rclpy 7 (node type descriptions interface); REP-2016.",
+    "Nodes of ROS 2 Iron and later offer this service when they start, and exit if it is denied. "
+    "Nodes of earlier distributions, such as Humble, do not have it: name theirs with --distro, "
+    "or by $ROS_DISTRO.",
+    "ROS 2 Jazzy, rclcpp 28 and rclpy 7 (node type descriptions interface); Iron, rclcpp 21; "
+    "REP-2016.",
     f'Allow <services reply="ALLOW"><service>~/get_type_description</service></services>. '
     f"{_INCLUDE_HINT}",
 )
@@ -342,6 +350,8 @@ def _basics(checked: _CheckedPolicy, enclave: Enclave, profile: Profile) -> Iter
     lacks_others = False
     for kind, right, names in _BASICS:
         if listener and kind not in _OF_LISTENERS:
+            continue
+        if kind is NO_TYPE_DESCRIPTION and not has_type_descriptions(checked.distribution):
             continue
         wanted = (expand(name, profile.ns, profile.node) for name in names)
         missing = [name for name in wanted if not checked.rules.allow(enclave.path, right, name)]
@@ -661,21 +671,24 @@ _INCLUDES = tuple(f"{{http://www.w3.org/{year}/XInclude}}include" for year in (2
 _MANY = 1000
 
 
-def _policy_findings(policy: Policy) -> Iterator[Finding]:
+def _policy_findings(policy: Policy, distribution: str) -> Iterator[Finding]:
     """Yield all findings in a readable policy."""
-    checked = _CheckedPolicy(policy)
+    checked = _CheckedPolicy(policy, distribution)
     for check in _CHECKS:
         yield from check(checked)
 
 
-def policy_file_findings(path: Path) -> Iterator[Finding]:
-    """Yield all findings in a policy file; a file that cannot be read is a finding too."""
+def policy_file_findings(path: Path, distribution: str = "") -> Iterator[Finding]:
+    """Yield all findings in a policy file; a file that cannot be read is a finding too.
+
+    ``distribution`` is the ROS 2 distribution of its nodes, such as ``humble``; "" is the latest.
+    """
     try:
         policy = read_policy(path)
     except SrosError as error:
         yield from _unreadable(path, error)
         return
-    yield from _policy_findings(policy)
+    yield from _policy_findings(policy, distribution)
     yield from _includes(path)
 
 

@@ -20,12 +20,16 @@ _ENCLAVE_FILES = (*REQUIRED_FILES, "permissions.xml", "crl.pem", "request.pem")
 
 @dataclass(frozen=True, slots=True)
 class Circumstances:
-    """The moment, time zone and other conditions of a check; see `keystore_findings`."""
+    """The moment, time zone and other conditions of a check; see `keystore_findings`.
+
+    ``distribution`` is the ROS 2 distribution of the nodes of policies; "" is the latest.
+    """
 
     now: datetime
     zone: tzinfo = UTC
     domain: int | None = None
     policies: tuple[Policy, ...] = ()
+    distribution: str = ""
 
 
 def path_findings(path: Path, at: Circumstances) -> list[Finding]:
@@ -44,14 +48,18 @@ def path_findings(path: Path, at: Circumstances) -> list[Finding]:
     if path.is_dir():
         policies = list(policies_below(path))
         if policies:
-            return [finding for each in policies for finding in policy_file_findings(each)]
+            return [
+                finding
+                for each in policies
+                for finding in policy_file_findings(each, at.distribution)
+            ]
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave, and holds no policy",
             "It has no enclaves folder with content, no cert.pem, and no XML file that begins "
             "with <policy>.",
         )
     read_bytes(path, "file")
-    return list(policy_file_findings(path))
+    return list(policy_file_findings(path, at.distribution))
 
 
 def policies_below(folder: Path) -> Iterator[Path]:

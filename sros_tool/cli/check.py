@@ -109,6 +109,12 @@ shown, else 0.""",
     "--domain", metavar="ID", help="The ROS domain that the enclaves must be able to join."
 )
 @click.option(
+    "--distro",
+    "distribution",
+    metavar="NAME",
+    help="The ROS 2 distribution of the nodes in policies. [default: $ROS_DISTRO, or the latest]",
+)
+@click.option(
     "--at",
     "moment",
     metavar="MOMENT",
@@ -140,6 +146,7 @@ def check(
     policies: tuple[Path, ...],
     vendor: str | None,
     domain: str | None,
+    distribution: str | None,
     moment: str | None,
     form: str,
     as_json: bool,
@@ -169,7 +176,7 @@ def check(
     if as_list:
         _print_kinds(selection, form)
         return 0
-    at = _circumstances(domain, moment, policies)
+    at = replace(_circumstances(domain, moment, policies), distribution=_distribution(distribution))
     found = [_shown(each) for each in _findings(family, paths, at)]
     chosen = selection.choose(found)
     _SHOW[form](chosen, selection)
@@ -202,6 +209,21 @@ def _circumstances(
     return Circumstances(moment_of(moment), local_zone(os.environ), domain_of(domain), read)
 
 
+def _distribution(named: str | None) -> str:
+    """Return the distribution that --distro or else $ROS_DISTRO names; "" stands for the latest."""
+    from sros_tool.names import DISTRIBUTIONS
+
+    if named is None:
+        return os.environ.get("ROS_DISTRO", "")
+    if named not in DISTRIBUTIONS:
+        raise UsageError(
+            f"{named!r} is not a distribution of ROS 2 that sros knows",
+            f"It knows {', '.join(DISTRIBUTIONS)}.",
+            "Name one of them.",
+        )
+    return named
+
+
 def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[Finding]:
     from sros_tool.checks.keystores.keystore import keystore_findings
     from sros_tool.checks.policies import policy_file_findings
@@ -214,7 +236,9 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
         if not paths:
             raise UsageError("no policy is named", "", "Name a file, or a folder of policies.")
         files = [f for path in paths for f in (policies_below(path) if path.is_dir() else [path])]
-        return [finding for file in files for finding in policy_file_findings(file)]
+        return [
+            finding for file in files for finding in policy_file_findings(file, at.distribution)
+        ]
     if family == "keystore":
         roots = paths or (keystore_from_environment(),)
         return [

@@ -21,6 +21,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     save,
+    visible,
 )
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.values import as_plain
@@ -465,7 +466,10 @@ Example:
   add_two_ints.xml     /add_two_ints/client, /add_two_ints/server
   ...
   $ sros policies --copy my_policies
-  copied the policies to 'my_policies'""",
+  copied the policies to 'my_policies'
+  $ sros policies --convert eloquent.xml -o robot.policy.xml
+  converted 2 nodes of 'eloquent.xml' to enclaves: /listener, /talker
+  wrote 'robot.policy.xml'""",
 )
 @click.option(
     "--copy",
@@ -474,27 +478,54 @@ Example:
     metavar="DIR",
     help="Copy them to the new folder DIR, as a start for your own.",
 )
+@click.option(
+    "--convert",
+    "earlier",
+    type=PATH,
+    metavar="OLD",
+    help="Convert the policy OLD of version 0.1.0 to the present format.",
+)
+@output_option("Write the converted policy to FILE.")
+@force_option
 @json_option
 @dry_run_option
-def policies(target: Path | None, as_json: bool, dry_run: bool) -> None:
-    """List the policies that ship with sros and their enclaves, or copy the policies."""
+def policies(
+    target: Path | None,
+    earlier: Path | None,
+    output: Path | None,
+    force: bool,
+    as_json: bool,
+    dry_run: bool,
+) -> int:
+    """List the policies that ship with sros and their enclaves, or copy the policies.
+
+    --convert gives a policy of version 0.1.0 (ROS 2 Crystal to Eloquent) the present format, with
+    the same rights: each node becomes an enclave with the node's name. The result is one file:
+    includes are resolved, and comments are lost. The exit status is 1 if a part was left out.
+    """
     from sros_tool.files import write_new_folder
     from sros_tool.policy.document import read_policy
     from sros_tool.resources import policies_dir
     from sros_tool.xml import read_bytes
 
+    if earlier is not None:
+        if target is not None:
+            raise UsageError("--convert and --copy exclude each other")
+        return _convert(earlier, output, force=force, as_json=as_json, dry_run=dry_run)
+    if output or force:
+        raise UsageError("--output and --force are for --convert only")
     source = policies_dir()
     if target is not None:
         if os.path.lexists(target):
             raise UsageError(f"'{target}' already exists", "", "Name a new folder.")
         if dry_run:
             click.echo(f"would copy the policies to '{target}'")
-            return
+            return 0
         found_files = (each for each in sorted(source.rglob("*")) if each.is_file())
         files = {str(each.relative_to(source)): read_bytes(each, "file") for each in found_files}
         write_new_folder(target, files)
         click.echo(f"copied the policies to '{target}'")
-        return
+        return 0
     found = {path: read_policy(path) for path in sorted(source.glob("*.xml"))}
     if as_json:
         print_json(
@@ -503,8 +534,60 @@ def policies(target: Path | None, as_json: bool, dry_run: bool) -> None:
                 for path, policy in found.items()
             ]
         )
-        return
+        return 0
     width = max(len(path.name) for path in found)
     for path, policy in found.items():
         click.echo(f"{path.name:{width}}  {', '.join(each.path for each in policy.enclaves)}")
     click.echo(f"they are in '{source}'", err=True)
+    return 0
+
+
+def _convert(
+    earlier: Path, output: Path | None, *, force: bool, as_json: bool, dry_run: bool
+) -> int:
+    """Convert a policy; return the exit status."""
+    from sros_tool.policy.document import convert_policy, read_policy, write_policy
+
+    if output:
+        check_output(output, force=force)
+    converted = convert_policy(earlier)
+    policy = converted.policy
+    document = write_policy(policy)
+    if read_policy(output or earlier, document) != policy:
+        raise PolicyError(
+            "the converted policy changes when it is written and read again",
+            "Nothing was written.",
+            "This is a defect of sros: please report it with the policy.",
+        )
+    names = ", ".join(each.path for each in policy.enclaves)
+    saved = save(output, document) if output and not dry_run else ""
+    if as_json:
+        value: dict[str, Any] = {
+            "policy": str(earlier),
+            "enclaves": [each.path for each in policy.enclaves],
+            "left_out": [each.text for each in converted.left_out],
+            "notes": as_plain(converted.notes),
+            "output": str(output) if saved else None,
+        }
+        print_json(value if output or dry_run else {**value, "document": document.decode()})
+    elif output is None and not dry_run:
+        click.echo(document, nl=False)
+    count = len(policy.enclaves)
+    what = f"{count} node{'s' * (count != 1)} of '{earlier}' to enclaves: {names}"
+    if dry_run and not as_json:
+        click.echo(visible(f"would convert {what}"))
+        if output:
+            click.echo(visible(f"would {'replace' if output.exists() else 'write'} {output}"))
+    elif not dry_run:
+        click.echo(visible(f"converted {what}"), err=True)
+    print_notes(converted.notes)
+    for each in converted.left_out:
+        click.echo(visible(f"left out: {each.text}"), err=True)
+    if saved:
+        click.echo(saved, err=True)
+        click.echo(
+            "the rights are the old ones; nodes of a later ROS 2 need more, such as to publish "
+            f"/rosout from a namespace: look with `sros check {output}`",
+            err=True,
+        )
+    return 1 if converted.left_out else 0

@@ -1,5 +1,8 @@
 """Policy files (SROS2 policy XML 0.2.0): reading them with their includes, and writing them.
 
+Policies of version 0.1.0 (ROS 2 Crystal to Eloquent) are converted: they have one profile for each
+node and no enclaves.
+
 The grammar follows the schema of ros2/sros2.  In addition every name is checked: a name that ROS
 does not allow is an error, because its author relies on that right or denial.
 
@@ -13,15 +16,16 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from shlex import quote
 from urllib.parse import unquote
 
 from lxml import etree
 
-from sros_tool.errors import DocumentError, InvalidNameError, PolicyError
-from sros_tool.names import check_enclave_name, check_namespace, expression_problem
+from sros_tool.errors import DocumentError, InvalidNameError, Note, PolicyError
+from sros_tool.names import check_enclave_name, check_namespace, expand, expression_problem
 from sros_tool.policy.model import (
     RIGHTS,
     VERSION,
@@ -252,6 +256,8 @@ def _too_large(where: str, limit: str) -> PolicyError:
 
 _XML_ATTRIBUTES = ("{http://www.w3.org/XML/1998/namespace}",)
 _VERSION = re.compile(r"0\.2\.[0-9]+\Z")
+_EARLIER = "Version 0.1.0, of ROS 2 Crystal to Eloquent, has nodes in place of enclaves."
+_EARLIER_BLOCKS = ("profiles", "contexts")
 _QUALIFIERS = {qualifier.value: qualifier for qualifier in Qualifier}
 
 
@@ -278,31 +284,53 @@ class _Reader:
             raise PolicyError(f"the policy file '{path}' does not exist")
 
     def policy(self) -> Policy:
-        root = self._includer.load(self._file)
-        place = IncludedFile(self._file)
+        root, place = self._root()
         where = self._where(root, place)
-        if root.tag != "policy":
-            raise PolicyError(
-                f"{where}: the file is not a policy",
-                f"Its root element is <{tag_of(root)}>, not <policy>.",
-                "" if root.tag != "profile" else "It is a fragment for other policies to include.",
-            )
         self._attributes(root, place, required=("version",))
         version = root.get("version", "")
         if not _VERSION.match(version):
             raise PolicyError(
                 f"{where}: the policy has version {_short(version)}",
-                f"sros reads version {VERSION} of the SROS2 policy format.",
-                "Version 0.1.0 writes <contexts> and <context> for <enclaves> and <enclave>."
-                if version.startswith("0.1")
-                else "",
+                f"sros reads version {VERSION} of the SROS2 policy format. {_EARLIER}"
+                if version == "0.1.0"
+                else f"sros reads version {VERSION} of the SROS2 policy format.",
+                self._how_to_convert() if version == "0.1.0" else "",
             )
-        enclaves: dict[str, Enclave] = {}
-        blocks = [self._expect(child, at, "enclaves") for child, at in self._children(root, place)]
+        blocks = self._children(root, place)
+        if len(blocks) == 1 and blocks[0][0].tag in _EARLIER_BLOCKS:
+            raise PolicyError(
+                f"{where}: the policy has <{blocks[0][0].tag}> in place of <enclaves>",
+                f"That is an earlier format than the version {version} that it names.",
+                self._how_to_convert(),
+            )
+        blocks = [self._expect(child, at, "enclaves") for child, at in blocks]
         if len(blocks) != 1:
             raise PolicyError(f"{where}: <policy> must contain exactly one <enclaves>")
-        for child, at in self._children(*blocks[0]):
-            enclave = self._enclave(*self._expect(child, at, "enclave"))
+        return self._with_enclaves(*blocks[0], version)
+
+    def _root(self) -> tuple[etree._Element, IncludedFile]:
+        root = self._includer.load(self._file)
+        place = IncludedFile(self._file)
+        if root.tag != "policy":
+            raise PolicyError(
+                f"{self._where(root, place)}: the file is not a policy",
+                f"Its root element is <{tag_of(root)}>, not <policy>.",
+                "" if root.tag != "profile" else "It is a fragment for other policies to include.",
+            )
+        return root, place
+
+    def _how_to_convert(self) -> str:
+        shown = str(self._shown)
+        new = self._shown.with_name(f"{self._shown.stem}.policy.xml")
+        return f"Convert it with `sros policies --convert {quote(shown)} -o {quote(str(new))}`."
+
+    def _with_enclaves(
+        self, element: etree._Element, place: IncludedFile, version: str, tag: str = "enclave"
+    ) -> Policy:
+        """Return the policy whose enclaves are the children of ``element``, named ``tag``."""
+        enclaves: dict[str, Enclave] = {}
+        for child, at in self._children(element, place):
+            enclave = self._enclave(*self._expect(child, at, tag))
             if enclave.path in enclaves:
                 raise PolicyError(
                     f"{enclave.source}: the enclave {enclave.path} is defined twice",
@@ -311,8 +339,11 @@ class _Reader:
                     "Join the two into one <enclave>.",
                 )
             enclaves[enclave.path] = enclave
+        return self._policy_of(enclaves, version)
+
+    def _policy_of(self, enclaves: Mapping[str, Enclave], version: str) -> Policy:
         if not enclaves:
-            raise PolicyError(f"{where}: the policy has no enclave")
+            raise PolicyError(f"'{self._shown}': the policy has no enclave")
         digest = self._includer.digest()
         read = tuple(replace(enclave, digest=digest) for enclave in enclaves.values())
         return Policy(read, version, str(self._shown))
@@ -404,7 +435,7 @@ class _Reader:
         return Group(kind, tuple(rights), names, self._source(element, place), lines)
 
     def _name(self, element: etree._Element, place: IncludedFile, node: str) -> str:
-        name = element.text or ""
+        name = self._written(element)
         problem = expression_problem(name)
         if not problem and name.startswith("~") and not node:
             problem = "A name with ~ is private to a node, and the profile has an empty node name."
@@ -419,6 +450,10 @@ class _Reader:
             )
         self._attributes(element, place)
         return name
+
+    def _written(self, element: etree._Element) -> str:
+        """Return the name in an element, as written."""
+        return element.text or ""
 
     def _children(
         self, element: etree._Element, place: IncludedFile
@@ -470,6 +505,121 @@ class _Reader:
 
     def _where(self, element: etree._Element, place: IncludedFile) -> str:
         return str(self._source(element, place))
+
+
+# ── earlier formats ────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class ConvertedPolicy:
+    """A policy of an earlier format with the same rights, as `Policy`.
+
+    ``left_out`` are the profiles that no enclave can stand for, with the reason; without them the
+    policy gives less than before, never more.
+    """
+
+    policy: Policy
+    notes: tuple[Note, ...]
+    left_out: tuple[Note, ...]
+
+
+def convert_policy(path: Path) -> ConvertedPolicy:
+    """Return the policy in a file of version 0.1.0, with an enclave for each node.
+
+    The enclave has the name of the node in its namespace, as its key had (ros2/sros2 0.6 to 0.8).
+    A private name is ``~/name`` since ROS 2 Eloquent; until then it was written ``~name``.  Files
+    that name version 0.1.0 and have ``<enclaves>``, and those with ``<contexts>`` (ros2/sros2 of
+    April 2020, never released), are converted too.
+
+    Raises:
+        PolicyError: (or another `DocumentError`, with file and line) the file violates the format,
+            or is of version 0.2.0 already.
+    """
+    return _EarlierReader(path, None).converted()
+
+
+class _EarlierReader(_Reader):
+    """Reader of a policy of an earlier format."""
+
+    def __init__(self, path: Path, content: bytes | None) -> None:
+        super().__init__(path, content)
+        self._private: list[str] = []
+
+    def converted(self) -> ConvertedPolicy:
+        root, place = self._root()
+        where = self._where(root, place)
+        self._attributes(root, place, optional=("version",))
+        version = root.get("version", "")
+        blocks = self._children(root, place)
+        tags = [tag_of(child) for child, _ in blocks]
+        if _VERSION.match(version) and tags == ["enclaves"]:
+            raise PolicyError(
+                f"{where}: the policy is of version {version} already",
+                "There is nothing to convert.",
+                "Use it as it is.",
+            )
+        if len(tags) != 1 or tags[0] not in ("enclaves", *_EARLIER_BLOCKS):
+            raise PolicyError(
+                f"{where}: <policy> must contain exactly one <profiles> or <enclaves>",
+                f"It contains {', '.join(f'<{tag}>' for tag in tags) or 'nothing'}.",
+                "Correct it first.",
+            )
+        left_out: list[Note] = []
+        if tags == ["profiles"]:
+            policy = self._policy_of(self._enclaves_of_nodes(*blocks[0], left_out), VERSION)
+        else:
+            policy = self._with_enclaves(*blocks[0], VERSION, tags[0].removesuffix("s"))
+        return ConvertedPolicy(policy, tuple(self._notes(policy)), tuple(left_out))
+
+    def _enclaves_of_nodes(
+        self, element: etree._Element, place: IncludedFile, left_out: list[Note]
+    ) -> dict[str, Enclave]:
+        self._attributes(element, place, optional=("type",))
+        enclaves: dict[str, Enclave] = {}
+        for child, at in self._children(element, place):
+            profile = self._profile(*self._expect(child, at, "profile"))
+            name = expand(profile.node, profile.ns, "")
+            why = ""
+            try:
+                check_enclave_name(name if profile.node else "")
+            except InvalidNameError as error:
+                why = f"{name!r} cannot be the name of an enclave. {error.why}"
+            if name in enclaves:
+                why = (
+                    f"{enclaves[name].source} has the node {name}, too. ros2/sros2 gives a node "
+                    "the rights of its first profile."
+                )
+            if why:
+                left_out.append(Note("convert.left-out", f"{profile.source}: {why}"))
+            else:
+                blocks = (Profiles((profile,)),)
+                enclaves[name] = Enclave(name, blocks, profile.source)
+        if not enclaves and left_out:
+            why = left_out[0].text
+            raise PolicyError(
+                f"nothing in '{self._shown}' can be converted", why, "Correct it first."
+            )
+        return enclaves
+
+    def _notes(self, policy: Policy) -> Iterator[Note]:
+        if self._private:
+            names = ", ".join(dict.fromkeys(self._private[:3]))
+            yield Note(
+                "convert.private-name",
+                f"{names}: a private name has a slash since ROS 2 Eloquent, and got one. "
+                "ros2/sros2 of Eloquent joined it to the name of the node without one.",
+            )
+        for enclave in policy.enclaves:
+            if not any(profile.groups for profile in enclave.all_profiles()):
+                text = f"{enclave.source}: {enclave.path} has no right at all, as before."
+                yield Note("convert.no-right", text)
+
+    def _written(self, element: etree._Element) -> str:
+        text = super()._written(element)
+        if len(text) < 2 or text[0] != "~" or text[1] == "/":
+            return text
+        self._private.append(text)
+        return f"~/{text[1:]}"
 
 
 def write_policy(policy: Policy) -> bytes:

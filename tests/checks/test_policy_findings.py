@@ -9,8 +9,19 @@ import pytest
 from sros_tool.checks.kind import WARNING, Finding
 from sros_tool.checks.policies import policy_file_findings
 from sros_tool.resources import policies_dir
-from tests.checks.policy_cases import BASICS, CASES, TYPES, Case, deny, services, topics
-from tests.support.harness import with_includes
+from tests.checks.policy_cases import (
+    BASICS,
+    CASES,
+    EVENTS,
+    LOG,
+    PARAMETERS,
+    TYPES,
+    Case,
+    deny,
+    services,
+    topics,
+)
+from tests.support.harness import sros, with_includes
 
 FOUND_OTHERWISE = {
     "policy.malformed",
@@ -89,6 +100,28 @@ def test_listeners_of_transforms_have_no_parameters(tmp_path: Path) -> None:
     assert "policy.no-parameter-events" in ids(tmp_path, text)
     listener = text.replace('node="n"', 'node="transform_listener_impl_*"')
     assert ids(tmp_path, listener) == set()
+
+
+@pytest.mark.parametrize(
+    ("words", "named", "found"),
+    [
+        ((), None, True),
+        ((), "humble", False),
+        ((), "jazzy", True),
+        (("--distro", "humble"), "jazzy", False),
+        (("--distro", "iron"), "humble", True),
+    ],
+)
+def test_type_descriptions_are_of_iron_and_later(
+    words: tuple[str, ...], named: str | None, found: bool, tmp_path: Path
+) -> None:
+    file = tmp_path / "robot.xml"
+    content = f"{LOG}{EVENTS}{services('reply', *PARAMETERS)}"
+    file.write_text(policy(enclave(content, basics=False)))
+    ended = sros("check", "policy", file, *words, env={"ROS_DISTRO": named})
+    assert ("policy.no-type-description" in ended.out) is found
+    assert ended.status == int(found)
+    assert sros("check", "policy", file, "--distro", "humbel").status == 2
 
 
 def test_a_node_that_lacks_everything_lacks_its_parameters_too(tmp_path: Path) -> None:
