@@ -144,7 +144,7 @@ def _topics(folder: Path, most: int, rounds: int) -> list[Row]:
         file = folder / f"topics{count}.xml"
         file.write_text(topics_policy(count))
         taken = _timed(
-            lambda _, file=file: create_permission(root, "/big", read_policy(file), now=now),  # type: ignore[misc]
+            lambda _, file=file: create_permission(root, ["/big"], read_policy(file), now=now),  # type: ignore[misc]
             rounds,
         )
         limit = "0.5 s" if count == most else "-"

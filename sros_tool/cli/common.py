@@ -63,6 +63,42 @@ def dry_run_option(function: Decorated) -> Decorated:
     )(function)
 
 
+def several_enclaves(function: Decorated) -> Decorated:
+    """Add ``--all`` and ``--match PATTERN`` to a verb that takes several enclaves."""
+    function = click.option(
+        "--match",
+        "patterns",
+        multiple=True,
+        metavar="PATTERN",
+        help="All enclaves that match, such as '/arm/*'; * also matches '/'.  Can be repeated.",
+    )(function)
+    return click.option("--all", "every", is_flag=True, help="All enclaves of the keystore.")(
+        function
+    )
+
+
+def chosen_enclaves(
+    root: Path, names: Sequence[str], patterns: Sequence[str], *, every: bool
+) -> tuple[str, ...]:
+    """Return the enclaves that the arguments and the options of `several_enclaves` name.
+
+    Raises:
+        UsageError: none is named.
+        KeystoreError: a pattern matches none.
+    """
+    from sros_tool.keystore.layout import select_enclaves
+
+    if not (names or patterns or every):
+        raise UsageError(
+            "no enclave is named",
+            "",
+            "Name one or more, such as /talker, or give --match PATTERN or --all.",
+        )
+    if not (patterns or every):
+        return tuple(names)  # the verb says what is wrong with a name
+    return select_enclaves(root, names, patterns, every=every)
+
+
 def output_option(help_text: str) -> Callable[[Decorated], Decorated]:
     """Add ``-o FILE`` to a verb that writes a policy."""
     return click.option("-o", "--output", type=PATH, metavar="FILE", help=help_text)

@@ -22,6 +22,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     print_plan,
+    several_enclaves,
     split_root,
     visible,
 )
@@ -51,14 +52,7 @@ Example:
     required=True,
     shell_complete=complete_keystore_and_enclave,
 )
-@click.option("--all", "every", is_flag=True, help="Export all enclaves of the keystore.")
-@click.option(
-    "--match",
-    "patterns",
-    multiple=True,
-    metavar="PATTERN",
-    help="Export matching enclaves, such as '/arm/*'; * also matches '/'.  Can be repeated.",
-)
+@several_enclaves
 @click.option("--force", is_flag=True, help="Replace files in TARGET that differ.")
 @dry_run_option
 def distribute_key(
@@ -154,8 +148,21 @@ Example:
 @click.option(
     "--at", metavar="MOMENT", help="Check as of a date (2027-06-01) or time from now (90d)."
 )
+@click.option(
+    "--match",
+    "patterns",
+    multiple=True,
+    metavar="PATTERN",
+    help="Only enclaves that match, such as '/arm/*'.  Can be repeated.",
+)
 @json_option
-def verify(folder: Path | None, domain: str | None, at: str | None, as_json: bool) -> int:
+def verify(
+    folder: Path | None,
+    domain: str | None,
+    at: str | None,
+    patterns: tuple[str, ...],
+    as_json: bool,
+) -> int:
     """On a robot: report whether the enclaves in DIR, or the enclave DIR, can be used.
 
     Checks that enclaves are complete, consistent, valid and loadable, that only the owner can read
@@ -165,11 +172,14 @@ def verify(folder: Path | None, domain: str | None, at: str | None, as_json: boo
     from sros_tool.checks.keystores.arrival import verify_arrival
     from sros_tool.cli.check import finding_lines
     from sros_tool.cli.common import local_zone
+    from sros_tool.keystore.layout import select_enclaves
     from sros_tool.validity import iso
 
     folder = folder or keystore_from_environment()
     wanted, moment = domain_of(domain), moment_of(at)
-    arrival = verify_arrival(folder, now=moment, domain=wanted, zone=local_zone(os.environ))
+    only = select_enclaves(folder, (), patterns) if patterns else None
+    zone = local_zone(os.environ)
+    arrival = verify_arrival(folder, now=moment, domain=wanted, zone=zone, only=only)
     if as_json:
         print_json({**arrival.as_json(), "at": iso(moment), "domain": wanted})
         return 1 if arrival.findings else 0

@@ -85,12 +85,13 @@ def _complete_enclave(
 
 
 _IGNORED = {
-    "": ("infrastructure",),
+    "": ("infrastructure", "patterns"),
     "--who": ("infrastructure", "policy", "all_vendors"),
-    "--reach": ("kind", "vendor", "all_vendors", "moment", "domain", "time_zone"),
-    "--log": ("infrastructure", "kind", "policy", "vendor", "all_vendors"),
+    "--reach": ("patterns", "kind", "vendor", "all_vendors", "moment", "domain", "time_zone"),
+    "--log": ("infrastructure", "patterns", "kind", "policy", "vendor", "all_vendors"),
 }
 """The parameters that have no effect, for each of the options that choose a mode."""
+_GOES_WITH = {"infrastructure": "--reach only", "patterns": "--who only"}
 
 
 def _refuse_ignored(mode: str) -> None:
@@ -100,7 +101,7 @@ def _refuse_ignored(mode: str) -> None:
         name = parameter.name or ""
         if name in _IGNORED[mode] and context.params[name]:
             option = parameter.opts[0]
-            text = f"{mode} takes no {option}" if mode else f"{option} goes with --reach only"
+            text = f"{mode} takes no {option}" if mode else f"{option} goes with {_GOES_WITH[name]}"
             raise UsageError(text, "", "Leave it out.")
 
 
@@ -160,6 +161,13 @@ Example:
 )
 @click.option("--who", is_flag=True, help="Show which enclaves of the keystore may do it.")
 @click.option(
+    "--match",
+    "patterns",
+    multiple=True,
+    metavar="PATTERN",
+    help="With --who: only enclaves that match, such as '/arm/*'.  Can be repeated.",
+)
+@click.option(
     "--reach",
     metavar="ENCLAVE",
     shell_complete=_complete_enclave,
@@ -183,6 +191,7 @@ def explain(
     domain: str | None,
     time_zone: str | None,
     who: bool,
+    patterns: tuple[str, ...],
     reach: str | None,
     infrastructure: bool,
     log: str | None,
@@ -208,7 +217,7 @@ def explain(
     if log is not None:
         return _show_log(log, root, rest, context, as_json)
     if who:
-        return _show_who(root, rest, kind, vendor, context, as_json)
+        return _show_who(root, rest, kind, vendor, context, patterns, as_json)
     return _show_answer(root, rest, kind, policy, vendor, all_vendors, context, as_json)
 
 
@@ -722,12 +731,13 @@ def _show_who(
     kind: str | None,
     vendor: str | None,
     options: _ContextOptions,
+    patterns: tuple[str, ...],
     as_json: bool,
 ) -> int:
     """Print which enclaves of the keystore may do something; return 0 if any may, else 1."""
     from sros_tool.explain.question import ask
     from sros_tool.explain.who import who
-    from sros_tool.keystore.layout import check_keystore
+    from sros_tool.keystore.layout import check_keystore, select_enclaves
 
     if not 1 <= len(rest) <= 2:
         raise UsageError(
@@ -737,7 +747,8 @@ def _show_who(
     chosen, why = _vendor_of(vendor)
     keystore = root or keystore_from_environment()
     check_keystore(keystore)
-    found = who(keystore, question, chosen, options.context, at=options.at)
+    names = select_enclaves(keystore, (), patterns) if patterns else None
+    found = who(keystore, question, chosen, options.context, at=options.at, names=names)
     allowed = any(each.outcome.ok for each in found)
     if as_json:
         print_json(
@@ -756,7 +767,7 @@ def _show_who(
         click.echo(f"{question}, on {chosen.title} ({why}{documented})", err=True)
         if question.word == "call" and not kind and not allowed:
             action = ask("call", question.name, "action")
-            as_action = who(keystore, action, chosen, options.context, at=options.at)
+            as_action = who(keystore, action, chosen, options.context, at=options.at, names=names)
             if any(each.outcome.ok for each in as_action):
                 text = f"enclaves may {action}: add --type action if it is an action."
                 print_notes([Note("explain.an-action", text)])

@@ -10,6 +10,7 @@ import click
 from sros_tool.cli.common import (
     PATH,
     SeveralValues,
+    chosen_enclaves,
     complete_keystore_and_enclave,
     complete_template,
     dry_run_option,
@@ -22,6 +23,7 @@ from sros_tool.cli.common import (
     print_plan,
     progress_bar,
     ros_domain,
+    several_enclaves,
     split_root,
 )
 from sros_tool.errors import UsageError
@@ -74,28 +76,32 @@ def create_enclave(words: tuple[str, ...], dry_run: bool) -> None:
     epilog="""\b
 Example:
   $ sros create_permission keystore /talker_listener/talker policy.xml
-  replaced the permissions of enclave /talker_listener/talker""",
+  replaced the permissions of enclave /talker_listener/talker
+  $ sros create_permission keystore --match '/arm/*' policy.xml""",
 )
 @click.argument(
     "words",
-    metavar="[ROOT] NAME POLICY_FILE",
+    metavar="[ROOT] [NAME...] POLICY_FILE",
     nargs=-1,
     required=True,
     shell_complete=complete_keystore_and_enclave,
 )
+@several_enclaves
 @dry_run_option
-def create_permission(words: tuple[str, ...], dry_run: bool) -> None:
-    """Give the enclave NAME the permissions that POLICY_FILE states for it."""
+def create_permission(
+    words: tuple[str, ...], every: bool, patterns: tuple[str, ...], dry_run: bool
+) -> None:
+    """Give the enclaves NAME... the permissions that POLICY_FILE states for them: all or none."""
     from sros_tool.keystore.lifecycle.create import create_permission as create
     from sros_tool.policy.document import read_policy
 
     root, rest = split_root(words)
-    if len(rest) != 2:
-        raise UsageError("create_permission takes a keystore, an enclave and a policy file")
-    name, file = rest
+    if len(rest) < (1 if every or patterns else 2):
+        raise UsageError("create_permission takes a keystore, one or more enclaves and a policy")
+    *given, file = rest
     result = create(
         root,
-        name,
+        chosen_enclaves(root, given, patterns, every=every),
         read_policy(PATH.convert(file, None, None)),
         now=now(),
         domain=ros_domain(),

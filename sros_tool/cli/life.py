@@ -9,6 +9,7 @@ import click
 
 from sros_tool.cli.common import (
     PATH,
+    chosen_enclaves,
     complete_keystore_and_enclave,
     dry_run_option,
     json_option,
@@ -19,6 +20,7 @@ from sros_tool.cli.common import (
     print_notes,
     print_plan,
     progress_bar,
+    several_enclaves,
     split_root,
 )
 from sros_tool.errors import UsageError
@@ -45,6 +47,7 @@ Example:
     nargs=-1,
     shell_complete=complete_keystore_and_enclave,
 )
+@several_enclaves
 @click.option(
     "--all-expiring",
     metavar="DURATION|PERCENT",
@@ -59,6 +62,8 @@ Example:
 @dry_run_option
 def renew(
     words: tuple[str, ...],
+    every: bool,
+    patterns: tuple[str, ...],
     all_expiring: str | None,
     new_key: bool,
     revoke_old: bool,
@@ -77,8 +82,8 @@ def renew(
     from sros_tool.keystore.lifecycle.renew import renew as work
 
     root, names = split_root(words)
-    if not names and all_expiring is None:
-        raise UsageError("no enclave is named", "", "Name one or more, or give --all-expiring 30d.")
+    if names or patterns or every or all_expiring is None:
+        names = chosen_enclaves(root, names, patterns, every=every)
     threshold = parse_threshold(all_expiring) if all_expiring is not None else None
     with progress_bar(len(names) or 50) as step:
         result = work(
@@ -139,11 +144,11 @@ Example:
 )
 @click.argument(
     "words",
-    metavar="[ROOT] NAME...",
+    metavar="[ROOT] [NAME...]",
     nargs=-1,
-    required=True,
     shell_complete=complete_keystore_and_enclave,
 )
+@several_enclaves
 @click.option(
     "--reason",
     default="unspecified",
@@ -157,7 +162,14 @@ Example:
     help="During a CA rotation: revoke without the key of the old identity CA.",
 )
 @dry_run_option
-def revoke(words: tuple[str, ...], reason: str, until_retired: bool, dry_run: bool) -> None:
+def revoke(
+    words: tuple[str, ...],
+    every: bool,
+    patterns: tuple[str, ...],
+    reason: str,
+    until_retired: bool,
+    dry_run: bool,
+) -> None:
     """Revoke the enclaves NAME...: processes that load the new crl.pem refuse them.
 
     Their files move to the folder "revoked" of the keystore.  Export the other enclaves to their
@@ -169,9 +181,8 @@ def revoke(words: tuple[str, ...], reason: str, until_retired: bool, dry_run: bo
     """
     from sros_tool.keystore.lifecycle.revoke import revoke as work
 
-    root, names = split_root(words)
-    if not names:
-        raise UsageError("no enclave is named", "", "Name one or more, such as /talker.")
+    root, given = split_root(words)
+    names = chosen_enclaves(root, given, patterns, every=every)
     words_of_rfc = reason.replace("-", "_").split("_")
     reason_text = words_of_rfc[0] + "".join(word.capitalize() for word in words_of_rfc[1:])
     result = work(

@@ -40,11 +40,12 @@ def who(
     context: Callable[[DomainSet | None], JoinContext],
     *,
     at: datetime,
+    names: Sequence[str] | None = None,
 ) -> tuple[EnclaveOutcome, ...]:
-    """Return the outcome of a question for every enclave of a keystore, sorted by name.
+    """Return the outcome of a question for enclaves of a keystore, sorted by name.
 
     ``context`` gives domain and time for an enclave by its domains; ``at`` is the time at which
-    the files are checked.
+    the files are checked.  Without ``names``, the question is asked for every enclave.
     """
 
     def work(names: Sequence[str]) -> list[EnclaveOutcome]:
@@ -58,5 +59,6 @@ def who(
             name, answer.outcome, decision.reason, decision.text, decision.expression or ""
         )
 
-    found = [each for _, part in map_slices(enclave_names(root), work) for each in part]
+    names = enclave_names(root) if names is None else names
+    found = [each for _, part in map_slices(names, work) for each in part]
     return tuple(sorted(found, key=lambda each: each.enclave))

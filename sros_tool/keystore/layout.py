@@ -9,6 +9,7 @@ import errno
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from shlex import quote
 
@@ -292,6 +293,30 @@ def list_enclaves(root: Path) -> tuple[str, ...]:
     """
     check_keystore(root)
     return enclave_names(root)
+
+
+def select_enclaves(
+    root: Path, names: Sequence[str], patterns: Sequence[str] = (), *, every: bool = False
+) -> tuple[str, ...]:
+    """Return ``names``, then the enclaves that match ``patterns``, or ``every`` one; each once.
+
+    In a pattern ``*`` stands for any part of a name, "/" included, as in policies.
+
+    Raises:
+        KeystoreError: a pattern matches no enclave, or ``every`` is given and there is none.
+    """
+    existing = list_enclaves(root)
+    chosen = dict.fromkeys(names)
+    for pattern in ("*",) if every else patterns:
+        fitting = [name for name in existing if fnmatchcase(name, pattern)]
+        if not fitting:
+            raise KeystoreError(
+                f"no enclave of keystore '{root}' matches {pattern!r}",
+                "",
+                f"See `sros list_enclaves {root}`.",
+            )
+        chosen |= dict.fromkeys(fitting)
+    return tuple(chosen)
 
 
 def check_keystore(root: Path) -> None:

@@ -138,7 +138,7 @@ def test_a_keystore_without_a_ledger_gets_one(tmp_path: Path) -> None:
         renew(root, ["/a"], now=NOW)
     policy = tmp_path / "p.xml"
     policy.write_text(policy_text({"/a": publish("x")}))
-    create_permission(root, "/a", read_policy(policy), now=NOW)
+    create_permission(root, ["/a"], read_policy(policy), now=NOW)
     renew(root, ["/a"], now=NOW)
     both = [("certificate", "/a"), ("permissions", "/a")]
     assert told(root) == [("gap", ""), ("permissions", "/a"), *both]

@@ -230,7 +230,7 @@ def test_other_commands_handle_an_enclave_whose_key_is_on_its_robot(
 ) -> None:
     sign(home, robot)
     (tmp_path / "p.xml").write_text(policy_text({NAME: publish("new"), "/base": publish("new")}))
-    create_permission(home, NAME, read_policy(tmp_path / "p.xml"), now=NOW)
+    create_permission(home, [NAME], read_policy(tmp_path / "p.xml"), now=NOW)
     assert topics_of(home / FOLDER) == {"rt/new", "ros_discovery_info"}
     assert create_enclaves(home, [NAME], now=NOW).kept == (NAME,)
     before = certificate(home / FOLDER / "cert.pem")

@@ -43,10 +43,10 @@ def root(tmp_path: Path) -> Path:
     root = tmp_path / "ks"
     create_keystore(root, template=load_template("development"), now=NOW)
     create_enclaves(root, ["/a"], now=NOW)
-    create_permission(root, "/a", policy(tmp_path, "rosout", "wide"), now=NOW)
+    create_permission(root, ["/a"], policy(tmp_path, "rosout", "wide"), now=NOW)
     for file in FILES:
         (tmp_path / file).write_bytes((root / "enclaves/a" / file).read_bytes())
-    create_permission(root, "/a", policy(tmp_path, "rosout"), now=NOW)
+    create_permission(root, ["/a"], policy(tmp_path, "rosout"), now=NOW)
     return root
 
 
@@ -114,7 +114,7 @@ def test_a_cut_ledger_does_not_vouch_for_them(
     with pytest.raises(KeystoreError, match="not certain that"):
         renew(root, ["/a"], now=NOW)
     # The way out that the error names.
-    create_permission(root, "/a", policy(tmp_path, "rosout"), now=NOW)
+    create_permission(root, ["/a"], policy(tmp_path, "rosout"), now=NOW)
     renew(root, ["/a"], now=NOW)
     assert "wide" not in str(topics_of(root / "enclaves/a"))
 
@@ -219,5 +219,5 @@ def test_a_ledger_from_before_the_chain_vouches_for_no_rights(root: Path, tmp_pa
     with pytest.raises(KeystoreError, match="not certain that") as caught:
         renew(root, ["/a"], now=NOW)
     assert "whether a line was removed" in caught.value.why
-    create_permission(root, "/a", policy(tmp_path, "rosout"), now=NOW)
+    create_permission(root, ["/a"], policy(tmp_path, "rosout"), now=NOW)
     renew(root, ["/a"], now=NOW)

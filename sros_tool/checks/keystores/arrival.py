@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
@@ -92,7 +93,12 @@ class Arrival:
 
 
 def verify_arrival(
-    path: Path, *, now: datetime, domain: int | None = None, zone: tzinfo = UTC
+    path: Path,
+    *,
+    now: datetime,
+    domain: int | None = None,
+    zone: tzinfo = UTC,
+    only: Sequence[str] | None = None,
 ) -> Arrival:
     """Return the state of the enclaves in a robot's folder, or of one enclave, with findings.
 
@@ -104,15 +110,18 @@ def verify_arrival(
         now: the moment to check for.
         domain: the ROS domain that the enclaves have to join.
         zone: the time zone of the robot.
+        only: the enclaves to check; None for all of them and the folder itself.
 
     Raises:
         DocumentError: ``path`` is neither of them.
     """
     if is_keystore(path):
-        root, names, only = path, search_enclaves(path)[0], None
+        root, kind = path, "keystore"
+        names = search_enclaves(path)[0] if only is None else tuple(only)
     elif path.is_dir() and is_enclave(path):
         root, name = locate_enclave(path)
-        names = only = (name,)
+        names, kind = (name,), "enclave"
+        only = names
     else:
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
@@ -126,7 +135,7 @@ def verify_arrival(
     return Arrival(
         path,
         root,
-        "enclave" if only else "keystore",
+        kind,
         tuple(_enclave(root, name, now, domain) for name in names),
         tuple(each for each in found if each in shown or each.kind is WAITS),
     )

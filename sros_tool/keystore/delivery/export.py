@@ -6,7 +6,6 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 from sros_tool.errors import KeystoreError
@@ -24,6 +23,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     key_on_robot,
     list_enclaves,
+    select_enclaves,
 )
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import open_enclave
@@ -65,28 +65,18 @@ def select(
 ) -> ExportSelection:
     """Return the enclaves to export: ``names``, and the matches of ``patterns``, or ``every`` one.
 
-    In a pattern ``*`` stands for any part of a name, "/" included, as in policies.  An enclave
-    whose key is on its robot is left out if it only matches a pattern; a named one is refused by
-    `distribute`.
+    An enclave whose key is on its robot is left out if it only matches a pattern; a named one is
+    refused by `distribute`.
 
     Raises:
         KeystoreError: a pattern matches no enclave, or the keys of all matches are on robots.
     """
-    existing = list_enclaves(root)
-    chosen = list(dict.fromkeys(names))
+    chosen: list[str] = []
     left_out: list[str] = []
-    for pattern in ("*",) if every else patterns:
-        fitting = [name for name in existing if fnmatchcase(name, pattern)]
-        if not fitting:
-            raise KeystoreError(
-                f"no enclave of keystore '{root}' matches {pattern!r}",
-                "",
-                f"See `sros list_enclaves {root}`.",
-            )
-        for name in fitting:
-            if name in chosen or name in left_out:
-                continue
-            (left_out if key_on_robot(enclave_path(root, name)) else chosen).append(name)
+    for name in select_enclaves(root, names, patterns, every=every):
+        only_matches = name not in names
+        at_robot = only_matches and key_on_robot(enclave_path(root, name))
+        (left_out if at_robot else chosen).append(name)
     if not chosen:
         raise KeystoreError(
             f"the keys of {', '.join(left_out)} are not in keystore '{root}'",

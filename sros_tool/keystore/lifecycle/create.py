@@ -168,7 +168,7 @@ def create_enclaves(
 
 def create_permission(
     root: Path,
-    name: str,
+    names: Sequence[str],
     policy: Policy,
     *,
     now: datetime,
@@ -176,18 +176,20 @@ def create_permission(
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
 ) -> Creation:
-    """Replace the permissions of an existing enclave with the rights in ``policy``."""
-    check_enclave_name(name)
+    """Replace the permissions of existing enclaves with their rights in ``policy``: all or none."""
+    for name in names:
+        check_enclave_name(name)
     if not dry_run:
         tidy(root)
     check_keystore(root)
     existing = set(enclave_names(root))
-    if name not in existing:
-        raise no_such_enclave(root, name, existing)
-    enclave = stated_enclave(policy, name)
+    for name in names:
+        if name not in existing:
+            raise no_such_enclave(root, name, existing)
+    wanted = {name: stated_enclave(policy, name) for name in names}
     with Transaction(root, dry_run=dry_run) as transaction:
         keystore = _open_keystore(transaction, domain, keyring, now)
-        return _write_enclaves(transaction, keystore, {name: enclave}, now)
+        return _write_enclaves(transaction, keystore, dict(wanted), now)
 
 
 def generate_artifacts(
