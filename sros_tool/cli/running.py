@@ -11,7 +11,7 @@ from pathlib import Path
 import click
 
 from sros_tool.cli.common import complete_keystore_and_enclave, now, split_root
-from sros_tool.errors import KeystoreError, UnavailableError, UsageError
+from sros_tool.errors import KeystoreError, SrosError, UnavailableError, UsageError
 
 _COMMAND = "sros.command"
 _WORDS = click.argument(
@@ -52,15 +52,21 @@ Example:
 def env(words: tuple[str, ...], form: str, as_json: bool, domain: str | None) -> None:
     """Print the environment variables that make a process run in the enclave NAME.
 
-    The strategy is Enforce: a process that cannot run in the enclave does not start.
+    The strategy is Enforce: a process that cannot run in the enclave does not start. If the
+    variables cannot be given, those that are printed let no node start, except with JSON.
     """
-    from sros_tool.runtime.environment import render_environment
+    from sros_tool.runtime.environment import render_environment, render_refusal
 
-    root, rest = split_root(words)
-    if len(rest) != 1:
-        raise UsageError("env takes a keystore and one enclave")
-    variables = loadable_environment(root, rest[0], domain)
-    click.echo(render_environment(variables, "json" if as_json else form), nl=False)
+    form = "json" if as_json else form
+    try:
+        root, rest = split_root(words)
+        if len(rest) != 1:
+            raise UsageError("env takes a keystore and one enclave")
+        text = render_environment(loadable_environment(root, rest[0], domain), form)
+    except (SrosError, OSError):
+        click.echo(render_refusal(form), nl=False)
+        raise
+    click.echo(text, nl=False)
 
 
 class _WithCommand(click.Command):

@@ -79,6 +79,19 @@ def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
     }
 
 
+def render_refusal(form: str) -> str:
+    """Return text that keeps a node from starting, for a form that cannot be given its variables.
+
+    What reads nothing, as a shell that evaluates an empty output, would start nodes unsecured.
+    With Enforce and no keystore, rcl starts none; in a shell, the text also fails as a command.
+    JSON has no such text: "".
+    """
+    if form == "json":
+        return ""
+    refusing = {KEYSTORE: "", ENABLE: "true", STRATEGY: "Enforce"}
+    return render_environment(refusing, form) + ("false\n" if form in ("sh", "fish") else "")
+
+
 def render_environment(variables: Mapping[str, str], form: str) -> str:
     """Return the variables as text in a form: sh, fish, json, systemd or docker.
 

@@ -151,6 +151,32 @@ def test_root_with_any_name(name: str, tmp_path: Path) -> None:
     run(["sh", "-c", script, "sh", *PROGRAM, "env", root, "/robot/arm"], cwd=tmp_path)
 
 
+@pytest.mark.parametrize("shell", ["sh", "bash", "zsh", "fish"])
+def test_a_shell_that_evaluates_a_refusal_starts_no_node(shell: str, tmp_path: Path) -> None:
+    """An empty text would evaluate well, and the next command run unsecured, even with set -e."""
+    if not shutil.which(shell):
+        pytest.skip(f"there is no {shell}")
+    form = "fish" if shell == "fish" else "sh"
+    ended = sros("env", tmp_path / "none", "/a", "--format", form)
+    assert ended.status != 0
+    status = "$status" if shell == "fish" else "$?"
+    names = "$ROS_SECURITY_ENABLE $ROS_SECURITY_STRATEGY [$ROS_SECURITY_KEYSTORE]"
+    env = {**os.environ, "ROS_SECURITY_KEYSTORE": "/srv/earlier"}
+    script = "eval $argv[1]" if shell == "fish" else 'eval "$1"'
+    words = [ended.out] if shell == "fish" else [shell, ended.out]
+    done = run([shell, "-c", f'{script}; echo "{status} {names}"', *words], env=env)
+    assert done.stdout.split() == ["1", "true", "Enforce", "[]"]
+    if shell != "fish":
+        run([shell, "-c", f"set -e; {script}; echo more", *words], env=env, status=1)
+
+
+@pytest.mark.parametrize("form", ["systemd", "docker", "json"])
+def test_a_file_with_a_refusal_starts_no_node(form: str, tmp_path: Path) -> None:
+    said = sros("env", tmp_path / "none", "/a", "--format", form).out
+    for each in ("ROS_SECURITY_ENABLE=true", "ROS_SECURITY_STRATEGY=Enforce"):
+        assert (each in said) is (form != "json")
+
+
 def test_root_is_the_working_folder_and_was_not_empty(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     sros("create_keystore", ".", cwd=tmp_path).ok()
