@@ -176,6 +176,12 @@ def check(
     if as_list:
         _print_kinds(selection, form)
         return 0
+    if family == "runtime" and policies:
+        raise UsageError(
+            "`check runtime` compares nothing with a policy",
+            "",
+            f"`sros audit {policies[0]}` reports what a policy would deny to the running robot.",
+        )
     at = replace(_circumstances(domain, moment, policies), distribution=_distribution(distribution))
     found = [_shown(each) for each in _findings(family, paths, at)]
     chosen = selection.choose(found)

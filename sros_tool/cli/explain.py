@@ -480,7 +480,7 @@ def _answer_lines(
     may = f"yes: {enclave.name} may" if answer.allowed else f"no: {enclave.name} may not"
     documented = ", as documented" if answer.as_documented else ""
     yield f"{may} {answer.question}, on {answer.vendor.title} ({why}{documented})"
-    yield _row("why", _reason(decision))
+    yield _row("why", decision.clause)
     yield from (_row("and", str(each)) for each in answer.problems[1:])
     if len(answer.parts) > 1 and not answer.allowed:
         for part, decided in answer.parts:
@@ -513,12 +513,6 @@ def _answer_lines(
 
 def _row(label: str, text: str) -> str:
     return f"  {label:{_LABEL_WIDTH}}{text}"
-
-
-def _reason(decision: Decision) -> str:
-    """Return the text of a decision without the vendor's name before it."""
-    _, colon, text = decision.text.partition(": ")
-    return (text if colon else decision.text).removesuffix(".")
 
 
 def _shown(source: Source) -> str:
@@ -587,7 +581,7 @@ def _table_lines(enclave: LoadedEnclave, answers: Sequence[Answer]) -> Iterator[
     width = max(len(each.vendor.title) for each in answers)
     for answer in answers:
         remark = " (as documented)" if answer.as_documented else ""
-        reason = _reason(answer.decision)
+        reason = answer.decision.clause
         yield f"  {answer.vendor.title:{width}}  {answer.outcome:11}  {reason}{remark}"
     yield _differences(answers)
 

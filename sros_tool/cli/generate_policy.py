@@ -231,7 +231,7 @@ def _json(plan: Draft, learned: Learned, observation: Observation, dry_run: bool
 
     return {
         "file": str(plan.path),
-        "source": "log" if learned.from_log else "graph",
+        "source": learned.source.value,
         "created": plan.before is None,
         "changed": plan.changes,
         "dry_run": dry_run,
@@ -243,8 +243,10 @@ def _json(plan: Draft, learned: Learned, observation: Observation, dry_run: bool
 
 
 def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
+    from sros_tool.graph.learn import RightsFound
     from sros_tool.policy.merge import merge_notes
 
+    from_log = learned.source is RightsFound.LOG
     would = "" if written else "would have "
     if plan.before is None:
         enclaves = {each.enclave for each in learned.profiles}
@@ -256,9 +258,9 @@ def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
     elif plan.added:
         click.echo(f"{would}added {_count(len(plan.added), 'right')} to '{plan.path}'")
     else:
-        known = "denied" if learned.from_log else "observed"
+        known = "denied" if from_log else "observed"
         click.echo(f"nothing to add: '{plan.path}' already covers everything that was {known}")
-    if plan.before is not None or learned.from_log:
+    if plan.before is not None or from_log:
         for each in plan.added:
             click.echo(f"  {each}")
     if plan.copies:

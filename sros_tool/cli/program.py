@@ -71,6 +71,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "check": VerbEntry(
             "check", "Find errors and weaknesses in policies, keystores, the runtime."
         ),
+        "audit": VerbEntry("audit", "Report what a policy would deny to the running robot."),
         "doctor": VerbEntry("check", "Find out which DDS here enforces security."),
     },
     "Running": {
@@ -215,6 +216,7 @@ _PHRASES = {
     "crl": "show or sign the revocation list",
     "completion": "print the completion script",
     "doctor": "examine this machine",
+    "audit": "audit the robot",
 }
 
 

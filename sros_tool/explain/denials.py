@@ -17,7 +17,14 @@ from dataclasses import dataclass, field, replace
 
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import Note, UsageError
-from sros_tool.graph.learn import CommonParts, Learned, LearnedProfile, NodeRight, groups_of
+from sros_tool.graph.learn import (
+    CommonParts,
+    Learned,
+    LearnedProfile,
+    NodeRight,
+    RightsFound,
+    groups_of,
+)
 from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.names import (
     ACTION_SEPARATOR,
@@ -276,7 +283,7 @@ def as_learned(
         )
         if found
     ]
-    return Learned(tuple(profiles), (*_notes(missing), *notes), from_log=True)
+    return Learned(tuple(profiles), (*_notes(missing), *notes), source=RightsFound.LOG)
 
 
 def _by_enclave(missing: MissingRights, enclave: str) -> dict[str, frozenset[NodeRight]]:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from sros_tool.errors import DocumentError, PolicyError
 from sros_tool.files import new_files, replace_file
-from sros_tool.graph.learn import CommonParts, Learned, LearnedProfile
+from sros_tool.graph.learn import CommonParts, Learned, LearnedProfile, RightsFound
 from sros_tool.names import check_namespace
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.merge import Contradiction, EditedText, PlacedElement, merge_into
@@ -24,16 +24,24 @@ from sros_tool.xml import read_bytes
 _XINCLUDE = "http://www.w3.org/2001/XInclude"
 _UNIT = "  "
 _DECLARATION = """<?xml version="1.0" encoding="UTF-8"?>\n"""
-_OBSERVED = """\
+_HEADERS = {
+    RightsFound.GRAPH: """\
 <!-- Written by sros generate_policy: rights that the robot was observed to use.
      Review it before you enforce it: rights that were not observed are not allowed, and rights
      that were observed may be unwanted. -->
-"""
-_FROM_LOG = """\
+""",
+    RightsFound.LOG: """\
 <!-- Written by sros generate_policy: rights that were denied, by the lines of logs.
      Review it before you enforce it: a process can print any line, also one that looks like a
      denial, to get a right that it should not have. -->
-"""
+""",
+    RightsFound.AUDIT: """\
+<!-- Written by sros audit: rights that nodes were observed to use, and that the policy or keystore
+     denies. Review it before you add it (sros merge_policy): rights that were observed may be
+     unwanted. -->
+""",
+}
+"""The comment at the head of a learned policy."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +172,7 @@ def render(learned: Learned) -> bytes:
             lines.append("        </profile>")
         lines += ["      </profiles>", "    </enclave>"]
     lines += ["  </enclaves>", "</policy>", ""]
-    header = _DECLARATION + (_FROM_LOG if learned.from_log else _OBSERVED)
+    header = _DECLARATION + _HEADERS[learned.source]
     return (header + "\n".join(lines)).encode()
 
 

@@ -22,7 +22,7 @@ from sros_tool.graph.observation import (
 from sros_tool.names import expand
 from sros_tool.translate import dds_names
 
-_UNSHOWN = ("/",)
+UNSHOWN = ("/",)
 """The enclaves of a node whose enclave the graph does not show."""
 
 _CONTAINER = "~/_container/load_node"
@@ -46,7 +46,7 @@ def enclave_per_node(observation: Observation) -> NamedEnclaves:
     """
     processes: dict[str, list[ObservedNode]] = {}
     for node in observation.nodes:
-        if node.enclaves == _UNSHOWN and not is_tool(node.name):
+        if node.enclaves == UNSHOWN and not is_tool(node.name):
             processes.setdefault(node.participant, []).append(node)
     names = {participant: _enclave_name(nodes) for participant, nodes in processes.items()}
     nodes = [

@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
@@ -52,16 +53,24 @@ class LearnedProfile:
     groups: tuple[Group, ...]
 
 
+class RightsFound(StrEnum):
+    """Where learned rights come from: observed, denied by the lines of a log, or missing."""
+
+    GRAPH = "graph"
+    LOG = "log"
+    AUDIT = "audit"
+
+
 @dataclass(frozen=True, slots=True)
 class Learned:
     """The result of learning: profiles sorted by enclave and node, and notes.
 
-    ``from_log`` says that the rights come from lines of logs, not from the ROS graph.
+    ``source`` says where the rights come from.
     """
 
     profiles: tuple[LearnedProfile, ...]
     notes: tuple[Note, ...] = ()
-    from_log: bool = False
+    source: RightsFound = RightsFound.GRAPH
 
     def noting(self, notes: Iterable[Note]) -> Learned:
         """Return the same with these notes before its own."""

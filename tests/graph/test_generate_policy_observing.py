@@ -3,41 +3,26 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.support.harness import Ended, sros
+from tests.graph.fake_graph import Beside, graph
+from tests.support.harness import Ended
 
-FAKE = Path(__file__).with_name("fake_rclpy.py")
+pytest_plugins = ["tests.graph.beside"]
+
 NO_NODES = "No nodes detected in the ROS graph. No policy file was generated."
 
 Program = Callable[..., Ended]
 
 
 @pytest.fixture
-def program(
-    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
-) -> Program:
+def program(beside_graph: Beside) -> Program:
     """Runs ``sros generate_policy`` in ``tmp_path`` beside the graph that it is given."""
-    place = tmp_path_factory.mktemp("fake")
-    for module in ("__init__", "parameter", "signals"):
-        (place / "rclpy").mkdir(exist_ok=True)
-        shutil.copy(FAKE, place / "rclpy" / f"{module}.py")
-    monkeypatch.syspath_prepend(str(place))
-
-    def run(graph: dict[str, Any], *words: str, **environment: str) -> Ended:
-        env = {"PYTHONPATH": str(place), "FAKE_GRAPH": json.dumps(graph), **environment}
-        return sros("generate_policy", *words, env=env, cwd=tmp_path)
-
-    return run
-
-
-def graph(*nodes: tuple[str, str, str, str, list[str]], rmw: str = "rmw_fake") -> dict[str, Any]:
-    return {"nodes": nodes, "rmw": rmw}
+    return partial(beside_graph, "generate_policy")
 
 
 TALKER = ("/talker", "/", "talker", "01", ["publish rt/chatter"])

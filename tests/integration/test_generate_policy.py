@@ -610,8 +610,8 @@ BEATS = "new: /steady (/steady) publish /beat"
 STEADY = process("/steady", node("steady", publish=["beat"]))
 
 
-def stopped(words: str, number: signal.Signals, once: str) -> dict[str, Any]:
-    """A command that gets a signal once it has said a text ("": once it looks at the graph)."""
+def stopped(words: str, number: signal.Signals, *once: str) -> dict[str, Any]:
+    """A command that gets a signal once it has said all texts (none: once it looks around)."""
     return {"words": words.split(), "signal": int(number), "once": once}
 
 
@@ -651,7 +651,7 @@ def test_a_signal_ends_a_watch_and_the_policy_is_written(
 
 
 def test_ctrl_c_in_a_snapshot_writes_nothing(tmp_path: Path) -> None:
-    command = stopped("generate_policy none.xml --spin-time 3600", signal.SIGINT, "")
+    command = stopped("generate_policy none.xml --spin-time 3600", signal.SIGINT)
     (ended,) = live(DOMAIN + 2, tmp_path, [], command)
     assert (ended.status, ended.err.strip()) == (130, "sros: interrupted")
     assert list(tmp_path.iterdir()) == []

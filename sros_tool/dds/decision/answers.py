@@ -52,6 +52,12 @@ class Decision:
     expression: str | None = None
     topic_rule: TopicRule | None = None
 
+    @property
+    def clause(self) -> str:
+        """The text without the vendor's name before it and the full stop after it."""
+        _, colon, text = self.text.partition(": ")
+        return (text if colon else self.text).removesuffix(".")
+
 
 _REASONS = {
     "allow-rule": "an allow rule matches",

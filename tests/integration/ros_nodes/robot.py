@@ -5,8 +5,9 @@ and prints JSON.  A process is ``{"enclave", "nodes" (as in run_nodes.py), "argu
 all but visitors are ready before the first command.  A visitor starts when the first command has
 said the first of two texts (``visits``) on its stderr, and is killed when it has said the second.
 A command is ``{"words", "signal", "once"}``: the words after ``sros``, and the signal that it gets
-once it has said a text, or, where that is empty, once it looks at the graph.  The commands of one
-list run at the same time.  All is in a network of its own where the kernel allows it.
+once it has said all of these texts, or, where there are none, once it looks at the graph.  The
+commands of one list run at the same time.  All is in a network of its own where the kernel allows
+it.
 """
 
 from __future__ import annotations
@@ -105,9 +106,9 @@ def run(command: dict[str, Any], visitors: list[dict[str, Any]], folder: str) ->
         visitor.kill()
         visitor.wait()
     if "signal" in command:
-        if command["once"]:
-            running.wait_until_said(command["once"])
-        else:
+        for text in command["once"]:
+            running.wait_until_said(text)
+        if not command["once"]:
             running.wait_until_it_looks()
         running.process.send_signal(command["signal"])
     return running.end()

@@ -1,0 +1,286 @@
+"""The verb `audit`: try a policy on the running robot without denying anything."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from sros_tool.cli.common import (
+    PATH,
+    check_output,
+    dry_run_option,
+    force_option,
+    json_option,
+    keystore_from_environment,
+    local_zone,
+    now,
+    print_json,
+    print_notes,
+    save,
+    visible,
+)
+from sros_tool.cli.observing import (
+    Watching,
+    check_duration,
+    observe,
+    observer_environment,
+    observing_options,
+    why_empty,
+)
+from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.errors import SrosError, UnavailableError, UsageError
+from sros_tool.values import as_plain
+
+if TYPE_CHECKING:
+    from sros_tool.explain.audit import Audit, AuditedEnclaves
+    from sros_tool.explain.evaluator import JoinContext
+    from sros_tool.graph.observation import Observation
+
+_NOT_ASKED = 2
+"""The exit status if the question could not be asked; 1 says that something would be denied."""
+
+
+@click.command(
+    "audit",
+    cls=Watching,
+    epilog="""\b
+Example:
+  $ sros audit robot.xml
+  /talker publish topic /status (/talker): no rule allows publish rt/status
+  1 right would be denied of 2 nodes with 47 endpoints, on Fast DDS 2.14
+  $ sros audit robot.xml --watch 1h --patch missing.xml
+  watching for 3600 s, or until Ctrl-C; then the result is shown
+  denied: /talker publish topic /status (/talker): no rule allows ...
+  ...
+  wrote 'missing.xml'; add it: sros merge_policy robot.xml missing.xml ...
+  $ sros merge_policy robot.xml missing.xml --in-place
+
+Exit status: 0 if nothing would be denied, 1 if something would be, 2 if that could not be
+asked.""",
+)
+@click.argument("source", metavar="[POLICY|KEYSTORE]", type=PATH, required=False)
+@observing_options("Observe a robot that is secured already, in this enclave.")
+@click.option(
+    "--vendor",
+    type=click.Choice([each.value for each in Vendor]),
+    help="The vendor whose decision counts. [default: the vendor of this machine's RMW]",
+)
+@click.option(
+    "--patch",
+    type=PATH,
+    metavar="FILE",
+    help="Write the rights to add as a policy, for merge_policy.",
+)
+@force_option
+@dry_run_option
+@json_option
+def audit(
+    source: Path | None,
+    watch: str | None,
+    spin_time: float | None,
+    domain: str | None,
+    enclave: str | None,
+    keystore: Path | None,
+    vendor: str | None,
+    patch: Path | None,
+    force: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> int:
+    """Report what a policy or keystore would deny to the nodes that are running now.
+
+    Nothing is denied: DDS has no permissive mode, so sros observes the ROS graph and decides about
+    every endpoint as the DDS vendor would. A node is looked up in the enclave that the graph shows,
+    or else in the enclave whose profiles name it. Observes until the graph stops changing; what a
+    node does only later needs --watch. The default is the keystore of $ROS_SECURITY_KEYSTORE.
+    """
+    try:
+        return _audit(
+            source or keystore_from_environment(),
+            watch,
+            spin_time,
+            observer_environment(enclave, keystore, domain),
+            enclave,
+            vendor,
+            patch,
+            force=force,
+            dry_run=dry_run,
+            as_json=as_json,
+        )
+    except SrosError as error:
+        error.exit_status = _NOT_ASKED
+        raise
+
+
+def _audit(
+    source: Path,
+    watch: str | None,
+    spin_time: float | None,
+    environment: dict[str, str],
+    enclave: str | None,
+    vendor: str | None,
+    patch: Path | None,
+    *,
+    force: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> int:
+    from sros_tool.explain.audit import audit as judge
+
+    check_duration(watch, spin_time)
+    if force and patch is None:
+        raise UsageError("--force is for --patch only", "", "Leave it out.")
+    if patch is not None:
+        check_output(patch, force=force)
+    enclaves = _enclaves(source, vendor, environment)
+    reported: set[str] = set()
+
+    def report(observation: Observation) -> None:
+        for line in _lines(judge(observation, enclaves)):
+            if line not in reported:
+                reported.add(line)
+                click.echo(f"denied: {line}", err=True)
+
+    secured = enclave is not None
+    then = "the result is shown"
+    snapshot, rmw = observe(environment, watch, spin_time, report, secured=secured, then=then)
+    found = judge(snapshot.observation, enclaves)
+    if not found.observation.nodes:
+        raise UnavailableError(
+            "there is nothing to audit: no node was observed",
+            why_empty(environment, snapshot.seconds, rmw, enclave),
+        )
+    written = _write_patch(found, patch, dry_run=dry_run)
+    if as_json:
+        print_json(_json(source, enclaves, found, patch if written else None, dry_run=dry_run))
+    else:
+        _show(found, enclaves)
+    print_notes((*found.notes, *found.missing.notes))
+    if not snapshot.settled:
+        click.echo(
+            f"the ROS graph kept changing for {snapshot.seconds:.0f} s; use --watch to collect "
+            "nodes that come and go.",
+            err=True,
+        )
+    if written:
+        policy = shlex.quote(str(source)) if enclaves.what == "policy" else "POLICY"
+        command = f"sros merge_policy {policy} {shlex.quote(str(patch))} --in-place"
+        click.echo(visible(f"{written}; add it: {command}"), err=True)
+    elif patch is not None:
+        click.echo("no patch is needed" if found.allowed else _NO_PATCH, err=True)
+    return 0 if found.allowed else 1
+
+
+_NO_PATCH = "no patch was written: no right that could be added would allow it"
+
+
+def _enclaves(source: Path, vendor: str | None, environment: dict[str, str]) -> AuditedEnclaves:
+    """Return the enclaves of the policy or keystore at ``source``.
+
+    Raises:
+        UsageError: It is neither.
+    """
+    from sros_tool.dds.domains import DomainSet
+    from sros_tool.explain.audit import keystore_enclaves, policy_enclaves
+    from sros_tool.explain.evaluator import JoinContext
+    from sros_tool.keystore.layout import enclave_names
+    from sros_tool.keystore.rights import load_rights
+    from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
+    from sros_tool.policy.document import read_policy
+    from sros_tool.runtime.environment import domain_from
+    from sros_tool.runtime.rmw import vendor_here
+    from sros_tool.translate import governance_for
+
+    everything = {**os.environ, **environment}
+    chosen = Vendor(vendor) if vendor else vendor_here(everything)[0]
+    domain = domain_from(everything) or 0
+    context = JoinContext(domain, now(), local_zone(os.environ))
+    rights = load_rights(source)
+    if rights.kind == "keystore":
+        return keystore_enclaves(rights, enclave_names(source), chosen, context)
+    if rights.kind != "policy":
+        raise UsageError(
+            f"'{source}' is neither a policy nor a keystore",
+            "A robot has nodes of several enclaves.",
+            "Name the policy, or the folder of the keystore.",
+        )
+    protection = load_template(DEFAULT_TEMPLATE).protection
+    governance = governance_for(protection, DomainSet.of((domain, domain)))
+    return policy_enclaves(read_policy(source), governance, chosen, context)
+
+
+def _write_patch(found: Audit, patch: Path | None, *, dry_run: bool) -> str:
+    """Write the rights to add to ``patch``; return what was done, "" if there is nothing to add."""
+    from sros_tool.graph.document import render
+
+    if patch is None or not found.missing.profiles:
+        return ""
+    document = render(found.missing)
+    if dry_run:
+        return f"would {'replace' if patch.exists() else 'write'} '{patch}'"
+    return save(patch, document)
+
+
+# ── output ──────────────────────────────────────────────────────────────────────────────
+
+
+def _lines(found: Audit) -> list[str]:
+    """Return a line for each enclave that is refused, and for each right that is denied."""
+    refused = [f"{name}: every process: {reason}" for name, reason in sorted(found.refused.items())]
+    return [*refused, *map(str, found.denied)]
+
+
+def _show(found: Audit, enclaves: AuditedEnclaves) -> None:
+    for line in _lines(found):
+        click.echo(visible(line))
+    seen = f"{_count(len(found.observation.nodes), 'node')} with "
+    seen += f"{_count(found.observation.endpoint_count, 'endpoint')}, on {enclaves.vendor.title}"
+    if found.allowed:
+        click.echo(f"nothing would be denied of {seen}", err=True)
+        return
+    what = [_count(len(found.denied), "right")] if found.denied else []
+    what += [_count(len(found.refused), "whole enclave")] if found.refused else []
+    click.echo(f"{' and '.join(what)} would be denied of {seen}", err=True)
+    if any(each.by_rule for each in found.denied):
+        click.echo("a DENY denies some of it; no right that is added changes that", err=True)
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}{'' if number == 1 else 's'}"
+
+
+def _json(
+    source: Path, enclaves: AuditedEnclaves, found: Audit, patch: Path | None, *, dry_run: bool
+) -> dict[str, Any]:
+    from sros_tool.graph.observation import to_json
+
+    context: JoinContext = enclaves.context
+    return {
+        "source": str(source),
+        "kind": enclaves.what,
+        "vendor": enclaves.vendor.value,
+        "domain": context.domain,
+        "allowed": found.allowed,
+        "denied": [
+            {
+                **as_plain(each.right),
+                "nodes": list(each.nodes),
+                "reason": each.reason,
+                "by_rule": each.by_rule,
+                "new_enclave": each.new_enclave,
+                "endpoints": as_plain(each.endpoints),
+            }
+            for each in found.denied
+        ],
+        "refused": [
+            {"enclave": name, "reason": reason} for name, reason in sorted(found.refused.items())
+        ],
+        **to_json(found.observation),
+        "patch": str(patch) if patch else None,
+        "dry_run": dry_run,
+        "notes": as_plain((*found.notes, *found.missing.notes)),
+    }

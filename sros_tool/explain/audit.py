@@ -1,0 +1,355 @@
+"""Find what a policy or a keystore would deny to the nodes of an observed ROS graph.
+
+DDS Security has no permissive mode: a rule denies, or there is no security.  So nothing is enforced
+here.  Every endpoint that the graph shows is put to the decision engine, in the enclave that its
+process would run in, and the answers are what a secured robot would log.
+
+The graph of a robot without security shows the enclave / for most processes.  The enclave is then
+the one that a profile of the policy, or the node's own services in the permissions of a keystore,
+names the node for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+from sros_tool.dds.decision.answers import AccessVerb
+from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.governance import Governance
+from sros_tool.errors import Note, PolicyError
+from sros_tool.explain.denials import nodes_served
+from sros_tool.explain.evaluator import (
+    Evaluator,
+    JoinContext,
+    LoadedEnclave,
+    load_enclave,
+    plan_enclave,
+)
+from sros_tool.explain.question import Part, Question
+from sros_tool.graph.enclaves import UNSHOWN, enclave_per_node
+from sros_tool.graph.learn import Learned, RightsFound, fold, is_tool, learn, listed
+from sros_tool.graph.observation import (
+    PUBLISH,
+    SUBSCRIBE,
+    Endpoint,
+    Observation,
+    ObservedNode,
+    make_observation,
+)
+from sros_tool.keystore.layout import enclave_path
+from sros_tool.keystore.rights import RightsSource
+from sros_tool.names import expand, is_expression
+from sros_tool.policy.model import ALLOW, Policy
+from sros_tool.policy.patterns import matches
+from sros_tool.policy.rights import Right, order
+from sros_tool.translate import dds_names
+
+_DENY_RULE = "deny-rule"
+_USE = "use"
+
+# ── the enclaves to audit ────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class EnclaveNodes:
+    """The names of the nodes that each enclave is for, perhaps with wildcards."""
+
+    by_enclave: Mapping[str, tuple[str, ...]]
+
+    def enclaves_for(self, node: str) -> frozenset[str]:
+        """Return the enclaves for the node with this full name; exact names count first."""
+        exact = frozenset(name for name, nodes in self.by_enclave.items() if node in nodes)
+        return exact or frozenset(
+            name
+            for name, nodes in self.by_enclave.items()
+            if any(is_expression(each) and matches(each, node) for each in nodes)
+        )
+
+
+@dataclass(frozen=True)
+class AuditedEnclaves:
+    """The enclaves of a policy or keystore (``what``), and how to ask a vendor about each."""
+
+    what: str
+    nodes: EnclaveNodes
+    load: Callable[[str], LoadedEnclave]
+    vendor: Vendor
+    context: JoinContext
+    _evaluators: dict[str, Evaluator] = field(default_factory=dict)
+
+    def evaluator(self, enclave: str) -> Evaluator:
+        """Return the evaluator for an enclave, which is loaded once."""
+        if enclave not in self._evaluators:
+            loaded = self.load(enclave)
+            self._evaluators[enclave] = Evaluator(self.vendor, loaded, self.context)
+        return self._evaluators[enclave]
+
+
+def policy_enclaves(
+    policy: Policy, governance: Governance, vendor: Vendor, context: JoinContext
+) -> AuditedEnclaves:
+    """Return the enclaves of a policy, as if it were signed now with this governance."""
+    nodes = {
+        each.path: tuple(expand("~", p.ns, p.node) for p in each.all_profiles())
+        for each in policy.enclaves
+    }
+
+    def load(name: str) -> LoadedEnclave:
+        enclave = policy.enclave(name)
+        if enclave is None:
+            raise PolicyError(f"unable to find enclave {name} in the policy '{policy.file}'")
+        return plan_enclave(enclave, governance, at=context.at)
+
+    return AuditedEnclaves("policy", EnclaveNodes(nodes), load, vendor, context)
+
+
+def keystore_enclaves(
+    source: RightsSource, names: Iterable[str], vendor: Vendor, context: JoinContext
+) -> AuditedEnclaves:
+    """Return the enclaves ``names`` of a keystore, of which ``source`` has the rights.
+
+    Permissions name no nodes: an enclave is for the nodes whose own services it may offer.
+    """
+    replies: dict[str, list[tuple[str, str]]] = {name: [] for name in names}
+    for right in source.rights:
+        if right.qualifier is ALLOW and right.enclave in replies:
+            replies[right.enclave].append((right.right, right.name))
+    nodes = {name: nodes_served(found) for name, found in replies.items()}
+
+    def load(name: str) -> LoadedEnclave:
+        return load_enclave(name, enclave_path(source.path, name), at=context.at)
+
+    return AuditedEnclaves("keystore", EnclaveNodes(nodes), load, vendor, context)
+
+
+# ── the audit ────────────────────────────────────────────────────────────────────────────────
+
+
+@dataclass(frozen=True, slots=True)
+class DeniedRight:
+    """A right that nodes of an enclave use, and that DDS would deny them.
+
+    ``nodes`` are their full names.  ``right.name`` is a DDS topic if it has no ROS name.
+    ``endpoints`` are the denied ones among those that the right needs.  ``by_rule`` says that a
+    rule denies it, so that a rule to allow it would not help; ``new_enclave`` that no enclave is
+    for the node, so that the enclave of ``right`` is a proposal.
+    """
+
+    right: Right
+    nodes: tuple[str, ...]
+    reason: str
+    by_rule: bool
+    new_enclave: bool
+    endpoints: tuple[Endpoint, ...]
+
+    def __str__(self) -> str:
+        """Return text like ``/robot publish topic /chatter (/talker): no rule allows it``."""
+        nodes = ", ".join(self.nodes)
+        return f"{self.right.enclave} {self.right.describe()} ({nodes}): {self.reason}"
+
+
+@dataclass(frozen=True)
+class Audit:
+    """What would be denied of an observation.
+
+    ``refused`` maps enclaves in which no process would start, or be let in, to the reason.
+    ``observation`` has the nodes that were judged, each with the enclaves it was judged in.
+    """
+
+    denied: tuple[DeniedRight, ...]
+    refused: Mapping[str, str]
+    observation: Observation
+    notes: tuple[Note, ...]
+
+    @property
+    def allowed(self) -> bool:
+        """Whether nothing would be denied."""
+        return not (self.denied or self.refused)
+
+    @cached_property
+    def missing(self) -> Learned:
+        """The rights to add so that everything is allowed that no rule of the policy denies."""
+        learned = learn(_used(self.denied, self.observation))
+        return replace(learned, source=RightsFound.AUDIT)
+
+
+def audit(observation: Observation, enclaves: AuditedEnclaves) -> Audit:
+    """Return what the enclaves would be denied of everything that is observed.
+
+    If several enclaves are for the nodes of a process, all of them are judged, with a note.
+    """
+    notes = list(_unjudged(observation))
+    processes: dict[str, list[ObservedNode]] = {}
+    for node in observation.nodes:
+        if not is_tool(node.name):
+            processes.setdefault(node.participant, []).append(node)
+    denied: list[DeniedRight] = []
+    refused: dict[str, str] = {}
+    judged: list[ObservedNode] = []
+    unclear, divided, homeless = [], [], []
+    for found in processes.values():
+        names = ", ".join(sorted(each.fqn for each in found))
+        candidates, together = _enclaves_of(found, enclaves.nodes)
+        if not candidates:
+            homeless += found
+            continue
+        answers = {name: _judge(found, name, enclaves) for name in candidates}
+        chosen = sorted(candidates)
+        if not together:
+            chosen = [min(chosen, key=lambda name: (len(answers[name].denied), name))]
+            divided.append(f"{names} (judged in {chosen[0]})")
+        elif len(chosen) > 1:
+            unclear.append(f"{names} in {' or '.join(chosen)}")
+        for name in chosen:
+            denied += answers[name].denied
+            if answers[name].refused:
+                refused[name] = answers[name].refused
+        judged += (replace(each, enclaves=tuple(chosen)) for each in found)
+    if homeless:
+        for each in enclave_per_node(make_observation(homeless)).observation.nodes:
+            judged.append(each)
+            denied += _without_enclave(each, enclaves.what)
+    if divided:
+        notes.append(Note("audit.divided-process", f"{_DIVIDED}: {listed(sorted(divided), '; ')}"))
+    if unclear:
+        notes.append(Note("audit.several-enclaves", f"{_UNCLEAR}: {listed(sorted(unclear), '; ')}"))
+    return Audit(_by_right(denied), refused, make_observation(judged), tuple(notes))
+
+
+_DIVIDED = (
+    "no enclave is for all nodes of these processes, and a process has one enclave; the one in "
+    "which least is denied was judged"
+)
+_UNCLEAR = (
+    "several enclaves are for these nodes, and the graph does not show in which they run; all of "
+    "them were judged; start each process with `--ros-args --enclave /its/name` to distinguish them"
+)
+_TOOLS = (
+    "left out, because these nodes are tools that observe the robot; on the secured robot they need"
+    " an enclave as policies/operator.xml has it"
+)
+_STRAYS = "not judged, because the writers or readers of these topics belong to no ROS node"
+
+
+def _unjudged(observation: Observation) -> Iterator[Note]:
+    tools = {each.fqn for each in observation.nodes if is_tool(each.name)}
+    tools |= {expand(f"/{n}", ns, n) for _, ns, n in observation.silent if is_tool(n)}
+    strays = {endpoint.topic for _, endpoint in observation.strays}
+    if tools:
+        yield Note("audit.tool", f"{_TOOLS}: {listed(sorted(tools))}")
+    if strays:
+        yield Note("audit.stray", f"{_STRAYS}: {listed(sorted(strays))}")
+
+
+def _enclaves_of(
+    process: Sequence[ObservedNode], known: EnclaveNodes
+) -> tuple[frozenset[str], bool]:
+    """Return the enclaves that a process may run in, and whether each is for all of its nodes.
+
+    The enclave that the graph shows counts, even if it is for other nodes.
+    """
+    shown = process[0].enclaves
+    if shown and shown != UNSHOWN:
+        return frozenset(shown).intersection(known.by_enclave), True
+    each_for = [found for node in process if (found := known.enclaves_for(node.fqn))]
+    common = frozenset.intersection(*each_for) if each_for else frozenset[str]()
+    if common:
+        return common, True
+    if each_for:
+        return frozenset().union(*each_for), False
+    return frozenset(shown).intersection(known.by_enclave), True
+
+
+@dataclass(frozen=True, slots=True)
+class _Judgement:
+    """What a process would be denied in one enclave; ``refused`` if it could not run there."""
+
+    denied: tuple[DeniedRight, ...]
+    refused: str = ""
+
+
+def _judge(process: Sequence[ObservedNode], enclave: str, enclaves: AuditedEnclaves) -> _Judgement:
+    evaluator = enclaves.evaluator(enclave)
+    join = evaluator.answer(Question("join"))
+    if not join.allowed:
+        return _Judgement((), join.decision.clause)
+    return _Judgement(
+        tuple(right for node in process for right in _denied_to(node, enclave, evaluator))
+    )
+
+
+def _denied_to(node: ObservedNode, enclave: str, evaluator: Evaluator) -> Iterator[DeniedRight]:
+    parts = tuple(Part(AccessVerb(e.direction), e.topic) for e in sorted(node.endpoints))
+    if not parts:
+        return
+    answer = evaluator.answer(Question(_USE, only=parts))
+    decisions = {
+        Endpoint(part.topic, part.verb.value): decision
+        for part, decision in answer.parts
+        if not decision.outcome.ok
+    }
+    for right, needed in _rights_of(node, enclave):
+        found = tuple(each for each in needed if each in decisions)
+        if found:
+            by_rule = [each for each in found if decisions[each].reason == _DENY_RULE]
+            reason = decisions[(by_rule or found)[0]].clause
+            yield DeniedRight(right, (node.fqn,), reason, bool(by_rule), False, found)
+
+
+def _rights_of(node: ObservedNode, enclave: str) -> Iterator[tuple[Right, tuple[Endpoint, ...]]]:
+    """Yield the rights that a node uses, each with the endpoints that it needs."""
+    folded = fold(node.endpoints)
+    for each in folded.rights:
+        yield Right(enclave, ALLOW, each.right, each.name), _endpoints(each.right, each.name)
+    for endpoint in folded.halves | folded.foreign:
+        yield Right(enclave, ALLOW, endpoint.direction, endpoint.topic), (endpoint,)
+
+
+def _endpoints(right: str, name: str) -> tuple[Endpoint, ...]:
+    names = dds_names(right, name)
+    return (
+        *(Endpoint(topic, PUBLISH) for topic in names.publish),
+        *(Endpoint(topic, SUBSCRIBE) for topic in names.subscribe),
+    )
+
+
+def _without_enclave(node: ObservedNode, what: str) -> Iterator[DeniedRight]:
+    reason = f"the {what} has no enclave for this node"
+    for enclave in node.enclaves:
+        for right, needed in _rights_of(node, enclave):
+            yield DeniedRight(right, (node.fqn,), reason, False, True, needed)
+
+
+def _by_right(denied: Iterable[DeniedRight]) -> tuple[DeniedRight, ...]:
+    """Return each denied right once, sorted, with all nodes of the enclave that use it."""
+    found: dict[Right, DeniedRight] = {}
+    for each in denied:
+        other = found.get(each.right, each)
+        nodes = tuple(sorted({*other.nodes, *each.nodes}))
+        found[each.right] = replace(other, nodes=nodes)
+    return tuple(found[right] for right in sorted(found, key=order))
+
+
+def _used(denied: Iterable[DeniedRight], observation: Observation) -> Observation:
+    """Return the nodes with the endpoints of denied rights only; what a rule denies is left out."""
+    wanted: dict[tuple[str, str], set[Endpoint]] = {}
+    for each in denied:
+        if each.by_rule:
+            continue
+        needed = set(each.endpoints)
+        if each.right.kind != "dds":
+            needed.update(_endpoints(each.right.right, each.right.name))
+        for node in each.nodes:
+            wanted.setdefault((each.right.enclave, node), set()).update(needed)
+    return make_observation(
+        replace(
+            node,
+            enclaves=(enclave,),
+            endpoints=node.endpoints.intersection(wanted[enclave, node.fqn]),
+        )
+        for node in observation.nodes
+        for enclave in node.enclaves
+        if (enclave, node.fqn) in wanted
+    )

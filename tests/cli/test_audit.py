@@ -1,0 +1,175 @@
+"""``sros audit`` beside a graph that is made up: what it prints, writes, and how it ends."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from tests.graph.fake_graph import Beside, graph
+from tests.support.harness import Ended, sros
+
+pytest_plugins = ["tests.graph.beside"]
+
+POLICY = """<policy version="0.2.0"><enclaves><enclave path="/t"><profiles>
+<profile ns="/" node="talker"><topics publish="ALLOW"><topic>chatter</topic></topics></profile>
+</profiles></enclave></enclaves></policy>
+"""
+FINE = ("/", "/", "talker", "01", ["publish rt/chatter"])
+LOUD = ("/", "/", "talker", "01", ["publish rt/chatter", "publish rt/x"])
+SHORT = ("--spin-time", "0.6")
+DENIED = "/t publish topic /x (/talker): no rule allows publish rt/x\n"
+
+Program = Callable[..., Ended]
+
+
+@pytest.fixture
+def program(beside_graph: Beside, tmp_path: Path) -> Program:
+    """Runs ``sros audit`` beside a policy ``robot.xml`` for a talker."""
+    (tmp_path / "robot.xml").write_text(POLICY)
+    return partial(beside_graph, "audit")
+
+
+def test_nothing_would_be_denied(program: Program) -> None:
+    ended = program(graph(FINE), "robot.xml", *SHORT)
+    summary = "nothing would be denied of 1 node with 1 endpoint, on Fast DDS 2.14\n"
+    assert ended == Ended(0, "", summary)
+
+
+def test_something_would_be_denied_and_nothing_is_written(program: Program, tmp_path: Path) -> None:
+    ended = program(graph(LOUD), "robot.xml", *SHORT)
+    summary = "1 right would be denied of 1 node with 2 endpoints, on Fast DDS 2.14\n"
+    assert ended == Ended(1, DENIED, summary)
+    assert [each.name for each in tmp_path.iterdir()] == ["robot.xml"]
+
+
+def test_the_vendor_of_the_robot_decides(program: Program) -> None:
+    ended = program(graph(LOUD), "robot.xml", *SHORT, "--vendor", "cyclonedds")
+    assert "on Cyclone DDS" in ended.err
+    ended = program(graph(LOUD), "robot.xml", *SHORT, RMW_IMPLEMENTATION="rmw_cyclonedds_cpp")
+    assert "on Cyclone DDS" in ended.err
+
+
+def test_json_has_a_stable_shape(program: Program) -> None:
+    ended = program(graph(LOUD), "robot.xml", *SHORT, "--json", ROS_DOMAIN_ID="7")
+    assert ended.status == 1
+    assert json.loads(ended.out) == {
+        "source": "robot.xml",
+        "kind": "policy",
+        "vendor": "fastdds",
+        "domain": 7,
+        "allowed": False,
+        "denied": [
+            {
+                "enclave": "/t",
+                "qualifier": "ALLOW",
+                "kind": "topics",
+                "right": "publish",
+                "name": "/x",
+                "nodes": ["/talker"],
+                "reason": "no rule allows publish rt/x",
+                "by_rule": False,
+                "new_enclave": False,
+                "endpoints": [{"topic": "rt/x", "direction": "publish"}],
+            }
+        ],
+        "refused": [],
+        "nodes": [
+            {
+                "enclaves": ["/t"],
+                "namespace": "/",
+                "name": "talker",
+                "participant": "01" + "00" * 11,
+                "publish": ["rt/chatter", "rt/x"],
+                "subscribe": [],
+            }
+        ],
+        "patch": None,
+        "dry_run": False,
+        "notes": [],
+    }
+
+
+def test_a_patch_is_merged_and_then_nothing_is_denied(program: Program, tmp_path: Path) -> None:
+    ended = program(graph(LOUD), "robot.xml", *SHORT, "--patch", "add.xml")
+    assert (ended.status, ended.out) == (1, DENIED)
+    assert "wrote 'add.xml'; add it: sros merge_policy robot.xml add.xml --in-place" in ended.err
+    sros("merge_policy", "robot.xml", "add.xml", "--in-place", cwd=tmp_path).ok()
+    ended = program(graph(LOUD), "robot.xml", *SHORT, "--patch", "more.xml").ok()
+    assert "no patch is needed" in ended.err
+    assert not (tmp_path / "more.xml").exists()
+
+
+def test_a_dry_run_writes_no_patch(program: Program, tmp_path: Path) -> None:
+    ended = program(graph(LOUD), "robot.xml", *SHORT, "--patch", "add.xml", "--dry-run")
+    assert ended.status == 1
+    assert "would write 'add.xml'" in ended.err
+    assert not (tmp_path / "add.xml").exists()
+
+
+def test_a_denial_by_a_rule_is_not_patched(program: Program, tmp_path: Path) -> None:
+    denial = '</topics><topics publish="DENY"><topic>x</topic></topics>'
+    (tmp_path / "robot.xml").write_text(POLICY.replace("</topics>", denial))
+    ended = program(graph(LOUD), "robot.xml", *SHORT, "--patch", "add.xml")
+    assert ended.status == 1
+    assert "denies publish rt/x" in ended.out
+    assert "a DENY denies some of it" in ended.err
+    assert "no patch was written" in ended.err
+    assert not (tmp_path / "add.xml").exists()
+
+
+def test_a_watch_tells_each_denial_when_it_is_seen(program: Program) -> None:
+    ended = program(graph(LOUD), "robot.xml", "--watch", "1s")
+    assert (ended.status, ended.out) == (1, DENIED)
+    watching, denied, _ = ended.err.splitlines()
+    assert watching == "watching for 1 s, or until Ctrl-C; then the result is shown"
+    assert denied == f"denied: {DENIED.strip()}"
+
+
+def test_a_keystore_is_audited_too(program: Program, tmp_path: Path) -> None:
+    sros("generate_artifacts", "-k", "ks", "-p", "robot.xml", cwd=tmp_path).ok()
+    shown = ("/t", *LOUD[1:])
+    ended = program(graph(shown), "ks", *SHORT)
+    assert (ended.status, ended.out) == (1, DENIED)
+    ended = program(graph(shown), *SHORT, ROS_SECURITY_KEYSTORE="ks")
+    assert (ended.status, ended.out) == (1, DENIED)
+
+
+FAILS = {"fails": "node", "says": "boom"}
+
+
+@pytest.mark.parametrize(
+    ("seen", "words", "said"),
+    [
+        (graph(), ("robot.xml",), "there is nothing to audit: no node was observed"),
+        (graph(("/", "/", "_ros2cli_12", "01", [])), ("robot.xml",), "no node was observed"),
+        (FAILS, ("robot.xml",), "rclpy cannot start a node to observe the graph"),
+        (graph(FINE), ("gone.xml",), "gone.xml"),
+        (graph(FINE), ("gone",), "gone"),
+        (graph(FINE), (), "no keystore is named"),
+        (graph(FINE), ("ks/enclaves/t",), "is neither a policy nor a keystore"),
+        (graph(FINE), ("robot.xml", "--force"), "--force is for --patch only"),
+        (graph(FINE), ("robot.xml", "--patch", "robot.xml"), "already exists"),
+        (graph(FINE), ("robot.xml", "--watch", "1s"), "--watch and --spin-time exclude"),
+        (graph(FINE), ("robot.xml", "--keystore", "ks"), "without --enclave"),
+        (graph(FINE), ("robot.xml", "--domain", "999"), "999"),
+    ],
+)
+def test_what_cannot_be_asked_is_not_a_no(
+    seen: dict[str, object], words: tuple[str, ...], said: str, program: Program, tmp_path: Path
+) -> None:
+    sros("generate_artifacts", "-k", "ks", "-p", "robot.xml", cwd=tmp_path).ok()
+    ended = program(seen, *words, *SHORT)
+    assert (ended.status, ended.out) == (2, "")
+    assert said in ended.err
+    assert ended.err.count("\n") == 1
+
+
+def test_a_policy_is_not_compared_with_the_runtime(tmp_path: Path) -> None:
+    (tmp_path / "robot.xml").write_text(POLICY)
+    ended = sros("check", "runtime", "--policy", "robot.xml", cwd=tmp_path)
+    assert ended.status == 2
+    assert "sros audit robot.xml" in ended.err

@@ -1,0 +1,313 @@
+"""What a policy or keystore would deny to an observed graph, and what to add."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import pytest
+
+from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.domains import DomainSet
+from sros_tool.explain.audit import (
+    Audit,
+    AuditedEnclaves,
+    audit,
+    keystore_enclaves,
+    policy_enclaves,
+)
+from sros_tool.explain.evaluator import JoinContext
+from sros_tool.graph.document import render
+from sros_tool.graph.observation import Endpoint, Observation, ObservedNode, make_observation
+from sros_tool.keystore.layout import enclave_names
+from sros_tool.keystore.lifecycle.create import generate_artifacts
+from sros_tool.keystore.rights import load_rights
+from sros_tool.keystore.template import load_template
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.merge import merge_into
+from sros_tool.translate import governance_for
+from tests.graph.graphs import graph, node
+
+NOW = datetime(2026, 11, 22, tzinfo=UTC)
+ONE_DOMAIN = DomainSet.of((0, 0))
+TEMPLATE = load_template("production")
+Enclaves = dict[str, dict[str, list[str]]]
+"""The rights of each node of each enclave, each said as "publish chatter"."""
+
+
+def written(folder: Path, enclaves: Enclaves) -> Path:
+    """A policy of these enclaves; a right may end with DENY."""
+    text = ""
+    for path, profiles in enclaves.items():
+        text += f'<enclave path="{path}"><profiles>'
+        for fqn, rights in profiles.items():
+            ns, _, name = fqn.rpartition("/")
+            text += (
+                f'<profile ns="{ns or "/"}" node="{name}">{"".join(map(group, rights))}</profile>'
+            )
+        text += "</profiles></enclave>"
+    file = folder / "policy.xml"
+    file.write_text(f'<policy version="0.2.0"><enclaves>{text}</enclaves></policy>')
+    return file
+
+
+def group(right: str) -> str:
+    word, name, *denied = right.split()
+    kind = {"p": "topic", "s": "topic", "c": "action", "e": "action"}.get(word[0], "service")
+    return f'<{kind}s {word}="{"DENY" if denied else "ALLOW"}"><{kind}>{name}</{kind}></{kind}s>'
+
+
+def audited(
+    folder: Path,
+    enclaves: Enclaves,
+    seen: Observation,
+    vendor: Vendor = Vendor.FAST,
+) -> Audit:
+    return audit(seen, of_policy(written(folder, enclaves), vendor))
+
+
+def of_policy(file: Path, vendor: Vendor = Vendor.FAST) -> AuditedEnclaves:
+    governance = governance_for(TEMPLATE.protection, ONE_DOMAIN)
+    return policy_enclaves(read_policy(file), governance, vendor, JoinContext(0, NOW))
+
+
+def said(found: Audit) -> list[str]:
+    return [str(each) for each in found.denied]
+
+
+def ids(found: Audit) -> list[str]:
+    return [each.id for each in found.notes]
+
+
+TALKER = {"/t": {"/talker": ["publish chatter"]}}
+UNNAMED = "the policy has no enclave for this node"
+
+
+def talks(*more: str, enclave: str = "/", fqn: str = "/talker", pid: str = "p1") -> ObservedNode:
+    return node(fqn, "publish /chatter", *more, enclave=enclave, participant=pid)
+
+
+@pytest.mark.parametrize(
+    ("enclaves", "nodes", "denied"),
+    [
+        (TALKER, [talks()], []),
+        (TALKER, [talks(enclave="/t")], []),
+        (
+            TALKER,
+            [talks("subscribe /chatter")],
+            ["/t subscribe topic /chatter (/talker): no rule allows subscribe rt/chatter"],
+        ),
+        (
+            TALKER,
+            [talks("reply ~/reset", "call fib")],
+            [
+                "/t reply service /talker/reset (/talker): no rule allows publish"
+                " rr/talker/resetReply",
+                "/t call action /fib (/talker): no rule allows publish"
+                " rq/fib/_action/cancel_goalRequest",
+            ],
+        ),
+        # A right is one of the enclave, whichever of its nodes uses it.
+        (
+            {"/t": {"/a": ["publish x"], "/b": []}},
+            [node("/a", "publish /y", enclave="/t"), node("/b", "publish /y", enclave="/t")],
+            ["/t publish topic /y (/a, /b): no rule allows publish rt/y"],
+        ),
+        # DDS knows processes: what another node of the enclave may do is allowed.
+        ({"/t": {"/talker": [], "/b": ["publish /chatter"]}}, [talks()], []),
+        # The enclave that the graph shows counts, whatever the names of the nodes.
+        (
+            {**TALKER, "/u": {"/other": ["publish /x"]}},
+            [talks(enclave="/u")],
+            ["/u publish topic /chatter (/talker): no rule allows publish rt/chatter"],
+        ),
+        (TALKER, [talks(enclave="/gone")], [f"/gone publish topic /chatter (/talker): {UNNAMED}"]),
+        (TALKER, [talks(fqn="/hall/x")], [f"/hall/x publish topic /chatter (/hall/x): {UNNAMED}"]),
+        # Enclaves by name: exact before wildcard, with the parts that change.
+        (
+            {"/any": {"/*": ["publish /chatter"]}, "/t": {"/talker": []}},
+            [talks()],
+            ["/t publish topic /chatter (/talker): no rule allows publish rt/chatter"],
+        ),
+        ({"/any": {"/*": ["publish /chatter"]}, "/t": {"/n": []}}, [talks()], []),
+        (
+            {"/t": {"/launch_ros_*": ["publish /chatter", "reply ~/x"]}},
+            [talks("reply ~/x", fqn="/launch_ros_12")],
+            [],
+        ),
+        ({"/": {"/n": ["publish /chatter"]}, "/u": {"/m": []}}, [talks()], []),
+    ],
+)
+def test_denied(
+    enclaves: Enclaves,
+    nodes: list[ObservedNode],
+    denied: list[str],
+    tmp_path: Path,
+) -> None:
+    found = audited(tmp_path, enclaves, graph(*nodes))
+    assert said(found) == denied
+    assert found.allowed is not bool(denied)
+    assert found.notes == ()
+
+
+def test_the_rest_of_a_process_shows_its_enclave(tmp_path: Path) -> None:
+    """A listener of transforms has the same name in every process."""
+    listener = "/transform_listener_impl_*"
+    enclaves: Enclaves = {
+        "/a": {"/a": ["publish x"], listener: ["subscribe /tf"]},
+        "/b": {"/b": ["publish y"], listener: ["subscribe /tf"]},
+    }
+    seen = graph(
+        node("/a", "publish x", enclave="/"),
+        node("/transform_listener_impl_55", "subscribe /tf", enclave="/"),
+        node("/b", "publish x", enclave="/", participant="p2"),
+        node("/transform_listener_impl_66", "subscribe /tf", enclave="/", participant="p2"),
+    )
+    found = audited(tmp_path, enclaves, seen)
+    assert said(found) == ["/b publish topic /x (/b): no rule allows publish rt/x"]
+    assert found.notes == ()
+
+
+def test_a_process_that_fits_several_enclaves_is_judged_in_all(tmp_path: Path) -> None:
+    enclaves: Enclaves = {"/one": {"/talker": ["publish /chatter"]}, "/two": {"/talker": []}}
+    found = audited(tmp_path, enclaves, graph(talks()))
+    assert said(found) == [
+        "/two publish topic /chatter (/talker): no rule allows publish rt/chatter"
+    ]
+    assert ids(found) == ["audit.several-enclaves"]
+    assert "/talker in /one or /two" in found.notes[0].text
+
+
+def test_a_process_whose_nodes_are_in_different_enclaves(tmp_path: Path) -> None:
+    enclaves = {"/a": {"/a": ["publish x"]}, "/b": {"/b": ["publish y", "publish z"]}}
+    seen = graph(
+        node("/a", "publish x", enclave="/"), node("/b", "publish y", "publish z", enclave="/")
+    )
+    found = audited(tmp_path, enclaves, seen)
+    assert said(found) == ["/b publish topic /x (/a): no rule allows publish rt/x"]
+    assert ids(found) == ["audit.divided-process"]
+
+
+def test_what_a_rule_denies_cannot_be_added(tmp_path: Path) -> None:
+    enclaves = {"/t": {"/talker": ["publish /*", "publish /chatter DENY"]}}
+    found = audited(tmp_path, enclaves, graph(talks("subscribe /x")))
+    assert [(each.right.right, each.by_rule) for each in found.denied] == [
+        ("publish", True),
+        ("subscribe", False),
+    ]
+    assert {each.right for p in found.missing.profiles for each in p.rights} == {"subscribe"}
+
+
+def test_tools_and_strays_are_said(tmp_path: Path) -> None:
+    seen = make_observation(
+        [talks(), node("/_ros2cli_12", "publish /x", enclave="/", participant="p2")],
+        strays=[("p9", Endpoint("Square", "publish"))],
+    )
+    found = audited(tmp_path, TALKER, seen)
+    assert found.allowed
+    assert ids(found) == ["audit.tool", "audit.stray"]
+    assert [each.fqn for each in found.observation.nodes] == ["/talker"]
+
+
+def test_topics_without_a_ros_name_are_judged_and_never_added(tmp_path: Path) -> None:
+    seen = talks()
+    odd = {
+        Endpoint("Square", "publish"),
+        Endpoint("rt/*", "publish"),
+        Endpoint("rq/aRequest", "publish"),
+    }
+    found = audited(tmp_path, TALKER, graph(replace(seen, endpoints=seen.endpoints | odd)))
+    assert {each.right.name for each in found.denied} == {"Square", "/*", "rq/aRequest"}
+    assert found.missing.profiles == ()
+    assert {note.id for note in found.missing.notes} == {
+        "graph.half-service", "graph.no-ros-name", "graph.odd-name",
+    }  # fmt: skip
+
+
+def test_vendors_differ(tmp_path: Path) -> None:
+    """Cyclone DDS refuses a topic of which the other direction is denied."""
+    enclaves = {"/t": {"/talker": ["publish /chatter", "subscribe /chatter DENY"]}}
+    assert audited(tmp_path, enclaves, graph(talks())).allowed
+    assert not audited(tmp_path, enclaves, graph(talks()), Vendor.CYCLONE).allowed
+
+
+ROBOT = {
+    "/t": {"/talker": ["publish chatter", "reply ~/get_parameters"]},
+    "/hall/l": {"/hall/listener": ["subscribe /chatter", "reply ~/get_parameters"]},
+}
+
+
+@pytest.mark.parametrize("enclaves", [{}, {"/t": {"/talker": []}}, ROBOT])
+def test_what_is_missing_makes_everything_allowed(enclaves: Enclaves, tmp_path: Path) -> None:
+    seen = graph(
+        talks("call /fib"),
+        node(
+            "/hall/listener", "subscribe /chatter", "reply ~/reset", enclave="/", participant="p2"
+        ),
+        node("/launch_ros_17", "reply ~/x", enclave="/", participant="p3"),
+    )
+    file = written(tmp_path, {"/other": {"/other": ["publish x"]}, **enclaves})
+    before = audit(seen, of_policy(file))
+    patch = tmp_path / "patch.xml"
+    patch.write_bytes(render(before.missing))
+    assert b"Written by sros audit" in patch.read_bytes()
+    merged = merge_into(file, read_policy(patch))
+    file.write_bytes(merged.document)
+    assert not before.allowed and merged.contradictions == ()
+    assert audit(seen, of_policy(file)).allowed
+    assert {(r.right, r.name) for r in merged.added} <= {
+        (r.right.right, r.right.name.replace("_17", "_*")) for r in before.denied
+    }
+
+
+# ── keystores ──────────────────────────────────────────────────────────────────────────────
+
+
+def of_keystore(root: Path, domain: int = 0) -> AuditedEnclaves:
+    context = JoinContext(domain, datetime.now(UTC))
+    return keystore_enclaves(load_rights(root), enclave_names(root), Vendor.FAST, context)
+
+
+@pytest.fixture(scope="module")
+def keystore(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("audit")
+    policy = read_policy(written(folder, ROBOT))
+    generate_artifacts(
+        folder / "ks",
+        policies=[policy],
+        now=datetime.now(UTC),
+        create=TEMPLATE,
+        domains=ONE_DOMAIN,
+    )
+    return folder / "ks"
+
+
+def uses(fqn: str, pid: str, *rights: str) -> ObservedNode:
+    return node(fqn, "reply ~/get_parameters", *rights, enclave="/", participant=pid)
+
+
+@pytest.mark.parametrize(
+    ("more", "denied"),
+    [
+        ((), []),
+        (("publish /x",), ["/hall/l publish topic /x (/hall/listener)"]),
+    ],
+)
+def test_permissions_know_their_nodes_by_the_services_that_these_offer(
+    keystore: Path, more: Iterable[str], denied: list[str]
+) -> None:
+    seen = graph(
+        uses("/talker", "p1", "publish /chatter"),
+        uses("/hall/listener", "p2", "subscribe /chatter", *more),
+    )
+    found = audit(seen, of_keystore(keystore))
+    assert [line.partition(":")[0] for line in said(found)] == denied
+
+
+def test_an_enclave_that_dds_refuses_is_reported_as_a_whole(keystore: Path) -> None:
+    found = audit(graph(uses("/talker", "p1", "publish /x")), of_keystore(keystore, domain=5))
+    assert said(found) == [] and not found.allowed
+    assert set(found.refused) == {"/t"}
+    assert "domain 5" in found.refused["/t"]
