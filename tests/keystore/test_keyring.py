@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -76,6 +77,23 @@ def test_keys_away_from_the_keystore(tmp_path: Path) -> None:
     moved = {role: f"file:{tmp_path / 'drawer' / role}.pem" for role in places}
     create_enclaves(root, ["/b"], now=NOW, keyring=Keyring(places=moved))
     assert list_enclaves(root) == ("/a", "/b")
+
+
+def test_a_template_takes_no_key_that_exists(tmp_path: Path) -> None:
+    """With the name of that CA, too, its certificates would be those of the other keystore."""
+    single = load_template("sros2")
+    create_keystore(tmp_path / "one", template=single, now=NOW)
+    place = f"file:{tmp_path / 'one/private/ca.key.pem'}"
+    hostile = replace(single, identity_key=place, permissions_key=place)
+    for dry_run in (False, True):
+        with pytest.raises(KeystoreError, match="names a key that exists.*--identity-key file:"):
+            create_keystore(tmp_path / "two", template=hostile, now=NOW, dry_run=dry_run)
+    assert not (tmp_path / "two").exists()
+    named = Keyring(places={"identity": place, "permissions": place})
+    create_keystore(tmp_path / "two", template=hostile, now=NOW, keyring=named)
+    new = replace(hostile, identity_key=f"file:{tmp_path / 'new.pem'}", permissions_key="")
+    create_keystore(tmp_path / "three", template=new, now=NOW)
+    create_enclaves(tmp_path / "three", ["/a"], now=NOW)
 
 
 def test_a_key_of_another_ca_is_refused(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from shlex import quote
 
 from sros_tool.errors import DocumentError, KeystoreError, PkiError, UsageError
 from sros_tool.files import remove_file, write_new_file
@@ -107,6 +108,11 @@ class Keyring:
 
         ``file`` is the path in the keystore for a new key that has no other place.  A dry run opens
         a token only if the key is ``compared`` with a certificate; otherwise any key will do.
+
+        Raises:
+            KeystoreError: the template alone names a file that has a key, and no certificate that
+                the user chose is ``compared`` with it: whoever wrote the template could have
+                another CA of the user sign for the new keystore.
         """
         place = self.places.get(role) or (
             template.identity_key if role == IDENTITY else template.permissions_key
@@ -122,6 +128,13 @@ class Keyring:
                 return generate_key()
             return create_token_key(place, self.secrets, named=named)
         if place and key_path(transaction.root, place).exists():
+            if not (compared or self._is_named(role)):
+                raise KeystoreError(
+                    f"the template names a key that exists, for the {role} CA: '{place}'",
+                    "What the new keystore signs could then be used wherever a CA with that key is "
+                    "trusted.",
+                    f"If that is intended, name it yourself: --{role}-key {quote(place)}.",
+                )
             return self.open(transaction.root, role, template)
         key = generate_key()
         pem = key_pem(key, self._new_passphrase(role) if self.encrypt else None)
