@@ -1,12 +1,15 @@
 """The exceptions of sros: each says what happened, why, and what to do.
 
-Only the command line prints them.  ``exit_status`` is the exit status of the command line for an
-uncaught error: 1 for a negative result or a failure, 2 for wrong usage.
+Only the command line prints them, with the exit status `NOT_DONE`: an error says that something
+could not be asked or done, and is never the answer "no".
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+
+NOT_DONE = 2
+"""Exit status for what could not be asked or done; 1 is the answer "no", or findings."""
 
 
 class SrosError(Exception):
@@ -15,8 +18,6 @@ class SrosError(Exception):
     ``what`` is a clause without a full stop at its end and without "Unable to ..." at its start;
     ``why`` and ``remedy`` are whole sentences, or empty.
     """
-
-    exit_status = 1
 
     def __init__(self, what: str, why: str = "", remedy: str = "") -> None:
         super().__init__(what, why, remedy)
@@ -32,8 +33,6 @@ class SrosError(Exception):
 
 class UsageError(SrosError):
     """A wrong argument or option."""
-
-    exit_status = 2
 
 
 class InvalidNameError(SrosError):

@@ -811,7 +811,7 @@ MISUSE: dict[str, tuple[str, str]] = {
     "no enclave": ("create_enclave ks", "no enclave"),
     "a keystore too many": ("create_keystore new newer", "unexpected extra"),
     "no policy": ("create_permission ks /a", "takes"),
-    "two policies": ("create_permission ks /a p.xml p.xml", "takes"),
+    "two policies": ("create_permission ks /a p.xml p.xml", "not a valid enclave name"),
     "empty policy": ("create_permission ks /a ''", "empty"),
     "enclave that is missing": ("create_permission ks /c p.xml", "does not exist"),
     "enclave not in the policy": ("create_permission ks /b p.xml", "unable to find enclave /b"),
@@ -961,7 +961,7 @@ def as_nobody(*words: object) -> Ended:
 
 @pytest.mark.parametrize(
     ("redirection", "status"),
-    [(">&-", 0), ("2>&-", 0), (">&- 2>&-", 0), ("<&-", 0), (">/dev/full", 1)],
+    [(">&-", 0), ("2>&-", 0), (">&- 2>&-", 0), ("<&-", 0), (">/dev/full", 2)],
 )
 def test_closed_and_full_outputs(redirection: str, status: int, keystore: Path) -> None:
     command = f'{sys.executable} -m sros_tool list_enclaves "$0" {redirection}'
@@ -975,7 +975,7 @@ def test_closed_and_full_outputs(redirection: str, status: int, keystore: Path) 
 def test_a_result_that_cannot_be_printed_is_not_told_as_nothing_changed(tmp_path: Path) -> None:
     command = f'{sys.executable} -m sros_tool create_keystore "$0" >/dev/full'
     ended = subprocess.run(["sh", "-c", command, tmp_path / "ks"], capture_output=True, text=True)
-    assert ended.returncode == 1
+    assert ended.returncode == 2
     assert "Nothing was changed" not in ended.stderr
     assert os.strerror(errno.ENOSPC) in ended.stderr
     assert ended.stderr.count("\n") == 1

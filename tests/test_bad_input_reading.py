@@ -132,7 +132,7 @@ def test_a_log_without_end(log: str) -> None:
             text=True,
             check=False,
         )
-    assert (ended.returncode, ended.stdout) == (1, "")
+    assert (ended.returncode, ended.stdout) == (2, "")
     assert f"the log '{log}' is" in ended.stderr
 
 
@@ -287,7 +287,7 @@ def test_a_folder_that_is_gone(line: str, keystore: Path, tmp_path: Path) -> Non
         text=True,
         check=False,
     )
-    assert ended.returncode == 1
+    assert ended.returncode == 2
     assert ended.stderr.count("\n") == 1
     assert "the working directory no longer exists" in ended.stderr
 

@@ -45,24 +45,30 @@ def path_findings(path: Path, at: Circumstances) -> list[Finding]:
     ):
         root, name = locate_enclave(enclave)
         return _keystore(root, at, name)
-    if path.is_dir():
-        policies = list(policies_below(path))
-        if policies:
-            return [
-                finding
-                for each in policies
-                for finding in policy_file_findings(each, at.distribution)
-            ]
-        raise DocumentError(
-            f"'{path}' is neither a keystore nor an enclave, and holds no policy",
-            "It has no enclaves folder with content, no cert.pem, and no XML file that begins "
-            "with <policy>.",
-        )
-    read_bytes(path, "file")
-    return list(policy_file_findings(path, at.distribution))
+    return policy_findings(path, at.distribution)
 
 
-def policies_below(folder: Path) -> Iterator[Path]:
+def policy_findings(path: Path, distribution: str = "") -> list[Finding]:
+    """Return the findings at a policy, or in a folder of policies.
+
+    Raises `DocumentError` if there is no file to read.
+    """
+    if not path.is_dir():
+        read_bytes(path, "file")
+        return list(policy_file_findings(path, distribution))
+    policies = list(_policies_below(path))
+    if policies:
+        return [
+            finding for each in policies for finding in policy_file_findings(each, distribution)
+        ]
+    raise DocumentError(
+        f"'{path}' is neither a keystore nor an enclave, and holds no policy",
+        "It has no enclaves folder with content, no cert.pem, and no XML file that begins "
+        "with <policy>.",
+    )
+
+
+def _policies_below(folder: Path) -> Iterator[Path]:
     """Return the policy files in a folder and below it, sorted, without fragments for includes."""
     for path in sorted(folder.rglob("*.xml")):
         try:

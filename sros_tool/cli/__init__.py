@@ -11,7 +11,7 @@ from types import FrameType
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run ``sros`` and exit with 0 (yes or done), 1 (no, denied or failed) or 2 (wrong usage)."""
+    """Run ``sros`` and exit with 0 (yes or done), 1 (no, or findings) or 2 (not asked or done)."""
     # SIGTERM raises SystemExit, so that clean-up code runs and no partial files remain.
     signal.signal(signal.SIGTERM, _terminate)
     if isinstance(sys.stdout, io.TextIOWrapper):
@@ -21,6 +21,7 @@ def main(arguments: list[str] | None = None) -> None:
     try:
         from sros_tool.cli.common import secrets_taken
         from sros_tool.cli.program import program, report_error
+        from sros_tool.errors import NOT_DONE
     except KeyboardInterrupt:
         print("sros: interrupted", file=sys.stderr)
         sys.exit(130)
@@ -32,7 +33,7 @@ def main(arguments: list[str] | None = None) -> None:
             sys.stdout.flush()
     except BrokenPipeError:
         _give_up_stdout()
-        sys.exit(1)
+        sys.exit(NOT_DONE)
     except BaseException as error:
         status = report_error(error)
         try:

@@ -232,8 +232,7 @@ def _distribution(named: str | None) -> str:
 
 def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[Finding]:
     from sros_tool.checks.keystores.keystore import keystore_findings
-    from sros_tool.checks.policies import policy_file_findings
-    from sros_tool.checks.targets import path_findings, policies_below
+    from sros_tool.checks.targets import path_findings, policy_findings
     from sros_tool.keystore.layout import is_keystore
 
     if family == "runtime":
@@ -241,10 +240,7 @@ def _findings(family: str, paths: tuple[Path, ...], at: Circumstances) -> list[F
     if family == "policy":
         if not paths:
             raise UsageError("no policy is named", "", "Name a file, or a folder of policies.")
-        files = [f for path in paths for f in (policies_below(path) if path.is_dir() else [path])]
-        return [
-            finding for file in files for finding in policy_file_findings(file, at.distribution)
-        ]
+        return [f for path in paths for f in policy_findings(path, at.distribution)]
     if family == "keystore":
         roots = paths or (keystore_from_environment(),)
         return [

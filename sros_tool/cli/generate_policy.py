@@ -139,7 +139,7 @@ def generate_policy(
     robot that is not secured yet, an attacker's nodes are observed, too.
 
     A log proves less: a process can print any line, and so ask for rights. Rights from a log are
-    shown with the lines that ask for them, and are written only with --accept; the exit status is 1
+    shown with the lines that ask for them, and are written only with --accept; the exit status is 2
     if that is missing. Without FILE, the rights are printed as a policy, for merge_policy.
     """
     present = _present_policy(file)

@@ -13,7 +13,7 @@ import click
 
 from sros_tool import __version__
 from sros_tool.cli.common import visible
-from sros_tool.errors import SrosError
+from sros_tool.errors import NOT_DONE, SrosError
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,7 +177,8 @@ Example:
   $ sros run keystore /talker -- ros2 run demo_nodes_cpp talker
 
 Where a verb takes a keystore, $ROS_SECURITY_KEYSTORE is the default.
-Exit status: 0 yes or done; 1 no, denied or failed; 2 wrong usage."""
+Exit status: 0 yes or done; 1 no, denied, different or findings; 2 could not be
+asked or done."""
 
 
 @click.group(
@@ -231,25 +232,25 @@ def report_error(error: BaseException) -> int:
         return 130
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         error.show()
-        return 2
+        return NOT_DONE
     if isinstance(error, click.UsageError):
         return _usage(error)
     if isinstance(error, SrosError):
-        return _print_error(_prefixed(str(error)), error.exit_status)
+        return _print_error(_prefixed(str(error)))
     if isinstance(error, OSError):
-        return _print_error(_prefixed(_os_problem(error)), 1)
+        return _print_error(_prefixed(_os_problem(error)))
     return _defect(error)
 
 
 def _usage(error: click.UsageError) -> int:
     message = error.format_message()
     where = error.ctx.command_path if error.ctx else "sros"
-    return _print_error(f"{where}: {message} See `{where} --help`.", 2)
+    return _print_error(f"{where}: {message} See `{where} --help`.")
 
 
-def _print_error(text: str, status: int) -> int:
+def _print_error(text: str) -> int:
     print(visible(" ".join(text.split())), file=sys.stderr)
-    return status
+    return NOT_DONE
 
 
 def _prefixed(text: str) -> str:
@@ -284,6 +285,5 @@ def _defect(error: BaseException) -> int:
         _prefixed(
             f"this is a defect of sros: {type(error).__name__}: {error}. Please report it; "
             "SROS_DEBUG=1 prints a traceback."
-        ),
-        1,
+        )
     )

@@ -156,7 +156,7 @@ def test_it_finds_out_what_a_path_is(bench: Bench, tmp_path: Path) -> None:
     assert "policies/one.xml:1: error" in sros("check", "policies", cwd=tmp_path).out
     (tmp_path / "empty").mkdir()
     for wrong in ("gone", "empty"):
-        assert sros("check", wrong, cwd=tmp_path).status == 1
+        assert sros("check", wrong, cwd=tmp_path).status == 2
         assert "Unable to check" in sros("check", wrong, cwd=tmp_path).err
 
 

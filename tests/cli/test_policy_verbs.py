@@ -115,7 +115,7 @@ def test_a_failing_merge_leaves_everything(folder: Path, bad: str, content: str)
     (folder / bad).write_text(content)
     before = snapshot(folder)
     ended = sros("merge_policy", "a.xml", "b.xml", "--in-place")
-    assert ended.status == 1
+    assert ended.status == 2
     assert ended.err.startswith("Unable to merge policies: ")
     assert snapshot(folder) == before
 
@@ -153,7 +153,7 @@ def test_a_folder_that_cannot_be_written(folder: Path) -> None:
         ended = subprocess.run(command, capture_output=True, text=True)
     finally:
         folder.chmod(0o755)
-    assert ended.returncode == 1
+    assert ended.returncode == 2
     (line,) = ended.stderr.splitlines()
     assert "Permission denied. Nothing was changed." in line
     assert snapshot(folder) == before
@@ -162,7 +162,7 @@ def test_a_folder_that_cannot_be_written(folder: Path) -> None:
 def test_includes_are_not_led_elsewhere(folder: Path) -> None:
     shutil.copytree(policies_dir(), folder / "robot")
     ended = sros("merge_policy", "robot/talker_listener.xml", "b.xml", "-o", "c.xml")
-    assert (ended.status, "its relative includes" in ended.err) == (1, True)
+    assert (ended.status, "its relative includes" in ended.err) == (2, True)
     assert not (folder / "c.xml").exists()
     sros("merge_policy", "robot/talker_listener.xml", "b.xml", "-o", "robot/c.xml").ok()
 
@@ -259,7 +259,7 @@ def test_wrong_usage(folder: Path, arguments: tuple[str, ...]) -> None:
 def test_diff_with_what_is_no_policy(folder: Path) -> None:
     (folder / "c.xml").write_text("<nothing/>")
     ended = sros("diff_policy", "a.xml", "c.xml")
-    assert (ended.status, ended.err.startswith("Unable to compare: ")) == (1, True)
+    assert (ended.status, ended.err.startswith("Unable to compare: ")) == (2, True)
 
 
 # ── minimize_policy ────────────────────────────────────────────────────────────────────────

@@ -51,7 +51,7 @@ def test_the_chosen_enclaves_and_no_others_are_meant(verb: str, choice: str, ks:
 def test_a_pattern_that_matches_nothing_changes_nothing(verb: str, ks: Path) -> None:
     before = snapshot(ks.parent)
     ended = sros(*verb.replace("{}", "ks /base --match /leg/*").split(), cwd=ks.parent)
-    assert ended.status == 1
+    assert ended.status == 2
     assert "no enclave of keystore 'ks' matches '/leg/*'" in ended.err
     assert snapshot(ks.parent) == before
 

@@ -78,15 +78,62 @@ def test_help_and_version() -> None:
     assert sros().status == 2
 
 
+@pytest.mark.parametrize(
+    "line",
+    [
+        "check {none}",
+        "check keystore {none}",
+        "check policy {none}",
+        "check policy {empty}",
+        "check {none} --needs-renewal 30d",
+        "check {keystore} --policy {none}",
+        "crl {none}",
+        "diff_policy {none} {keystore}",
+        "diff_policy {keystore} {none}",
+        "diff_policy {file} {keystore}",
+        "distribute_key {keystore} /none {none}",
+        "env {keystore} /none",
+        "explain {none} /a publish /chatter",
+        "explain {keystore} /none publish /chatter",
+        "explain {keystore} --who fly /chatter",
+        "explain {none} --who publish /chatter",
+        "explain {none} --reach /a",
+        "explain {keystore} --log {none}",
+        "explain /a publish /chatter --policy {file}",
+        "inspect {none}",
+        "inspect {file}",
+        "inspect {none} --history",
+        "list_enclaves {none}",
+        "merge_policy {none} {file}",
+        "minimize_policy {file} --observed {file}",
+        "policies none.xml --copy {none}",
+        "rotate_ca {none}",
+        "run {keystore} /none -- true",
+        "verify {none}",
+        "verify {file}",
+        "view {none}",
+        "view {file}",
+    ],
+)
+def test_what_could_not_be_asked_is_not_no(line: str, keystore: Path, tmp_path: Path) -> None:
+    (tmp_path / "file.xml").write_text("broken")
+    (tmp_path / "empty").mkdir()
+    places = {name: tmp_path / name for name in ("none", "empty")}
+    places |= {"file": tmp_path / "file.xml", "keystore": keystore}
+    ended = sros(*line.format_map(places).split())
+    assert ended.status == 2, ended
+    assert ended.err.count("\n") == 1, ended
+
+
 # ── what scripts of ros2/sros2 rely on ─────────────────────────────────────────────────────
 
 
-def test_messages_and_statuses_of_ros2(keystore: Path, tmp_path: Path) -> None:
+def test_messages_of_ros2(keystore: Path, tmp_path: Path) -> None:
     ended = sros("create_keystore", keystore)
-    assert ended.status == 1
+    assert ended.status == 2
     assert ended.err.startswith(f"Unable to create keystore: keystore '{keystore}' already exists")
     ended = sros("list_enclaves", tmp_path / "none")
-    assert ended.status == 1
+    assert ended.status == 2
     assert ended.err.startswith(
         f"Unable to list enclaves: '{tmp_path / 'none'}' is not a valid keystore"
     )
@@ -351,7 +398,7 @@ def test_an_export_grows_and_is_replaced_on_request_only(keystore: Path, tmp_pat
     (tmp_path / "p.xml").write_text(policy_text({"/a": publish("new")}))
     sros("create_permission", keystore, "/a", tmp_path / "p.xml").ok()
     before = snapshot(target)
-    assert sros("distribute_key", keystore, "/a", target).status == 1
+    assert sros("distribute_key", keystore, "/a", target).status == 2
     assert snapshot(target) == before
     assert "replaced" in sros("distribute_key", keystore, "/a", target, "--force").ok().err
     assert "rt/new" in topics_of(target / "enclaves/a")
@@ -420,7 +467,7 @@ def test_inspect_of_a_date_at_the_end_of_time(date: str, keystore: Path, tmp_pat
     start, end = document.index("<not_after>"), document.index("</not_after>")
     (tmp_path / "p.xml").write_text(document[:start] + f"<not_after>{date}" + document[end:])
     ended = sros("inspect", tmp_path / "p.xml")
-    assert ended.status == 1
+    assert ended.status == 2
     assert "defect" not in ended.err
 
 
@@ -597,5 +644,5 @@ def test_a_polite_end_leaves_nothing(number: signal.Signals, keystore: Path) -> 
 def test_the_root_of_the_file_system_is_no_keystore() -> None:
     for words in (("create_keystore", "/"), ("generate_artifacts", "-k", "/", "-e", "/a")):
         ended = sros(*words)
-        assert ended.status == 1, ended
+        assert ended.status == 2, ended
         assert "root of the file system" in ended.err

@@ -186,9 +186,9 @@ def test_a_party_that_is_no_table(folder: Path) -> None:
 
 def test_broken_toml_and_missing_files(folder: Path) -> None:
     ended = sros("demo", "--scenario", write(folder, "a = = 1\n"))
-    assert ended.status == 1
+    assert ended.status == 2
     assert "line" in ended.err
     ended = sros("demo", "--scenario", folder / "none.toml")
-    assert ended.status == 1
+    assert ended.status == 2
     assert "none.toml" in ended.err
     assert "Traceback" not in ended.err

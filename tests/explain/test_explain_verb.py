@@ -288,14 +288,14 @@ def test_a_policy_before_anything_is_signed(tmp_path: Path) -> None:
     # A keystore of the environment does not come between.
     env: dict[str, str | None] = {"ROS_SECURITY_KEYSTORE": str(tmp_path / "none")}
     assert explain(ENCLAVE, *words, env=env).status == 0
-    assert explain("/nobody", *words).status == 1
+    assert explain("/nobody", *words).status == 2
 
 
 def test_an_enclave_that_is_not_signed_yet_under_its_keystore(keystore: Path) -> None:
     shutil.rmtree(Enclave(keystore).folder)
     words = ("publish", "/chatter", "--policy", POLICY)
     assert answer(keystore, ENCLAVE, *words)["policy"]["provenance"] == "planned"
-    assert explain(keystore, ENCLAVE, "publish", "/chatter").status == 1
+    assert explain(keystore, ENCLAVE, "publish", "/chatter").status == 2
 
 
 def test_by_environment_option_and_folder(whole: Path, tmp_path: Path) -> None:
@@ -306,7 +306,7 @@ def test_by_environment_option_and_folder(whole: Path, tmp_path: Path) -> None:
     folder = whole / "enclaves" / ENCLAVE[1:]
     assert explain(folder, *words).status == 0
     assert explain(ENCLAVE, *words, "--keystore", folder).status == 0
-    assert explain(OTHER, *words, "--keystore", folder).status == 1
+    assert explain(OTHER, *words, "--keystore", folder).status == 2
     sros("distribute_key", whole, ENCLAVE, tmp_path / "robot").ok()
     assert explain(tmp_path / "robot", ENCLAVE, *words).status == 0
 
@@ -468,7 +468,7 @@ def test_reach(whole: Path) -> None:
     assert told["learns_from"][0]["path"][0]["name"] == "/parameter_events"
     policy = answer("--reach", ENCLAVE, "--policy", POLICY)
     assert [each["enclave"] for each in policy["influences"]] == [OTHER]
-    assert explain(whole, "--reach", "/nobody").status == 1
+    assert explain(whole, "--reach", "/nobody").status == 2
 
 
 # ── completion ─────────────────────────────────────────────────────────────────────────────

@@ -434,7 +434,7 @@ def test_json(tmp_path: Path) -> None:
 
 
 def test_wrong_usage(tmp_path: Path) -> None:
-    assert sros("explain", "--log", tmp_path / "none.log").status == 1
+    assert sros("explain", "--log", tmp_path / "none.log").status == 2
     assert sros("explain", "ks", "/a", "publish", "/x", "--log", "-").status == 2
 
 

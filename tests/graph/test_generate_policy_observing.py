@@ -167,7 +167,7 @@ def test_a_failure_is_one_paragraph(
     program: Program, tmp_path: Path, stage: str, says: str, what: str
 ) -> None:
     ended = program({"fails": stage, "says": says}, *SHORT)
-    assert (ended.status, ended.out) == (1, "")
+    assert (ended.status, ended.out) == (2, "")
     assert ended.err.count("\n") == 1
     assert ended.err.startswith("Unable to generate policy: ")
     assert what in ended.err

@@ -25,7 +25,7 @@ def no_rclpy(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("no_rclpy")
 def test_without_rclpy_one_paragraph_says_what_to_install(tmp_path: Path) -> None:
     ended = sros("generate_policy", tmp_path / "robot.xml")
-    assert (ended.status, ended.out) == (1, "")
+    assert (ended.status, ended.out) == (2, "")
     assert ended.err.count("\n") == 1
     assert ended.err.startswith("Unable to generate policy: rclpy is not installed")
     assert "pip install 'sros_tool[ros]'" in ended.err
@@ -48,7 +48,7 @@ def test_a_policy_that_is_broken_is_found_before_anything_else(tmp_path: Path) -
     path = tmp_path / "robot.xml"
     path.write_text("<policy>")
     ended = sros("generate_policy", path, "--watch", "10m")
-    assert ended.status == 1
+    assert ended.status == 2
     assert "not well-formed" in ended.err
 
 
@@ -201,7 +201,7 @@ def test_no_right_from_a_log_is_written_that_nobody_accepted(
     if present:
         path.write_text(present)
     ended = sros("generate_policy", path, "--from-log", log)
-    assert ended.status == 1 and path.exists() == bool(present)
+    assert ended.status == 2 and path.exists() == bool(present)
     assert present in (None, path.exists() and path.read_text())
     assert f"  {TALKER} ALLOW publish topic /cmd_vel\n" in ended.out
     assert f"  {log}:2: evil-2: publish rt/cmd_vel in {TALKER}\n" in ended.out
@@ -227,7 +227,7 @@ def test_json_and_the_policy_say_that_the_rights_come_from_a_log(tmp_path: Path)
     assert (shown["source"], shown["denials"]) == ("log", [denial])
     ended = sros("generate_policy", tmp_path / "robot.xml", "--from-log", log, "--json")
     value = json.loads(ended.out)
-    assert (ended.status, value["source"], value["accepted"]) == (1, "log", False)
+    assert (ended.status, value["source"], value["accepted"]) == (2, "log", False)
     assert value["denials"] == [denial]
     printed = sros("generate_policy", "--from-log", log).ok()
     assert "a process can print any line" in printed.out.partition("<policy")[0]

@@ -166,7 +166,7 @@ def test_a_keystore_in_which_nobody_talks(tmp_path: Path) -> None:
     assert sros("create_keystore", root, "--template", "production").status == 0
     assert sros("create_enclave", root, "/a", "/b").status == 0
     ended = sros("demo", "--scenario", "attacks", "--keystore", root)
-    assert ended.status == 1
+    assert ended.status == 2
     assert "no two enclaves" in ended.err
     ended = sros("demo", "--keystore", root)
     assert ended.status == 2

@@ -32,7 +32,7 @@ def test_a_request_is_signed_renewed_and_revoked_by_the_token(
     sign = ("sign_request", home, robot / FOLDER / "request.pem", "-o", answer)
     before = {path: path.read_bytes() for path in home.rglob("*") if path.is_file()}
     refused = sros(without, *sign)
-    assert (refused.returncode, refused.stderr.count("\n")) == (1, 1), refused.stderr
+    assert (refused.returncode, refused.stderr.count("\n")) == (2, 1), refused.stderr
     assert {path: path.read_bytes() for path in home.rglob("*") if path.is_file()} == before
     assert not answer.exists()
     for words in ((), ("--renew", "--force")):

@@ -76,11 +76,11 @@ def test_what_is_wrong_with_a_token_is_said(token: dict[str, str], tmp_path: Pat
     root = tmp_path / "ks"
     make(token, root)
     wrong_pin = sros(token | {"SROS_PKCS11_PIN": "9999"}, "create_enclave", root, "/a")
-    assert (wrong_pin.returncode, "PinIncorrect" in wrong_pin.stderr) == (1, True)
+    assert (wrong_pin.returncode, "PinIncorrect" in wrong_pin.stderr) == (2, True)
     no_pin = sros(token | {"SROS_PKCS11_PIN": ""}, "create_enclave", root, "/a")
-    assert (no_pin.returncode, "SROS_PKCS11_PIN" in no_pin.stderr) == (1, True)
+    assert (no_pin.returncode, "SROS_PKCS11_PIN" in no_pin.stderr) == (2, True)
     no_token = sros(token | {"SROS_IDENTITY_KEY": uri("nobody")}, "create_enclave", root, "/a")
-    assert (no_token.returncode, "has no key 'nobody'" in no_token.stderr) == (1, True)
+    assert (no_token.returncode, "has no key 'nobody'" in no_token.stderr) == (2, True)
     leak = sros(
         token, "create_keystore", tmp_path / "x", "--identity-key", uri("i") + "&pin-value=1"
     )
@@ -165,7 +165,7 @@ def test_without_the_token_nothing_is_renewed_or_revoked(
         ("crl", root, "--refresh"),
     ):
         ended = sros(without, *words)
-        assert (ended.returncode, ended.stderr.count("\n")) == (1, 1), (words, ended.stderr)
+        assert (ended.returncode, ended.stderr.count("\n")) == (2, 1), (words, ended.stderr)
     assert {path: path.read_bytes() for path in root.rglob("*") if path.is_file()} == before
     for reading in (
         ("crl", root),
@@ -212,4 +212,4 @@ def test_a_dry_run_of_a_new_keystore_opens_no_token(token: dict[str, str], tmp_p
     broken = [f"--{role}-key=pkcs11:token=robot;object=o?module-path=/gone.so" for role in ROLES]
     planned = sros(token, "create_keystore", tmp_path / "ks", *broken, "--dry-run")
     assert planned.returncode == 0, planned.stderr
-    assert sros(token, "create_keystore", tmp_path / "ks", *broken).returncode == 1
+    assert sros(token, "create_keystore", tmp_path / "ks", *broken).returncode == 2

@@ -159,7 +159,7 @@ def test_the_program_takes_secrets_from_the_environment_or_a_file(tmp_path: Path
     by_value = none | {"SROS_CA_PASSPHRASE": RIGHT}
     sros("create_keystore", root, "--encrypt-ca-keys", env=by_value).ok()
     refused = sros("create_enclave", root, "/a", env=none)
-    assert refused.status == 1
+    assert refused.status == 2
     assert "SROS_CA_PASSPHRASE" in refused.err
     by_file = none | {"SROS_CA_PASSPHRASE_FILE": str(file)}
     sros("create_enclave", root, "/a", env=by_file).ok()
@@ -226,7 +226,7 @@ def test_a_passphrase_that_is_no_text_is_refused_in_one_line(where: str, tmp_pat
     if where == "file":
         env = {"SROS_CA_PASSPHRASE_FILE": str(tmp_path / "file")}
     refused = sros("create_keystore", tmp_path / "ks", "--encrypt-ca-keys", env=env)
-    assert (refused.status, refused.err.count("\n")) == (1, 1), refused
+    assert (refused.status, refused.err.count("\n")) == (2, 1), refused
     assert "is not UTF-8 text" in refused.err
     assert "horse" not in refused.err
 

@@ -228,4 +228,4 @@ def test_history_needs_a_keystore(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for path in (tmp_path, tmp_path / "file"):
         ended = sros("inspect", path, "--history")
-        assert (ended.status, "is not a valid keystore" in ended.err) == (1, True), ended
+        assert (ended.status, "is not a valid keystore" in ended.err) == (2, True), ended

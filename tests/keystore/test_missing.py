@@ -72,7 +72,7 @@ def test_of_a_revoked_enclave_it_says_since_when(tmp_path: Path) -> None:
     assert str(no_such_enclave(root, "/camera", list_enclaves(root))) == said
     for words in (("/camera", "publish", "/x"), ("--reach", "/camera")):
         found = sros("explain", root, *words)
-        assert (found.status, found.out) == (1, "")
+        assert (found.status, found.out) == (2, "")
         assert said in found.err
     # Made anew it is there; and if its files are lost then, that is no revocation.
     sros("create_enclave", root, "/camera").ok()

@@ -142,7 +142,7 @@ def test_all_commands_print_the_same_fingerprint(tmp_path: Path) -> None:
     assert signed.count("SHA-256") == 2
     for wrong in ("0" * 64, told.replace(told[0], "f" if told[0] != "f" else "e")):
         refused = sros("import", tmp_path / "answer.tgz", robot, "--ca", wrong)
-        assert refused.status == 1
+        assert refused.status == 2
         assert refused.err.count("\n") == 1
         assert told in refused.err
     unclear = sros("import", tmp_path / "answer.tgz", robot, "--ca", told[:-1])

@@ -235,7 +235,7 @@ def test_permissions_that_fail_the_proof_are_not_written(
     for wrong in (forgetful, greedy):
         monkeypatch.setattr(writer_of_enclaves, "permissions_for", wrong)
         found = sros("generate_artifacts", "-k", keystore, "-p", policy)
-        assert found.status == 1
+        assert found.status == 2
         assert "would not match the policy" in found.err
         assert "rt/" in found.err
         assert snapshot(keystore) == before

@@ -429,7 +429,7 @@ def test_the_program(tmp_path: Path) -> None:
     assert sros("crl", root).ok().out.count("superseded") == 4
     assert sros("renew", root).status == 2
     assert sros("renew", root, "--all-expiring", "soon").status == 2
-    assert sros("renew", root, "/missing").status == 1
+    assert sros("renew", root, "/missing").status == 2
 
 
 def test_the_check_answers_by_its_exit_status(tmp_path: Path) -> None:

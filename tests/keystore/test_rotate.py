@@ -435,7 +435,7 @@ def test_without_the_old_key_revoking_waits_for_the_end(
             kept.unlink()
     before = snapshot(separate)
     refused = sros("revoke", separate, "/d")
-    assert refused.status == 1
+    assert refused.status == 2
     assert refused.err.count("\n") == 1
     assert "the key of the old identity CA" in refused.err
     assert f"rotate_ca {separate} --to retire" in refused.err

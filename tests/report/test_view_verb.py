@@ -187,7 +187,7 @@ def test_what_cannot_be_meant_is_refused(
 def test_what_is_no_source_is_told_in_one_paragraph(tmp_path: Path, content: str) -> None:
     (tmp_path / "odd").write_text(content)
     ended = sros("view", tmp_path / "odd", "-o", tmp_path / "page.html")
-    assert ended.status == 1
+    assert ended.status == 2
     assert "Traceback" not in ended.err and ended.err.count("\n") == 1
     assert not (tmp_path / "page.html").exists()
 
@@ -195,5 +195,5 @@ def test_what_is_no_source_is_told_in_one_paragraph(tmp_path: Path, content: str
 def test_graphviz_draws_only_where_it_is(tmp_path: Path) -> None:
     policy = write(tmp_path, "robot.xml", "/x")
     ended = sros("view", policy, "--format", "svg", "--graphviz", env={"PATH": str(tmp_path)})
-    assert ended.status == 1
+    assert ended.status == 2
     assert "Graphviz is not installed" in ended.err
