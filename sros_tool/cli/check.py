@@ -17,6 +17,7 @@ from sros_tool.cli.common import (
     PATH,
     domain_of,
     json_option,
+    json_text,
     keystore_from_environment,
     moment_of,
     now,
@@ -174,6 +175,8 @@ def check(
         return _needs_renewal(root, needs_renewal, at.now, form == "json")
     selection = FindingFilter(include, exclude, Severity[severity.upper()], strict, vendor or "")
     if as_list:
+        if form == "sarif":
+            raise UsageError("--list has no SARIF output", "", "Use --json.")
         _print_kinds(selection, form)
         return 0
     if family == "runtime" and policies:
@@ -304,15 +307,19 @@ def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> in
     due = [each for each in found if each.due(threshold, moment)]
     if as_json:
         print_json(
-            [
-                {
-                    "enclave": each.name,
-                    "certificate_until": iso(each.certificate.not_after),
-                    "permissions_until": iso(each.permissions.not_after),
-                }
-                for each in due
-            ]
-            + [{"enclave": each.name, "problem": str(each.error)} for each in unreadable]
+            {
+                "enclaves": [
+                    {
+                        "enclave": each.name,
+                        "certificate_until": iso(each.certificate.not_after),
+                        "permissions_until": iso(each.permissions.not_after),
+                    }
+                    for each in due
+                ],
+                "unreadable": [
+                    {"enclave": each.name, "problem": str(each.error)} for each in unreadable
+                ],
+            }
         )
     else:
         for each in due:
@@ -320,9 +327,6 @@ def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> in
         for other in unreadable:
             click.echo(f"{other.name}  unknown: {other.error}")
     return 1 if due or unreadable else 0
-
-
-_SCHEMA = 1
 
 
 def _print_text(chosen: ChosenFindings, _selection: FindingFilter) -> None:
@@ -363,7 +367,6 @@ def _counts(chosen: ChosenFindings) -> dict[str, int]:
 def _print_json(chosen: ChosenFindings, _selection: FindingFilter) -> None:
     print_json(
         {
-            "version": _SCHEMA,
             "findings": [each.as_json() for each in chosen.shown],
             "accepted": [each.as_json() for each in chosen.accepted],
             "counts": {**_counts(chosen), "hidden": chosen.hidden},
@@ -376,7 +379,7 @@ def _print_sarif(chosen: ChosenFindings, selection: FindingFilter) -> None:
     from sros_tool.checks.sarif import sarif
 
     kinds, findings = select_kinds(selection), (*chosen.shown, *chosen.accepted)
-    print_json(sarif(findings, kinds, version=__version__, base=Path.cwd()))
+    click.echo(json_text(sarif(findings, kinds, version=__version__, base=Path.cwd())))
 
 
 def _print_kinds(selection: FindingFilter, form: str) -> None:
@@ -385,7 +388,7 @@ def _print_kinds(selection: FindingFilter, form: str) -> None:
 
     kinds = list(select_kinds(selection))
     if form != "text":
-        print_json([each.as_json() for each in kinds])
+        print_json({"kinds": [each.as_json() for each in kinds]})
         return
     width = max((len(each.id) for each in kinds), default=0)
     for each in kinds:

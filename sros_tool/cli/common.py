@@ -210,9 +210,23 @@ def visible_json(document: str) -> str:
     return document.translate(_IN_JSON)
 
 
-def print_json(value: object) -> None:
-    """Print a value as JSON on stdout."""
-    click.echo(visible_json(json.dumps(value, indent=2, ensure_ascii=False)))
+_JSON_VERSION = 1
+"""The version of what ``--json`` prints: a key that changes its meaning or goes raises it."""
+
+
+def versioned(value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the object that ``--json`` prints: ``version`` before the keys of ``value``."""
+    return {"version": _JSON_VERSION, **value}
+
+
+def json_text(value: object) -> str:
+    """Return a value as the text of a JSON document."""
+    return visible_json(json.dumps(value, indent=2, ensure_ascii=False))
+
+
+def print_json(value: Mapping[str, Any]) -> None:
+    """Print what ``--json`` shows of a verb on stdout; docs/json.md has the keys."""
+    click.echo(json_text(versioned(value)))
 
 
 def print_notes(notes: Sequence[Note]) -> None:

@@ -217,7 +217,8 @@ def demo(
 
 def _list(scenarios: Sequence[Scenario], as_json: bool) -> None:
     if as_json:
-        print_json([{"name": s.name, "title": s.title, "rows": len(s.rows)} for s in scenarios])
+        listed = [{"name": s.name, "title": s.title, "rows": len(s.rows)} for s in scenarios]
+        print_json({"scenarios": listed})
         return
     width = max(len(scenario.name) for scenario in scenarios)
     for scenario in scenarios:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -26,7 +26,22 @@ from sros_tool.cli.common import (
     split_root,
     visible,
 )
+from sros_tool.cli.written import (
+    authority_json,
+    changes_json,
+    enclave_json,
+    file_change,
+    notes_json,
+)
 from sros_tool.errors import DocumentError, UsageError
+
+if TYPE_CHECKING:
+    from cryptography import x509
+
+    from sros_tool.keystore.delivery.answer import ImportedEnclave
+    from sros_tool.keystore.delivery.export import ExportSelection
+    from sros_tool.keystore.delivery.request import Requested
+    from sros_tool.keystore.delivery.signing import Signed
 
 _STREAM = Path("-")
 """The file argument that means standard input or output."""
@@ -55,8 +70,14 @@ Example:
 @several_enclaves
 @click.option("--force", is_flag=True, help="Replace files in TARGET that differ.")
 @dry_run_option
+@json_option
 def distribute_key(
-    words: tuple[str, ...], every: bool, patterns: tuple[str, ...], force: bool, dry_run: bool
+    words: tuple[str, ...],
+    every: bool,
+    patterns: tuple[str, ...],
+    force: bool,
+    dry_run: bool,
+    as_json: bool,
 ) -> None:
     """Export the enclaves NAME... to TARGET: a folder, a .tar.gz, or - for standard output.
 
@@ -74,30 +95,67 @@ def distribute_key(
     selection = select(root, names, patterns, every=every)
     if target == _STREAM:
         if not dry_run:
+            _refuse_json(as_json)
             _refuse_terminal()
         packed = pack_enclaves(root, selection.names, now=now())
-        if dry_run:
+        changes = [{"action": "send", "path": path} for path in packed.paths]
+        if not dry_run:
+            _write_stdout(packed.data)
+        elif not as_json:
             for path in packed.paths:
                 click.echo(f"would send {path}")
-        else:
-            _write_stdout(packed.data)
         where, done = "standard output", not dry_run
     else:
         export = distribute(root, selection.names, target, now=now(), force=force, dry_run=dry_run)
         where, done = f"'{target}'", bool(export.changes) and not dry_run
-        if dry_run:
-            archive = target.name.endswith(SUFFIXES)
-            print_plan(target.parent if archive else target, export.changes)
-        elif not export.changes:
+        below = target.parent if target.name.endswith(SUFFIXES) else target
+        changes = changes_json(below, export.changes)
+        if dry_run and not as_json:
+            print_plan(below, export.changes)
+        elif not export.changes and not dry_run:
             for name in selection.names:
                 click.echo(f"enclave {name} in '{target}' is already up to date", err=True)
         for change in export.changes if done else ():
             if change.action == "replace":
                 click.echo(f"replaced {change.path}", err=True)
-    for name in selection.names if done else ():
+    for name in selection.names if done and not as_json else ():
         click.echo(f"exported enclave {name} to {where}", err=target == _STREAM)
+    if as_json:
+        print_json(_export_json(root, target, selection, changes, dry_run))
     for name in selection.left_out:
         click.echo(f"left out enclave {name}: its key was made on its robot", err=True)
+
+
+def _export_json(
+    root: Path,
+    target: Path,
+    selection: ExportSelection,
+    changes: list[dict[str, str]],
+    dry_run: bool,
+) -> dict[str, Any]:
+    from sros_tool.keystore.delivery.archive import SUFFIXES
+    from sros_tool.keystore.layout import enclave_folder
+
+    archive = target == _STREAM or target.name.endswith(SUFFIXES)
+    outcome = "exported" if changes else "kept"
+    return {
+        "keystore": str(root),
+        "dry_run": dry_run,
+        "target": str(target),
+        "enclaves": [
+            enclave_json(
+                root,
+                name,
+                outcome,
+                written=True,
+                folder=(Path() if archive else target) / enclave_folder(name),
+            )
+            for name in selection.names
+        ],
+        "left_out": list(selection.left_out),
+        "changes": changes,
+        "notes": [],
+    }
 
 
 def _check_target(root: Path, word: str) -> None:
@@ -117,6 +175,16 @@ def _write_stdout(data: bytes) -> None:
     sys.stdout.flush()
     sys.stdout.buffer.write(data)
     sys.stdout.buffer.flush()
+
+
+def _refuse_json(as_json: bool) -> None:
+    """Raise `UsageError` for --json if standard output gets an archive."""
+    if as_json:
+        raise UsageError(
+            "--json and an archive cannot both go to standard output",
+            "",
+            "Name a file for the archive, or leave out --json.",
+        )
 
 
 def _refuse_terminal() -> None:
@@ -192,10 +260,6 @@ def verify(
     return 1 if arrival.findings else 0
 
 
-if TYPE_CHECKING:
-    from cryptography import x509
-
-
 @click.command(
     "create_request",
     epilog="""\b
@@ -211,7 +275,10 @@ Example:
 @click.argument("folder", metavar="[DIR]", type=PATH, required=False)
 @click.option("--again", is_flag=True, help="Make the request again, for the existing key.")
 @dry_run_option
-def create_request(name: str, folder: Path | None, again: bool, dry_run: bool) -> None:
+@json_option
+def create_request(
+    name: str, folder: Path | None, again: bool, dry_run: bool, as_json: bool
+) -> None:
     """On a robot: create the key of the enclave NAME in the folder DIR, and a signing request.
 
     The key never leaves DIR.  Send the request to the keystore, where `sros sign_request` answers
@@ -221,6 +288,9 @@ def create_request(name: str, folder: Path | None, again: bool, dry_run: bool) -
 
     folder = folder or keystore_from_environment()
     made = create(folder, name, again=again, dry_run=dry_run)
+    if as_json:
+        print_json(_requested_json(folder, made, again, dry_run))
+        return
     if dry_run:
         print_plan(folder, made.changes)
         return
@@ -230,6 +300,26 @@ def create_request(name: str, folder: Path | None, again: bool, dry_run: bool) -
         click.echo(f"made the key of enclave {name}, which stays in '{folder}'")
     click.echo(f"  its SHA-256 is {made.key}")
     click.echo(f"  have '{made.file}' signed: sros sign_request")
+
+
+def _requested_json(folder: Path, made: Requested, again: bool, dry_run: bool) -> dict[str, Any]:
+    # A dry run makes a key, too, but does not keep it.
+    known = again or not dry_run
+    return {
+        "folder": str(folder),
+        "dry_run": dry_run,
+        "enclaves": [
+            {
+                "name": made.name,
+                "outcome": "requested_again" if again else "requested",
+                "folder": str(made.file.parent),
+                "request": str(made.file),
+                "key_sha256": made.key if known else None,
+            }
+        ],
+        "changes": changes_json(folder, made.changes),
+        "notes": [],
+    }
 
 
 @click.command(
@@ -263,6 +353,7 @@ Example:
 )
 @click.option("--force", is_flag=True, help="Replace ANSWER if it exists.")
 @dry_run_option
+@json_option
 def sign_request(
     words: tuple[str, ...],
     policy_file: Path | None,
@@ -270,6 +361,7 @@ def sign_request(
     renew: bool,
     force: bool,
     dry_run: bool,
+    as_json: bool,
 ) -> None:
     """At the keystore: certify the key in REQUEST (or -), and sign the enclave's permissions.
 
@@ -293,7 +385,9 @@ def sign_request(
         output = _STREAM if request == _STREAM else Path(request.name).with_suffix(".answer.tar.gz")
     stream = output == _STREAM
     if stream and not dry_run:
+        _refuse_json(as_json)
         _refuse_terminal()
+    existed = output.exists()
     signed = sign(
         root,
         _read(request, "signing request"),
@@ -306,10 +400,15 @@ def sign_request(
         keyring=keyring(),
         dry_run=dry_run,
     )
-    if dry_run:
+    if as_json:
+        changes = changes_json(root, signed.changes)
+        if not stream:
+            changes += file_change(output, existed=existed)
+        print_json(_signed_json(root, signed, output, changes, dry_run))
+    elif dry_run:
         print_plan(root, signed.changes)
         if not stream:
-            click.echo(f"would {'replace' if output.exists() else 'create'} {output}")
+            click.echo(f"would {'replace' if existed else 'create'} {output}")
     else:
         if stream:
             _write_stdout(signed.archive)
@@ -325,6 +424,38 @@ def sign_request(
                 f"{digest(permissions_ca)}"
             )
     print_notes(signed.notes)
+
+
+def _signed_json(
+    root: Path, signed: Signed, answer: Path, changes: list[dict[str, str]], dry_run: bool
+) -> dict[str, Any]:
+    from sros_tool.keystore.layout import PERMISSIONS
+    from sros_tool.keystore.reader import load_ca_certificate
+
+    outcome = "renewed" if signed.renewed else "created"
+    enclave = enclave_json(root, signed.name, outcome, written=not dry_run)
+    permissions_ca = load_ca_certificate(root, PERMISSIONS)
+    return {
+        "keystore": str(root),
+        "dry_run": dry_run,
+        "answer": str(answer),
+        "enclaves": [{**enclave, "key_sha256": signed.key}],
+        "authorities": _authorities_json(signed.identity_ca, permissions_ca),
+        "changes": changes,
+        "notes": notes_json(signed.notes),
+    }
+
+
+def _authorities_json(
+    identity: x509.Certificate, permissions: x509.Certificate
+) -> list[dict[str, Any]]:
+    """Return the CAs that a robot trusts as JSON values; one for both roles, if it is one."""
+    from sros_tool.keystore.layout import ROLES
+
+    if identity == permissions:
+        return [authority_json(ROLES, identity)]
+    pairs = zip(ROLES, (identity, permissions), strict=True)
+    return [authority_json((role,), certificate) for role, certificate in pairs]
 
 
 @click.command(
@@ -350,8 +481,9 @@ Example:
     "sign_request and create_keystore print.",
 )
 @dry_run_option
+@json_option
 def import_verb(
-    answer: Path, folder: Path | None, force: bool, pin: str | None, dry_run: bool
+    answer: Path, folder: Path | None, force: bool, pin: str | None, dry_run: bool, as_json: bool
 ) -> None:
     """On a robot: install the file ANSWER (or -) next to the key in DIR, or change nothing.
 
@@ -367,6 +499,9 @@ def import_verb(
     pinned = read_pin(pin) if pin is not None else frozenset[str]()
     data = _read(answer, "answer")
     done = import_answer(folder, data, now=now(), pinned=pinned, force=force, dry_run=dry_run)
+    if as_json:
+        print_json(_imported_json(folder, done, bool(pinned), dry_run))
+        return
     if dry_run:
         print_plan(folder, done.changes)
         return
@@ -384,6 +519,22 @@ def import_verb(
             "  compare both with the output of sign_request, or use --ca: otherwise they are "
             "not verified"
         )
+
+
+def _imported_json(
+    folder: Path, done: ImportedEnclave, pinned: bool, dry_run: bool
+) -> dict[str, Any]:
+    outcome = "imported" if done.changes else "kept"
+    known = not dry_run or not done.changes
+    return {
+        "folder": str(folder),
+        "dry_run": dry_run,
+        "enclaves": [enclave_json(folder, done.name, outcome, written=known)],
+        "authorities": _authorities_json(done.identity_ca, done.permissions_ca),
+        "authorities_verified": pinned or not done.first,
+        "changes": changes_json(folder, done.changes),
+        "notes": [],
+    }
 
 
 def _read(path: Path, what: str) -> bytes:

@@ -26,6 +26,7 @@ from sros_tool.cli.observing import (
     observing_options,
     why_empty,
 )
+from sros_tool.cli.written import file_change
 from sros_tool.errors import SrosError, UsageError
 from sros_tool.values import as_plain
 
@@ -189,6 +190,8 @@ def generate_policy(
     found = named(snapshot.observation)
     learned = learn(found.observation, None if flat else common).noting(found.notes)
     if not learned.profiles:
+        if as_json:
+            print_json(_json(None, file, learned, found.observation, dry_run))
         click.echo(_NO_NODES, err=True)
         print_notes(learned.notes)
         click.echo(why_empty(environment, snapshot.seconds, rmw, enclave), err=True)
@@ -197,7 +200,7 @@ def generate_policy(
     if not dry_run:
         write(plan)
     if as_json:
-        print_json(_json(plan, learned, found.observation, dry_run))
+        print_json(_json(plan, file, learned, found.observation, dry_run))
     else:
         _show(plan, learned, written=not dry_run)
     if not snapshot.settled:
@@ -225,21 +228,43 @@ def _present_policy(file: Path | None) -> Policy | None:
     return None
 
 
-def _json(plan: Draft, learned: Learned, observation: Observation, dry_run: bool) -> dict[str, Any]:
+def _json(
+    plan: Draft | None, file: Path | None, learned: Learned, observation: Observation, dry_run: bool
+) -> dict[str, Any]:
+    """Return what was learned as JSON values; without a ``plan``, no file changes."""
     from sros_tool.graph.observation import to_json
     from sros_tool.policy.merge import merge_notes
+    from sros_tool.policy.rights import order, policy_rights
 
-    return {
-        "file": str(plan.path),
+    value: dict[str, Any] = {
+        "file": str(file) if file else None,
         "source": learned.source.value,
-        "created": plan.before is None,
-        "changed": plan.changes,
+        "created": False,
+        "changed": False,
         "dry_run": dry_run,
         **to_json(observation),
-        "added": as_plain(plan.added),
-        "copied": sorted(plan.copies),
-        "notes": as_plain((*merge_notes(plan.contradictions), *learned.notes)),
+        "added": as_plain(sorted(policy_rights(learned.policy()), key=order)),
+        "copied": [],
+        "changes": [],
+        "notes": as_plain(learned.notes),
     }
+    if plan:
+        copied = sorted(plan.copies)
+        changes = file_change(plan.path, existed=plan.before is not None) if plan.changes else []
+        value |= {
+            "created": plan.before is None,
+            "changed": plan.changes,
+            "added": as_plain(plan.added),
+            "copied": copied,
+            "changes": [*changes, *(_created(plan.path.parent / each) for each in copied)],
+            "notes": as_plain((*merge_notes(plan.contradictions), *learned.notes)),
+        }
+    return value
+
+
+def _created(path: Path) -> dict[str, str]:
+    (change,) = file_change(path, existed=False)
+    return change
 
 
 def _show(plan: Draft, learned: Learned, *, written: bool) -> None:
@@ -333,17 +358,15 @@ def _propose(
     from sros_tool.graph.document import draft, render, write
     from sros_tool.graph.learn import common_parts
     from sros_tool.graph.observation import Observation
-    from sros_tool.policy.rights import order, policy_rights
     from sros_tool.resources import policies_dir
 
-    if not learned.profiles:
-        return 1
-    if file is None:
+    if not learned.profiles or file is None:
         if as_json:
-            added = as_plain(sorted(policy_rights(learned.policy()), key=order))
-            notes = as_plain(learned.notes)
-            print_json({"source": "log", "added": added, "denials": lines, "notes": notes})
-        else:
+            value = _json(None, file, learned, Observation(), dry_run)
+            print_json({**value, "source": "log", "accepted": accept, "denials": lines})
+        if not learned.profiles:
+            return 1
+        if not as_json:
             print_notes(learned.notes)
             click.echo(render(learned).decode(), nl=False)
             _show_lines(lines, err=True)
@@ -354,7 +377,7 @@ def _propose(
     if written:
         write(plan)
     if as_json:
-        value = _json(plan, learned, Observation(), dry_run)
+        value = _json(plan, file, learned, Observation(), dry_run)
         print_json({**value, "accepted": accept, "denials": lines})
     else:
         _show(plan, learned, written=written)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -26,6 +27,7 @@ from sros_tool.cli.common import (
     several_enclaves,
     split_root,
 )
+from sros_tool.cli.written import authority_json, changes_json, enclave_json, notes_json
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
@@ -48,7 +50,8 @@ Example:
     shell_complete=complete_keystore_and_enclave,
 )
 @dry_run_option
-def create_enclave(words: tuple[str, ...], dry_run: bool) -> None:
+@json_option
+def create_enclave(words: tuple[str, ...], dry_run: bool, as_json: bool) -> None:
     """Create the enclaves NAME... in the keystore ROOT.
 
     An existing enclave keeps its key and its permissions; missing files are added.
@@ -68,7 +71,7 @@ def create_enclave(words: tuple[str, ...], dry_run: bool) -> None:
             dry_run=dry_run,
             progress=step,
         )
-    _show(result, dry_run)
+    _show(result, dry_run, as_json)
 
 
 @click.command(
@@ -88,8 +91,13 @@ Example:
 )
 @several_enclaves
 @dry_run_option
+@json_option
 def create_permission(
-    words: tuple[str, ...], every: bool, patterns: tuple[str, ...], dry_run: bool
+    words: tuple[str, ...],
+    every: bool,
+    patterns: tuple[str, ...],
+    dry_run: bool,
+    as_json: bool,
 ) -> None:
     """Give the enclaves NAME... the permissions that POLICY_FILE states for them: all or none."""
     from sros_tool.keystore.lifecycle.create import create_permission as create
@@ -108,7 +116,7 @@ def create_permission(
         keyring=keyring(),
         dry_run=dry_run,
     )
-    _show(result, dry_run)
+    _show(result, dry_run, as_json)
 
 
 class _SeveralEnclavesAndPolicies(SeveralValues):
@@ -146,12 +154,14 @@ Example:
     shell_complete=complete_template,
 )
 @dry_run_option
+@json_option
 def generate_artifacts(
     keystore_root_path: Path | None,
     enclaves: tuple[str, ...],
     policy_files: tuple[Path, ...],
     template_name: str,
     dry_run: bool,
+    as_json: bool,
 ) -> None:
     """Create enclaves, with the permissions that policies state for them: all or nothing.
 
@@ -183,12 +193,15 @@ def generate_artifacts(
         )
     if result.new_keystore and not dry_run:
         click.echo(f"'{root}' is not a valid keystore, creating new keystore", err=True)
-        _print_new_keystore(root, template, result.domains)
-    _show(result, dry_run)
+        if not as_json:
+            _print_new_keystore(root, template, result.domains)
+    _show(result, dry_run, as_json)
 
 
-def _show(result: Creation, dry_run: bool) -> None:
-    if dry_run:
+def _show(result: Creation, dry_run: bool, as_json: bool) -> None:
+    if as_json:
+        print_json(_creation_json(result, dry_run))
+    elif dry_run:
         print_plan(result.root, result.changes)
     else:
         for names, text in (
@@ -201,6 +214,22 @@ def _show(result: Creation, dry_run: bool) -> None:
     for name in result.kept:
         click.echo(f"enclave {name} already exists: not changed", err=True)
     print_notes(result.notes)
+
+
+def _creation_json(result: Creation, dry_run: bool) -> dict[str, Any]:
+    names = ("created", "changed", "completed", "kept")
+    return {
+        "keystore": str(result.root),
+        "dry_run": dry_run,
+        "new_keystore": result.new_keystore,
+        "enclaves": [
+            enclave_json(result.root, name, each, written=not dry_run or each == "kept")
+            for each in names
+            for name in getattr(result, each)
+        ],
+        "changes": changes_json(result.root, result.changes),
+        "notes": notes_json(result.notes),
+    }
 
 
 @click.command(
@@ -289,6 +318,7 @@ Example:
     "--encrypt-ca-keys", is_flag=True, help="Protect new CA keys in files with a passphrase."
 )
 @dry_run_option
+@json_option
 def create_keystore(
     root: Path | None,
     template_name: str,
@@ -303,6 +333,7 @@ def create_keystore(
     permissions_key: str | None,
     encrypt_ca_keys: bool,
     dry_run: bool,
+    as_json: bool,
 ) -> None:
     """Create a keystore in the folder ROOT, with the settings of a template.
 
@@ -330,11 +361,40 @@ def create_keystore(
         dry_run=dry_run,
     )
     print_notes(result.notes)
-    if dry_run:
+    if as_json:
+        print_json(_keystore_json(result, template, imported, dry_run))
+    elif dry_run:
         print_plan(root, result.changes)
-        return
-    _print_new_keystore(root, template, result.domains, frozenset(imported))
-    _print_open_rights(template)
+    else:
+        _print_new_keystore(root, template, result.domains, frozenset(imported))
+    if not dry_run:
+        _print_open_rights(template)
+
+
+def _keystore_json(
+    result: Creation, template: Template, imported: Mapping[str, bytes], dry_run: bool
+) -> dict[str, Any]:
+    from sros_tool.keystore.layout import ROLES
+    from sros_tool.keystore.reader import load_ca_certificate
+    from sros_tool.pki.certificates import load_certificate
+
+    authorities = []
+    for roles in [(each,) for each in ROLES] if template.separate_authorities else [ROLES]:
+        role, certificate = roles[0], None
+        if not dry_run:
+            certificate = load_ca_certificate(result.root, role)
+        elif role in imported:
+            certificate = load_certificate(imported[role], f"of the {role} CA")
+        authorities.append({**authority_json(roles, certificate), "imported": role in imported})
+    return {
+        "keystore": str(result.root),
+        "dry_run": dry_run,
+        "template": template.name,
+        "domains": str(result.domains),
+        "authorities": authorities,
+        "changes": changes_json(result.root, result.changes),
+        "notes": notes_json(result.notes),
+    }
 
 
 def _choices(

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -23,10 +24,13 @@ from sros_tool.cli.common import (
     several_enclaves,
     split_root,
 )
+from sros_tool.cli.written import changes_json, enclave_json, notes_json
 from sros_tool.errors import UsageError
 
 if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.renew import Renewal
+    from sros_tool.keystore.lifecycle.revoke import Revocation
+    from sros_tool.pki.crl import RevocationList
 
 _MAX_NAMES = 5
 """Number of enclaves that a message names."""
@@ -60,6 +64,7 @@ Example:
     help="Revoke earlier certificates of renewed enclaves, with the reason superseded.",
 )
 @dry_run_option
+@json_option
 def renew(
     words: tuple[str, ...],
     every: bool,
@@ -68,6 +73,7 @@ def renew(
     new_key: bool,
     revoke_old: bool,
     dry_run: bool,
+    as_json: bool,
 ) -> None:
     """Issue new certificates for the enclaves NAME..., and sign their permissions again.
 
@@ -97,15 +103,35 @@ def renew(
             dry_run=dry_run,
             progress=step,
         )
-    if dry_run:
+    if as_json:
+        print_json(_renewal_json(result, dry_run))
+    elif dry_run:
         print_plan(root, result.changes)
     else:
         for name in result.renewed:
             click.echo(f"renewed enclave {name}")
-        if not result.renewed:
-            click.echo("no enclave needs to be renewed", err=True)
+    if not result.renewed and not dry_run:
+        click.echo("no enclave needs to be renewed", err=True)
     print_notes(result.notes)
     _print_replaced(result)
+
+
+def _renewal_json(result: Renewal, dry_run: bool) -> dict[str, Any]:
+    from sros_tool.validity import iso
+
+    return {
+        "keystore": str(result.root),
+        "dry_run": dry_run,
+        "enclaves": [
+            enclave_json(result.root, name, "renewed", written=not dry_run)
+            for name in result.renewed
+        ],
+        "replaced_work_until": iso(result.works_until) if result.works_until else None,
+        "revoked": result.revoked,
+        "restart": list(result.restart),
+        "changes": changes_json(result.root, result.changes),
+        "notes": notes_json((*result.notes, *result.remarks)),
+    }
 
 
 def _print_replaced(result: Renewal) -> None:
@@ -122,7 +148,7 @@ def _print_replaced(result: Renewal) -> None:
     elif result.restart:
         _print_restart(result.restart)
     for remark in result.remarks:
-        click.echo(remark, err=True)
+        click.echo(remark.text, err=True)
 
 
 def _complete_reason(
@@ -162,6 +188,7 @@ Example:
     help="During a CA rotation: revoke without the key of the old identity CA.",
 )
 @dry_run_option
+@json_option
 def revoke(
     words: tuple[str, ...],
     every: bool,
@@ -169,6 +196,7 @@ def revoke(
     reason: str,
     until_retired: bool,
     dry_run: bool,
+    as_json: bool,
 ) -> None:
     """Revoke the enclaves NAME...: processes that load the new crl.pem refuse them.
 
@@ -194,14 +222,31 @@ def revoke(
         until_retired=until_retired,
         dry_run=dry_run,
     )
-    if dry_run:
+    if as_json:
+        print_json(_revocation_json(result, reason_text, dry_run))
+    elif dry_run:
         print_plan(root, result.changes)
     else:
         for name in result.revoked:
             click.echo(f"revoked enclave {name}")
     _print_restart(result.restart)
     for remark in result.remarks:
-        click.echo(remark, err=True)
+        click.echo(remark.text, err=True)
+
+
+def _revocation_json(result: Revocation, reason: str, dry_run: bool) -> dict[str, Any]:
+    from sros_tool.validity import iso
+
+    return {
+        "keystore": str(result.root),
+        "dry_run": dry_run,
+        "enclaves": [{"name": name, "outcome": "revoked"} for name in result.revoked],
+        "reason": reason,
+        "next_update": iso(result.next_update),
+        "restart": list(result.restart),
+        "changes": changes_json(result.root, result.changes),
+        "notes": notes_json(result.remarks),
+    }
 
 
 @click.command(
@@ -228,57 +273,30 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
     from sros_tool.keystore.layout import list_enclaves
     from sros_tool.keystore.lifecycle.revoke import refresh_crl
     from sros_tool.keystore.reader import read_lists
-    from sros_tool.pki.certificates import subject_text
-    from sros_tool.validity import iso
 
     root = root or keystore_from_environment()
     list_enclaves(root)
+    result = None
     if refresh:
         result = refresh_crl(root, now=now(), keyring=keyring(), dry_run=dry_run)
-        if dry_run:
+        if dry_run and not as_json:
             print_plan(root, result.changes)
             return 0
-        _print_restart(result.restart)
+        if not dry_run:
+            _print_restart(result.restart)
         for remark in result.remarks:
-            click.echo(remark, err=True)
+            click.echo(remark.text, err=True)
     lists = read_lists(root)
-    if not lists:
-        print_json(None) if as_json else click.echo("nothing was ever revoked", err=True)
-        return 0
-    found, *others = lists
-    soon = min(each.next_update for each in lists) - now() < timedelta(days=30)
+    soon = bool(lists) and min(each.next_update for each in lists) - now() < timedelta(days=30)
     if as_json:
-        print_json(
-            {
-                "number": found.number,
-                "this_update": iso(found.this_update),
-                "next_update": iso(found.next_update),
-                "ends_soon": soon,
-                "revoked": [
-                    {"serial": f"{each.serial:x}", "date": iso(each.date), "reason": each.reason}
-                    for each in found.revoked
-                ],
-                "beside": [
-                    {
-                        "issuer": subject_text(each.list.issuer),
-                        "number": each.number,
-                        "this_update": iso(each.this_update),
-                        "next_update": iso(each.next_update),
-                        "revoked": [f"{one.serial:x}" for one in each.revoked],
-                    }
-                    for each in others
-                ],
-            }
-        )
+        print_json(_lists_json(root, lists, result, expires_soon=soon, dry_run=dry_run))
+    elif lists:
+        for line in _list_lines(lists):
+            click.echo(line)
     else:
-        click.echo(f"revocation list {found.number}, until {iso(found.next_update)}")
-        for each in found.revoked:
-            click.echo(f"  {each.serial:x}  {iso(each.date)}  {each.reason}")
-        for other in others:  # of the other CA during a rotation
-            click.echo(
-                f"next to it, list {other.number} of {subject_text(other.list.issuer)}, until "
-                f"{iso(other.next_update)}: {len(other.revoked)} revoked"
-            )
+        click.echo("nothing was ever revoked", err=True)
+    if result and dry_run:
+        return 0
     if soon:
         click.echo(
             "the list expires soon, and DDS then refuses every participant: "
@@ -286,6 +304,61 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
             err=True,
         )
     return 1 if soon else 0
+
+
+def _list_lines(lists: Sequence[RevocationList]) -> Iterator[str]:
+    from sros_tool.pki.certificates import subject_text
+    from sros_tool.validity import iso
+
+    found, *others = lists
+    yield f"revocation list {found.number}, until {iso(found.next_update)}"
+    for each in found.revoked:
+        yield f"  {each.serial:x}  {iso(each.date)}  {each.reason}"
+    for other in others:  # of the other CA during a rotation
+        yield (
+            f"next to it, list {other.number} of {subject_text(other.list.issuer)}, until "
+            f"{iso(other.next_update)}: {len(other.revoked)} revoked"
+        )
+
+
+def _lists_json(
+    root: Path,
+    lists: Sequence[RevocationList],
+    refreshed: Revocation | None,
+    *,
+    expires_soon: bool,
+    dry_run: bool,
+) -> dict[str, Any]:
+    """Return the revocation lists as JSON values; null and empty if nothing was ever revoked."""
+    from sros_tool.pki.certificates import subject_text
+    from sros_tool.validity import iso
+
+    found = lists[0] if lists else None
+    return {
+        "keystore": str(root),
+        "dry_run": dry_run,
+        "number": found.number if found else None,
+        "this_update": iso(found.this_update) if found else None,
+        "next_update": iso(found.next_update) if found else None,
+        "expires_soon": expires_soon,
+        "revoked": [
+            {"serial": f"{each.serial:x}", "date": iso(each.date), "reason": each.reason}
+            for each in (found.revoked if found else ())
+        ],
+        "other_lists": [
+            {
+                "issuer": subject_text(each.list.issuer),
+                "number": each.number,
+                "this_update": iso(each.this_update),
+                "next_update": iso(each.next_update),
+                "revoked": [f"{one.serial:x}" for one in each.revoked],
+            }
+            for each in lists[1:]
+        ],
+        "restart": list(refreshed.restart) if refreshed else [],
+        "changes": changes_json(root, refreshed.changes) if refreshed else [],
+        "notes": notes_json(refreshed.remarks) if refreshed else [],
+    }
 
 
 def _print_restart(names: tuple[str, ...]) -> None:
@@ -418,11 +491,34 @@ def rotate_ca(
                 dry_run=dry_run,
                 progress=tick,
             )
-    if dry_run:
+    if as_json:
+        remarks = () if dry_run else rotation_status(root, now=now()).remarks
+        print_json(_step_json(step, remarks, dry_run))
+    elif dry_run:
         print_plan(root, step.changes)
     else:
         _print_step(step, rotation_status(root, now=now()), together=finish, same_key=same_key)
     print_notes(step.notes)
+
+
+def _step_json(step: RotationStep, remarks: Sequence[str], dry_run: bool) -> dict[str, Any]:
+    outcome = (
+        "reissued" if any(each.path.endswith("/cert.pem") for each in step.changes) else "kept"
+    )
+    return {
+        "keystore": str(step.root),
+        "dry_run": dry_run,
+        "stage": step.stage.value,
+        "authorities": list(step.files),
+        "enclaves": [
+            enclave_json(step.root, name, outcome, written=not dry_run or outcome == "kept")
+            for name in step.enclaves
+        ],
+        "old_keys_elsewhere": list(step.kept_elsewhere),
+        "remarks": list(remarks),
+        "changes": changes_json(step.root, step.changes),
+        "notes": notes_json(step.notes),
+    }
 
 
 def _print_step(
@@ -469,7 +565,7 @@ def _show_status(status: RotationStatus, as_json: bool) -> None:
                 "authorities": [
                     {
                         "roles": list(each.roles),
-                        "standing": each.state,
+                        "state": each.state,
                         "subject": each.subject,
                         "serial": each.serial,
                         "not_before": iso(each.validity.not_before),

@@ -23,6 +23,7 @@ from sros_tool.cli.common import (
     save,
     visible,
 )
+from sros_tool.cli.written import file_change, notes_json
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.values import as_plain
 
@@ -73,7 +74,7 @@ def merge_policy(
     the policies are reported.
     """
     from sros_tool.policy.document import read_policy
-    from sros_tool.policy.merge import merge_all, merge_notes
+    from sros_tool.policy.merge import EditedText, merge_all, merge_notes
 
     if in_place and output:
         raise UsageError("--in-place and --output exclude each other")
@@ -84,11 +85,16 @@ def merge_policy(
     if output:
         _check_includes(policy, output, merged.document)
     saved = ""
-    if target and not dry_run and (merged.added or output):
-        saved = save(target, merged.document)
+    changes = []
+    if target and (merged.added or output):
+        changes = file_change(target, existed=target.exists())
+        saved = "" if dry_run else save(target, merged.document)
     if as_json:
-        show = target is None and not dry_run
-        _print_merged_json(policy, merged, target if saved else None, show=show)
+        value = _merged_json(policy, merged, target if saved else None)
+        if target is None and not dry_run:
+            value["document"] = EditedText(merged.document, str(policy)).text
+        notes = notes_json(merge_notes(merged.contradictions))
+        print_json({**value, "dry_run": dry_run, "changes": changes, "notes": notes})
     elif dry_run:
         for right in merged.added:
             click.echo(f"would add {right}")
@@ -115,18 +121,13 @@ def _print_added(merged: Merged) -> None:
         click.echo(f"  {right}", err=True)
 
 
-def _print_merged_json(policy: Path, merged: Merged, written: Path | None, *, show: bool) -> None:
-    from sros_tool.policy.merge import EditedText
-
-    value: dict[str, Any] = {
+def _merged_json(policy: Path, merged: Merged, written: Path | None) -> dict[str, Any]:
+    return {
         "policy": str(policy),
         "added": as_plain(merged.added),
         "contradictions": as_plain(merged.contradictions),
         "output": str(written) if written else None,
     }
-    if show:
-        value["document"] = EditedText(merged.document, str(policy)).text
-    print_json(value)
 
 
 def _check_includes(policy: Path, output: Path, document: bytes) -> None:
@@ -310,10 +311,12 @@ def minimize_policy(
             "Nothing was written.",
             "This is a defect of sros: please report it with the policy.",
         )
+    changes = file_change(output, existed=output.exists()) if output else []
     saved = save(output, document) if output and not dry_run else ""
     if as_json:
         value = _minimized_json(policy, result, measured, output if not dry_run else None)
-        print_json({**value, "notes": as_plain(notes)})
+        value |= {"dry_run": dry_run, "changes": changes, "notes": notes_json(notes)}
+        print_json(value)
     else:
         for use in result.uses:
             for line in _use_lines(use, measured[use.enclave]):
@@ -518,21 +521,28 @@ def policies(
     if target is not None:
         if os.path.lexists(target):
             raise UsageError(f"'{target}' already exists", "", "Name a new folder.")
-        if dry_run:
+        if dry_run and not as_json:
             click.echo(f"would copy the policies to '{target}'")
             return 0
         found_files = (each for each in sorted(source.rglob("*")) if each.is_file())
         files = {str(each.relative_to(source)): read_bytes(each, "file") for each in found_files}
-        write_new_folder(target, files)
-        click.echo(f"copied the policies to '{target}'")
+        if not dry_run:
+            write_new_folder(target, files)
+        if as_json:
+            changes = [{"action": "create", "path": str(target / each)} for each in files]
+            print_json({"folder": str(target), "dry_run": dry_run, "changes": changes, "notes": []})
+        else:
+            click.echo(f"copied the policies to '{target}'")
         return 0
     found = {path: read_policy(path) for path in sorted(source.glob("*.xml"))}
     if as_json:
         print_json(
-            [
-                {"file": str(path), "enclaves": [each.path for each in policy.enclaves]}
-                for path, policy in found.items()
-            ]
+            {
+                "policies": [
+                    {"file": str(path), "enclaves": [each.path for each in policy.enclaves]}
+                    for path, policy in found.items()
+                ]
+            }
         )
         return 0
     width = max(len(path.name) for path in found)

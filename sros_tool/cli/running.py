@@ -10,7 +10,13 @@ from pathlib import Path
 
 import click
 
-from sros_tool.cli.common import complete_keystore_and_enclave, now, split_root
+from sros_tool.cli.common import (
+    complete_keystore_and_enclave,
+    json_option,
+    now,
+    print_json,
+    split_root,
+)
 from sros_tool.errors import KeystoreError, SrosError, UnavailableError, UsageError
 
 _COMMAND = "sros.command"
@@ -45,11 +51,11 @@ Example:
     type=click.Choice(["sh", "fish", "json", "systemd", "docker"]),
     default="sh",
     show_default=True,
-    help="For a shell, a program, a systemd unit, or a Docker env-file.",
+    help="For a shell, a systemd unit or Docker; json has names and values alone.",
 )
-@click.option("--json", "as_json", is_flag=True, help="The same as --format json.")
 @_DOMAIN
-def env(words: tuple[str, ...], form: str, as_json: bool, domain: str | None) -> None:
+@json_option
+def env(words: tuple[str, ...], form: str, domain: str | None, as_json: bool) -> None:
     """Print the environment variables that make a process run in the enclave NAME.
 
     The strategy is Enforce: a process that cannot run in the enclave does not start. If the
@@ -62,11 +68,15 @@ def env(words: tuple[str, ...], form: str, as_json: bool, domain: str | None) ->
         root, rest = split_root(words)
         if len(rest) != 1:
             raise UsageError("env takes a keystore and one enclave")
-        text = render_environment(loadable_environment(root, rest[0], domain), form)
+        variables = loadable_environment(root, rest[0], domain)
+        text = render_environment(variables, form)
     except (SrosError, OSError):
         click.echo(render_refusal(form), nl=False)
         raise
-    click.echo(text, nl=False)
+    if as_json:
+        print_json({"keystore": str(root), "enclave": rest[0], "variables": variables})
+    else:
+        click.echo(text, nl=False)
 
 
 class _WithCommand(click.Command):

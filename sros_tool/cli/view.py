@@ -16,10 +16,15 @@ from sros_tool.cli.common import (
     complete_template,
     dry_run_option,
     force_option,
+    json_text,
     now,
+    print_json,
     save,
+    versioned,
 )
+from sros_tool.cli.written import file_change
 from sros_tool.errors import UsageError
+from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -113,6 +118,10 @@ def view(
         check_output(output, force=force or dry_run)
     picture = _picture(sources, observed, template, hosts, moment)
     document = _rendered(picture, written, everything, graphviz, moment)
+    if dry_run and as_json:
+        changes = file_change(output, existed=output.exists()) if output else []
+        print_json({"dry_run": True, "changes": changes, "notes": []})
+        return
     if dry_run:
         click.echo(f"would write {output or 'to standard output'}: {len(document)} characters")
         return
@@ -232,9 +241,7 @@ def _rendered(
     from sros_tool.report.layout import scenes_of
 
     if form == "json":
-        from sros_tool.report.picture import render_json
-
-        return render_json(picture)
+        return json_text(versioned(as_plain(picture))) + "\n"
     scenes = scenes_of(picture, placed=form in ("html", "svg") and not graphviz)
     if form == "html":
         from sros_tool.report.page import render_page

@@ -6,7 +6,6 @@ sources always give the same picture.
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from enum import StrEnum
 
 from sros_tool.policy.model import ALLOW, RIGHTS, Qualifier
 from sros_tool.policy.rights import RIGHT_ORDER
-from sros_tool.values import as_plain, shows
+from sros_tool.values import shows
 
 SENDS = {"publish": True, "request": True, "call": True} | dict.fromkeys(
     ("subscribe", "reply", "execute"), False
@@ -302,8 +301,3 @@ def _joined(bundles: Sequence[Bundle]) -> Bundle:
 def _order(tie: Tie) -> tuple[int, str, str, tuple[str, ...], tuple[str, ...], str, bool]:
     right = RIGHT_ORDER[tie.right]
     return right, tie.node, tie.qualifier, tie.by, tie.parts, tie.mark, tie.common
-
-
-def render_json(picture: Picture) -> str:
-    """Return the picture as JSON with the field names of `Picture`."""
-    return json.dumps(as_plain(picture), indent=1, ensure_ascii=False) + "\n"

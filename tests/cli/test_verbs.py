@@ -365,7 +365,7 @@ def test_a_lost_certificate_is_issued_for_the_same_key(keystore: Path) -> None:
 
 def test_list_enclaves_as_json(keystore: Path) -> None:
     listed = json.loads(sros("list_enclaves", keystore, "--json").ok().out)
-    assert listed == {"keystore": str(keystore), "enclaves": ["/a", "/b"]}
+    assert listed == {"version": 1, "keystore": str(keystore), "enclaves": ["/a", "/b"]}
 
 
 def test_exports_repeat_byte_by_byte(keystore: Path, tmp_path: Path) -> None:
@@ -474,7 +474,7 @@ def test_inspect_of_a_date_at_the_end_of_time(date: str, keystore: Path, tmp_pat
 def test_policies_are_listed_and_copied(tmp_path: Path) -> None:
     listed = sros("policies").ok().out
     assert "/talker_listener/talker" in listed
-    as_json = json.loads(sros("policies", "--json").ok().out)
+    as_json = json.loads(sros("policies", "--json").ok().out)["policies"]
     assert len(as_json) == len(listed.splitlines())
     sros("policies", "--copy", tmp_path / "mine").ok()
     assert snapshot(tmp_path / "mine") == snapshot(policies_dir())
@@ -513,7 +513,7 @@ def variables(keystore: Path, domain: int = 0) -> dict[str, str]:
 
 def test_env_in_every_form(keystore: Path) -> None:
     wanted = variables(keystore)
-    assert json.loads(sros("env", keystore, "/a", "--json").ok().out) == wanted
+    assert json.loads(sros("env", keystore, "/a", "--json").ok().out)["variables"] == wanted
     assert json.loads(sros("env", keystore, "/a", "--format", "json").ok().out) == wanted
     docker = sros("env", keystore, "/a", "--format", "docker").ok().out
     assert dict(line.split("=", 1) for line in docker.splitlines()) == wanted
@@ -529,7 +529,8 @@ def test_env_of_a_path_that_a_form_cannot_hold(tmp_path: Path) -> None:
     sros("create_enclave", root, "/a").ok()
     for form in ("docker", "systemd"):
         assert sros("env", root, "/a", "--format", form).status == 2
-    assert json.loads(sros("env", root, "/a", "--json").ok().out) == variables(root)
+    shown = json.loads(sros("env", root, "/a", "--json").ok().out)
+    assert shown["variables"] == variables(root)
 
 
 @pytest.mark.parametrize(
@@ -553,7 +554,7 @@ def test_the_domain_of_a_process(
     words = ["--domain", option] if option else []
     env = {"ROS_DOMAIN_ID": environment}
     said = sros("env", tmp_path / "ks", "/a", *words, "--json", env=env).ok().out
-    assert json.loads(said)["ROS_DOMAIN_ID"] == chosen
+    assert json.loads(said)["variables"]["ROS_DOMAIN_ID"] == chosen
 
 
 SHOW = """

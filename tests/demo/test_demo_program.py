@@ -217,5 +217,5 @@ def test_the_list_of_scenarios() -> None:
     assert [line.split()[0] for line in text.splitlines()] == [
         *("isolation", "services", "actions", "composition", "attacks", "governance")
     ]
-    shown = json.loads(sros("demo", "--list", "--json").ok().out)
+    shown = json.loads(sros("demo", "--list", "--json").ok().out)["scenarios"]
     assert shown[0]["rows"] == 11

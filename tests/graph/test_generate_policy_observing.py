@@ -41,6 +41,7 @@ def test_what_is_seen_is_written_and_nothing_else_on_stdout(program: Program) ->
 def test_json_has_a_stable_shape(program: Program) -> None:
     ended = program(graph(TALKER), *SHORT, "--json").ok()
     assert json.loads(ended.out) == {
+        "version": 1,
         "file": "robot.xml",
         "source": "graph",
         "created": True,
@@ -66,6 +67,7 @@ def test_json_has_a_stable_shape(program: Program) -> None:
             }
         ],
         "copied": [],
+        "changes": [{"action": "create", "path": "robot.xml"}],
         "notes": [],
     }
 

@@ -114,7 +114,7 @@ def test_a_changed_ledger_is_noticed_and_revoking_goes_on(case: str, root: Path)
     present = certificate(root / "enclaves/a/cert.pem").serial_number
     done = revoke(root, ["/a"], now=NOW)
     assert present in revoked(root)
-    assert any(gaps[0] in remark and "stay valid" in remark for remark in done.remarks)
+    assert any(gaps[0] in remark.text and "stay valid" in remark.text for remark in done.remarks)
     # What the new head signs hides nothing of it.
     assert gaps[0] in read_ledger(root).gaps
     renew(root, ["/b"], now=NOW, new_key=True) if "/b" in certain(root) else None
@@ -173,7 +173,7 @@ def test_a_ledger_without_a_chain_is_read_and_chained_from_then_on(root: Path) -
     ledger = read_ledger(root)
     assert (ledger.gaps, ledger.unchained) == ((), len(before))
     (remark,) = revoke(root, ["/a"], now=NOW).remarks
-    assert f"whether a line was removed from its first {len(before)}" in remark
+    assert f"whether a line was removed from its first {len(before)}" in remark.text
     put(root, lines_of(root)[1:])
     assert read_ledger(root).gaps
 
@@ -212,7 +212,7 @@ def test_an_older_revocation_list_brings_nothing_back(put_back: bool, root: Path
     assert refresh_crl(root, now=NOW).remarks == ()
     file.write_bytes(older) if put_back else file.unlink()
     (remark,) = refresh_crl(root, now=NOW).remarks
-    assert "2 revocations are in it again" in remark
+    assert "2 revocations are in it again" in remark.text
     assert revoked(root) == wanted
 
 

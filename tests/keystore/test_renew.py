@@ -440,9 +440,9 @@ def test_the_check_answers_by_its_exit_status(tmp_path: Path) -> None:
     assert sros(*check, "66%").ok().out == ""
     due = sros(*check, "181d")
     assert (due.status, due.out.startswith("/a  permissions until ")) == (1, True), due
-    (entry,) = json.loads(sros(*check, "181d", "--json").out)
+    (entry,) = json.loads(sros(*check, "181d", "--json").out)["enclaves"]
     assert set(entry) == {"enclave", "certificate_until", "permissions_until"}
-    assert json.loads(sros(*check, "30d", "--json").ok().out) == []
+    assert json.loads(sros(*check, "30d", "--json").ok().out)["enclaves"] == []
     assert sros(*check, "often").status == 2
 
 
@@ -457,6 +457,7 @@ def test_the_check_goes_on_after_one_that_cannot_be_read(tmp_path: Path) -> None
     assert told.out.startswith("/b  unknown: enclave /b cannot be read")
     told = sros(*check, "181d")
     assert [line.split()[0] for line in told.out.splitlines()] == ["/a", "/c", "/b"]
-    *due, unreadable = json.loads(sros(*check, "181d", "--json").out)
-    assert [entry["enclave"] for entry in due] == ["/a", "/c"]
-    assert set(unreadable) == {"enclave", "problem"}
+    shown = json.loads(sros(*check, "181d", "--json").out)
+    assert [entry["enclave"] for entry in shown["enclaves"]] == ["/a", "/c"]
+    (unreadable,) = shown["unreadable"]
+    assert (unreadable["enclave"], set(unreadable)) == ("/b", {"enclave", "problem"})

@@ -618,7 +618,7 @@ def test_the_verb(separate: Path) -> None:
     told = json.loads(sros("inspect", separate / "public/identity_ca.cert.pem", "--json").ok().out)
     assert [each["is_ca"] for each in told["further"]] == [True]
     told = json.loads(sros("rotate_ca", separate, "--status", "--json").ok().out)
-    assert [(each["standing"], each["enclaves"]) for each in told["authorities"]] == [
+    assert [(each["state"], each["enclaves"]) for each in told["authorities"]] == [
         ("issuing", 3),
         ("next", 0),
     ] * 2

@@ -131,8 +131,8 @@ def test_crl_shows_the_list_beside(root: Path) -> None:
     assert "next to it" not in sros("crl", root).ok().out
     rotate_ca(root, now=NOW)
     assert "next to it, list 2 of CN=" in sros("crl", root).ok().out
-    (beside,) = json.loads(sros("crl", root, "--json").ok().out)["beside"]
-    assert (beside["number"], beside["revoked"]) == (2, [])
+    (other,) = json.loads(sros("crl", root, "--json").ok().out)["other_lists"]
+    assert (other["number"], other["revoked"]) == (2, [])
     for _ in range(2):
         rotate_ca(root, now=NOW)
-    assert json.loads(sros("crl", root, "--json").ok().out)["beside"] == []
+    assert json.loads(sros("crl", root, "--json").ok().out)["other_lists"] == []

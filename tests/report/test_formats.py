@@ -12,7 +12,6 @@ from lxml import etree
 
 from sros_tool.report.dot_mermaid import render_dot, render_mermaid
 from sros_tool.report.layout import scenes_of
-from sros_tool.report.picture import render_json
 from sros_tool.report.svg import render_svg
 from tests.report.pictures import HOSTILE, MOBILE_ROBOT, hostile_permissions, mobile_robot
 from tests.support.children import importing, python, run
@@ -106,7 +105,8 @@ def test_mermaid_holds_no_letter_of_markup_in_a_label(tmp_path: Path) -> None:
 
 def test_json_is_complete() -> None:
     picture = mobile_robot()
-    value = json.loads(render_json(picture))
+    value = json.loads(sros("view", MOBILE_ROBOT, "--json").ok().out)
+    assert value["version"] == 1
     assert len(value["edges"]) == len(picture.edges)
     scan = [e for e in value["edges"] if e["name"] == "/scan" and e["right"] == "publish"]
     assert [(e["enclave"], e["direction"], e["qualifier"]) for e in scan] == [

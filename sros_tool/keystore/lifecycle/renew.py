@@ -60,7 +60,7 @@ class Renewal:
     ``works_until`` is the latest expiry of the replaced certificates, or None if they have expired
     or were revoked.  ``revoked`` is the number of revoked certificates.  ``restart`` are the
     enclaves whose processes trust the revoked certificates until they are restarted.  ``remarks``
-    are sentences about open tasks.
+    are notes about open tasks.
     """
 
     root: Path
@@ -70,7 +70,7 @@ class Renewal:
     works_until: datetime | None = None
     revoked: int = 0
     restart: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[Note, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

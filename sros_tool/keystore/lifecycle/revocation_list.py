@@ -17,7 +17,7 @@ from pathlib import Path
 
 from cryptography import x509
 
-from sros_tool.errors import KeystoreError, SrosError
+from sros_tool.errors import KeystoreError, Note, SrosError
 from sros_tool.keystore.authorities.authority import Authority, write_bundle
 from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.layout import CRL, IDENTITY, revoked_certificates
@@ -137,7 +137,7 @@ class RevocationListSigner:
         self._keyring = keyring
         self._ledger = ledger
         self._now = now
-        self.remarks: list[str] = []
+        self.remarks: list[Note] = []
         self.present = self._authentic(read_crl(self._root))
 
     def _authentic(self, found: RevocationList | None) -> RevocationList | None:
@@ -150,10 +150,11 @@ class RevocationListSigner:
         trusted = certificates_of(self._root, file) if file else (self._authority.certificate,)
         if found is None or any(signed_by(found.list, each) for each in trusted):
             return found
-        self.remarks.append(
+        text = (
             "No identity CA of this keystore signed the revocation list that was there, so its "
             "entries do not count: find out who wrote it."
         )
+        self.remarks.append(Note("crl.not-signed-here", text))
         return None
 
     def sign(
@@ -172,10 +173,11 @@ class RevocationListSigner:
         expiries = self._expiries()
         if lost := self._lost(expiries):
             new_entries = [*new_entries, *lost]
-            self.remarks.append(
+            text = (
                 f"The revocation list was not the last one that this keystore signed: {len(lost)} "
                 "revocations are in it again."
             )
+            self.remarks.append(Note("crl.put-back", text))
         signed = self._sign(self._authority, self.present, new_entries, expiries, 0)
         self._transaction.write(CRL, signed.document)
         found = [signed]
@@ -320,4 +322,5 @@ class RevocationListSigner:
         elif old:
             text += f"; it expires at {iso(old.next_update)}, and Fast DDS then refuses "
             text += "the enclaves of that CA"
-        self.remarks.append(f"{text}: run `sros rotate_ca {self._root} --to retire`.")
+        text += f": run `sros rotate_ca {self._root} --to retire`."
+        self.remarks.append(Note("crl.old-ca-not-signed", text))

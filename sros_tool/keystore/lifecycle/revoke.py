@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from sros_tool.errors import KeystoreError, UsageError
+from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.authorities.authority import Authority, load_authority
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.layout import (
@@ -42,7 +42,7 @@ class Revocation:
 
     ``revoked`` are the revoked enclaves.  ``restart`` are the enclaves whose processes trust the
     revoked certificates until they are restarted.  ``next_update`` is the expiry of the revocation
-    list, in UTC.  ``remarks`` are sentences about open tasks.
+    list, in UTC.  ``remarks`` are notes about open tasks.
     """
 
     root: Path
@@ -50,7 +50,7 @@ class Revocation:
     restart: tuple[str, ...]
     next_update: datetime
     changes: tuple[Change, ...]
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[Note, ...] = ()
 
 
 def revoke(
@@ -178,7 +178,7 @@ def still_valid(
     return found
 
 
-def remarks_on_lack(root: Path, ledger: Ledger, present: Mapping[int, str]) -> tuple[str, ...]:
+def remarks_on_lack(root: Path, ledger: Ledger, present: Mapping[int, str]) -> tuple[Note, ...]:
     """Return a remark if the ledger may lack earlier certificates of revoked enclaves.
 
     ``present`` maps the serial numbers of their last certificates to their names.
@@ -191,10 +191,11 @@ def remarks_on_lack(root: Path, ledger: Ledger, present: Mapping[int, str]) -> t
         why.append(f"it does not have the present certificate of {', '.join(unknown)}")
     if not why:
         return ()
-    return (
+    text = (
         f"The ledger of '{root}' may lack earlier certificates: {'; '.join(why)}. Those that it "
-        "lacks stay valid until they expire or their CA is replaced: see `sros rotate_ca`.",
+        "lacks stay valid until they expire or their CA is replaced: see `sros rotate_ca`."
     )
+    return (Note("ledger.may-lack-certificates", text),)
 
 
 def revocation_entry(certificate: Entry, now: datetime, reason: str, *, key: str) -> Entry:
