@@ -57,6 +57,7 @@ def test_json_has_a_stable_shape(program: Program) -> None:
     ended = program(graph(LOUD), "robot.xml", *SHORT, "--json", ROS_DOMAIN_ID="7")
     assert ended.status == 1
     assert json.loads(ended.out) == {
+        "version": 1,
         "source": "robot.xml",
         "kind": "policy",
         "vendor": "fastdds",
