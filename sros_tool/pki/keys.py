@@ -155,10 +155,7 @@ def _check_derivation(pem: bytes, name: str) -> None:
     """
     for block in _ENCRYPTED.findall(pem):
         try:
-            content = base64.b64decode(block)
-            scheme = der.first(der.first(content).content)
-            scrypt = der.encode(der.OID, der.encode_oid(_SCRYPT)) in scheme.content
-            numbers = list(_integers(scheme.content))
+            scrypt, numbers = _derivation(block)
         except (ValueError, PkiError) as error:
             raise _unreadable(name) from error
         if scrypt:
@@ -174,6 +171,44 @@ def _check_derivation(pem: bytes, name: str) -> None:
                 f"Its file asks for {max(numbers)} rounds to try a passphrase.",
                 "Encrypt it again with `openssl pkcs8 -topk8 -scrypt -in KEY -out KEY.new`.",
             )
+
+
+def _derivation(block: bytes) -> tuple[bool, list[int]]:
+    """Return whether a block of PEM is encrypted by scrypt, and the numbers of the derivation.
+
+    For scrypt these are N, r and p, for others the rounds, perhaps with more after them.
+
+    Raises:
+        ValueError, PkiError: it is damaged.
+    """
+    scheme = der.first(der.first(base64.b64decode(block)).content).content
+    scrypt = der.encode(der.OID, der.encode_oid(_SCRYPT)) in scheme
+    return scrypt, list(_integers(scheme))
+
+
+_FEWEST_ROUNDS = 600_000  # OWASP Password Storage Cheat Sheet (2025), of PBKDF2 with SHA-256
+_LEAST_SCRYPT_WORK = 2**17  # N * r * p of `openssl pkcs8 -scrypt`
+_TRADITIONAL = b"Proc-Type: 4,ENCRYPTED"
+
+
+def few_rounds(pem: bytes) -> str:
+    """Return why passphrases of an encrypted key are tried fast, as a clause; "" if they are not.
+
+    Source: RFC 8018, 4.2; OpenSSL 3.0, openssl-pkcs8 (2048 rounds) and PEM_write_bio_PrivateKey
+    (one round of MD5).
+    """
+    if _TRADITIONAL in pem:
+        return "one round of MD5 tries a passphrase"
+    for block in _ENCRYPTED.findall(pem):
+        try:
+            scrypt, numbers = _derivation(block)
+        except (ValueError, PkiError):
+            continue  # `load_key` reports it
+        if scrypt and math.prod(numbers[:3]) < _LEAST_SCRYPT_WORK:
+            return f"scrypt with {', '.join(map(str, numbers[:3]))} tries a passphrase"
+        if not scrypt and numbers and numbers[0] < _FEWEST_ROUNDS:
+            return f"{numbers[0]} rounds try a passphrase"
+    return ""
 
 
 def _integers(data: bytes, depth: int = 3) -> Iterator[int]:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
-from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID
 
@@ -45,6 +45,15 @@ def give_away(path: Path) -> None:
     if os.geteuid() != 0:
         pytest.skip("only root can give a folder to another user")
     os.chown(path, STRANGER, STRANGER, follow_symlinks=False)
+
+
+def weakly_encrypted(bench: Bench) -> None:
+    """As OpenSSL and the library `cryptography` encrypt a key unless told otherwise."""
+    path = bench.path("private/identity_ca.key.pem")
+    pem_of = bench.key("identity").private_bytes
+    secret = serialization.BestAvailableEncryption(SECRET.encode())
+    form = serialization.PrivateFormat.PKCS8
+    path.write_bytes(pem_of(serialization.Encoding.PEM, form, secret))
 
 
 IS_CA = (x509.BasicConstraints(True, None), True)
@@ -112,6 +121,7 @@ CASES |= {
     "keystore.ca-key-plain": lambda b: b.path("private/identity_ca.key.pem").write_bytes(
         key_pem(b.key("identity"))
     ),
+    "keystore.ca-key-few-rounds": lambda b: weakly_encrypted(b),
     "keystore.not-a-ca": lambda b: b.trust("identity", b.new_authority()[0]),
     "keystore.ca-extensions": lambda b: b.trust("identity", b.new_authority(IS_CA)[0]),
     "portable.intermediate": lambda b: b.trust(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -13,8 +14,9 @@ from sros_tool.keystore.authorities.keyring import Keyring
 from sros_tool.keystore.lifecycle.create import create_keystore
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.certificates import pem
+from sros_tool.pki.keys import load_key
 from sros_tool.policy.document import read_policy
-from tests.checks.bench import Bench
+from tests.checks.bench import SECRET, Bench
 from tests.checks.keystore_cases import CASES, STRANGER, give_away
 from tests.support.harness import sros
 
@@ -184,3 +186,29 @@ def _present(text: str, changes: tuple[tuple[str, str], ...]) -> str:
     for old, new in changes:
         text = text.replace(old, new)
     return text
+
+
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_the_remedy_for_few_rounds_runs(elsewhere: bool, bench: Bench, tmp_path: Path) -> None:
+    kind = "keystore.ca-key-few-rounds"
+    CASES[kind](bench)
+    key = bench.path("private/identity_ca.key.pem")
+    if elsewhere:
+        key = key.rename(tmp_path / "the key.pem")
+        settings = bench.path("sros.toml")
+        settings.write_text(
+            settings.read_text().replace(
+                "[authorities]", f'[authorities]\nidentity_key = "file:{key}"'
+            )
+        )
+    (found,) = (each for each in keystore_findings(bench.root, now=bench.now) if each.id == kind)
+    command = found.remedy.removeprefix("Run `").removesuffix("`.")
+    secrets = "pkcs8 -passin env:SECRET -passout env:SECRET"
+    subprocess.run(
+        ["sh", "-c", command.replace("pkcs8", secrets)],
+        env={**os.environ, "SECRET": SECRET},
+        check=True,
+    )
+    assert kind not in ids(bench)
+    assert load_key(key.read_bytes(), "", lambda: SECRET)
+    assert key.stat().st_mode & 0o777 == 0o600

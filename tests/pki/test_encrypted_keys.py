@@ -12,7 +12,14 @@ from cryptography.hazmat.primitives.asymmetric import rsa
 
 from sros_tool.errors import PkiError
 from sros_tool.pki import der
-from sros_tool.pki.keys import PrivateKey, generate_key, holds_private_key, key_pem, load_key
+from sros_tool.pki.keys import (
+    PrivateKey,
+    few_rounds,
+    generate_key,
+    holds_private_key,
+    key_pem,
+    load_key,
+)
 
 PASSPHRASE = "Öffne dich, Sesam"
 KEYS: dict[str, PrivateKey] = {"EC": generate_key(), "RSA": rsa.generate_private_key(65537, 2048)}
@@ -145,3 +152,28 @@ def test_a_private_key_is_found_in_every_form_of_openssl(key: PrivateKey, words:
     pem = key_pem(key)
     assert holds_private_key(b"other text\n" + openssl(*words, data=pem))
     assert not holds_private_key(openssl("pkey", "-pubout", data=pem))
+
+
+ROUNDS = {
+    "pkcs8 -topk8": "2048 rounds try a passphrase",
+    "pkcs8 -topk8 -iter 1000": "1000 rounds try a passphrase",
+    "pkcs8 -topk8 -iter 600000": "",
+    "pkcs8 -topk8 -v1 PBE-SHA1-3DES": "2048 rounds try a passphrase",
+    "pkcs8 -topk8 -scrypt": "",
+    "pkcs8 -topk8 -scrypt -scrypt_N 1024": "scrypt with 1024, 8, 1 tries a passphrase",
+    "pkey -traditional -aes256": "one round of MD5 tries a passphrase",
+    "pkey": "",
+}
+
+
+@pytest.mark.parametrize("form", ROUNDS)
+def test_few_rounds_to_try_a_passphrase(form: str) -> None:
+    encrypted = [] if form == "pkey" else ["-passout", f"pass:{PASSPHRASE}"]
+    pem = openssl(*form.split(), *encrypted, data=key_pem(KEYS["EC"]))
+    assert few_rounds(pem) == ROUNDS[form]
+
+
+def test_sros_and_its_damaged_keys_have_no_few_rounds() -> None:
+    pem = key_pem(KEYS["EC"], PASSPHRASE)
+    assert few_rounds(pem) == ""
+    assert few_rounds(pem.replace(pem[40:80], b"")) == ""

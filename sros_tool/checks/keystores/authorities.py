@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import datetime, timedelta
+from pathlib import Path
+from shlex import quote
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
@@ -29,7 +31,7 @@ from sros_tool.keystore.loading import authority_refusals, refusals_text
 from sros_tool.pki.certificates import same_key, subject_text, validity_of, weakness
 from sros_tool.pki.chains import purpose_faults
 from sros_tool.pki.crl import signed_by
-from sros_tool.pki.keys import algorithm, load_key
+from sros_tool.pki.keys import algorithm, few_rounds, load_key
 from sros_tool.pki.token_uri import is_token_uri
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
@@ -204,6 +206,15 @@ CA_KEY_PLAIN = FindingKind(
     "ros2/sros2 issue 282; NIST SP 800-57 part 1, 6 (protection of keys).",
     "Create keystores with --encrypt-ca-keys or with keys on a token, or keep private/ offline.",
 )
+CA_KEY_FEW_ROUNDS = FindingKind(
+    "keystore.ca-key-few-rounds",
+    NOTE,
+    "a CA key whose passphrase can be guessed fast",
+    "Whoever copies the key can try millions of passphrases in a minute. OpenSSL makes 2048 rounds "
+    "of PBKDF2 unless it is told otherwise; 600,000 are recommended, or scrypt.",
+    "OWASP Password Storage Cheat Sheet (2025); OpenSSL 3.0 (openssl-pkcs8).",
+    "Run `openssl pkcs8 -topk8 -scrypt -in KEY -out KEY.new && mv KEY.new KEY`.",
+)
 SETTINGS_MISSING = FindingKind(
     "keystore.settings-missing",
     WARNING,
@@ -325,8 +336,10 @@ def _key(keystore: CheckedKeystore, role: str, certificate: x509.Certificate) ->
         yield from _key_elsewhere(keystore, role)
         return
     try:
-        key = load_key(read_bytes(path, "key"), f"'{path}'", _locked)
+        pem = read_bytes(path, "key")
+        key = load_key(pem, f"'{path}'", _locked)
     except _LockedError:
+        yield from _few_rounds(role, path, pem)
         return
     except SrosError as error:
         yield UNREADABLE.found(f"{role} CA key", f"{error.what}. {error.why}", str(path))
@@ -346,6 +359,15 @@ def _key_elsewhere(keystore: CheckedKeystore, role: str) -> Iterator[Finding]:
         path = key_path(keystore.root, place)
         with suppress(OSError):  # it may be on a medium that is not there now
             yield from key_mode_findings(str(path), path.stat().st_mode)
+        with suppress(SrosError):
+            yield from _few_rounds(role, path, read_bytes(path, "key"))
+
+
+def _few_rounds(role: str, path: Path, pem: bytes) -> Iterator[Finding]:
+    if text := few_rounds(pem):
+        old, new = quote(str(path)), quote(f"{path}.new")
+        remedy = f"Run `openssl pkcs8 -topk8 -scrypt -in {old} -out {new} && mv {new} {old}`."
+        yield CA_KEY_FEW_ROUNDS.found(f"{role} CA key", text, str(path), remedy=remedy)
 
 
 class _LockedError(Exception):
