@@ -33,7 +33,7 @@ from sros_tool.names import (
 from sros_tool.pki.certificates import common_name, subject_text
 from sros_tool.policy.document import IncludedFile, Includer, read_policy
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Policy, Profile, Source
-from sros_tool.policy.patterns import covers, literal_prefix, matches, overlap
+from sros_tool.policy.patterns import ComparisonLimit, Names, covers, literal_prefix
 from sros_tool.policy.rights import GOAL, WHOLE, Right, Rules, parts, policy_rights
 from sros_tool.resources import policies_dir
 from sros_tool.translate import permissions_for
@@ -204,13 +204,13 @@ def _check_counterparts(checked: _CheckedPolicy) -> Iterator[Finding]:
     for each in checked.statements:
         if each.allows:
             names[each.right.right].add(each.name)
-    wild = {right: [n for n in found if is_expression(n)] for right, found in names.items()}
+    sides = {right: Names(sorted(names[right])) for right in _OTHER_SIDE.values()}
     for each in checked.statements:
         other = _OTHER_SIDE.get(each.right.right)
         name = each.name
         if not other or not each.allows or is_expression(name) or name in _GLOBAL_TOPICS:
             continue
-        if name not in names[other] and not any(matches(wide, name) for wide in wild[other]):
+        if not sides[other].meets(name):
             if action_part(name)[1]:
                 continue  # the other side may name the whole action
             yield each.found(NO_COUNTERPART, f"no enclave may {other} {name}")
@@ -517,7 +517,7 @@ def outside_findings(
     permissions: Permissions, signed_bytes: int, subject: str, file: str, line: int | None = None
 ) -> Iterator[Finding]:
     """Yield findings about the parts of permissions that are outside of the portable profile."""
-    for identity, fact in outside(permissions, signed_bytes, overlap):
+    for identity, fact in outside(permissions, signed_bytes, lambda names: Names(names).meets):
         yield _OUTSIDE[identity].found(subject, fact, file, line)
 
 
@@ -584,7 +584,7 @@ def _check_rules(checked: _CheckedPolicy) -> Iterator[Finding]:
     for each in checked.statements:
         if each.allows:
             yield from _permission(each, checked.rules)
-        elif not checked.rules.meeting(each.right._replace(qualifier=ALLOW)):
+        elif not checked.rules.meet(each.right._replace(qualifier=ALLOW)):
             yield each.found(NO_EFFECT, f"no rule allows to {each.right.describe()}")
     yield from _redundant(checked)
 
@@ -613,14 +613,15 @@ def _redundant(checked: _CheckedPolicy) -> Iterator[Finding]:
     for each in checked.statements:
         if each.allows and is_expression(each.name):
             wild[id(each.profile), each.right.right].append(each.name)
+    limit = ComparisonLimit()
+    names = {place: Names(found, limit) for place, found in wild.items()}
     for each in checked.statements:
         # Included rights are the same for all nodes, so a redundant one is not a mistake.
         if not each.allows or each.source.file != each.profile.source.file:
             continue
-        for wide in wild.get((id(each.profile), each.right.right), ()):
-            if wide != each.name and covers(wide, each.name):
-                yield each.found(REDUNDANT_RULE, f"{each.right.describe()} is covered by {wide}")
-                break
+        there = names.get((id(each.profile), each.right.right))
+        if there and (wide := next(there.covering(each.name), "")):
+            yield each.found(REDUNDANT_RULE, f"{each.right.describe()} is covered by {wide}")
 
 
 MALFORMED = FindingKind(

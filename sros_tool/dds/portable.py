@@ -36,19 +36,24 @@ _CONSEQUENCES = {
 }
 
 
-def _either_matches(one: str, other: str) -> bool:
+Meets = Callable[[str], bool]
+"""Whether an expression and some of certain others match a common name."""
+
+
+def _meets_text(names: Sequence[str]) -> Meets:
     """Return whether one expression matches the text of the other; other overlaps are missed."""
-    return fnmatchcase(one, other) or fnmatchcase(other, one)
+    return lambda name: any(fnmatchcase(each, name) or fnmatchcase(name, each) for each in names)
 
 
 def outside(
     permissions: Permissions,
     signed_bytes: int,
-    share: Callable[[str, str], bool] = _either_matches,
+    meets_some_of: Callable[[Sequence[str]], Meets] = _meets_text,
 ) -> Iterator[tuple[str, str]]:
     """Yield the id and a clause of a note for each part of a document outside of the profile.
 
-    ``share`` returns whether two expressions match a common name.
+    ``meets_some_of`` returns the function that says whether an expression and one of its arguments
+    match a common name.
     """
     if signed_bytes >= MAX_SIGNED_BYTES:
         yield "portable.document-size", f"the signed permissions have {signed_bytes} bytes"
@@ -68,8 +73,7 @@ def outside(
             blocked = _blocked(
                 [t for r in denied for t in _topics(getattr(r, direction))],
                 {t for r in denied for t in _topics(getattr(r, other))},
-                [t for r in allowed for t in _topics(getattr(r, other))],
-                share,
+                meets_some_of([t for r in allowed for t in _topics(getattr(r, other))]),
             )
             if blocked:
                 kept_from = "subscribing" if other == "subscribe" else "publishing"
@@ -88,15 +92,9 @@ def _topics(criteria: Iterable[Criteria]) -> tuple[str, ...]:
     return tuple(topic for each in criteria for topic in each.topics)
 
 
-def _blocked(
-    denied: list[str], denied_too: set[str], allowed: list[str], share: Callable[[str, str], bool]
-) -> list[str]:
+def _blocked(denied: list[str], denied_too: set[str], is_allowed: Meets) -> list[str]:
     """Return the denied expressions that share a name with one allowed in the other direction."""
-    return [
-        expression
-        for expression in denied
-        if expression not in denied_too and any(share(expression, each) for each in allowed)
-    ]
+    return [each for each in denied if each not in denied_too and is_allowed(each)]
 
 
 def name_notes(names: Iterable[str], new: Iterable[str]) -> Iterator[Note]:

@@ -165,10 +165,10 @@ class _Narrowing:
         """Return whether a right, or a part of a wildcard, is allowed."""
         if self._is_allowed(part):
             return True
-        return is_expression(part.name) and bool(self._rules.meeting(part))
+        return is_expression(part.name) and self._rules.meet(part)
 
     def _is_observed(self, rule: Right) -> bool:
-        return bool(self._use.meeting(rule))
+        return self._use.meet(rule)
 
     def result(self) -> tuple[Enclave, EnclaveUse]:
         if not self._observed:
@@ -277,9 +277,7 @@ class _Narrowing:
         if not self._denied:
             return found
         return {
-            pair
-            for pair in found
-            if not self._rules.meeting(Right(self._enclave.path, DENY, *pair))
+            pair for pair in found if not self._rules.meet(Right(self._enclave.path, DENY, *pair))
         }
 
     def _with_actions(self, found: set[_Pair], rules: Rules) -> set[_Pair]:

@@ -4,19 +4,21 @@
 one character of a set, ``[!a-c]`` one that is not in it.  This is fnmatch of glibc without escapes,
 as the DDS vendors match.
 
-`overlap` compares two expressions.  `common_name` compares any number, also with exceptions, and
-returns an example; it only considers valid absolute ROS names.
+`overlap` and `covers` compare two expressions, `Names` searches many.  `common_name` compares any
+number, also with exceptions, and returns an example; it only considers valid absolute ROS names.
 """
 
 from __future__ import annotations
 
 import re
-from collections import deque
-from collections.abc import Iterable, Iterator
+from bisect import bisect_left
+from collections import Counter, deque
+from collections.abc import Iterable, Iterator, Sequence
 from fnmatch import translate
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from string import ascii_letters, digits
 
+from sros_tool.errors import DocumentError
 from sros_tool.names import is_expression
 
 _MANY = 4096
@@ -24,7 +26,7 @@ _WILDCARD = re.compile(r"[*?\[]")
 _PIECE = re.compile(r"\*+|\?|\[(!?)([^\]]+)\]|(.)", re.DOTALL)
 _RANGE = re.compile(r"(.)-(.)|(.)", re.DOTALL)
 _ALPHABET = frozenset(map(chr, range(33, 127)))  # wider than ROS names: DDS topics may be foreign
-_ANY: frozenset[str] = frozenset()
+_ANY = frozenset([""])
 """The piece of a pattern that means ``*``."""
 
 
@@ -36,7 +38,22 @@ def compiled(expression: str) -> re.Pattern[str]:
 
 def matches(expression: str, name: str) -> bool:
     """Return whether ``expression`` matches ``name``, which has no wildcards."""
-    return compiled(expression).match(name) is not None
+    if "?" in expression or "[" in expression:
+        return compiled(expression).match(name) is not None
+    # To compile an expression takes much longer than to look for its parts once.
+    first, *others = expression.split("*")
+    if not others:
+        return expression == name
+    *middle, last = others
+    at, end = len(first), len(name) - len(last)
+    if end < at or not name.startswith(first) or not name.endswith(last):
+        return False
+    for part in middle:
+        at = name.find(part, at, end)
+        if at < 0:
+            return False
+        at += len(part)
+    return True
 
 
 def literal_prefix(expression: str) -> str:
@@ -56,24 +73,7 @@ def covers(wide: str, narrow: str) -> bool:
         return False
     if not is_expression(narrow):
         return matches(wide, narrow)
-    return narrow.startswith(literal_prefix(wide)) and _covers(wide, narrow)
-
-
-@lru_cache(maxsize=_MANY)
-def _covers(wide: str, narrow: str) -> bool:
-    outer, inner = _pieces(wide), _pieces(narrow)
-    # reached[i]: the first i pieces of outer cover the pieces of inner that were seen so far.
-    reached = _after_stars({0}, outer)
-    for piece in inner:
-        following = {i for i in reached if i < len(outer) and outer[i] is _ANY}
-        if piece is not _ANY:
-            following |= {
-                i + 1
-                for i in reached
-                if i < len(outer) and outer[i] is not _ANY and piece <= outer[i]
-            }
-        reached = _after_stars(following, outer)
-    return len(outer) in reached
+    return narrow.startswith(literal_prefix(wide)) and _form(wide).covers(_form(narrow))
 
 
 def overlap(one: str, other: str) -> bool:
@@ -83,61 +83,122 @@ def overlap(one: str, other: str) -> bool:
     if not is_expression(other):
         return matches(one, other)
     shorter, longer = sorted((literal_prefix(one), literal_prefix(other)), key=len)
-    return longer.startswith(shorter) and _overlap(one, other)
+    return longer.startswith(shorter) and _form(one).overlaps(_form(other))
 
 
-@lru_cache(maxsize=_MANY)
-def _overlap(one: str, other: str) -> bool:
-    first, second = _pieces(one), _pieces(other)
-    seen: set[tuple[int, int]] = set()
-    states = [(0, 0)]
-    while states:
-        state = states.pop()
-        if state in seen:
-            continue
-        seen.add(state)
-        i, j = state
-        if i == len(first) and j == len(second):
-            return True
-        here = first[i] if i < len(first) else None
-        there = second[j] if j < len(second) else None
-        if here is _ANY:
-            states.append((i + 1, j))
-            if there is not None:
-                states.append((i, j + 1))
-        if there is _ANY:
-            states.append((i, j + 1))
-            if here is not None:
-                states.append((i + 1, j))
-        if here and there and not here.isdisjoint(there):
-            states.append((i + 1, j + 1))
-    return False
+_Pieces = tuple[frozenset[str], ...]
 
 
-def _after_stars(reached: set[int], pieces: tuple[frozenset[str], ...]) -> set[int]:
-    """Return ``reached`` and the positions after stars, which can match nothing."""
-    grown = set(reached)
-    for i in sorted(reached):
-        while i < len(pieces) and pieces[i] is _ANY:
-            i += 1
-            grown.add(i)
-    return grown
+class _Form:
+    """The pieces of an expression, and its positions as the bits of an integer.
+
+    Bit i of a set of positions stands for "the first i pieces matched".
+    """
+
+    __slots__ = ("_covering", "_letters", "_meeting", "back", "front", "pieces", "starred", "stars")
+
+    def __init__(self, pieces: _Pieces) -> None:
+        self.pieces = pieces
+        at = [i for i, piece in enumerate(pieces) if piece is _ANY]
+        self.starred = bool(at)
+        self.stars = sum(1 << i for i in at)
+        self.front = pieces[: at[0]] if at else pieces
+        self.back = pieces[at[-1] + 1 :] if at else pieces
+        self._letters: dict[str, int] = {}
+        self._covering: dict[frozenset[str], int] = {}
+        self._meeting: dict[frozenset[str], int] = {}
+
+    def covers(self, narrow: _Form) -> bool:
+        """Return whether these pieces cover those of ``narrow``, one by one."""
+        reached = self._begin()
+        for piece in narrow.pieces:
+            kept = reached & self.stars
+            if piece is not _ANY:
+                kept |= (reached & self._covers_at(piece)) << 1
+            reached = kept | (kept & self.stars) << 1
+            if not reached:
+                return False
+        return bool(reached >> len(self.pieces))
+
+    def overlaps(self, other: _Form) -> bool:
+        """Return whether some name matches both."""
+        if not (all(self.pieces) and all(other.pieces)):
+            return False  # a set without members matches nothing
+        if self.starred and other.starred:
+            # A name that begins and ends as both demand, and has the middle of one and then that
+            # of the other in between, matches both: the stars match the rest.
+            return _meet(self.front, other.front) and _meet(self.back[::-1], other.back[::-1])
+        if not self.starred and not other.starred:
+            return len(self.pieces) == len(other.pieces) and _meet(self.pieces, other.pieces)
+        return self._meets(other) if self.starred else other._meets(self)
+
+    def _meets(self, fixed: _Form) -> bool:
+        """Return whether a name of the pieces of ``fixed``, which has no star, matches."""
+        reached = self._begin()
+        for piece in fixed.pieces:
+            kept = reached & self.stars | (reached & self._meets_at(piece)) << 1
+            reached = kept | (kept & self.stars) << 1
+            if not reached:
+                return False
+        return bool(reached >> len(self.pieces))
+
+    def _begin(self) -> int:
+        return 1 | (self.stars & 1) << 1
+
+    def _covers_at(self, piece: frozenset[str]) -> int:
+        """Return the positions of the pieces that match all letters of ``piece``."""
+        if piece not in self._covering:
+            every = ~0
+            for letter in piece:
+                every &= self._at(letter)
+            self._covering[piece] = every & (1 << len(self.pieces)) - 1 & ~self.stars
+        return self._covering[piece]
+
+    def _meets_at(self, piece: frozenset[str]) -> int:
+        """Return the positions of the pieces that match some letter of ``piece``."""
+        if piece not in self._meeting:
+            some = 0
+            for letter in piece:
+                some |= self._at(letter)
+            self._meeting[piece] = some
+        return self._meeting[piece]
+
+    def _at(self, letter: str) -> int:
+        if letter not in self._letters:
+            self._letters[letter] = sum(
+                1 << i for i, piece in enumerate(self.pieces) if letter in piece
+            )
+        return self._letters[letter]
 
 
-@lru_cache(maxsize=_MANY)
-def _pieces(expression: str) -> tuple[frozenset[str], ...]:
+def _meet(one: _Pieces, other: _Pieces) -> bool:
+    """Return whether pieces at the same position have a common letter; more of one do not count."""
+    return not any(map(frozenset.isdisjoint, one, other))
+
+
+@lru_cache(maxsize=4 * _MANY)
+def _form(expression: str) -> _Form:
+    return _Form(_pieces(expression))
+
+
+def _pieces(expression: str) -> _Pieces:
     """Return the pieces of an expression: `_ANY` for ``*``, else the set of matching characters."""
     found: list[frozenset[str]] = []
     for piece in _PIECE.finditer(expression):
         negated, members, literal = piece.groups()
         if literal is not None:
-            found.append(frozenset(literal))
+            found.append(_one(literal))
         elif members is not None:
             chosen = _members(members)
             found.append(_ALPHABET - chosen if negated else chosen)
         else:
             found.append(_ALPHABET if piece[0] == "?" else _ANY)
     return tuple(found)
+
+
+@lru_cache(maxsize=_MANY)
+def _one(letter: str) -> frozenset[str]:
+    return frozenset(letter)
 
 
 def _members(text: str) -> frozenset[str]:
@@ -147,12 +208,181 @@ def _members(text: str) -> frozenset[str]:
     return frozenset(chosen)
 
 
+# ── many expressions ───────────────────────────────────────────────────────────────────────
+
+
+class ComparisonLimit:
+    """A limit for the comparisons of one question, so that nobody waits without end."""
+
+    def __init__(self, most: int = 60_000_000) -> None:
+        """Allow comparisons in vain of expressions with ``most`` characters: some ten seconds."""
+        self._left = most
+
+    def spend(self, characters: int) -> None:
+        """Count a comparison of expressions with so many characters that had no result.
+
+        Raises:
+            DocumentError: there were too many.
+        """
+        self._left -= characters
+        if self._left < 0:
+            raise DocumentError(
+                "the names with wildcards are too many and too much alike to be compared",
+                "Almost every one of them has to be compared with every other one.",
+                "Replace wildcards by the names that they stand for, or by fewer wildcards, or "
+                "divide the rules between several enclaves.",
+            )
+
+
+_FEW = 16
+"""So many expressions are compared one by one, without an index."""
+_LAST = "\U0010ffff"
+_END = re.compile(r".*[*?\]]", re.DOTALL)
+_BETWEEN = "\0"
+_RUN = re.compile(r"[^\0]+")
+_GRAM = 4
+
+
+class Names:
+    """Names and expressions in an order, and a fast search for those that cover or meet others.
+
+    Only those are compared that have the same beginning, end or letters.  ``limit`` limits the
+    comparisons: sets that are asked for one purpose share it.
+    """
+
+    def __init__(self, names: Iterable[str], limit: ComparisonLimit | None = None) -> None:
+        self._names = tuple(dict.fromkeys(names))
+        self._exact = frozenset(each for each in self._names if not is_expression(each))
+        self._wild = tuple(each for each in self._names if is_expression(each))
+        self._limit = limit or ComparisonLimit()
+
+    def covering(self, name: str) -> Iterator[str]:
+        """Yield the other expressions that cover ``name``, as `covers` decides, in their order."""
+        for wide in self._that_may_cover(name):
+            if wide != name and self._tried(covers(wide, name), wide, name):
+                yield wide
+
+    def meets(self, name: str) -> bool:
+        """Return whether some name of this set and ``name`` match a common name."""
+        if is_expression(name):
+            candidates = map(self._names.__getitem__, self._that_may_meet(name))
+            return any(self._tried(overlap(e, name), e, name) for e in candidates)
+        return name in self._exact or any(True for _ in self.covering(name))
+
+    def meeting(self, name: str) -> Iterator[str]:
+        """Yield the names of this set that overlap with ``name``, in their order."""
+        if is_expression(name):
+            for each in map(self._names.__getitem__, sorted(self._that_may_meet(name))):
+                if self._tried(overlap(each, name), each, name):
+                    yield each
+            return
+        if name in self._exact:
+            yield name
+        yield from self.covering(name)
+
+    def _tried(self, fits: bool, one: str, other: str) -> bool:
+        if not fits:
+            self._limit.spend(len(one) + len(other))
+        return fits
+
+    def _that_may_cover(self, name: str) -> Iterable[str]:
+        if len(self._wild) <= _FEW:
+            return self._wild
+        text = _letters_of(name)
+        keys = {
+            text[i : i + size] for size in range(_GRAM + 1) for i in range(len(text) - size + 1)
+        }
+        found = [each for key in keys & self._by_letters.keys() for each in self._by_letters[key]]
+        return [self._wild[each] for each in sorted(found)]
+
+    @cached_property
+    def _by_letters(self) -> dict[str, list[int]]:
+        """The numbers of the expressions, by letters that every name that they match has.
+
+        Of the letters of an expression, those are taken that the fewest others have.
+        """
+        grams = [
+            {gram for run in _RUN.findall(_letters_of(each)) for gram in _grams(run)}
+            for each in self._wild
+        ]
+        count = Counter(gram for each in grams for gram in each)
+
+        def rarity(gram: str) -> tuple[int, int, str]:
+            return -len(gram), count[gram], gram
+
+        found: dict[str, list[int]] = {}
+        for number, each in enumerate(grams):
+            key = min(each, key=rarity) if each else ""
+            found.setdefault(key, []).append(number)
+        return found
+
+    def _that_may_meet(self, expression: str) -> Sequence[int]:
+        """Return the numbers of the names that may overlap with an expression, in any order."""
+        if len(self._names) <= _FEW:
+            return range(len(self._names))
+        begin, end = literal_prefix(expression), _END.sub("", expression)[::-1]
+        return min(self._by_begin.compatible(begin), self._by_end.compatible(end), key=len)
+
+    @cached_property
+    def _by_begin(self) -> _Beginnings:
+        return _Beginnings([(literal_prefix(each), is_expression(each)) for each in self._names])
+
+    @cached_property
+    def _by_end(self) -> _Beginnings:
+        return _Beginnings(
+            [
+                (_END.sub("", each)[::-1], True) if is_expression(each) else (each[::-1], False)
+                for each in self._names
+            ]
+        )
+
+
+class _Beginnings:
+    """Numbered texts, some of which go on with anything."""
+
+    def __init__(self, texts: Sequence[tuple[str, bool]]) -> None:
+        ordered = sorted((text, number) for number, (text, _) in enumerate(texts))
+        self._texts = [text for text, _ in ordered]
+        self._numbers = [number for _, number in ordered]
+        self._open: dict[str, list[int]] = {}
+        for number, (text, goes_on) in enumerate(texts):
+            if goes_on:
+                self._open.setdefault(text, []).append(number)
+        self._sizes = sorted({len(text) for text in self._open})
+
+    def compatible(self, begin: str) -> list[int]:
+        """Return the numbers of texts that begin so, and of open ones that ``begin`` goes on."""
+        first = bisect_left(self._texts, begin)
+        found = self._numbers[first : bisect_left(self._texts, begin + _LAST, lo=first)]
+        for size in self._sizes:
+            if size >= len(begin):
+                break
+            found += self._open.get(begin[:size], ())
+        return found
+
+
+def _letters_of(expression: str) -> str:
+    """Return the letters of an expression that are fixed, with NUL in place of the others."""
+    if "[" not in expression:
+        return expression.replace("*", _BETWEEN).replace("?", _BETWEEN)
+    pieces = _form(expression).pieces
+    return "".join(next(iter(each)) or _BETWEEN if len(each) == 1 else _BETWEEN for each in pieces)
+
+
+def _grams(run: str) -> Iterator[str]:
+    """Yield the parts of four letters of a run of letters, or the run if it is shorter."""
+    for i in range(max(len(run) - _GRAM, 0) + 1):
+        yield run[i : i + _GRAM]
+
+
+# ── names that expressions have in common ──────────────────────────────────────────────────
+
+
 _LETTERS = ascii_letters + digits + "_/"
 _MOST_STATES = 5_000
 _START, _SLASH, _TOKEN = range(3)
 """Positions in a ROS name: before its start, after a "/", or within one of its parts."""
 
-_Pieces = tuple[frozenset[str], ...]
 _State = tuple[int, tuple[frozenset[int], ...]]
 
 
@@ -176,7 +406,7 @@ def common_name(
 
 @lru_cache(maxsize=4096)
 def _search(wanted: tuple[str, ...], unwanted: tuple[str, ...], begin: int) -> str | None:
-    patterns = [_pieces(each) for each in (*wanted, *unwanted)]
+    patterns = [_form(each).pieces for each in (*wanted, *unwanted)]
     alphabet = _representatives(patterns)
     start: _State = (begin, tuple(_closed({0}, each) for each in patterns))
     before: dict[_State, tuple[_State, str] | None] = {start: None}

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from sros_tool.names import ACTION_SEPARATOR, ACTION_SERVICES, ACTION_TOPICS, expand, is_expression
+from sros_tool.names import ACTION_SEPARATOR, ACTION_SERVICES, ACTION_TOPICS, expand
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Policy, Profile, Qualifier
-from sros_tool.policy.patterns import covers, overlap
+from sros_tool.policy.patterns import ComparisonLimit, Names
 from sros_tool.values import shows
 
 KIND_OF = {right: kind for kind, pair in RIGHTS.items() for right in pair}
@@ -149,13 +149,11 @@ class Rules:
 
     def __init__(self, rights: Iterable[Right]) -> None:
         self._stated = unfolded(rights)
-        self._names: dict[_Place, list[str]] = defaultdict(list)
-        self._wild: dict[_Place, list[str]] = defaultdict(list)
+        names: dict[_Place, list[str]] = defaultdict(list)
         for enclave, qualifier, right, name in sorted(self._stated):
-            place = (enclave, qualifier, right)
-            self._names[place].append(name)
-            if is_expression(name):
-                self._wild[place].append(name)
+            names[enclave, qualifier, right].append(name)
+        limit = ComparisonLimit()
+        self._names = {place: Names(found, limit) for place, found in names.items()}
 
     def cover(self, right: Right) -> bool:
         """Return whether these rights cover all of ``right`` (an ALLOW, or a DENY)."""
@@ -166,37 +164,34 @@ class Rules:
         found = [self._covering(part) for part in parts(right)]
         return tuple(dict.fromkeys(each for each in found if each)) if all(found) else ()
 
+    def meet(self, right: Right) -> bool:
+        """Return whether some right of this set matches a name that ``right`` matches."""
+        return any(self._at(part).meets(part.name) for part in parts(right))
+
     def meeting(self, right: Right) -> tuple[Right, ...]:
         """Return the rights of this set that match some name that ``right`` matches."""
-        found: dict[Right, None] = {}
-        for part in parts(right):
-            place = part[:3]
-            if is_expression(part.name):
-                candidates = self._names.get(place, ())
-            else:
-                candidates = self._wild.get(place, ())
-                if part in self._stated:
-                    found[part] = None
-            for name in candidates:
-                if overlap(name, part.name):
-                    found[Right(*place, name)] = None
-        return tuple(found)
+        return tuple(
+            Right(*part[:3], name)
+            for part in parts(right)
+            for name in self._at(part).meeting(part.name)
+        )
 
     def allow(self, enclave: str, right: str, name: str) -> bool:
         """Return whether ``name`` is allowed completely, and no part of it is denied."""
         wanted = Right(enclave, ALLOW, right, name)
-        return self.cover(wanted) and not self.meeting(wanted._replace(qualifier=DENY))
+        return self.cover(wanted) and not self.meet(wanted._replace(qualifier=DENY))
+
+    def _at(self, part: Right) -> Names:
+        return self._names.get(part[:3], _NO_NAMES)
 
     def _covering(self, part: Right) -> Right | None:
         if part in self._stated:
             return part
-        place = part[:3]
-        for wide in self._wild.get(place, ()):
-            if covers(wide, part.name):
-                return Right(*place, wide)
-        return None
+        wide = next(self._at(part).covering(part.name), None)
+        return Right(*part[:3], wide) if wide else None
 
 
+_NO_NAMES = Names(())
 _Place = tuple[str, Qualifier, str]
 
 

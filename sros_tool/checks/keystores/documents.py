@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from datetime import UTC, datetime, timedelta
+from itertools import chain, islice
 from math import isfinite
 
 from sros_tool.checks.keystores.enclaves import grant_of, plain, plain_file
@@ -27,7 +28,7 @@ from sros_tool.keystore.layout import GOVERNANCE_XML
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text
-from sros_tool.policy.patterns import covers, overlap
+from sros_tool.policy.patterns import ComparisonLimit, Names, covers
 from sros_tool.translate import governance_for
 from sros_tool.validity import iso
 
@@ -256,25 +257,52 @@ def _utc(seconds: float) -> str:
 
 
 def _order(grant: Grant, name: str, file: str) -> Iterator[Finding]:
+    limit = ComparisonLimit()
+    stated = {
+        (direction, allow): _Topics(grant, direction, allow, limit)
+        for direction in _DIRECTIONS
+        for allow in (True, False)
+    }
     for index, rule in enumerate(grant.rules):
-        if not index:
-            continue
         for direction in _DIRECTIONS:
-            earlier = [
-                (before, topic)
-                for before in grant.rules[:index]
-                for topic in _topics(getattr(before, direction))
-                if _share_domains(before, rule)
-            ]
+            others = stated[direction, not rule.allow]
             for topic in _topics(getattr(rule, direction)):
-                by = [(b, t) for b, t in earlier if b.allow is not rule.allow and covers(t, topic)]
-                meets = [t for b, t in earlier if b.allow and overlap(t, topic)]
-                if not rule.allow and meets:
-                    text = f"a rule denies to {direction} {topic} after one that allows {meets[0]}"
-                    yield NO_EFFECT.found(name, text, file)
-                elif rule.allow and by:
-                    text = f"a rule allows to {direction} {topic} after one that denies {by[0][1]}"
+                if rule.allow and (by := others.covering(topic, index)):
+                    text = f"a rule allows to {direction} {topic} after one that denies {by}"
                     yield UNREACHABLE.found(name, text, file)
+                elif not rule.allow and (met := others.meeting(topic, index)):
+                    text = f"a rule denies to {direction} {topic} after one that allows {met}"
+                    yield NO_EFFECT.found(name, text, file)
+
+
+class _Topics:
+    """The topics of the rules of a grant that allow, or of those that deny."""
+
+    def __init__(self, grant: Grant, direction: str, allow: bool, limit: ComparisonLimit) -> None:
+        self._rules = grant.rules
+        self._places: dict[str, list[int]] = {}
+        for index, rule in enumerate(grant.rules):
+            if rule.allow is allow:
+                for topic in _topics(getattr(rule, direction)):
+                    self._places.setdefault(topic, []).append(index)
+        self._names = Names(self._places, limit)
+
+    def covering(self, topic: str, index: int) -> str:
+        """Return a topic that covers this one in an earlier rule than that of the index, or ""."""
+        found = (topic,) if topic in self._places else ()
+        return self._earlier(chain(found, self._names.covering(topic)), index)
+
+    def meeting(self, topic: str, index: int) -> str:
+        """Return a topic that overlaps with this one in an earlier rule, or ""."""
+        return self._earlier(self._names.meeting(topic), index)
+
+    def _earlier(self, topics: Iterable[str], index: int) -> str:
+        """Return the first of the topics in a rule before this one that shares a domain with it."""
+        for topic in topics:
+            for place in self._places[topic]:
+                if place < index and _share_domains(self._rules[place], self._rules[index]):
+                    return topic
+        return ""
 
 
 def _share_domains(one: Rule, other: Rule) -> bool:
@@ -505,9 +533,13 @@ def _topic_rules(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
         yield NO_TOPIC_RULE, "no topic rule matches ros_discovery_info"
     elif "*" not in expressions:
         yield NO_TOPIC_RULE, "there is no rule for *"
+    names = Names(expressions)
+    first = {each: index for index, each in reversed([*enumerate(expressions)])}
     for index, topic in enumerate(rule.topic_access_rules):
         yield from _topic_rule(rule, topic)
-        hiding = next((e for e in expressions[:index] if covers(e, topic.topic_expression)), None)
+        same = topic.topic_expression
+        others = chain([same], islice(names.covering(same), 1))
+        hiding = min((e for e in others if first[e] < index), key=first.__getitem__, default=None)
         if hiding is not None:
             yield (
                 UNREACHABLE_TOPIC_RULE,
