@@ -82,14 +82,18 @@ def _read_open(path: Path) -> tuple[os.stat_result, bytes]:
         return state, file.read(_MAX_BYTES + 1) if stat.S_ISREG(state.st_mode) else b""
 
 
-def parse(data: bytes, name: str) -> etree._Element:
+_UTF_8 = ("UTF-8", "UTF8", "US-ASCII", "ASCII")
+
+
+def parse(data: bytes, name: str, *, as_bytes: bool = False) -> etree._Element:
     """Return the root element of an XML document, without comments and processing instructions.
 
-    ``name`` names the document in errors.
+    ``name`` names the document in errors.  ``as_bytes`` is for documents that DDS reads: vendors
+    read bytes whatever the declared encoding is, so that only UTF-8 means the same to all.
 
     Raises:
         DocumentError: the document is not well-formed, too large, or has a document type
-            declaration (entities could read other files).
+            declaration (entities could read other files), or with ``as_bytes`` another encoding.
     """
     if not data.strip():
         raise DocumentError(f"{name} is empty", "An XML document was expected.")
@@ -109,6 +113,14 @@ def parse(data: bytes, name: str) -> etree._Element:
             f"{name} has a document type declaration",
             "It is not accepted, because entities could pull other files into a signed document.",
             "Remove the <!DOCTYPE ...> line.",
+        )
+    encoding = root.getroottree().docinfo.encoding or "UTF-8"
+    if as_bytes and encoding.upper() not in _UTF_8:
+        raise DocumentError(
+            f"{name} is not in UTF-8",
+            f"It has the encoding {encoding}, but DDS vendors read its bytes as UTF-8, and could "
+            "read other rights in them.",
+            "Write it in UTF-8.",
         )
     return root
 

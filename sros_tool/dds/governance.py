@@ -194,7 +194,7 @@ def parse_governance(data: bytes, name: str = "the governance document") -> Gove
     Raises:
         DocumentError: ``data`` is not a governance document.
     """
-    root = parse(data, name)
+    root = parse(data, name, as_bytes=True)
     parent = root.find("domain_access_rules")
     if root.tag != "dds" or parent is None:
         raise DocumentError(

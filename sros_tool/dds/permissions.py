@@ -144,7 +144,7 @@ def parse_permissions(data: bytes, name: str = "the permissions document") -> Pe
     Raises:
         DocumentError: ``data`` is not a permissions document.
     """
-    root = parse(data, name)
+    root = parse(data, name, as_bytes=True)
     parent = root.find("permissions")
     if root.tag != "dds" or parent is None:
         raise DocumentError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import string
+from base64 import b64encode
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from lxml import etree
 
+from sros_tool.dds.decision import cyclone, fastdds
 from sros_tool.dds.domains import MAX_DOMAIN, DomainSet
 from sros_tool.dds.governance import (
     DomainRule,
@@ -30,6 +32,9 @@ from sros_tool.dds.permissions import (
     render_permissions,
 )
 from sros_tool.errors import DocumentError
+from tests.dds.decision_documents import allow, grant, publish
+from tests.dds.decision_documents import governance as decided_governance
+from tests.dds.decision_documents import permissions as decided
 
 domains = st.lists(st.integers(0, MAX_DOMAIN), min_size=1, max_size=4).map(
     lambda ids: DomainSet.of(*((each, each) for each in ids))
@@ -164,3 +169,40 @@ def test_each_attribute_can_have_the_values_that_it_declares(
         assert {each.open, each.portable} <= set(each.values)
         assert each.open != each.portable
         assert each.default is None or each.default in each.values
+
+
+def utf_7(text: str) -> str:
+    """Return text so that only UTF-7 reads it; for others, it has no markup."""
+    return f"+{b64encode(text.encode('utf-16-be')).decode().rstrip('=')}-"
+
+
+def test_a_document_with_other_rights_in_another_encoding_is_refused() -> None:
+    """Vendors pass over the encoding: what they read is a comment to lxml, and the reverse."""
+    narrow, wide = (allow(publish(topic), domains="<id>0</id>") for topic in ("rt/x", "*"))
+    end = "<default>DENY</default></grant>"
+    hidden = f"<!-- {utf_7('-->')}{narrow}{utf_7('<!--')} +AGE-->{wide}{end}"
+    hidden += f'<grant name="{utf_7(f"-->{end}<grant name=" + chr(34))}">'
+    _, _, rest = grant(narrow).partition(">")
+    text = grant(hidden, default="").removesuffix("</grant>") + rest
+    document = decided(text).replace(b"UTF-8", b"UTF-7")
+    for read in (fastdds.read_permissions, cyclone.read_permissions):
+        assert [rule.publish[0].topics for rule in read(document).grants[0].rules] == [("*",)]
+    assert b">rt/x<" in etree.tostring(etree.fromstring(document)[0][0])  # as other readers do
+    with pytest.raises(DocumentError, match=r"is not in UTF-8.*the encoding UTF-7"):
+        parse_permissions(document)
+
+
+@pytest.mark.parametrize("encoding", ["UTF-7", "ISO-8859-1", "UTF-16"])
+def test_only_utf_8_is_read(encoding: str) -> None:
+    def declared(document: bytes, name: str) -> bytes:
+        assert b'encoding="UTF-8"' in document
+        return document.decode().replace("UTF-8", name).encode(name)
+
+    for document, read in (
+        (decided(grant(allow(publish("rt/x")))), parse_permissions),
+        (decided_governance(), parse_governance),
+    ):
+        with pytest.raises(DocumentError, match="is not in UTF-8"):
+            read(declared(document, encoding))
+        for name in ("utf-8", "us-ascii"):
+            assert read(declared(document, name)) == read(document)
