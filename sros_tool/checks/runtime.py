@@ -14,7 +14,7 @@ from sros_tool.checks.keystores.keystore import joined, keystore_findings
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import parse_governance
-from sros_tool.errors import SrosError
+from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.keystore.layout import (
     GOVERNANCE_P7S,
     IDENTITY,
@@ -22,6 +22,7 @@ from sros_tool.keystore.layout import (
     ca_key,
     enclave_path,
     is_keystore,
+    refuse_earlier,
     search_enclaves,
 )
 from sros_tool.pki import smime
@@ -448,7 +449,12 @@ def _check_variables(state: RuntimeState) -> Iterator[Finding]:
         yield KEYSTORE_RELATIVE.found(KEYSTORE, _value(environment, KEYSTORE))
     if not is_keystore(root):
         missing = "does not exist" if not root.exists() else "has no enclaves folder with content"
-        yield KEYSTORE_NOT_FOUND.found(KEYSTORE, f"'{root}' {missing}")
+        remedy = ""
+        try:
+            refuse_earlier(root)
+        except KeystoreError as error:
+            missing, remedy = f"is not read. {error.why}".rstrip("."), error.remedy
+        yield KEYSTORE_NOT_FOUND.found(KEYSTORE, f"'{root}' {missing}", remedy=remedy)
         return
     yield from _enclave(state, root, domain)
 

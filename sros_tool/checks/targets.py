@@ -11,7 +11,12 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
 from sros_tool.checks.policies import policy_file_findings
 from sros_tool.errors import DocumentError, SrosError
-from sros_tool.keystore.layout import REQUIRED_FILES, is_keystore, locate_enclave
+from sros_tool.keystore.layout import (
+    REQUIRED_FILES,
+    is_keystore,
+    locate_enclave,
+    refuse_earlier,
+)
 from sros_tool.policy.model import Policy
 from sros_tool.xml import parse, read_bytes
 
@@ -61,6 +66,7 @@ def policy_findings(path: Path, distribution: str = "") -> list[Finding]:
         return [
             finding for each in policies for finding in policy_file_findings(each, distribution)
         ]
+    refuse_earlier(path)
     raise DocumentError(
         f"'{path}' is neither a keystore nor an enclave, and holds no policy",
         "It has no enclaves folder with content, no cert.pem, and no XML file that begins "

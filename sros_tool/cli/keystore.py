@@ -245,10 +245,11 @@ Example:
 def list_enclaves(root: Path | None, as_json: bool) -> None:
     """List the enclaves of the keystore ROOT, sorted."""
     from sros_tool.errors import KeystoreError
-    from sros_tool.keystore.layout import enclave_names, is_keystore
+    from sros_tool.keystore.layout import enclave_names, is_keystore, refuse_earlier
 
     root = root or keystore_from_environment()
     if not is_keystore(root):
+        refuse_earlier(root)
         raise KeystoreError(f"'{root}' is not a valid keystore")
     names = enclave_names(root)
     if as_json:
@@ -273,9 +274,17 @@ Example:
     identity CA and permissions CA: separate, valid for 3650d; ...
     identity CA SHA-256 5fe417aaed47cccd3f4a6b3e8e94db185bfc8e1003ee5b8c...
     permissions CA SHA-256 e15ab4af9ee8c94bd8a5e4c6c10bb86fb7ac17e2cdd91...
-  $ sros create_keystore fleet --template production --domain 10-19""",
+  $ sros create_keystore fleet --template production --domain 10-19
+  $ sros create_keystore keystore --from eloquent_keys""",
 )
 @click.argument("root", type=PATH)
+@click.option(
+    "--from",
+    "earlier",
+    type=PATH,
+    metavar="OLD",
+    help="Take over the CA, keys and rights of OLD, a keystore of ROS 2 Eloquent or earlier.",
+)
 @click.option(
     "--template",
     "template_name",
@@ -321,6 +330,7 @@ Example:
 @json_option
 def create_keystore(
     root: Path | None,
+    earlier: Path | None,
     template_name: str,
     domain: str | None,
     ca_layout: str | None,
@@ -345,6 +355,9 @@ def create_keystore(
     from sros_tool.keystore.lifecycle.create import create_keystore as create
 
     root = root or keystore_from_environment()
+    if earlier is not None:
+        _adopt(root, earlier, dry_run)
+        return
     own = ros_domain() if domain is None else None
     domains = DomainSet.parse(domain, "--domain") if domain is not None else None
     if own is not None:
@@ -395,6 +408,46 @@ def _keystore_json(
         "changes": changes_json(result.root, result.changes),
         "notes": notes_json(result.notes),
     }
+
+
+def _adopt(root: Path, earlier: Path, dry_run: bool) -> None:
+    from click.core import ParameterSource
+
+    from sros_tool.keystore.layout import earlier_nodes
+    from sros_tool.keystore.lifecycle.adopt import adopt_keystore
+
+    context = click.get_current_context()
+    for option in context.command.params:
+        given = context.get_parameter_source(option.name or "") is ParameterSource.COMMANDLINE
+        if given and option.name not in ("root", "earlier", "dry_run"):
+            raise UsageError(
+                f"{option.opts[0]} and --from exclude each other",
+                f"The new keystore gets what '{earlier}' has.",
+                "Leave one of them out.",
+            )
+    with progress_bar(sum(1 for _ in earlier_nodes(earlier))) as step:
+        result = adopt_keystore(
+            root, earlier, now=now(), keyring=keyring(), dry_run=dry_run, progress=step
+        )
+    print_notes(result.notes)
+    if dry_run:
+        print_plan(root, result.changes)
+        return
+    count = len(result.created)
+    click.echo(f"created keystore '{root}' for domain {result.domains}")
+    click.echo(
+        f"  with the CA, the governance and {count} node{'s' * (count != 1)} of '{earlier}':"
+    )
+    for name in result.created:
+        click.echo(f"  enclave {name}")
+    click.echo(
+        "Keys and certificates are those of the nodes; their permissions are signed again. "
+        f"'{earlier}' is as it was: its permissions work until they expire, with ROS 2 Eloquent or "
+        "earlier. Start a node with ROS_SECURITY_KEYSTORE in place of ROS_SECURITY_ROOT_DIRECTORY "
+        "and --ros-args --enclave NAME, or by `sros run`.",
+        err=True,
+    )
+    _print_open_rights(result.template)
 
 
 def _choices(

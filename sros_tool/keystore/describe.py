@@ -20,6 +20,7 @@ from sros_tool.keystore.layout import (
     ca_key,
     is_keystore,
     permissions_ca_for,
+    refuse_earlier,
     search_enclaves,
 )
 from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_enclave
@@ -62,6 +63,7 @@ def describe(path: Path, *, now: datetime, authority: Path | None = None) -> Des
                 "path": str(path),
                 **_describe_enclave(open_enclave(path, now=now)),
             }
+        refuse_earlier(path)
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
             "It has no enclaves folder, and neither cert.pem nor permissions.p7s.",

@@ -106,7 +106,15 @@ def folder_mode(path: str) -> int:
     return 0o755 if path in ("", PUBLIC) else 0o700
 
 
+EARLIER_CA, EARLIER_CA_KEY = "ca.cert.pem", "ca.key.pem"
+"""The CA in a keystore of ros2/sros2 0.6 to 0.8 (ROS 2 Crystal, Dashing, Eloquent), at its top.
+
+Such a keystore is flat: the folder of a node has the name of the node, below the keystore itself.
+"""
+_MOST_FOLDERS = 1000
+
 _TOP_FILES = frozenset((SETTINGS, LEDGER, LEDGER_HEAD, ROTATION))
+_OF_NODE = (CERTIFICATE_FILE, KEY_FILE, PERMISSIONS_FILE)
 _FILE_TYPES = (".pem", ".p7s", ".xml")
 _TOP_FOLDERS = frozenset((ENCLAVES, PUBLIC, PRIVATE, REVOKED, RETIRED))
 
@@ -319,9 +327,73 @@ def select_enclaves(
     return tuple(chosen)
 
 
+def earlier_nodes(root: Path) -> Iterator[str]:
+    """Yield the names of the nodes in a flat keystore of ROS 2 Eloquent or earlier.
+
+    A node is a folder, or a link to one, that has a certificate, its key, or its permissions.
+
+    Raises:
+        KeystoreError: a node may be missing, because a folder cannot be read.
+    """
+    top = os.fspath(root)
+
+    def fail(error: OSError) -> None:
+        effect = "Its nodes would be missing."
+        raise _unreadable(root, [UnreadPath.of(error)], effect) from error
+
+    for folder, folders, _ in os.walk(top, onerror=fail):
+        folders[:] = sorted(each for each in folders if not each.startswith("."))
+        if folder == top:
+            folders[:] = [each for each in folders if each not in _TOP_FOLDERS]
+        for each in folders:
+            path = os.path.join(folder, each)
+            if any(os.path.lexists(f"{path}/{file}") for file in _OF_NODE):
+                yield path[len(top) :].replace(os.sep, "/")
+
+
+def is_earlier_keystore(root: Path) -> bool:
+    """Return whether ``root`` has the CA of a flat keystore of ROS 2 Eloquent or earlier."""
+    return any((root / file).is_file() for file in (EARLIER_CA, EARLIER_CA_KEY))
+
+
+def refuse_earlier(root: Path) -> None:
+    """Raise `KeystoreError` if ``root`` is a flat keystore of ROS 2 Eloquent or earlier, or a part.
+
+    A keystore of today is not refused, even if parts of an earlier one are in it.
+    """
+    if not root.is_dir() or is_keystore(root):
+        return
+    if is_earlier_keystore(root):
+        raise KeystoreError(
+            f"'{root}' is not a valid keystore",
+            "It is one of ROS 2 Eloquent or earlier, with its CA and the folders of its nodes at "
+            f"the top; ROS 2 since Foxy reads {ENCLAVES}, {PUBLIC} and {PRIVATE}.",
+            f"Run `sros create_keystore NEW --from {quote(str(root))}`: the keystore NEW gets its "
+            "CA, its keys and the rights of its nodes, and this one stays as it is.",
+        )
+    if _holds_earlier_node(root):
+        raise KeystoreError(
+            f"'{root}' is not a valid keystore",
+            "It holds nodes of a keystore of ROS 2 Eloquent or earlier, without their CA.",
+            "Run `sros create_keystore NEW --from OLD` where the CA of that keystore OLD is, and "
+            "export the enclaves with `sros distribute_key NEW`.",
+        )
+
+
+def _holds_earlier_node(root: Path) -> bool:
+    """Return whether one of the first folders below ``root`` is that of a node."""
+    walk = os.walk(root)
+    for _, (folder, folders, files) in zip(range(_MOST_FOLDERS), walk, strict=False):
+        folders[:] = [each for each in folders if each not in _TOP_FOLDERS and each[0] != "."]
+        if folder != os.fspath(root) and {PERMISSIONS_CA_FILE, *_OF_NODE} <= set(files):
+            return True
+    return False
+
+
 def check_keystore(root: Path) -> None:
     """Raise `KeystoreError` if ``root`` is no keystore."""
     if not is_keystore(root):
+        refuse_earlier(root)
         raise KeystoreError(
             f"'{root}' is not a valid keystore",
             "It does not exist."

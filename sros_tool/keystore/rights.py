@@ -22,6 +22,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     is_keystore,
     permissions_ca_for,
+    refuse_earlier,
 )
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
@@ -64,6 +65,7 @@ def load_rights(path: Path) -> RightsSource:
             return _keystore_rights(path)
         if (path / PERMISSIONS_FILE).exists():
             return _document_rights(path, "enclave", path / PERMISSIONS_FILE)
+        refuse_earlier(path)
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
             f"It has no enclaves folder, and no {PERMISSIONS_FILE}.",

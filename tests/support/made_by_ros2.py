@@ -17,12 +17,12 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import pkcs7
 from cryptography.x509.oid import NameOID
 
-_XML = '<?xml version="1.0" encoding="UTF-8"?>\n'
-_SCHEMA = (
+XML = '<?xml version="1.0" encoding="UTF-8"?>\n'
+SCHEMA = (
     'xmlns:xsi="http://www.w3.org/2001/XMLSchema-instance" xsi:noNamespaceSchemaLocation='
     '"http://www.omg.org/spec/DDS-SECURITY/20170901/omg_shared_ca_{}.xsd"'
 )
-_GOVERNANCE = """<dds {schema}>
+GOVERNANCE = """<dds {schema}>
   <domain_access_rules>
     <domain_rule>
       <domains><id>{domain}</id></domains>
@@ -74,13 +74,13 @@ def make(root: Path, *names: str, now: datetime, domain: int = 0) -> None:
     """Make the keystore with some enclaves, as ``ros2 security`` would have at ``now``."""
     for part in ("public", "private", "enclaves"):
         (root / part).mkdir(parents=True)
-    authority, key = _certificate("sros2CA", now)
-    _write(root / "public/ca.cert.pem", authority, root / "private/ca.key.pem", key)
+    authority, key = issue("sros2CA", now)
+    write(root / "public/ca.cert.pem", authority, root / "private/ca.key.pem", key)
     for role in ("permissions", "identity"):
         os.symlink("ca.cert.pem", root / f"public/{role}_ca.cert.pem")
         os.symlink("ca.key.pem", root / f"private/{role}_ca.key.pem")
-    text = _XML + _GOVERNANCE.format(schema=_SCHEMA.format("governance"), domain=domain)
-    _sign(root / "enclaves/governance", text, authority, key)
+    text = XML + GOVERNANCE.format(schema=SCHEMA.format("governance"), domain=domain)
+    sign(root / "enclaves/governance", text, authority, key)
     for name in names:
         folder = root / f"enclaves{name}"
         folder.mkdir(parents=True)
@@ -88,20 +88,20 @@ def make(root: Path, *names: str, now: datetime, domain: int = 0) -> None:
             os.symlink(os.path.relpath(root / path, folder), folder / Path(path).name)
         governance = root / "enclaves/governance.p7s"
         os.symlink(os.path.relpath(governance, folder), folder / "governance.p7s")
-        certificate, own = _certificate(name, now, (authority, key))
-        _write(folder / "cert.pem", certificate, folder / "key.pem", own)
-        text = _XML + _PERMISSIONS.format(
-            schema=_SCHEMA.format("permissions"),
+        certificate, own = issue(name, now, (authority, key))
+        write(folder / "cert.pem", certificate, folder / "key.pem", own)
+        text = XML + _PERMISSIONS.format(
+            schema=SCHEMA.format("permissions"),
             name=name,
             begin=now - timedelta(days=1),
             end=now + timedelta(days=3650),
             domain=domain,
             topics=_TOPICS,
         )
-        _sign(folder / "permissions", text, authority, key)
+        sign(folder / "permissions", text, authority, key)
 
 
-def _certificate(
+def issue(
     name: str,
     now: datetime,
     issuer: tuple[x509.Certificate, ec.EllipticCurvePrivateKey] | None = None,
@@ -120,7 +120,7 @@ def _certificate(
     return builder.sign(issuer[1] if issuer else key, hashes.SHA256()), key
 
 
-def _write(
+def write(
     place: Path, certificate: x509.Certificate, key_place: Path, key: ec.EllipticCurvePrivateKey
 ) -> None:
     place.write_bytes(certificate.public_bytes(serialization.Encoding.PEM))
@@ -133,7 +133,7 @@ def _write(
     )
 
 
-def _sign(
+def sign(
     stem: Path, text: str, authority: x509.Certificate, key: ec.EllipticCurvePrivateKey
 ) -> None:
     stem.with_suffix(".xml").write_text(text)

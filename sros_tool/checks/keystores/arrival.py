@@ -21,6 +21,7 @@ from sros_tool.keystore.layout import (
     is_enclave,
     is_keystore,
     locate_enclave,
+    refuse_earlier,
     search_enclaves,
     waits_for_answer,
 )
@@ -123,6 +124,7 @@ def verify_arrival(
         names, kind = (name,), "enclave"
         only = names
     else:
+        refuse_earlier(path)
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
             "It does not exist."

@@ -9,7 +9,13 @@ from pathlib import Path
 from cryptography import x509
 
 from sros_tool.errors import KeystoreError, UsageError
-from sros_tool.keystore.layout import ENCLAVES, IDENTITY_CA_FILE, PRIVATE, PUBLIC
+from sros_tool.keystore.layout import (
+    ENCLAVES,
+    IDENTITY_CA_FILE,
+    PRIVATE,
+    PUBLIC,
+    refuse_earlier,
+)
 from sros_tool.pki.certificates import digest, fingerprints, load_certificates, subject_text
 from sros_tool.xml import read_bytes
 
@@ -75,6 +81,7 @@ def check_same_authority(target: Path, files: Mapping[str, bytes]) -> None:
 
 def refuse_ca_keystore(folder: Path, remedy: str) -> None:
     """Raise `KeystoreError` if ``folder`` is a keystore with CAs, not a folder of a robot."""
+    refuse_earlier(folder)
     if (folder / PRIVATE).exists() or (folder / PUBLIC).exists():
         raise KeystoreError(
             f"'{folder}' is a keystore with CAs",

@@ -54,6 +54,7 @@ from sros_tool.keystore.layout import (
     enclave_names,
     enclave_path,
     is_keystore,
+    refuse_earlier,
 )
 from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
 from sros_tool.keystore.missing import no_such_enclave
@@ -124,7 +125,7 @@ def create_keystore(
     """
     if not dry_run:
         tidy(root)
-    _check_free(root)
+    check_free(root)
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
         domains = domains or DomainSet.of((0, 0))
         keystore = _write_keystore(transaction, template, domains, keyring, now, imported)
@@ -136,7 +137,7 @@ def create_keystore(
         domains,
         True,
         changes=tuple(transaction.changes),
-        notes=(*keystore.authorities.notes, *_place_notes(root)),
+        notes=(*keystore.authorities.notes, *place_notes(root)),
     )
 
 
@@ -219,13 +220,13 @@ def generate_artifacts(
             keystore = _open_keystore(transaction, domain, keyring, now)
             return _write_enclaves(transaction, keystore, wanted, now, progress)
     _check_typo(root)
-    _check_free(root)
+    check_free(root)
     domains = domains or DomainSet.of((0 if domain is None else domain,) * 2)
     check_domain(domains, domain, root)
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
         keystore = _write_keystore(transaction, create, domains, keyring, now, _NONE_IMPORTED)
         creation = _write_enclaves(transaction, keystore, wanted, now, progress)
-    return replace(creation, notes=(*creation.notes, *_place_notes(root)))
+    return replace(creation, notes=(*creation.notes, *place_notes(root)))
 
 
 def _rights_by_enclave(
@@ -284,7 +285,7 @@ def _write_keystore(
     imported: Mapping[str, bytes],
 ) -> _Keystore:
     """Stage a new keystore: its CAs, its governance and its settings."""
-    _check_free(transaction.root)  # another process may have created it meanwhile
+    check_free(transaction.root)  # another process may have created it meanwhile
     for span in (template.certificate_validity, template.permissions_validity):
         window(now, span)  # raises if the CAs could not issue anything
     authorities = create_authorities(transaction, template, keyring, now, imported)
@@ -307,10 +308,11 @@ def _write_keystore(
     return _Keystore(authorities, template, domains, known, entries=tuple(entries))
 
 
-def _check_free(root: Path) -> None:
+def check_free(root: Path) -> None:
     """Raise `KeystoreError` if a new keystore cannot be created at ``root``."""
     if is_keystore(root):
         raise _already_exists(root)
+    refuse_earlier(root)
     if root.resolve() == Path("/"):
         raise KeystoreError(
             "the root of the file system cannot be a keystore", "", "Choose another path."
@@ -331,7 +333,7 @@ def _check_free(root: Path) -> None:
         )
 
 
-def _place_notes(root: Path) -> Iterator[Note]:
+def place_notes(root: Path) -> Iterator[Note]:
     """Note that users other than this one and root can replace a new keystore."""
     trusted = frozenset({0, os.geteuid()})
     found = list(replaceable_on_the_way(root, trusted))
