@@ -26,6 +26,7 @@ from sros_tool.cli.common import (
     ros_domain,
     several_enclaves,
     split_root,
+    visible,
 )
 from sros_tool.cli.written import authority_json, changes_json, enclave_json, notes_json
 from sros_tool.errors import UsageError
@@ -356,7 +357,7 @@ def create_keystore(
 
     root = root or keystore_from_environment()
     if earlier is not None:
-        _adopt(root, earlier, dry_run)
+        _adopt(root, earlier, dry_run, as_json)
         return
     own = ros_domain() if domain is None else None
     domains = DomainSet.parse(domain, "--domain") if domain is not None else None
@@ -410,36 +411,45 @@ def _keystore_json(
     }
 
 
-def _adopt(root: Path, earlier: Path, dry_run: bool) -> None:
+_WITH_FROM = ("root", "earlier", "dry_run", "as_json", "verbose")
+"""The parameters of create_keystore that go with --from."""
+
+
+def _adopt(root: Path, earlier: Path, dry_run: bool, as_json: bool) -> None:
     from click.core import ParameterSource
 
-    from sros_tool.keystore.layout import earlier_nodes
+    from sros_tool.keystore.layout import earlier_nodes, is_earlier_keystore
     from sros_tool.keystore.lifecycle.adopt import adopt_keystore
 
     context = click.get_current_context()
     for option in context.command.params:
         given = context.get_parameter_source(option.name or "") is ParameterSource.COMMANDLINE
-        if given and option.name not in ("root", "earlier", "dry_run"):
+        if given and option.name not in _WITH_FROM:
             raise UsageError(
                 f"{option.opts[0]} and --from exclude each other",
                 f"The new keystore gets what '{earlier}' has.",
                 "Leave one of them out.",
             )
-    with progress_bar(sum(1 for _ in earlier_nodes(earlier))) as step:
+    total = sum(1 for _ in earlier_nodes(earlier)) if is_earlier_keystore(earlier) else 0
+    with progress_bar(total) as step:
         result = adopt_keystore(
             root, earlier, now=now(), keyring=keyring(), dry_run=dry_run, progress=step
         )
     print_notes(result.notes)
-    if dry_run:
+    if as_json:
+        value = _keystore_json(result, result.template, {}, dry_run)
+        print_json({**value, **_creation_json(result, dry_run), "from": str(earlier)})
+    elif dry_run:
         print_plan(root, result.changes)
+    else:
+        count = len(result.created)
+        nodes = f"{count} node{'s' * (count != 1)}"
+        click.echo(visible(f"created keystore '{root}' for domain {result.domains}"))
+        click.echo(visible(f"  with the CA, the governance and {nodes} of '{earlier}'"))
+        for name in result.created:
+            click.echo(f"  enclave {name}")
+    if dry_run:
         return
-    count = len(result.created)
-    click.echo(f"created keystore '{root}' for domain {result.domains}")
-    click.echo(
-        f"  with the CA, the governance and {count} node{'s' * (count != 1)} of '{earlier}':"
-    )
-    for name in result.created:
-        click.echo(f"  enclave {name}")
     click.echo(
         "Keys and certificates are those of the nodes; their permissions are signed again. "
         f"'{earlier}' is as it was: its permissions work until they expire, with ROS 2 Eloquent or "

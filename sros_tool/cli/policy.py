@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -570,14 +571,17 @@ def _convert(
             "This is a defect of sros: please report it with the policy.",
         )
     names = ", ".join(each.path for each in policy.enclaves)
+    changes = file_change(output, existed=output.exists()) if output else []
     saved = save(output, document) if output and not dry_run else ""
     if as_json:
         value: dict[str, Any] = {
             "policy": str(earlier),
             "enclaves": [each.path for each in policy.enclaves],
             "left_out": [each.text for each in converted.left_out],
-            "notes": as_plain(converted.notes),
             "output": str(output) if saved else None,
+            "dry_run": dry_run,
+            "changes": changes,
+            "notes": notes_json(converted.notes),
         }
         print_json(value if output or dry_run else {**value, "document": document.decode()})
     elif output is None and not dry_run:
@@ -597,7 +601,7 @@ def _convert(
         click.echo(saved, err=True)
         click.echo(
             "the rights are the old ones; nodes of a later ROS 2 need more, such as to publish "
-            f"/rosout from a namespace: look with `sros check {output}`",
+            f"/rosout from a namespace: look with `sros check {quote(str(output))}`",
             err=True,
         )
     return 1 if converted.left_out else 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import stat
@@ -107,6 +108,11 @@ def test_taken_over_it_keeps_ca_keys_and_rights(made: Path, tmp_path: Path) -> N
     before, new = snapshot(made), tmp_path / "new"
     plan = sros("create_keystore", new, "--from", made, "--dry-run").ok()
     assert not new.exists() and f"would create {new}/private/ca.key.pem" in plan.out
+    told = json.loads(
+        sros("-v", "create_keystore", new, "--from", made, "--json", "--dry-run").ok().out
+    )
+    assert told["from"] == str(made) and len(told["enclaves"]) == len(NODES)
+    assert told["domains"] == "7" and told["dry_run"]
     said = sros("create_keystore", new, "--from", made).ok()
     assert "for domain 7" in said.out and "enclave /plant/north/valve" in said.out
     assert snapshot(made) == before and not remains(tmp_path)
@@ -211,8 +217,9 @@ def test_what_cannot_be_taken_over_is_refused_as_a_whole(case: str, tmp_path: Pa
 def test_nothing_else_can_be_chosen_and_nothing_else_taken_over(tmp_path: Path) -> None:
     make(tmp_path / "foxy", "/a", now=NOW)
     _eloquent(tmp_path / "old")
-    refused = sros("create_keystore", tmp_path / "new", "--from", tmp_path / "foxy")
-    assert refused.status and "used as it is" in refused.err
+    for other in (tmp_path / "foxy", tmp_path / "nothing"):
+        refused = sros("create_keystore", tmp_path / "new", "--from", other)
+        assert refused.status and "used as it is" in refused.err
     for words in (("--template", "production"), ("--domain", "3"), ("--encrypt-ca-keys",)):
         ended = sros("create_keystore", tmp_path / "new", "--from", tmp_path / "old", *words)
         assert ended.status == 2 and f"{words[0]} and --from exclude" in ended.err
