@@ -28,7 +28,8 @@ def main(arguments: list[str] | None = None) -> None:
 
     try:
         with secrets_taken():
-            status = program.main(arguments, prog_name="sros", standalone_mode=False)
+            colour = False if os.environ.get("NO_COLOR") else None
+            status = program.main(arguments, prog_name="sros", standalone_mode=False, color=colour)
         if sys.stdout:  # None where it was closed
             sys.stdout.flush()
     except BrokenPipeError:

@@ -32,16 +32,13 @@ from sros_tool.cli.observing import (
     why_empty,
 )
 from sros_tool.dds.decision.vendors import Vendor
-from sros_tool.errors import SrosError, UnavailableError, UsageError
+from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.values import as_plain
 
 if TYPE_CHECKING:
     from sros_tool.explain.audit import Audit, AuditedEnclaves
     from sros_tool.explain.evaluator import JoinContext
     from sros_tool.graph.observation import Observation
-
-_NOT_ASKED = 2
-"""The exit status if the question could not be asked; 1 says that something would be denied."""
 
 
 @click.command(
@@ -98,22 +95,18 @@ def audit(
     or else in the enclave whose profiles name it. Observes until the graph stops changing; what a
     node does only later needs --watch. The default is the keystore of $ROS_SECURITY_KEYSTORE.
     """
-    try:
-        return _audit(
-            source or keystore_from_environment(),
-            watch,
-            spin_time,
-            observer_environment(enclave, keystore, domain),
-            enclave,
-            vendor,
-            patch,
-            force=force,
-            dry_run=dry_run,
-            as_json=as_json,
-        )
-    except SrosError as error:
-        error.exit_status = _NOT_ASKED
-        raise
+    return _audit(
+        source or keystore_from_environment(),
+        watch,
+        spin_time,
+        observer_environment(enclave, keystore, domain),
+        enclave,
+        vendor,
+        patch,
+        force=force,
+        dry_run=dry_run,
+        as_json=as_json,
+    )
 
 
 def _audit(

@@ -15,6 +15,7 @@ import click
 from sros_tool import __version__
 from sros_tool.cli.common import (
     PATH,
+    coloured,
     domain_of,
     json_option,
     json_text,
@@ -24,6 +25,7 @@ from sros_tool.cli.common import (
     print_json,
     visible,
 )
+from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import MEASURED
 from sros_tool.errors import UsageError
 
@@ -186,7 +188,8 @@ def check(
             f"`sros audit {policies[0]}` reports what a policy would deny to the running robot.",
         )
     at = replace(_circumstances(domain, moment, policies), distribution=_distribution(distribution))
-    found = [_shown(each) for each in _findings(family, paths, at)]
+    with progress("checking"):
+        found = [_shown(each) for each in _findings(family, paths, at)]
     chosen = selection.choose(found)
     _SHOW[form](chosen, selection)
     return 1 if fail_on != "never" and chosen.fails(Severity[fail_on.upper()]) else 0
@@ -331,7 +334,7 @@ def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> in
 
 def _print_text(chosen: ChosenFindings, _selection: FindingFilter) -> None:
     for each in chosen.shown:
-        click.echo(visible("\n".join(finding_lines(each))))
+        echo_finding(each)
     for choice in dict.fromkeys(each.accepted for each in chosen.accepted):
         kinds = {e.id: e.kind.title for e in chosen.accepted if e.accepted == choice}
         kinds_text = "; ".join(f"{title} [{identity}]" for identity, title in kinds.items())
@@ -339,7 +342,7 @@ def _print_text(chosen: ChosenFindings, _selection: FindingFilter) -> None:
     click.echo(_summary(chosen), err=True)
 
 
-def finding_lines(finding: Finding) -> list[str]:
+def _finding_lines(finding: Finding) -> list[str]:
     """Return a finding as three lines: place and title, reason, and remedy.
 
     A line feed in the name of a file is escaped: it could end the line and forge the next one.
@@ -349,6 +352,13 @@ def finding_lines(finding: Finding) -> list[str]:
     by = f" (accepted by the {finding.accepted})" if finding.accepted else ""
     lines = (head, f"    {subject}{finding.text}{by}", f"    {finding.remedy}")
     return [line.replace("\n", "\\x0a") for line in lines]
+
+
+def echo_finding(finding: Finding) -> None:
+    """Print a finding as text, its severity in colour on a terminal."""
+    word = f": {finding.severity.word}: "
+    head, *rest = (visible(line) for line in _finding_lines(finding))
+    click.echo("\n".join((head.replace(word, f": {coloured(word[2:-2])}: ", 1), *rest)))
 
 
 def _summary(chosen: ChosenFindings) -> str:
@@ -444,6 +454,7 @@ def doctor(as_json: bool) -> None:
         click.echo(diagnosis_text(diagnosis))
         for each in findings:
             if each.severity >= WARNING:
-                click.echo("\n".join(("", *finding_lines(each))))
+                click.echo()
+                echo_finding(each)
     if not diagnosis.enforces or any(each.severity >= ERROR for each in findings):
         sys.exit(1)

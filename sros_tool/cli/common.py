@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from sros_tool.cli.progress import paused
 from sros_tool.errors import DocumentError, PkiError, UsageError
 
 if TYPE_CHECKING:
@@ -210,6 +211,24 @@ def visible_json(document: str) -> str:
     return document.translate(_IN_JSON)
 
 
+_COLOURS = {
+    "error": "red",
+    "warning": "yellow",
+    "note": "cyan",
+    "yes": "green",
+    "no": "red",
+    "NOT LOADABLE": "red",
+}
+
+
+def coloured(word: str) -> str:
+    """Return a word in its colour, which `click.echo` takes away unless it prints on a terminal.
+
+    Neither is it shown with $NO_COLOR (https://no-color.org).
+    """
+    return click.style(word, fg=_COLOURS[word], bold=True)
+
+
 _JSON_VERSION = 1
 """The version of what ``--json`` prints: a key that changes its meaning or goes raises it."""
 
@@ -241,19 +260,6 @@ def print_plan(root: Path, changes: Sequence[Change]) -> None:
         click.echo(f"would {change.action} {root / change.path}")
     if not changes:
         click.echo("nothing would change")
-
-
-@contextmanager
-def progress_bar(total: int) -> Iterator[Callable[[str], None] | None]:
-    """Show a progress bar for 50 items or more on a terminal; yield the function to advance it.
-
-    Yields None if no bar is shown.
-    """
-    if total < 50 or not sys.stderr.isatty():
-        yield None
-        return
-    with click.progressbar(length=total, label="signing", file=sys.stderr) as bar:
-        yield lambda _name: bar.update(1)
 
 
 def check_output(output: Path, *, force: bool) -> None:
@@ -450,12 +456,13 @@ class _Secrets:
             value = self._lines[file]
         if not value and sys.stdin.isatty():
             confirm = self._new and not is_pin
-            value = click.prompt(
-                visible(f"{what[:1].upper()}{what[1:]}"),  # a keystore may name the token
-                hide_input=True,
-                err=True,
-                confirmation_prompt=confirm,
-            )
+            with paused():
+                value = click.prompt(
+                    visible(f"{what[:1].upper()}{what[1:]}"),  # a keystore may name the token
+                    hide_input=True,
+                    err=True,
+                    confirmation_prompt=confirm,
+                )
         if not value:
             names = _PIN if is_pin else f"{_PASSPHRASE} or {_PASSPHRASE_FILE}"
             raise PkiError(

@@ -11,6 +11,7 @@ import click
 
 from sros_tool.cli.common import (
     PATH,
+    coloured,
     complete_keystore_and_enclave,
     domain_of,
     dry_run_option,
@@ -24,8 +25,8 @@ from sros_tool.cli.common import (
     print_plan,
     several_enclaves,
     split_root,
-    visible,
 )
+from sros_tool.cli.progress import progress
 from sros_tool.cli.written import (
     authority_json,
     changes_json,
@@ -97,7 +98,8 @@ def distribute_key(
         if not dry_run:
             _refuse_json(as_json)
             _refuse_terminal()
-        packed = pack_enclaves(root, selection.names, now=now())
+        with progress("exporting"):
+            packed = pack_enclaves(root, selection.names, now=now())
         changes = [{"action": "send", "path": path} for path in packed.paths]
         if not dry_run:
             _write_stdout(packed.data)
@@ -106,7 +108,10 @@ def distribute_key(
                 click.echo(f"would send {path}")
         where, done = "standard output", not dry_run
     else:
-        export = distribute(root, selection.names, target, now=now(), force=force, dry_run=dry_run)
+        with progress("exporting"):
+            export = distribute(
+                root, selection.names, target, now=now(), force=force, dry_run=dry_run
+            )
         where, done = f"'{target}'", bool(export.changes) and not dry_run
         below = target.parent if target.name.endswith(SUFFIXES) else target
         changes = changes_json(below, export.changes)
@@ -238,7 +243,7 @@ def verify(
     status is 0 if there are no findings.
     """
     from sros_tool.checks.keystores.arrival import verify_arrival
-    from sros_tool.cli.check import finding_lines
+    from sros_tool.cli.check import echo_finding
     from sros_tool.cli.common import local_zone
     from sros_tool.keystore.layout import select_enclaves
     from sros_tool.validity import iso
@@ -247,16 +252,21 @@ def verify(
     wanted, moment = domain_of(domain), moment_of(at)
     only = select_enclaves(folder, (), patterns) if patterns else None
     zone = local_zone(os.environ)
-    arrival = verify_arrival(folder, now=moment, domain=wanted, zone=zone, only=only)
+    with progress("verifying"):
+        arrival = verify_arrival(folder, now=moment, domain=wanted, zone=zone, only=only)
     if as_json:
         print_json({**arrival.as_json(), "at": iso(moment), "domain": wanted})
         return 1 if arrival.findings else 0
     for each in arrival.enclaves:
         until = f" until {iso(each.until)}" if each.until else ""
-        state = f"loadable in domain {each.domains}{until}" if each.loadable else "NOT LOADABLE"
+        state = (
+            f"loadable in domain {each.domains}{until}"
+            if each.loadable
+            else coloured("NOT LOADABLE")
+        )
         click.echo(f"{each.name}  {state}")
     for finding in arrival.findings:
-        click.echo(visible("\n".join(finding_lines(finding))))
+        echo_finding(finding)
     return 1 if arrival.findings else 0
 
 

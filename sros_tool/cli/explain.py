@@ -13,6 +13,7 @@ import click
 from sros_tool.cli.common import (
     KEYSTORE_VARIABLE,
     PATH,
+    coloured,
     complete_keystore_and_enclave,
     domain_of,
     json_option,
@@ -24,6 +25,7 @@ from sros_tool.cli.common import (
     ros_domain,
     visible,
 )
+from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import NEWEST, Vendor
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
 from sros_tool.names import is_expression
@@ -46,6 +48,11 @@ if TYPE_CHECKING:
     from sros_tool.policy.model import Enclave, Source
 
 _WORDS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply", "join")
+_KINDS = {
+    **dict.fromkeys(("publish", "subscribe"), "topics"),
+    **dict.fromkeys(("call", "serve", "request", "reply"), "services"),
+    "execute": "actions",
+}
 
 
 # ── options ────────────────────────────────────────────────────────────────────────────────
@@ -54,19 +61,36 @@ _WORDS = ("publish", "subscribe", "call", "serve", "execute", "request", "reply"
 def _complete_words(
     ctx: click.Context, parameter: click.Parameter, incomplete: str
 ) -> list[CompletionItem | str]:
-    """Complete the keystore, then its enclaves, then the operations of `_WORDS`."""
+    """Complete the keystore, its enclaves, the operations of `_WORDS`, and then the ROS names."""
     from sros_tool.keystore.layout import is_keystore
 
     given: tuple[str, ...] = ctx.params.get("words") or ()
     named = bool(given) and is_keystore(Path(given[0]))
     rest = given[1:] if named else given
-    if len(rest) == (0 if ctx.params.get("who") else 1):
+    before = 0 if ctx.params.get("who") else 1  # the enclave
+    if len(rest) == before:
         return [word for word in _WORDS if word.startswith(incomplete)]
+    if len(rest) == before + 1:
+        root = Path(given[0]) if named else ctx.params.get("keystore")
+        names = _names_in_rights(ctx.params.get("policy") or root, _KINDS.get(rest[-1], ""))
+        return [name for name in names if name.startswith(incomplete)]
     if rest:
         return []
     if named or ctx.params.get("keystore"):
         return _complete_enclave(ctx, parameter, incomplete)
     return complete_keystore_and_enclave(ctx, parameter, incomplete)
+
+
+def _names_in_rights(path: Path | None, kind: str) -> list[str]:
+    """Return the names of a kind in the rights of a policy or keystore, if they can be read."""
+    from sros_tool.keystore.rights import load_rights
+
+    try:
+        rights = load_rights(path or keystore_from_environment()).rights
+    except (SrosError, OSError):
+        return []
+    names = {each.name for each in rights if each.kind == kind}
+    return sorted(name for name in names if not is_expression(name))
 
 
 def _complete_enclave(
@@ -316,7 +340,10 @@ def _show_answer(
         asked = _question_json(enclave, context, question)
         print_json({**asked, **_answer_json(enclave, answer, policy), "vendor_why": why})
     else:
-        _echo(_answer_lines(enclave, answer, why, policy))
+        lines = _answer_lines(enclave, answer, why, policy)
+        word, _, head = next(lines).partition(":")
+        click.echo(f"{coloured(word)}:{visible(head)}")
+        _echo(lines)
     notes = [*_provenance_notes(answer, policy), *_other_type(evaluator, answer, kind)]
     if not all_vendors:
         measured = [
@@ -742,7 +769,8 @@ def _show_who(
     keystore = root or keystore_from_environment()
     check_keystore(keystore)
     names = select_enclaves(keystore, (), patterns) if patterns else None
-    found = who(keystore, question, chosen, options.context, at=options.at, names=names)
+    with progress("asking"):
+        found = who(keystore, question, chosen, options.context, at=options.at, names=names)
     allowed = any(each.outcome.ok for each in found)
     if as_json:
         print_json(
@@ -819,7 +847,8 @@ def _show_reach(
             f"enclave {enclave} has no rights in '{source.path}'",
             f"Enclaves with rights: {', '.join(network.enclaves[:5]) or 'none'}.",
         )
-    reach = network.reach(enclave)
+    with progress("following the rights"):
+        reach = network.reach(enclave)
     if as_json:
         print_json({"path": str(source.path), "left_out": list(without), **_reach_json(reach)})
     else:

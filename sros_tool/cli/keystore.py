@@ -22,12 +22,12 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     print_plan,
-    progress_bar,
     ros_domain,
     several_enclaves,
     split_root,
     visible,
 )
+from sros_tool.cli.progress import progress
 from sros_tool.cli.written import authority_json, changes_json, enclave_json, notes_json
 from sros_tool.errors import UsageError
 
@@ -62,7 +62,7 @@ def create_enclave(words: tuple[str, ...], dry_run: bool, as_json: bool) -> None
     root, names = split_root(words)
     if not names:
         raise UsageError("no enclave is named", "", "Name one or more, such as /talker.")
-    with progress_bar(len(names)) as step:
+    with progress("signing", len(names)) as step:
         result = create_enclaves(
             root,
             names,
@@ -180,7 +180,7 @@ def generate_artifacts(
     policies = [read_policy(path) for path in policy_files]
     template = load_template(template_name)
     total = len(enclaves) + sum(len(policy.enclaves) for policy in policies)
-    with progress_bar(total) as step:
+    with progress("signing", total) as step:
         result = generate(
             root,
             enclaves=enclaves,

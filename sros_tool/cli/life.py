@@ -20,10 +20,10 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     print_plan,
-    progress_bar,
     several_enclaves,
     split_root,
 )
+from sros_tool.cli.progress import progress
 from sros_tool.cli.written import changes_json, enclave_json, notes_json
 from sros_tool.errors import UsageError
 
@@ -91,7 +91,7 @@ def renew(
     if names or patterns or every or all_expiring is None:
         names = chosen_enclaves(root, names, patterns, every=every)
     threshold = parse_threshold(all_expiring) if all_expiring is not None else None
-    with progress_bar(len(names) or 50) as step:
+    with progress("renewing") as step:
         result = work(
             root,
             names,
@@ -213,15 +213,16 @@ def revoke(
     names = chosen_enclaves(root, given, patterns, every=every)
     words_of_rfc = reason.replace("-", "_").split("_")
     reason_text = words_of_rfc[0] + "".join(word.capitalize() for word in words_of_rfc[1:])
-    result = work(
-        root,
-        names,
-        now=now(),
-        reason=reason_text,
-        keyring=keyring(),
-        until_retired=until_retired,
-        dry_run=dry_run,
-    )
+    with progress("revoking"):
+        result = work(
+            root,
+            names,
+            now=now(),
+            reason=reason_text,
+            keyring=keyring(),
+            until_retired=until_retired,
+            dry_run=dry_run,
+        )
     if as_json:
         print_json(_revocation_json(result, reason_text, dry_run))
     elif dry_run:
@@ -477,7 +478,7 @@ def rotate_ca(
         )
     else:
         roles = [r for r, on in (("identity", identity), ("permissions", permissions)) if on]
-        with progress_bar(50) as tick:
+        with progress("rotating the CA") as tick:
             step = work(
                 root,
                 RotationStage(to) if to else None,

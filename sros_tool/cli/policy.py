@@ -24,6 +24,7 @@ from sros_tool.cli.common import (
     save,
     visible,
 )
+from sros_tool.cli.progress import progress
 from sros_tool.cli.written import file_change, notes_json
 from sros_tool.errors import Note, PolicyError, UsageError
 from sros_tool.values import as_plain
@@ -176,7 +177,8 @@ def diff_policy(a: Path, b: Path, as_json: bool) -> int:
     from sros_tool.keystore.rights import load_rights
     from sros_tool.policy.rights import compare
 
-    first, second = load_rights(a), load_rights(b)
+    with progress("reading"):
+        first, second = load_rights(a), load_rights(b)
     scope = None
     if first.scope is None or second.scope is None:
         scope = second.scope if first.scope is None else first.scope

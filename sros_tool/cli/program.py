@@ -8,12 +8,16 @@ import sys
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from sros_tool import __version__
 from sros_tool.cli.common import visible
 from sros_tool.errors import NOT_DONE, SrosError
+
+if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +148,21 @@ class _Program(click.Group):
         if _VERBOSE not in command.params:
             command.params.append(_VERBOSE)
         return command
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Complete verbs without importing them; with hyphens, if one was typed, and aliases."""
+        from click.shell_completion import CompletionItem
+
+        if incomplete.startswith("-"):
+            return super().shell_complete(ctx, incomplete)
+        typed = incomplete.replace("-", "_")
+        names = [name for name in _VERBS if name.startswith(typed)]
+        names = names or [alias for alias in _NAMES if alias.startswith(typed)]
+        mark = "-" if "-" in incomplete else "_"
+        return [
+            CompletionItem(name.replace("_", mark), help=_VERBS[_NAMES[name]].help)
+            for name in names
+        ]
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]

@@ -22,6 +22,7 @@ from sros_tool.cli.common import (
     save,
     versioned,
 )
+from sros_tool.cli.progress import progress
 from sros_tool.cli.written import file_change
 from sros_tool.errors import UsageError
 from sros_tool.values import as_plain
@@ -116,8 +117,9 @@ def view(
     written = _format("json" if as_json else form, output, graphviz)
     if output:
         check_output(output, force=force or dry_run)
-    picture = _picture(sources, observed, template, hosts, moment)
-    document = _rendered(picture, written, everything, graphviz, moment)
+    with progress("drawing"):
+        picture = _picture(sources, observed, template, hosts, moment)
+        document = _rendered(picture, written, everything, graphviz, moment)
     if dry_run and as_json:
         changes = file_change(output, existed=output.exists()) if output else []
         print_json({"dry_run": True, "changes": changes, "notes": []})

@@ -486,16 +486,32 @@ def test_completion(shell: str) -> None:
     assert "_SROS_COMPLETE" in sros("completion", shell).ok().out
 
 
-def test_completion_of_enclaves(keystore: Path) -> None:
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        ("env {} /", "/a /b"),
+        ("explain {} /a pub", "publish"),
+        ("explain {} /a publish /old", "/old_a /old_b"),
+        ("explain {} --who publish /old", "/old_a /old_b"),
+        ("explain {} /a publish /x", ""),
+        ("explain {}/nothing /a publish /", ""),
+        ("create_k", "create_keystore"),
+        ("create-", "create-keystore create-enclave create-permission create-request"),
+        ("export", "export_enclave"),
+        ("nope", ""),
+    ],
+)
+def test_completion_of_words(words: str, wanted: str, keystore: Path) -> None:
+    line = "sros " + words.replace("{}", str(keystore))
     environment = {
         **os.environ,
         "_SROS_COMPLETE": "bash_complete",
-        "COMP_WORDS": f"sros env {keystore} /",
-        "COMP_CWORD": "3",
+        "COMP_WORDS": line,
+        "COMP_CWORD": str(len(line.split()) - 1),
     }
     script = "from sros_tool.cli import main; main()"
     ended = python("-c", script, env=environment)
-    assert ended.stdout.split() == ["plain,/a", "plain,/b"], ended
+    assert ended.stdout.replace("plain,", "").split() == wanted.split(), ended
 
 
 # ── env and run ────────────────────────────────────────────────────────────────────────────

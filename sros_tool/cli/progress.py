@@ -1,0 +1,99 @@
+"""Progress of long work, on a terminal only: one line, which is erased when the work is done."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+_FIRST, _EVERY = 1.0, 0.5  # seconds
+_ERASE = "\r\x1b[K"
+
+
+class _Line:
+    """A line on the terminal that a timer draws again and again.
+
+    The timer is a signal: unlike a thread, it does not get in the way of the processes that are
+    forked for the work, and they do not inherit it.
+    """
+
+    def __init__(self, label: str, total: int) -> None:
+        self._label, self._total = label, total
+        self._done = 0
+        self._drawn = False
+        self._began = time.monotonic()
+        self._before = signal.signal(signal.SIGALRM, self._draw)
+        signal.setitimer(signal.ITIMER_REAL, _FIRST, _EVERY)
+
+    def step(self, _name: str) -> None:
+        """Count one more item as done."""
+        self._done += 1
+
+    def pause(self) -> None:
+        """Erase the line and draw no more."""
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        if self._drawn:
+            _write(_ERASE)
+
+    def go_on(self) -> None:
+        """Draw again."""
+        signal.setitimer(signal.ITIMER_REAL, _FIRST, _EVERY)
+
+    def end(self) -> None:
+        """Erase the line for good."""
+        self.pause()
+        signal.signal(signal.SIGALRM, self._before)
+
+    def _draw(self, _number: int, _frame: FrameType | None) -> None:
+        count = f" {self._done} of {self._total}" if self._total and self._done else ""
+        seconds = time.monotonic() - self._began
+        _write(f"{_ERASE}{self._label}{count} ... {seconds:.0f} s")
+        self._drawn = True
+
+
+def _write(text: str) -> None:
+    """Write to the terminal itself: a signal may come while the stream's buffer is in use."""
+    os.write(sys.stderr.fileno(), text.encode())
+
+
+_lines: list[_Line] = []
+
+
+@contextmanager
+def progress(label: str, total: int = 0) -> Iterator[Callable[[str], None] | None]:
+    """Show ``label`` and the seconds on the terminal from the first second on, until the body ends.
+
+    Args:
+        label: what is done, such as "signing".
+        total: number of items, if the body counts them with the yielded function.
+
+    Yields None where nothing is shown: standard error is no terminal.
+    """
+    on_terminal = sys.stderr is not None and sys.stderr.isatty()
+    if not on_terminal or _lines or threading.current_thread() is not threading.main_thread():
+        yield None
+        return
+    line = _Line(label, total)
+    _lines.append(line)
+    try:
+        yield line.step
+    finally:
+        _lines.pop()
+        line.end()
+
+
+@contextmanager
+def paused() -> Iterator[None]:
+    """Keep the terminal free for a question, such as for a passphrase."""
+    for line in _lines:
+        line.pause()
+    try:
+        yield
+    finally:
+        for line in _lines:
+            line.go_on()

@@ -1,0 +1,111 @@
+"""What only a terminal gets: progress that leaves nothing behind, and colours."""
+
+from __future__ import annotations
+
+import os
+import pty
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+from sros_tool.cli import main
+from sros_tool.cli import progress as showing
+from tests.support.harness import sros
+
+ERASE = "\r\x1b[K"
+ESCAPE = "\x1b["
+
+
+def on_terminal(work: Callable[[], object]) -> str:
+    """Do work in a process whose standard output and error are a terminal; return what is there."""
+    child, terminal = pty.fork()
+    if child == 0:
+        try:
+            sys.stdin, sys.stdout, sys.stderr = os.fdopen(0), os.fdopen(1, "w"), os.fdopen(2, "w")
+            with suppress(SystemExit):
+                work()
+            sys.stdout.flush()
+        finally:
+            os._exit(0)
+    said = b""
+    while True:
+        try:
+            data = os.read(terminal, 4096)
+        except OSError:  # the process has ended
+            break
+        if not data:
+            break
+        said += data
+    os.close(terminal)
+    os.waitpid(child, 0)
+    return said.decode()
+
+
+def until_drawn(label: str, total: int) -> None:
+    """Work until the line was drawn twice, whatever the machine's speed."""
+    with showing.progress(label, total) as step:
+        assert step
+        step("/a")
+        line = showing._lines[0]
+        for _ in range(2):
+            line._drawn = False
+            while not line._drawn:
+                time.sleep(0.01)
+
+
+def test_long_work_is_shown_and_leaves_no_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(showing, "_FIRST", 0.01)
+    monkeypatch.setattr(showing, "_EVERY", 0.01)
+    said = on_terminal(lambda: until_drawn("signing", 3))
+    assert "signing 1 of 3 ... 0 s" in said
+    assert said.endswith(ERASE)
+
+
+def test_short_work_shows_nothing() -> None:
+    def work() -> None:
+        with showing.progress("signing"):
+            pass
+
+    assert on_terminal(work) == ""
+
+
+def test_a_question_is_not_overwritten(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(showing, "_FIRST", 0.01)
+
+    def work() -> None:
+        with showing.progress("signing"), showing.paused():
+            os.write(2, b"Passphrase: ")
+            time.sleep(0.1)
+
+    assert "signing" not in on_terminal(work).partition("Passphrase: ")[2]
+
+
+def test_a_pipe_gets_no_progress(capfd: pytest.CaptureFixture[str]) -> None:
+    with showing.progress("signing") as step:
+        assert step is None
+    assert capfd.readouterr() == ("", "")
+
+
+def run(*words: object, no_colour: str = "") -> str:
+    def work() -> None:
+        os.environ["NO_COLOR"] = no_colour
+        main([str(word) for word in words])
+
+    return on_terminal(work)
+
+
+def test_colours_are_for_terminals_and_can_be_turned_off(keystore: Path) -> None:
+    (keystore / "enclaves/a/key.pem").chmod(0o644)
+    for words, coloured in (
+        (("check", keystore), f"{ESCAPE}31m{ESCAPE}1merror"),
+        (("verify", keystore), f"{ESCAPE}31m{ESCAPE}1merror"),
+        (("explain", keystore, "/b", "publish", "/nope"), f"{ESCAPE}31m{ESCAPE}1mno{ESCAPE}0m:"),
+    ):
+        assert coloured in run(*words)
+        assert ESCAPE not in run(*words, no_colour="1")
+        ended = sros(*words)
+        assert ESCAPE not in ended.out + ended.err
