@@ -252,7 +252,7 @@ def test_json_of_one_answer(whole: Path) -> None:
         "enclave", "question", "domain", "at", "time_zone", "vendor", "vendor_title", "vendor_why",
         "documented_only", "allowed", "outcome", "reason", "text", "denied_by", "rule", "wildcard",
         "policy", "protection", "until", "until_file", "problems", "parts", "remedy", "change",
-        "commands", "policy_sha256",
+        "commands", "policy_sha256", "version",
     } == set(told)  # fmt: skip
     assert told["rule"] == {
         "grant": 0,
@@ -479,7 +479,7 @@ def test_reach(whole: Path) -> None:
     [
         ("{ks} /", [ENCLAVE, OTHER]),
         ("{ks} /a p", ["publish"]),
-        ("{ks} /a publish /c", ["/chatter"]),
+        ("{ks} /a publish /cha", ["/chatter"]),
         ("{ks} /a execute /", []),
         ("/a s", ["subscribe", "serve"]),
         ("--keystore {ks} /talker_listener/t", [ENCLAVE]),
