@@ -431,7 +431,7 @@ def _adopt(root: Path, earlier: Path, dry_run: bool, as_json: bool) -> None:
                 "Leave one of them out.",
             )
     total = sum(1 for _ in earlier_nodes(earlier)) if is_earlier_keystore(earlier) else 0
-    with progress_bar(total) as step:
+    with progress("signing", total) as step:
         result = adopt_keystore(
             root, earlier, now=now(), keyring=keyring(), dry_run=dry_run, progress=step
         )
