@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -55,7 +56,7 @@ def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
         "ruleId": finding.id,
         "ruleIndex": rule,
         "level": finding.severity.word,
-        "message": {"text": f"{finding.subject}: {finding.text}. {finding.remedy}"},
+        "message": {"text": _plain(f"{finding.subject}: {finding.text}. {finding.remedy}")},
     }
     if finding.file:
         result["locations"] = [
@@ -74,6 +75,14 @@ def _result(finding: Finding, rule: int, base: Path) -> dict[str, Any]:
             {"kind": "external", "status": "accepted", "justification": finding.accepted}
         ]
     return result
+
+
+def _plain(text: str) -> str:
+    """Return text without embedded links (SARIF 2.1.0, 3.11.6): names in it may be of others.
+
+    Only text with the form of a link is escaped, because many viewers show the escapes.
+    """
+    return re.sub(r"([\[\]\\])", r"\\\1", text) if "](" in text else text
 
 
 def _relative(file: str, base: Path) -> str:

@@ -12,6 +12,7 @@ import pytest
 from sros_tool.checks import runtime
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Severity
 from sros_tool.checks.registry import KINDS, FindingFilter
+from sros_tool.checks.sarif import sarif
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UsageError
 from tests.checks import keystore_cases, policy_cases, runtime_cases, test_policy_findings
@@ -223,6 +224,22 @@ def test_sarif(bench: Bench) -> None:
         assert place["artifactLocation"]["uri"] == "policy.xml"
         assert place["region"]["startLine"] >= 1
         assert place["artifactLocation"]["uriBaseId"] in run["originalUriBaseIds"]
+
+
+@pytest.mark.parametrize(
+    ("subject", "shown"),
+    [
+        ("[read this](http://example.org)", r"\[read this\](http://example.org)"),
+        (r"\[a](b)", r"\\\[a\](b)"),
+        ("rt/[ab]", "rt/[ab]"),
+    ],
+)
+def test_no_name_becomes_a_link_in_sarif(subject: str, shown: str, tmp_path: Path) -> None:
+    """A viewer shows [text](target) in a message as a link (SARIF 2.1.0, 3.11.6)."""
+    kind = next(iter(KINDS.values()))
+    log = sarif([kind.found(subject, "it is open")], [kind], version="1", base=tmp_path)
+    (result,) = log["runs"][0]["results"]
+    assert result["message"]["text"].startswith(f"{shown}: it is open")
 
 
 def test_sarif_shows_what_was_accepted_as_suppressed(tmp_path: Path) -> None:
