@@ -164,6 +164,16 @@ class Fault(Enum):
         "RFC 5280, 6.3.3; Fast DDS 2.14.5; measured.",
         _CRL,
     )
+    CRL_PARTIAL = (
+        "crl-partial",
+        "a revocation list that is not the whole list of its CA",
+        "No certificate can be verified with it, so every participant is refused. OpenSSL uses no "
+        "list of changes, of one place or of some certificates, and none with a critical extension "
+        "that it does not know.",
+        "RFC 5280, 5.2; OpenSSL 3 (x_crl.c, x509_vfy.c); Fast DDS 2.9.1, Cyclone DDS 0.10.2; "
+        "measured.",
+        _CRL,
+    )
     CRL_NOT_YET_VALID = (
         "crl-not-yet-valid",
         "a revocation list that is not valid yet",

@@ -65,6 +65,7 @@ from sros_tool.pki.crl import (
     lists_as_revoked,
     load_crl,
     read_list,
+    refusal_of,
     signed_by,
 )
 from sros_tool.pki.keys import load_key
@@ -578,6 +579,9 @@ class _EnclaveFiles:
         if not authentic:
             text = "it is not of the identity CA, so DDS refuses every participant"
             self._add(CRL_FILE, text, Fault.CRL_ISSUER)
+        if refusal := refusal_of(crl):
+            text = f"{refusal}, so DDS refuses every participant"
+            self._add(CRL_FILE, text, Fault.CRL_PARTIAL)
         if crl.last_update_utc > self._now:
             text = (
                 f"it is not valid before {iso(crl.last_update_utc)}: every participant is refused"

@@ -9,6 +9,7 @@ from datetime import datetime
 from cryptography import x509
 from cryptography.exceptions import UnsupportedAlgorithm
 from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.x509.oid import CRLEntryExtensionOID, ExtensionOID
 
 from sros_tool.errors import PkiError
 from sros_tool.pki.certificates import authority_identifier, subject_text
@@ -128,6 +129,43 @@ def lists_as_revoked(crl: x509.CertificateRevocationList, serial: int) -> bool:
     """
     entry = crl.get_revoked_certificate_by_serial_number(serial)
     return entry is not None and _revoked(entry).reason in REASONS
+
+
+_READ_IF_CRITICAL = (
+    ExtensionOID.ISSUING_DISTRIBUTION_POINT,
+    ExtensionOID.AUTHORITY_KEY_IDENTIFIER,
+    ExtensionOID.DELTA_CRL_INDICATOR,
+)
+
+
+_OF_USERS = x509.IssuingDistributionPoint(
+    full_name=None,
+    relative_name=None,
+    only_contains_user_certs=True,
+    only_contains_ca_certs=False,
+    only_some_reasons=None,
+    indirect_crl=False,
+    only_contains_attribute_certs=False,
+)
+
+
+def refusal_of(crl: x509.CertificateRevocationList) -> str:
+    """Return why OpenSSL verifies no certificate with a list, as a clause; "" if it does.
+
+    Source: OpenSSL 3, x_crl.c (crl_set_issuers, crl_cb) and x509_vfy.c (get_crl_score).
+    """
+    for each in crl.extensions:
+        if each.critical and each.oid not in _READ_IF_CRITICAL:
+            return f"it has the unknown critical extension {each.oid.dotted_string}"
+        if each.oid == ExtensionOID.DELTA_CRL_INDICATOR:
+            return "it has only the changes of another list"
+        if isinstance(each.value, x509.IssuingDistributionPoint) and each.value != _OF_USERS:
+            return "it is not for all certificates of its CA"
+    for entry in crl:
+        for found in entry.extensions:
+            if found.critical and found.oid != CRLEntryExtensionOID.CERTIFICATE_ISSUER:
+                return f"an entry has the unknown critical extension {found.oid.dotted_string}"
+    return ""
 
 
 def signed_by(crl: x509.CertificateRevocationList, authority: x509.Certificate) -> bool:

@@ -92,6 +92,7 @@ _CRL = (
     Fault.CRL_EXPIRED,
     Fault.CRL_MALFORMED,
     Fault.CRL_ISSUER,
+    Fault.CRL_PARTIAL,
     Fault.CRL_NOT_YET_VALID,
     Fault.REVOKED,
 )

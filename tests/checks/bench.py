@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from cryptography import x509
-from cryptography.hazmat.primitives import hashes
+from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
@@ -140,8 +140,9 @@ class Bench:
         begin: datetime | None = None,
         end: datetime | None = None,
         linked: bool = True,
+        scope: str = "",
     ) -> None:
-        """Put a revocation list in place."""
+        """Put a revocation list in place; with ``scope``, one of a place with this URI."""
         ca, key = by or (self.authority("identity"), self.key("identity"))
         data = sign_crl(
             ca,
@@ -151,6 +152,8 @@ class Bench:
             this_update=begin or self.now - DAY,
             next_update=end or self.now + 1000 * DAY,
         )
+        if scope:
+            data = _with_scope(data, key, scope)
         self.path("public/identity_ca.crl.pem").write_bytes(data)
         for name in ("base", "arm") if linked else ():
             link = self.path(f"enclaves/{name}/crl.pem")
@@ -178,6 +181,23 @@ class Bench:
 
 
 @cache
+def _with_scope(data: bytes, key: PrivateKey, uri: str) -> bytes:
+    """Return a revocation list without entries that is only of the place ``uri``."""
+    like = x509.load_pem_x509_crl(data)
+    scope = x509.IssuingDistributionPoint(
+        [x509.UniformResourceIdentifier(uri)], None, False, False, None, False, False
+    )
+    builder = (
+        x509.CertificateRevocationListBuilder()
+        .issuer_name(like.issuer)
+        .last_update(like.last_update_utc)
+        .add_extension(scope, critical=True)
+    )
+    assert like.next_update_utc
+    signed = builder.next_update(like.next_update_utc).sign(key, hashes.SHA256())
+    return signed.public_bytes(serialization.Encoding.PEM)
+
+
 def _unlocked(data: bytes) -> PrivateKey:
     return load_key(data, "a CA key", lambda: SECRET)
 

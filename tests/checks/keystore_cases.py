@@ -169,6 +169,7 @@ CASES |= {
     ),
     "enclave.crl-malformed": lambda b: b.path("enclaves/base/crl.pem").write_text("x"),
     "enclave.crl-issuer": lambda b: b.revoke(by=b.foreign()),
+    "enclave.crl-partial": lambda b: b.revoke(scope="http://example.org/crl"),
     "enclave.crl-not-yet-valid": lambda b: b.revoke(begin=b.now + DAY),
     "enclave.crl-expired": lambda b: b.revoke(begin=b.now - 9 * DAY, end=b.now - DAY),
     "enclave.revoked": lambda b: b.revoke(b.certificate().serial_number),

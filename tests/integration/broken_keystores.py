@@ -275,6 +275,10 @@ ROWS = (
         "enclave.crl-issuer", "", "unable to get certificate CRL",
     ),
     Breakage(
+        "CRL of a place", lambda b: b.revoke(scope="http://example.org/crl"), REFUSED, REFUSED,
+        "enclave.crl-partial", "", "ifferent CRL scope",
+    ),
+    Breakage(
         "identity CA expired", lambda b: expired_authority(b, "identity"), REFUSED, REFUSED,
         "enclave.ca-expired", "", "certificate has expired",
     ),

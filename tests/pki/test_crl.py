@@ -1,0 +1,108 @@
+"""Revocation lists with odd content: what is said of them is what OpenSSL does with them."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.x509.oid import NameOID
+
+from sros_tool.pki.certificates import Issuer, authority_identifier, common_name, issue_ca, pem
+from sros_tool.pki.crl import lists_as_revoked, load_crl, refusal_of
+from sros_tool.pki.keys import generate_key
+from sros_tool.validity import Window
+from tests.support.children import run
+
+NOW = datetime.now(UTC).replace(microsecond=0)
+DAY = timedelta(days=1)
+OWN, OTHER = 7, 8
+USABLE, REVOKED, REFUSED = "usable", "revoked", "refused"
+Extensions = tuple[tuple[x509.ExtensionType, bool], ...]
+
+UNKNOWN = x509.UnrecognizedExtension(x509.ObjectIdentifier("1.2.3.4.5"), b"\x05\x00")
+SOMEBODY = x509.CertificateIssuer(
+    [x509.DirectoryName(x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "x")]))]
+)
+
+
+def scope(
+    *,
+    name: str = "",
+    users: bool = False,
+    cas: bool = False,
+    reasons: frozenset[x509.ReasonFlags] | None = None,
+    indirect: bool = False,
+    attributes: bool = False,
+) -> x509.IssuingDistributionPoint:
+    names = [x509.UniformResourceIdentifier(name)] if name else None
+    return x509.IssuingDistributionPoint(names, None, users, cas, reasons, indirect, attributes)
+
+
+def because(reason: str, critical: bool = False) -> Extensions:
+    return ((x509.CRLReason(x509.ReasonFlags(reason)), critical),)
+
+
+CASES: dict[str, tuple[str, Extensions, dict[int, Extensions]]] = {
+    "nothing": (USABLE, (), {}),
+    "another certificate": (USABLE, (), {OTHER: ()}),
+    "the certificate": (REVOKED, (), {OWN: ()}),
+    "on hold": (REVOKED, (), {OWN: because("certificateHold")}),
+    "removed from the list": (USABLE, (), {OWN: because("removeFromCRL")}),
+    "a critical reason": (REFUSED, (), {OTHER: because("unspecified", critical=True)}),
+    "an unknown extension": (USABLE, ((UNKNOWN, False),), {}),
+    "an unknown critical extension": (REFUSED, ((UNKNOWN, True),), {}),
+    "one of an entry": (REFUSED, (), {OTHER: ((UNKNOWN, True),)}),
+    "of another issuer": (USABLE, (), {OTHER: ((SOMEBODY, True),)}),
+    "changes": (REFUSED, ((x509.DeltaCRLIndicator(3), True),), {}),
+    "changes, not critical": (REFUSED, ((x509.DeltaCRLIndicator(3), False),), {}),
+    "of users": (USABLE, ((scope(users=True), True),), {}),
+    "of CAs": (REFUSED, ((scope(cas=True), True),), {}),
+    "of attributes": (REFUSED, ((scope(attributes=True), True),), {}),
+    "of some reasons": (
+        REFUSED,
+        ((scope(reasons=frozenset({x509.ReasonFlags.key_compromise})), True),),
+        {},
+    ),
+    "indirect": (REFUSED, ((scope(indirect=True), True),), {}),
+    "of a place": (REFUSED, ((scope(name="http://x/"), True),), {}),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_said_of_a_list_is_what_openssl_does(case: str, tmp_path: Path) -> None:
+    expected, extensions, entries = CASES[case]
+    key, window = generate_key(), Window(NOW - DAY, NOW + DAY)
+    ca = issue_ca(key, common_name("CA"), window)
+    certificate = Issuer(ca, key).issue(common_name("/a"), generate_key().public_key(), window)
+    builder = (
+        x509.CertificateRevocationListBuilder()
+        .issuer_name(ca.subject)
+        .last_update(NOW - DAY)
+        .next_update(NOW + DAY)
+        .add_extension(authority_identifier(ca), critical=False)
+    )
+    for extension, critical in extensions:
+        builder = builder.add_extension(extension, critical=critical)
+    for number, more in entries.items():
+        entry = x509.RevokedCertificateBuilder().revocation_date(NOW - DAY)
+        entry = entry.serial_number(certificate.serial_number if number == OWN else number)
+        for extension, critical in more:
+            entry = entry.add_extension(extension, critical=critical)
+        builder = builder.add_revoked_certificate(entry.build())
+    document = builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
+
+    files = {"ca": pem(ca), "crl": document, "certificate": pem(certificate)}
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    command = ["openssl", "verify", "-crl_check", "-CAfile", "ca", "-CRLfile", "crl", "certificate"]
+    done = run(command, cwd=tmp_path, status=None)
+    revoked = "certificate revoked" in done.stderr
+    assert (USABLE if not done.returncode else REVOKED if revoked else REFUSED) == expected
+
+    parsed = load_crl(document, "")
+    listed = lists_as_revoked(parsed.list, certificate.serial_number)
+    assert (REFUSED if refusal_of(parsed.list) else REVOKED if listed else USABLE) == expected
+    assert parsed.revokes(certificate.serial_number) is listed
