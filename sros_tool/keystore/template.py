@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import tomllib
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from datetime import timedelta
 from pathlib import Path
@@ -16,6 +17,7 @@ from sros_tool.errors import DocumentError, SrosError
 from sros_tool.files import parse_toml
 from sros_tool.names import expression_problem
 from sros_tool.pki.token_uri import refuse_pin
+from sros_tool.policy.patterns import matches
 from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.resources import templates_dir
 from sros_tool.validity import Span, duration_text, parse_duration, parse_span, span_text
@@ -30,13 +32,22 @@ _TYPES: dict[type, str] = {str: "a string", bool: "a boolean", list: "a list"}
 
 
 @dataclass(frozen=True, slots=True)
+class ShortLived:
+    """The validity of the enclaves whose names match ``name``, which may have wildcards."""
+
+    name: str
+    validity: timedelta
+
+
+@dataclass(frozen=True, slots=True)
 class Template:
     """The settings of a keystore.
 
     ``authority_name`` begins the common names of its CAs.  Durations count from the creation of a
     certificate or document.  ``default_permissions`` is `EVERYTHING` or `NODE_BASICS`.
     ``identity_key`` and ``permissions_key`` are the URIs of CA keys outside of the keystore.  With
-    ``unique_subject``, the subject of every certificate has a unique part.
+    ``unique_subject``, the subject of every certificate has a unique part.  ``short_lived`` are
+    enclaves whose certificates and permissions expire earlier than the others.
     """
 
     name: str
@@ -52,6 +63,12 @@ class Template:
     permissions_key: str = ""
     unique_subject: bool = False
     revocation_validity: timedelta = timedelta(days=3650)
+    short_lived: tuple[ShortLived, ...] = ()
+
+    def longest_validity(self, enclave: str) -> timedelta | None:
+        """Return the longest validity of a short-lived enclave; None for all others."""
+        found = (each.validity for each in self.short_lived if matches(each.name, enclave))
+        return min(found, default=None)
 
 
 def template_names() -> tuple[str, ...]:
@@ -122,6 +139,7 @@ def parse_template(text: str, name: str) -> Template:
         permissions_key=_key_place(authorities, "permissions_key"),
         unique_subject=certificates.flag("unique_subject", False),
         revocation_validity=revocation.duration("validity", "10y"),
+        short_lived=tuple(_short_lived(table)),
     )
     for part in (authorities, certificates, permissions, revocation, table):
         part.finish()
@@ -156,11 +174,28 @@ def render_template(template: Template) -> str:
         "\n[protection.default]",
         *_topic_lines(protection.default),
     ]
+    for each in template.short_lived:
+        lines += ["\n[[enclaves]]", f"names = [{_toml(each.name)}]"]
+        lines.append(f"validity = {_toml(duration_text(each.validity))}")
     items = {kind: item for item, kind in _KINDS.items()}
     for named in protection.named:
         lines += [f"\n[[protection.{items[named.kind]}]]", f"names = [{_toml(named.name)}]"]
         lines += _topic_lines(named.protection)
     return "\n".join(lines) + "\n"
+
+
+def _short_lived(table: _Table) -> Iterator[ShortLived]:
+    for entry in table.tables("enclaves"):
+        validity = entry.duration("validity")
+        for name in entry.texts("names"):
+            problem = expression_problem(name)
+            if problem or not name.startswith("/"):
+                why = (problem or "It does not start with '/'.").removesuffix(".")
+                raise _TemplateError(
+                    f"{entry.path}.names has {name!r}, which is not the name of an enclave: {why}"
+                )
+            yield ShortLived(name, validity)
+        entry.finish()
 
 
 def _authority_name(table: _Table) -> str:

@@ -224,6 +224,13 @@ def test_a_broken_tag_is_found_at_its_line(tmp_path: Path) -> None:
     assert "<string>" not in found.text
 
 
+WIDE_ON_PURPOSE = {
+    "operator_configure": {"policy.sets-all-parameters"},
+    "operator_drive": {"policy.sets-all-parameters", "policy.everything"},
+}
+"""What is found in the wide steps of a person's enclaves, which are no better than others."""
+
+
 @pytest.mark.parametrize(
     "path",
     [
@@ -234,4 +241,5 @@ def test_a_broken_tag_is_found_at_its_line(tmp_path: Path) -> None:
     ids=lambda path: path.stem,
 )
 def test_nothing_in_the_policies_of_sros(path: Path) -> None:
-    assert [each for each in policy_file_findings(path) if each.severity >= WARNING] == []
+    found = {each.id for each in policy_file_findings(path) if each.severity >= WARNING}
+    assert found == WIDE_ON_PURPOSE.get(path.stem, set())

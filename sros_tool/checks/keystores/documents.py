@@ -247,9 +247,12 @@ def _times(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Finding
         return  # TIME_FORMAT reports it
     if not begin <= int(now.timestamp()) <= end:
         here = f"in {enclave.keystore.zone} Fast DDS reads that as {_utc(begin)} to {_utc(end)}"
-        yield LOCAL_TIME.found(enclave.name, f"{text}, and {here}", file)
+        accepted = enclave.accepts_expiry if now.timestamp() > end else ""
+        yield LOCAL_TIME.found(enclave.name, f"{text}, and {here}", file, accepted=accepted)
     elif now - _WEST < window.not_before or now + _EAST > window.not_after:
-        yield TIME_WINDOW.found(enclave.name, f"{text}, and now it is {iso(now)}", file)
+        accepted = enclave.accepts_expiry if now - _WEST >= window.not_before else ""
+        text = f"{text}, and now it is {iso(now)}"
+        yield TIME_WINDOW.found(enclave.name, text, file, accepted=accepted)
 
 
 def _utc(seconds: float) -> str:

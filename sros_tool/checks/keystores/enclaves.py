@@ -63,7 +63,8 @@ def _check_loading(enclave: CheckedEnclave) -> Iterator[Finding]:
             there = f"KEYSTORE/enclaves{quote(enclave.name)}/{problem.file}"
             path = there if "`" in remedy else quote(file)
         remedy = remedy.format(root=root, enclave="NAME", path=path)
-        yield kind.found(enclave.name, text, file, remedy=remedy)
+        accepted = enclave.accepts_expiry if problem.fault in _EXPIRED else ""
+        yield kind.found(enclave.name, text, file, remedy=remedy, accepted=accepted)
 
 
 EXPIRES_SOON = FindingKind(
@@ -239,7 +240,11 @@ def _expiry(
         if window.contains(now) and _expires_soon(window, now):
             verb = "expires" if what == "the certificate" else "expire"
             text = f"{what} {verb} at {iso(window.not_after)}"
-            yield EXPIRES_SOON.found(enclave.name, text, enclave.file(file))
+            accepted = enclave.accepts_expiry
+            yield EXPIRES_SOON.found(enclave.name, text, enclave.file(file), accepted=accepted)
+
+
+_EXPIRED = (Fault.CERTIFICATE_EXPIRED, Fault.PERMISSIONS_EXPIRED)
 
 
 def _expires_soon(window: Window, now: datetime) -> bool:

@@ -91,6 +91,13 @@ class CheckedEnclave:
         """Its folder."""
         return enclave_path(self.keystore.root, self.name)
 
+    @property
+    def accepts_expiry(self) -> str:
+        """Text naming the template that lets this enclave expire early; "" if none does."""
+        settings = self.keystore.settings
+        short = settings is not None and settings.longest_validity(self.name) is not None
+        return f"template {settings.name}" if settings and short else ""
+
     def file(self, name: str) -> str:
         """Return the path of one of its files."""
         return f"{self.folder}/{name}"

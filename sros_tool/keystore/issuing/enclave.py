@@ -111,13 +111,15 @@ class Issued:
     """The certificate and the new permissions of an enclave.
 
     ``document`` is the signed ``permissions.p7s``.  If the permissions do not change,
-    ``permissions`` and ``document`` are empty.
+    ``permissions`` and ``document`` are empty.  ``short_lived`` says that the settings of the
+    keystore let this enclave expire earlier than others.
     """
 
     issuance: Issuance
     certificate: x509.Certificate
     permissions: Permissions = Permissions(())  # noqa: RUF009 - frozen
     document: bytes = b""
+    short_lived: bool = False
 
     def notes(self) -> Iterator[Note]:
         """Yield notes on permissions that are not portable, or differ from those of ros2/sros2."""
@@ -127,6 +129,13 @@ class Issued:
                 "policy.several-profiles",
                 f"{name}: the rights of its {len(rights.enclave.profiles)} <profiles> are joined. "
                 "ros2/sros2 makes one grant per <profiles>, and DDS reads only the first grant.",
+            )
+        if self.short_lived:
+            end = validity_of(self.certificate).not_after
+            yield Note(
+                "enclave.short-lived",
+                f"{name}: it expires at {iso(end)}, as [[enclaves]] of the keystore's sros.toml "
+                "chooses for it. `sros renew` issues it again.",
             )
         if self.document:
             yield from document_notes(name, self.permissions, len(self.document))
@@ -153,6 +162,7 @@ class EnclaveWriter:
     ) -> None:
         self.entries: list[Entry] = []
         self._transaction = transaction
+        self._template = template
         self._now = now
         self._issuer = identity.issuer() if identity else None
         self._signer = permissions
@@ -188,7 +198,8 @@ class EnclaveWriter:
         if rights is None:
             return Issued(issuance, certificate)
         subject = subject_text(certificate.subject)
-        validity = self._permissions_validity.within(validity_of(certificate))
+        validity = self._validity(name, self._permissions_validity)
+        validity = validity.within(validity_of(certificate))
         permissions = _permissions(rights, subject, validity)
         message = self._sign(name, permissions)
         policy = rights.policy if isinstance(rights, EarlierRights) else rights.enclave.digest
@@ -203,7 +214,13 @@ class EnclaveWriter:
                 policy=policy,
             )
         )
-        return Issued(issuance, certificate, permissions, message)
+        short = self._template.longest_validity(name) is not None
+        return Issued(issuance, certificate, permissions, message, short_lived=short)
+
+    def _validity(self, name: str, usual: Window) -> Window:
+        """Return the validity of what is issued for an enclave; shorter if it is short-lived."""
+        longest = self._template.longest_validity(name)
+        return usual if longest is None else usual.within(window(self._now, longest))
 
     def _issue(self, name: str, identity: NewIdentity) -> x509.Certificate:
         if self._issuer is None:
@@ -213,7 +230,9 @@ class EnclaveWriter:
             pem_of_key = key_pem(identity.new_key)
             self._transaction.write(f"{folder}/{KEY_FILE}", pem_of_key, private=True)
         certificate = self._issuer.issue(
-            identity.subject, identity.public_key, self._certificate_validity
+            identity.subject,
+            identity.public_key,
+            self._validity(name, self._certificate_validity),
         )
         self._transaction.write(f"{folder}/{CERTIFICATE_FILE}", pem(certificate))
         self.entries.append(certificate_entry(self._now, "certificate", certificate, name))

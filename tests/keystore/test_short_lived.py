@@ -1,0 +1,94 @@
+"""Enclaves that the settings of a keystore let expire early do so, however they are issued."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+
+from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.keystore.expiry import survey
+from sros_tool.resources import policies_dir
+from sros_tool.validity import BACKDATE
+from tests.support.harness import sros
+
+DAY = timedelta(days=1)
+SHORT, LONG = "/operator/look", "/robot"
+POLICY = policies_dir() / "operator_look.xml"
+
+
+def create(root: Path) -> None:
+    sros("generate_artifacts", "-k", root, "-p", POLICY, "-e", LONG).ok()
+
+
+def create_without_policy(root: Path) -> None:
+    sros("create_enclave", root, SHORT, LONG).ok()
+
+
+def renew(root: Path) -> None:
+    create(root)
+    sros("renew", root, SHORT, LONG, "--new-key").ok()
+
+
+def state_again(root: Path) -> None:
+    create_without_policy(root)
+    sros("create_permission", root, SHORT, POLICY).ok()
+
+
+def rotate(root: Path) -> None:
+    create(root)
+    for stage in ("distribute", "reissue", "retire"):
+        sros("rotate_ca", root, "--to", stage).ok()
+
+
+def sign(root: Path) -> None:
+    sros("create_enclave", root, LONG).ok()
+    laptop = root.with_name("laptop")
+    sros("create_request", SHORT, laptop).ok()
+    request = laptop / "enclaves/operator/look/request.pem"
+    answer = root.with_name("answer.tar.gz")
+    sros("sign_request", root, request, "-p", POLICY, "-o", answer).ok()
+
+
+@pytest.mark.parametrize("issue", [create, create_without_policy, renew, state_again, rotate, sign])
+def test_an_enclave_lives_for_a_day_and_others_for_longer(
+    issue: Callable[[Path], None], tmp_path: Path
+) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", "production").ok()
+    issue(root)
+    lifetimes, unreadable = survey(root)
+    assert unreadable == ()
+    for each in lifetimes:
+        for window in (each.certificate, each.permissions):
+            length = window.not_after - window.not_before - BACKDATE
+            assert (length <= DAY) == (each.name == SHORT), each
+    assert {each.name for each in lifetimes} == {SHORT, LONG}
+
+
+def test_its_expiry_is_said_when_it_is_issued(tmp_path: Path) -> None:
+    sros("create_keystore", tmp_path / "ks").ok()
+    ended = sros("create_enclave", tmp_path / "ks", SHORT, LONG).ok()
+    assert ended.err.count("note [enclave.short-lived]") == 1
+    assert f"{SHORT}: it expires at 20" in ended.err
+
+
+@pytest.mark.parametrize("days", [0.0, 0.9, 2.0])
+def test_its_expiry_is_accepted_and_that_of_others_is_found(days: float, tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", "production").ok()
+    sros("generate_artifacts", "-k", root, "-p", POLICY).ok()
+    at = datetime.now(UTC) + days * DAY
+
+    def ids(*, accepted: bool) -> set[str]:
+        found = keystore_findings(root, now=at)
+        return {each.id for each in found if bool(each.accepted) is accepted}
+
+    late = ids(accepted=True)
+    assert bool(late) == (days > 0)
+    assert not late & ids(accepted=False)
+    settings = root / "sros.toml"
+    settings.write_text(settings.read_text().replace("/operator/*", "/nobody/*"))
+    assert late <= ids(accepted=False)
