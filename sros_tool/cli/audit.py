@@ -95,36 +95,11 @@ def audit(
     or else in the enclave whose profiles name it. Observes until the graph stops changing; what a
     node does only later needs --watch. The default is the keystore of $ROS_SECURITY_KEYSTORE.
     """
-    return _audit(
-        source or keystore_from_environment(),
-        watch,
-        spin_time,
-        observer_environment(enclave, keystore, domain),
-        enclave,
-        vendor,
-        patch,
-        force=force,
-        dry_run=dry_run,
-        as_json=as_json,
-    )
-
-
-def _audit(
-    source: Path,
-    watch: str | None,
-    spin_time: float | None,
-    environment: dict[str, str],
-    enclave: str | None,
-    vendor: str | None,
-    patch: Path | None,
-    *,
-    force: bool,
-    dry_run: bool,
-    as_json: bool,
-) -> int:
     from sros_tool.explain.audit import audit as judge
 
     check_duration(watch, spin_time)
+    source = source or keystore_from_environment()
+    environment = observer_environment(enclave, keystore, domain)
     if force and patch is None:
         raise UsageError("--force is for --patch only", "", "Leave it out.")
     if patch is not None:
