@@ -6,7 +6,10 @@ import os
 import shutil
 import signal
 import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -17,7 +20,7 @@ from sros_tool.cli.common import (
     print_json,
     split_root,
 )
-from sros_tool.errors import KeystoreError, SrosError, UnavailableError, UsageError
+from sros_tool.errors import KeystoreError, UnavailableError, UsageError
 
 _COMMAND = "sros.command"
 _WORDS = click.argument(
@@ -32,8 +35,64 @@ _DOMAIN = click.option(
 )
 
 
+class _FailingClosed(click.Command):
+    """A verb whose output is evaluated: if it fails in any way, no node starts with its output.
+
+    That includes wrong options: a shell evaluates whatever is printed, and ignores the exit status.
+    """
+
+    def make_context(
+        self,
+        info_name: str | None,
+        args: list[str],
+        parent: click.Context | None = None,
+        **more: Any,
+    ) -> click.Context:
+        """Parse the arguments."""
+        if more.get("resilient_parsing"):  # completion
+            return super().make_context(info_name, args, parent, **more)
+        with _refusal_printed(_form_of(args), "--json" in args):
+            return super().make_context(info_name, args, parent, **more)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the verb."""
+        with _refusal_printed(ctx.params["form"], ctx.params["as_json"]):
+            return super().invoke(ctx)
+
+
+@contextmanager
+def _refusal_printed(form: str, as_json: bool) -> Iterator[None]:
+    """Print what starts no node if an error or a signal ends the context."""
+    try:
+        yield
+    except click.exceptions.Exit:  # --help
+        raise
+    except BaseException:
+        from sros_tool.runtime.environment import REFUSING, render_refusal
+
+        if as_json:
+            print_json({"keystore": None, "enclave": None, "variables": REFUSING})
+        else:
+            click.echo(render_refusal(form), nl=False)
+        raise
+
+
+_FORMS = ("sh", "fish", "json", "systemd", "docker")
+
+
+def _form_of(arguments: Sequence[str]) -> str:
+    """Return the form that arguments ask for which could not be parsed."""
+    named = (
+        each.removeprefix("--format=")
+        for each, before in zip(arguments, ["", *arguments], strict=False)
+        if each.startswith("--format=") or before == "--format"
+    )
+    return next((each for each in named if each in _FORMS), _FORMS[0])
+
+
 @click.command(
     "env",
+    cls=_FailingClosed,
     epilog="""\b
 Example:
   $ eval "$(sros env keystore /talker)"
@@ -48,8 +107,8 @@ Example:
 @click.option(
     "--format",
     "form",
-    type=click.Choice(["sh", "fish", "json", "systemd", "docker"]),
-    default="sh",
+    type=click.Choice(_FORMS),
+    default=_FORMS[0],
     show_default=True,
     help="For a shell, a systemd unit or Docker; json has names and values alone.",
 )
@@ -59,24 +118,18 @@ def env(words: tuple[str, ...], form: str, domain: str | None, as_json: bool) ->
     """Print the environment variables that make a process run in the enclave NAME.
 
     The strategy is Enforce: a process that cannot run in the enclave does not start. If the
-    variables cannot be given, those that are printed let no node start, except with JSON.
+    variables cannot be given, those that are printed let no node start.
     """
-    from sros_tool.runtime.environment import render_environment, render_refusal
+    from sros_tool.runtime.environment import render_environment
 
-    form = "json" if as_json else form
-    try:
-        root, rest = split_root(words)
-        if len(rest) != 1:
-            raise UsageError("env takes a keystore and one enclave")
-        variables = loadable_environment(root, rest[0], domain)
-        text = render_environment(variables, form)
-    except (SrosError, OSError):
-        click.echo(render_refusal(form), nl=False)
-        raise
+    root, rest = split_root(words)
+    if len(rest) != 1:
+        raise UsageError("env takes a keystore and one enclave")
+    variables = loadable_environment(root, rest[0], domain)
     if as_json:
         print_json({"keystore": str(root), "enclave": rest[0], "variables": variables})
     else:
-        click.echo(text, nl=False)
+        click.echo(render_environment(variables, form), nl=False)
 
 
 class _WithCommand(click.Command):

@@ -79,17 +79,22 @@ def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
     }
 
 
+REFUSING: Mapping[str, str] = {KEYSTORE: "", ENABLE: "true", STRATEGY: "Enforce"}
+"""Variables with which rcl starts no node."""
+
+
 def render_refusal(form: str) -> str:
     """Return text that keeps a node from starting, for a form that cannot be given its variables.
 
-    What reads nothing, as a shell that evaluates an empty output, would start nodes unsecured.
-    With Enforce and no keystore, rcl starts none; in a shell, the text also fails as a command.
-    JSON has no such text: "".
+    What reads nothing, such as a shell that evaluates an empty output, or jq, would start nodes
+    unsecured: see `REFUSING`.  In a shell, the text also fails as a
+    command, also where ``eval $(...)`` without quotes makes it a single line; in a unit, it keeps
+    systemd from starting the service.
     """
-    if form == "json":
-        return ""
-    refusing = {KEYSTORE: "", ENABLE: "true", STRATEGY: "Enforce"}
-    return render_environment(refusing, form) + ("false\n" if form in ("sh", "fish") else "")
+    text = render_environment(REFUSING, form)
+    if form in ("sh", "fish"):
+        return "; ".join((*text.splitlines(), "false")) + "\n"
+    return text + ("ExecStartPre=/bin/false\n" if form == "systemd" else "")
 
 
 def render_environment(variables: Mapping[str, str], form: str) -> str:

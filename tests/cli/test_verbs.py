@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import stat
@@ -21,6 +22,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import common_name, issue_ca, pem
 from sros_tool.pki.keys import generate_key
 from sros_tool.resources import policies_dir
+from sros_tool.runtime.environment import REFUSING, render_refusal
 from sros_tool.validity import Window
 from tests.support.children import finish, python, run, wait_for
 from tests.support.harness import (
@@ -215,13 +217,58 @@ def test_a_shell_that_evaluates_a_refusal_starts_no_node(shell: str, tmp_path: P
     assert done.stdout.split() == ["1", "true", "Enforce", "[]"]
     if shell != "fish":
         run([shell, "-c", f"set -e; {script}; echo more", *words], env=env, status=1)
+        bare = run([shell, "-c", f'eval $1; echo "$? {names}"', *words], env=env)
+        assert bare.stdout == done.stdout
 
 
-@pytest.mark.parametrize("form", ["systemd", "docker", "json"])
-def test_a_file_with_a_refusal_starts_no_node(form: str, tmp_path: Path) -> None:
-    said = sros("env", tmp_path / "none", "/a", "--format", form).out
-    for each in ("ROS_SECURITY_ENABLE=true", "ROS_SECURITY_STRATEGY=Enforce"):
-        assert (each in said) is (form != "json")
+def test_a_file_with_a_refusal_starts_no_node(tmp_path: Path) -> None:
+    def said(form: str) -> str:
+        return sros("env", tmp_path / "none", "/a", "--format", form).out
+
+    assert json.loads(said("json")) == REFUSING
+    assert json.loads(sros("env", tmp_path / "none", "/a", "--json").out)["variables"] == REFUSING
+    assert dict(line.split("=") for line in said("docker").splitlines()) == REFUSING
+    unit = said("systemd").splitlines()
+    assert unit == [f'Environment="{k}={v}"' for k, v in REFUSING.items()] + [
+        "ExecStartPre=/bin/false"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "form"),
+    [
+        ("env", "sh"),
+        ("env {ks}", "sh"),
+        ("env {ks} /a /b", "sh"),
+        ("env {ks} /a --bogus", "sh"),
+        ("env {ks} /a --format csh", "sh"),
+        ("env {ks} /a --domain", "sh"),
+        ("env {ks} /a --domain 7", "sh"),
+        ("env --bogus {ks} /a --format fish", "fish"),
+        ("env --bogus {ks} /a --format=docker", "docker"),
+        ("env --bogus {ks} /a --format json", "json"),
+    ],
+)
+def test_wrong_words_are_refused_in_the_form_too(words: str, form: str, keystore: Path) -> None:
+    ended = sros(*words.format(ks=keystore).split())
+    assert (ended.status, ended.out) == (2, render_refusal(form)), ended
+
+
+def test_help_and_completion_of_env_print_no_refusal(keystore: Path) -> None:
+    assert "ROS_SECURITY_STRATEGY=Enforce;" not in sros("env", "--help").ok().out
+    env = {"_SROS_COMPLETE": "bash_complete", "COMP_WORDS": f"sros env {keystore} --f"}
+    completed = sros(env={**env, "COMP_CWORD": "3"})
+    assert completed.out.split(",")[-1].split() == ["--format"], completed
+
+
+def test_rcl_starts_no_node_with_a_refusal(tmp_path: Path) -> None:
+    pytest.importorskip("rclpy")
+    node = "import rclpy; rclpy.init(); print('RUNS')"
+    script = f'eval "$1"; {shlex.join((sys.executable, "-c", node))}'
+    refused = sros("env", tmp_path / "none", "/a").out
+    for text, runs in ((refused, False), ("unset ROS_SECURITY_ENABLE", True)):
+        done = run(["sh", "-c", script, "sh", text], status=None)
+        assert ("RUNS" in done.stdout) is runs, done
 
 
 def test_root_is_the_working_folder_and_was_not_empty(tmp_path: Path) -> None:
