@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import stat
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import click
@@ -32,6 +34,13 @@ _WORDS = click.argument(
 )
 _DOMAIN = click.option(
     "--domain", metavar="ID", help="The ROS domain. [default: $ROS_DOMAIN_ID, or the keystore's]"
+)
+
+
+_ACCEPT_KEY = click.option(
+    "--accept-readable-key",
+    is_flag=True,
+    help="Accept a private key that other users can read, as on a file system without modes.",
 )
 
 
@@ -113,8 +122,15 @@ Example:
     help="For a shell, a systemd unit or Docker; json has names and values alone.",
 )
 @_DOMAIN
+@_ACCEPT_KEY
 @json_option
-def env(words: tuple[str, ...], form: str, domain: str | None, as_json: bool) -> None:
+def env(
+    words: tuple[str, ...],
+    form: str,
+    domain: str | None,
+    accept_readable_key: bool,
+    as_json: bool,
+) -> None:
     """Print the environment variables that make a process run in the enclave NAME.
 
     The strategy is Enforce: a process that cannot run in the enclave does not start. If the
@@ -125,7 +141,7 @@ def env(words: tuple[str, ...], form: str, domain: str | None, as_json: bool) ->
     root, rest = split_root(words)
     if len(rest) != 1:
         raise UsageError("env takes a keystore and one enclave")
-    variables = loadable_environment(root, rest[0], domain)
+    variables = loadable_environment(root, rest[0], domain, accept_key=accept_readable_key)
     if as_json:
         print_json({"keystore": str(root), "enclave": rest[0], "variables": variables})
     else:
@@ -168,9 +184,16 @@ Example:
     shell_complete=complete_keystore_and_enclave,
 )
 @_DOMAIN
+@_ACCEPT_KEY
 @click.option("--no-ros-args", is_flag=True, help="Add no arguments to COMMAND.")
 @click.pass_context
-def run(ctx: click.Context, words: tuple[str, ...], domain: str | None, no_ros_args: bool) -> None:
+def run(
+    ctx: click.Context,
+    words: tuple[str, ...],
+    domain: str | None,
+    accept_readable_key: bool,
+    no_ros_args: bool,
+) -> None:
     """Run COMMAND in the enclave NAME of the keystore ROOT, or not at all (strategy Enforce).
 
     The enclave is checked first, so that problems are reported here and not by an obscure message
@@ -184,7 +207,7 @@ def run(ctx: click.Context, words: tuple[str, ...], domain: str | None, no_ros_a
     name, command = rest[0] if rest else "", [*rest[1:], *ctx.meta[_COMMAND]]
     if not command:
         raise UsageError("no command is given", "", "Write `sros run ROOT NAME -- COMMAND...`.")
-    variables = loadable_environment(root, name, domain)
+    variables = loadable_environment(root, name, domain, accept_key=accept_readable_key)
     program = shutil.which(command[0])
     if program is None:
         raise UsageError(
@@ -206,16 +229,26 @@ def run(ctx: click.Context, words: tuple[str, ...], domain: str | None, no_ros_a
     os.execve(program, command, {**os.environ, **variables})
 
 
-def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict[str, str]:
+def loadable_environment(
+    root: Path, name: str, domain_text: str | None, *, accept_key: bool = False
+) -> dict[str, str]:
     """Return the environment variables of an enclave after checking that a process can run in it.
 
-    ``domain_text`` is the value of --domain; None stands for $ROS_DOMAIN_ID.
+    ``domain_text`` is the value of --domain; None stands for $ROS_DOMAIN_ID.  ``accept_key``
+    accepts a private key that other users can read.
 
     Raises:
         UsageError: the domain or the enclave's name is invalid.
-        KeystoreError: the enclave does not exist, or a process cannot run in it.
+        KeystoreError: the enclave does not exist, a process cannot run in it, or others can read
+            its private key.
     """
-    from sros_tool.keystore.layout import check_keystore, enclave_path, has_enclave, list_enclaves
+    from sros_tool.keystore.layout import (
+        KEY_FILE,
+        check_keystore,
+        enclave_path,
+        has_enclave,
+        list_enclaves,
+    )
     from sros_tool.keystore.missing import no_such_enclave
     from sros_tool.keystore.reader import open_enclave
     from sros_tool.names import check_enclave_name
@@ -244,7 +277,22 @@ def loadable_environment(root: Path, name: str, domain_text: str | None) -> dict
             "; ".join(map(str, state.problems)) + ".",
             f"See `sros inspect {folder}`.",
         )
+    if not accept_key:
+        _check_key_closed(folder / KEY_FILE, root, name)
     return secured_environment(root, name, domain)
+
+
+def _check_key_closed(key: Path, root: Path, name: str) -> None:
+    """Raise `KeystoreError` if users other than the owner can read a private key."""
+    mode = stat.S_IMODE(key.stat().st_mode)
+    if mode & 0o077:
+        raise KeystoreError(
+            f"others can read the private key of enclave {name}",
+            f"The mode of '{key}' is {mode:04o}: whoever has read the key can act as the enclave.",
+            f"Run `chmod 600 {quote(str(key))}`. If others had access, give the enclave another "
+            f"key: `sros renew {quote(str(root))} {name} --new-key --revoke-old`. To run it "
+            "nevertheless, add --accept-readable-key.",
+        )
 
 
 @click.command(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shlex
 import shutil
 import signal
@@ -584,6 +585,26 @@ def test_env_in_every_form(keystore: Path) -> None:
         said = sros("env", keystore, "/a", "--format", form).ok().out
         assert len(said.splitlines()) == len(wanted)
         assert all(line.startswith(start) for line in said.splitlines())
+
+
+@pytest.mark.parametrize("mode", [0o644, 0o640, 0o604, 0o620])
+def test_no_process_starts_with_a_key_that_others_can_read(mode: int, keystore: Path) -> None:
+    key = keystore / "enclaves/a/key.pem"
+    key.chmod(mode)
+    marker = keystore.parent / "ran"
+    refused = sros("run", keystore, "/a", "--", "touch", marker)
+    assert refused.status == 2, refused
+    assert f"'{key}' is {mode:04o}" in refused.err
+    assert sros("env", keystore, "/a").out == render_refusal("sh")
+    accepted = sros("env", keystore, "/a", "--accept-readable-key", "--json").ok()
+    assert json.loads(accepted.out)["variables"] == variables(keystore)
+    run([*PROGRAM, "run", keystore, "/a", "--accept-readable-key", "--", "touch", marker])
+    marker.unlink()
+    mend, replace = re.findall("`(.+?)`", refused.err)
+    run(["sh", "-c", mend])
+    run([*PROGRAM, "run", keystore, "/a", "--", "touch", marker])
+    assert marker.exists()
+    sros(*shlex.split(replace)[1:]).ok()
 
 
 def test_env_of_a_path_that_a_form_cannot_hold(tmp_path: Path) -> None:
