@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.reader import read_certificate, read_lists
 from sros_tool.parallel import map_slices
-from sros_tool.pki.certificates import subject_text
+from sros_tool.pki.certificates import common_name_of, subject_text
 from sros_tool.pki.crl import SUPERSEDED
 from sros_tool.pki.keys import PublicKey, load_key
 from sros_tool.pki.requests import key_digest
@@ -66,6 +67,28 @@ class KnownKeys:
         }
         lists = (entry for crl in read_lists(self._root) for entry in crl.revoked)
         return found | {entry.serial for entry in lists if entry.reason != SUPERSEDED}
+
+    @cached_property
+    def revoked_enclaves(self) -> Collection[str]:
+        """The enclaves whose last certificate was revoked, and not superseded.
+
+        Where the ledger was lost, those whose files are in ``revoked``, with a certificate that a
+        revocation list names.
+        """
+        found, recorded = set(), set()
+        for each in read_ledger(self._root).entries:
+            recorded.add(each.serial)
+            if each.what == "certificate":
+                found.discard(each.enclave)
+            elif each.what == "revocation" and each.reason != SUPERSEDED:
+                found.add(each.enclave)
+        for path in revoked_certificates(self._root):
+            if path.parent.name not in recorded:
+                with suppress(SrosError):  # a file that is no certificate
+                    certificate = read_certificate(path)
+                    if certificate.serial_number in self._revoked_serials:
+                        found.add(common_name_of(certificate.subject))
+        return found
 
     @cached_property
     def _enclaves(self) -> Mapping[str, Sequence[str]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -25,7 +26,7 @@ from sros_tool.keystore.reader import open_enclave, read_crl
 from sros_tool.keystore.template import load_template
 from sros_tool.pki.crl import REASONS, RevocationList
 from tests.support.children import run
-from tests.support.harness import certificate, check_whole, snapshot, sros
+from tests.support.harness import certificate, check_whole, policy_text, publish, snapshot, sros
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
 DAY = timedelta(days=1)
@@ -165,6 +166,32 @@ def test_again_under_the_same_name(tmp_path: Path) -> None:
     revoke(root, ["/a"], now=NOW)
     assert len(crl_of(root).revoked) == 2
     assert len(list((root / "revoked").iterdir())) == 2
+
+
+@pytest.mark.parametrize("ledger", ["whole", "lost"])
+def test_a_policy_alone_makes_no_revoked_enclave_again(ledger: str, tmp_path: Path) -> None:
+    root = made(tmp_path / "ks", "/b")
+    policy = tmp_path / "robot.xml"
+    policy.write_text(policy_text({"/a": publish("chatter"), "/c": publish("x")}))
+    given = ("generate_artifacts", "-k", root, "-p", policy)
+    sros(*given).ok()
+    sros("renew", root, "/c", "--revoke-old").ok()  # superseded: /c still is an enclave
+    sros("revoke", root, "/a", "--reason", "cessation_of_operation").ok()
+    shutil.rmtree(root / "enclaves/c")
+    if ledger == "lost":
+        (root / "ledger.jsonl").unlink()
+    before = snapshot(root)
+    refused = sros(*given)
+    assert refused.status == 2, refused
+    assert "a policy names /a, revoked in keystore" in refused.err
+    assert snapshot(root) == before
+    insisting = Path(shutil.copytree(root, tmp_path / "named", symlinks=True))
+    named = sros("generate_artifacts", "-k", insisting, "-e", "/a", "-p", policy).ok()
+    assert "/a was revoked, and now exists again" in named.err
+    (command,) = re.findall("`sros (create_enclave .+?)`", refused.err)
+    assert "/a was revoked, and now exists again" in sros(*command.split()).ok().err
+    assert "was revoked" not in sros(*given).ok().err
+    assert {"/a", "/c"} < set(list_enclaves(root))
 
 
 def test_put_back_and_revoked_again(tmp_path: Path) -> None:

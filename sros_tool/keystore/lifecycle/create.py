@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import hashlib
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from enum import Enum
@@ -210,6 +210,9 @@ def generate_artifacts(
 
     If a policy names an existing enclave, the enclave's permissions are replaced.  If the keystore
     does not exist and ``create`` is given, it is created from that template.
+
+    Raises:
+        KeystoreError: a policy names a revoked enclave that ``enclaves`` does not name.
     """
     wanted = _rights_by_enclave(enclaves, policies)
     if not dry_run:
@@ -218,7 +221,9 @@ def generate_artifacts(
         check_keystore(root)
         with Transaction(root, dry_run=dry_run) as transaction:
             keystore = _open_keystore(transaction, domain, keyring, now)
-            return _write_enclaves(transaction, keystore, wanted, now, progress)
+            again = _revoked_before(keystore, wanted, enclaves, root)
+            creation = _write_enclaves(transaction, keystore, wanted, now, progress)
+        return replace(creation, notes=(*again, *creation.notes))
     _check_typo(root)
     check_free(root)
     domains = domains or DomainSet.of((0 if domain is None else domain,) * 2)
@@ -227,6 +232,33 @@ def generate_artifacts(
         keystore = _write_keystore(transaction, create, domains, keyring, now, _NONE_IMPORTED)
         creation = _write_enclaves(transaction, keystore, wanted, now, progress)
     return replace(creation, notes=(*creation.notes, *place_notes(root)))
+
+
+def _revoked_before(
+    keystore: _Keystore, wanted: Iterable[str], named: Collection[str], root: Path
+) -> list[Note]:
+    """Return a note for each revoked enclave that is created again because it is ``named``.
+
+    Raises:
+        KeystoreError: a revoked enclave is only in a policy, from which nobody removed it.
+    """
+    missing = [name for name in wanted if name not in keystore.names]
+    again = [name for name in missing if name in keystore.known.revoked_enclaves]
+    if unasked := [name for name in again if name not in named]:
+        raise KeystoreError(
+            f"a policy names {', '.join(unasked)}, revoked in keystore '{root}'",
+            "Its policy would create it again, and `distribute_key --all` would export it.",
+            "Remove it from the policy; or, to have it again with another key, create it by its "
+            f"name first: `sros create_enclave {quote(str(root))} {' '.join(unasked)}`.",
+        )
+    return [
+        Note(
+            "keystore.revoked-before",
+            f"{name} was revoked, and now exists again, with another key and certificate; the "
+            "revoked ones stay revoked.",
+        )
+        for name in again
+    ]
 
 
 def _rights_by_enclave(
