@@ -31,6 +31,7 @@ from sros_tool.cli.observing import (
     observing_options,
     why_empty,
 )
+from sros_tool.cli.written import file_change
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.values import as_plain
@@ -122,9 +123,12 @@ def audit(
             "there is nothing to audit: no node was observed",
             why_empty(environment, snapshot.seconds, rmw, enclave),
         )
+    existed = patch is not None and patch.exists()
     written = _write_patch(found, patch, dry_run=dry_run)
     if as_json:
-        print_json(_json(source, enclaves, found, patch if written else None, dry_run=dry_run))
+        value = _json(source, enclaves, found, patch if written else None, dry_run=dry_run)
+        changes = file_change(patch, existed=existed) if patch and written else []
+        print_json({**value, "changes": changes})
     else:
         _show(found, enclaves)
     print_notes((*found.notes, *found.missing.notes))

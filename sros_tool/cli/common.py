@@ -53,7 +53,7 @@ PATH = _NamedPath()
 
 
 def json_option(function: Decorated) -> Decorated:
-    """Add ``--json`` to a verb that reads."""
+    """Add ``--json`` to a verb."""
     return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(function)
 
 

@@ -91,6 +91,7 @@ def test_json_has_a_stable_shape(program: Program) -> None:
         "patch": None,
         "dry_run": False,
         "notes": [],
+        "changes": [],
     }
 
 

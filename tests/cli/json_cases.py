@@ -1,0 +1,308 @@
+"""Commands for `tests/cli/test_json.py`, and the folder in which they run."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from tests.support.harness import policy_text, publish, sros
+from tests.support.made_by_eloquent import EVERYTHING, make_eloquent
+
+WITHOUT_JSON = {
+    "run": "it becomes the command that it runs, whose output is the result",
+    "completion": "it prints the script of a shell",
+}
+"""The verbs without ``--json``, and why."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A command without ``--json``, its exit status, and the commands that run before it."""
+
+    words: str
+    status: int = 0
+    before: tuple[str, ...] = ()
+
+
+LOGS = Path(__file__).parents[1] / "explain"
+DENIALS = LOGS / "denial_logs" / "fastdds_2.9.1.log"
+EXPIRED = LOGS / "logs" / "cyclone_0.10.2.certificate_expired.log"
+
+_WILD = """<topics publish="ALLOW" subscribe="ALLOW"><topic>/*</topic></topics>
+<services request="ALLOW"><service>/s*</service></services>"""
+_SUBSCRIBE = '<topics subscribe="ALLOW"><topic>/x</topic></topics>'
+_DENIED = '<topics publish="DENY"><topic>/x</topic></topics>'
+_OLD = """<policy version="0.1.0"><profiles><profile ns="/" node="n">
+<topics publish="ALLOW"><topic>/x</topic></topics></profile></profiles></policy>"""
+POLICIES = {
+    "policy.xml": policy_text({"/a": publish("/x"), "/b": publish("/y") + _SUBSCRIBE}),
+    "other.xml": policy_text({"/a": publish("/x", "/z"), "/new": publish("/x")}),
+    "denied.xml": policy_text({"/a": _DENIED, "/b": publish("/x")}),
+    "wild.xml": policy_text({"/a": _WILD, "/b": publish("/x")}),
+    "large.xml": policy_text({"/a": publish(*(f"/{'n' * 60}/x{i}" for i in range(900)))}),
+    "old.xml": _OLD,
+    "odd.xml": _OLD.replace("</profiles>", '<profile ns="/" node="b*"/></profiles>'),
+}
+
+
+def make_folder(folder: Path) -> None:
+    """Fill a folder with what the cases name: keystores in several states, a robot, policies."""
+    for name, text in POLICIES.items():
+        (folder / name).write_text(text)
+    (folder / "quiet.log").write_text("nothing to see\n")
+    for line in (
+        "create_keystore ks",
+        "create_keystore empty",
+        "create_keystore single --ca-layout single",
+        "generate_artifacts -k ks -p policy.xml -e /c",
+        "revoke ks /c",
+        "create_request /r robot",
+        "create_request /s robot",
+        "sign_request ks robot/enclaves/r/request.pem -o r.tgz",
+        "sign_request single robot/enclaves/r/request.pem -o single.tgz",
+        "distribute_key ks /a out",
+        "create_enclave single /a",
+        "revoke single /a",
+        "rotate_ca single --next",
+        "create_keystore elsewhere --identity-key file:identity.pem",
+    ):
+        sros(*line.split(), cwd=folder).ok()
+    make_eloquent(folder / "eloquent", {"/talker": EVERYTHING}, now=datetime.now(UTC))
+    for copy in ("turned", "broken", "lost", "wrecked"):
+        shutil.copytree(folder / "ks", folder / copy, symlinks=True)
+    sros("rotate_ca", "turned", "--next", cwd=folder).ok()
+    (folder / "lost/public/identity_ca.crl.pem").unlink()
+    (folder / "broken/enclaves/b/cert.pem").write_text("x")
+    ledger = folder / "broken/ledger.jsonl"
+    ledger.write_bytes(b"".join(ledger.read_bytes().splitlines(keepends=True)[1:]))
+    for file in ("public/identity_ca.cert.pem", "public/permissions_ca.cert.pem"):
+        (folder / "wrecked" / file).write_text("x")
+    (folder / "wrecked/enclaves/governance.p7s").write_text("x")
+
+
+CASES: dict[str, tuple[Case, ...]] = {
+    "create_keystore": (
+        Case("new"),
+        Case("new --dry-run --ca-layout single --domain 3"),
+        Case("new --from eloquent"),
+        Case("new --from eloquent --dry-run"),
+        Case(
+            "new --identity-ca ks/public/identity_ca.cert.pem --identity-key file:ks/private/"
+            "identity_ca.key.pem"
+        ),
+        Case(
+            "new --dry-run --identity-ca ks/public/identity_ca.cert.pem --identity-key file:ks/"
+            "private/identity_ca.key.pem"
+        ),
+    ),
+    "create_enclave": (
+        Case("ks /a /new"),
+        Case("ks /a /new --dry-run"),
+        Case("ks /a /A"),
+    ),
+    "create_permission": (Case("ks /a policy.xml"), Case("ks /a policy.xml --dry-run")),
+    "generate_artifacts": (
+        Case("-k ks -p policy.xml -e /c"),
+        Case("-k new -p policy.xml"),
+        Case("-k new -p policy.xml --dry-run"),
+    ),
+    "list_enclaves": (Case("ks"), Case("empty")),
+    "inspect": (
+        Case("ks"),
+        Case("turned"),
+        Case("broken", 1),
+        Case("wrecked", 1),
+        Case("single"),
+        Case("robot", 1),
+        Case("ks/enclaves/a"),
+        Case("ks/enclaves/b/cert.pem"),
+        Case("turned/public/identity_ca.cert.pem"),
+        Case("ks/public/identity_ca.crl.pem"),
+        Case("ks/private/identity_ca.key.pem"),
+        Case("ks/enclaves/a/permissions.p7s"),
+        Case("ks/enclaves/a/permissions.xml"),
+        Case("ks/enclaves/governance.p7s"),
+        Case("ks/enclaves/governance.xml"),
+        Case("ks --history"),
+        Case("broken --history", 1),
+    ),
+    "renew": (
+        Case("ks /a"),
+        Case("ks /a --dry-run"),
+        Case("ks --all-expiring 1d"),
+        Case("ks /a /b --revoke-old"),
+    ),
+    "revoke": (
+        Case("ks /a --reason key_compromise"),
+        Case("ks /a --dry-run"),
+        Case("broken /a"),
+    ),
+    "crl": (
+        Case("ks"),
+        Case("empty"),
+        Case("turned"),
+        Case("ks --refresh"),
+        Case("ks --refresh --dry-run"),
+        Case("lost --refresh"),
+    ),
+    "rotate_ca": (
+        Case("ks"),
+        Case("turned --status"),
+        Case("ks --next"),
+        Case("ks --next --dry-run"),
+        Case("turned --next"),
+        Case("ks --finish"),
+        Case("ks --same-key"),
+        Case("elsewhere --finish --identity-key file:new.pem"),
+    ),
+    "distribute_key": (
+        Case("ks /a out"),
+        Case("ks /a out", before=("distribute_key ks /a out",)),
+        Case("ks --all out.tar.gz"),
+        Case("ks /a out --dry-run"),
+        Case("ks /a - --dry-run"),
+    ),
+    "verify": (Case("out"), Case("out --domain 7 --at 2000-01-01", 1)),
+    "create_request": (
+        Case("/r new"),
+        Case("/r new --dry-run"),
+        Case("/r robot --again"),
+    ),
+    "sign_request": (
+        Case("ks robot/enclaves/r/request.pem -o answer.tgz --renew"),
+        Case("ks robot/enclaves/s/request.pem -o answer.tgz"),
+        Case("ks robot/enclaves/s/request.pem -o answer.tgz --dry-run"),
+        Case("empty robot/enclaves/s/request.pem -o - --dry-run"),
+    ),
+    "import": (
+        Case("r.tgz robot"),
+        Case("r.tgz robot --dry-run"),
+        Case("r.tgz robot", before=("import r.tgz robot",)),
+        Case("r.tgz robot --ca ks/public/permissions_ca.cert.pem"),
+        Case("single.tgz robot"),
+    ),
+    "generate_policy": (
+        Case(f"--enclave /a --from-log {DENIALS}"),
+        Case(f"new.xml --enclave /a --from-log {DENIALS} --accept"),
+        Case(f"new.xml --enclave /a --from-log {DENIALS} --dry-run"),
+        Case(f"new.xml --from-log {EXPIRED}", 1),
+    ),
+    "merge_policy": (
+        Case("policy.xml other.xml"),
+        Case("policy.xml other.xml -o new.xml"),
+        Case("policy.xml other.xml --in-place --dry-run"),
+        Case("policy.xml policy.xml --in-place"),
+        Case("policy.xml denied.xml"),
+    ),
+    "diff_policy": (
+        Case("policy.xml policy.xml"),
+        Case("policy.xml other.xml", 1),
+        Case("policy.xml ks", 1),
+        Case("ks/enclaves/a/permissions.xml ks/enclaves/a", 0),
+        Case("wild.xml policy.xml", 1),
+    ),
+    "minimize_policy": (
+        Case("policy.xml --observed other.xml"),
+        Case("wild.xml --observed policy.xml other.xml -o new.xml"),
+        Case("wild.xml --observed policy.xml -o new.xml --dry-run"),
+        Case("large.xml --observed large.xml"),
+    ),
+    "policies": (
+        Case(""),
+        Case("--copy mine"),
+        Case("--copy mine --dry-run"),
+        Case("--convert old.xml"),
+        Case("--convert old.xml -o new.xml"),
+        Case("--convert old.xml -o new.xml --dry-run"),
+        Case("--convert odd.xml", 1),
+    ),
+    "explain": (
+        Case("ks /a publish /x --policy policy.xml"),
+        Case("ks /a publish /nope --policy policy.xml", 1),
+        Case("ks /a publish /x --policy denied.xml", 0),
+        Case("ks /a join"),
+        Case("broken /b publish /x", 1),
+        Case("/a publish /x --policy denied.xml", 1),
+        Case("ks /a publish /x --all-vendors"),
+        Case("ks /a publish /x --policy policy.xml --all-vendors"),
+        Case("ks /a publish /nope --policy policy.xml --all-vendors", 1),
+        Case("/a publish /x --policy denied.xml --all-vendors", 1),
+        Case("broken /b publish /x --all-vendors", 1),
+        Case("ks --who publish /x"),
+        Case("ks --reach /a"),
+        Case("ks --reach /b"),
+        Case(f"ks /a --log {EXPIRED}", 1),
+        Case("--log quiet.log"),
+    ),
+    "view": (
+        Case("ks"),
+        Case("policy.xml"),
+        Case("policy.xml denied.xml"),
+        Case("wild.xml --observed policy.xml"),
+        Case("broken"),
+        Case("ks -o new.json --dry-run"),
+        Case("ks --dry-run"),
+    ),
+    "check": (
+        Case("ks"),
+        Case("ks --severity note"),
+        Case("broken", 1),
+        Case("empty --list"),
+        Case("--list --include policy.*"),
+        Case("keystore ks --needs-renewal 1d"),
+        Case("keystore ks --needs-renewal 99y", 1),
+        Case("keystore broken --needs-renewal 1d", 1),
+    ),
+    "env": (Case("ks /a"), Case("ks /a --domain 0")),
+    "demo": (Case("--list"),),
+    "doctor": (),
+    "audit": (),
+}
+"""The commands of each verb; those of `doctor` and `audit` need more than a folder."""
+
+SHARED_PARTS = {
+    "check": Case("broken", 1),
+    "crl": Case("lost --refresh"),
+    "import": Case("r.tgz robot"),
+    "merge_policy": Case("policy.xml other.xml"),
+}
+"""Commands whose outputs together have every shared part."""
+
+ERRORS = {
+    "create_keystore": "ks",
+    "create_enclave": "none /a",
+    "create_permission": "ks /a none.xml",
+    "generate_artifacts": "-k ks -p none.xml",
+    "list_enclaves": "none",
+    "inspect": "none",
+    "renew": "ks /none",
+    "revoke": "ks /none",
+    "rotate_ca": "ks --to retire --next",
+    "crl": "none",
+    "distribute_key": "ks /none out",
+    "verify": "none",
+    "create_request": "/r robot",
+    "sign_request": "ks none.pem",
+    "import": "none.tgz robot",
+    "generate_policy": "new.xml --from-log none.log",
+    "merge_policy": "policy.xml none.xml",
+    "diff_policy": "policy.xml none.xml",
+    "minimize_policy": "policy.xml --observed none.xml",
+    "policies": "--copy ks",
+    "explain": "ks /none publish /x",
+    "view": "none",
+    "check": "none",
+    "audit": "none",
+    "doctor": "surplus",
+    "env": "ks /none",
+    "demo": "--scenario none",
+}
+"""A command of each verb that fails, in the folder of the cases."""
+
+BINARY = (
+    "distribute_key ks /a -",
+    "sign_request ks robot/enclaves/s/request.pem -o -",
+)
+"""Commands whose standard output is an archive."""

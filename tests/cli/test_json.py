@@ -1,0 +1,297 @@
+"""What ``--json`` prints fits the schema of the verb, which docs/json.md shows."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from jsonschema import Draft202012Validator
+from referencing import Registry, Resource
+
+from sros_tool.checks import runtime
+from sros_tool.cli.program import FAMILIES, program
+from sros_tool.demo import doctor
+from sros_tool.demo import program as demo
+from sros_tool.demo.casting import CastMember
+from sros_tool.demo.doctor import Diagnosis
+from tests.checks.test_doctor_findings import CYCLONE, RMW
+from tests.cli.json_cases import (
+    BINARY,
+    CASES,
+    ERRORS,
+    SHARED_PARTS,
+    WITHOUT_JSON,
+    Case,
+    make_folder,
+)
+from tests.cli.test_audit import FINE, LOUD, POLICY, SHORT
+from tests.demo.test_demo_result import CLOSED, COST, OPEN, TWIN, result
+from tests.graph.fake_graph import Beside, graph
+from tests.support.harness import Ended, sros
+from tools.json_page import SCHEMAS, SHARED, page
+
+pytest_plugins = ["tests.graph.beside"]
+
+VERBS = [name for family in FAMILIES.values() for name in family]
+Schema = Mapping[str, Any]
+DOCUMENTS: dict[str, Schema] = {
+    path.name: json.loads(path.read_text()) for path in sorted(SCHEMAS.glob("*.json"))
+}
+REGISTRY: Registry[Any] = Registry().with_resources(
+    (name, Resource.from_contents(schema)) for name, schema in DOCUMENTS.items()
+)
+
+# ── the schemas ────────────────────────────────────────────────────────────────────────────
+
+
+def test_every_verb_prints_json_or_says_why_not() -> None:
+    with_option = set()
+    for verb in VERBS:
+        command = program.get_command(click.Context(program), verb)
+        assert command
+        if any("--json" in parameter.opts for parameter in command.params):
+            with_option.add(verb)
+    assert set(VERBS) - with_option == set(WITHOUT_JSON)
+    assert {Path(name).stem for name in DOCUMENTS} == {*with_option, SHARED}
+
+
+def objects(schema: Any) -> Iterator[Schema]:
+    """Yield every schema of an object in a schema."""
+    if isinstance(schema, dict):
+        if "properties" in schema and isinstance(schema.get("type"), str | list):
+            yield schema
+        for value in schema.values():
+            yield from objects(value)
+    elif isinstance(schema, list):
+        for value in schema:
+            yield from objects(value)
+
+
+@pytest.mark.parametrize("name", DOCUMENTS)
+def test_a_schema_is_closed_and_describes_every_property(name: str) -> None:
+    Draft202012Validator.check_schema(DOCUMENTS[name])
+    for schema in objects(DOCUMENTS[name]):
+        assert schema["additionalProperties"] is False, schema
+        for key, value in schema["properties"].items():
+            text = "" if "$ref" in value else value["description"]
+            assert "$ref" in value or text.endswith("."), key
+        assert set(schema["required"]) <= set(schema["properties"])
+
+
+@pytest.mark.parametrize("name", [name for name in DOCUMENTS if Path(name).stem != SHARED])
+def test_every_shape_begins_with_the_version(name: str) -> None:
+    schema = DOCUMENTS[name]
+    shapes = [schema["$defs"][each["$ref"].rpartition("/")[2]] for each in schema.get("oneOf", ())]
+    for shape in shapes or [schema]:
+        assert next(iter(shape["properties"])) == shape["required"][0] == "version"
+
+
+def test_the_page_is_made_from_the_schemas() -> None:
+    path = SCHEMAS.parents[1] / "docs" / "json.md"
+    assert path.read_text() == page(), "run `python -m tools.json_page > docs/json.md`"
+
+
+# ── what is printed ────────────────────────────────────────────────────────────────────────
+
+
+class Seen:
+    """Checks what verbs print against their schemas, and remembers the properties it has."""
+
+    def __init__(self) -> None:
+        self._seen: set[str] = set()
+
+    def check(self, verb: str, ended: Ended) -> None:
+        """Fail unless the output is one object that fits the schema of the verb."""
+        value = json.loads(ended.out)
+        assert next(iter(value.items())) == ("version", 1)
+        problems = [
+            f"{each.json_path}: {each.message}"
+            for problem in _validator(f"{verb}.json").iter_errors(value)
+            for each in (problem, *(problem.context or ()))
+        ]
+        assert problems == [], ended.out
+        self._walk(DOCUMENTS[f"{verb}.json"], value, f"{verb}.json", "")
+
+    def unseen(self, name: str) -> list[str]:
+        """Return the properties of a schema that no output had."""
+        return sorted(set(_properties(DOCUMENTS[f"{name}.json"], f"{name}.json#")) - self._seen)
+
+    def _walk(self, schema: Schema, value: Any, file: str, place: str) -> None:
+        if "$ref" in schema:
+            name, _, pointer = schema["$ref"].partition("#")
+            file, place = name or file, pointer
+            schema = DOCUMENTS[file]
+            for part in pointer.strip("/").split("/"):
+                schema = schema[part]
+        for word in ("oneOf", "anyOf"):
+            for index, each in enumerate(schema.get(word, ())):
+                under = f"{place}/{word}/{index}"
+                if _validator(f"{file}#{under}").is_valid(value):
+                    self._walk(each, value, file, under)
+        if isinstance(value, dict):
+            for key, each in value.items():
+                if key in schema.get("properties", {}):
+                    under = f"{place}/properties/{key}"
+                    self._seen.add(f"{file}#{under}")
+                    self._walk(schema["properties"][key], each, file, under)
+                elif isinstance(schema.get("additionalProperties"), dict):
+                    under = f"{place}/additionalProperties"
+                    self._walk(schema["additionalProperties"], each, file, under)
+        elif isinstance(value, list) and "items" in schema:
+            for each in value:
+                self._walk(schema["items"], each, file, f"{place}/items")
+
+
+def _validator(reference: str) -> Draft202012Validator:
+    return Draft202012Validator({"$ref": reference}, registry=REGISTRY)
+
+
+def _properties(schema: Any, place: str) -> Iterator[str]:
+    """Yield the places of all properties in a schema."""
+    if isinstance(schema, dict):
+        if "properties" in schema and "required" in schema:
+            yield from (f"{place}/properties/{key}" for key in schema["properties"])
+        for key, value in schema.items():
+            yield from _properties(value, f"{place}/{key}")
+    elif isinstance(schema, list):
+        for index, value in enumerate(schema):
+            yield from _properties(value, f"{place}/{index}")
+
+
+@pytest.fixture(scope="session")
+def made_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder that the cases run in; only to be copied."""
+    folder = tmp_path_factory.mktemp("json")
+    make_folder(folder)
+    return folder
+
+
+def both_ways(verb: str, case: Case, made: Path, place: Path) -> Ended:
+    """Run a case without and with --json, each in a new copy of the folder; return the second."""
+    ended = []
+    for number, option in enumerate(([], ["--json"])):
+        folder = Path(shutil.copytree(made, place / str(number), symlinks=True))
+        for before in case.before:
+            sros(*before.split(), cwd=folder).ok()
+        ended.append(sros(verb, *case.words.split(), *option, cwd=folder))
+        shutil.rmtree(folder)
+    text, shown = ended
+    assert (text.status, shown.status) == (case.status, case.status), (text, shown)
+    return shown
+
+
+WITH_A_GRAPH = {
+    "generate_policy": (
+        ("robot.xml", graph(LOUD), 0),
+        ("new.xml", graph(LOUD), 0),
+        ("new.xml --dry-run", graph(LOUD), 0),
+        ("new.xml", graph(), 1),
+    ),
+    "audit": (
+        ("robot.xml", graph(FINE), 0),
+        ("robot.xml --patch add.xml", graph(LOUD), 1),
+        ("robot.xml --patch add.xml --dry-run", graph(LOUD), 1),
+        ("ks", graph(("/b", "/", "n", "01", ["publish rt/y"])), 1),
+    ),
+}
+
+
+@pytest.mark.parametrize("verb", sorted({*CASES} - {"demo", "doctor", *WITH_A_GRAPH}))
+def test_what_a_verb_prints(verb: str, made_folder: Path, tmp_path: Path) -> None:
+    seen = Seen()
+    for case in CASES[verb]:
+        seen.check(verb, both_ways(verb, case, made_folder, tmp_path))
+    assert seen.unseen(verb) == []
+
+
+@pytest.mark.parametrize("verb", WITH_A_GRAPH)
+def test_what_a_verb_prints_beside_a_graph(
+    verb: str, made_folder: Path, tmp_path: Path, beside_graph: Beside
+) -> None:
+    seen = Seen()
+    for case in CASES[verb]:
+        seen.check(verb, both_ways(verb, case, made_folder, tmp_path))
+    shutil.copytree(made_folder / "broken", tmp_path / "ks", symlinks=True)
+    for words, there, status in WITH_A_GRAPH[verb]:
+        (tmp_path / "robot.xml").write_text(POLICY)
+        for file in ("new.xml", "add.xml"):
+            (tmp_path / file).unlink(missing_ok=True)
+        ended = beside_graph(verb, there, *words.split(), *SHORT, "--json")
+        assert ended.status == status, ended
+        seen.check(verb, ended)
+    assert seen.unseen(verb) == []
+
+
+def test_what_doctor_prints(made_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(runtime, "running_processes", lambda: iter(()))
+    seen = Seen()
+    for stacks, status in (((RMW, CYCLONE), 1), ((RMW,), 1), ((CYCLONE,), 0)):
+        monkeypatch.setattr(doctor, "examine", lambda *_, found=stacks: Diagnosis(found))
+        wrong = {"ROS_SECURITY_ENABLE": "yes"} if status else {}
+        ended = sros("doctor", "--json", env=wrong, cwd=made_folder)
+        assert ended.status == status, ended
+        seen.check("doctor", ended)
+    assert seen.unseen("doctor") == []
+
+
+def test_what_demo_prints(
+    made_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen = Seen()
+    for case in CASES["demo"]:
+        seen.check("demo", both_ways("demo", case, made_folder, tmp_path))
+    shown = result(CLOSED, TWIN, OPEN, cost=COST)
+    cast = (CastMember("listener", "/a", ("/n",)),)
+    shown = replace(shown, scenarios=(replace(shown.scenarios[0], cast=cast),))
+    for each, status in ((shown, 0), (result(replace(OPEN, unaccepted=True)), 1)):
+        monkeypatch.setattr(demo, "run_demo", lambda *_, found=each: found)
+        ended = sros("demo", "--json", cwd=tmp_path)
+        assert ended.status == status, ended
+        seen.check("demo", ended)
+    assert seen.unseen("demo") == []
+
+
+def test_every_shared_part_is_seen(made_folder: Path, tmp_path: Path) -> None:
+    seen = Seen()
+    for verb, case in SHARED_PARTS.items():
+        seen.check(verb, both_ways(verb, case, made_folder, tmp_path))
+    assert seen.unseen(SHARED) == []
+
+
+def test_a_property_that_no_schema_has_is_found(made_folder: Path) -> None:
+    ended = sros("list_enclaves", "ks", "--json", cwd=made_folder)
+    seen = Seen()
+    seen.check("list_enclaves", ended)
+    more = json.dumps({**json.loads(ended.out), "more": 1})
+    with pytest.raises(AssertionError, match="more"):
+        seen.check("list_enclaves", replace(ended, out=more))
+
+
+# ── errors, and standard output that is an archive ─────────────────────────────────────────
+
+
+@pytest.mark.parametrize("verb", sorted({*VERBS} - {*WITHOUT_JSON}))
+def test_an_error_prints_no_json(verb: str, made_folder: Path, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(made_folder, tmp_path / "made", symlinks=True))
+    text = sros(verb, *ERRORS[verb].split(), cwd=folder)
+    shown = sros(verb, *ERRORS[verb].split(), "--json", cwd=folder)
+    assert (shown.status, shown.out) == (text.status, "")
+    assert shown.status in (1, 2)
+    assert len(shown.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", BINARY)
+def test_an_archive_and_json_do_not_share_standard_output(command: str, made_folder: Path) -> None:
+    ended = sros(*command.split(), "--json", cwd=made_folder)
+    assert (ended.status, ended.out) == (2, "")
+    assert "--json and an archive" in ended.err
+    (shown,) = json.loads(sros(*command.split(), "--json", "--dry-run", cwd=made_folder).ok().out)[
+        "enclaves"
+    ]
+    assert shown["name"] in ("/a", "/s")
