@@ -8,6 +8,10 @@ from contextlib import contextmanager
 from cryptography import x509
 
 from sros_tool.errors import PkiError
+from sros_tool.pki import der
+
+_TEXTS = (0x0C, 0x12, 0x13, 0x14, 0x16, 0x1C, 0x1E)
+"""The ASN.1 types of text that OpenSSL reads in names (B_ASN1_PRINTABLE, without BIT STRING)."""
 
 
 @contextmanager
@@ -27,7 +31,12 @@ def reading(what: str, why: str, remedy: str = "") -> Iterator[None]:
 def read_name(name: x509.Name) -> None:
     """Parse every part of a distinguished name that sros shows, compares or copies.
 
-    Raises one of the errors that `reading` handles.
+    Raises one of the errors that `reading` handles: also for a value that OpenSSL takes for no part
+    of a name, such as a time.
     """
     name.rfc4514_string()
-    name.public_bytes()
+    for part in der.children(der.first(name.public_bytes()).content):
+        for attribute in der.children(part.content):
+            _, value = der.children(attribute.content)
+            if value.tag not in _TEXTS:
+                raise ValueError(f"a value of a name has the ASN.1 type {value.tag}")

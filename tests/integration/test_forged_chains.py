@@ -191,13 +191,44 @@ def our_fault(start: bytes, trusted: list[bytes], others: list[bytes], *, strict
     return chain_fault(first, rest[:split], rest[split:], at=NOW, strict=strict)
 
 
-@pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("strict", [False, True])
-def test_no_chain_is_accepted_that_openssl_rejects(strict: bool) -> None:
+@pytest.fixture
+def verifier() -> Verifier:
     try:
-        verifier = Verifier()
+        return Verifier()
     except OSError:
         pytest.skip("there is no libcrypto.so.3")
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("tag", range(1, 0x1F))
+def test_a_name_of_a_type_that_openssl_cannot_read_is_refused(tag: int, verifier: Verifier) -> None:
+    root, leaf = (
+        x509.CertificateBuilder(
+            common_name("root"), common_name(name), KEYS[own].public_key(), 1, NOW - DAY, NOW + DAY
+        )
+        .add_extension(x509.BasicConstraints(ca=name == "root", path_length=None), critical=True)
+        .sign(KEYS[0], hashes.SHA256())
+        .public_bytes(Encoding.DER)
+        for own, name in enumerate(("root", "leaf"))
+    )
+    assert not verifier.fault(leaf, [root], [], strict=False)
+    (certificate,) = Node.read(leaf)
+    text = certificate.children[0].children[3].children[0].children[0].children[1]
+    text.tag = tag
+    text.content = {0x03: b"\0root", 0x1C: "root".encode("utf-32-be")}.get(tag, b"root")
+    signature = KEYS[0].sign(certificate.children[0].write(), ec.ECDSA(hashes.SHA256()))
+    certificate.children[2].content = b"\0" + signature
+    for start, others in ((certificate.write(), []), (root, [certificate.write()])):
+        theirs = verifier.fault(start, [root], others, strict=False)
+        ours = our_fault(start, [root], others, strict=False)
+        assert not theirs or ours, f"OpenSSL: {theirs}"
+        if tag == 0x0C:
+            assert not theirs and not ours
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("strict", [False, True])
+def test_no_chain_is_accepted_that_openssl_rejects(strict: bool, verifier: Verifier) -> None:
     dice, count, wrong = random.Random(5), Counter[str](), []
     for _ in range(DRAWN):
         root = draw(dice, "root", ("root", 0), 0, ca=True)
