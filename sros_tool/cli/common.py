@@ -504,11 +504,17 @@ def _read_at_most(path: Path, count: int) -> bytes:
     Raises:
         OSError: it cannot be read, or it is a pipe that nobody writes to.
     """
-    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
-        handle = file.fileno()
+    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    try:
         begin = _first_of_pipe(handle, path) if stat.S_ISFIFO(os.fstat(handle).st_mode) else b""
         os.set_blocking(handle, True)
-        return begin + file.read(count - len(begin))
+        with open(handle, "rb", closefd=False) as file:
+            return begin + file.read(count - len(begin))
+    except OSError as error:
+        error.filename = str(path)  # not the number of the descriptor
+        raise
+    finally:
+        os.close(handle)
 
 
 def _first_of_pipe(handle: int, path: Path) -> bytes:
