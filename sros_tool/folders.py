@@ -118,14 +118,14 @@ class Folder:
         """Return the sorted names in the folder at ``path``."""
         return sorted(os.listdir(self.handle(path)))
 
-    def read(self, path: str) -> bytes:
-        """Return the content of the regular file at ``path``, of at most 128 MiB."""
+    def read(self, path: str, *, most: int = _MOST_BYTES) -> bytes:
+        """Return the content of the regular file at ``path``, of at most ``most`` bytes."""
         parent, name = self._at(path)
         with self._naming(path), open(os.open(name, _OLD_FILE, dir_fd=parent), "rb") as file:
             state = os.fstat(file.fileno())
             if not stat.S_ISREG(state.st_mode):
                 raise OSError(errno.EINVAL, "it is not a regular file", str(self.path / path))
-            if state.st_size > _MOST_BYTES:
+            if state.st_size > most:
                 raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(self.path / path))
             return file.read(state.st_size)
 

@@ -34,8 +34,8 @@ def _parser() -> etree.XMLParser:
     )
 
 
-def read_bytes(path: Path, what: str, *, owner: int | None = None) -> bytes:
-    """Return the content of a regular file of at most 16 MiB.
+def read_bytes(path: Path, what: str, *, owner: int | None = None, most: int = _MAX_BYTES) -> bytes:
+    """Return the content of a regular file of at most ``most`` bytes (16 MiB).
 
     ``what`` describes the file in errors, such as "policy".  A file without a size is empty, also
     one of the kernel (proc(5)), which may have no end, or wait for its next line.  With ``owner``,
@@ -47,8 +47,8 @@ def read_bytes(path: Path, what: str, *, owner: int | None = None) -> bytes:
     try:
         # Looked at first, because opening a pipe would wait for its writer.
         there, data = path.stat(), b""
-        if stat.S_ISREG(there.st_mode) and 0 < there.st_size <= _MAX_BYTES:
-            there, data = _read_open(path)
+        if stat.S_ISREG(there.st_mode) and 0 < there.st_size <= most:
+            there, data = _read_open(path, most)
         if not stat.S_ISREG(there.st_mode):
             raise DocumentError(f"the {what} '{path}' is not a regular file")
         if owner not in (None, there.st_uid):
@@ -63,23 +63,23 @@ def read_bytes(path: Path, what: str, *, owner: int | None = None) -> bytes:
         raise DocumentError(
             f"the {what} '{path}' cannot be read", f"{os.strerror(number)}."
         ) from error
-    if max(there.st_size, len(data)) > _MAX_BYTES:
+    if max(there.st_size, len(data)) > most:
         raise DocumentError(
             f"the {what} '{path}' is too large",
-            f"It has more than {_MAX_BYTES // 1024**2} MiB.",
-        )
+            f"It has more than {most // 1024**2} MiB.",
+        ) from OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
     _LOG.debug("read the %s '%s', %d bytes", what, path, len(data))
     return data
 
 
-def _read_open(path: Path) -> tuple[os.stat_result, bytes]:
-    """Return the state of a file and at most one byte more of it than `read_bytes` allows.
+def _read_open(path: Path, most: int) -> tuple[os.stat_result, bytes]:
+    """Return the state of a file and at most one byte more of it than ``most``.
 
     Without its content if it is not a regular file, as one that has just been exchanged.
     """
     with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
         state = os.fstat(file.fileno())
-        return state, file.read(_MAX_BYTES + 1) if stat.S_ISREG(state.st_mode) else b""
+        return state, file.read(most + 1) if stat.S_ISREG(state.st_mode) else b""
 
 
 _UTF_8 = ("UTF-8", "UTF8", "US-ASCII", "ASCII")

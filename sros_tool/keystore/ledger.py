@@ -14,21 +14,22 @@ from __future__ import annotations
 
 import errno
 import hashlib
+import io
 import json
-import os
 import re
-import stat
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from datetime import datetime
+from itertools import islice
 from pathlib import Path
+from sys import intern
 from typing import TYPE_CHECKING, NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes
 
-from sros_tool.errors import KeystoreError, PkiError, SrosError
+from sros_tool.errors import DocumentError, KeystoreError, PkiError, SrosError
 from sros_tool.keystore.layout import LEDGER, LEDGER_HEAD, ROLES, SETTINGS, ca_certificate
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import digest, load_certificates, subject_text, validity_of
@@ -102,9 +103,14 @@ class _Fault(NamedTuple):
     text: str
 
 
-_MOST_BYTES = 128 * 1024 * 1024  # as `Folder.read`
+# Ten thousand enclaves that are renewed every month write 150 MB a year, in 240,000 lines.
+_MOST_BYTES = 512 * 1024 * 1024
+_MOST_LINES = 1_000_000
 _FIELDS = tuple(each.name for each in fields(Entry))
 _TEXTS = tuple(each.name for each in fields(Entry) if each.type == "str")
+_REPEATED = frozenset(
+    ("time", "what", "enclave", "subject", "not_before", "not_after", "policy", "reason")
+)
 _SERIAL = re.compile(r"[0-9a-f]{1,40}")
 _MOST_BITS = 159
 """The length of a serial number (RFC 5280, 4.1.2.2)."""
@@ -174,119 +180,146 @@ def read_ledger(root: Path) -> Ledger:
 
 
 class _Reading(NamedTuple):
-    """The ledger, its lines, and the faults that no entry ``gap`` records yet."""
+    """The ledger, its bytes, and the faults that no entry ``gap`` records yet."""
 
     ledger: Ledger
-    lines: Sequence[bytes] = ()
+    data: bytes = b""
     chained: bool = False
     unrecorded: Sequence[_Fault] = ()
 
 
 def _read(root: Path, *, follow_link: bool = True) -> _Reading:
     while True:
-        lines = _lines(root, follow_link)
-        reading = _compare(root, lines)
+        data = _bytes(root, follow_link)
+        reading = _compare(root, data)
         # A transaction of another process may have ended between the reading of the two files.
-        if not reading.unrecorded or _lines(root, follow_link) == lines:
+        if not reading.unrecorded or _bytes(root, follow_link) == data:
             return reading
 
 
-def _compare(root: Path, lines: list[bytes] | None) -> _Reading:
-    """Return the ledger with these lines, compared with its head."""
-    if not lines:
-        if lines is None and not any((root / file).exists() for file in (SETTINGS, LEDGER_HEAD)):
+def _compare(root: Path, data: bytes | None) -> _Reading:
+    """Return the ledger with these bytes, compared with its head."""
+    if not data:
+        if data is None and not any((root / file).exists() for file in (SETTINGS, LEDGER_HEAD)):
             return _Reading(Ledger())
-        missing = _Fault(0, f"there is no {LEDGER}" if lines is None else f"{LEDGER} is empty")
+        missing = _Fault(0, f"there is no {LEDGER}" if data is None else f"{LEDGER} is empty")
         return _Reading(Ledger(gaps=(missing.text,)), unrecorded=[missing])
     numbered: list[tuple[int, Entry]] = []
     faults: list[_Fault] = []
-    chained = damaged = False
-    unchained = 0
-    for number, line in enumerate(lines, 1):
+    damaged = 0  # how many lines before this one are no entries
+    unchained = number = 0
+    chained = False
+    line, all_before = b"", hashlib.sha256()
+    for number, (before, line) in enumerate(_with_previous(data), 1):
+        if number > _MOST_LINES:
+            raise _too_large(root / LEDGER, f"{_MOST_LINES} lines")
+        if not chained and number > 1:
+            all_before.update((b"\n" if number > 2 else b"") + before)
         entry = _parse(line)
         if entry is None:
-            faults.append(_Fault(number, f"line {number} is not an entry"))
-            damaged = True
+            damaged += 1
             continue
+        if damaged:
+            faults.append(_not_entries(number - 1, damaged))
         if chained and not entry.previous:
             faults.append(_Fault(number, f"line {number} was added from outside"))
         elif entry.previous:
-            before = lines[number - 2 : number - 1] if chained else lines[: number - 1]
-            if entry.previous != _digest(b"\n".join(before)) and not damaged:
+            expected = _digest(before) if chained else all_before.hexdigest()
+            if entry.previous != expected and not damaged:
                 text = f"before line {number}, a line was changed or removed"
                 faults.append(_Fault(number - 1, text))
             if not chained:
                 chained, unchained = True, number - 1
-        damaged = False
+        damaged = 0
         numbered.append((number, entry))
+    if damaged:
+        faults.append(_not_entries(number, damaged))
     if not chained:
-        unchained = len(lines)
+        unchained = number
     authorities = _authorities(root)
-    if fault := _head_fault(root, lines, authorities, chained=chained):
+    if fault := _head_fault(root, data, number, authorities, chained=chained):
         faults.append(fault)
     recorded = [_Fault(each.number, each.reason) for _, each in numbered if each.what == GAP]
-    last_recorded = max((number for number, each in numbered if each.what == GAP), default=0)
+    last_recorded = max((at for at, each in numbered if each.what == GAP), default=0)
     start = _first_of(authorities, numbered)
     every = [*recorded, *faults]
     last = max((each.line for each in every), default=0)
     ledger = Ledger(
         tuple(entry for _, entry in numbered),
         tuple(dict.fromkeys(each.text for each in every if each.line >= start)),
-        tuple(entry for number, entry in numbered if number > last),
+        tuple(entry for at, entry in numbered if at > last),
         0 if start > unchained else unchained,
-        len(lines),
+        number,
     )
     unrecorded = [each for each in faults if each.line >= last_recorded]
-    return _Reading(ledger, lines, chained, unrecorded)
+    return _Reading(ledger, data, chained, unrecorded)
 
 
-def _lines(root: Path, follow_link: bool) -> list[bytes] | None:
-    """Return the lines, or None without a ledger.
+def _not_entries(last: int, count: int) -> _Fault:
+    """Return the fault of ``count`` lines up to the line ``last``."""
+    if count == 1:
+        return _Fault(last, f"line {last} is not an entry")
+    return _Fault(last, f"lines {last - count + 1} to {last} are not entries")
+
+
+def _lines_of(data: bytes) -> Iterator[bytes]:
+    """Yield the lines one by one: a list of them would take as much memory again."""
+    return (line.removesuffix(b"\n") for line in io.BytesIO(data))
+
+
+def _with_previous(data: bytes) -> Iterator[tuple[bytes, bytes]]:
+    """Yield each line after the line before it."""
+    before = b""
+    for line in _lines_of(data):
+        yield before, line
+        before = line
+
+
+def _bytes(root: Path, follow_link: bool) -> bytes | None:
+    """Return the content of the ledger, or None without one.
 
     While a transaction is being committed, the file is a link.  Whoever holds the lock of the
     keystore does not follow it: another link could lead to a file that is not of the keystore.
     """
     path = root / LEDGER
     try:
-        if not follow_link:
-            from sros_tool.folders import Folder  # a question does not load what writes
+        if follow_link:
+            return read_bytes(path, "ledger", most=_MOST_BYTES)
+        from sros_tool.folders import Folder  # a question does not load what writes
 
-            with Folder(root) as folder:
-                data = folder.read(LEDGER)
-        elif path.is_file() or not path.exists():
-            data = _followed(path)
-        else:
-            raise KeystoreError("it is not a regular file")
-    except FileNotFoundError:
-        return None
-    except (OSError, KeystoreError) as error:
+        with Folder(root) as folder:
+            return folder.read(LEDGER, most=_MOST_BYTES)
+    except (OSError, SrosError) as error:
+        cause = error.__cause__ if isinstance(error, DocumentError) else error
+        if isinstance(cause, FileNotFoundError):
+            return None
+        if isinstance(cause, OSError) and cause.errno == errno.EFBIG:
+            raise _too_large(path, f"{_MOST_BYTES // 1024**2} MiB") from error
         raise KeystoreError(
             f"the ledger '{path}' cannot be read",
-            f"{error.strerror if isinstance(error, OSError) else error.what}.",
+            f"{error.strerror}." if isinstance(error, OSError) else error.why or f"{error.what}.",
             "Restore it from a backup.",
         ) from error
-    return data.removesuffix(b"\n").split(b"\n") if data else []
 
 
-def _followed(path: Path) -> bytes:
-    """Return the content of the ledger, also behind a link; do not wait for a pipe.
-
-    A sparse file takes no space on the disk, and would take all memory.
-    """
-    handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    with open(handle, "rb") as file:
-        state = os.fstat(handle)
-        if not stat.S_ISREG(state.st_mode):
-            raise KeystoreError("it is not a regular file")
-        if state.st_size > _MOST_BYTES:
-            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
-        return file.read(state.st_size)
+def _too_large(path: Path, limit: str) -> KeystoreError:
+    root = path.parent
+    return KeystoreError(
+        f"the ledger '{path}' is too large",
+        f"It has more than {limit}.",
+        f"If all of it is of this keystore, move {LEDGER} and {LEDGER_HEAD} to an archive, state "
+        f"all rights again with `sros generate_artifacts -k {root} -p POLICY_FILE`, and replace "
+        f"the CAs with `sros rotate_ca {root} --next`, so that nothing that the new ledger lacks "
+        "is valid. Otherwise restore it from a backup.",
+    )
 
 
 def _parse(line: bytes) -> Entry | None:
     """Return the entry of a line, or None if it is not an entry."""
+    if not line.startswith(b"{"):
+        return None
     try:
-        entry = Entry(**json.loads(line))
+        entry = Entry(**json.loads(line, object_pairs_hook=_shared))
     except (ValueError, TypeError, RecursionError):
         return None
     if not all(isinstance(getattr(entry, name), str) for name in _TEXTS):
@@ -298,6 +331,14 @@ def _parse(line: bytes) -> Entry | None:
         if not valid or not 0 < int(entry.serial, 16).bit_length() <= _MOST_BITS:
             return None
     return entry
+
+
+def _shared(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    """Return the fields of a line; texts that many lines have are in the memory once."""
+    return {
+        name: intern(value) if name in _REPEATED and isinstance(value, str) else value
+        for name, value in pairs
+    }
 
 
 def _digest(data: bytes) -> str:
@@ -326,30 +367,35 @@ def _first_of(authorities: Iterable[x509.Certificate], found: Iterable[tuple[int
 
 
 def _head_fault(
-    root: Path, lines: Sequence[bytes], authorities: Sequence[x509.Certificate], *, chained: bool
+    root: Path,
+    data: bytes,
+    lines: int,
+    authorities: Sequence[x509.Certificate],
+    *,
+    chained: bool,
 ) -> _Fault | None:
     """Return what is wrong between the ledger and its signed head, or None."""
     if not (root / LEDGER_HEAD).exists():
         text = f"{LEDGER_HEAD}, which signs its end, is missing"
-        return _Fault(len(lines), text) if chained else None
+        return _Fault(lines, text) if chained else None
     try:
         signed = smime.parse(read_bytes(root / LEDGER_HEAD, "signed head of the ledger"))
         if authorities:
             _verify(signed, authorities)
         stated = _HEAD.fullmatch(signed.document.replace(b"\r\n", b"\n"))
     except SrosError as error:
-        return _Fault(len(lines), f"{LEDGER_HEAD} does not sign its end: {error.what}")
+        return _Fault(lines, f"{LEDGER_HEAD} does not sign its end: {error.what}")
     if not stated:
-        return _Fault(len(lines), f"{LEDGER_HEAD} is not the signed end of a ledger")
+        return _Fault(lines, f"{LEDGER_HEAD} is not the signed end of a ledger")
     count = int(stated[1])
-    if count > len(lines):
-        missing = count - len(lines)
+    if count > lines:
+        missing = count - lines
         text = f"{missing} line{'s are' if missing > 1 else ' is'} missing at its end"
-        return _Fault(len(lines), text)
-    if not count or _digest(lines[count - 1]) != stated[2].decode():
-        return _Fault(len(lines), f"its last lines are not the ones that {LEDGER_HEAD} signs")
-    if count < len(lines):
-        return _Fault(len(lines), f"line {count + 1} was added from outside")
+        return _Fault(lines, text)
+    if not count or _digest(next(islice(_lines_of(data), count - 1, None))) != stated[2].decode():
+        return _Fault(lines, f"its last lines are not the ones that {LEDGER_HEAD} signs")
+    if count < lines:
+        return _Fault(lines, f"line {count + 1} was added from outside")
     return None
 
 
@@ -375,14 +421,19 @@ def append(
     if not added:
         return
     present = _read(transaction.root, follow_link=transaction.dry_run)
-    lines = list(present.lines)
-    before = lines[-1:] if present.chained else lines
+    data, number, chained = present.data, present.ledger.lines, present.chained
+    if data and not data.endswith(b"\n"):
+        data += b"\n"
+    before = data.removesuffix(b"\n")
+    if chained:
+        before = before[before.rfind(b"\n") + 1 :]
     gaps = (Entry(iso(now), GAP, reason=e.text, number=e.line) for e in present.unrecorded)
+    new = []
     for entry in (*gaps, *added):
-        lines.append(_line(replace(entry, previous=_digest(b"\n".join(before)))))
-        before = lines[-1:]
-    head = f"sros ledger 1\nlines {len(lines)}\nsha256 {_digest(lines[-1])}\n".encode()
-    transaction.write(LEDGER, b"".join(line + b"\n" for line in lines))
+        before = _line(replace(entry, previous=_digest(before)))
+        new.append(before)
+    head = f"sros ledger 1\nlines {number + len(new)}\nsha256 {_digest(before)}\n".encode()
+    transaction.write(LEDGER, b"".join((data, *(line + b"\n" for line in new))))
     transaction.write(LEDGER_HEAD, authority.sign(head, "the head of the ledger"))
 
 

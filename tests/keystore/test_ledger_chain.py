@@ -25,7 +25,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.pki.keys import load_key
 from tests.support.children import run
-from tests.support.harness import certificate, sros
+from tests.support.harness import certificate, policy_text, publish, sros
 
 NOW = datetime.now(UTC)
 FIRST = 4  # the lines before the first certificate: two CAs, governance; it is the fourth
@@ -239,3 +239,41 @@ def test_a_huge_ledger_and_a_pipe_are_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / LEDGER)
     with pytest.raises(KeystoreError, match="not a regular file"):
         read_ledger(tmp_path)
+
+
+def test_a_ledger_of_many_lines_that_are_none(root: Path) -> None:
+    """They are one fault, not as many as lines."""
+    lines = lines_of(root)
+    put(root, [*lines[:3], *([b""] * 5000), *lines[3:], b"nonsense"])
+    ledger = read_ledger(root)
+    assert len(ledger.entries) == len(lines)
+    assert ledger.gaps[0] == "lines 4 to 5003 are not entries"
+    assert f"line {len(lines) + 5001} is not an entry" in ledger.gaps
+    assert len(ledger.gaps) <= 4
+
+
+@pytest.mark.parametrize("limit", ["_MOST_LINES", "_MOST_BYTES"])
+def test_a_ledger_over_the_limit_says_how_to_go_on(
+    limit: str, root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = {"_MOST_LINES": read_ledger(root).lines, "_MOST_BYTES": (root / LEDGER).stat().st_size}
+    with monkeypatch.context() as patch:
+        patch.setattr(f"sros_tool.keystore.ledger.{limit}", size[limit])
+        assert not read_ledger(root).gaps
+        patch.setattr(f"sros_tool.keystore.ledger.{limit}", size[limit] - 1)
+        for work in (lambda: read_ledger(root), lambda: create_enclaves(root, ["/new"], now=NOW)):
+            with pytest.raises(KeystoreError, match="too large") as refused:
+                work()
+        assert f"`sros rotate_ca {root} --next`" in refused.value.remedy
+    # What the error says to do.
+    for name in (LEDGER, LEDGER_HEAD):
+        (root / name).rename(tmp_path / f"archived {name}")
+    policy = tmp_path / "policy.xml"
+    policy.write_text(policy_text({"/a": publish("x"), "/b": publish("x")}))
+    sros("generate_artifacts", "-k", root, "-p", policy).ok()
+    before = load_certificate((root / "public/identity_ca.cert.pem").read_bytes(), "")
+    for _ in range(3):  # distribute, switch, retire
+        sros("rotate_ca", root, "--next").ok()
+    assert load_certificate((root / "public/identity_ca.cert.pem").read_bytes(), "") != before
+    assert read_ledger(root).gaps == ()
+    revoke(root, ["/a"], now=NOW)
