@@ -217,7 +217,7 @@ def test_history_as_text_and_json(tmp_path: Path) -> None:
     ]
     assert "keyCompromise" in lines[7]
     document = json.loads(sros("inspect", root, "--history", "--json").ok().out)
-    assert set(document) == {"kind", "path", "entries", "unexplained", "gaps"}
+    assert set(document) == {"version", "kind", "path", "entries", "unexplained", "gaps"}
     assert len(document["entries"]) == 9
     assert {*document["entries"][3]} == {*Entry.__slots__, "status", "path"}
     assert {entry["status"] for entry in document["entries"]} <= set(HistoryStatus)
