@@ -16,6 +16,7 @@ from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.explain.evaluator import Evaluator, JoinContext, plan_enclave
 from sros_tool.explain.question import Part, Question
+from sros_tool.graph.observation import Endpoint
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
 from sros_tool.resources import policies_dir
@@ -107,10 +108,15 @@ def evaluator(step: str, vendor: Vendor) -> Evaluator:
     return Evaluator(vendor, loaded, CONTEXT)
 
 
-def allowed(step: str, vendor: Vendor, node: str, rights: tuple[str, ...]) -> bool:
+def endpoints_of(node: str, rights: tuple[str, ...]) -> frozenset[Endpoint]:
+    """What a node with this full name writes and reads by these rights."""
     ns, _, name = node.rpartition("/")
-    found = endpoints(ns or "/", name, rights)
-    parts = tuple(Part(AccessVerb(each.direction), each.topic) for each in sorted(found))
+    return endpoints(ns or "/", name, rights)
+
+
+def allowed(step: str, vendor: Vendor, node: str, rights: tuple[str, ...]) -> bool:
+    found = sorted(endpoints_of(node, rights))
+    parts = tuple(Part(AccessVerb(each.direction), each.topic) for each in found)
     return evaluator(step, vendor).answer(Question("use", only=parts)).allowed
 
 
