@@ -83,6 +83,7 @@ def create_keystore(
     *,
     domains: int | str = 0,
     encrypt_ca_keys: bool = False,
+    short_passphrase: bool = False,
     secrets: Secrets | None = None,
     now: datetime | None = None,
 ) -> Keystore:
@@ -94,13 +95,14 @@ def create_keystore(
             file, or a `Template` from `load_template`.
         domains: The ROS domain ids of the keystore, such as 0, "0,7" or "10-19".
         encrypt_ca_keys: Encrypt the CA keys with the passphrase that ``secrets`` returns.
+        short_passphrase: Accept a passphrase of less than 12 characters, which is soon guessed.
         secrets: Called for the passphrase of a CA key, or the PIN of a token.
         now: The time from which validities count; the current time by default.
 
     Raises:
         KeystoreError: The folder holds a keystore or a part of one, or a CA key cannot be used.
         DocumentError: The template does not exist, or is malformed.
-        UsageError: ``domains`` are not domain ids.
+        UsageError: ``domains`` are not domain ids, or the passphrase is too short.
 
     Example:
         >>> keystore = sros_tool.create_keystore("ks", template="production")
@@ -113,7 +115,7 @@ def create_keystore(
         template=load_template(template) if isinstance(template, str) else template,
         domains=DomainSet.parse(str(domains), "domains"),
         now=_moment(now),
-        keyring=_keyring(secrets, encrypt=encrypt_ca_keys),
+        keyring=_keyring(secrets, encrypt=encrypt_ca_keys, short=short_passphrase),
     )
     return Keystore(result.root, result.notes)
 
@@ -391,10 +393,10 @@ def _policy(given: AnyPath | Policy) -> Policy:
     return read_policy(given) if isinstance(given, str | PathLike) else given
 
 
-def _keyring(secrets: Secrets | None, *, encrypt: bool = False) -> Keyring:
+def _keyring(secrets: Secrets | None, *, encrypt: bool = False, short: bool = False) -> Keyring:
     from sros_tool.keystore.authorities.keyring import Keyring, no_secrets
 
-    return Keyring(secrets or no_secrets, encrypt=encrypt)
+    return Keyring(secrets or no_secrets, encrypt=encrypt, short_passphrase=short)
 
 
 def _several(parameter: str, given: Iterable[Item]) -> Iterable[Item]:

@@ -157,6 +157,18 @@ def test_an_encrypted_key_is_asked_for(tmp_path: Path) -> None:
     assert "the passphrase of the identity CA key" in asked
 
 
+def test_a_short_passphrase_needs_insisting(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    with pytest.raises(UsageError, match="too short"):
+        sros_tool.create_keystore(root, encrypt_ca_keys=True, secrets=lambda _: "short")
+    assert not root.exists()
+    sros_tool.create_keystore(
+        root, encrypt_ca_keys=True, short_passphrase=True, secrets=lambda _: "short"
+    )
+    key = (root / "private/identity_ca.key.pem").read_text()
+    assert "BEGIN ENCRYPTED PRIVATE KEY" in key
+
+
 @pytest.mark.parametrize(
     ("call", "error", "text"),
     [

@@ -186,7 +186,7 @@ class Keyring:
                 f"It has {length} characters. Whoever copies the key can try passphrases without "
                 "limit, and short ones are found.",
                 f"Choose one of at least {_SHORTEST_PASSPHRASE} characters, or insist with "
-                "SROS_SHORT_PASSPHRASE=1.",
+                "SROS_SHORT_PASSPHRASE=1 (in Python, short_passphrase=True).",
             )
         return passphrase
 
