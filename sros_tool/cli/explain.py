@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator, Sequence
 from datetime import tzinfo
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +29,7 @@ from sros_tool.cli.common import (
 from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import NEWEST, Vendor
 from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
-from sros_tool.names import is_expression
+from sros_tool.names import check_enclave_name, is_expression
 from sros_tool.validity import iso
 from sros_tool.values import as_plain
 
@@ -949,14 +950,16 @@ def _show_log(
                 "Write the keystore before the enclave.",
             )
 
+    # Once for each enclave: whoever writes the log chooses how many it names, and how often.
+    @cache
     def find(enclave: str) -> LoadedEnclave | None:
         if named is not None and enclave in ("", named.name):
             return named
         if root is None or not enclave:
             return None
         try:
-            return _signed_enclave(root, enclave, options)
-        except SrosError:  # the log names an enclave of another keystore
+            return _signed_enclave(root, check_enclave_name(enclave), options, planned=True)
+        except SrosError:  # the log names an enclave of another keystore, or a path
             return None
 
     findings = explain_log(

@@ -209,6 +209,7 @@ class _Examiner:
         self._find = find
         self._context = context
         self._root = root
+        self._evaluators: dict[tuple[Vendor, str], Evaluator] = {}
 
     def message(self, hits: list[_Hit]) -> LogFinding:
         """Return the finding for one group of equal messages."""
@@ -281,7 +282,10 @@ class _Examiner:
         )
 
     def _answer(self, enclave: LoadedEnclave, vendor: Vendor, question: Question) -> Answer:
-        return Evaluator(vendor, enclave, self._context(enclave)).answer(question)
+        of = vendor, enclave.name
+        if of not in self._evaluators:
+            self._evaluators[of] = Evaluator(vendor, enclave, self._context(enclave))
+        return self._evaluators[of].answer(question)
 
     def _causes(
         self, enclave: LoadedEnclave, answer: Answer, faults: tuple[Fault, ...]

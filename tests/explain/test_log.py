@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -12,7 +13,10 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.explain import evaluator
+from sros_tool.explain.evaluator import LoadedEnclave, load_enclave
 from sros_tool.explain.log import LogFinding, explain_log
+from sros_tool.keystore.ledger import Ledger
 from sros_tool.resources import policies_dir
 from tests.explain.broken import BREAKAGES, ENCLAVE, Enclave, make_keystore
 from tests.support.children import python, run
@@ -436,6 +440,36 @@ def test_json(tmp_path: Path) -> None:
 def test_wrong_usage(tmp_path: Path) -> None:
     assert sros("explain", "--log", tmp_path / "none.log").status == 2
     assert sros("explain", "ks", "/a", "publish", "/x", "--log", "-").status == 2
+
+
+def test_how_often_files_are_read_is_not_for_the_log_to_choose(
+    keystore: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither by names that the keystore does not have, nor by many topics, nor by a path."""
+    shutil.copytree(keystore, tmp_path / "other", symlinks=True)
+    names = [ENCLAVE, *(f"/unknown{n}" for n in range(9)), f"/../../other/enclaves{ENCLAVE}"]
+    lines = [
+        f"[node-{number}] Found security directory: {keystore}/enclaves{name}\n"
+        f"[node-{number}] rt/t{topic} topic not found in allow rule. local writer\n"
+        for number, name in enumerate(names)
+        for topic in range(3)
+    ]
+    (tmp_path / "log").write_text("".join(lines))
+    read: list[str] = []
+
+    def opened(name: str, folder: Path, **more: object) -> LoadedEnclave:
+        read.append(name)
+        return load_enclave(name, folder, **more)  # type: ignore[arg-type]
+
+    def refuse(_root: Path) -> Ledger:
+        raise AssertionError("the ledger was read")
+
+    monkeypatch.setattr(evaluator, "load_enclave", opened)
+    monkeypatch.setattr("sros_tool.keystore.ledger.read_ledger", refuse)
+    monkeypatch.setattr("sros_tool.keystore.missing.read_ledger", refuse)
+    findings = json.loads(sros("explain", keystore, "--log", tmp_path / "log", "--json").out)
+    assert [each["checked"] for each in findings["findings"]].count(True) == 3
+    assert read == [ENCLAVE]
 
 
 def test_what_a_log_says_does_not_become_a_command() -> None:
