@@ -174,6 +174,13 @@ def complete_keystore_and_enclave(
     return [CompletionItem(incomplete, type="dir")]
 
 
+def complete_file(incomplete: str) -> list[CompletionItem | str]:
+    """Complete files and folders, as the shell does."""
+    from click.shell_completion import CompletionItem
+
+    return [CompletionItem(incomplete, type="file")]
+
+
 def complete_template(
     _ctx: click.Context, _parameter: click.Parameter, incomplete: str
 ) -> list[str]:

@@ -12,6 +12,7 @@ import click
 from sros_tool.cli.common import (
     PATH,
     coloured,
+    complete_file,
     complete_keystore_and_enclave,
     domain_of,
     dry_run_option,
@@ -344,7 +345,13 @@ Example:
   $ sros sign_request keystore keystore/enclaves/arm/camera/request.pem \\
         --renew -o camera.tgz""",
 )
-@click.argument("words", metavar="[ROOT] REQUEST", nargs=-1, required=True)
+@click.argument(
+    "words",
+    metavar="[ROOT] REQUEST",
+    nargs=-1,
+    required=True,
+    shell_complete=lambda _ctx, _parameter, incomplete: complete_file(incomplete),
+)
 @click.option(
     "-p",
     "--policy-file",

@@ -1,0 +1,162 @@
+"""A table of all verbs, made from the program: none lacks what the others have.
+
+Each verb has help with an example, ``--json``, ``--dry-run`` where it writes, completion of its
+arguments, progress where its work grows with the keystore, and the exit status 0 for yes or done,
+1 for no, 2 for what could not be asked or done.
+"""
+
+from __future__ import annotations
+
+import inspect
+import shutil
+from importlib import import_module
+from pathlib import Path
+
+import click
+import pytest
+
+from sros_tool.cli.program import FAMILIES, program
+from tests.conftest import POLICY
+from tests.support.harness import policy_text, publish, sros
+
+ENTRIES = {name: entry for family in FAMILIES.values() for name, entry in family.items()}
+COMMANDS = {name: program.get_command(click.Context(program), name) for name in ENTRIES}
+
+# What a verb does not have, and why.
+NO_JSON = {"run": "its output is that of the command", "completion": "its output is a script"}
+READS = {
+    "list_enclaves", "inspect", "verify", "diff_policy", "explain", "check", "doctor", "env",
+    "completion",
+}  # fmt: skip
+RUNS = {"run", "demo"}
+NEW_NAMES = {("create_request", "name")}
+"""Arguments that are a name which does not exist yet."""
+GROWS = {
+    "create_enclave", "generate_artifacts", "renew", "revoke", "rotate_ca", "distribute_key",
+    "verify", "diff_policy", "explain", "view", "check",
+}  # fmt: skip
+
+
+def options(verb: str) -> set[str]:
+    command = COMMANDS[verb]
+    assert command
+    return {word for parameter in command.params for word in parameter.opts}
+
+
+@pytest.mark.parametrize("verb", ENTRIES)
+def test_every_verb_has_an_example_with_its_name(verb: str) -> None:
+    command = COMMANDS[verb]
+    assert command and command.epilog
+    assert "Example" in command.epilog
+    assert f"sros {verb}" in command.epilog
+
+
+@pytest.mark.parametrize("verb", ENTRIES)
+def test_every_verb_has_json(verb: str) -> None:
+    assert ("--json" in options(verb)) != (verb in NO_JSON)
+
+
+@pytest.mark.parametrize("verb", ENTRIES)
+def test_every_verb_that_writes_has_a_dry_run(verb: str) -> None:
+    assert ("--dry-run" in options(verb)) != (verb in READS | RUNS)
+
+
+@pytest.mark.parametrize("verb", ENTRIES)
+def test_every_argument_completes(verb: str) -> None:
+    command = COMMANDS[verb]
+    assert command
+    for parameter in command.params:
+        if not isinstance(parameter, click.Argument) or (verb, parameter.name) in NEW_NAMES:
+            continue
+        found = parameter.shell_complete(click.Context(command), "")
+        assert found, f"{verb} {parameter.name}"
+
+
+@pytest.mark.parametrize("verb", sorted(GROWS))
+def test_work_that_grows_with_the_keystore_shows_progress(verb: str) -> None:
+    module = import_module(f"sros_tool.cli.{ENTRIES[verb].module}")
+    assert "with progress(" in inspect.getsource(module)
+
+
+# ── exit status ────────────────────────────────────────────────────────────────────────────
+
+
+@pytest.fixture(scope="module")
+def made(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with all that the lines below name; only to be copied."""
+    folder = tmp_path_factory.mktemp("table")
+    shutil.copytree(made_keystore, folder / "ks", symlinks=True)
+    (folder / "p.xml").write_text(POLICY)
+    (folder / "wide.xml").write_text(policy_text({"/a": publish("*")}))
+    (folder / "q.xml").write_text(policy_text({"/a": publish("new")}))
+    (folder / "broken.xml").write_text("<policy")
+    (folder / "log").write_text("[rcl]: couldn't find all security files!\n")
+    for line in (
+        "create_keystore strict --template production",
+        "generate_artifacts -k strict -p p.xml",
+        "distribute_key strict --all robot",
+        "distribute_key strict --all damaged",
+        "create_request /r asking",
+        "sign_request ks asking/enclaves/r/request.pem -o answer.tar.gz",
+        "generate_artifacts -k late -p p.xml",
+    ):
+        sros(*line.split(), cwd=folder).ok()
+    (folder / "damaged/enclaves/a/cert.pem").write_text("damaged")
+    shutil.copy(folder / "asking/enclaves/r/request.pem", folder / "request.pem")
+    return folder
+
+
+NEVER = ""
+SIGNED, OTHER_CA = "strict/enclaves/a/permissions.p7s", "strict/public/identity_ca.cert.pem"
+STATUS: dict[str, tuple[str, str, str]] = {
+    # verb: yes or done, no, could not be asked or done
+    "create_keystore": ("new", NEVER, "ks"),
+    "create_enclave": ("ks /new", NEVER, "nothing /new"),
+    "create_permission": ("ks /a p.xml", NEVER, "ks /a broken.xml"),
+    "generate_artifacts": ("-k ks -p p.xml", NEVER, "-k ks -p broken.xml"),
+    "list_enclaves": ("ks", NEVER, "nothing"),
+    "inspect": (SIGNED, f"{SIGNED} --ca {OTHER_CA}", "nothing"),
+    "renew": ("ks /a", NEVER, "ks /nobody"),
+    "revoke": ("ks /a", NEVER, "ks /nobody"),
+    "rotate_ca": ("ks --next", NEVER, "nothing --next"),
+    "crl": ("ks", NEVER, "nothing"),
+    "distribute_key": ("ks /a out", NEVER, "ks /nobody out"),
+    "verify": ("robot", "damaged", "nothing"),
+    "create_request": ("/new out", NEVER, "/r asking"),
+    "sign_request": ("strict request.pem -o new.tar.gz", NEVER, "ks p.xml"),
+    "import": ("answer.tar.gz asking", NEVER, "p.xml asking"),
+    "merge_policy": ("p.xml q.xml -o new.xml", NEVER, "p.xml broken.xml"),
+    "diff_policy": ("p.xml p.xml", "p.xml q.xml", "p.xml nothing"),
+    "explain": ("strict /a publish /old_a", "strict /a publish /no", "strict /nobody join"),
+    "view": ("p.xml -o new.svg", NEVER, "nothing"),
+    "policies": ("", NEVER, "--copy ks"),
+    "check": ("keystore strict --severity error", "damaged", "nothing"),
+    "env": ("ks /a", NEVER, "nothing /a"),
+    "completion": ("bash", NEVER, "powershell"),
+}
+ELSEWHERE = {
+    "generate_policy": "tests/graph", "minimize_policy": "tests/policy",
+    "audit": "tests/cli/test_audit.py", "doctor": "tests/checks", "run": "tests/runtime",
+    "demo": "tests/demo",
+}  # fmt: skip
+"""Verbs that need a running robot or another program, and where their status is tested."""
+
+
+def test_the_status_of_every_verb_is_tested() -> None:
+    assert STATUS.keys() | ELSEWHERE.keys() == ENTRIES.keys()
+    assert not STATUS.keys() & ELSEWHERE.keys()
+    assert all(Path(__file__).parents[2].joinpath(path).exists() for path in ELSEWHERE.values())
+
+
+@pytest.mark.parametrize("verb", STATUS)
+def test_status(verb: str, made: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(made, tmp_path / "w", symlinks=True)
+    for wanted in (2, 1, 0):  # what is done last may change the folder
+        words = STATUS[verb][wanted]
+        if words == NEVER and wanted == 1:
+            continue
+        ended = sros(verb, *words.split(), cwd=folder)
+        assert ended.status == wanted, ended
+        assert not (wanted == 2 and ended.out and verb != "env"), ended
+        usage = sros(verb, "--no-such-option", cwd=folder)
+        assert usage.status == 2 and f"sros {verb}" in usage.err
