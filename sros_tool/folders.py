@@ -187,6 +187,22 @@ class Folder:
         with self._naming(path):
             os.symlink(target, name, dir_fd=parent)  # its owner grants nothing, so it stays
 
+    def close_to_others(self, path: str) -> None:
+        """Take the rights of the group and of others away from a file or folder.
+
+        It stays as it is if it belongs to somebody else than this folder, or has a second name,
+        which may be one elsewhere.
+        """
+        parent, name = self._at(path)
+        with self._naming(path):
+            handle = os.open(name, _OLD_FILE, dir_fd=parent)
+            try:
+                state = os.fstat(handle)
+                if state.st_uid == self._owner[0] and _has_one_name(state):
+                    os.fchmod(handle, stat.S_IMODE(state.st_mode) & 0o700)
+            finally:
+                os.close(handle)
+
     def mkdir(self, path: str, mode: int) -> None:
         """Make the folder ``path``; its permission bits are ``mode`` whatever the umask is."""
         parent, name = self._at(path)
@@ -321,6 +337,10 @@ class Folder:
                 "Replace the link with a real folder.",
             )
         return KeystoreError(f"'{whole}' is in the way", "It is not a folder.", "Move it away.")
+
+
+def _has_one_name(state: os.stat_result) -> bool:
+    return stat.S_ISDIR(state.st_mode) or (stat.S_ISREG(state.st_mode) and state.st_nlink == 1)
 
 
 def make_folders(path: Path) -> list[Path]:

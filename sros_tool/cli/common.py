@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -267,6 +268,22 @@ def print_plan(root: Path, changes: Sequence[Change]) -> None:
         click.echo(f"would {change.action} {root / change.path}")
     if not changes:
         click.echo("nothing would change")
+
+
+def print_closed(root: Path, changes: Sequence[Change]) -> None:
+    """Say on stderr which keys of a keystore were closed to other users, and what that means."""
+    closed = [visible(str(root / each.path)) for each in changes if each.action == "close"]
+    if closed:
+        more = f" and {len(closed) - 3} more" if len(closed) > 3 else ""
+        where = quote(str(root))
+        click.echo(
+            f"closed to other users, who could open them until now: {', '.join(closed[:3])}{more}. "
+            "Run the nodes as the owner of the keystore, or from an export of that user (`sros "
+            "distribute_key`). Replace keys that somebody may have copied: `sros renew "
+            f"{where} NAME --new-key --revoke-old` those of enclaves, `sros rotate_ca {where} "
+            "--next` those of CAs.",
+            err=True,
+        )
 
 
 def check_output(output: Path, *, force: bool) -> None:

@@ -21,6 +21,7 @@ from sros_tool.cli.common import (
     keystore_from_environment,
     moment_of,
     now,
+    print_closed,
     print_json,
     print_notes,
     print_plan,
@@ -440,6 +441,8 @@ def sign_request(
                 f"  send '{output}' to the robot: sros import {output.name} DIR --ca "
                 f"{digest(permissions_ca)}"
             )
+    if not dry_run:
+        print_closed(root, signed.changes)
     print_notes(signed.notes)
 
 
@@ -516,6 +519,8 @@ def import_verb(
     pinned = read_pin(pin) if pin is not None else frozenset[str]()
     data = _read(answer, "answer")
     done = import_answer(folder, data, now=now(), pinned=pinned, force=force, dry_run=dry_run)
+    if not dry_run:
+        print_closed(folder, done.changes)
     if as_json:
         print_json(_imported_json(folder, done, bool(pinned), dry_run))
         return

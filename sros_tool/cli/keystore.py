@@ -19,6 +19,7 @@ from sros_tool.cli.common import (
     keyring,
     keystore_from_environment,
     now,
+    print_closed,
     print_json,
     print_notes,
     print_plan,
@@ -214,6 +215,8 @@ def _show(result: Creation, dry_run: bool, as_json: bool) -> None:
                 click.echo(text.format(name))
     for name in result.kept:
         click.echo(f"enclave {name} already exists: not changed", err=True)
+    if not dry_run:
+        print_closed(result.root, result.changes)
     print_notes(result.notes)
 
 

@@ -17,6 +17,7 @@ from sros_tool.cli.common import (
     keyring,
     keystore_from_environment,
     now,
+    print_closed,
     print_json,
     print_notes,
     print_plan,
@@ -110,6 +111,8 @@ def renew(
     else:
         for name in result.renewed:
             click.echo(f"renewed enclave {name}")
+    if not dry_run:
+        print_closed(root, result.changes)
     if not result.renewed and not dry_run:
         click.echo("no enclave needs to be renewed", err=True)
     print_notes(result.notes)
@@ -230,6 +233,8 @@ def revoke(
     else:
         for name in result.revoked:
             click.echo(f"revoked enclave {name}")
+    if not dry_run:
+        print_closed(root, result.changes)
     _print_restart(result.restart)
     for remark in result.remarks:
         click.echo(remark.text, err=True)
@@ -284,6 +289,7 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
             print_plan(root, result.changes)
             return 0
         if not dry_run:
+            print_closed(root, result.changes)
             _print_restart(result.restart)
         for remark in result.remarks:
             click.echo(remark.text, err=True)
@@ -499,6 +505,8 @@ def rotate_ca(
         print_plan(root, step.changes)
     else:
         _print_step(step, rotation_status(root, now=now()), together=finish, same_key=same_key)
+    if not dry_run:
+        print_closed(root, step.changes)
     print_notes(step.notes)
 
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import os
+import re
 import shutil
+import stat
 import subprocess
 from datetime import UTC, datetime
 from pathlib import Path
@@ -72,6 +76,95 @@ def test_renewing(new_key: bool, root: Path) -> None:
     found = history(root, now=NOW)
     assert {item.entry.enclave for item in found.items} == {"/a", "/b/c", "/d"}
     assert found.unexplained == ("enclaves/governance.p7s", "public/ca.cert.pem")
+
+
+WRITING = (
+    ("renew", "{}", "/a"),
+    ("renew", "{}", "/a", "--new-key", "--revoke-old"),
+    ("revoke", "{}", "/d"),
+    ("create_enclave", "{}", "/new"),
+    ("generate_artifacts", "-k", "{}", "-e", "/new"),
+    ("rotate_ca", "{}", "--next"),
+    ("rotate_ca", "{}", "--finish"),
+)
+
+
+def open_to_others(root: Path) -> set[str]:
+    """The private keys, and the folders of keys at the top, that others can open."""
+    return {
+        str(path.relative_to(root))
+        for path in (*root.glob("*/"), *root.rglob("*key.pem"))
+        if path.name != "public"
+        and not path.is_symlink()
+        and stat.S_IMODE(path.stat().st_mode) & 0o077
+    }
+
+
+@pytest.mark.parametrize("words", WRITING, ids=" ".join)
+def test_writing_closes_the_keys_to_other_users_and_says_so(
+    words: tuple[str, ...], root: Path
+) -> None:
+    for path in (root, *root.rglob("*")):
+        if not path.is_symlink():
+            path.chmod(0o755 if path.is_dir() else 0o644)  # by the usual umask
+    kept = {"private/ca.key.pem", *(f"enclaves{name}/key.pem" for name in ("/a", "/b/c", "/d"))}
+    assert open_to_others(root) == {"private", "enclaves", *kept}
+    words = tuple(word.format(root) for word in words)
+    plan = sros(*words, "--dry-run").ok()
+    assert f"would close {root}/enclaves/b/c/key.pem" in plan.out
+    assert open_to_others(root) == {"private", "enclaves", *kept}, "a dry run changed modes"
+    ended = sros(*words).ok()
+    assert open_to_others(root) == set()
+    assert f"closed to other users, who could open them until now: {root}/private" in ended.err
+    assert "closed to" not in sros("renew", root, "/a").ok().err
+
+
+def test_reading_and_a_failing_verb_leave_the_modes(root: Path) -> None:
+    (root / "enclaves/d/key.pem").chmod(0o644)
+    before = open_to_others(root)
+    found = sros("check", root).out
+    assert "keystore.key-readable" in found
+    sros("inspect", root).ok()
+    assert sros("renew", root, "/no_such_enclave").status
+    assert open_to_others(root) == before
+
+
+def test_a_key_with_a_name_elsewhere_and_a_link_stay_as_they_are(
+    root: Path, tmp_path: Path
+) -> None:
+    """As root this would change the mode of any file that is linked into the keystore."""
+    other = tmp_path / "other.pem"
+    other.write_bytes(b"something else")
+    other.chmod(0o644)
+    os.link(other, root / "private/hard.key.pem")
+    (root / "private/soft.key.pem").symlink_to(other)
+    sros("renew", root, "/a").ok()
+    assert stat.S_IMODE(other.stat().st_mode) == 0o644
+    assert open_to_others(root) == {"private/hard.key.pem"}
+
+
+OPENED = {
+    "keystore.key-readable": ("enclaves/d/key.pem", 0o644),
+    "keystore.folder-open": ("private", 0o755),
+    "keystore.world-writable": ("public/ca.cert.pem", 0o646),
+}
+
+
+@pytest.mark.parametrize("kind", OPENED)
+def test_the_remedy_of_an_open_mode_runs(kind: str, root: Path) -> None:
+    path, mode = OPENED[kind]
+    (root / path).chmod(mode)
+
+    def remedies() -> list[str]:
+        found = json.loads(sros("check", root, "--json").out)["findings"]
+        return [each["remedy"] for each in found if each["id"] == kind]
+
+    assert remedies()
+    for remedy in remedies():
+        command = re.search(r"`(chmod [^`]+)`", remedy)
+        assert command, remedy
+        subprocess.run(command[1], shell=True, check=True)
+    assert not remedies()
 
 
 def test_revoking(root: Path, tmp_path: Path) -> None:

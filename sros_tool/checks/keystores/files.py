@@ -271,12 +271,15 @@ def _openness(path: str, root: str, mode: int, home: bool) -> Iterator[Finding]:
     # Others cannot enter what is below a closed top folder.
     asked = inside.parts[0] in _KEY_FOLDERS and (len(inside.parts) == 1 or not home)
     if asked and mode & 0o077 and not mode & stat.S_IWOTH:
-        yield FOLDER_OPEN.found(path, f"its mode is {stat.S_IMODE(mode):04o}", path)
+        text, remedy = f"its mode is {stat.S_IMODE(mode):04o}", f"Run `chmod 700 {quote(path)}`."
+        yield FOLDER_OPEN.found(path, text, path, remedy=remedy)
 
 
 def _writers(path: str, info: os.stat_result, trusted: frozenset[int]) -> Iterator[Finding]:
     if info.st_mode & stat.S_IWOTH:
-        yield WORLD_WRITABLE.found(path, f"its mode is {stat.S_IMODE(info.st_mode):04o}", path)
+        text = f"its mode is {stat.S_IMODE(info.st_mode):04o}"
+        remedy = f"Run `chmod o-w {quote(path)}`."
+        yield WORLD_WRITABLE.found(path, text, path, remedy=remedy)
     elif why := other_writers(info, trusted):
         yield OTHERS_WRITE.found(path, why, path)
 

@@ -41,11 +41,15 @@ class Move(NamedTuple):
     after: str | None
 
 
+CLOSE = "close"
+
+
 @dataclass(frozen=True, slots=True)
 class Change:
     """One file or link that a transaction changes.
 
-    ``action`` is "create", "replace" or "remove"; ``path`` is relative to the keystore.
+    ``action`` is "create", "replace" or "remove", or `CLOSE` for a private key or a folder of keys
+    that other users cannot open any more; ``path`` is relative to the keystore.
     """
 
     action: str

@@ -18,20 +18,30 @@ import logging
 import os
 import secrets
 import stat
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from sros_tool.errors import KeystoreError, SrosError
 from sros_tool.folders import Folder, make_folders, remove_folders
-from sros_tool.keystore.layout import STAGE, check_readable, folder_mode
+from sros_tool.keystore.layout import (
+    ENCLAVES,
+    KEY_FILE,
+    PRIVATE,
+    RETIRED,
+    REVOKED,
+    STAGE,
+    check_readable,
+    folder_mode,
+)
 from sros_tool.keystore.transaction.lock import KeystoreLock, lock_new
 from sros_tool.keystore.transaction.recovery import complete, recover
 from sros_tool.keystore.transaction.stage import (
     ADDED,
     AFTER,
     BEFORE,
+    CLOSE,
     LIVE,
     Change,
     Move,
@@ -45,6 +55,7 @@ from sros_tool.keystore.transaction.stage import (
 from sros_tool.parallel import map_slices
 
 _LOG = logging.getLogger(__name__)
+_KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
 
 
 class Transaction:
@@ -305,9 +316,14 @@ class Transaction:
     def commit(self) -> None:
         """Put all staged changes in place atomically, and flush them to disk.
 
+        Private keys and folders of keys that other users could open are closed to them:
+        ros2/sros2 leaves them as open as the umask lets them be.
+
         Raises:
             KeystoreError: another process has created the keystore meanwhile.
         """
+        if self.changes and not self._new_root:
+            self._close_keys()
         if self.dry_run or not self.changes:
             return
         folder = self._in
@@ -324,6 +340,16 @@ class Transaction:
         self._report_commit()
         with contextlib.suppress(OSError, SrosError):  # already committed; `_end` tries again
             complete(folder, self._moves)
+
+    def _close_keys(self) -> None:
+        for path in _open_keys(self.root):
+            if path in self._staged:
+                continue
+            if not self.dry_run:
+                with contextlib.suppress(OSError):  # `check` finds what stays open
+                    self._in.close_to_others(path)
+            if self.dry_run or not self._in.mode(path) & 0o077:
+                self.changes.append(Change(CLOSE, path))
 
     def _report_commit(self) -> None:
         _LOG.info("committed %d changes to the keystore '%s'", len(self.changes), self.root)
@@ -349,6 +375,27 @@ class Transaction:
         self._undo.clear()
         with contextlib.suppress(OSError), Folder(self.root.parent) as parent:
             parent.flush()  # already in place; otherwise the system flushes it soon
+
+
+def _open_keys(root: Path) -> Iterator[str]:
+    """Yield the paths of private keys, and top folders of keys, that other users can open."""
+    for top in _KEY_FOLDERS:
+        if _is_open(f"{root}/{top}", stat.S_IFDIR):
+            yield top
+        for folder, folders, files in os.walk(f"{root}/{top}"):
+            folders[:] = [each for each in folders if not each.startswith(".")]
+            for name in files:
+                path = f"{folder}/{name}"
+                if name.endswith(KEY_FILE) and _is_open(path, stat.S_IFREG):
+                    yield os.path.relpath(path, root)
+
+
+def _is_open(path: str, kind: int) -> bool:
+    try:
+        mode = os.lstat(path).st_mode
+    except OSError:
+        return False
+    return stat.S_IFMT(mode) == kind and bool(mode & 0o077)
 
 
 # ── links through the stage ────────────────────────────────────────────────────────────────
