@@ -208,6 +208,20 @@ def test_the_module_of_a_received_keystore_is_not_loaded(
         assert done.returncode == 0, done.stderr
 
 
+def test_a_template_takes_no_key_of_the_token(token: dict[str, str], tmp_path: Path) -> None:
+    root, new = tmp_path / "ks", tmp_path / "new"
+    make(token, root)
+    template = tmp_path / "template.toml"
+    template.write_text((root / "sros.toml").read_text())
+    known = token | {"PKCS11_MODULE_PATH": str(MODULE)}
+    refused = sros(known, "create_keystore", new, "--template", template)
+    assert (refused.returncode, new.exists()) == (2, False), refused.stderr
+    assert "names a key that exists" in refused.stderr
+    keys = ["--identity-key", uri("identity"), "--permissions-key", uri("permissions")]
+    named = sros(known, "create_keystore", new, "--template", template, *keys)
+    assert named.returncode == 0, named.stderr
+
+
 def test_a_dry_run_of_a_new_keystore_opens_no_token(token: dict[str, str], tmp_path: Path) -> None:
     broken = [f"--{role}-key=pkcs11:token=robot;object=o?module-path=/gone.so" for role in ROLES]
     planned = sros(token, "create_keystore", tmp_path / "ks", *broken, "--dry-run")

@@ -110,7 +110,7 @@ class Keyring:
         a token only if the key is ``compared`` with a certificate; otherwise any key will do.
 
         Raises:
-            KeystoreError: the template alone names a file that has a key, and no certificate that
+            KeystoreError: the template alone names a key that exists, and no certificate that
                 the user chose is ``compared`` with it: whoever wrote the template could have
                 another CA of the user sign for the new keystore.
         """
@@ -123,18 +123,13 @@ class Keyring:
                 return generate_key()
             named = self._is_named(role)
             if holds_token_key(place, self.secrets, named=named):
+                self._check_chosen(role, place, compared=compared)
                 return open_token_key(place, self.secrets, named=named)
             if transaction.dry_run:
                 return generate_key()
             return create_token_key(place, self.secrets, named=named)
         if place and key_path(transaction.root, place).exists():
-            if not (compared or self._is_named(role)):
-                raise KeystoreError(
-                    f"the template names a key that exists, for the {role} CA: '{place}'",
-                    "What the new keystore signs could then be used wherever a CA with that key is "
-                    "trusted.",
-                    f"If that is intended, name it yourself: --{role}-key {quote(place)}.",
-                )
+            self._check_chosen(role, place, compared=compared)
             return self.open(transaction.root, role, template)
         key = generate_key()
         pem = key_pem(key, self._new_passphrase(role) if self.encrypt else None)
@@ -143,6 +138,16 @@ class Keyring:
         elif not transaction.dry_run:
             _write_outside(key_path(transaction.root, place), pem, transaction)
         return key
+
+    def _check_chosen(self, role: str, place: str, *, compared: bool) -> None:
+        """Raise `KeystoreError` unless the user chose the existing key for a new CA."""
+        if not (compared or self._is_named(role)):
+            raise KeystoreError(
+                f"the template names a key that exists, for the {role} CA: '{place}'",
+                "What the new keystore signs could then be used wherever a CA with that key is "
+                "trusted.",
+                f"If that is intended, name it yourself: --{role}-key {quote(place)}.",
+            )
 
     def settings_with_places(self, template: Template) -> Template:
         """Return ``template`` with the places of the CA keys, as settings of a new keystore."""
