@@ -21,7 +21,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     save,
-    visible,
+    visible_line,
 )
 from sros_tool.cli.observing import (
     Watching,
@@ -112,7 +112,7 @@ def audit(
         for line in _lines(judge(observation, enclaves)):
             if line not in reported:
                 reported.add(line)
-                click.echo(f"denied: {line}", err=True)
+                click.echo(f"denied: {visible_line(line)}", err=True)
 
     secured = enclave is not None
     then = "the result is shown"
@@ -141,7 +141,7 @@ def audit(
     if written:
         policy = shlex.quote(str(source)) if enclaves.what == "policy" else "POLICY"
         command = f"sros merge_policy {policy} {shlex.quote(str(patch))} --in-place"
-        click.echo(visible(f"{written}; add it: {command}"), err=True)
+        click.echo(visible_line(f"{written}; add it: {command}"), err=True)
     elif patch is not None:
         click.echo("no patch is needed" if found.allowed else _NO_PATCH, err=True)
     return 0 if found.allowed else 1
@@ -208,7 +208,7 @@ def _lines(found: Audit) -> list[str]:
 
 def _show(found: Audit, enclaves: AuditedEnclaves) -> None:
     for line in _lines(found):
-        click.echo(visible(line))
+        click.echo(visible_line(line))
     seen = f"{_count(len(found.observation.nodes), 'node')} with "
     seen += f"{_count(found.observation.endpoint_count, 'endpoint')}, on {enclaves.vendor.title}"
     if found.allowed:

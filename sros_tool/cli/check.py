@@ -23,7 +23,7 @@ from sros_tool.cli.common import (
     moment_of,
     now,
     print_json,
-    visible,
+    visible_line,
 )
 from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import MEASURED
@@ -343,21 +343,17 @@ def _print_text(chosen: ChosenFindings, _selection: FindingFilter) -> None:
 
 
 def _finding_lines(finding: Finding) -> list[str]:
-    """Return a finding as three lines: place and title, reason, and remedy.
-
-    A line feed in the name of a file is escaped: it could end the line and forge the next one.
-    """
+    """Return a finding as three lines: place and title, reason, and remedy."""
     head = f"{finding.place}: {finding.severity.word}: {finding.kind.title} [{finding.id}]"
     subject = "" if finding.subject in (finding.file, finding.place) else f"{finding.subject}: "
     by = f" (accepted by the {finding.accepted})" if finding.accepted else ""
-    lines = (head, f"    {subject}{finding.text}{by}", f"    {finding.remedy}")
-    return [line.replace("\n", "\\x0a") for line in lines]
+    return [head, f"    {subject}{finding.text}{by}", f"    {finding.remedy}"]
 
 
 def echo_finding(finding: Finding) -> None:
     """Print a finding as text, its severity in colour on a terminal."""
     word = f": {finding.severity.word}: "
-    head, *rest = (visible(line) for line in _finding_lines(finding))
+    head, *rest = (visible_line(line) for line in _finding_lines(finding))
     click.echo("\n".join((head.replace(word, f": {coloured(word[2:-2])}: ", 1), *rest)))
 
 

@@ -214,6 +214,11 @@ def visible(text: str) -> str:
     return text.translate(_SHOWN)
 
 
+def visible_line(text: str) -> str:
+    """Return ``text`` as `visible` does, on one line: a line feed could forge the next one."""
+    return visible(text).replace("\n", "\\x0a")
+
+
 def visible_json(document: str) -> str:
     """Replace the control characters in a JSON document with JSON escapes of the same value."""
     return document.translate(_IN_JSON)
@@ -259,7 +264,7 @@ def print_json(value: Mapping[str, Any]) -> None:
 def print_notes(notes: Sequence[Note]) -> None:
     """Print notes on stderr."""
     for note in notes:
-        click.echo(visible(f"note [{note.id}]: {note.text}"), err=True)
+        click.echo(visible_line(f"note [{note.id}]: {note.text}"), err=True)
 
 
 def print_plan(root: Path, changes: Sequence[Change]) -> None:

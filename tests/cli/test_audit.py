@@ -175,3 +175,19 @@ def test_a_policy_is_not_compared_with_the_runtime(tmp_path: Path) -> None:
     ended = sros("check", "runtime", "--policy", "robot.xml", cwd=tmp_path)
     assert ended.status == 2
     assert "sros audit robot.xml" in ended.err
+
+
+@pytest.mark.parametrize("words", [SHORT, ("--watch", "1s")])
+def test_a_name_on_the_network_forges_no_line(program: Program, words: tuple[str, ...]) -> None:
+    """The names of nodes and topics are what anybody on the network sends."""
+    hostile = ("/", "/", "talker", "01", ["publish rt/x\x1b[2J\n/t publish topic /y"])
+    ended = program(graph(hostile), "robot.xml", *words)
+    assert ended.status == 1
+    assert "\x1b" not in ended.out + ended.err
+    for text in (ended.out, ended.err):
+        assert [line for line in text.splitlines() if line.startswith("/t publish topic /y")] == []
+    assert "\\x1b[2J\\x0a/t publish topic /y" in ended.out
+    stray = graph(LOUD, ("/", "/", "_NODE_NAME_UNKNOWN_", "09", ["publish Sq\nnote [x]: forged"]))
+    ended = program(stray, "robot.xml", *words)
+    assert [line for line in ended.err.splitlines() if line.startswith("note [x]")] == []
+    assert "note [audit.stray]" in ended.err
