@@ -21,7 +21,8 @@ output. Its first key is `version`, which is 1: it is raised when a key goes or 
 meaning. Keys may be added without that, so ignore those that you do not know.
 
 - The exit status is the same as without `--json`. Look at it first: after an error (status 2, or \
-1 for some) standard output is empty, and standard error has one paragraph.
+1 for some) standard output is empty, and standard error has one paragraph. Only `env` then prints \
+variables with which no node starts.
 - Notes and messages for people still go to standard error; `notes` has the notes, too.
 - With `--dry-run`, `dry_run` is true, and the object says what would be done.
 - Moments are in UTC, as `2027-05-21T12:50:48Z`; serial numbers and SHA-256 are lower-case \

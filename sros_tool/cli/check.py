@@ -15,6 +15,7 @@ import click
 from sros_tool import __version__
 from sros_tool.cli.common import (
     PATH,
+    check_one_format,
     coloured,
     domain_of,
     json_option,
@@ -165,6 +166,7 @@ def check(
     from sros_tool.checks.kind import Severity
     from sros_tool.checks.registry import FindingFilter
 
+    check_one_format()
     family, paths = _family(targets)
     form = "json" if as_json else "sarif" if as_sarif else form
     if needs_renewal is not None:

@@ -18,6 +18,7 @@ from shlex import quote
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
+from click.core import ParameterSource
 
 from sros_tool.cli.progress import paused
 from sros_tool.errors import DocumentError, PkiError, UsageError
@@ -56,6 +57,17 @@ PATH = _NamedPath()
 def json_option(function: Decorated) -> Decorated:
     """Add ``--json`` to a verb."""
     return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(function)
+
+
+def check_one_format() -> None:
+    """Raise `UsageError` if the verb that runs got --json and another format, too."""
+    context = click.get_current_context()
+    named = context.get_parameter_source("form") is ParameterSource.COMMANDLINE
+    form = context.params["form"] if named else "json"
+    if context.params.get("as_sarif"):
+        form = "sarif"
+    if context.params["as_json"] and form != "json":
+        raise UsageError(f"--json and the format {form} exclude each other", "", "Choose one.")
 
 
 def dry_run_option(function: Decorated) -> Decorated:

@@ -30,7 +30,7 @@ from sros_tool.cli.common import (
 )
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import authority_json, changes_json, enclave_json, notes_json
-from sros_tool.errors import UsageError
+from sros_tool.errors import Note, UsageError
 
 if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.create import Creation
@@ -410,7 +410,7 @@ def _keystore_json(
         "domains": str(result.domains),
         "authorities": authorities,
         "changes": changes_json(result.root, result.changes),
-        "notes": notes_json(result.notes),
+        "notes": notes_json((*result.notes, *_open_rights(template))),
     }
 
 
@@ -441,7 +441,7 @@ def _adopt(root: Path, earlier: Path, dry_run: bool, as_json: bool) -> None:
     print_notes(result.notes)
     if as_json:
         value = _keystore_json(result, result.template, {}, dry_run)
-        print_json({**value, **_creation_json(result, dry_run), "from": str(earlier)})
+        print_json({**_creation_json(result, dry_run), **value, "from": str(earlier)})
     elif dry_run:
         print_plan(root, result.changes)
     else:
@@ -536,19 +536,26 @@ def _print_new_keystore(
 
 
 def _print_open_rights(template: Template) -> None:
+    for note in _open_rights(template):
+        click.echo(f"still open: {note.text}", err=True)
+
+
+def _open_rights(template: Template) -> list[Note]:
+    """Return what a template leaves open."""
     from sros_tool.keystore.template import EVERYTHING
 
+    found = []
     if template.default_permissions == EVERYTHING:
-        click.echo(
-            "still open: a new enclave may publish, subscribe and call everything; "
-            "restrict it with `sros create_permission` and a policy, or create the keystore with "
-            "`--template production`.",
-            err=True,
+        text = (
+            "a new enclave may publish, subscribe and call everything; restrict it with "
+            "`sros create_permission` and a policy, or create the keystore with "
+            "`--template production`."
         )
+        found.append(Note("keystore.open-permissions", text))
     if not template.separate_authorities:
-        click.echo(
-            "still open: with one CA for both, an enclave can sign its own permissions, and "
-            "Cyclone DDS 0.10.2 and Fast DDS 2.9.1 accept them; create the keystore with "
-            "`--ca-layout separate`.",
-            err=True,
+        text = (
+            "with one CA for both, an enclave can sign its own permissions, and Cyclone DDS 0.10.2 "
+            "and Fast DDS 2.9.1 accept them; create the keystore with `--ca-layout separate`."
         )
+        found.append(Note("keystore.single-ca", text))
+    return found

@@ -16,6 +16,7 @@ from typing import Any
 import click
 
 from sros_tool.cli.common import (
+    check_one_format,
     complete_keystore_and_enclave,
     json_option,
     now,
@@ -138,14 +139,16 @@ def env(
     """
     from sros_tool.runtime.environment import render_environment
 
+    check_one_format()
     root, rest = split_root(words)
     if len(rest) != 1:
         raise UsageError("env takes a keystore and one enclave")
     variables = loadable_environment(root, rest[0], domain, accept_key=accept_readable_key)
+    text = render_environment(variables, "json" if as_json else form)
     if as_json:
         print_json({"keystore": str(root), "enclave": rest[0], "variables": variables})
     else:
-        click.echo(render_environment(variables, form), nl=False)
+        click.echo(text, nl=False)
 
 
 class _WithCommand(click.Command):

@@ -12,6 +12,7 @@ import click
 from sros_tool.cli.common import (
     PATH,
     SeveralValues,
+    check_one_format,
     check_output,
     complete_template,
     dry_run_option,
@@ -113,6 +114,7 @@ def view(
 
     The page is one file that needs no network. No format contains keys or paths of this machine.
     """
+    check_one_format()
     moment = now()
     written = _format("json" if as_json else form, output, graphviz)
     if output:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -273,10 +274,50 @@ def test_a_property_that_no_schema_has_is_found(made_folder: Path) -> None:
         seen.check("list_enclaves", replace(ended, out=more))
 
 
+def test_what_a_template_leaves_open_is_in_the_notes(made_folder: Path, tmp_path: Path) -> None:
+    open_ = ["keystore.open-permissions", "keystore.single-ca"]
+    for template, layout, wanted in (
+        ("development", "single", open_),
+        ("development", "separate", open_[:1]),
+        ("production", "separate", []),
+    ):
+        words = ("--template", template, "--ca-layout", layout, "--json", "--dry-run")
+        shown = json.loads(sros("create_keystore", tmp_path / "ks", *words).ok().out)
+        ids = [each["id"] for each in shown["notes"]]
+        assert [each for each in ids if each in open_] == wanted
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        "env ks /a --format fish",
+        "view ks --format svg",
+        "check ks --format text",
+        "check ks --sarif",
+    ],
+)
+def test_json_and_another_format_exclude_each_other(words: str, made_folder: Path) -> None:
+    ended = sros(*words.split(), "--json", cwd=made_folder)
+    assert ended.status == 2
+    assert "exclude each other" in ended.err
+    verb, *target = words.split()[: 2 + words.startswith("env")]
+    sros(verb, *target, "--json", "--format", "json", cwd=made_folder).ok()
+
+
+def test_a_path_that_no_json_holds_is_not_in_an_environment(
+    made_folder: Path, tmp_path: Path
+) -> None:
+    root = tmp_path / os.fsdecode(b"k\xff")
+    shutil.copytree(made_folder / "ks", root, symlinks=True)
+    ended = sros("env", root, "/a", "--json")
+    assert ended.status == 2
+    assert json.loads(ended.out)["enclave"] is None
+
+
 # ── errors, and standard output that is an archive ─────────────────────────────────────────
 
 
-@pytest.mark.parametrize("verb", sorted({*VERBS} - {*WITHOUT_JSON}))
+@pytest.mark.parametrize("verb", sorted({*VERBS} - {*WITHOUT_JSON, "env"}))
 def test_an_error_prints_no_json(verb: str, made_folder: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(made_folder, tmp_path / "made", symlinks=True))
     text = sros(verb, *ERRORS[verb].split(), cwd=folder)
