@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -354,3 +355,11 @@ def test_a_line_feed_in_a_file_name_forges_no_line(tmp_path: Path) -> None:
     assert found.status != 0
     assert not [line for line in found.out.splitlines() if line.startswith("ok:")]
     assert "\\x0a\\x0aok" in found.out
+
+
+def test_permissions_in_place_of_the_governance_are_named(keystore: Path) -> None:
+    shutil.copy(keystore / "enclaves/a/permissions.p7s", keystore / "enclaves/governance.p7s")
+    for words in (("inspect", keystore), ("inspect", keystore, "--json")):
+        ended = sros(*words)
+        assert "it is a permissions document" in ended.out
+        assert not ended.err

@@ -111,12 +111,14 @@ def _keystore(root: Path, now: datetime) -> Description:
             authorities[role] = {"error": str(error)}
     names, unread = search_enclaves(root)
     enclaves = [_enclave(name, keystore.enclave(name, now=now)) for name in names]
-    governance = None
+    governance: Description | None = None
     if (root / GOVERNANCE_P7S).exists():
         try:
             governance = describe(root / GOVERNANCE_P7S, now=now)
         except SrosError as error:
             governance = {"error": str(error)}
+        if governance.get("kind", "governance") != "governance":
+            governance = {"error": f"it is a {governance['kind']} document"}
     problems = [f"{e['name']}: {problem}" for e in enclaves for problem in e["problems"]]
     unreadable = [f"'{each.path}' cannot be read: {each.why}" for each in unread]
     problems += unreadable

@@ -148,11 +148,18 @@ def _validated(key: rsa.RSAPrivateKey, name: str) -> rsa.RSAPrivateKey:
         raise _unreadable(name) from error
 
 
+_INITIAL_VALUE = re.compile(rb"^DEK-Info: *([^,\s]*),([0-9A-Fa-f]*)", re.MULTILINE)
+_HEX_DIGITS = {b"DES-CBC": 16, b"DES-EDE3-CBC": 16}
+"""Length of the initial value of ciphers with blocks of 64 bits; RFC 1421, 4.6.1.3."""
+
+
 def _check_derivation(pem: bytes, name: str) -> None:
     """Refuse an encrypted key whose file demands hours or gigabytes to try a passphrase.
 
     Source: RFC 5958, 3; RFC 8018, A; RFC 7914, 7.
     """
+    if (found := _INITIAL_VALUE.search(pem)) and len(found[2]) < _HEX_DIGITS.get(found[1], 32):
+        raise _unreadable(name)  # `cryptography` panics
     for block in _ENCRYPTED.findall(pem):
         try:
             scrypt, numbers = _derivation(block)

@@ -24,8 +24,10 @@ def reading(what: str, why: str, remedy: str = "") -> Iterator[None]:
     """
     try:
         yield
-    except Exception as error:
-        raise PkiError(what, why, remedy) from error
+    except BaseException as error:
+        if isinstance(error, Exception) or type(error).__name__ == "PanicException":
+            raise PkiError(what, why, remedy) from error
+        raise
 
 
 def read_name(name: x509.Name) -> None:

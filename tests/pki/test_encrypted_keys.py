@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 import subprocess
 from pathlib import Path
 
@@ -77,6 +78,18 @@ def test_keys_that_others_encrypted_are_read(words: str) -> None:
     pem = openssl(*words.split(), "-passout", f"pass:{PASSPHRASE}", data=key_pem(key))
     assert b"ENCRYPTED" in pem
     assert plain(load_key(pem, "k", lambda: PASSPHRASE)) == plain(key)
+
+
+@pytest.mark.parametrize("cipher", ["aes128", "aes256", "des3"])
+@pytest.mark.parametrize("digits", [0, 1, 15])
+def test_a_key_with_too_short_an_initial_value_is_damaged(cipher: str, digits: int) -> None:
+    """`cryptography` would panic, past every handler of errors."""
+    words = f"ec -{cipher} -passout pass:{PASSPHRASE}".split(" ", 3)
+    made = openssl(*words, data=key_pem(KEYS["EC"]))
+    assert load_key(made, "drawn", lambda: PASSPHRASE)
+    value = re.findall(rb"DEK-Info: \S+,([0-9A-F]+)", made)[0]
+    with pytest.raises(PkiError, match="cannot be read"):
+        load_key(made.replace(value, value[:digits]), "drawn", lambda: PASSPHRASE)
 
 
 def test_keys_that_earlier_versions_encrypted_are_read() -> None:
