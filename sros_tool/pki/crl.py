@@ -127,7 +127,10 @@ def lists_as_revoked(crl: x509.CertificateRevocationList, serial: int) -> bool:
 
     An entry with the reason removeFromCRL does not (OpenSSL 3, x509_vfy.c, cert_crl).
     """
-    entry = crl.get_revoked_certificate_by_serial_number(serial)
+    if serial < 0:  # RFC 5280 forbids it, OpenSSL accepts it, and the search below raises
+        entry = next((each for each in crl if each.serial_number == serial), None)
+    else:
+        entry = crl.get_revoked_certificate_by_serial_number(serial)
     return entry is not None and _revoked(entry).reason in REASONS
 
 

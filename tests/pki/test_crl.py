@@ -8,12 +8,14 @@ from pathlib import Path
 import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
 from sros_tool.pki.certificates import Issuer, authority_identifier, common_name, issue_ca, pem
 from sros_tool.pki.crl import lists_as_revoked, load_crl, refusal_of
-from sros_tool.pki.keys import generate_key
+from sros_tool.pki.keys import PrivateKey, generate_key
 from sros_tool.validity import Window
+from tests.integration.forged_signatures import Node
 from tests.support.children import run
 
 NOW = datetime.now(UTC).replace(microsecond=0)
@@ -106,3 +108,44 @@ def test_what_is_said_of_a_list_is_what_openssl_does(case: str, tmp_path: Path) 
     listed = lists_as_revoked(parsed.list, certificate.serial_number)
     assert (REFUSED if refusal_of(parsed.list) else REVOKED if listed else USABLE) == expected
     assert parsed.revokes(certificate.serial_number) is listed
+
+
+@pytest.mark.filterwarnings("ignore")  # of cryptography, for the serial number
+@pytest.mark.parametrize("listed", [False, True])
+def test_a_certificate_with_a_negative_serial_number(listed: bool, tmp_path: Path) -> None:
+    key, window = generate_key(), Window(NOW - DAY, NOW + DAY)
+    ca = issue_ca(key, common_name("CA"), window)
+    issued = Issuer(ca, key).issue(common_name("/a"), generate_key().public_key(), window)
+    (changed,) = Node.read(issued.public_bytes(serialization.Encoding.DER))
+    changed.children[0].children[1].content = b"\xfb"  # -5
+    certificate = x509.load_der_x509_certificate(signed_again(changed, key))
+    entry = x509.RevokedCertificateBuilder().revocation_date(NOW - DAY).serial_number(OWN)
+    built = (
+        x509.CertificateRevocationListBuilder()
+        .issuer_name(ca.subject)
+        .last_update(NOW - DAY)
+        .next_update(NOW + DAY)
+        .add_extension(authority_identifier(ca), critical=False)
+        .add_extension(x509.CRLNumber(1), critical=False)
+        .add_revoked_certificate(entry.build())
+        .sign(key, hashes.SHA256())
+    )
+    (changed,) = Node.read(built.public_bytes(serialization.Encoding.DER))
+    if listed:
+        entries = next(each for each in changed.children[0].children[::-1] if each.tag == 0x30)
+        entries.children[0].children[0].content = b"\xfb"
+    crl = x509.load_der_x509_crl(signed_again(changed, key))
+    (tmp_path / "ca").write_bytes(pem(ca))
+    (tmp_path / "crl").write_bytes(crl.public_bytes(serialization.Encoding.PEM))
+    (tmp_path / "certificate").write_bytes(pem(certificate))
+    command = ["openssl", "verify", "-crl_check", "-CAfile", "ca", "-CRLfile", "crl", "certificate"]
+    done = run(command, cwd=tmp_path, status=None)
+    assert ("certificate revoked" in done.stderr) is listed
+    assert lists_as_revoked(crl, certificate.serial_number) is listed
+
+
+def signed_again(changed: Node, key: PrivateKey) -> bytes:
+    assert isinstance(key, ec.EllipticCurvePrivateKey)
+    signature = key.sign(changed.children[0].write(), ec.ECDSA(hashes.SHA256()))
+    changed.children[2].content = b"\0" + signature
+    return changed.write()
