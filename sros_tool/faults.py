@@ -295,7 +295,8 @@ class Fault(Enum):
     DOCUMENT_SIZE = (
         "document-size",
         "permissions that are too large for a handshake",
-        "The node starts, and the handshake with its peers never finishes.",
+        "The node starts, and the handshake with its peers never finishes, if the permissions and "
+        "the certificate do not fit into one message of 64 KB.",
         "Fast DDS 2.9.1; measured.",
         "Make the permissions smaller, with wildcards, or split the enclave.",
     )

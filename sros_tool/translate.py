@@ -5,14 +5,22 @@ Names are mapped as in ros2/sros2, so that both tools give the same rights for a
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Set
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
-from sros_tool.dds.permissions import Criteria, Grant, Permissions, Rule, grant
-from sros_tool.names import ROS_DISCOVERY_TOPIC, expand
+from sros_tool.dds.permissions import (
+    LARGE_BYTES,
+    TOPIC_LINE_BYTES,
+    Criteria,
+    Grant,
+    Permissions,
+    Rule,
+    grant,
+)
+from sros_tool.names import ROS_DISCOVERY_TOPIC, expand, is_expression
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Qualifier
 from sros_tool.policy.patterns import covers
 from sros_tool.policy.rights import ACTION_PARTS, GOAL, Right
@@ -91,6 +99,9 @@ def permissions_for(
 
     The allow rule also has ``ros_discovery_info``, which every ROS 2 participant publishes and
     subscribes: no participant starts without that right.
+
+    A large document lists no name that a wildcard of the same list matches anyway.  A smaller one
+    has every name of the policy, so that it can be read next to it.
     """
     allowed, denied = _Topics(), _Topics()
     for profile in enclave.all_profiles():
@@ -100,9 +111,12 @@ def permissions_for(
                 topics = allowed if qualifier is ALLOW else denied
                 for name in group.names:
                     topics.add(right, expand(name, ns, node))
-    rules = [] if denied.is_empty() else [denied.rule(allow=False, domains=domains)]
     allowed.publish.add(ROS_DISCOVERY_TOPIC)
     allowed.subscribe.add(ROS_DISCOVERY_TOPIC)
+    if allowed.text_bytes() + denied.text_bytes() >= LARGE_BYTES:
+        allowed.shorten()
+        denied.shorten()
+    rules = [] if denied.is_empty() else [denied.rule(allow=False, domains=domains)]
     rules.append(allowed.rule(allow=True, domains=domains))
     return Permissions((grant(enclave.path, subject, validity, tuple(rules)),))
 
@@ -122,12 +136,36 @@ class _Topics:
     def is_empty(self) -> bool:
         return not (self.publish or self.subscribe)
 
+    def text_bytes(self) -> int:
+        return sum(TOPIC_LINE_BYTES + len(each) for each in (*self.publish, *self.subscribe))
+
+    def shorten(self) -> None:
+        self.publish = needed_expressions(self.publish)
+        self.subscribe = needed_expressions(self.subscribe)
+
     def rule(self, *, allow: bool, domains: DomainSet) -> Rule:
         return Rule(allow, domains, _criteria(self.publish), _criteria(self.subscribe))
 
 
 def _criteria(topics: set[str]) -> tuple[Criteria, ...]:
     return (Criteria(tuple(sorted(topics))),) if topics else ()
+
+
+def needed_expressions(topics: Set[str]) -> set[str]:
+    """Return ``topics`` without the ones that a wildcard among them matches, for every vendor.
+
+    What is left matches the same names.  An expression with a ``[set]``, which vendors read
+    differently, neither covers another one nor is left out.
+    """
+    alike = [each for each in topics if "[" not in each]
+    needed = set(topics)
+    wildcards = sorted(filter(is_expression, alike), key=lambda each: (len(each), each))
+    # The shortest wildcards stay.  What is left out covers nothing any more, so that of two
+    # wildcards that cover each other one remains.
+    for each in sorted(alike, key=lambda each: (-len(each), each)):
+        if any(wide != each and wide in needed and covers(wide, each) for wide in wildcards):
+            needed.remove(each)
+    return needed
 
 
 def governance_for(protection: DomainProtection, domains: DomainSet) -> Governance:

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from dataclasses import fields
 from datetime import UTC, datetime, timedelta
-from itertools import combinations
+from itertools import combinations, product
+from unittest.mock import patch
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sros_tool.dds.decision.access import Access
+from sros_tool.dds.decision.answers import AccessVerb, Outcome
+from sros_tool.dds.decision.matching import matches
+from sros_tool.dds.decision.vendors import Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, TopicRule, attributes
 from sros_tool.dds.permissions import Criteria, Permissions, Rule
+from sros_tool.keystore.issuing.proof import example_topics
 from sros_tool.names import ROS_DISCOVERY_TOPIC, expand
 from sros_tool.policy.model import ALLOW, DENY, RIGHTS, Enclave, Group, Profile, Profiles, Qualifier
 from sros_tool.policy.patterns import covers
@@ -22,11 +28,19 @@ from sros_tool.policy.protection import (
     NamedProtection,
     TopicProtection,
 )
-from sros_tool.translate import dds_names, governance_for, permissions_for, ros_rights
+from sros_tool.translate import (
+    dds_names,
+    governance_for,
+    needed_expressions,
+    permissions_for,
+    ros_rights,
+)
 from sros_tool.validity import window
 
 DOMAINS = DomainSet.parse("0,7")
-VALIDITY = window(datetime(2026, 1, 1, tzinfo=UTC), timedelta(days=1))
+BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
+VALIDITY = window(BEGIN, timedelta(days=2))
+NOW = BEGIN + timedelta(days=1)
 NAMES = (
     "x",
     "/x",
@@ -129,6 +143,79 @@ def test_the_rights_of_a_rule_are_its_topics(enclave: Enclave) -> None:
             told["subscribe"].update(names.subscribe)
         assert told["publish"] == topics([rule], "publish")
         assert told["subscribe"] == topics([rule], "subscribe")
+
+
+# ── large documents ────────────────────────────────────────────────────────────────────────
+
+PIECES = ["a", "b", "/", "*", "?", "**", "[ab]", "[!a]", "[^a]", "[[:alpha:]]"]
+expressions = st.lists(st.sampled_from(PIECES), min_size=1, max_size=4).map(
+    lambda pieces: "rt/" + "".join(pieces)
+)
+TOPICS = ["rt/" + "".join(each) for size in range(4) for each in product("ab/]", repeat=size)]
+
+
+@given(st.frozensets(expressions, max_size=8))
+def test_needed_expressions_match_the_same_names_for_every_vendor(listed: frozenset[str]) -> None:
+    needed = needed_expressions(listed)
+    assert needed <= listed
+    for style, topic in product(Style, TOPICS):
+        before, after = (
+            any(matches(style, each, topic) for each in some) for some in (listed, needed)
+        )
+        assert before == after, (style, topic)
+
+
+@pytest.mark.parametrize(
+    ("listed", "needed"),
+    [
+        ("rt/a rt/b", "rt/a rt/b"),
+        ("rt/a rt/* rq/aRequest", "rt/* rq/aRequest"),
+        ("rt/a/* rt/a/b/* rt/a/b rt/b", "rt/a/* rt/b"),
+        ("rt/?* rt/*? rt/ab", "rt/*? rt/?*"),
+        ("rt/** rt/* rt/***", "rt/*"),
+        ("rt/[ab] rt/a rt/[ab]?", "rt/[ab] rt/a rt/[ab]?"),
+        ("rt/* rt/[ab]", "rt/* rt/[ab]"),
+        ("rt/?a rt/b?", "rt/?a rt/b?"),
+        ("rt/*/a rt/b*", "rt/*/a rt/b*"),
+    ],
+)
+def test_needed_expressions(listed: str, needed: str) -> None:
+    assert needed_expressions(set(listed.split())) == set(needed.split())
+
+
+@given(enclaves)
+def test_a_large_document_decides_as_a_small_one(enclave: Enclave) -> None:
+    """Every vendor decides the same for every name, whether or not names are left out."""
+    full = made(enclave)
+    with patch("sros_tool.translate.LARGE_BYTES", 0):
+        short = made(enclave)
+    listed = {each for grant in full.grants for rule in grant.rules for each in all_topics(rule)}
+    names = set(example_topics(listed)) | {
+        name for each in listed for name in example_topics([each])
+    }
+    for vendor in Vendor:
+        governed = governance_for(DomainProtection(), DOMAINS)
+        one, other = (
+            Access(vendor, governed, each, "CN=/e", domain=7, at=NOW) for each in (full, short)
+        )
+        assert one.join().outcome is other.join().outcome is Outcome.ALLOWED
+        for name, verb in product(names, ("publish", "subscribe")):
+            before, after = (each.decide(AccessVerb(verb), name).outcome for each in (one, other))
+            assert before is after, (vendor, verb, name)
+
+
+def test_only_a_large_document_leaves_names_out() -> None:
+    """A smaller one can be read next to its policy."""
+    names = tuple(f"/sensors/{'very_' * 5}long_{number}" for number in range(800))
+    for few, expected in ((100, 102), (800, 2)):
+        group = Group("topics", (("publish", ALLOW),), ("/sensors/*", *names[:few]))
+        enclave = Enclave("/e", (Profiles((Profile("/", "n", (group,)),)),))
+        (rule,) = made(enclave).grants[0].rules
+        assert len(rule.publish[0].topics) == expected
+
+
+def all_topics(rule: Rule) -> set[str]:
+    return topics([rule], "publish") | topics([rule], "subscribe")
 
 
 def test_services_and_actions_are_told_as_such() -> None:

@@ -367,12 +367,14 @@ def _basics(checked: _CheckedPolicy, enclave: Enclave, profile: Profile) -> Iter
 DOCUMENT_SIZE = FindingKind(
     "portable.document-size",
     WARNING,
-    "signed permissions of 64 KB or more",
-    "Participants send them in the handshake. Fast DDS 2.9 never finishes such a handshake, and "
-    "sometimes aborts; Fast DDS 2.14 and Cyclone DDS accept them.",
+    "signed permissions of 60 KB or more",
+    "Participants send them in the handshake, with their certificate. If both do not fit into one "
+    "message of 64 KB, Fast DDS 2.9 never finishes the handshake, or aborts; Fast DDS 2.14 and "
+    "Cyclone DDS accept them.",
     "ros2/sros2 issue 228; Fast DDS 2.9.1 (SecurityManager.cpp) and 2.14.5, Cyclone DDS 0.10.2; "
     "measured.",
-    "Use wildcards (`sros minimize_policy` proposes them), or split the enclave.",
+    "Remove rights that are never used, or use wildcards (`sros minimize_policy` shows both), or "
+    "split the enclave.",
     vendors=(Vendor.FAST_2_9,),
 )
 LONG_NAME = FindingKind(

@@ -257,7 +257,7 @@ Example:
     never observed, but kept because every node needs it: 11
     observed, and not allowed
       publish topic /cmd_vel
-    permissions.p7s: 4044 bytes, then 4028, of at most 65535
+    permissions.p7s: 4044 bytes, then 4028, of at most 61439
   wrote 'narrow.xml'""",
 )
 @click.argument("policy", type=PATH)

@@ -97,7 +97,7 @@ def _faults(traits: VendorTraits, state: OpenedEnclave, at: datetime) -> Iterato
     largest = traits.largest_document
     if largest is not None and state.permissions_bytes > largest:
         text = f"it has {state.permissions_bytes} bytes, and from {largest + 1} on the "
-        yield Problem(PERMISSIONS_FILE, f"{text}handshake never finishes", Fault.DOCUMENT_SIZE)
+        yield Problem(PERMISSIONS_FILE, f"{text}handshake may never finish", Fault.DOCUMENT_SIZE)
 
 
 @lru_cache(maxsize=8)

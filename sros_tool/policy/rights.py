@@ -220,15 +220,18 @@ def compare(
 ) -> RightsDifference:
     """Return the differences of two sets of rights, for the enclaves in ``scope`` (None: all).
 
-    The difference is empty if and only if both state the same rights; an action counts as its
-    services and topics.
+    An action counts as its services and topics.  A right that only one side states is no difference
+    if wildcards that both state cover it: large permissions leave such names out.
     """
     one, other = (
         folded(each for each in side if scope is None or each.enclave in scope)
         for side in (first, second)
     )
-    only_first = tuple(sorted(one - other, key=order))
-    only_second = tuple(sorted(other - one, key=order))
+    both = Rules(unfolded(one) & unfolded(other) if one != other else ())
+    only_first, only_second = (
+        tuple(sorted((right for right in side if not both.cover(right)), key=order))
+        for side in (one - other, other - one)
+    )
     covered: dict[Right, tuple[Right, ...]] = {}
     for rights, side in ((only_first, other), (only_second, one)):
         rules = Rules(side if rights else ())

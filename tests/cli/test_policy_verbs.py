@@ -292,7 +292,7 @@ def test_minimize_with_permissions_and_several_observations(keystore: Path) -> N
     assert by_name["/a"]["ratio"] == 7.0
     assert [right["name"] for right in by_name["/b"]["never_observed"]] == ["/more"]
     assert by_name["/c"]["observed_at_all"] is False
-    assert by_name["/a"]["bytes"]["limit"] == 65536
+    assert by_name["/a"]["bytes"]["limit"] == 61440
 
 
 def test_what_every_node_needs_stays_unless_strict(folder: Path) -> None:

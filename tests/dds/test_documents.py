@@ -24,6 +24,7 @@ from sros_tool.dds.governance import (
     render_governance,
 )
 from sros_tool.dds.permissions import (
+    LARGE_BYTES,
     Criteria,
     Grant,
     Permissions,
@@ -206,3 +207,24 @@ def test_only_utf_8_is_read(encoding: str) -> None:
             read(declared(document, encoding))
         for name in ("utf-8", "us-ascii"):
             assert read(declared(document, name)) == read(document)
+
+
+@pytest.mark.parametrize("missing", [1, 0])
+def test_a_large_document_is_not_indented(missing: int) -> None:
+    """It says the same in fewer bytes, so that more fits below the limit of Fast DDS 2.9."""
+    names = tuple(f"rt/name_{number}" for number in range(1200))
+    small = document_of(names)
+    room = LARGE_BYTES - len(small.replace(b"\n", b"\r\n")) - missing
+    assert room > 0
+    made = document_of((*names[:-1], names[-1] + "n" * room))
+    assert (b"\n    <grant" in made) is bool(missing)
+    assert (len(made.replace(b"\n", b"\r\n")) == LARGE_BYTES - 1) is bool(missing)
+    assert bool(re.search(rb"\n ", made)) is bool(missing)
+    (grant,) = parse_permissions(made).grants
+    assert len(grant.rules[0].publish[0].topics) == 1200
+
+
+def document_of(topics: tuple[str, ...]) -> bytes:
+    rule = Rule(True, DomainSet.of((0, 0)), (Criteria(topics),))
+    date = "2026-01-01T00:00:00Z"
+    return render_permissions(Permissions((Grant("/a", "CN=/a", date, date, (rule,)),)))

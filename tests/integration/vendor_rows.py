@@ -365,7 +365,11 @@ def names() -> list[Row]:
     """Names of topics at the limit."""
     everything = permissions(grant(allow(criteria("publish", "*"))))
     unclosed = permissions(grant(allow(criteria("publish", "rt/[z-"))))
+    listed = [f"rt/{'long_' * 8}{number}" for number in range(975)]
+    large = permissions(grant(allow(criteria("publish", *listed, "rt/a"))))
+    assert 59_500 < len(large) < 59_800, "signed, it is just below the limit"
     return [
+        Row("the last name of permissions of 60 KB", ask(large), YES, YES),
         Row("a name of 251 characters", ask(everything, f"rt/{'n' * 248}"), YES, YES),
         Row("a name of 252 characters", ask(everything, f"rt/{'n' * 249}"), PEER_DENIES, YES),
         Row("a set that ends in an open range", ask(unclosed, "rt/[z-"), NO, INVALID),

@@ -1,4 +1,4 @@
-"""Every command that issues reports a validity that the CA's expiry shortens."""
+"""Issuing: validity that the CA's expiry shortens is reported, large permissions are shortened."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.dds.permissions import MAX_SIGNED_BYTES
 from sros_tool.errors import Note
 from sros_tool.keystore.delivery.request import create_request
 from sros_tool.keystore.delivery.signing import sign_request
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore
 from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.template import load_template
+from tests.support.harness import policy_text, publish, sros, topics_of
 
 NOW = datetime(2026, 6, 1, tzinfo=UTC)
 LATE = NOW + timedelta(days=1800)  # CAs of the production template are valid for 1825 days
@@ -50,3 +52,41 @@ def test_a_validity_shortened_by_less_than_one_percent_gets_no_note(tmp_path: Pa
     for days, said in ((0, 0), (30, 0), (60, 2)):
         notes = create_enclaves(root, [f"/e{days}"], now=NOW + timedelta(days=days)).notes
         assert len(early(notes)) == said
+
+
+# ── large permissions ──────────────────────────────────────────────────────────────────────
+
+NAMES = tuple(f"/sensors/{'very_' * 3}long_{number}" for number in range(1000))
+
+
+@pytest.mark.parametrize(
+    ("names", "listed", "fits"),
+    [
+        (("/sensors/a", "/sensors/*"), 2, True),
+        ((*NAMES, "/sensors/*"), 1, True),
+        (NAMES, 1000, True),  # with indentation it would be too large
+        ((*NAMES, *(f"{each}_more" for each in NAMES)), 2000, False),
+    ],
+)
+def test_large_permissions_are_as_small_as_they_can_be(
+    names: tuple[str, ...], listed: int, fits: bool, tmp_path: Path
+) -> None:
+    keystore, policy = tmp_path / "ks", tmp_path / "policy.xml"
+    policy.write_text(policy_text({"/a": publish(*names)}))
+    sros("create_keystore", keystore).ok()
+    sros("create_enclave", keystore, "/a").ok()
+    done = sros("create_permission", keystore, "/a", policy).ok()
+    signed = keystore / "enclaves" / "a" / "permissions.p7s"
+    assert (signed.stat().st_size < MAX_SIGNED_BYTES) is fits
+    assert ("sros minimize_policy" in done.err) is not fits
+    topics = {topic for topic in topics_of(signed.parent) if "/sensors/" in topic}
+    assert len(topics) == listed
+    # The keystore has what the policy says, also where it lists less.
+    sros("diff_policy", policy, keystore).ok()
+    stale = ("check", keystore, "--policy", policy, "--include", "enclave.stale-permissions")
+    sros(*stale).ok()
+    other = tmp_path / "other.xml"
+    other.write_text(policy_text({"/a": publish(*names[1:], "/elsewhere")}))
+    assert sros("diff_policy", other, keystore).status == 1
+    stale = ("check", keystore, "--policy", other, "--include", "enclave.stale-permissions")
+    assert sros(*stale).status == 1

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from unittest.mock import patch
 
 import pytest
 from hypothesis import given, settings
@@ -24,6 +26,7 @@ from sros_tool.keystore.issuing.proof import (
     signed_expressions,
     stated_expressions,
 )
+from sros_tool.names import ROS_DISCOVERY_TOPIC
 from sros_tool.pki import smime
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Enclave, Policy, Qualifier
@@ -76,6 +79,57 @@ def test_stated_expressions_allow_what_the_policy_allows(policy: Policy) -> None
                 for verb in ("publish", "subscribe"):
                     allowed = rules.allow(enclave.path, verb, topic[2:])
                     assert stated.allow(verb, topic) == allowed, (verb, topic)
+
+
+@settings(max_examples=30)
+@given(policies())
+def test_the_short_form_of_a_large_document_is_proven(policy: Policy) -> None:
+    for enclave in policy.enclaves:
+        with patch("sros_tool.translate.LARGE_BYTES", 0):
+            made = permissions_of(enclave)
+        prove(enclave, made, DOMAINS)
+        assert differences(enclave, made, DOMAINS, ASKED) == []
+
+
+SHORT = '<topics publish="ALLOW"><topic>/x/*</topic><topic>/x/a</topic><topic>/x/b*</topic>'
+
+
+@pytest.mark.parametrize(
+    ("more", "signed", "same"),
+    [
+        ("", "rt/x/*", True),
+        ("", "rt/x/* rt/x/a", True),
+        ("", "rt/x/a rt/x/b*", False),
+        ("<topic>/y</topic>", "rt/x/*", False),
+        ("<topic>/y/*</topic>", "rt/x/*", False),
+        ("<topic>/x*</topic>", "rt/x/*", False),
+        ("<topic>/x*</topic>", "rt/x*", True),
+        ("<topic>/[xy]/*</topic>", "rt/[xy]/*", True),
+        ("<topic>/[xy]/*</topic>", "rt/x/*", False),
+    ],
+)
+def test_only_what_a_wildcard_matches_is_left_out(
+    more: str, signed: str, same: bool, tmp_path: Path
+) -> None:
+    enclave = of_text(f"{SHORT}{more}</topics>", tmp_path)
+    (full,) = permissions_of(enclave).grants[0].rules
+    topics = (*signed.split(), ROS_DISCOVERY_TOPIC)
+    rule = replace(full, publish=(Criteria(topics),))
+    made = only_grant(permissions_of(enclave), lambda grant: replace(grant, rules=(rule,)))
+    with nullcontext() if same else pytest.raises(KeystoreError, match="would not match"):
+        prove(enclave, made, DOMAINS)
+
+
+def test_the_short_form_is_proven_without_asking_the_engine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Asking takes minutes for a large document."""
+    enclave = of_text(f"{SHORT}</topics>", tmp_path)
+    monkeypatch.setattr("sros_tool.translate.LARGE_BYTES", 0)
+    made = permissions_of(enclave)
+    monkeypatch.setattr(proof, "differences", lambda *_: pytest.fail("the engine was asked"))
+    assert len(made.grants[0].rules[0].publish[0].topics) == 2
+    prove(enclave, made, DOMAINS)
 
 
 # ── errors are found ───────────────────────────────────────────────────────────────────────

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import product
+
+import pytest
 from hypothesis import given
 
+from sros_tool.names import ACTION_SERVICES
 from sros_tool.policy.model import ALLOW, DENY, Policy
 from sros_tool.policy.rights import Right, Rules, compare, policy_rights
-from tests.policy.drawn_policies import PATHS, listed, policies
+from tests.policy.drawn_policies import PATHS, listed, meant, policies
 
 
 def right(name: str, word: str = "publish", enclave: str = "/a") -> Right:
@@ -14,13 +18,44 @@ def right(name: str, word: str = "publish", enclave: str = "/a") -> Right:
 
 
 @given(policies(), policies())
-def test_empty_just_if_the_permissions_list_the_same(first: Policy, second: Policy) -> None:
-    same = all(
-        listed(first, path, allow=allow) == listed(second, path, allow=allow)
-        for path in PATHS
-        for allow in (True, False)
-    )
-    assert bool(compare(policy_rights(first), policy_rights(second))) is not same
+def test_empty_only_if_dds_is_told_the_same(first: Policy, second: Policy) -> None:
+    both = list(product(PATHS, (True, False)))
+    difference = compare(policy_rights(first), policy_rights(second))
+    if all(listed(first, p, allow=a) == listed(second, p, allow=a) for p, a in both):
+        assert not difference
+    if not difference:
+        assert all(meant(first, p, allow=a) == meant(second, p, allow=a) for p, a in both)
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "lines"),
+    [
+        (["publish /x", "publish /*"], ["publish /*"], []),
+        (["publish /x", "publish /*"], ["publish /y", "publish /*"], []),
+        (["publish /x"], ["publish /*"], ["+ publish /*", "- publish /x"]),
+        (["publish /x", "publish /*"], ["publish /x"], ["- publish /*"]),
+        (["publish /x", "subscribe /*"], ["subscribe /*"], ["- publish /x"]),
+        (["publish /x/y", "publish /x/*"], ["publish /x/?", "publish /x/*"], []),
+        (["publish /**"], ["publish /*"], ["+ publish /*", "- publish /**"]),
+        (
+            ["call /f", "subscribe /*"],
+            [*(f"request /f/_action/{each}" for each in ACTION_SERVICES), "subscribe /*"],
+            [],
+        ),
+        (["call /f", "subscribe /*"], ["subscribe /*"], ["- call /f"]),
+    ],
+)
+def test_what_a_wildcard_of_both_covers_is_no_difference(
+    first: list[str], second: list[str], lines: list[str]
+) -> None:
+    one, other = ([right(*each.split()[::-1]) for each in side] for side in (first, second))
+    found = compare(one, other).lines()
+    assert [f"{sign} {each.right} {each.name}" for sign, each in found] == lines
+
+
+def test_a_denial_does_not_cover_a_permission() -> None:
+    denied = Right("/a", DENY, "publish", "/*")
+    assert compare([right("/x"), denied], [denied]).only_first == (right("/x"),)
 
 
 @given(policies(), policies())

@@ -184,8 +184,10 @@ def test_wildcards_of_services_and_topics_count_known_actions() -> None:
 
 
 def test_the_size_of_a_right_is_what_it_adds() -> None:
+    """In a document so large that its size matters."""
     scale = SizeEstimator()
     bare = group("topics", "/x", "publish subscribe") + group("services", "/s", "request reply")
+    bare += group("topics", " ".join(f"/long/name/n{number}" for number in range(1500)), "publish")
     before = scale.signed_bytes(policy(bare).enclaves[0])
     for right in ("publish /longer/name", "request /srv", "call /fibonacci", "execute /f"):
         word, name = right.split()

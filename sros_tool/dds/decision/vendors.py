@@ -164,7 +164,7 @@ class VendorTraits:
     hashes: Hashes = Hashes.ANY
     keys: Keys = Keys.ANY
     largest_document: int | None = None
-    """With larger signed permissions, in bytes, a handshake never finishes."""
+    """With larger signed permissions, in bytes, a handshake may never finish."""
 
 
 _STANDARD = VendorTraits("DDS-Security 1.1")
@@ -222,7 +222,7 @@ class Vendor(StrEnum):
             refuses_open_rtps=False,
             signers=Signers.CHAIN,
             verifies_authorities=False,
-            largest_document=64 * 1024 - 1,
+            largest_document=60 * 1024 - 1,
         ),
     )
     CYCLONE = (

@@ -4,8 +4,8 @@ A policy allows a topic if a rule allows it and no rule denies it.  DDS applies 
 matches.  Both decide the same for every topic name if
 
 - the document has one grant, its deny rules come first, every rule is for all domains of the
-  keystore and without partitions, the default is to deny, and its expressions equal the policy's:
-  a comparison of sets;
+  keystore and without partitions, the default is to deny, and its expressions equal the policy's,
+  but for those that a wildcard of the same list matches anyway: a comparison of sets;
 - the vendors match each expression with wildcards as a policy does: a comparison of matchers, for
   names that distinguish them.  (Without wildcards, an expression matches only itself.)
 
@@ -92,6 +92,19 @@ class ExpressionSets:
             self.denied[verb], topic
         )
 
+    def says(self, stated: ExpressionSets) -> bool:
+        """Return whether these match the same names as ``stated``, of which they are a part."""
+        return all(
+            own <= theirs and _matched_anyway(theirs - own, own)
+            for own, theirs in self.beside(stated)
+        )
+
+    def beside(self, other: ExpressionSets) -> Iterator[tuple[set[str], set[str]]]:
+        """Yield each of these sets with the one of ``other`` for the same side and direction."""
+        for own, theirs in ((self.allowed, other.allowed), (self.denied, other.denied)):
+            for verb in (_OUT, _IN):
+                yield own[verb], theirs[verb]
+
     def all(self) -> Iterator[str]:
         """Yield every expression, perhaps more than once."""
         for side in (self.allowed, self.denied):
@@ -124,7 +137,8 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
     """Raise `KeystoreError` unless ``permissions`` decide as ``policy`` does on all ``domains``."""
     stated = stated_expressions(policy)
     wildcards = {each for each in stated.all() if is_expression(each)}
-    if signed_expressions(permissions, domains) == stated and all(map(matched_as_meant, wildcards)):
+    signed = signed_expressions(permissions, domains)
+    if signed and signed.says(stated) and all(map(matched_as_meant, wildcards)):
         return
     found = differences(policy, permissions, domains)
     if found:
@@ -134,6 +148,23 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
             + (f" (and {len(found) - 1} more differences)." if len(found) > 1 else "."),
             "Nothing was written. This is a defect of sros: please report it with the policy.",
         )
+
+
+def _matched_anyway(left_out: set[str], present: set[str]) -> bool:
+    """Return whether one of the wildcards in ``present`` matches all that each left out one does.
+
+    This does not use `covers`, by which `sros_tool.translate` leaves them out.
+    """
+    wildcards = list(filter(is_expression, present))
+    return all(
+        any(
+            common_name([each], [wide], absolute=False) is None
+            if is_expression(each)
+            else matches(wide, each)
+            for wide in wildcards
+        )
+        for each in left_out
+    )
 
 
 @lru_cache(maxsize=4096)
@@ -196,13 +227,18 @@ def differences(
     """Return the differences between the vendors' decisions and the policy.
 
     They are compared for the `example_topics` of all expressions together, and of each expression
-    with wildcards alone.
+    with wildcards alone, and for a topic of each expression that only one of both has.
     """
     stated = stated_expressions(policy)
     expressions = {*stated.all(), *_topics(permissions)}
     topics = set(example_topics(expressions))
     for each in filter(is_expression, expressions):
         topics.update(example_topics([each]))
+    signed = signed_expressions(permissions, domains)
+    for pair in signed.beside(stated) if signed else ():
+        for one, other in (pair, pair[::-1]):
+            names = (common_name([each], sorted(other), absolute=False) for each in one - other)
+            topics.update(filter(None, names))
     found = []
     for vendor in vendors:
         for domain in _ends(domains):

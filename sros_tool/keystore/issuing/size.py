@@ -14,7 +14,7 @@ from sros_tool.policy.rights import Right
 from sros_tool.translate import dds_names, permissions_for
 from sros_tool.validity import window
 
-_LINE = len("            <topic></topic>\r\n")
+_LINE = len("<topic></topic>\r\n")
 
 
 class SizeEstimator:
@@ -42,6 +42,9 @@ class SizeEstimator:
 
 
 def right_bytes(right: Right) -> int:
-    """Return the size in bytes of one right in a permissions document: one line per DDS topic."""
+    """Return the size in bytes of one right in a large permissions document.
+
+    It has one line per DDS topic.  In a smaller document the lines are indented as well.
+    """
     names = dds_names(right.right, right.name)
     return sum(_LINE + len(name) for name in (*names.publish, *names.subscribe))
