@@ -233,6 +233,52 @@ def _narrow_first(rules: list[TopicRule]) -> list[TopicRule]:
     return ordered
 
 
+def protection_for(governance: Governance) -> DomainProtection | None:
+    """Return the protection that `governance_for` translates to ``governance``, or None.
+
+    None means that the document protects a DDS topic without a ROS name, half of a service, or
+    single domains in different ways, which no settings of a keystore can state.
+    """
+    from sros_tool.policy.protection import DomainProtection, NamedProtection, TopicProtection
+
+    if len(governance.domain_access_rules) != 1:
+        return None
+    (rule,) = governance.domain_access_rules
+    *narrow, last = rule.topic_access_rules or (None,)
+    if last is None or last.topic_expression != "*":
+        return None
+    by_protection: dict[TopicProtection, list[str]] = {}
+    for each in narrow:
+        if each is not None:
+            values = TopicProtection(**_terms(each))
+            by_protection.setdefault(values, []).append(each.topic_expression)
+    named = []
+    for values, expressions in by_protection.items():
+        both = (Criteria(tuple(expressions)),)
+        found = ros_rights(Rule(True, rule.domains, both, both))
+        if any(each.kind == "dds" for each in found):
+            return None
+        places = dict.fromkeys((each.kind, each.name) for each in found)
+        named += [NamedProtection(kind, name, values) for kind, name in places]
+    order = [each.topic_expression for each in narrow if each is not None]
+    named.sort(key=lambda each: min(order.index(one) for one in _expressions(each)))
+    protection = DomainProtection(
+        **_terms(rule), default=TopicProtection(**_terms(last)), named=tuple(named)
+    )
+    same = governance_for(protection, governance.domains().closed())
+    return protection if same == governance else None
+
+
+def _terms(rule: DomainRule | TopicRule) -> dict[str, Any]:
+    """Map the fields of a protection to the values of a rule, as `_values` does backwards."""
+    from sros_tool.policy.protection import Level
+
+    chosen = {each: getattr(rule, each.name) for each in attributes(type(rule))}
+    return {
+        each.term: value if each.is_flag else Level(str(value)) for each, value in chosen.items()
+    }
+
+
 # ── DDS → ROS ──────────────────────────────────────────────────────────────────────────────
 
 

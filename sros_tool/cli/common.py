@@ -303,6 +303,19 @@ def print_closed(root: Path, changes: Sequence[Change]) -> None:
         )
 
 
+_MAX_NAMES = 5
+"""Number of enclaves that a message names."""
+
+
+def print_restart(names: Sequence[str]) -> None:
+    """Print on stderr that the processes of the enclaves ``names`` have to be restarted."""
+    if not names:
+        return
+    shown = ", ".join(names[:_MAX_NAMES]) + (", ..." if len(names) > _MAX_NAMES else "")
+    number = "1 enclave" if len(names) == 1 else f"{len(names)} enclaves"
+    click.echo(f"restart the processes of {number} for it to take effect: {shown}", err=True)
+
+
 def check_output(output: Path, *, force: bool) -> None:
     """Check that ``output`` can be written.
 

@@ -1,9 +1,10 @@
-"""The verbs that create keystores, enclaves and permissions, and list enclaves."""
+"""The verbs that create and change keystores, enclaves and permissions, and list enclaves."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -23,6 +24,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     print_plan,
+    print_restart,
     ros_domain,
     several_enclaves,
     split_root,
@@ -34,6 +36,8 @@ from sros_tool.errors import Note, UsageError
 
 if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.create import Creation
+    from sros_tool.keystore.lifecycle.replaced import ReplacedRights
+    from sros_tool.keystore.lifecycle.update import KeystoreUpdate
 
 
 @click.command(
@@ -76,6 +80,13 @@ def create_enclave(words: tuple[str, ...], dry_run: bool, as_json: bool) -> None
     _show(result, dry_run, as_json)
 
 
+_revoke_old_option = click.option(
+    "--revoke-old",
+    is_flag=True,
+    help="Also issue the certificates again, and revoke all earlier ones.",
+)
+
+
 @click.command(
     "create_permission",
     epilog="""\b
@@ -92,16 +103,22 @@ Example:
     shell_complete=complete_keystore_and_enclave,
 )
 @several_enclaves
+@_revoke_old_option
 @dry_run_option
 @json_option
 def create_permission(
     words: tuple[str, ...],
     every: bool,
     patterns: tuple[str, ...],
+    revoke_old: bool,
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Give the enclaves NAME... the permissions that POLICY_FILE states for them: all or none."""
+    """Give the enclaves NAME... the permissions that POLICY_FILE states for them: all or none.
+
+    Anyone who has a copy of the replaced permissions, with the certificate of that time, can use
+    them until they expire. With --revoke-old, processes that load the new crl.pem refuse them.
+    """
     from sros_tool.keystore.lifecycle.create import create_permission as create
     from sros_tool.policy.document import read_policy
 
@@ -115,6 +132,7 @@ def create_permission(
         read_policy(PATH.convert(file, None, None)),
         now=now(),
         domain=ros_domain(),
+        revoke_old=revoke_old,
         keyring=keyring(),
         dry_run=dry_run,
     )
@@ -149,28 +167,32 @@ Example:
 @click.option(
     "--template",
     "template_name",
-    default="development",
-    show_default=True,
     metavar="NAME|FILE",
-    help="Template to create a missing keystore from: a name, or a TOML file.",
+    help="Template to create a missing keystore from: a name, or a TOML file.  "
+    "[default: development]",
     shell_complete=complete_template,
 )
+@_revoke_old_option
 @dry_run_option
 @json_option
 def generate_artifacts(
     keystore_root_path: Path | None,
     enclaves: tuple[str, ...],
     policy_files: tuple[Path, ...],
-    template_name: str,
+    template_name: str | None,
+    revoke_old: bool,
     dry_run: bool,
     as_json: bool,
 ) -> None:
     """Create enclaves, with the permissions that policies state for them: all or nothing.
 
-    The permissions in a policy replace the current permissions of an enclave.
+    The permissions in a policy replace the current permissions of an enclave; what --revoke-old
+    does then is described at `sros create_permission --help`.
     """
+    from sros_tool.keystore.layout import is_keystore
     from sros_tool.keystore.lifecycle.create import generate_artifacts as generate
-    from sros_tool.keystore.template import load_template
+    from sros_tool.keystore.lifecycle.create import refuse_other_template
+    from sros_tool.keystore.template import DEFAULT_TEMPLATE, load_template
     from sros_tool.policy.document import read_policy
 
     root = keystore_root_path or keystore_from_environment()
@@ -179,7 +201,9 @@ def generate_artifacts(
             "neither an enclave nor a policy is named", "", "Give -e NAME... or -p FILE... ."
         )
     policies = [read_policy(path) for path in policy_files]
-    template = load_template(template_name)
+    template = load_template(template_name or DEFAULT_TEMPLATE)
+    if template_name is not None and is_keystore(root):
+        refuse_other_template(root, template)
     total = len(enclaves) + sum(len(policy.enclaves) for policy in policies)
     with progress("signing", total) as step:
         result = generate(
@@ -189,6 +213,7 @@ def generate_artifacts(
             now=now(),
             domain=ros_domain(),
             create=template,
+            revoke_old=revoke_old,
             keyring=keyring(),
             dry_run=dry_run,
             progress=step,
@@ -198,9 +223,13 @@ def generate_artifacts(
         if not as_json:
             _print_new_keystore(root, template, result.domains)
     _show(result, dry_run, as_json)
+    if result.new_keystore:
+        _print_open_rights(root, template)
 
 
 def _show(result: Creation, dry_run: bool, as_json: bool) -> None:
+    from sros_tool.validity import iso
+
     if as_json:
         print_json(_creation_json(result, dry_run))
     elif dry_run:
@@ -217,10 +246,27 @@ def _show(result: Creation, dry_run: bool, as_json: bool) -> None:
         click.echo(f"enclave {name} already exists: not changed", err=True)
     if not dry_run:
         print_closed(result.root, result.changes)
+    _show_rights(result.replaced, dry_run, err=True)  # stdout is that of ros2/sros2
+    for each in result.replaced:
+        if each.lost and each.works_until:
+            name, root = quote(each.enclave), quote(str(result.root))
+            click.echo(
+                f"{each.enclave}: what it lost works until {iso(each.works_until)} for whoever "
+                "kept its earlier permissions and its key, and in its processes until they are "
+                f"restarted. To end it, run `sros renew {root} {name} --revoke-old`, and restart "
+                "all processes, those of this enclave first.",
+                err=True,
+            )
+    if result.restart:
+        print_restart(result.restart)
+    for remark in result.remarks:
+        click.echo(remark.text, err=True)
     print_notes(result.notes)
 
 
 def _creation_json(result: Creation, dry_run: bool) -> dict[str, Any]:
+    from sros_tool.values import as_plain
+
     names = ("created", "changed", "completed", "kept")
     return {
         "keystore": str(result.root),
@@ -231,9 +277,23 @@ def _creation_json(result: Creation, dry_run: bool) -> dict[str, Any]:
             for each in names
             for name in getattr(result, each)
         ],
+        "rights": as_plain(result.replaced),
+        "restart": list(result.restart),
         "changes": changes_json(result.root, result.changes),
-        "notes": notes_json(result.notes),
+        "notes": notes_json((*result.notes, *result.remarks)),
     }
+
+
+def _show_rights(replaced: Sequence[ReplacedRights], dry_run: bool, *, err: bool = False) -> None:
+    """Print what enclaves lose and gain, on stdout or with ``err`` on stderr."""
+    from sros_tool.keystore.lifecycle.replaced import rights_text
+
+    would = "would " if dry_run else ""
+    for each in replaced:
+        for verb, rights in (("lose", each.lost), ("gain", each.gained)):
+            if rights:
+                text = f"{each.enclave} {would}{verb}{'' if dry_run else 's'}: "
+                click.echo(visible(text + rights_text(rights)), err=err)
 
 
 @click.command(
@@ -265,7 +325,7 @@ def list_enclaves(root: Path | None, as_json: bool) -> None:
 
 if TYPE_CHECKING:
     from sros_tool.dds.domains import DomainSet
-    from sros_tool.keystore.template import Template
+    from sros_tool.keystore.template import NamedValues, Template
 
 
 @click.command(
@@ -385,7 +445,7 @@ def create_keystore(
     else:
         _print_new_keystore(root, template, result.domains, frozenset(imported))
     if not dry_run:
-        _print_open_rights(template)
+        _print_open_rights(root, template)
 
 
 def _keystore_json(
@@ -410,7 +470,7 @@ def _keystore_json(
         "domains": str(result.domains),
         "authorities": authorities,
         "changes": changes_json(result.root, result.changes),
-        "notes": notes_json((*result.notes, *_open_rights(template))),
+        "notes": notes_json((*result.notes, *_open_rights(result.root, template))),
     }
 
 
@@ -460,7 +520,7 @@ def _adopt(root: Path, earlier: Path, dry_run: bool, as_json: bool) -> None:
         "and --ros-args --enclave NAME, or by `sros run`.",
         err=True,
     )
-    _print_open_rights(result.template)
+    _print_open_rights(root, result.template)
 
 
 def _choices(
@@ -535,27 +595,273 @@ def _print_new_keystore(
             click.echo(f"    imported, valid until {iso(validity_of(certificate).not_after)}")
 
 
-def _print_open_rights(template: Template) -> None:
-    for note in _open_rights(template):
+def _print_open_rights(root: Path, template: Template) -> None:
+    for note in _open_rights(root, template):
         click.echo(f"still open: {note.text}", err=True)
 
 
-def _open_rights(template: Template) -> list[Note]:
+def _open_rights(root: Path, template: Template) -> list[Note]:
     """Return what a template leaves open."""
     from sros_tool.keystore.template import EVERYTHING
 
+    change = f"`sros update_keystore {quote(str(root))} --template production`"
     found = []
     if template.default_permissions == EVERYTHING:
         text = (
-            "a new enclave may publish, subscribe and call everything; restrict it with "
-            "`sros create_permission` and a policy, or create the keystore with "
-            "`--template production`."
+            f"by the template {template.name}, an enclave without a policy may publish, subscribe "
+            "and call everything; restrict it with `sros create_permission` and a policy, or the "
+            f"whole keystore with {change}."
         )
         found.append(Note("keystore.open-permissions", text))
     if not template.separate_authorities:
         text = (
             "with one CA for both, an enclave can sign its own permissions, and Cyclone DDS 0.10.2 "
-            "and Fast DDS 2.9.1 accept them; create the keystore with `--ca-layout separate`."
+            "and Fast DDS 2.9.1 accept them; create the keystore with `--ca-layout separate`, or "
+            f"change it with {change}."
         )
         found.append(Note("keystore.single-ca", text))
     return found
+
+
+@click.command(
+    "update_keystore",
+    epilog="""\b
+Example:
+  $ sros update_keystore keystore --template production --dry-run
+  would update keystore 'keystore': template development -> production
+    tighter  protection.rtps SIGN -> ENCRYPT: whole messages: encrypted
+    ...
+  $ sros update_keystore keystore --template production --next
+  $ sros update_keystore keystore --template production --next
+  $ sros update_keystore keystore --domain 0,7 --allow-looser
+  $ sros update_keystore keystore --set permissions.validity=90d \\
+        --rule 'topic /camera/* data=NONE metadata=SIGN' --allow-looser""",
+)
+@click.argument("root", type=PATH, required=False)
+@click.option(
+    "--template",
+    "template_name",
+    metavar="NAME|FILE",
+    help="Take over all settings of a template: a name, or a TOML file.",
+    shell_complete=complete_template,
+)
+@click.option(
+    "--set",
+    "values",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Change one setting, such as protection.rtps=ENCRYPT or permissions.validity=90d.",
+)
+@click.option(
+    "--rule",
+    "rules",
+    multiple=True,
+    metavar="RULE",
+    help="Protect a name of its own: 'topic /camera/* data=NONE metadata=SIGN'.",
+)
+@click.option(
+    "--drop-rule",
+    "dropped",
+    multiple=True,
+    metavar="RULE",
+    help="Remove the protection of a name: 'topic /camera/*'.",
+)
+@click.option("--domain", metavar="IDS", help="The ROS domains of its enclaves: 0 or 0,7 or 10-19.")
+@click.option(
+    "--take-edits", is_flag=True, help="Carry out what sros.toml or governance.xml now says."
+)
+@click.option(
+    "--discard-edits", is_flag=True, help="Write sros.toml and governance.xml as they were."
+)
+@click.option("--next", "next_stage", is_flag=True, help="Do only the next stage.")
+@click.option(
+    "--allow-looser", is_flag=True, help="Allow that something becomes possible that was not."
+)
+@_revoke_old_option
+@json_option
+@dry_run_option
+def update_keystore(
+    root: Path | None,
+    template_name: str | None,
+    values: tuple[str, ...],
+    rules: tuple[str, ...],
+    dropped: tuple[str, ...],
+    domain: str | None,
+    take_edits: bool,
+    discard_edits: bool,
+    next_stage: bool,
+    allow_looser: bool,
+    revoke_old: bool,
+    as_json: bool,
+    dry_run: bool,
+) -> int:
+    """Change the settings of the keystore ROOT, and sign again what follows from them.
+
+    The keys are those of sros.toml. What becomes looser and what tighter is shown, and a looser
+    keystore has to be allowed. Keys of enclaves stay, and so do the rights of policies.
+
+    By default all is changed at once. With --next, in two stages: first the certificates and
+    permissions, after which processes are restarted one by one; then, with the same command, the
+    governance. Where that changes the protection of messages, processes with the old one and with
+    the new one do not communicate (Cyclone DDS 0.10.2, Fast DDS 2.9.1): restart them together.
+
+    The exit status of a dry run is 1 if --allow-looser is needed and missing.
+    """
+    from sros_tool.dds.domains import DomainSet
+    from sros_tool.keystore.lifecycle.update import (
+        edited_settings,
+        present_settings,
+    )
+    from sros_tool.keystore.lifecycle.update import update_keystore as work
+    from sros_tool.keystore.template import load_template, with_values
+
+    root = root or keystore_from_environment()
+    if sum((template_name is not None, take_edits, discard_edits)) > 1 and not (
+        template_name and discard_edits
+    ):
+        raise UsageError("give only one of --template, --take-edits and --discard-edits")
+    chosen = (template_name, values, rules, dropped, domain, take_edits, discard_edits)
+    if not any(each not in (None, (), False) for each in chosen):
+        raise UsageError(
+            "no change is named", "", "Name one with --template, --set, --rule or --domain."
+        )
+    if take_edits and next_stage:
+        raise UsageError(
+            "--take-edits has no stages",
+            "The first stage would write sros.toml, and so undo the edits of the second one.",
+            "Copy sros.toml elsewhere, undo the edits with --discard-edits, and name the copy with "
+            "--template.",
+        )
+    present = present_settings(root)
+    target, domains = present.settings, None
+    if template_name is not None:
+        target = load_template(template_name)
+    elif take_edits:
+        target, domains = edited_settings(root, present)
+    target = with_values(
+        target,
+        [_key_and_value(each) for each in values],
+        [_named_rule(each) for each in rules],
+        [_kind_and_name(each.split()) for each in dropped],
+    )
+    if domain is not None:
+        domains = DomainSet.parse(domain, "--domain")
+    with progress("signing") as step:
+        update = work(
+            root,
+            target,
+            domains,
+            now=now(),
+            next_stage=next_stage,
+            allow_looser=allow_looser,
+            revoke_old=revoke_old,
+            keep_edits=not (take_edits or discard_edits),
+            keyring=keyring(),
+            dry_run=dry_run,
+            progress=step,
+        )
+    _show_update(update, dry_run=dry_run, as_json=as_json)
+    refused = bool(update.looser()) and not allow_looser
+    if refused:  # only a dry run comes here
+        click.echo("this would be refused: it needs --allow-looser", err=True)
+    return 1 if refused else 0
+
+
+def _key_and_value(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not (key and equals):
+        raise UsageError(f"{text!r} is not KEY=VALUE", "", "Write protection.rtps=ENCRYPT.")
+    return key, value
+
+
+def _kind_and_name(words: Sequence[str]) -> tuple[str, str]:
+    if len(words) != 2 or words[0] not in ("topic", "service", "action"):
+        raise UsageError(
+            f"{' '.join(words)!r} names no topic, service or action",
+            "",
+            "Write for example 'topic /camera/*'.",
+        )
+    return words[0], words[1]
+
+
+def _named_rule(text: str) -> NamedValues:
+    from sros_tool.keystore.template import NamedValues
+
+    words = text.split()
+    if len(words) < 3:
+        raise UsageError(
+            f"{text!r} is not a rule", "", "Write 'topic /camera/* data=NONE metadata=SIGN'."
+        )
+    kind, name = _kind_and_name(words[:2])
+    return NamedValues(kind, name, tuple(_key_and_value(each) for each in words[2:]))
+
+
+def _show_update(update: KeystoreUpdate, *, dry_run: bool, as_json: bool) -> None:
+    from sros_tool.validity import iso
+    from sros_tool.values import as_plain
+
+    if as_json:
+        print_json(
+            {
+                "keystore": str(update.root),
+                "dry_run": dry_run,
+                "needs_allow_looser": bool(update.looser()),
+                "template": {"before": update.before, "after": update.after},
+                "done": as_plain(update.done),
+                "left": as_plain(update.left),
+                "settings": as_plain(update.settings),
+                "rights": as_plain(update.rights),
+                "looser": list(update.looser()),
+                "renewed": list(update.renewed),
+                "signed": list(update.signed),
+                "replaced_work_until": as_plain(update.works_until),
+                "revoked": update.revoked,
+                "restart": list(update.restart),
+                "changes": changes_json(update.root, update.changes),
+                "notes": notes_json((*update.remarks, *update.notes)),
+            }
+        )
+        return
+    if not update.done:
+        click.echo("nothing is left to do", err=True)
+        return
+    template = f": template {update.before} -> {update.after}"
+    verb = "would update" if dry_run else "updated"
+    named = template if update.before != update.after else ""
+    click.echo(visible(f"{verb} keystore '{update.root}'{named}"))
+    for change in update.settings:
+        click.echo(visible(f"  {change.effect:7}  {change}"))
+    _show_rights(update.rights, dry_run)
+    for names, what in ((update.renewed, "renewed"), (update.signed, "signed the permissions of")):
+        if names and not dry_run:
+            shown = ", ".join(names[:_NAMES_SHOWN])
+            more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
+            click.echo(f"{what} {shown}{more}")
+    if dry_run:
+        print_plan(update.root, update.changes)
+    if not dry_run:
+        print_closed(update.root, update.changes)
+    if update.works_until:
+        names = (*update.renewed, *update.signed)
+        shown = " ".join(map(quote, names)) if len(names) <= _NAMES_SHOWN else "NAME..."
+        ends = f"run `sros renew {quote(str(update.root))} {shown} --revoke-old`"
+        if update.left:
+            ends = f"add --revoke-old to the stage {update.left[-1]}, or {ends}"
+        click.echo(
+            "the replaced certificates and permissions, with the rights that they had, work until "
+            f"{iso(update.works_until)} for whoever kept them with the key. To end it, {ends}.",
+            err=True,
+        )
+    for remark in update.remarks:
+        click.echo(remark.text, err=True)
+    if update.left:
+        click.echo(
+            f"stage {update.done[-1]} {'would be' if dry_run else 'is'} done; left: "
+            f"{', '.join(update.left)}. Run the same command again once the processes were "
+            "restarted.",
+            err=True,
+        )
+    print_notes(update.notes)
+
+
+_NAMES_SHOWN = 5

@@ -21,6 +21,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     print_plan,
+    print_restart,
     several_enclaves,
     split_root,
 )
@@ -32,9 +33,6 @@ if TYPE_CHECKING:
     from sros_tool.keystore.lifecycle.renew import Renewal
     from sros_tool.keystore.lifecycle.revoke import Revocation
     from sros_tool.pki.crl import RevocationList
-
-_MAX_NAMES = 5
-"""Number of enclaves that a message names."""
 
 
 @click.command(
@@ -149,7 +147,7 @@ def _print_replaced(result: Renewal) -> None:
         )
         click.echo(f"{what}, unless revoked: see --revoke-old", err=True)
     elif result.restart:
-        _print_restart(result.restart)
+        print_restart(result.restart)
     for remark in result.remarks:
         click.echo(remark.text, err=True)
 
@@ -235,7 +233,7 @@ def revoke(
             click.echo(f"revoked enclave {name}")
     if not dry_run:
         print_closed(root, result.changes)
-    _print_restart(result.restart)
+    print_restart(result.restart)
     for remark in result.remarks:
         click.echo(remark.text, err=True)
 
@@ -290,7 +288,7 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
             return 0
         if not dry_run:
             print_closed(root, result.changes)
-            _print_restart(result.restart)
+            print_restart(result.restart)
         for remark in result.remarks:
             click.echo(remark.text, err=True)
     lists = read_lists(root)
@@ -366,14 +364,6 @@ def _lists_json(
         "changes": changes_json(root, refreshed.changes) if refreshed else [],
         "notes": notes_json(refreshed.remarks) if refreshed else [],
     }
-
-
-def _print_restart(names: tuple[str, ...]) -> None:
-    if not names:
-        return
-    shown = ", ".join(names[:_MAX_NAMES]) + (", ..." if len(names) > _MAX_NAMES else "")
-    number = "1 enclave" if len(names) == 1 else f"{len(names)} enclaves"
-    click.echo(f"restart the processes of {number} for it to take effect: {shown}", err=True)
 
 
 if TYPE_CHECKING:

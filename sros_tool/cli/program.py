@@ -38,6 +38,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "generate_artifacts": VerbEntry(
             "keystore", "Create enclaves and permissions from policies."
         ),
+        "update_keystore": VerbEntry("keystore", "Change the settings of a keystore."),
         "list_enclaves": VerbEntry("keystore", "List the enclaves of a keystore.", ("list_keys",)),
         "inspect": VerbEntry("inspect", "Show the contents of a keystore or a single file."),
     },
@@ -219,6 +220,7 @@ _PHRASES = {
     "create_enclave": "create enclave",
     "create_permission": "create permission",
     "generate_artifacts": "generate artifacts",
+    "update_keystore": "update keystore",
     "list_enclaves": "list enclaves",
     "distribute_key": "distribute key",
     "rotate_ca": "rotate the CA",

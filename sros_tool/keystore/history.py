@@ -19,6 +19,7 @@ from sros_tool.keystore.layout import (
     PUBLIC,
     RETIRED,
     REVOKED,
+    SETTINGS,
     enclave_folder,
     list_enclaves,
     revoked_certificates,
@@ -39,6 +40,8 @@ class HistoryStatus(StrEnum):
     """It is in the keystore, and has not expired."""
     SUPERSEDED = "superseded"
     """It is no longer in the keystore, but neither revoked nor expired: DDS still accepts it."""
+    REPLACED = "replaced"
+    """Settings that the keystore had before; DDS never reads any."""
     REVOKED = "revoked"
     RETIRED = "retired"
     """A CA that was replaced, and is no longer trusted."""
@@ -81,12 +84,15 @@ def history(root: Path, *, now: datetime) -> History:
     revoked = {each.serial for each in entries if each.what == "revocation"}
     revoked |= {f"{each.serial:x}" for crl in read_lists(root) for each in crl.revoked}
     moment = iso(now)
+    settings = _files(root, iter((SETTINGS,)))
 
     def status(entry: Entry) -> HistoryStatus:
         if entry.what == GAP:
             return HistoryStatus.DAMAGED
         if entry.what == "answer":
             return HistoryStatus.SENT
+        if entry.what == "settings":
+            return HistoryStatus.CURRENT if entry.sha256 in settings else HistoryStatus.REPLACED
         if entry.what == "revocation" or entry.serial in revoked or entry.sha256 in revoked_files:
             return HistoryStatus.REVOKED
         if entry.sha256 in retired and entry.sha256 not in issued:
@@ -99,7 +105,7 @@ def history(root: Path, *, now: datetime) -> History:
     found = {**retired, **revoked_files, **issued}
     return History(
         tuple(
-            HistoryItem(entry, status(entry), (found.get(entry.sha256) or [""])[0])
+            HistoryItem(entry, status(entry), ({**found, **settings}.get(entry.sha256) or [""])[0])
             for entry in entries
         ),
         tuple(

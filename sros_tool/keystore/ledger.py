@@ -50,8 +50,8 @@ class Entry:
     """A line of the ledger: a certificate or document that was issued, or a revocation.
 
     ``what`` is ca, certificate, permissions, governance, crl, revocation, answer (the signed list
-    of the files sent to a robot), or gap (``reason`` says what was wrong with the lines up to
-    ``number``).
+    of the files sent to a robot), settings (of the keystore, with the whole TOML text in
+    ``settings``), or gap (``reason`` says what was wrong with the lines up to ``number``).
     ``sha256`` is the hash of a certificate's DER or of a document's bytes; ``serial`` is
     hexadecimal; ``policy`` is the SHA-256 of the policy file, with its includes, that permissions
     were made from; the ``number`` of an answer orders it.  ``key`` is the SHA-256 of the public key
@@ -71,6 +71,7 @@ class Entry:
     reason: str = ""
     key: str = ""
     number: int = 0
+    settings: str = ""
     previous: str = ""
 
 

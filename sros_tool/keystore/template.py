@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from datetime import timedelta
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from sros_tool.errors import DocumentError, SrosError
+from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import parse_toml
 from sros_tool.names import expression_problem
 from sros_tool.pki.token_uri import refuse_pin
@@ -120,7 +120,11 @@ def parse_template(text: str, name: str) -> Template:
         tomllib.TOMLDecodeError: the text is not TOML.
         _TemplateError: a key is missing, unknown (it may be a typo), or has a wrong value.
     """
-    table = _Table(parse_toml(text), "")
+    return _template(parse_toml(text), name)
+
+
+def _template(values: object, name: str) -> Template:
+    table = _Table(values, "")
     authorities = table.table("authorities")
     certificates = table.table("certificates")
     permissions = table.table("permissions")
@@ -196,6 +200,90 @@ def _short_lived(table: _Table) -> Iterator[ShortLived]:
                 )
             yield ShortLived(name, validity)
         entry.finish()
+
+
+def settings_values(template: Template) -> dict[str, str]:
+    """Map the keys of a template, such as ``protection.rtps``, to their values as text.
+
+    The protection of single names has keys such as ``protection.topic /camera/*.data``.
+    """
+    found: dict[str, str] = {}
+
+    def add(key: str, value: object) -> None:
+        if isinstance(value, dict):
+            for name, inner in value.items():
+                add(f"{key}.{name}" if key else name, inner)
+        elif isinstance(value, list):
+            for entry in value:
+                for name in entry["names"]:
+                    add(f"{key} {name}", {k: v for k, v in entry.items() if k != "names"})
+        else:
+            found[key] = json.dumps(value) if isinstance(value, bool) else str(value)
+
+    add("", parse_toml(render_template(template)))
+    return found
+
+
+def with_values(
+    template: Template,
+    values: Sequence[tuple[str, str]] = (),
+    rules: Sequence[NamedValues] = (),
+    dropped: Sequence[tuple[str, str]] = (),
+) -> Template:
+    """Return ``template`` with other values.
+
+    Args:
+        template: the template.
+        values: keys, such as ``protection.rtps``, with their new values as text.
+        rules: protection of names, each in place of the one that the name has.
+        dropped: kinds and names (``topic``, ``/camera/*``) whose own protection is removed.
+
+    Raises:
+        UsageError: a key or value is not one of a template, or a dropped name has no protection.
+    """
+    table = parse_toml(render_template(template))
+    protection = table["protection"]
+    for kind, name in [*dropped, *((each.kind, each.name) for each in rules)]:
+        entries = protection.get(kind, [])
+        left = [each for each in entries if each["names"] != [name]]
+        if (kind, name) in dropped and len(left) == len(entries):
+            raise UsageError(
+                f"the {kind} {name} has no protection of its own",
+                "Only what `[[protection...]]` of the settings names can be dropped.",
+                "See sros.toml of the keystore.",
+            )
+        protection[kind] = left
+    for each in rules:
+        typed = {key: _typed(value) for key, value in each.values}
+        protection.setdefault(each.kind, []).append({"names": [each.name], **typed})
+    for key, value in values:
+        *path, last = key.split(".")
+        inner: Any = table
+        for part in path:
+            inner = inner.get(part) if isinstance(inner, dict) else None
+        if not path or not isinstance(inner, dict) or isinstance(inner.get(last), dict):
+            raise UsageError(
+                f"{key!r} is not a setting of a keystore",
+                "",
+                "Name one such as protection.rtps, permissions.validity or permissions.default.",
+            )
+        inner[last] = _typed(value)
+    try:
+        return _template(table, template.name)
+    except _TemplateError as error:
+        raise UsageError(f"the settings would not be valid: {error}") from error
+
+
+class NamedValues(NamedTuple):
+    """The protection of a name: kind (topic, service or action), name, and keys with values."""
+
+    kind: str
+    name: str
+    values: tuple[tuple[str, str], ...]
+
+
+def _typed(text: str) -> str | bool:
+    return {"true": True, "false": False}.get(text, text)
 
 
 def _authority_name(table: _Table) -> str:

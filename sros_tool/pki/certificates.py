@@ -105,6 +105,11 @@ def enclave_subject(name: str, *, unique: bool) -> x509.Name:
     return x509.Name([part, x509.NameAttribute(NameOID.COMMON_NAME, name)])
 
 
+def has_unique_part(subject: x509.Name) -> bool:
+    """Return whether an enclave's subject has a part besides its common name."""
+    return len(subject.rdns) > 1 or any(len(each) > 1 for each in subject.rdns)
+
+
 def issue_ca(key: PrivateKey, name: x509.Name, validity: Window) -> x509.Certificate:
     """Return a self-signed CA certificate.
 

@@ -41,6 +41,12 @@ def at(bench: Bench, days: float) -> None:
     bench.options["now"] = bench.now + days * DAY
 
 
+def _replace(bench: Bench, file: str, old: str, new: str) -> None:
+    text = bench.path(file).read_text()
+    assert old in text
+    bench.path(file).write_text(text.replace(old, new))
+
+
 def give_away(path: Path) -> None:
     if os.geteuid() != 0:
         pytest.skip("only root can give a folder to another user")
@@ -108,6 +114,10 @@ def _(bench: Bench) -> None:
 CASES |= {
     "keystore.file-unreadable": lambda b: b.path("sros.toml").write_text("nonsense\n"),
     "keystore.ledger-damaged": lambda b: b.path("ledger.jsonl").write_text("nonsense\n"),
+    "keystore.settings-edited": lambda b: _replace(b, "sros.toml", "180d", "181d"),
+    "governance.not-as-settings": lambda b: b.governance(
+        ("<rtps_protection_kind>ENCRYPT", "<rtps_protection_kind>SIGN")
+    ),
     "keystore.settings-missing": lambda b: b.unlink("sros.toml"),
     "keystore.ledger-missing": lambda b: b.unlink("ledger.jsonl"),
     "keystore.one-authority": lambda b: b.trust("permissions", b.authority("identity")),

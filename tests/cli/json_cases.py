@@ -108,6 +108,13 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("-k new -p policy.xml"),
         Case("-k new -p policy.xml --dry-run"),
     ),
+    "update_keystore": (
+        Case("ks --template production --dry-run"),
+        Case("ks --template production --next --revoke-old"),
+        Case("ks --set protection.rtps=NONE --dry-run", 1),
+        Case("ks --domain 0,7 --set authorities.validity=20y --allow-looser"),
+        Case("ks --template development"),
+    ),
     "list_enclaves": (Case("ks"), Case("empty")),
     "inspect": (
         Case("ks"),
@@ -275,6 +282,7 @@ ERRORS = {
     "create_enclave": "none /a",
     "create_permission": "ks /a none.xml",
     "generate_artifacts": "-k ks -p none.xml",
+    "update_keystore": "ks --set protection.rtps=NONE",
     "list_enclaves": "none",
     "inspect": "none",
     "renew": "ks /none",

@@ -48,7 +48,7 @@ def test_every_command_records_what_it_issues(
 ) -> None:
     root = made(tmp_path / "ks", "/a", "/b", template=template)
     both = [("certificate", "/a"), ("permissions", "/a")]
-    expected = [("ca", "")] * authorities + [("governance", "")] + both
+    expected = [("ca", "")] * authorities + [("governance", ""), ("settings", "")] + both
     expected += [("certificate", "/b"), ("permissions", "/b")]
     assert told(root) == expected
     create_enclaves(root, ["/a"], now=NOW)  # nothing to do
@@ -112,10 +112,10 @@ def test_a_damaged_ledger_is_reported_and_kept(line: str, tmp_path: Path) -> Non
     with (root / LEDGER).open("a", encoding="latin-1") as file:
         file.write(line + "\n")
     before = snapshot(root)
-    assert read_ledger(root).gaps[0] == "line 6 is not an entry"
+    assert read_ledger(root).gaps[0] == "line 7 is not an entry"
     ended = sros("inspect", root, "--history")
     assert (ended.status, ended.err) == (1, ""), ended
-    assert "LEDGER DAMAGED  line 6 is not an entry" in ended.out
+    assert "LEDGER DAMAGED  line 7 is not an entry" in ended.out
     assert snapshot(root) == before
 
 
@@ -167,6 +167,7 @@ def test_every_item_has_its_status(tmp_path: Path) -> None:
     assert statuses(root, later) == {
         ("ca", ""): ["current"] * 2,
         ("governance", ""): ["current"],
+        ("settings", ""): ["current"],
         ("certificate", "/a"): ["superseded", "current"],
         ("permissions", "/a"): ["superseded", "current"],
         ("certificate", "/b"): ["revoked", "revoked"],
@@ -208,14 +209,15 @@ def test_history_as_text_and_json(tmp_path: Path) -> None:
     sros("create_enclave", root, "/a", "/b").ok()
     sros("revoke", root, "/b", "--reason", "key_compromise").ok()
     lines = sros("inspect", root, "--history").ok().out.splitlines()
-    assert len(lines) == len(read_ledger(root).entries) == 9
-    assert [line.split()[1:3] for line in lines[:4]] == [
+    assert len(lines) == len(read_ledger(root).entries) == 10
+    assert [line.split()[1:3] for line in lines[:5]] == [
         ["ca", "current"],
         ["ca", "current"],
         ["governance", "current"],
+        ["settings", "current"],
         ["certificate", "current"],
     ]
-    assert "keyCompromise" in lines[7]
+    assert "keyCompromise" in lines[8]
     document = json.loads(sros("inspect", root, "--history", "--json").ok().out)
     assert set(document) == {"version", "kind", "path", "entries", "unexplained", "gaps"}
     assert len(document["entries"]) == 9

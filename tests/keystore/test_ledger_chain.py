@@ -28,7 +28,7 @@ from tests.support.children import run
 from tests.support.harness import certificate, policy_text, publish, sros
 
 NOW = datetime.now(UTC)
-FIRST = 4  # the lines before the first certificate: two CAs, governance; it is the fourth
+FIRST = 5  # before the first certificate: two CAs, governance, settings; it is the fifth
 
 
 @pytest.fixture(scope="session")

@@ -318,7 +318,7 @@ def test_ten_years(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert refused[RotationStage.NONE, "not trusted"]
     assert refused[RotationStage.NONE, "ended"]
     counts = check_history(root, end)
-    assert counts["current"] == 2 * ENCLAVES + 4  # and two CAs, governance and the list
+    assert counts["current"] == 2 * ENCLAVES + 5  # and two CAs, governance, settings, the list
     assert counts["retired"] == 2
     assert counts["revoked"] >= 2 * len(thieves)
     assert counts["expired"] > ENCLAVES * 2 * 11

@@ -28,6 +28,7 @@ from sros_tool.keystore.layout import (
     key_path,
 )
 from sros_tool.keystore.loading import authority_refusals, refusals_text
+from sros_tool.keystore.settings import edit_remedy
 from sros_tool.pki.certificates import same_key, subject_text, validity_of, weakness
 from sros_tool.pki.chains import purpose_faults
 from sros_tool.pki.crl import signed_by
@@ -162,7 +163,8 @@ ONE_AUTHORITY = FindingKind(
     "permissions for itself.",
     "CVE-2023-24011 class; reproduced on Cyclone DDS 0.10.2, where readers received data of such "
     "an enclave.",
-    "Create a keystore with separate CAs, from any template except sros2.",
+    "Run `sros update_keystore ROOT --set authorities.layout=separate`, and then `sros rotate_ca "
+    "ROOT --permissions --next`.",
 )
 CA_EXPIRES_SOON = FindingKind(
     "keystore.ca-ends-soon",
@@ -223,6 +225,23 @@ SETTINGS_MISSING = FindingKind(
     "everything, for ten years.",
     "sros: sros.toml holds the settings of a keystore.",
     "Restore sros.toml from a backup.",
+)
+SETTINGS_EDITED = FindingKind(
+    "keystore.settings-edited",
+    WARNING,
+    "settings that were edited by hand and not carried out",
+    "What is issued later may follow them, and what was issued does not: the edit takes effect in "
+    "part, and nobody was shown what it makes looser.",
+    "sros: the ledger has the settings as sros wrote them.",
+    edit_remedy("ROOT"),
+)
+NOT_AS_SETTINGS = FindingKind(
+    "governance.not-as-settings",
+    WARNING,
+    "a signed governance that is not what the settings state",
+    "DDS loads the signed governance. The [protection] in sros.toml has no effect.",
+    "sros: sros.toml holds the settings of a keystore; DDS-Security 1.1, 9.4.1.2.",
+    edit_remedy("ROOT"),
 )
 LEDGER_MISSING = FindingKind(
     "keystore.ledger-missing",
@@ -306,6 +325,11 @@ def _records(keystore: CheckedKeystore) -> Iterator[Finding]:
     if settings and not ledger:
         yield LEDGER_MISSING.found("ledger", f"there is no {LEDGER}", str(keystore.root))
         return
+    edits, file = keystore.edits, keystore.shown(SETTINGS)
+    if edits.settings:
+        yield SETTINGS_EDITED.found("settings", "; ".join(edits.settings), file)
+    for clause in edits.unsigned:
+        yield NOT_AS_SETTINGS.found("settings", clause, file)
     file = keystore.shown(LEDGER)
     for gap in keystore.ledger.gaps:
         yield LEDGER_DAMAGED.found("ledger", gap, file)

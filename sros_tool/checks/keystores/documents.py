@@ -12,7 +12,7 @@ from datetime import UTC, datetime, timedelta
 from itertools import chain, islice
 from math import isfinite
 
-from sros_tool.checks.keystores.enclaves import grant_of, plain, plain_file
+from sros_tool.checks.keystores.enclaves import grant_of, plain
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
 from sros_tool.checks.policies import outside_findings
@@ -25,6 +25,7 @@ from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, Top
 from sros_tool.dds.permissions import Criteria, Grant, Rule, render_permissions
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import GOVERNANCE_XML
+from sros_tool.keystore.settings import edit_remedy
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text
@@ -334,7 +335,10 @@ def _domains(enclave: CheckedEnclave, grant: Grant, file: str) -> Iterator[Findi
 
 
 _GOVERNANCE = "DDS-Security 1.1, 9.4.1.2"
-_TEMPLATE = "Create a keystore from a template with more protection, such as production."
+_TEMPLATE = (
+    "Run `sros update_keystore ROOT --template production --dry-run` to see what it would change, "
+    "and then without --dry-run."
+)
 
 UNAUTHENTICATED = FindingKind(
     "governance.unauthenticated",
@@ -343,7 +347,7 @@ UNAUTHENTICATED = FindingKind(
     "On Fast DDS 2.14 they can read and write every topic without access control and protection; "
     "with RTPS protection too, it refuses the document. Fast DDS 2.9 ignores the attribute.",
     f"{_GOVERNANCE} (allow_unauthenticated_participants); measured.",
-    "Set allow_unauthenticated_participants to false.",
+    "Run `sros update_keystore ROOT --set protection.allow_unauthenticated_participants=false`.",
 )
 NO_JOIN_CONTROL = FindingKind(
     "governance.no-join-control",
@@ -352,7 +356,7 @@ NO_JOIN_CONTROL = FindingKind(
     "The permissions of a participant are not checked when it joins; vendors then decide "
     "differently on a participant without permissions.",
     f"{_GOVERNANCE} (enable_join_access_control); Fast DDS 2.14.5, Cyclone DDS 0.10.2.",
-    "Set enable_join_access_control to true.",
+    "Run `sros update_keystore ROOT --set protection.join_access_control=true`.",
 )
 NO_ACCESS_CONTROL = FindingKind(
     "governance.no-access-control",
@@ -444,7 +448,7 @@ XML_DIFFERS = FindingKind(
     "governance.xml differs from the signed governance.p7s",
     "DDS loads governance.p7s. The readable copy was changed and never signed.",
     "rcl 9 (security.c).",
-    "Restore it from governance.p7s (`sros inspect` shows it).",
+    f"{edit_remedy('ROOT')}",
 )
 
 _OPEN = {
@@ -578,8 +582,8 @@ def _topic_rule(rule: DomainRule, topic: TopicRule) -> Iterator[tuple[FindingKin
 
 
 def _copy(keystore: CheckedKeystore) -> Iterator[Finding]:
-    xml, signed = keystore.root / GOVERNANCE_XML, keystore.governance
-    if signed and xml.is_file() and plain_file(xml) != _content(signed):
+    xml = keystore.root / GOVERNANCE_XML
+    if keystore.edits.governance:
         text = "governance.xml differs from the content of governance.p7s"
         yield XML_DIFFERS.found("governance", text, str(xml))
 

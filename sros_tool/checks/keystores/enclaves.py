@@ -125,7 +125,8 @@ LONG_PERMISSIONS = FindingKind(
     "permissions that are valid for years, for a subject that never changes",
     "Replaced permissions stay valid until they expire, for anyone who kept a copy.",
     "ros2/sros2 issue 275; DDS-Security 1.1, 9.4.1.3 (there is no revocation of permissions).",
-    "Use the template production, whose subjects change with every renewal, or a shorter validity.",
+    "Run `sros update_keystore ROOT --set certificates.unique_subject=true`, so that subjects "
+    "change with every renewal, or `sros update_keystore ROOT --set permissions.validity=180d`.",
 )
 EVERYTHING = FindingKind(
     "keystore.allow-everything",
@@ -282,7 +283,7 @@ def _is_as_long(chosen: Span, length: timedelta) -> bool:
 
 def _copies(enclave: CheckedEnclave) -> Iterator[Finding]:
     xml, signed = enclave.folder / "permissions.xml", enclave.state.permissions_document
-    if signed and xml.is_file() and plain_file(xml) != plain(signed):
+    if signed and xml.is_file() and _plain_file(xml) != plain(signed):
         text = "permissions.xml differs from the content of permissions.p7s"
         yield XML_DIFFERS.found(enclave.name, text, enclave.file("permissions.xml"))
     if enclave.keystore.crl and not (enclave.folder / "crl.pem").exists():
@@ -295,7 +296,7 @@ def plain(document: bytes) -> bytes:
     return document.replace(b"\r\n", b"\n").strip()
 
 
-def plain_file(path: Path) -> bytes:
+def _plain_file(path: Path) -> bytes:
     """Return a file's content for comparison, or b"" if it cannot be read."""
     try:
         return plain(read_bytes(path, "file"))

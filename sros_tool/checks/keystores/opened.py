@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import TypeVar
 
 from cryptography import x509
 
+from sros_tool.dds.governance import Governance
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
     CRL,
@@ -24,6 +26,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Ledger
 from sros_tool.keystore.reader import OpenedEnclave, open_keystore
+from sros_tool.keystore.settings import HandEdits, hand_edits
 from sros_tool.keystore.template import Template
 from sros_tool.pki.crl import RevocationList
 from sros_tool.policy.model import Policy
@@ -48,6 +51,7 @@ class CheckedKeystore:
     its CA file, the issuing one first.  ``governance`` is the signed document that its enclaves
     share, or b"".  ``is_home`` is false on a robot, where no CA key may be.  ``policies`` are
     compared with its permissions; ``zone`` is the time zone of the host on which its enclaves run.
+    ``edits`` are what somebody edited by hand.
     """
 
     root: Path
@@ -62,6 +66,7 @@ class CheckedKeystore:
     policies: tuple[Policy, ...] = ()
     zone: tzinfo = UTC
     is_home: bool = True
+    edits: HandEdits = HandEdits()  # noqa: RUF009 - frozen
 
     def accepts(self, chosen: Callable[[Template], bool]) -> str:
         """Return text naming the template or keystore that accepts a weakness; "" if none does.
@@ -149,6 +154,10 @@ def read_keystore(
         lambda: read_bytes(signed, "governance document") if signed.is_file() else b"",
         b"",
     )
+    signed_governance: Governance | None = None
+    with suppress(SrosError):  # what is wrong with it is a finding of each enclave
+        signed_governance = keystore.governance
+    edits = hand_edits(root, ledger, settings, signed_governance)
     return CheckedKeystore(
         root,
         now,
@@ -162,4 +171,5 @@ def read_keystore(
         policies,
         zone,
         keystore.is_home and not on_robot,
+        edits,
     )

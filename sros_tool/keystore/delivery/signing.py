@@ -52,11 +52,12 @@ from sros_tool.keystore.reader import (
     read_certificate,
     read_signed_grant,
 )
+from sros_tool.keystore.settings import edit_notes
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
-from sros_tool.pki.certificates import enclave_subject, pem, validity_of
+from sros_tool.pki.certificates import enclave_subject, has_unique_part, pem, validity_of
 from sros_tool.pki.certificates import subject_text as text_of
 from sros_tool.pki.keys import holds_private_key, load_key
 from sros_tool.pki.requests import SigningRequest, key_digest, load_request
@@ -127,7 +128,8 @@ def sign_request(
         _check_key(root, request, known, renew)
         template = load_settings(root)
         authorities = load_authorities(root, template, keyring, now)
-        domains = load_governance(root, authorities.permissions.certificate).domains().closed()
+        governance = load_governance(root, authorities.permissions.certificate)
+        domains = governance.domains().closed()
         check_domain(domains, domain, root)
         notes = _new_key_note(root, request) or [*known.shared_notes([name])] if renew else []
         rights: EarlierRights | StatedRights
@@ -142,12 +144,14 @@ def sign_request(
             identity=authorities.identity,
             permissions=authorities.permissions,
         )
-        subject = enclave_subject(name, unique=template.unique_subject)
-        identity = NewIdentity(subject, request.public_key)
+        unique = template.unique_subject or (
+            renew and has_unique_part(_present_certificate(root, name).subject)
+        )
+        identity = NewIdentity(enclave_subject(name, unique=unique), request.public_key)
         issued = writer.write(Issuance(name, identity, rights))
         transaction.write(f"{enclave_folder(name)}/{REQUEST}", request.pem)
         link_shared_files(transaction, name, present_files(root, name))
-        notes += [*issued.notes(), *writer.notes]
+        notes += [*issued.notes(), *writer.notes, *edit_notes(root, governance)]
         files = _answer_files(root, issued)
         number = read_ledger(root).next_number()
         sealed = seal(files, number, authorities.permissions)

@@ -16,13 +16,11 @@ from types import MappingProxyType
 from cryptography import x509
 
 from sros_tool.dds.domains import DomainSet
-from sros_tool.dds.governance import parse_governance, render_governance
 from sros_tool.dds.permissions import parse_permissions
 from sros_tool.dds.portable import name_notes
 from sros_tool.errors import KeystoreError, Note, PolicyError, SrosError, UsageError
 from sros_tool.keystore.authorities.authority import (
     Authorities,
-    check_meaning,
     create_authorities,
     load_authorities,
 )
@@ -38,28 +36,33 @@ from sros_tool.keystore.issuing.enclave import (
     present_files,
     stated_enclave,
 )
+from sros_tool.keystore.issuing.governance import write_governance
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
     ENCLAVES,
-    GOVERNANCE_P7S,
-    GOVERNANCE_XML,
     KEY_FILE,
     PERMISSIONS_FILE,
     PRIVATE,
     PUBLIC,
     REQUEST,
-    SETTINGS,
     check_keystore,
     enclave_names,
     enclave_path,
     is_keystore,
     refuse_earlier,
 )
-from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
+from sros_tool.keystore.ledger import Entry, append, certificate_entry
+from sros_tool.keystore.lifecycle.replaced import (
+    ReplacedRights,
+    earlier_permissions,
+    replaced_rights,
+)
+from sros_tool.keystore.lifecycle.revoke import Superseded, revoke_superseded
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import check_domain, load_governance, load_settings, read_certificate
-from sros_tool.keystore.template import Template, render_template
+from sros_tool.keystore.settings import edit_notes, with_places, write_settings
+from sros_tool.keystore.template import Template, template_names
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
@@ -75,7 +78,7 @@ from sros_tool.pki.certificates import (
     subject_text,
     validity_of,
 )
-from sros_tool.pki.keys import generate_key, load_key
+from sros_tool.pki.keys import PublicKey, generate_key, load_key
 from sros_tool.policy.model import Enclave, Policy
 from sros_tool.translate import governance_for
 from sros_tool.validity import iso, window
@@ -89,7 +92,9 @@ class Creation:
     """The result of creating a keystore or enclaves; with ``dry_run``, the result it would have.
 
     ``created`` are the new enclaves, ``changed`` the enclaves with new permissions, ``completed``
-    the enclaves that got missing files, and ``kept`` the enclaves without changes.
+    the enclaves that got missing files, and ``kept`` the enclaves without changes.  ``replaced``
+    are the rights that changed with the permissions.  ``restart`` are the enclaves whose processes
+    trust revoked certificates until they are restarted, ``remarks`` notes about open tasks.
     """
 
     root: Path
@@ -102,6 +107,9 @@ class Creation:
     kept: tuple[str, ...] = ()
     changes: tuple[Change, ...] = ()
     notes: tuple[Note, ...] = ()
+    replaced: tuple[ReplacedRights, ...] = ()
+    restart: tuple[str, ...] = ()
+    remarks: tuple[Note, ...] = ()
 
 
 def create_keystore(
@@ -174,10 +182,15 @@ def create_permission(
     *,
     now: datetime,
     domain: int | None = None,
+    revoke_old: bool = False,
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
 ) -> Creation:
-    """Replace the permissions of existing enclaves with their rights in ``policy``: all or none."""
+    """Replace the permissions of existing enclaves with their rights in ``policy``: all or none.
+
+    The replaced permissions work for whoever kept them, until they expire.  ``revoke_old`` ends
+    that: the enclaves get new certificates for the same keys, and all earlier ones are revoked.
+    """
     for name in names:
         check_enclave_name(name)
     if not dry_run:
@@ -190,7 +203,9 @@ def create_permission(
     wanted = {name: stated_enclave(policy, name) for name in names}
     with Transaction(root, dry_run=dry_run) as transaction:
         keystore = _open_keystore(transaction, domain, keyring, now)
-        return _write_enclaves(transaction, keystore, dict(wanted), now)
+        return _write_enclaves(
+            transaction, keystore, dict(wanted), now, revoke_old=revoke_old, keyring=keyring
+        )
 
 
 def generate_artifacts(
@@ -202,14 +217,16 @@ def generate_artifacts(
     domain: int | None = None,
     create: Template | None = None,
     domains: DomainSet | None = None,
+    revoke_old: bool = False,
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> Creation:
     """Create the named enclaves and the enclaves of policies, with permissions, all or nothing.
 
-    If a policy names an existing enclave, the enclave's permissions are replaced.  If the keystore
-    does not exist and ``create`` is given, it is created from that template.
+    If a policy names an existing enclave, the enclave's permissions are replaced, and with
+    ``revoke_old`` its certificate, as by `create_permission`.  If the keystore does not exist and
+    ``create`` is given, it is created from that template.
 
     Raises:
         KeystoreError: a policy names a revoked enclave that ``enclaves`` does not name.
@@ -222,7 +239,15 @@ def generate_artifacts(
         with Transaction(root, dry_run=dry_run) as transaction:
             keystore = _open_keystore(transaction, domain, keyring, now)
             again = _revoked_before(keystore, wanted, enclaves, root)
-            creation = _write_enclaves(transaction, keystore, wanted, now, progress)
+            creation = _write_enclaves(
+                transaction,
+                keystore,
+                wanted,
+                now,
+                progress,
+                revoke_old=revoke_old,
+                keyring=keyring,
+            )
         return replace(creation, notes=(*again, *creation.notes))
     _check_typo(root)
     check_free(root)
@@ -261,6 +286,22 @@ def _revoked_before(
     ]
 
 
+def refuse_other_template(root: Path, template: Template) -> None:
+    """Raise `UsageError` if the existing keystore ``root`` was made from another template."""
+    present = load_settings(root)
+    named = template.name == present.name and template.name in template_names()
+    plain = replace(template, name=present.name, description=present.description)
+    if not (named or with_places(plain, present) == present):
+        where = quote(str(root))
+        raise UsageError(
+            f"keystore '{root}' exists already, with the template {present.name}",
+            f"The template {template.name} would change nothing in it.",
+            f"Leave --template out, or first run `sros update_keystore {where} --template "
+            f"{quote(template.name)} --dry-run`, which shows what it changes, and then without "
+            "--dry-run.",
+        )
+
+
 def _rights_by_enclave(
     names: Sequence[str], policies: Sequence[Policy]
 ) -> dict[str, Enclave | None]:
@@ -286,7 +327,8 @@ def _rights_by_enclave(
 class _Keystore:
     """A keystore that enclaves are added to; ``names`` are the existing enclaves.
 
-    ``known`` are its keys.  ``entries`` are the ledger entries of a new keystore.
+    ``known`` are its keys.  ``entries`` are the ledger entries of a new keystore, ``notes`` remarks
+    on files that were edited by hand.
     """
 
     authorities: Authorities
@@ -295,6 +337,7 @@ class _Keystore:
     known: KnownKeys
     names: tuple[str, ...] = ()
     entries: tuple[Entry, ...] = ()
+    notes: tuple[Note, ...] = ()
 
 
 def _open_keystore(
@@ -303,9 +346,17 @@ def _open_keystore(
     root = transaction.root
     template = load_settings(root)
     authorities = load_authorities(root, template, keyring, now)
-    domains = load_governance(root, authorities.permissions.certificate).domains().closed()
+    governance = load_governance(root, authorities.permissions.certificate)
+    domains = governance.domains().closed()
     check_domain(domains, domain, root)
-    return _Keystore(authorities, template, domains, KnownKeys(root), enclave_names(root))
+    return _Keystore(
+        authorities,
+        template,
+        domains,
+        KnownKeys(root),
+        enclave_names(root),
+        notes=edit_notes(root, governance),
+    )
 
 
 def _write_keystore(
@@ -324,18 +375,9 @@ def _write_keystore(
     distinct = dict.fromkeys((authorities.identity, authorities.permissions))
     entries = [certificate_entry(now, "ca", each.certificate) for each in distinct]
     governance = governance_for(template.protection, domains)
-    document = render_governance(governance)
-    what = "the governance document"
-    check_meaning(parse_governance(document), governance, what)
-    message = authorities.permissions.sign(document, what)
-    transaction.write(GOVERNANCE_XML, document)
-    transaction.write(GOVERNANCE_P7S, message)
-    entries.append(document_entry(now, "governance", message))
-    transaction.write(
-        SETTINGS,
-        b"# The settings of this keystore; sros uses them for each enclave that is added.\n"
-        + render_template(keyring.settings_with_places(template)).encode(),
-    )
+    entries.append(write_governance(transaction, governance, authorities.permissions, (), now))
+    settings = keyring.settings_with_places(template)
+    entries.append(write_settings(transaction, settings, now))
     known = KnownKeys(transaction.root)
     return _Keystore(authorities, template, domains, known, entries=tuple(entries))
 
@@ -422,6 +464,9 @@ def _write_enclaves(
     wanted: Mapping[str, Enclave | None],
     now: datetime,
     progress: Progress | None = None,
+    *,
+    revoke_old: bool = False,
+    keyring: Keyring = IN_KEYSTORE,
 ) -> Creation:
     """Create or complete the enclaves, sign the permissions of their policies, and commit."""
     writer = EnclaveWriter(
@@ -432,14 +477,29 @@ def _write_enclaves(
         permissions=keystore.authorities.permissions,
     )
 
-    def write(name: str) -> tuple[_Outcome, tuple[Note, ...]]:
-        return _write_enclave(writer, transaction, keystore, name, wanted[name], now)
+    def write(name: str) -> _Written:
+        return _write_enclave(
+            writer, transaction, keystore, name, wanted[name], now, revoke_old=revoke_old
+        )
 
     done = writer.for_each(list(wanted), write, progress)
     entries = [*keystore.entries, *writer.entries]
+    superseded = [each.superseded for each in done.values() if each.superseded]
+    revoked = None
+    if superseded:
+        revoked = revoke_superseded(
+            transaction,
+            superseded,
+            keystore.authorities.identity,
+            keystore.template,
+            keyring,
+            keystore.names,
+            now,
+        )
+        entries += revoked.entries
     append(transaction, entries, keystore.authorities.identity, now)
     transaction.commit()
-    outcomes = {name: outcome for name, (outcome, _) in done.items()}
+    outcomes = {name: each.outcome for name, each in done.items()}
     created = _names_with(outcomes, _Outcome.CREATED)
     return Creation(
         transaction.root,
@@ -452,15 +512,29 @@ def _write_enclaves(
         _names_with(outcomes, _Outcome.KEPT),
         tuple(transaction.changes),
         (
-            *(note for _, notes in done.values() for note in notes),
+            *(note for each in done.values() for note in each.notes),
             *(writer.notes if writer.entries else ()),
             *name_notes({*keystore.names, *created}, created),
+            *keystore.notes,
         ),
+        tuple(each.replaced for each in done.values() if each.replaced),
+        keystore.names if revoked else (),
+        revoked.remarks if revoked else (),
     )
 
 
 def _names_with(outcomes: Mapping[str, _Outcome], outcome: _Outcome) -> tuple[str, ...]:
     return tuple(name for name, each in outcomes.items() if each is outcome)
+
+
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """What was done to an enclave: ``superseded`` is its old certificate, if that is revoked."""
+
+    outcome: _Outcome
+    notes: tuple[Note, ...]
+    replaced: ReplacedRights | None = None
+    superseded: Superseded | None = None
 
 
 def _write_enclave(
@@ -470,11 +544,24 @@ def _write_enclave(
     name: str,
     policy: Enclave | None,
     now: datetime,
-) -> tuple[_Outcome, tuple[Note, ...]]:
+    *,
+    revoke_old: bool,
+) -> _Written:
     """Stage the missing files of an enclave, and new permissions if ``policy`` is given."""
-    present = present_files(transaction.root, name)
+    root = transaction.root
+    present = present_files(root, name)
     before = len(transaction.changes)
-    identity = _identity(transaction.root, keystore, name, present, now, replaced=bool(policy))
+    identity = _identity(root, keystore, name, present, now, replaced=bool(policy))
+    earlier, old = None, None
+    if policy and PERMISSIONS_FILE in present:
+        authority = keystore.authorities.permissions.certificate
+        earlier = earlier_permissions(root, name, authority)
+        if revoke_old and isinstance(identity, x509.Certificate):
+            old = identity
+            public: PublicKey = old.public_key()  # type: ignore[assignment]
+            remedy = f"Give it another key with `sros renew {root} {name} --new-key`."
+            keystore.known.refuse_revoked(public, f"enclave {name}", remedy, old)
+            identity = NewIdentity(enclave_subject(name, unique=True), public)
     rights = None
     if policy or PERMISSIONS_FILE not in present:
         enclave = policy or default_rights(keystore.template, name)
@@ -483,11 +570,17 @@ def _write_enclave(
     link_shared_files(transaction, name, present)
     notes = tuple(issued.notes())
     if not present & {KEY_FILE, REQUEST}:
-        return _Outcome.CREATED, notes
+        return _Written(_Outcome.CREATED, notes)
     if PERMISSIONS_FILE in present and policy:
-        return _Outcome.CHANGED, notes
+        (grant,) = issued.permissions.grants
+        replaced = replaced_rights(name, earlier, grant, now) if earlier else None
+        if old is None:
+            return _Written(_Outcome.CHANGED, notes, replaced)
+        superseded = Superseded.by(name, old, issued.certificate, now)
+        replaced = replaced.revoked() if replaced else None
+        return _Written(_Outcome.CHANGED, notes, replaced, superseded)
     completed = len(transaction.changes) > before
-    return _Outcome.COMPLETED if completed else _Outcome.KEPT, notes
+    return _Written(_Outcome.COMPLETED if completed else _Outcome.KEPT, notes)
 
 
 def _identity(

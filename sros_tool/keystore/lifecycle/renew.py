@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -18,6 +19,7 @@ from sros_tool.keystore.expiry import (
     refuse_unreadable,
 )
 from sros_tool.keystore.issuing.enclave import (
+    EarlierRights,
     EnclaveWriter,
     Issuance,
     NewIdentity,
@@ -31,26 +33,23 @@ from sros_tool.keystore.layout import (
     has_enclave,
     list_enclaves,
 )
-from sros_tool.keystore.ledger import Entry, append, certificate_entry, read_ledger
-from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner
-from sros_tool.keystore.lifecycle.revoke import (
-    link_everywhere,
-    remarks_on_lack,
-    revocation_entry,
-    still_valid,
-)
+from sros_tool.keystore.ledger import append
+from sros_tool.keystore.lifecycle.revoke import Superseded, revoke_superseded
 from sros_tool.keystore.missing import no_such_enclave
-from sros_tool.keystore.reader import load_settings
-from sros_tool.keystore.template import Template
+from sros_tool.keystore.reader import governance_of, load_settings
+from sros_tool.keystore.settings import edit_notes
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
 from sros_tool.parallel import Progress
-from sros_tool.pki.certificates import enclave_subject, issued_by, subject_text, validity_of
-from sros_tool.pki.crl import SUPERSEDED, Revoked
+from sros_tool.pki.certificates import (
+    enclave_subject,
+    has_unique_part,
+    issued_by,
+    subject_text,
+)
 from sros_tool.pki.keys import PrivateKey, PublicKey, generate_key
-from sros_tool.pki.requests import key_digest
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,16 +72,6 @@ class Renewal:
     remarks: tuple[Note, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class _Replaced:
-    """A certificate that was replaced, and the digest of the key of the new certificate."""
-
-    name: str
-    old: Entry
-    not_after: datetime
-    new_key: str
-
-
 def renew(
     root: Path,
     names: Sequence[str] = (),
@@ -100,7 +89,7 @@ def renew(
     The new certificate is for the same key, or with ``new_key`` for a new key; the signed rights do
     not change.  All files are replaced at once.  A replaced certificate works for anyone who
     has its key until it expires or is revoked; ``revoke_old`` revokes all earlier certificates of
-    the renewed enclaves.
+    the renewed enclaves, and gives them subjects that no earlier permissions fit.
 
     Raises:
         KeystoreError: enclaves cannot be renewed; the error names all of them.
@@ -123,41 +112,40 @@ def renew(
         )
         known = KnownKeys(root)
         renewer = _Renewer(
-            transaction, writer, authorities, template, now, known=known, new_key=new_key
+            transaction,
+            writer,
+            authorities,
+            now,
+            known=known,
+            new_key=new_key,
+            unique=template.unique_subject or revoke_old,
         )
         existing = list_enclaves(root) if expiring or revoke_old else ()
         thresholds: dict[str, Threshold | None] = dict.fromkeys(names)
         if expiring is not None:
             thresholds |= {name: expiring for name in existing if name not in thresholds}
 
-        def renew_one(name: str) -> _Replaced | UnreadableEnclave | None:
+        def renew_one(name: str) -> Superseded | UnreadableEnclave | None:
             return renewer.renew_if_due(name, thresholds[name])
 
         done = writer.for_each(list(thresholds), renew_one, progress)
         refuse_unreadable(
             tuple(each for each in done.values() if isinstance(each, UnreadableEnclave)), "renewed"
         )
-        replaced = [each for each in done.values() if isinstance(each, _Replaced)]
+        replaced = [each for each in done.values() if isinstance(each, Superseded)]
         renewed = tuple(each.name for each in replaced)
         notes = writer.notes if replaced else ()
+        with suppress(SrosError):  # its governance is not what is renewed
+            notes += edit_notes(root, governance_of(root))
         if not new_key:
             notes += tuple(known.shared_notes(renewed))
         valid = [each for each in replaced if each.not_after >= now]
-        entries, lists, count = writer.entries, None, 0
+        entries, revoked = writer.entries, None
         if revoke_old and replaced:
-            ledger = read_ledger(root)
-            lists = RevocationListSigner(
-                transaction, authorities.identity, template, keyring, ledger, now
+            revoked = revoke_superseded(
+                transaction, replaced, authorities.identity, template, keyring, existing, now
             )
-            revocations = _superseded(root, replaced, ledger.entries, lists, now)
-            present = {int(each.old.serial, 16): each.name for each in replaced}
-            lists.remarks += remarks_on_lack(root, ledger, present)
-            count = len(revocations)
-            date = now.replace(microsecond=0)
-            new_entries = [Revoked(int(each.serial, 16), date, SUPERSEDED) for each in revocations]
-            _, signed = lists.sign(new_entries, existing, incomplete=False)
-            entries += [*revocations, *signed]
-            link_everywhere(transaction, existing)
+            entries += revoked.entries
         append(transaction, entries, authorities.identity, now)
         transaction.commit()
     return Renewal(
@@ -165,35 +153,11 @@ def renew(
         renewed,
         tuple(transaction.changes),
         notes,
-        max((each.not_after for each in valid), default=None) if lists is None else None,
-        count,
-        existing if lists else (),
-        tuple(lists.remarks) if lists else (),
+        None if revoked else max((each.not_after for each in valid), default=None),
+        revoked.count if revoked else 0,
+        existing if revoked else (),
+        revoked.remarks if revoked else (),
     )
-
-
-def _superseded(
-    root: Path,
-    replaced: Sequence[_Replaced],
-    ledger: Sequence[Entry],
-    lists: RevocationListSigner,
-    now: datetime,
-) -> list[Entry]:
-    """Return the ledger entries for revoking all earlier certificates that have not expired."""
-    listed = {each.serial for each in lists.present.revoked} if lists.present else set()
-    known = still_valid(root, ledger, [each.name for each in replaced], now)
-    found = []
-    for each in replaced:
-        # The ledger lacks certificates that ros2/sros2 issued.
-        valid = known[each.name]
-        if each.not_after >= now:
-            valid[int(each.old.serial, 16)] = each.old
-        found += [
-            revocation_entry(one, now, SUPERSEDED, key="" if one.key == each.new_key else one.key)
-            for serial, one in valid.items()
-            if serial not in listed
-        ]
-    return found
 
 
 class _Renewer:
@@ -204,24 +168,24 @@ class _Renewer:
         transaction: Transaction,
         writer: EnclaveWriter,
         authorities: Authorities,
-        template: Template,
         now: datetime,
         *,
         known: KnownKeys,
         new_key: bool,
+        unique: bool,
     ) -> None:
         self._root = transaction.root
         self._writer = writer
         self._authorities = authorities
-        self._template = template
         self._now = now
         self._known = known
         self._new_key = new_key
+        self._unique = unique
         self._recorded = RecordedRights(transaction.root)
 
     def renew_if_due(
         self, name: str, threshold: Threshold | None
-    ) -> _Replaced | UnreadableEnclave | None:
+    ) -> Superseded | UnreadableEnclave | None:
         """Renew an enclave and return the replaced certificate; None if it is not due.
 
         Without ``threshold`` it is always due.  If its files cannot be read, return that error.
@@ -233,24 +197,15 @@ class _Renewer:
             issued = self._writer.write(self._issuance(state))
         except SrosError as error:
             return UnreadableEnclave(name, error)
-        old = state.certificate
-        entry = certificate_entry(self._now, "certificate", old, name)
-        new_key = key_digest(issued.certificate.public_key())  # type: ignore[arg-type]
-        return _Replaced(name, entry, validity_of(old).not_after, new_key)
+        return Superseded.by(name, state.certificate, issued.certificate, self._now)
 
     def _issuance(self, state: Credentials) -> Issuance:
         """Verify the files of an enclave, and return what to issue in their place."""
         name = state.name
-        if not issued_by(state.certificate, self._authorities.identity.certificate):
-            raise KeystoreError(
-                f"the certificate of enclave {name} was not issued by the identity CA of this "
-                "keystore",
-                f"It names the issuer {subject_text(state.certificate.issuer)}.",
-                "Restore the certificate, or remove the enclave's folder and create it again.",
-            )
-        state.signed.verify(self._authorities.permissions.certificate)
-        rights = self._recorded.of(name, state.digest, state.grant)
-        subject = enclave_subject(name, unique=self._template.unique_subject)
+        rights = checked_rights(state, self._authorities, self._recorded)
+        # Once earlier permissions were cut off by a unique subject, they stay cut off.
+        unique = self._unique or has_unique_part(state.certificate.subject)
+        subject = enclave_subject(name, unique=unique)
         if self._new_key:
             key = self._generate_key(name)
             identity = NewIdentity(subject, key.public_key(), key)
@@ -270,3 +225,24 @@ class _Renewer:
                 "with `sros sign_request --renew`.",
             )
         return generate_key()
+
+
+def checked_rights(
+    state: Credentials, authorities: Authorities, recorded: RecordedRights
+) -> EarlierRights:
+    """Return the rights of an enclave, after verifying its files, to sign them again.
+
+    Raises:
+        KeystoreError: the CAs of the keystore did not issue its certificate, or the permissions are
+            not the last ones that the ledger has for it.
+        PkiError: the permissions CA did not sign them.
+    """
+    if not issued_by(state.certificate, authorities.identity.certificate):
+        raise KeystoreError(
+            f"the certificate of enclave {state.name} was not issued by the identity CA of this "
+            "keystore",
+            f"It names the issuer {subject_text(state.certificate.issuer)}.",
+            "Restore the certificate, or remove the enclave's folder and create it again.",
+        )
+    state.signed.verify(authorities.permissions.certificate)
+    return recorded.of(state.name, state.digest, state.grant)

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
+from cryptography import x509
+
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.authorities.authority import Authority, load_authority
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
@@ -24,12 +26,14 @@ from sros_tool.keystore.ledger import Entry, Ledger, append, certificate_entry, 
 from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner, put_away
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import load_settings, read_certificate
+from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import check_enclave_name
 from sros_tool.pki.certificates import common_name_of, issued_by, validity_of
-from sros_tool.pki.crl import REASONS, Revoked
+from sros_tool.pki.crl import REASONS, SUPERSEDED, Revoked
+from sros_tool.pki.requests import key_digest
 from sros_tool.validity import iso
 
 _FILES = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml", REQUEST)
@@ -95,7 +99,7 @@ def revoke(
         revoked: list[Revoked] = []
         entries: list[Entry] = []
         present: dict[int, str] = {}
-        known = still_valid(root, issued, names, now)
+        known = _still_valid(root, issued, names, now)
         for name, valid in known.items():
             last = _move_away(transaction, authority, name, now)
             present[int(last.serial, 16)] = name
@@ -104,11 +108,11 @@ def revoke(
                 if serial not in listed:
                     listed.add(serial)
                     revoked.append(Revoked(serial, now.replace(microsecond=0), reason))
-                    entries.append(revocation_entry(each, now, reason, key=each.key))
+                    entries.append(_revocation_entry(each, now, reason, key=each.key))
         remaining = tuple(name for name in existing if name not in names)
         next_update, signed = lists.sign(revoked, remaining, incomplete=until_retired)
         entries += signed
-        link_everywhere(transaction, remaining)
+        _link_everywhere(transaction, remaining)
         append(transaction, entries, authority, now)
         transaction.commit()
     return Revocation(
@@ -117,7 +121,7 @@ def revoke(
         remaining,
         next_update,
         tuple(transaction.changes),
-        (*lists.remarks, *remarks_on_lack(root, ledger, present)),
+        (*lists.remarks, *_remarks_on_lack(root, ledger, present)),
     )
 
 
@@ -139,7 +143,7 @@ def refresh_crl(
             transaction, authority, template, keyring, read_ledger(root), now
         )
         next_update, entries = lists.sign((), existing, incomplete=True)
-        link_everywhere(transaction, existing)
+        _link_everywhere(transaction, existing)
         append(transaction, entries, authority, now)
         transaction.commit()
     changes, remarks = tuple(transaction.changes), tuple(lists.remarks)
@@ -156,7 +160,7 @@ def _check_names(root: Path, names: Sequence[str]) -> tuple[str, ...]:
     return existing
 
 
-def still_valid(
+def _still_valid(
     root: Path, issued: Iterable[Entry], names: Iterable[str], now: datetime
 ) -> dict[str, dict[int, Entry]]:
     """Map each of the enclaves ``names`` to its earlier certificates that have not expired.
@@ -178,7 +182,7 @@ def still_valid(
     return found
 
 
-def remarks_on_lack(root: Path, ledger: Ledger, present: Mapping[int, str]) -> tuple[Note, ...]:
+def _remarks_on_lack(root: Path, ledger: Ledger, present: Mapping[int, str]) -> tuple[Note, ...]:
     """Return a remark if the ledger may lack earlier certificates of revoked enclaves.
 
     ``present`` maps the serial numbers of their last certificates to their names.
@@ -198,7 +202,7 @@ def remarks_on_lack(root: Path, ledger: Ledger, present: Mapping[int, str]) -> t
     return (Note("ledger.may-lack-certificates", text),)
 
 
-def revocation_entry(certificate: Entry, now: datetime, reason: str, *, key: str) -> Entry:
+def _revocation_entry(certificate: Entry, now: datetime, reason: str, *, key: str) -> Entry:
     """Return the entry of a revocation; ``key`` is the digest of the revoked key, or ""."""
     return Entry(
         iso(now),
@@ -209,6 +213,85 @@ def revocation_entry(certificate: Entry, now: datetime, reason: str, *, key: str
         reason=reason,
         key=key,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Superseded:
+    """A certificate that was replaced, and the digest of the key of the new certificate."""
+
+    name: str
+    old: Entry
+    not_after: datetime
+    new_key: str
+
+    @classmethod
+    def by(
+        cls, name: str, old: x509.Certificate, new: x509.Certificate, now: datetime
+    ) -> Superseded:
+        """Return the record that ``new`` replaced ``old`` at ``now``."""
+        entry = certificate_entry(now, "certificate", old, name)
+        key = key_digest(new.public_key())  # type: ignore[arg-type]
+        return cls(name, entry, validity_of(old).not_after, key)
+
+
+@dataclass(frozen=True, slots=True)
+class SupersededRevocation:
+    """The revocation of replaced certificates: ledger entries, their number, and remarks."""
+
+    entries: tuple[Entry, ...]
+    count: int
+    remarks: tuple[Note, ...]
+
+
+def revoke_superseded(
+    transaction: Transaction,
+    replaced: Sequence[Superseded],
+    authority: Authority,
+    template: Template,
+    keyring: Keyring,
+    existing: Sequence[str],
+    now: datetime,
+) -> SupersededRevocation:
+    """Stage the revocation of all certificates that the enclaves of ``replaced`` had before.
+
+    ``authority`` is the identity CA; ``existing`` are all enclaves of the keystore, which get the
+    list.
+    """
+    root = transaction.root
+    ledger = read_ledger(root)
+    lists = RevocationListSigner(transaction, authority, template, keyring, ledger, now)
+    revocations = _superseded(root, replaced, ledger.entries, lists, now)
+    present = {int(each.old.serial, 16): each.name for each in replaced}
+    date = now.replace(microsecond=0)
+    new_entries = [Revoked(int(each.serial, 16), date, SUPERSEDED) for each in revocations]
+    _, signed = lists.sign(new_entries, existing, incomplete=False)
+    _link_everywhere(transaction, existing)
+    remarks = (*lists.remarks, *_remarks_on_lack(root, ledger, present))
+    return SupersededRevocation((*revocations, *signed), len(revocations), remarks)
+
+
+def _superseded(
+    root: Path,
+    replaced: Sequence[Superseded],
+    ledger: Sequence[Entry],
+    lists: RevocationListSigner,
+    now: datetime,
+) -> list[Entry]:
+    """Return the ledger entries for revoking all earlier certificates that have not expired."""
+    listed = {each.serial for each in lists.present.revoked} if lists.present else set()
+    known = _still_valid(root, ledger, [each.name for each in replaced], now)
+    found = []
+    for each in replaced:
+        # The ledger lacks certificates that ros2/sros2 issued.
+        valid = known[each.name]
+        if each.not_after >= now:
+            valid[int(each.old.serial, 16)] = each.old
+        found += [
+            _revocation_entry(one, now, SUPERSEDED, key="" if one.key == each.new_key else one.key)
+            for serial, one in valid.items()
+            if serial not in listed
+        ]
+    return found
 
 
 def _move_away(transaction: Transaction, authority: Authority, name: str, now: datetime) -> Entry:
@@ -236,7 +319,7 @@ def _move_away(transaction: Transaction, authority: Authority, name: str, now: d
     return certificate_entry(now, "certificate", certificate, name)
 
 
-def link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
+def _link_everywhere(transaction: Transaction, names: Sequence[str]) -> None:
     """Stage the link ``crl.pem`` to the revocation list for each enclave without it."""
     for name in names:
         folder = enclave_folder(name)

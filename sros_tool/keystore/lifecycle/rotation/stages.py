@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -41,7 +42,6 @@ from sros_tool.keystore.layout import (
     RETIRED,
     ROLES,
     ROTATION,
-    SETTINGS,
     ca_key,
     enclave_folder,
     enclave_path,
@@ -68,12 +68,14 @@ from sros_tool.keystore.reader import (
     authority_files,
     certificates_of,
     embedded_crl,
+    governance_of,
     load_settings,
     read_certificate,
     read_crl,
     read_signed_grant,
 )
-from sros_tool.keystore.template import Template, render_template
+from sros_tool.keystore.settings import edit_remedy, found_edits, write_settings
+from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
@@ -147,6 +149,8 @@ def rotate_ca(
             transaction, rotation, names, keyring, now, delete_old_key=delete_old_key
         )
         if finish or stage not in (rotation.stage, RotationStage.NONE):
+            if rotation.stage is not RotationStage.REISSUE:  # the last stage signs nothing
+                _refuse_edited(root)
             stage = rotator.go_to(stage, roles, new_keys, validity, progress)
             transaction.commit()
     return RotationStep(
@@ -158,6 +162,19 @@ def rotate_ca(
         tuple(rotator.kept_elsewhere),
         rotator.notes,
     )
+
+
+def _refuse_edited(root: Path) -> None:
+    """Raise `KeystoreError` if settings or governance were edited: signing would undo that."""
+    governance = None
+    with suppress(SrosError):  # signing it again reports it
+        governance = governance_of(root)
+    if edits := found_edits(root, governance):
+        raise KeystoreError(
+            f"files of keystore '{root}' were edited by hand: {'; '.join(edits.clauses())}",
+            "The new CA would sign the governance as it was before.",
+            f"First carry it out or undo it: {edit_remedy(root)}",
+        )
 
 
 def _target_stage(root: Path, rotation: Rotation, to: RotationStage | None) -> RotationStage:
@@ -505,10 +522,7 @@ class _Rotator:
             permissions_key=places.get(PERMISSIONS, self._template.permissions_key),
         )
         if template != self._template:
-            comment = (
-                b"# The settings of this keystore; sros uses them for each enclave that is added.\n"
-            )
-            self._transaction.write(SETTINGS, comment + render_template(template).encode())
+            self._entries.append(write_settings(self._transaction, template, self._now))
 
 
 # ── files of one enclave ───────────────────────────────────────────────────────────────────

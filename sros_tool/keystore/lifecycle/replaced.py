@@ -1,0 +1,98 @@
+"""The rights that an enclave gains and loses when its permissions are replaced.
+
+DDS Security 1.1 cannot revoke permissions: replaced ones are valid until they expire, for whoever
+kept them with a certificate that they fit (ros2/sros2 issue 275).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from cryptography import x509
+
+from sros_tool.dds.permissions import Grant
+from sros_tool.errors import SrosError
+from sros_tool.keystore.layout import CERTIFICATE_FILE, PERMISSIONS_FILE, enclave_path
+from sros_tool.keystore.reader import read_certificate, read_signed_grant
+from sros_tool.pki.certificates import subject_text, validity_of
+from sros_tool.policy.model import ALLOW
+from sros_tool.policy.rights import Right, compare
+from sros_tool.translate import grant_rights
+
+
+@dataclass(frozen=True, slots=True)
+class EarlierPermissions:
+    """The permissions of an enclave before they are replaced, and its certificate."""
+
+    certificate: x509.Certificate
+    grant: Grant
+
+
+@dataclass(frozen=True, slots=True)
+class ReplacedRights:
+    """The rights of an enclave that changed with its permissions.
+
+    ``lost`` and ``gained`` are rights and denials as their statement would read: a new denial is
+    lost as ``ALLOW`` is.  ``works_until`` is when the replaced permissions expire for whoever kept
+    them with the certificate of that time, or None if they no longer work.
+    """
+
+    enclave: str
+    lost: tuple[Right, ...]
+    gained: tuple[Right, ...]
+    works_until: datetime | None
+
+    def revoked(self) -> ReplacedRights:
+        """Return the same rights, for a certificate that was revoked."""
+        return ReplacedRights(self.enclave, self.lost, self.gained, None)
+
+
+def earlier_permissions(
+    root: Path, name: str, authority: x509.Certificate
+) -> EarlierPermissions | None:
+    """Return the present permissions of an enclave; None if DDS would refuse them.
+
+    ``authority`` is the permissions CA.
+    """
+    folder = enclave_path(root, name)
+    with suppress(SrosError):
+        certificate = read_certificate(folder / CERTIFICATE_FILE)
+        found = read_signed_grant(folder / PERMISSIONS_FILE, subject_text(certificate.subject))
+        found.signed.verify(authority)
+        if found.grant:
+            return EarlierPermissions(certificate, found.grant)
+    return None
+
+
+def replaced_rights(
+    name: str, earlier: EarlierPermissions, grant: Grant, now: datetime
+) -> ReplacedRights:
+    """Return what changes when ``grant`` replaces the ``earlier`` permissions of an enclave."""
+    difference = compare(grant_rights(name, earlier.grant), grant_rights(name, grant))
+    lost: list[Right] = []
+    gained: list[Right] = []
+    for sign, right in difference.lines():
+        if right not in difference.covered:
+            taken = (sign == "-") == (right.qualifier is ALLOW)
+            (lost if taken else gained).append(right)
+    end = validity_of(earlier.certificate).not_after
+    with suppress(SrosError):  # an expiry before the beginning
+        end = min(end, earlier.grant.validity.not_after)
+    return ReplacedRights(name, tuple(lost), tuple(gained), end if end >= now else None)
+
+
+_RIGHTS_SHOWN = 6
+
+
+def rights_text(rights: Sequence[Right]) -> str:
+    """Return rights as text, such as ``publish topic /a, call action /b``."""
+    shown = ", ".join(
+        each.describe() if each.qualifier is ALLOW else f"denial to {each.describe()}"
+        for each in rights[:_RIGHTS_SHOWN]
+    )
+    more = len(rights) - _RIGHTS_SHOWN
+    return f"{shown} and {more} more" if more > 0 else shown

@@ -1,0 +1,663 @@
+"""Change of an existing keystore: its governance, its settings, and what follows from them.
+
+Two stages, because a running robot survives one of them without a pause.  credentials: enclaves get
+certificates and permissions as the new settings state them; processes with old and new ones
+communicate.  governance: the signed governance and the domains; most differences of governance
+keep a process with the old one from communicating with a process with the new one.  Each stage is
+one transaction, and no state is kept: what the keystore does not have yet is what is left to do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from enum import StrEnum
+from pathlib import Path
+from shlex import quote
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.governance import Governance, parse_governance
+from sros_tool.dds.permissions import Grant
+from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
+from sros_tool.keystore.authorities.authority import Authorities, load_authorities
+from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.comparison import (
+    Effect,
+    Mismatch,
+    SettingChange,
+    compare_governance,
+    compare_settings,
+    mismatch,
+)
+from sros_tool.keystore.expiry import (
+    Credentials,
+    UnreadableEnclave,
+    read_credentials,
+    refuse_unreadable,
+)
+from sros_tool.keystore.issuing.enclave import (
+    EarlierRights,
+    EnclaveWriter,
+    Issuance,
+    NewIdentity,
+    RecordedRights,
+    StatedRights,
+    default_rights,
+)
+from sros_tool.keystore.issuing.governance import write_governance
+from sros_tool.keystore.known_keys import KnownKeys
+from sros_tool.keystore.layout import (
+    GOVERNANCE_XML,
+    PERMISSIONS,
+    PRIVATE,
+    PUBLIC,
+    ROLES,
+    SETTINGS,
+    ca_certificate,
+    ca_key,
+    enclave_path,
+    key_on_robot,
+    list_enclaves,
+    waits_for_answer,
+)
+from sros_tool.keystore.ledger import append, read_ledger
+from sros_tool.keystore.lifecycle.renew import checked_rights
+from sros_tool.keystore.lifecycle.replaced import (
+    EarlierPermissions,
+    ReplacedRights,
+    replaced_rights,
+    rights_text,
+)
+from sros_tool.keystore.lifecycle.revoke import Superseded, revoke_superseded
+from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
+from sros_tool.keystore.reader import authority_files, governance_of, load_settings
+from sros_tool.keystore.settings import (
+    HandEdits,
+    edit_remedy,
+    hand_edits,
+    recorded_settings,
+    with_places,
+    write_settings,
+)
+from sros_tool.keystore.template import EVERYTHING, Template, with_values
+from sros_tool.keystore.transaction.recovery import tidy
+from sros_tool.keystore.transaction.stage import Change
+from sros_tool.keystore.transaction.transaction import Transaction
+from sros_tool.parallel import Progress
+from sros_tool.pki.certificates import enclave_subject, has_unique_part, same_key, validity_of
+from sros_tool.pki.keys import PublicKey
+from sros_tool.policy.rights import compare
+from sros_tool.translate import governance_for, grant_rights, permissions_for, protection_for
+from sros_tool.validity import span_text, window
+from sros_tool.xml import read_bytes
+
+
+class UpdateStage(StrEnum):
+    """The stages of an update, in order."""
+
+    CREDENTIALS = "credentials"
+    """Certificates and permissions of the enclaves, and the settings that they follow."""
+    GOVERNANCE = "governance"
+    """The signed governance, and the domains in governance and permissions."""
+
+
+@dataclass(frozen=True, slots=True)
+class PresentSettings:
+    """The settings that are in force in a keystore, and what was edited by hand.
+
+    ``settings`` are as sros wrote them last, with the protection of the signed ``governance``.
+    ``written`` are those that ``sros.toml`` states now; None for a keystore of ros2/sros2.
+    """
+
+    settings: Template
+    written: Template | None
+    governance: Governance
+    edits: HandEdits
+
+    @property
+    def domains(self) -> DomainSet:
+        """The domains of the signed governance."""
+        return self.governance.domains().closed()
+
+
+@dataclass(frozen=True, slots=True)
+class KeystoreUpdate:
+    """The result of an update; with ``dry_run``, the result it would have.
+
+    ``done`` are the stages that it carries out, ``left`` those that remain.  ``renewed`` are the
+    enclaves with a new certificate and permissions, ``signed`` those with new permissions only.
+    ``rights`` has what enclaves gain and lose.  ``works_until`` is the latest expiry of replaced
+    certificates with their permissions, or None if none works.  ``revoked`` is the number of
+    revoked certificates.  ``restart`` are the enclaves whose processes have to be restarted,
+    ``remarks`` notes about that and other open tasks.
+    """
+
+    root: Path
+    before: str
+    after: str
+    done: tuple[UpdateStage, ...]
+    left: tuple[UpdateStage, ...]
+    settings: tuple[SettingChange, ...]
+    rights: tuple[ReplacedRights, ...]
+    renewed: tuple[str, ...]
+    signed: tuple[str, ...]
+    works_until: datetime | None
+    revoked: int
+    restart: tuple[str, ...]
+    remarks: tuple[Note, ...]
+    changes: tuple[Change, ...]
+    notes: tuple[Note, ...] = ()
+
+    def looser(self) -> tuple[str, ...]:
+        """Return a clause for each thing that becomes possible."""
+        gained = [f"{each.enclave} gains {rights_text(each.gained)}" for each in self.rights]
+        return (
+            *(str(each) for each in self.settings if each.effect is Effect.LOOSER),
+            *(text for text, each in zip(gained, self.rights, strict=True) if each.gained),
+        )
+
+
+# ── what is, and what shall be ─────────────────────────────────────────────────────────────
+
+
+def present_settings(root: Path) -> PresentSettings:
+    """Return the settings that are in force in a keystore.
+
+    Raises:
+        KeystoreError: ``root`` is no keystore, or its governance cannot be used.
+        DocumentError: its settings are malformed.
+    """
+    list_enclaves(root)
+    governance, ledger = governance_of(root), read_ledger(root)
+    loaded = load_settings(root)
+    written = loaded if (root / SETTINGS).exists() else None
+    recorded = recorded_settings(ledger)
+    settings = with_places(recorded, loaded) if recorded and written else loaded
+    if protection := protection_for(governance):
+        settings = replace(settings, protection=protection)
+    return PresentSettings(
+        settings, written, governance, hand_edits(root, ledger, written, governance)
+    )
+
+
+def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, DomainSet]:
+    """Return the settings and domains that the edited files of a keystore state.
+
+    Raises:
+        KeystoreError: nothing was edited, both files state another protection, or the governance
+            cannot be stated in settings.
+    """
+    edits = present.edits
+    if not edits:
+        raise KeystoreError(
+            f"no file of keystore '{root}' was edited",
+            f"{SETTINGS} and {GOVERNANCE_XML} are as sros wrote them.",
+            "Edit one of them first, or name what to change with --set or --template.",
+        )
+    written = present.written or present.settings
+    if not edits.governance:
+        return written, present.domains
+    path = root / GOVERNANCE_XML
+    governance = parse_governance(read_bytes(path, "governance document"), f"'{path}'")
+    protection = protection_for(governance)
+    if protection is None:
+        raise KeystoreError(
+            f"'{path}' states what the settings of a keystore cannot",
+            "It has several domain rules, no rule for * at its end, or a rule for a DDS topic that "
+            "is no topic, service or action of ROS.",
+            f"State the protection in {SETTINGS} in its place: "
+            f"`sros update_keystore {quote(str(root))} --discard-edits` writes it anew.",
+        )
+    if written.protection not in (present.settings.protection, protection):
+        raise KeystoreError(
+            f"{SETTINGS} and {GOVERNANCE_XML} of keystore '{root}' were edited, and differ",
+            "Both state the protection of messages.",
+            f"Put one of them back, or both with `sros update_keystore {quote(str(root))} "
+            "--discard-edits`.",
+        )
+    return replace(written, protection=protection), governance.domains().closed()
+
+
+def _checked_target(root: Path, present: PresentSettings, target: Template) -> Template:
+    """Return ``target`` with the places of the present CA keys; raise if it cannot be reached."""
+    for name in ("identity_key", "permissions_key"):
+        wanted, place = getattr(target, name), getattr(present.settings, name)
+        if wanted and wanted != place:
+            raise UsageError(
+                f"the settings name '{wanted}' as the place of a CA key, and it is at "
+                f"'{place or PRIVATE}'",
+                "An update moves no CA key.",
+                f"Leave authorities.{name} out; `sros rotate_ca --{name.replace('_', '-')}` makes "
+                "a CA with a key elsewhere.",
+            )
+    if not target.separate_authorities and len(authority_files(root)) > 1:
+        raise UsageError(
+            "a keystore with separate CAs does not go back to one CA for both",
+            "With one CA, every enclave can sign its own permissions (Cyclone DDS 0.10.2, Fast DDS "
+            "2.9.1).",
+            "Add --set authorities.layout=separate to keep them, or create another keystore.",
+        )
+    return with_places(with_values(target), present.settings)
+
+
+# ── the update ─────────────────────────────────────────────────────────────────────────────
+
+
+def update_keystore(
+    root: Path,
+    target: Template,
+    domains: DomainSet | None = None,
+    *,
+    now: datetime,
+    next_stage: bool = False,
+    allow_looser: bool = False,
+    revoke_old: bool = False,
+    keep_edits: bool = False,
+    keyring: Keyring = IN_KEYSTORE,
+    dry_run: bool = False,
+    progress: Progress | None = None,
+) -> KeystoreUpdate:
+    """Change a keystore to the settings ``target`` and to ``domains`` (None: as they are).
+
+    Args:
+        root: the keystore.
+        target: its new settings; the places of its CA keys stay.
+        domains: its new domains.
+        now: the time from which validities count.
+        next_stage: do only the first stage that is left.
+        allow_looser: accept that something becomes possible that was not.
+        revoke_old: issue all certificates again, with subjects that no earlier permissions fit, and
+            revoke all earlier ones.
+        keep_edits: refuse if somebody edited the settings or the governance.
+        keyring: opens the keys of the CAs.
+        dry_run: report the changes without making them.
+        progress: called with the name of each enclave that is done.
+
+    Raises:
+        UsageError: something would become looser without ``allow_looser``, or ``target`` cannot be
+            reached from here.
+        KeystoreError: an enclave cannot be issued again, or files were edited by hand.
+    """
+    if not dry_run:
+        tidy(root)
+    list_enclaves(root)
+    with Transaction(root, dry_run=dry_run) as transaction:
+        present = present_settings(root)
+        if keep_edits and present.edits:
+            raise KeystoreError(
+                f"files of keystore '{root}' were edited by hand: "
+                f"{'; '.join(present.edits.clauses())}",
+                "The update would undo it.",
+                f"First carry it out or undo it: {edit_remedy(root)}",
+            )
+        goal = _Goal(
+            _checked_target(root, present, target), domains.closed() if domains else present.domains
+        )
+        pending = _pending(present, goal)
+        done = pending[:1] if next_stage else pending
+        step = goal if done == pending else _first_step(present, goal)
+        authorities = load_authorities(root, load_settings(root), keyring, now)
+        updater = _Updater(transaction, present, step, authorities, now, revoke_old=revoke_old)
+        if revoke_old and not pending:
+            raise UsageError(
+                "nothing changes in the keystore, so no certificate is replaced",
+                "",
+                f"To replace and revoke certificates, run `sros renew {root} NAME --revoke-old`.",
+            )
+        update = updater.update(done, pending, keyring, progress)
+        if not dry_run and not allow_looser and (looser := update.looser()):
+            raise UsageError(
+                f"the update would make keystore '{root}' looser: {'; '.join(looser)}",
+                "Nothing was changed.",
+                "If that is meant, add --allow-looser.",
+            )
+        transaction.commit()
+    return update
+
+
+@dataclass(frozen=True, slots=True)
+class _Goal:
+    """The settings and the domains that a keystore shall have."""
+
+    settings: Template
+    domains: DomainSet
+
+    def governance(self) -> Governance:
+        """Return the governance that follows from them."""
+        return governance_for(self.settings.protection, self.domains)
+
+
+def _first_step(present: PresentSettings, goal: _Goal) -> _Goal:
+    """Return the goal after the stage CREDENTIALS: protection, domains and name stay."""
+    settings = replace(
+        goal.settings,
+        protection=present.settings.protection,
+        name=present.settings.name,
+        description=present.settings.description,
+    )
+    return _Goal(settings, present.domains)
+
+
+def _pending(present: PresentSettings, goal: _Goal) -> tuple[UpdateStage, ...]:
+    """Return the stages that change something, in order."""
+    found = []
+    before, after = present.settings, _first_step(present, goal).settings
+    if before != after:
+        found.append(UpdateStage.CREDENTIALS)
+    if goal.governance() != present.governance or present.edits.governance:
+        found.append(UpdateStage.GOVERNANCE)
+    named = (before.name, before.description) != (goal.settings.name, goal.settings.description)
+    if not found and (named or present.edits or present.written is None):
+        found.append(UpdateStage.CREDENTIALS)
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True)
+class _Reissued:
+    """An enclave after its update; ``old`` is the record of its replaced certificate, if any."""
+
+    name: str
+    rights: ReplacedRights
+    old: Superseded | None
+
+
+class _Updater:
+    """Writer of one update, within a transaction."""
+
+    def __init__(
+        self,
+        transaction: Transaction,
+        present: PresentSettings,
+        goal: _Goal,
+        authorities: Authorities,
+        now: datetime,
+        *,
+        revoke_old: bool,
+    ) -> None:
+        self._transaction = transaction
+        self._root = transaction.root
+        self._present = present
+        self._goal = goal
+        self._authorities = authorities
+        self._now = now
+        self._revoke_old = revoke_old
+        before, after = present.settings, goal.settings
+        self._certificates = revoke_old or (
+            (before.certificate_validity, before.unique_subject)
+            != (after.certificate_validity, after.unique_subject)
+        )
+        self._permissions = (
+            self._certificates
+            or before.permissions_validity != after.permissions_validity
+            or present.domains != goal.domains
+            # Rights that no ledger records would not be signed again once there are settings.
+            or present.written is None
+        )
+        self._recorded = RecordedRights(self._root)
+        self._known = KnownKeys(self._root)
+        self._writer = EnclaveWriter(
+            transaction,
+            after,
+            now,
+            identity=authorities.identity,
+            permissions=authorities.permissions,
+        )
+
+    def update(
+        self,
+        done: tuple[UpdateStage, ...],
+        pending: tuple[UpdateStage, ...],
+        keyring: Keyring,
+        progress: Progress | None,
+    ) -> KeystoreUpdate:
+        """Stage the changes of the stages ``done``, and return what they are."""
+        names = tuple(
+            each
+            for each in list_enclaves(self._root)
+            if not waits_for_answer(enclave_path(self._root, each))
+        )
+        before, after = self._present.settings, self._goal.settings
+        governance = self._goal.governance()
+        reissued = self._reissue(names, progress) if done else []
+        entries = list(self._writer.entries)
+        if UpdateStage.GOVERNANCE in done:
+            permissions = self._authorities.permissions
+            entries.append(
+                write_governance(self._transaction, governance, permissions, names, self._now)
+            )
+        if done:
+            self._part_authorities()
+            entries.append(write_settings(self._transaction, after, self._now))
+        revoked = None
+        superseded = [each.old for each in reissued if each.old]
+        if self._revoke_old and superseded:
+            revoked = revoke_superseded(
+                self._transaction,
+                superseded,
+                self._authorities.identity,
+                after,
+                keyring,
+                names,
+                self._now,
+            )
+            entries += revoked.entries
+        append(self._transaction, entries, self._authorities.identity, self._now)
+        rights = tuple(each.rights.revoked() if revoked else each.rights for each in reissued)
+        settings = (
+            *compare_governance(self._present.governance, governance),
+            *compare_settings(before, after, self._now),
+        )
+        restart = bool(reissued) or governance != self._present.governance
+        remarks = [*(revoked.remarks if revoked else ())]
+        if restart and names:
+            disturbed = mismatch(self._present.governance, governance)
+            text = _restart_remark(disturbed, revoked=bool(revoked))
+            remarks.append(Note("keystore.restart", text))
+            remarks.append(Note("keystore.export-again", self._exports(names)))
+        remarks += self._open_tasks(settings)
+        ends = [each.works_until for each in rights if each.works_until]
+        return KeystoreUpdate(
+            self._root,
+            before.name,
+            after.name,
+            done,
+            pending[len(done) :],
+            settings,
+            tuple(each for each in rights if each.lost or each.gained),
+            tuple(each.name for each in reissued if each.old),
+            tuple(each.name for each in reissued if not each.old),
+            max(ends, default=None),
+            revoked.count if revoked else 0,
+            names if restart else (),
+            tuple(remarks),
+            tuple(self._transaction.changes),
+            self._writer.notes if reissued else (),
+        )
+
+    # ── enclaves ───────────────────────────────────────────────────────────────────────────
+
+    def _reissue(self, names: Sequence[str], progress: Progress | None) -> list[_Reissued]:
+        before, after = self._present.settings, self._goal.settings
+        same = (before.default_permissions, before.short_lived) == (
+            after.default_permissions,
+            after.short_lived,
+        )
+        if same and not self._permissions:
+            return []
+
+        def work(name: str) -> _Reissued | UnreadableEnclave | None:
+            try:
+                return self._reissue_one(read_credentials(self._root, name))
+            except SrosError as error:
+                return UnreadableEnclave(name, error)
+
+        found = self._writer.for_each(names, work, progress).values()
+        unreadable = tuple(each for each in found if isinstance(each, UnreadableEnclave))
+        refuse_unreadable(unreadable, "updated")
+        return [each for each in found if isinstance(each, _Reissued)]
+
+    def _reissue_one(self, state: Credentials) -> _Reissued | None:
+        name = state.name
+        earlier = checked_rights(state, self._authorities, self._recorded)
+        replaces_default = self._has_default_rights(state, earlier)
+        certificate = self._certificates or self._expires_otherwise(name)
+        if not (self._permissions or replaces_default or certificate):
+            return None
+        rights: EarlierRights | StatedRights
+        if replaces_default:
+            enclave = default_rights(self._goal.settings, name)
+            rights = StatedRights(enclave, self._goal.domains)
+        else:
+            rights = replace(earlier, grant=self._on_domains(name, earlier.grant))
+        identity = self._new_identity(state) if certificate else state.certificate
+        issued = self._writer.write(Issuance(name, identity, rights))
+        (grant,) = issued.permissions.grants
+        present = EarlierPermissions(state.certificate, state.grant)
+        old = None
+        if certificate:
+            old = Superseded.by(name, state.certificate, issued.certificate, self._now)
+        return _Reissued(name, replaced_rights(name, present, grant, self._now), old)
+
+    def _expires_otherwise(self, name: str) -> bool:
+        """Return whether an enclave becomes short-lived, or is no longer."""
+        before, after = self._present.settings, self._goal.settings
+        return before.longest_validity(name) != after.longest_validity(name)
+
+    def _new_identity(self, state: Credentials) -> NewIdentity:
+        name, settings = state.name, self._goal.settings
+        public: PublicKey = state.certificate.public_key()  # type: ignore[assignment]
+        remedy = f"Give it another key with `sros renew {self._root} {name} --new-key`."
+        self._known.refuse_revoked(public, f"enclave {name}", remedy, state.certificate)
+        kept = settings.unique_subject == self._present.settings.unique_subject
+        unique = (
+            settings.unique_subject
+            or self._revoke_old
+            or (kept and has_unique_part(state.certificate.subject))
+        )
+        return NewIdentity(enclave_subject(name, unique=unique), public)
+
+    def _has_default_rights(self, state: Credentials, earlier: EarlierRights) -> bool:
+        """Return whether an enclave has the rights of no policy, and these change."""
+        before, after = self._present.settings, self._goal.settings
+        if before.default_permissions == after.default_permissions:
+            return False
+        default = default_rights(before, state.name)
+        if earlier.policy not in ("", default.digest):
+            return False
+        validity, domains = state.lifetime().permissions, self._present.domains
+        (meant,) = permissions_for(
+            default, subject=state.grant.subject, validity=validity, domains=domains
+        ).grants
+        own = grant_rights(state.name, state.grant)
+        if before.default_permissions == EVERYTHING:  # ros2/sros2 adds the DDS topic *
+            own = frozenset(each for each in own if each.kind != "dds")
+        difference = compare(grant_rights(state.name, meant), own)
+        return all(each in difference.covered for _, each in difference.lines())
+
+    def _on_domains(self, name: str, grant: Grant) -> Grant:
+        """Return a grant whose rules are for the new domains.
+
+        Raises:
+            KeystoreError: a rule is not for the domains of the keystore.
+        """
+        if self._present.domains == self._goal.domains:
+            return grant
+        if any(each.domains.closed() != self._present.domains for each in grant.rules):
+            raise KeystoreError(
+                f"the permissions of enclave {name} are not for domain {self._present.domains}",
+                "So it is not certain which rights it shall have in other domains.",
+                f"State them with `sros create_permission {self._root} {name} POLICY_FILE`.",
+            )
+        rules = tuple(replace(each, domains=self._goal.domains) for each in grant.rules)
+        return replace(grant, rules=rules)
+
+    # ── authorities ────────────────────────────────────────────────────────────────────────
+
+    def _part_authorities(self) -> None:
+        """Stage a file of its own for each CA, if one file has both; DDS loads the same bytes."""
+        settings, files = self._goal.settings, authority_files(self._root)
+        if not settings.separate_authorities or len(files) > 1:
+            return
+        if read_rotation(self._root).stage is not RotationStage.NONE:
+            raise KeystoreError(
+                f"a rotation of the CA of keystore '{self._root}' is under way",
+                "It replaces the CA in both roles.",
+                f"Finish it first with `sros rotate_ca {self._root} --next`.",
+            )
+        (file,) = files
+        for one, private, path_of in (
+            (f"{PUBLIC}/{file}.cert.pem", False, ca_certificate),
+            (f"{PRIVATE}/{file}.key.pem", True, ca_key),
+        ):
+            if not (self._root / one).is_file():
+                continue  # a key that is kept elsewhere
+            data = self._transaction.read(one)
+            for role in ROLES:
+                self._transaction.write(path_of(role), data, private=private)
+            if one not in map(path_of, ROLES):
+                self._transaction.remove(one)
+
+    # ── remarks ────────────────────────────────────────────────────────────────────────────
+
+    def _exports(self, names: Sequence[str]) -> str:
+        root = quote(str(self._root))
+        text = "Robots have the files of before: export them again (`sros distribute_key "
+        text += f"{root} NAME TARGET --force`)"
+        remote = [each for each in names if key_on_robot(enclave_path(self._root, each))]
+        if remote:
+            text += f"; for {', '.join(remote)}, answer the request again (`sros sign_request "
+            text += f"{root} REQUEST --renew`)"
+        return f"{text}."
+
+    def _open_tasks(self, changes: Sequence[SettingChange]) -> list[Note]:
+        identity = self._authorities.identity.certificate
+        shared = same_key(identity, self._authorities.permissions.key)
+        if self._goal.settings.separate_authorities and shared:
+            text = (
+                "Identity CA and permissions CA have files of their own now, and still the same "
+                "key, so an enclave can sign its own permissions: replace the permissions CA with "
+                f"{self._rotation(f' --{PERMISSIONS}')}."
+            )
+            return [Note("keystore.one-authority", text)]
+        if any(e.effect is Effect.TIGHTER and e.key.startswith("protection") for e in changes):
+            role = "" if shared else f" --{PERMISSIONS}"
+            text = (
+                "The governance of before is still validly signed: whoever changes the files of a "
+                "robot can put it back there. That ends when the CA that signed it is replaced: "
+                f"{self._rotation(role)}."
+            )
+            return [Note("keystore.earlier-governance", text)]
+        return []
+
+    def _rotation(self, role: str) -> str:
+        """Return the command that begins to replace the CA of permissions, or with "" both."""
+        span = self._goal.settings.authority_validity
+        old = validity_of(self._authorities.permissions.certificate).not_after
+        # A CA that expires before the one that it replaces has to be asked for.
+        earlier = window(self._now, span).not_after < old
+        validity = f" --ca-validity {span_text(span)}" if earlier else ""
+        return f"`sros rotate_ca {quote(str(self._root))}{role} --next{validity}`"
+
+
+def _restart_remark(disturbed: Mismatch, *, revoked: bool) -> str:
+    """Return which processes to restart in which order; the vendors agree (measured)."""
+    if revoked and not disturbed.everything:
+        return (
+            "All vendors: restart all processes together; processes after the restart refuse the "
+            "revoked certificates of processes before it. Until then, running processes "
+            "communicate as before."
+        )
+    if disturbed:
+        which, what = "all processes", "do not communicate"
+        if not disturbed.everything:
+            which = "the processes that use these names"
+            what += f" on {', '.join(disturbed.names)}, and do on everything else"
+        return (
+            f"Cyclone DDS and Fast DDS: restart {which} together; processes before and after the "
+            f"restart {what}. Until then, running processes communicate as before."
+        )
+    return (
+        "All vendors: restart the processes one by one, at any time; processes before and after "
+        "the restart communicate. Until its restart, a process has what it had before."
+    )

@@ -1,0 +1,169 @@
+"""The settings of a keystore: writing ``sros.toml``, and finding what was edited by hand.
+
+The ledger has the text of the settings as sros wrote them last, so that an edit is noticed, can be
+carried out (`sros_tool.keystore.lifecycle.update`) or undone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import tomllib
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from shlex import quote
+from typing import TYPE_CHECKING
+
+from sros_tool.dds.governance import Governance, parse_governance
+from sros_tool.errors import Note, SrosError
+from sros_tool.keystore.layout import GOVERNANCE_P7S, GOVERNANCE_XML, SETTINGS
+from sros_tool.keystore.ledger import Entry, Ledger, read_ledger
+from sros_tool.keystore.reader import OpenedKeystore
+from sros_tool.keystore.template import Template, parse_template, render_template, settings_values
+from sros_tool.pki import smime
+from sros_tool.translate import governance_for
+from sros_tool.validity import iso
+from sros_tool.xml import read_bytes
+
+if TYPE_CHECKING:
+    from sros_tool.keystore.transaction.transaction import Transaction
+
+_COMMENT = """\
+# The settings of this keystore; sros uses them for each enclave that is added.
+# To change them, run `sros update_keystore`: it also signs what follows from them.
+"""
+
+
+def write_settings(transaction: Transaction, template: Template, now: datetime) -> Entry:
+    """Stage ``template`` as the settings of the keystore; return the entry for the ledger."""
+    text = render_template(template)
+    document = (_COMMENT + text).encode()
+    transaction.write(SETTINGS, document)
+    digest = hashlib.sha256(document).hexdigest()
+    return Entry(iso(now), "settings", sha256=digest, settings=text)
+
+
+def recorded_settings(ledger: Ledger) -> Template | None:
+    """Return the settings that sros wrote last, or None if the ledger has none."""
+    for entry in reversed(ledger.entries):
+        if entry.what == "settings":
+            with suppress(tomllib.TOMLDecodeError, ValueError):
+                return parse_template(entry.settings, "")
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class HandEdits:
+    """What somebody edited in a keystore, and sros has not carried out.
+
+    ``settings`` are clauses about keys of ``sros.toml``; ``governance`` is a clause about
+    ``governance.xml``, or "".  ``unsigned`` are clauses about protection that ``sros.toml`` states
+    and the signed governance does not have.
+    """
+
+    settings: tuple[str, ...] = ()
+    governance: str = ""
+    unsigned: tuple[str, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.settings or self.governance or self.unsigned)
+
+    def clauses(self) -> tuple[str, ...]:
+        """Return all clauses, each once."""
+        found = (*self.settings, *self.unsigned, self.governance)
+        return tuple(dict.fromkeys(each for each in found if each))
+
+
+_SHOWN = 3
+
+
+def edit_notes(root: Path, governance: Governance) -> tuple[Note, ...]:
+    """Return a note on files that were edited by hand, for a verb that does not carry it out.
+
+    ``governance`` is the signed governance of the keystore.
+    """
+    edits = found_edits(root, governance)
+    if not edits:
+        return ()
+    clauses = edits.clauses()
+    more = f"; and {len(clauses) - _SHOWN} more" if len(clauses) > _SHOWN else ""
+    text = f"{'; '.join(clauses[:_SHOWN])}{more}. Only what is issued from now on may follow it, "
+    text += f"and the signed governance does not: {edit_remedy(root)}"
+    return (Note("keystore.edited", text),)
+
+
+def found_edits(root: Path, governance: Governance | None) -> HandEdits:
+    """Return what was edited in a keystore; ``governance`` is the signed one, if it is readable."""
+    return hand_edits(root, read_ledger(root), OpenedKeystore(root).settings, governance)
+
+
+def edit_remedy(root: Path | str) -> str:
+    """Return what to do with edited files, as a sentence with commands."""
+    shown = root if isinstance(root, str) else quote(str(root))
+    return (
+        f"`sros update_keystore {shown} --take-edits --dry-run` shows what it would change, "
+        f"`sros update_keystore {shown} --discard-edits` undoes it."
+    )
+
+
+def hand_edits(
+    root: Path, ledger: Ledger, present: Template | None, governance: Governance | None
+) -> HandEdits:
+    """Return what was edited by hand; ``governance`` is the signed one, ``present`` sros.toml.
+
+    A keystore of ros2/sros2 has no settings, so only its ``governance.xml`` is compared.
+    """
+    recorded = recorded_settings(ledger)
+    settings: tuple[str, ...] = ()
+    unsigned: tuple[str, ...] = ()
+    if present and recorded:
+        settings = tuple(_differences(recorded, present, "written by sros"))
+    if present and governance:
+        meant = governance_for(present.protection, governance.domains().closed())
+        if meant != governance:
+            unsigned = tuple(_unsigned(present, recorded, settings))
+    return HandEdits(settings, _governance_edit(root), unsigned)
+
+
+def _unsigned(
+    present: Template, recorded: Template | None, settings: Sequence[str]
+) -> Iterator[str]:
+    """Yield a clause if the signed governance is not what sros.toml states."""
+    if not settings or (recorded and recorded.protection == present.protection):
+        yield f"the signed governance is not what [protection] in {SETTINGS} states"
+
+
+def _differences(old: Template, new: Template, origin: str) -> Iterator[str]:
+    """Yield a clause for each key with another value; names and descriptions do not count."""
+    before, after = settings_values(old), settings_values(new)
+    for key in dict.fromkeys((*before, *after)):
+        one, other = before.get(key, "nothing"), after.get(key, "nothing")
+        if one != other and key not in ("name", "description"):
+            yield f"{key} in {SETTINGS} is {other}, and {one} was {origin}"
+
+
+def _governance_edit(root: Path) -> str:
+    """Return a clause if ``governance.xml`` is another document than the signed one, else ""."""
+    xml, signed = root / GOVERNANCE_XML, root / GOVERNANCE_P7S
+    if not (xml.is_file() and signed.is_file()):
+        return ""
+    try:
+        one = read_bytes(xml, "governance document")
+        other = smime.parse(read_bytes(signed, "governance document")).document
+    except SrosError:
+        return ""
+    if one.replace(b"\r\n", b"\n").strip() == other.replace(b"\r\n", b"\n").strip():
+        return ""
+    with suppress(SrosError):
+        if parse_governance(one) == parse_governance(other):
+            return ""
+    return f"{GOVERNANCE_XML} is not the signed governance"
+
+
+def with_places(template: Template, places: Template) -> Template:
+    """Return ``template`` with the places of the CA keys of ``places``."""
+    return replace(
+        template, identity_key=places.identity_key, permissions_key=places.permissions_key
+    )

@@ -1,0 +1,530 @@
+"""Changing a keystore: all of it follows the new settings, or nothing changes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from sros_tool.checks.keystores.keystore import keystore_findings
+from sros_tool.checks.kind import NOTE
+from sros_tool.dds.domains import DomainSet
+from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.keystore.history import history
+from sros_tool.keystore.layout import enclave_path, list_enclaves
+from sros_tool.keystore.ledger import read_ledger
+from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.lifecycle.renew import renew
+from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
+from sros_tool.keystore.lifecycle.update import (
+    KeystoreUpdate,
+    UpdateStage,
+    edited_settings,
+    present_settings,
+    update_keystore,
+)
+from sros_tool.keystore.reader import (
+    authority_files,
+    governance_of,
+    load_settings,
+    open_enclave,
+    read_crl,
+)
+from sros_tool.keystore.template import (
+    NamedValues,
+    ShortLived,
+    Template,
+    load_template,
+    with_values,
+)
+from sros_tool.policy.document import read_policy
+from sros_tool.translate import governance_for
+from tests.support import made_by_ros2
+from tests.support.harness import (
+    certificate,
+    check_whole,
+    policy_text,
+    publish,
+    remains,
+    snapshot,
+    sros,
+    topics_of,
+)
+
+NOW = datetime.now(UTC)
+LATER = NOW + timedelta(hours=1)
+ZERO = DomainSet.of((0, 0))
+
+
+def make(folder: Path, template: str = "development") -> Path:
+    """A keystore in which /free has no policy, and /robot one."""
+    root = folder / "ks"
+    create_keystore(root, template=load_template(template), now=NOW)
+    create_enclaves(root, ["/free"], now=NOW)
+    policy = folder / "policy.xml"
+    policy.write_text(policy_text({"/robot": publish("/scan", "/odom")}))
+    generate_artifacts(root, policies=[read_policy(policy)], now=NOW)
+    return root
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return make(tmp_path)
+
+
+def change(root: Path, *values: tuple[str, str], **options: object) -> KeystoreUpdate:
+    """Change single settings, with everything allowed."""
+    target = with_values(present_settings(root).settings, values)
+    return to(root, target, **options)
+
+
+def to(root: Path, target: Template | str, *domains: int, **options: object) -> KeystoreUpdate:
+    template = load_template(target) if isinstance(target, str) else target
+    chosen = DomainSet.of(*((each, each) for each in domains)) if domains else None
+    settings: dict[str, Any] = {"allow_looser": True, **options}
+    done = update_keystore(root, template, chosen, now=LATER, **settings)
+    sound(root)
+    return done
+
+
+def sound(root: Path) -> None:
+    """DDS loads every enclave, nothing is left behind, and the ledger knows every file."""
+    assert not remains(root.parent)
+    check_whole(root)
+    for name in list_enclaves(root):
+        assert open_enclave(enclave_path(root, name), now=LATER).problems_at_home == (), name
+    # No ledger has the CA that ros2/sros2 made.
+    left = set(history(root, now=LATER).unexplained)
+    assert left <= {"public/identity_ca.cert.pem", "public/permissions_ca.cert.pem"}
+
+
+def told(update: KeystoreUpdate) -> str:
+    return " ".join(each.text for each in update.remarks)
+
+
+def found(root: Path) -> set[str]:
+    every = keystore_findings(root, now=LATER)
+    return {each.id for each in every if each.kind.severity > NOTE}
+
+
+def until(root: Path, name: str) -> tuple[int, int]:
+    """The days for which certificate and permissions of an enclave are valid."""
+    state = open_enclave(enclave_path(root, name), now=LATER)
+    assert state.certificate
+    assert state.grant
+    ends = (state.certificate.not_valid_after_utc, state.grant.validity.not_after)
+    one, other = ((each - LATER).days + 1 for each in ends)
+    return one, other
+
+
+# ── what changes ───────────────────────────────────────────────────────────────────────────
+
+
+def test_from_development_to_production(root: Path) -> None:
+    names = ("/free", "/robot")
+    keys = {each: (enclave_path(root, each) / "key.pem").read_bytes() for each in names}
+    robot = topics_of(enclave_path(root, "/robot"))
+    done = to(root, "production", allow_looser=False)
+    assert (done.before, done.after, done.left) == ("development", "production", ())
+    assert done.renewed == ("/free", "/robot")
+    assert not done.looser()
+    template = load_template("production")
+    assert governance_of(root) == governance_for(template.protection, ZERO)
+    assert load_settings(root) == template
+    for name, key in keys.items():
+        folder = enclave_path(root, name)
+        assert (folder / "key.pem").read_bytes() == key
+        assert len(certificate(folder / "cert.pem").subject.rdns) == 2
+        assert until(root, name) == (365, 180)
+    assert topics_of(enclave_path(root, "/robot")) == robot  # the rights of a policy stay
+    assert "rt/*" not in topics_of(enclave_path(root, "/free"))
+    (lost,) = done.rights
+    assert (lost.enclave, lost.gained) == ("/free", ())
+    assert "publish topic /*" in [each.describe() for each in lost.lost]
+    assert done.works_until
+    assert (done.works_until - NOW).days >= 3649
+    assert found(root) == set()
+
+
+def test_and_back(tmp_path: Path) -> None:
+    root = make(tmp_path, "production")
+    before = snapshot(root)
+    with pytest.raises(UsageError, match=r"looser.*/free gains publish topic"):
+        to(root, "development", allow_looser=False)
+    assert snapshot(root) == before
+    done = to(root, "development")
+    assert load_settings(root) == load_template("development")
+    assert len(certificate(enclave_path(root, "/robot") / "cert.pem").subject.rdns) == 1
+    assert until(root, "/robot") == (5 * 365, 5 * 365)  # with the CAs, at the latest
+    assert any("/free gains" in each for each in done.looser())
+    assert found(root) == found(make(tmp_path / "other"))
+
+
+@pytest.fixture(autouse=True)
+def other_folder(tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+
+
+@pytest.mark.parametrize(
+    ("value", "renewed", "signed", "governed"),
+    [
+        (("protection.rtps", "ENCRYPT"), False, False, True),
+        (("protection.default.data", "NONE"), False, False, True),
+        (("permissions.validity", "30d"), False, True, False),
+        (("certificates.validity", "30d"), True, False, False),
+        (("certificates.unique_subject", "true"), True, False, False),
+        (("authorities.validity", "1y"), False, False, False),
+        (("revocation.validity", "1y"), False, False, False),
+    ],
+)
+def test_only_what_follows_from_a_setting_changes(
+    value: tuple[str, str], renewed: bool, signed: bool, governed: bool, root: Path
+) -> None:
+    governance = (root / "enclaves/governance.p7s").read_bytes()
+    done = change(root, value)
+    names = ("/free", "/robot")
+    assert (done.renewed, done.signed) == (names if renewed else (), names if signed else ())
+    assert ((root / "enclaves/governance.p7s").read_bytes() != governance) == governed
+    assert done.restart == (names if renewed or signed or governed else ())
+    assert value[1].replace("1y", "365d") in (root / "sros.toml").read_text()
+    again = change(root, value)
+    assert (again.done, again.changes) == ((), ())
+
+
+def test_short_lived_enclaves_are_issued_again_alone(root: Path) -> None:
+    settings = present_settings(root).settings
+    short = (ShortLived("/free", timedelta(days=2)),)
+    done = to(root, replace(settings, short_lived=short))
+    assert (done.renewed, done.signed) == (("/free",), ())
+    assert until(root, "/free") == (2, 2)
+    assert to(root, settings).renewed == ("/free",)
+    assert until(root, "/free") == (3650, 3650)
+
+
+def test_domains(root: Path) -> None:
+    with pytest.raises(UsageError, match="may also join domain 7"):
+        to(root, present_settings(root).settings, 0, 7, allow_looser=False)
+    done = to(root, present_settings(root).settings, 0, 7)
+    assert done.signed == ("/free", "/robot")
+    for name in list_enclaves(root):
+        folder = enclave_path(root, name)
+        assert not open_enclave(folder, now=LATER, domain=7).problems
+    to(root, present_settings(root).settings, 7, allow_looser=False)
+    assert open_enclave(enclave_path(root, "/robot"), now=LATER, domain=0).problems
+    assert found(root) <= {"keystore.allow-everything", "enclave.long-permissions"}
+
+
+def test_rules_for_names(root: Path) -> None:
+    camera = NamedValues("topic", "/camera/*", (("data", "NONE"), ("metadata", "SIGN")))
+    target = with_values(present_settings(root).settings, rules=[camera])
+    done = to(root, target)
+    assert "on topic /camera/*" in told(done)
+    expressions = [
+        each.topic_expression
+        for each in governance_of(root).domain_access_rules[0].topic_access_rules
+    ]
+    assert expressions == ["rt/camera/*", "*"]
+    to(root, with_values(present_settings(root).settings, dropped=[("topic", "/camera/*")]))
+    assert load_settings(root) == load_template("development")
+
+
+def test_own_copies_of_the_governance_follow(root: Path) -> None:
+    own = enclave_path(root, "/robot") / "governance.p7s"
+    data = own.read_bytes()
+    own.unlink()
+    own.write_bytes(data)
+    change(root, ("protection.rtps", "ENCRYPT"))
+    assert own.read_bytes() == (root / "enclaves/governance.p7s").read_bytes() != data
+
+
+def test_an_enclave_whose_key_is_on_its_robot(root: Path) -> None:
+    folder = enclave_path(root, "/robot")
+    (folder / "key.pem").rename(folder / "request.pem")
+    done = to(root, "production")
+    assert "/robot" in done.renewed
+    assert "answer the request again" in told(done)
+
+
+def test_rights_that_were_put_back_are_not_signed_again(root: Path) -> None:
+    file = enclave_path(root, "/robot") / "permissions.p7s"
+    before = file.read_bytes()
+    renew(root, ["/robot"], now=NOW)
+    file.write_bytes(before)
+    state = snapshot(root)
+    with pytest.raises(KeystoreError, match="not certain that the permissions of enclave /robot"):
+        update_keystore(root, load_template("production"), now=LATER)
+    assert snapshot(root) == state
+
+
+# ── stages ─────────────────────────────────────────────────────────────────────────────────
+
+
+def test_the_stages(root: Path) -> None:
+    target = load_template("production")
+    governance = governance_of(root)
+    first = to(root, target, next_stage=True)
+    assert (first.done, first.left) == ((UpdateStage.CREDENTIALS,), (UpdateStage.GOVERNANCE,))
+    assert governance_of(root) == governance
+    assert load_settings(root).name == "development"
+    assert "one by one" in first.remarks[0].text
+    assert found(root) == set()
+    # What is created between the stages follows the new settings already.
+    create_enclaves(root, ["/late"], now=LATER)
+    assert until(root, "/late") == (365, 180)
+    second = to(root, target, next_stage=True)
+    assert (second.done, second.left) == ((UpdateStage.GOVERNANCE,), ())
+    assert (second.renewed, second.signed) == ((), ())
+    assert "together" in second.remarks[0].text
+    assert load_settings(root) == target
+    third = to(root, target, next_stage=True)
+    assert (third.done, third.changes) == ((), ())
+
+
+def test_revoking_the_old(root: Path) -> None:
+    serials = {each: serial_of(root, each) for each in list_enclaves(root)}
+    done = change(root, ("permissions.validity", "30d"), revoke_old=True)
+    assert done.revoked == 2
+    assert done.works_until is None
+    crl = read_crl(root)
+    assert crl
+    assert {each.serial for each in crl.revoked} == set(serials.values())
+    assert "restart all processes together" in told(done)
+    for name in serials:  # the permissions of before fit no certificate any more
+        assert len(certificate(enclave_path(root, name) / "cert.pem").subject.rdns) == 2
+    renew(root, ["/robot"], now=LATER)
+    assert len(certificate(enclave_path(root, "/robot") / "cert.pem").subject.rdns) == 2
+    with pytest.raises(UsageError, match="renew"):
+        change(root, ("permissions.validity", "30d"), revoke_old=True)
+
+
+def serial_of(root: Path, name: str) -> int:
+    return certificate(enclave_path(root, name) / "cert.pem").serial_number
+
+
+# ── the layout of the CAs ──────────────────────────────────────────────────────────────────
+
+
+@pytest.mark.parametrize("by_ros2", [False, True])
+def test_one_ca_becomes_two(by_ros2: bool, tmp_path: Path) -> None:
+    if by_ros2:
+        root = tmp_path / "ks"
+        made_by_ros2.make(root, "/free", "/robot", now=NOW)
+        for key in root.glob("**/*key.pem"):
+            key.chmod(0o600)
+    else:
+        root = make(tmp_path, "sros2")
+    done = to(root, "production", allow_looser=False)
+    assert "rotate_ca" in told(done)
+    assert set(authority_files(root)) == {"identity_ca", "permissions_ca"}
+    assert not list(root.glob("*/ca.*"))
+    # The two files still hold one CA, and that is found until the permissions CA is replaced.
+    assert found(root) - {"keystore.folder-open"} == {"keystore.one-authority"}
+    before = present_settings(root).settings
+    command = done.remarks[-1].text.partition("`sros ")[2].partition("`")[0].split()
+    sros(*command).ok()
+    for _ in range(2):
+        rotate_ca(root, now=LATER)
+        sound(root)
+    assert present_settings(root).settings == before
+    assert found(root) <= {"keystore.folder-open"}
+
+
+def test_two_cas_do_not_become_one(root: Path) -> None:
+    before = snapshot(root)
+    with pytest.raises(UsageError, match="does not go back"):
+        to(root, "sros2")
+    assert snapshot(root) == before
+    kept = with_values(load_template("sros2"), [("authorities.layout", "separate")])
+    to(root, kept)
+    assert load_settings(root).name == "sros2"
+
+
+def test_a_key_is_not_moved(root: Path) -> None:
+    target = replace(load_template("production"), identity_key="file:/elsewhere.pem")
+    with pytest.raises(UsageError, match="moves no CA key"):
+        to(root, target)
+
+
+# ── edits by hand ──────────────────────────────────────────────────────────────────────────
+
+
+def _weaker_settings(root: Path) -> None:
+    _put(root / "sros.toml", 'rtps = "SIGN"', 'rtps = "NONE"')
+
+
+def _stronger_settings(root: Path) -> None:
+    _put(root / "sros.toml", 'rtps = "SIGN"', 'rtps = "ENCRYPT"')
+
+
+def _shorter(root: Path) -> None:
+    _put(root / "sros.toml", '[permissions]\nvalidity = "3650d"', '[permissions]\nvalidity = "30d"')
+
+
+def _governance(root: Path) -> None:
+    kind = "<rtps_protection_kind>"
+    _put(root / "enclaves/governance.xml", f"{kind}SIGN", f"{kind}NONE")
+
+
+def _put(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+EDITS: dict[str, tuple[Callable[[Path], None], str, bool]] = {
+    "weaker settings": (_weaker_settings, "keystore.settings-edited", True),
+    "stronger settings": (_stronger_settings, "keystore.settings-edited", False),
+    "another validity": (_shorter, "keystore.settings-edited", False),
+    "another governance": (_governance, "governance.xml-differs", True),
+}
+
+
+@pytest.mark.parametrize("case", EDITS)
+def test_an_edit_is_found_and_taken_over_or_undone(case: str, root: Path, tmp_path: Path) -> None:
+    edit, finding, looser = EDITS[case]
+    assert finding not in found(root)
+    clean = {each: (root / each).read_bytes() for each in ("sros.toml", "enclaves/governance.xml")}
+    edit(root)
+    (kind,) = found(root) - {"enclave.long-permissions", "keystore.allow-everything"}
+    assert kind == finding
+    edited = snapshot(root)
+    # Nothing that signs the governance or writes the settings undoes it.
+    for refused in (
+        lambda: rotate_ca(root, now=LATER),
+        lambda: to(root, "production", keep_edits=True),
+    ):
+        with pytest.raises(KeystoreError, match="edited by hand"):
+            refused()
+        assert snapshot(root) == edited
+    (note,) = renew(root, ["/robot"], now=NOW).notes
+    assert (note.id, "--take-edits" in note.text) == ("keystore.edited", True)
+    (note,) = create_enclaves(root, ["/late"], now=NOW).notes
+    assert note.id == "keystore.edited"
+    target, domains = edited_settings(root, present_settings(root))
+    if looser:
+        with pytest.raises(UsageError, match="looser"):
+            update_keystore(root, target, domains, now=LATER)
+    else:
+        update_keystore(root, target, domains, now=LATER)
+        assert finding not in found(root)
+        edit_again = snapshot(root)
+        assert edit_again != edited
+        return
+    update_keystore(root, present_settings(root).settings, now=LATER)
+    assert {each: (root / each).read_bytes() for each in clean} == clean
+    assert finding not in found(root)
+    edit(root)
+    update_keystore(root, target, domains, now=LATER, allow_looser=True)
+    assert finding not in found(root)
+    assert governance_of(root).domain_access_rules[0].rtps_protection_kind == "NONE"
+    sound(root)
+
+
+def test_a_comment_is_no_edit(root: Path) -> None:
+    with (root / "sros.toml").open("a") as file:
+        file.write("\n# mine\n")
+    assert "keystore.settings-edited" not in found(root)
+
+
+def test_edits_that_contradict_each_other(root: Path) -> None:
+    _stronger_settings(root)
+    _governance(root)
+    with pytest.raises(KeystoreError, match="differ"):
+        edited_settings(root, present_settings(root))
+
+
+def test_without_an_edit_there_is_nothing_to_take(root: Path) -> None:
+    with pytest.raises(KeystoreError, match=r"no file .* was edited"):
+        edited_settings(root, present_settings(root))
+
+
+def test_a_keystore_from_before_the_record(root: Path) -> None:
+    """Without the settings in the ledger, an edited protection is still found."""
+    ledger = root / "ledger.jsonl"
+    lines = [x for x in ledger.read_text().splitlines() if '"what":"settings"' not in x]
+    ledger.write_text("\n".join(lines) + "\n")
+    assert "governance.not-as-settings" not in found(root)
+    _stronger_settings(root)
+    assert "governance.not-as-settings" in found(root)
+
+
+# ── the verb ───────────────────────────────────────────────────────────────────────────────
+
+
+def test_a_dry_run_says_what_the_run_does_and_changes_nothing(root: Path) -> None:
+    before = snapshot(root)
+    words = ("update_keystore", root, "--template", "production")
+    would = json.loads(sros(*words, "--dry-run", "--json").ok().out)
+    text = sros(*words, "--dry-run").ok()
+    assert snapshot(root) == before
+    done = json.loads(sros(*words, "--json").ok().out)
+    for key in ("settings", "rights", "renewed", "changes", "restart", "done", "template"):
+        assert would[key] == done[key], key
+    assert "tighter  protection.rtps SIGN -> ENCRYPT: whole messages: encrypted" in text.out
+    assert "/free would lose: publish topic /*" in text.out
+    assert "would replace" in text.out
+    assert "restart all processes together" in text.err
+    assert "--revoke-old" in text.err
+
+
+def test_a_looser_dry_run_is_refused_as_the_run_is(root: Path) -> None:
+    words = ("update_keystore", root, "--set", "protection.rtps=NONE")
+    assert sros(*words, "--dry-run").status == 1
+    assert sros(*words, "--dry-run", "--allow-looser").status == 0
+    ended = sros(*words)
+    assert (ended.status, "--allow-looser" in ended.err) == (2, True)
+    sros(*words, "--allow-looser").ok()
+
+
+def test_the_options(root: Path) -> None:
+    sros(
+        "update_keystore", root, "--domain", "0,7", "--rule",
+        "topic /camera/* data=NONE metadata=SIGN", "--allow-looser",
+    ).ok()  # fmt: skip
+    assert str(present_settings(root).domains) == "0,7"
+    sros("update_keystore", root, "--drop-rule", "topic /camera/*").ok()
+    assert governance_of(root).domain_access_rules[0].topic_access_rules[0].topic_expression == "*"
+    _stronger_settings(root)
+    assert "--take-edits" in sros("update_keystore", root, "--set", "protection.rtps=NONE").err
+    sros("update_keystore", root, "--take-edits").ok()
+    assert load_settings(root).protection.rtps == "ENCRYPT"
+    _put(root / "sros.toml", 'rtps = "ENCRYPT"', 'rtps = "NONE"')
+    sros("update_keystore", root, "--discard-edits").ok()
+    assert load_settings(root).protection.rtps == "ENCRYPT"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        (),
+        ("--set", "protection.rtps"),
+        ("--set", "protection.rtps=LOUD"),
+        ("--rule", "topic /a"),
+        ("--rule", "node /a data=NONE"),
+        ("--drop-rule", "topic /a"),
+        ("--domain", "x"),
+        ("--template", "production", "--take-edits"),
+        ("--take-edits", "--discard-edits"),
+        ("--take-edits", "--next"),
+    ],
+)
+def test_wrong_usage_changes_nothing(words: tuple[str, ...], root: Path) -> None:
+    before = snapshot(root)
+    assert sros("update_keystore", root, *words).status == 2
+    assert snapshot(root) == before
+
+
+def test_no_keystore(tmp_path: Path) -> None:
+    with pytest.raises(SrosError):
+        present_settings(tmp_path)
+
+
+def test_the_settings_are_in_the_ledger(root: Path) -> None:
+    to(root, "production")
+    entries = [each for each in read_ledger(root).entries if each.what == "settings"]
+    assert ['name = "production"' in each.settings for each in entries] == [False, True]
