@@ -274,6 +274,7 @@ SHARED_PARTS = {
     "crl": Case("lost --refresh"),
     "import": Case("r.tgz robot"),
     "merge_policy": Case("policy.xml other.xml"),
+    "update_keystore": Case("ks --template production"),
 }
 """Commands whose outputs together have every shared part."""
 
