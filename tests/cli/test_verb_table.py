@@ -32,7 +32,7 @@ RUNS = {"run", "demo"}
 NEW_NAMES = {("create_request", "name")}
 """Arguments that are a name which does not exist yet."""
 GROWS = {
-    "create_enclave", "generate_artifacts", "renew", "revoke", "rotate_ca", "distribute_key",
+    "create_enclave", "generate_artifacts", "update_keystore", "renew", "revoke", "rotate_ca", "distribute_key",
     "verify", "diff_policy", "explain", "view", "check",
 }  # fmt: skip
 
@@ -114,6 +114,11 @@ STATUS: dict[str, tuple[str, str, str]] = {
     "create_enclave": ("ks /new", NEVER, "nothing /new"),
     "create_permission": ("ks /a p.xml", NEVER, "ks /a broken.xml"),
     "generate_artifacts": ("-k ks -p p.xml", NEVER, "-k ks -p broken.xml"),
+    "update_keystore": (
+        "ks --template production",
+        "ks --set protection.rtps=NONE --dry-run",
+        "ks --set protection.rtps=NONE",
+    ),
     "list_enclaves": ("ks", NEVER, "nothing"),
     "inspect": (SIGNED, f"{SIGNED} --ca {OTHER_CA}", "nothing"),
     "renew": ("ks /a", NEVER, "ks /nobody"),
