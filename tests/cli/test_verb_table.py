@@ -32,8 +32,8 @@ RUNS = {"run", "demo"}
 NEW_NAMES = {("create_request", "name")}
 """Arguments that are a name which does not exist yet."""
 GROWS = {
-    "create_enclave", "generate_artifacts", "update_keystore", "renew", "revoke", "rotate_ca", "distribute_key",
-    "verify", "diff_policy", "explain", "view", "check",
+    "create_enclave", "generate_artifacts", "update_keystore", "renew", "revoke", "rotate_ca",
+    "distribute_key", "verify", "diff_policy", "explain", "view", "check",
 }  # fmt: skip
 
 
