@@ -599,6 +599,47 @@ def test_what_cyclone_denied_is_proposed_and_then_allowed(tmp_path: Path) -> Non
     assert refused(keystore("after"), enclave, wrong | never) == never
 
 
+# ── without enclaves ──────────────────────────────────────────────────────────────────────
+
+UNSHOWN = "/"
+"""The enclave that the graph shows for a process that was started without one."""
+UNSECURED = [
+    process(UNSHOWN, node("talker", publish=["chatter"])),
+    process(UNSHOWN, node("listener", "/hall", subscribe=["/chatter"])),
+    process(UNSHOWN, node("left", publish=["out"]), node("right", "/cellar", subscribe=["/in"])),
+    process(UNSHOWN, node("twin", publish=["one"])),
+    process(UNSHOWN, node("twin", publish=["two"])),
+]
+
+
+def test_a_robot_without_enclaves_is_learned_into_one_for_each_process(tmp_path: Path) -> None:
+    commands = ("generate_policy own.xml --enclave-per-node", "generate_policy shared.xml --flat")
+    own, shared = live(DOMAIN + 5, tmp_path, UNSECURED, list(commands))
+    assert own.status == shared.status == 0, (own, shared)
+    assert "note [graph.several-nodes]" in own.err and "/left has /cellar/right, /left" in own.err
+    assert "note [graph.shared-enclave]" in own.err and "/twin (2 processes)" in own.err
+    assert "note [graph.root-enclave]" in shared.err and "[graph.root-enclave]" not in own.err
+    rights = rights_of(tmp_path / "own.xml")
+    assert {each[0] for each in rights} == {"/talker", "/hall/listener", "/left", "/twin"}
+    assert {each[0] for each in rights_of(tmp_path / "shared.xml")} == {"/"}
+    topics = {each for each in rights if each[2] in ("/chatter", "/out", "/in", "/one", "/two")}
+    assert topics == {
+        ("/talker", "publish", "/chatter"),
+        ("/hall/listener", "subscribe", "/chatter"),
+        ("/left", "publish", "/out"),
+        ("/left", "subscribe", "/in"),
+        ("/twin", "publish", "/one"),
+        ("/twin", "publish", "/two"),
+    }
+
+    keystore = keystore_of(read_policy(tmp_path / "own.xml"), tmp_path / "keystore")
+    pair = talker(keystore, "/talker"), listener(keystore, "/hall/listener")
+    said = converse(DOMAIN + 3, *pair)
+    assert said.heard(), said
+    others = {("publish", "rt/out"), ("subscribe", "rt/in"), ("publish", "rt/one")}
+    assert refused(keystore, "/talker", {("publish", "rt/chatter"), *others}) == others
+
+
 # ── over time ──────────────────────────────────────────────────────────────────────────────
 
 WATCHING = "watching until Ctrl-C; then the policy is written"
