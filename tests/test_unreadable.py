@@ -170,8 +170,11 @@ def test_a_link_to_enclaves_elsewhere_is_not_skipped(keystore: Path, tmp_path: P
     assert renew(keystore, ["/b"], now=NOW).renewed == ("/b",)
 
 
-def test_a_link_in_place_of_a_file_hides_no_other_enclave(keystore: Path, tmp_path: Path) -> None:
-    (keystore / "enclaves/a/key.pem").unlink()
-    (keystore / "enclaves/a/key.pem").symlink_to(tmp_path)
+@pytest.mark.parametrize("file", ["key.pem", "permissions.xml"])
+def test_a_link_in_place_of_a_file_hides_no_other_enclave(
+    file: str, keystore: Path, tmp_path: Path
+) -> None:
+    (keystore / "enclaves/a" / file).unlink()
+    (keystore / "enclaves/a" / file).symlink_to(tmp_path)
     assert sros("list_enclaves", keystore).ok().out.split() == ["/a", "/b"]
     assert "/b" in sros("explain", keystore, "--who", "publish", "/old_b").out

@@ -219,7 +219,7 @@ def _walk(top: str, unread: list[UnreadPath]) -> Iterator[tuple[str, list[str]]]
         folders[:] = [each for each in folders if not each.startswith(".")]
         for each in folders:
             path = os.path.join(folder, each)
-            if each in (*REQUIRED_FILES, *OPTIONAL_FILES):
+            if each.endswith(_FILE_TYPES):
                 continue  # no enclave has such a name: a fault of the enclave in this folder alone
             if Path(path).is_symlink() and not _is_inside(path, top):
                 unread.append(UnreadPath(path, _FOLDER_ELSEWHERE))
