@@ -233,6 +233,14 @@ def test_vendors_differ(tmp_path: Path) -> None:
     assert not audited(tmp_path, enclaves, graph(talks()), Vendor.CYCLONE).allowed
 
 
+def test_what_only_peers_deny_counts_too(tmp_path: Path) -> None:
+    """Fast DDS creates a writer on a topic with a long name, and no peer matches it."""
+    long = f"/{'x' * 255}"
+    enclaves = {"/t": {"/talker": ["publish /*"]}}
+    found = audited(tmp_path, enclaves, graph(talks(f"publish {long}")))
+    assert [each.right.name for each in found.denied] == [long]
+
+
 ROBOT = {
     "/t": {"/talker": ["publish chatter", "reply ~/get_parameters"]},
     "/hall/l": {"/hall/listener": ["subscribe /chatter", "reply ~/get_parameters"]},

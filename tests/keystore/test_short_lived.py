@@ -92,3 +92,18 @@ def test_its_expiry_is_accepted_and_that_of_others_is_found(days: float, tmp_pat
     settings = root / "sros.toml"
     settings.write_text(settings.read_text().replace("/operator/*", "/nobody/*"))
     assert late <= ids(accepted=False)
+
+
+def test_permissions_of_an_older_certificate_are_short_too(tmp_path: Path) -> None:
+    """The entry came later than the certificate, which lives on."""
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", "production").ok()
+    settings = root / "sros.toml"
+    text = settings.read_text()
+    settings.write_text(text.replace("/operator/*", "/nobody/*"))
+    sros("create_enclave", root, SHORT).ok()
+    settings.write_text(text)
+    sros("create_permission", root, SHORT, POLICY).ok()
+    ((found,), _) = survey(root)
+    assert found.permissions.not_after - found.permissions.not_before - BACKDATE == DAY
+    assert found.certificate.not_after - found.permissions.not_after > 300 * DAY
