@@ -17,6 +17,15 @@ _SHOWN: dict[type, tuple[str, ...]] = {}
 """The attributes of each class that its JSON object has."""
 
 
+_JSON_VERSION = 1
+"""The version of what ``--json`` prints: a key that changes its meaning or goes raises it."""
+
+
+def versioned(value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the object that ``--json`` prints: ``version`` before the keys of ``value``."""
+    return {"version": _JSON_VERSION, **value}
+
+
 def parse_json(data: bytes) -> Any:
     """Return the value of a JSON document; raise `ValueError` if it is none."""
     try:

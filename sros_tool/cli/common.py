@@ -22,6 +22,7 @@ from click.core import ParameterSource
 
 from sros_tool.cli.progress import paused
 from sros_tool.errors import DocumentError, PkiError, UsageError
+from sros_tool.values import versioned
 
 if TYPE_CHECKING:
     from click.shell_completion import CompletionItem
@@ -252,15 +253,6 @@ def coloured(word: str) -> str:
     Neither is it shown with $NO_COLOR (https://no-color.org).
     """
     return click.style(word, fg=_COLOURS[word], bold=True)
-
-
-_JSON_VERSION = 1
-"""The version of what ``--json`` prints: a key that changes its meaning or goes raises it."""
-
-
-def versioned(value: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the object that ``--json`` prints: ``version`` before the keys of ``value``."""
-    return {"version": _JSON_VERSION, **value}
 
 
 def json_text(value: object) -> str:

@@ -21,12 +21,11 @@ from sros_tool.cli.common import (
     now,
     print_json,
     save,
-    versioned,
 )
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import file_change
 from sros_tool.errors import UsageError
-from sros_tool.values import as_plain
+from sros_tool.values import as_plain, versioned
 
 if TYPE_CHECKING:
     from datetime import datetime

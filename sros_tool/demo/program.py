@@ -30,6 +30,7 @@ from sros_tool.errors import UnavailableError, UsageError
 from sros_tool.keystore.template import Template, load_template
 from sros_tool.runtime.netns import Isolation, try_isolation
 from sros_tool.translate import dds_names
+from sros_tool.values import versioned
 
 _DEFAULT_DOMAIN = 80
 """The first domain of the rows: below 102, where Linux assigns no ports by itself."""
@@ -126,7 +127,7 @@ def run_demo(options: DemoOptions, now: datetime, progress: Progress) -> DemoRes
             )
         result = DemoResult(backend, topic, isolation, template.name, tuple(results))
         if options.keep is not None:
-            text = json.dumps(result.as_json(), indent=2) + "\n"
+            text = json.dumps(versioned(result.as_json()), indent=2) + "\n"
             (folder / "result.json").write_text(text, encoding="utf-8")
     return result
 
