@@ -20,7 +20,7 @@ _INDENT = "  "
 Example:
   $ sros inspect keystore/enclaves/talker/permissions.p7s
   permissions keystore/enclaves/talker/permissions.p7s
-    signed by CN=sros permissions CA 5f0c3a1e, sha256, 2154 bytes: ...
+    signed by CN=sros permissions CA 5f0c3a1e (SHA-256 8e1d22c4), ...
     grant /talker for CN=/talker
       valid from 2026-11-20T05:59:44Z to 2027-05-20T05:59:44Z
       ALLOW in domain 0
@@ -89,7 +89,9 @@ def _show_history(root: Path, as_json: bool) -> int:
         for item in found.items:
             entry = item.entry
             until = f"until {entry.not_after}" if entry.not_after else ""
-            words = (entry.enclave or entry.subject, until, entry.serial, entry.reason)
+            named = f" (SHA-256 {entry.sha256[:8]})" if entry.what == "ca" else ""
+            subject = f"{entry.enclave or entry.subject}{named}"
+            words = (subject, until, entry.serial, entry.reason)
             line = "  ".join(word for word in words if word)
             shown = visible(f"{entry.time}  {entry.what:11}  {item.status:10}  {line}")
             click.echo(shown.rstrip())
@@ -111,12 +113,12 @@ def _keystore(d: dict[str, Any]) -> Iterator[str]:
             continue
         key = "key here" if authority["key_present"] else "key elsewhere"
         yield (
-            f"  {role} CA {authority['subject']}, {authority['key']}, {key}, "
+            f"  {role} CA {_named(authority)}, {authority['key']}, {key}, "
             f"valid until {authority['not_after']}"
         )
         for other in authority.get("further", ()):
             yield (
-                f"    next to it {other['subject']}, {other['key']}, "
+                f"    next to it {_named(other)}, {other['key']}, "
                 f"valid until {other['not_after']}, serial {other['serial']}"
             )
         if "crl" in authority:
@@ -141,12 +143,19 @@ def _keystore(d: dict[str, Any]) -> Iterator[str]:
         yield f"    {problem}"
 
 
+def _named(d: dict[str, Any], key: str = "") -> str:
+    """Return the subject of a CA with the first digits of its SHA-256, as `authority_text` does."""
+    subject, sha256 = d[key or "subject"], d[f"{key}_sha256" if key else "sha256"]
+    return f"{subject} (SHA-256 {sha256[:8]})" if sha256 else str(subject)
+
+
 def _enclave(d: dict[str, Any]) -> Iterator[str]:
     yield f"enclave {d['path']}: {'loadable' if d['loadable'] else 'NOT LOADABLE'}"
     for problem in d["problems"]:
         yield f"  {problem}"
     yield f"  subject {d['subject']}, valid until {d['valid_until']}"
-    yield f"  identity CA {d['identity_ca']}, permissions CA {d['permissions_ca']}"
+    identity, permissions = _named(d, "identity_ca"), _named(d, "permissions_ca")
+    yield f"  identity CA {identity}, permissions CA {permissions}"
     yield f"  domains {d['domains']}"
     for grant in d["permissions"] or ():
         yield from _indented(_grant(grant))
@@ -212,7 +221,7 @@ def _signature(d: dict[str, Any]) -> Iterator[str]:
         return
     verified = {True: "signature verified", False: "SIGNATURE NOT VERIFIED", None: "not verified"}
     yield (
-        f"signed by {d['signer']}, {d['digest']}, {d['bytes']} bytes: "
+        f"signed by {_named(d, 'signer')}, {d['digest']}, {d['bytes']} bytes: "
         f"{verified[d['signature_verified']]}"
     )
     if d["signature_problem"]:

@@ -321,8 +321,9 @@ def _list_lines(lists: Sequence[RevocationList]) -> Iterator[str]:
         yield f"  {each.serial:x}  {iso(each.date)}  {each.reason}"
     for other in others:  # of the other CA during a rotation
         yield (
-            f"next to it, list {other.number} of {subject_text(other.list.issuer)}, until "
-            f"{iso(other.next_update)}: {len(other.revoked)} revoked"
+            f"next to it, list {other.number} of the other CA, "
+            f"{subject_text(other.list.issuer)}, until {iso(other.next_update)}: "
+            f"{len(other.revoked)} revoked"
         )
 
 
@@ -567,6 +568,7 @@ def _show_status(status: RotationStatus, as_json: bool) -> None:
                         "state": each.state,
                         "subject": each.subject,
                         "serial": each.serial,
+                        "sha256": each.sha256,
                         "not_before": iso(each.validity.not_before),
                         "not_after": iso(each.validity.not_after),
                         "enclaves": each.enclaves,
@@ -585,7 +587,7 @@ def _show_status(status: RotationStatus, as_json: bool) -> None:
             end = f"EXPIRED {iso(each.validity.not_after)}"
         click.echo(
             f"  {name:14} {each.state:7} {each.enclaves} of {status.enclaves} enclaves  {end}"
-            f"  {each.subject}"
+            f"  {each.subject} (SHA-256 {each.sha256[:8]})"
         )
     for remark in status.remarks:
         click.echo(remark)

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from cryptography import x509
-from cryptography.hazmat.primitives import hashes
 
 from sros_tool.dds.governance import Governance, parse_governance, values_of
 from sros_tool.dds.permissions import Grant, Permissions, parse_permissions
@@ -26,6 +25,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import OpenedEnclave, OpenedKeystore, open_enclave
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
+    digest,
     load_certificates,
     subject_text,
     validity_of,
@@ -158,13 +158,19 @@ def _describe_enclave(state: OpenedEnclave) -> Description:
         "problems": [str(problem) for problem in state.problems],
         "subject": state.subject or None,
         "valid_until": iso(validity_of(state.certificate).not_after) if state.certificate else None,
-        "identity_ca": subject_text(state.identity_ca.subject) if state.identity_ca else None,
-        "permissions_ca": (
-            subject_text(state.permissions_ca.subject) if state.permissions_ca else None
-        ),
+        **_authority("identity_ca", state.identity_ca),
+        **_authority("permissions_ca", state.permissions_ca),
         "domains": str(domains) if domains else None,
         "permissions": _permissions(state.permissions) if state.permissions else None,
         "permissions_bytes": state.permissions_bytes,
+    }
+
+
+def _authority(key: str, certificate: x509.Certificate | None) -> Description:
+    """Return the subject of a CA as ``key``, and its SHA-256, since two CAs can have one name."""
+    return {
+        key: subject_text(certificate.subject) if certificate else None,
+        f"{key}_sha256": digest(certificate) if certificate else None,
     }
 
 
@@ -175,15 +181,15 @@ def _describe_certificate(certificate: x509.Certificate, now: datetime) -> Descr
         is_ca = certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
     except x509.ExtensionNotFound:
         is_ca = False
-    digest = certificate.signature_hash_algorithm
+    signature = certificate.signature_hash_algorithm
     return {
         "subject": subject_text(certificate.subject),
         "issuer": subject_text(certificate.issuer),
         "serial": f"{certificate.serial_number:x}",
         "is_ca": is_ca,
         "key": algorithm(certificate.public_key()),
-        "signature": str(digest.name) if digest else "none",
-        "sha256": certificate.fingerprint(hashes.SHA256()).hex(),
+        "signature": str(signature.name) if signature else "none",
+        "sha256": digest(certificate),
         "not_before": iso(validity.not_before),
         "not_after": iso(validity.not_after),
         "valid_now": validity.contains(now),
@@ -230,7 +236,7 @@ def _signed(path: Path, data: bytes, now: datetime, authority: Path | None) -> D
     return {
         **_document(signed.document, now),
         "signed": True,
-        "signer": subject_text(signer.subject) if signer else None,
+        **_authority("signer", signer),
         "digest": signed.digest,
         "bytes": len(data),
         "signature_verified": verified,

@@ -53,6 +53,7 @@ from sros_tool.pki.certificates import (
     issued_by,
     load_certificate,
     load_certificates,
+    other_issuer,
     same_key,
     subject_text,
     validity_of,
@@ -533,7 +534,7 @@ class _EnclaveFiles:
             self._add(
                 CERTIFICATE_FILE,
                 f"it was not issued by the identity CA of the enclave ({subject_text(ca.subject)}) "
-                f"but by {subject_text(certificate.issuer)}",
+                f"but by {other_issuer(certificate, ca)}",
                 Fault.CERTIFICATE_ISSUER,
             )
         elif certificate and ca and authorities and not self._problems:

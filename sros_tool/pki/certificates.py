@@ -296,6 +296,21 @@ def digest(certificate: x509.Certificate) -> str:
     return certificate.fingerprint(hashes.SHA256()).hex()
 
 
+def authority_text(certificate: x509.Certificate) -> str:
+    """Return the subject of a CA with the first digits of its SHA-256.
+
+    An old and a new CA of a rotation have one name, unless they only issue identities: Fast DDS
+    2.9.1 refuses peers whose permissions CA has another name.
+    """
+    return f"{subject_text(certificate.subject)} (SHA-256 {digest(certificate)[:8]})"
+
+
+def other_issuer(certificate: x509.Certificate, authority: x509.Certificate) -> str:
+    """Return how to name the issuer of a certificate that ``authority`` did not issue."""
+    name = subject_text(certificate.issuer)
+    return f"another CA named {name}" if certificate.issuer == authority.subject else name
+
+
 def subject_text(name: x509.Name) -> str:
     """Return a distinguished name as OpenSSL prints it by RFC 2253: the text that vendors compare.
 

@@ -30,7 +30,12 @@ from sros_tool.keystore.reader import (
 )
 from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.template import load_template
-from sros_tool.pki.certificates import load_certificates, subject_text, validity_of
+from sros_tool.pki.certificates import (
+    authority_text,
+    load_certificates,
+    subject_text,
+    validity_of,
+)
 from sros_tool.pki.keys import algorithm
 from sros_tool.policy.document import read_policy
 from sros_tool.policy.model import Policy
@@ -221,7 +226,7 @@ def _authorities(root: Path) -> Iterator[Validity]:
             roles[certificate].append(role)
     for certificate, found in roles.items():
         named = [role for role in found if role != "ca"] or found
-        title = f"{' and '.join(dict.fromkeys(named))} CA, {subject_text(certificate.subject)}"
+        title = f"{' and '.join(dict.fromkeys(named))} CA, {authority_text(certificate)}"
         yield _certificate(certificate, "authority", title, "")
     for crl in read_lists(root):
         title = f"revocation list {crl.number}"

@@ -9,7 +9,7 @@ import pytest
 
 from sros_tool.dds.decision.vendors import Vendor
 from tests.dds.decision_documents import allow, grant, permissions, publish, subscribe
-from tests.dds.signer_rows import YES, rows, write_enclave
+from tests.dds.signer_rows import SIGNER, YES, Made, Row, authority, rows, write_enclave
 from tests.integration.fastdds import fastdds_vendor
 from tests.integration.vendor_oracle import (
     PEER,
@@ -25,6 +25,29 @@ from tests.integration.vendor_rows import OPEN
 pytestmark = pytest.mark.dds
 
 TOPIC = "rt/a"
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("permissions CA", YES), ("permissions CA 2", "unmatched")]
+)
+def test_the_next_permissions_ca_needs_the_name_of_the_old_one(
+    name: str, expected: str, tmp_path: Path
+) -> None:
+    """Why a rotation gives both CAs one name: Fast DDS compares the names of permissions CAs.
+
+    Each enclave trusts both CAs, its own first, as in the stage reissue.
+    """
+    old, new = SIGNER, authority(name)
+    granted = permissions(
+        grant(allow(publish("*"), subscribe("*"), domains="<id>0</id>"), subject="CN=/t")
+    )
+    own, peer = tmp_path / "own", tmp_path / "peer"
+    write_enclave(Row("", Made(permissions=(old, new)), "", "", ""), own, "CN=/t", OPEN, granted)
+    turned = Row("", Made(permissions=(new, old)), "", "", "")
+    write_enclave(turned, peer, PEER, OPEN, PEER_PERMISSIONS)
+    seconds = 8 if expected == YES else 2.5
+    (reply,) = ask_fastdds_folders([(own, peer, "UTC")], TOPIC, tmp_path, seconds=seconds)
+    assert reply.end == "joined" and reply.answers == (expected,), reply
 
 
 @pytest.mark.parametrize("asked", ["Fast DDS", "Cyclone DDS"])

@@ -17,7 +17,7 @@ from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rota
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage
 from sros_tool.keystore.reader import authority_files, certificates_of
 from sros_tool.keystore.template import load_template
-from sros_tool.pki.certificates import digest
+from sros_tool.pki.certificates import common_name_of, digest
 from tests.support.harness import sros
 
 NOW = datetime.now(UTC)
@@ -61,6 +61,49 @@ def test_the_history_knows_both_cas_and_their_lists(root: Path) -> None:
     gone = [each for each in history(root, now=NOW).items if each.entry.enclave == "/c"]
     # Its permissions were put away with its certificate; the new CA's list names neither.
     assert Counter(each.status for each in gone) == {HistoryStatus.REVOKED: 3}
+
+
+def test_the_old_and_the_new_ca_are_told_apart(root: Path) -> None:
+    """A new permissions CA has the name of the old one, because Fast DDS compares names."""
+    file = next(file for file, roles in authority_files(root).items() if "permissions" in roles)
+    (old,) = (digest(each)[:8] for each in certificates_of(root, file))
+    signed = root / "enclaves/a/permissions.p7s"
+    for stage, issuing in zip(STAGES, (0, 1, 1), strict=True):
+        rotate_ca(root, stage, now=NOW)
+        new = next(mark for c in certificates_of(root, file) if (mark := digest(c)[:8]) != old)
+        both = (old, new)
+        there = both if stage is not RotationStage.RETIRE else (new,)
+        for words in (("inspect", root), ("rotate_ca", root, "--status")):
+            text = sros(*words).ok().out
+            assert all(f"(SHA-256 {mark})" in text for mark in there), (words, text)
+        assert f"permissions CA CN={_name(root, file)} (SHA-256 {both[issuing]})" in (
+            sros("inspect", root / "enclaves/a").ok().out
+        )
+        assert f"(SHA-256 {both[issuing]}), sha256" in sros("inspect", signed).ok().out
+        told = json.loads(sros("inspect", signed, "--json").ok().out)
+        assert told["signer_sha256"].startswith(both[issuing])
+    history_text = sros("inspect", root, "--history").out
+    assert f"(SHA-256 {old})" in history_text and f"(SHA-256 {new})" in history_text
+
+
+def _name(root: Path, file: str) -> str:
+    return common_name_of(certificates_of(root, file)[0].subject)
+
+
+@pytest.mark.parametrize("kept", ["cert.pem", "identity_ca.cert.pem"])
+def test_a_certificate_of_the_other_ca_is_said_to_be_of_another_one(kept: str, root: Path) -> None:
+    """With "issued by CN=x, not by CN=x" nobody knows what is wrong."""
+    folder = root / "enclaves/a"
+    old = (folder / kept).read_bytes()
+    rotate_ca(root, finish=True, now=NOW)
+    (folder / kept).unlink()
+    (folder / kept).write_bytes(old)
+    text = sros("inspect", folder).out
+    same = "public/ca.cert.pem" in {f"public/{each}.cert.pem" for each in authority_files(root)}
+    assert ("but by another CA named CN=" in text) is same, text
+    if kept == "cert.pem":
+        refused = sros("renew", root, "/a").err
+        assert ("another CA named CN=" in refused) is same, refused
 
 
 @pytest.mark.parametrize("target", [".", "..", "../..", "../private", "/", "gone.cert.pem"])
@@ -130,7 +173,7 @@ def test_crl_shows_the_list_beside(root: Path) -> None:
     revoke(root, ["/c"], now=NOW)
     assert "next to it" not in sros("crl", root).ok().out
     rotate_ca(root, now=NOW)
-    assert "next to it, list 2 of CN=" in sros("crl", root).ok().out
+    assert "next to it, list 2 of the other CA, CN=" in sros("crl", root).ok().out
     (other,) = json.loads(sros("crl", root, "--json").ok().out)["other_lists"]
     assert (other["number"], other["revoked"]) == (2, [])
     for _ in range(2):

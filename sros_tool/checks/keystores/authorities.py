@@ -29,7 +29,13 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.loading import authority_refusals, refusals_text
 from sros_tool.keystore.settings import edit_remedy
-from sros_tool.pki.certificates import same_key, subject_text, validity_of, weakness
+from sros_tool.pki.certificates import (
+    authority_text,
+    same_key,
+    subject_text,
+    validity_of,
+    weakness,
+)
 from sros_tool.pki.chains import purpose_faults
 from sros_tool.pki.crl import signed_by
 from sros_tool.pki.keys import algorithm, few_rounds, load_key
@@ -110,7 +116,7 @@ def _authority_findings(
 ) -> Iterator[Finding]:
     """Yield findings about a CA that some vendor refuses; ``chain`` is the content of its file."""
     certificate = chain[0]
-    name = subject_text(certificate.subject)
+    name = authority_text(certificate)
     if certificate.issuer != certificate.subject:
         issuer = subject_text(certificate.issuer)
         refused = refusals_text(authority_refusals(role, chain, at))
@@ -342,7 +348,7 @@ def _authority(
 ) -> Iterator[Finding]:
     certificate = chain[0]
     file, subject = keystore.shown(ca_certificate(role)), f"{role} CA"
-    name, validity = subject_text(certificate.subject), validity_of(certificate)
+    name, validity = authority_text(certificate), validity_of(certificate)
     begin, end = iso(validity.not_before), iso(validity.not_after)
     if not validity.contains(keystore.now):
         yield CA_EXPIRED.found(subject, f"{name} is valid from {begin} to {end}", file)
@@ -415,7 +421,7 @@ def shared_ca_findings(
 ) -> Iterator[Finding]:
     """Yield a finding if the identity CA and the permissions CA have the same key."""
     if identity.public_key() == permissions.public_key():
-        text = f"{subject_text(identity.subject)} is identity CA and permissions CA"
+        text = f"{authority_text(identity)} is identity CA and permissions CA"
         accepted = keystore.accepts(lambda settings: not settings.separate_authorities)
         yield ONE_AUTHORITY.found("the CAs", text, file, accepted=accepted)
 

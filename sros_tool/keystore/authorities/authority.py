@@ -33,11 +33,11 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     Issuer,
+    authority_text,
     common_name,
     issue_ca,
     pem,
     same_key,
-    subject_text,
     validity_of,
 )
 from sros_tool.pki.keys import PrivateKey
@@ -188,7 +188,7 @@ def load_authority(
     validity = validity_of(certificate)
     if not validity.contains(now):
         raise KeystoreError(
-            f"the {role} CA {subject_text(certificate.subject)} is not valid now",
+            f"the {role} CA {authority_text(certificate)} is not valid now",
             f"It is valid from {iso(validity.not_before)} to {iso(validity.not_after)}, and DDS "
             "refuses the certificates and documents of a CA outside its validity.",
             "Check the clock of this machine; otherwise make a new keystore.",

@@ -60,6 +60,7 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import (
     issued_by,
     load_certificate,
+    other_issuer,
     pem,
     same_key,
     subject_text,
@@ -285,7 +286,7 @@ def _read_node(
     if not issued_by(certificate, authority):
         raise KeystoreError(
             "the CA of the keystore did not issue its certificate",
-            f"It names the issuer {subject_text(certificate.issuer)}.",
+            f"Its issuer is {other_issuer(certificate, authority)}.",
         )
     if not same_key(certificate, load_key(key_data, KEY_FILE)):
         raise PkiError(f"its {KEY_FILE} is not the key of its {CERTIFICATE_FILE}")

@@ -74,8 +74,8 @@ from sros_tool.pki.certificates import (
     common_name_of,
     enclave_subject,
     issued_by,
+    other_issuer,
     parse_subject,
-    subject_text,
     validity_of,
 )
 from sros_tool.pki.keys import PublicKey, generate_key, load_key
@@ -636,11 +636,12 @@ def _usable_certificate(
     """Return the certificate of an enclave; raise `KeystoreError` if DDS would refuse it."""
     path = enclave_path(root, name) / CERTIFICATE_FILE
     certificate = read_certificate(path)
-    if not issued_by(certificate, keystore.authorities.identity.certificate):
+    authority = keystore.authorities.identity.certificate
+    if not issued_by(certificate, authority):
         raise KeystoreError(
             f"the certificate of enclave {name} was not issued by the identity CA of this keystore",
-            f"'{path}' names the issuer {subject_text(certificate.issuer)}; other nodes of this "
-            "keystore would refuse the enclave.",
+            f"The issuer of '{path}' is {other_issuer(certificate, authority)}; other nodes of "
+            "this keystore would refuse the enclave.",
             "Restore the right certificate, or remove the enclave's folder and create it again.",
         )
     validity = validity_of(certificate)

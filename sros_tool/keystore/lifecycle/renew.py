@@ -47,7 +47,7 @@ from sros_tool.pki.certificates import (
     enclave_subject,
     has_unique_part,
     issued_by,
-    subject_text,
+    other_issuer,
 )
 from sros_tool.pki.keys import PrivateKey, PublicKey, generate_key
 
@@ -237,11 +237,12 @@ def checked_rights(
             not the last ones that the ledger has for it.
         PkiError: the permissions CA did not sign them.
     """
-    if not issued_by(state.certificate, authorities.identity.certificate):
+    authority = authorities.identity.certificate
+    if not issued_by(state.certificate, authority):
         raise KeystoreError(
             f"the certificate of enclave {state.name} was not issued by the identity CA of this "
             "keystore",
-            f"It names the issuer {subject_text(state.certificate.issuer)}.",
+            f"Its issuer is {other_issuer(state.certificate, authority)}.",
             "Restore the certificate, or remove the enclave's folder and create it again.",
         )
     state.signed.verify(authorities.permissions.certificate)

@@ -39,11 +39,11 @@ from sros_tool.keystore.reader import (
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.pki.certificates import (
+    authority_text,
     digest,
     issued_by,
     pem,
     same_key,
-    subject_text,
     validity_of,
 )
 from sros_tool.pki.crl import REASONS, RevocationList, Revoked, sign_crl, signed_by
@@ -287,7 +287,7 @@ class RevocationListSigner:
         keyring = replace(self._keyring, places={})
         key = keyring.open(self._root, IDENTITY, replace(self._template, identity_key=place))
         if not same_key(certificate, key):
-            name = subject_text(certificate.subject)
+            name = authority_text(certificate)
             raise KeystoreError(
                 f"the key at '{place}' does not belong to the CA {name}",
                 "A revocation list signed with it would not verify.",
@@ -305,7 +305,7 @@ class RevocationListSigner:
         incomplete: bool,
     ) -> None:
         """Add a remark on the unsigned list of the old CA; raise if a revocation needs it."""
-        name = subject_text(old_ca.subject)
+        name = authority_text(old_ca)
         if new_entries and not incomplete:
             raise KeystoreError(
                 f"the key of the old identity CA {name} is not available",

@@ -86,6 +86,7 @@ from sros_tool.pki.certificates import (
     digest,
     issue_ca,
     issued_by,
+    other_issuer,
     pem,
     same_key,
     subject_text,
@@ -551,8 +552,8 @@ def _issuance(
     if identity:
         if not issued_by(kept, identity.old[0]):
             raise KeystoreError(
-                f"its certificate was issued by {subject_text(kept.issuer)}, not by the identity "
-                "CA of this keystore"
+                f"its certificate was issued by {other_issuer(kept, identity.old[0])}, not by the "
+                "identity CA of this keystore"
             )
         key: PublicKey = kept.public_key()  # type: ignore[assignment]
         remedy = f"Renew it with `sros renew {root} {name} --new-key`, or revoke it."

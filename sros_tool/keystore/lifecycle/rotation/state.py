@@ -100,6 +100,7 @@ class AuthorityStatus:
     state: str
     subject: str
     serial: str
+    sha256: str
     validity: Window
     enclaves: int
 
@@ -184,6 +185,7 @@ def rotation_status(root: Path, *, now: datetime) -> RotationStatus:
                     state,
                     subject_text(certificate.subject),
                     f"{certificate.serial_number:x}",
+                    digest(certificate),
                     validity_of(certificate),
                     counts[index],
                 )
