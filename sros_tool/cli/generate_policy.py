@@ -378,6 +378,8 @@ def _propose(
         write(plan)
     if as_json:
         value = _json(plan, file, learned, Observation(), dry_run)
+        if not (written or dry_run):
+            value["changes"] = []
         print_json({**value, "accepted": accept, "denials": lines})
     else:
         _show(plan, learned, written=written)

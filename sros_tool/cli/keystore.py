@@ -812,8 +812,11 @@ def _show_update(update: KeystoreUpdate, *, dry_run: bool, as_json: bool) -> Non
                 "settings": as_plain(update.settings),
                 "rights": as_plain(update.rights),
                 "looser": list(update.looser()),
-                "renewed": list(update.renewed),
-                "signed": list(update.signed),
+                "enclaves": [
+                    enclave_json(update.root, name, outcome, written=not dry_run)
+                    for outcome, names in (("renewed", update.renewed), ("signed", update.signed))
+                    for name in names
+                ],
                 "replaced_work_until": as_plain(update.works_until),
                 "revoked": update.revoked,
                 "restart": list(update.restart),

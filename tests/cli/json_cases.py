@@ -194,6 +194,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case(f"--enclave /a --from-log {DENIALS}"),
         Case(f"new.xml --enclave /a --from-log {DENIALS} --accept"),
         Case(f"new.xml --enclave /a --from-log {DENIALS} --dry-run"),
+        Case(f"new.xml --enclave /a --from-log {DENIALS} --dry-run --accept"),
         Case(f"new.xml --from-log {EXPIRED}", 1),
     ),
     "merge_policy": (

@@ -34,7 +34,7 @@ from tests.cli.json_cases import (
 from tests.cli.test_audit import FINE, LOUD, POLICY, SHORT
 from tests.demo.test_demo_result import CLOSED, COST, OPEN, TWIN, result
 from tests.graph.fake_graph import Beside, graph
-from tests.support.harness import Ended, sros
+from tests.support.harness import Ended, snapshot, sros
 from tools.json_page import SCHEMAS, SHARED, page
 
 pytest_plugins = ["tests.graph.beside"]
@@ -263,6 +263,42 @@ def test_every_shared_part_is_seen(made_folder: Path, tmp_path: Path) -> None:
     for verb, case in SHARED_PARTS.items():
         seen.check(verb, both_ways(verb, case, made_folder, tmp_path))
     assert seen.unseen(SHARED) == []
+
+
+DRY_RUNS = [
+    (verb, case)
+    for verb, cases in CASES.items()
+    for case in cases
+    if "--dry-run" in case.words.split() and " - " not in f"{case.words} " and verb != "view"
+]
+
+
+@pytest.mark.parametrize(("verb", "case"), DRY_RUNS, ids=[verb for verb, _ in DRY_RUNS])
+def test_a_dry_run_says_what_would_be_done(
+    verb: str, case: Case, made_folder: Path, tmp_path: Path
+) -> None:
+    folder = Path(shutil.copytree(made_folder, tmp_path / "made", symlinks=True))
+    words = [each for each in case.words.split() if each != "--dry-run"]
+    would = json.loads(sros(verb, *words, "--dry-run", "--json", cwd=folder).out)
+    assert snapshot(folder) == snapshot(made_folder)
+    done = json.loads(sros(verb, *words, "--json", cwd=folder).out or "{}")
+    if not done:  # what needs a choice is shown by a dry run, and refused
+        return
+    assert (would["dry_run"], done["dry_run"]) == (True, False)
+    if done.get("accepted") is False:
+        assert (done["changes"], snapshot(folder)) == ([], snapshot(made_folder))
+        return
+    assert would["changes"] == done["changes"]
+    named = [[_named(each) for each in shown.get("enclaves", ())] for shown in (would, done)]
+    assert named[0] == named[1]
+    for change in done["changes"]:
+        assert os.path.lexists(folder / change["path"]) != (change["action"] == "remove"), change
+
+
+def _named(enclave: Any) -> Any:
+    """Return what a dry run knows of an enclave."""
+    keys = ("name", "outcome", "folder", "enclave")
+    return [enclave.get(key) for key in keys] if isinstance(enclave, dict) else enclave
 
 
 def test_a_property_that_no_schema_has_is_found(made_folder: Path) -> None:

@@ -463,8 +463,10 @@ def test_a_dry_run_says_what_the_run_does_and_changes_nothing(root: Path) -> Non
     text = sros(*words, "--dry-run").ok()
     assert snapshot(root) == before
     done = json.loads(sros(*words, "--json").ok().out)
-    for key in ("settings", "rights", "renewed", "changes", "restart", "done", "template"):
+    for key in ("settings", "rights", "changes", "restart", "done", "template"):
         assert would[key] == done[key], key
+    named = [[(each["name"], each["outcome"]) for each in e["enclaves"]] for e in (would, done)]
+    assert named[0] == named[1] != []
     assert "tighter  protection.rtps SIGN -> ENCRYPT: whole messages: encrypted" in text.out
     assert "/free would lose: publish topic /*" in text.out
     assert "would replace" in text.out
