@@ -23,7 +23,14 @@ from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.reader import open_enclave
 from sros_tool.pki import smime
-from tests.support.harness import certificate, remains, snapshot, sros
+from tests.support.harness import (
+    certificate,
+    policy_text,
+    publish,
+    remains,
+    snapshot,
+    sros,
+)
 from tests.support.made_by_eloquent import EVERYTHING, age, make_dashing, make_eloquent
 from tests.support.made_by_ros2 import make
 
@@ -70,6 +77,10 @@ READING = (
     "create_enclave {} /new",
     "generate_artifacts -k {} -e /new",
     "create_keystore {}",
+    "update_keystore {} --template production",
+    "create_permission {} /talker policy.xml",
+    "sign_request {} robot/enclaves/new/request.pem",
+    "demo --scenario attacks --keystore {}",
     "create_request /new {}",
     "distribute_key {} /talker out",
     "env {} /talker",
@@ -83,8 +94,10 @@ READING = (
 @pytest.mark.parametrize("words", READING)
 def test_every_verb_says_what_it_is_and_what_to_do(words: str, made: Path, tmp_path: Path) -> None:
     before = snapshot(made)
+    (tmp_path / "policy.xml").write_text(policy_text({"/talker": publish("/x")}))
+    sros("create_request", "/new", tmp_path / "robot").ok()
     ended = sros(*words.format(made, made).split(), cwd=tmp_path)
-    assert ended.status, ended
+    assert ended.status == 2, ended
     assert f"create_keystore NEW --from {made}" in ended.err, ended
     assert ended.err.count("\n") == 1, ended
     assert snapshot(made) == before
@@ -238,16 +251,34 @@ def test_a_second_pki_in_an_earlier_keystore_does_not_hide_it(tmp_path: Path) ->
     assert sros("list_enclaves", tmp_path / "new").out.split() == sorted(NODES)
 
 
-def test_a_governance_of_ones_own_stays(tmp_path: Path) -> None:
-    """Then there are no settings, which would say another protection."""
+@pytest.mark.parametrize(
+    ("changed", "stated"),
+    [(("kind>SIGN<", "kind>NONE<"), True), (("expression>*<", "expression>clock*<"), False)],
+)
+def test_a_governance_of_ones_own_stays(
+    changed: tuple[str, str], stated: bool, tmp_path: Path
+) -> None:
+    """Where no settings can state it, there are none: they would say another protection."""
     old, new = tmp_path / "old", tmp_path / "new"
-    make_eloquent(old, NODES, now=NOW, protected="NONE")
+    make_eloquent(old, NODES, now=NOW, changed=changed)
     sros("create_keystore", new, "--from", old).ok()
-    assert not (new / "sros.toml").exists() and not (new / "ledger.jsonl").exists()
-    assert "rtps NONE" in sros("inspect", new).ok().out
-    assert "settings" not in sros("check", new).out
+    assert (new / "enclaves/governance.p7s").read_bytes() == (old / "governance.p7s").read_bytes()
+    for file in ("sros.toml", "ledger.jsonl"):
+        assert (new / file).exists() is stated
+    found = sros("check", new).out
+    assert "settings" not in found and "edited" not in found, found
     sros("create_enclave", new, "/added").ok()
     sros("renew", new, "/talker").ok()
+
+
+def test_taken_over_it_can_get_the_settings_of_another_template(tmp_path: Path) -> None:
+    old, new = tmp_path / "old", tmp_path / "new"
+    make_eloquent(old, NODES, now=NOW)
+    sros("create_keystore", new, "--from", old).ok()
+    told = sros("update_keystore", new, "--set", "protection.rtps=ENCRYPT").ok()
+    assert "protection.rtps SIGN -> ENCRYPT" in told.out
+    for name in NODES:
+        assert not open_enclave(enclave_path(new, name), now=datetime.now(UTC), domain=0).problems
 
 
 def test_a_ca_that_has_expired_is_refused(tmp_path: Path) -> None:

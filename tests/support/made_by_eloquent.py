@@ -84,14 +84,17 @@ def make_eloquent(
     *,
     now: datetime,
     domain: int = 0,
-    protected: str = "SIGN",
+    changed: tuple[str, str] = ("", ""),
 ) -> None:
-    """Make the keystore of Eloquent with the DDS topics of its nodes, and this RTPS protection."""
+    """Make the keystore of Eloquent with the DDS topics of its nodes.
+
+    In its governance the first text of ``changed`` is replaced by the second.
+    """
     root.mkdir(parents=True)
     authority, key = issue("sros2testCA", now)
     write(root / "ca.cert.pem", authority, root / "ca.key.pem", key)
     text = XML + GOVERNANCE.format(schema=SCHEMA.format("governance"), domain=domain)
-    text = text.replace("kind>SIGN<", f"kind>{protected}<")
+    text = text.replace(*changed) if changed[0] else text
     sign(root / "governance", text, authority, key)
     for name, topics in nodes.items():
         folder = _folder(root, name)

@@ -42,7 +42,6 @@ from sros_tool.keystore.layout import (
     PRIVATE,
     PUBLIC,
     ROLES,
-    SETTINGS,
     ca_certificate,
     ca_key,
     earlier_nodes,
@@ -51,7 +50,8 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.create import Creation, check_free, place_notes
-from sros_tool.keystore.template import Template, load_template, render_template
+from sros_tool.keystore.settings import write_settings
+from sros_tool.keystore.template import Template, load_template
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.names import ROS_DISCOVERY_TOPIC, check_enclave_name
@@ -67,7 +67,7 @@ from sros_tool.pki.certificates import (
     validity_of,
 )
 from sros_tool.pki.keys import PublicKey, load_key
-from sros_tool.translate import governance_for
+from sros_tool.translate import governance_for, protection_for
 from sros_tool.validity import iso
 
 
@@ -143,7 +143,7 @@ def adopt_keystore(
         transaction.write(GOVERNANCE_P7S, old.signed_governance)
         entries.append(document_entry(now, "governance", old.signed_governance))
         if settings:
-            transaction.write(SETTINGS, render_template(settings).encode())
+            entries.append(write_settings(transaction, settings, now))
         writer = EnclaveWriter(
             transaction, template, now, identity=authority, permissions=authority
         )
@@ -197,13 +197,16 @@ def _write_node(
 def _settings(old: _EarlierKeystore) -> tuple[Template, Template | None]:
     """Return the template for what is issued now, and the settings that the keystore gets.
 
-    These are None if its governance is not that of ros2/sros2, because settings would say another
-    protection; without them it is continued as one that ros2/sros2 made.
+    These are None if no settings can state its governance; without them it is continued as one that
+    ros2/sros2 made.
     """
     template = load_template("sros2")
-    domains = old.governance.domains()
-    usual = governance_for(template.protection, domains) == old.governance
-    return template, template if usual else None
+    protection = protection_for(old.governance)
+    if protection is None:
+        return template, None
+    template = replace(template, protection=protection)
+    same = governance_for(protection, old.governance.domains()) == old.governance
+    return template, template if same else None
 
 
 # ── reading ────────────────────────────────────────────────────────────────────────────────
