@@ -22,6 +22,7 @@ from sros_tool.dds.permissions import parse_permissions
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.reader import open_enclave
+from sros_tool.keystore.rights import load_rights
 from sros_tool.pki import smime
 from tests.support.harness import (
     certificate,
@@ -32,7 +33,7 @@ from tests.support.harness import (
     sros,
 )
 from tests.support.made_by_eloquent import EVERYTHING, age, make_dashing, make_eloquent
-from tests.support.made_by_ros2 import make
+from tests.support.made_by_ros2 import RELEASES, make
 
 NOW = datetime.now(UTC).replace(microsecond=0)
 NODES = {
@@ -287,12 +288,22 @@ def test_a_ca_that_has_expired_is_refused(tmp_path: Path) -> None:
     assert ended.status and "cannot be the identity CA now" in ended.err
 
 
-def test_keystores_of_foxy_and_later_are_used_as_they_are(tmp_path: Path) -> None:
+@pytest.mark.parametrize("release", RELEASES)
+def test_keystores_of_foxy_and_later_are_used_as_they_are(release: str, tmp_path: Path) -> None:
     root = tmp_path / "ks"
-    make(root, "/a", now=NOW)
-    assert sros("list_enclaves", root).ok().out == "/a\n"
+    make(root, "/a", "/n/b", now=NOW, release=RELEASES[release])
+    assert sros("list_enclaves", root).ok().out == "/a\n/n/b\n"
     sros("inspect", root).ok()
-    sros("create_enclave", root, "/b").ok()
+    rights = load_rights(root)
+    assert rights.sound and "/n/b ALLOW publish topic /*" in map(str, rights.rights)
+    sros("create_enclave", root, "/added").ok()
+    sros("renew", root, "/a").ok()
+    sros("rotate_ca", root, "--finish").ok()
+    kept = {each for each in load_rights(root).rights if each.enclave != "/added"}
+    assert kept == set(rights.rights)
+    for name in ("/a", "/n/b", "/added"):
+        assert not open_enclave(enclave_path(root, name), now=datetime.now(UTC), domain=0).problems
+    assert sros("create_keystore", tmp_path / "new", "--from", root).status == 2
 
 
 def _topics(folder: Path) -> set[tuple[str, str]]:

@@ -1,6 +1,6 @@
 """A keystore laid out as ros2/sros2 makes it: what it writes, with its modes, and nothing else.
 
-One CA named sros2CA for both jobs, behind links; certificates of ten years with BasicConstraints
+One CA for both jobs, behind links; certificates of ten years with BasicConstraints
 alone, so without key identifiers; documents signed with the clear text beside; files as open as the
 umask lets them be; no settings and no ledger.
 """
@@ -8,8 +8,12 @@ umask lets them be; no settings and no ledger.
 from __future__ import annotations
 
 import os
+import subprocess
+from dataclasses import dataclass
 from datetime import datetime, timedelta
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
@@ -64,23 +68,53 @@ _PERMISSIONS = """<dds {schema}>
   </permissions>
 </dds>
 """
-_TOPICS = "".join(
-    f"<topic>{each}</topic>"
-    for each in ("rq/*Request", "rr/*Reply", "rt/*", "ros_discovery_info", "*")
-)
+_OF_ROS = "".join(f"<topic>{each}</topic>" for each in ("rq/*Request", "rr/*Reply", "rt/*"))
+_TOPICS = f"{_OF_ROS}<topic>ros_discovery_info</topic><topic>*</topic>"
 
 
-def make(root: Path, *names: str, now: datetime, domain: int = 0) -> None:
+@dataclass(frozen=True)
+class Release:
+    """What differs between the releases of ros2/sros2 since Foxy (its branches of these names).
+
+    ``authority`` is the name of the CA.  With ``openssl`` documents are signed by that library, and
+    not by cryptography's own PKCS#7.  ``discovery`` says whether the RMW that was installed had
+    ``ros_discovery_info`` allowed, in a rule of its own.
+    """
+
+    authority: str = "sros2CA"
+    openssl: bool = False
+    discovery: bool | None = None
+
+
+RELEASES = {
+    "foxy": Release("sros2testCA", openssl=True, discovery=True),
+    "foxy with Connext": Release("sros2testCA", openssl=True, discovery=False),
+    "galactic to iron": Release(openssl=True, discovery=True),
+    "jazzy and rolling": Release(discovery=True),
+}
+_DISCOVERY = """<allow_rule>
+        <domains><id>{domain}</id></domains>
+        <publish><topics><topic>ros_discovery_info</topic></topics></publish>
+        <subscribe><topics><topic>ros_discovery_info</topic></topics></subscribe>
+      </allow_rule>
+      <default>DENY</default>"""
+
+
+def make(
+    root: Path, *names: str, now: datetime, domain: int = 0, release: Release | None = None
+) -> None:
     """Make the keystore with some enclaves, as ``ros2 security`` would have at ``now``."""
+    made = release or Release()
+    signed = partial(sign, openssl=made.openssl)
     for part in ("public", "private", "enclaves"):
         (root / part).mkdir(parents=True)
-    authority, key = issue("sros2CA", now)
+    authority, key = issue(made.authority, now)
     write(root / "public/ca.cert.pem", authority, root / "private/ca.key.pem", key)
     for role in ("permissions", "identity"):
         os.symlink("ca.cert.pem", root / f"public/{role}_ca.cert.pem")
         os.symlink("ca.key.pem", root / f"private/{role}_ca.key.pem")
     text = XML + GOVERNANCE.format(schema=SCHEMA.format("governance"), domain=domain)
-    sign(root / "enclaves/governance", text, authority, key)
+    signed(root / "enclaves/governance", text, authority, key)
     for name in names:
         folder = root / f"enclaves{name}"
         folder.mkdir(parents=True)
@@ -96,9 +130,12 @@ def make(root: Path, *names: str, now: datetime, domain: int = 0) -> None:
             begin=now - timedelta(days=1),
             end=now + timedelta(days=3650),
             domain=domain,
-            topics=_TOPICS,
+            topics=_TOPICS if made.discovery is None else _OF_ROS,
         )
-        sign(folder / "permissions", text, authority, key)
+        if made.discovery:
+            rule = _DISCOVERY.format(domain=domain)
+            text = text.replace("<default>DENY</default>", rule)
+        signed(folder / "permissions", text, authority, key)
 
 
 def issue(
@@ -134,9 +171,22 @@ def write(
 
 
 def sign(
-    stem: Path, text: str, authority: x509.Certificate, key: ec.EllipticCurvePrivateKey
+    stem: Path,
+    text: str,
+    authority: x509.Certificate,
+    key: ec.EllipticCurvePrivateKey,
+    *,
+    openssl: bool = False,
 ) -> None:
     stem.with_suffix(".xml").write_text(text)
+    if openssl:
+        with TemporaryDirectory() as folder:
+            write(Path(folder, "cert.pem"), authority, Path(folder, "key.pem"), key)
+            plain, signed = (str(stem.absolute().with_suffix(end)) for end in (".xml", ".p7s"))
+            words = ["smime", "-sign", "-text", "-in", plain, "-out", signed]
+            words += ["-signer", "cert.pem", "-inkey", "key.pem"]
+            subprocess.run(["openssl", *words], cwd=folder, check=True, capture_output=True)
+        return
     builder = pkcs7.PKCS7SignatureBuilder().set_data(text.encode())
     message = builder.add_signer(authority, key, hashes.SHA256()).sign(
         serialization.Encoding.SMIME,
