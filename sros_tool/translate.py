@@ -9,6 +9,8 @@ from collections.abc import Iterable, Set
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from sros_tool.dds.decision.matching import ExpressionIndex
+from sros_tool.dds.decision.vendors import Style
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, ProtectionKind, TopicRule, attributes
 from sros_tool.dds.permissions import (
@@ -152,20 +154,14 @@ def _criteria(topics: set[str]) -> tuple[Criteria, ...]:
 
 
 def needed_expressions(topics: Set[str]) -> set[str]:
-    """Return ``topics`` without the ones that a wildcard among them matches, for every vendor.
-
-    What is left matches the same names.  An expression with a ``[set]``, which vendors read
-    differently, neither covers another one nor is left out.
-    """
-    alike = [each for each in topics if "[" not in each]
-    needed = set(topics)
-    wildcards = sorted(filter(is_expression, alike), key=lambda each: (len(each), each))
-    # The shortest wildcards stay.  What is left out covers nothing any more, so that of two
-    # wildcards that cover each other one remains.
-    for each in sorted(alike, key=lambda each: (-len(each), each)):
-        if any(wide != each and wide in needed and covers(wide, each) for wide in wildcards):
-            needed.remove(each)
-    return needed
+    """Return ``topics`` without the names that wildcards among them match for every vendor."""
+    wildcards = set(filter(is_expression, topics))
+    matched = [ExpressionIndex(style, wildcards) for style in Style]
+    return {
+        each
+        for each in topics
+        if each in wildcards or any(index.first(each) is None for index in matched)
+    }
 
 
 def governance_for(protection: DomainProtection, domains: DomainSet) -> Governance:

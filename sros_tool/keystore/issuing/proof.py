@@ -5,7 +5,7 @@ matches.  Both decide the same for every topic name if
 
 - the document has one grant, its deny rules come first, every rule is for all domains of the
   keystore and without partitions, the default is to deny, and its expressions equal the policy's,
-  but for those that a wildcard of the same list matches anyway: a comparison of sets;
+  but for names that a wildcard of the same list matches anyway: a comparison of sets;
 - the vendors match each expression with wildcards as a policy does: a comparison of matchers, for
   names that distinguish them.  (Without wildcards, an expression matches only itself.)
 
@@ -26,8 +26,9 @@ from functools import lru_cache
 
 from sros_tool.dds.decision.access import Access
 from sros_tool.dds.decision.answers import AccessVerb, Outcome
+from sros_tool.dds.decision.matching import ExpressionIndex
 from sros_tool.dds.decision.matching import matches as dds_matches
-from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.dds.decision.vendors import Style, Vendor
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import DomainRule, Governance, TopicRule, settings
 from sros_tool.dds.permissions import Permissions
@@ -151,19 +152,13 @@ def prove(policy: Enclave, permissions: Permissions, domains: DomainSet) -> None
 
 
 def _matched_anyway(left_out: set[str], present: set[str]) -> bool:
-    """Return whether one of the wildcards in ``present`` matches all that each left out one does.
-
-    This does not use `covers`, by which `sros_tool.translate` leaves them out.
-    """
+    """Return whether all of ``left_out`` are names that wildcards in ``present`` match."""
     wildcards = list(filter(is_expression, present))
+    index = ExpressionIndex(Style.FNMATCH, wildcards)
     return all(
-        any(
-            common_name([each], [wide], absolute=False) is None
-            if is_expression(each)
-            else matches(wide, each)
-            for wide in wildcards
-        )
-        for each in left_out
+        not is_expression(name)
+        and any(matches(wildcards[position], name) for position in index.matching(name))
+        for name in left_out
     )
 
 
