@@ -1,9 +1,10 @@
-"""Rotate CAs under Cyclone DDS nodes that run, restart these one by one, and say who hears whom.
+"""Change a keystore under Cyclone DDS nodes that run, restart these one by one: who hears whom?
 
-Arguments: a keystore with the enclaves /talker and /listener, and a domain.  Reads as JSON the
-steps (stages of `rotate_ca`, "finish", or "same-key") with what is expected after each, and prints
-in the same form what came: "running" (nobody was restarted), "listener" (it alone was), "talker",
-and "both", each true or false.
+Arguments: a keystore with the enclaves /talker and /listener, perhaps also /server and /client, and
+a domain.  Reads as JSON the steps (stages of `rotate_ca`, "finish", "same-key", or a template and a
+stage of `update_keystore`, as in "production governance") with what is expected after each, and
+prints in the same form what came: "running" (nobody was restarted), "listener" (it alone was),
+"talker", and "both", each true or false.  A client counts as listener, and its server as talker.
 """
 
 from __future__ import annotations
@@ -13,12 +14,16 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from subprocess import Popen
 
+from sros_tool.keystore.layout import list_enclaves
 from sros_tool.keystore.lifecycle.rotation.stages import renew_identity_ca, rotate_ca
 from sros_tool.keystore.lifecycle.rotation.state import RotationStage
+from sros_tool.keystore.lifecycle.update import UpdateStage, update_keystore
+from sros_tool.keystore.template import load_template
 from sros_tool.runtime.events import EventKind, read_events
 from sros_tool.runtime.netns import enter_isolation, try_isolation
 from tests.integration.converse import SETTLED, SILENCE, Node, start
@@ -74,6 +79,11 @@ def go(root: Path, step: str) -> None:
         renew_identity_ca(root, now=now)
     elif step == "finish":
         rotate_ca(root, finish=True, now=now)
+    elif " " in step:
+        template, stage = step.split()
+        target = load_template(template)
+        done = update_keystore(root, target, now=now, next_stage=True, allow_looser=True).done
+        assert done == (UpdateStage(stage),), done
     else:
         assert rotate_ca(root, RotationStage(step), now=now).changes
 
@@ -83,26 +93,40 @@ def main() -> None:
     steps: dict[str, dict[str, bool]] = json.load(sys.stdin)
     if try_isolation().isolated:
         enter_isolation()
+    pairs = [("listener", "talker")]
+    pairs += [("client", "server")] if "/client" in list_enclaves(root) else []
     answers = {}
     with tempfile.TemporaryDirectory() as folder:
         nodes = Nodes(str(root), domain, Path(folder))
-        talker, listener = nodes.start("talker", 0), nodes.start("listener", 0)
-        assert nodes.hears(listener, talker)
+        old = {role: nodes.start(role, 0) for role in roles(pairs, 1) + roles(pairs, 0)}
+
+        def hear(listening: Mapping[str, str], talking: Mapping[str, str], wanted: bool) -> bool:
+            """Whether each listener hears its talker, which has to be the same for all."""
+            (found,) = {
+                nodes.hears(listening[one], talking[other], expected=wanted) for one, other in pairs
+            }
+            return found
+
+        assert hear(old, old, True)
         for number, (step, expected) in enumerate(steps.items(), 1):
             go(root, step)
-            answer = {"running": nodes.hears(listener, talker, expected=expected["running"])}
-            new_listener = nodes.start("listener", number)
-            answer["listener"] = nodes.hears(new_listener, talker, expected=expected["listener"])
-            new_talker = nodes.start("talker", number)
-            answer["both"] = nodes.hears(new_listener, new_talker, expected=expected["both"])
-            answer["talker"] = nodes.hears(listener, new_talker, expected=expected["talker"])
+            answer = {"running": hear(old, old, expected["running"])}
+            new = {role: nodes.start(role, number) for role in roles(pairs, 0)}
+            answer["listener"] = hear(new, old, expected["listener"])
+            new |= {role: nodes.start(role, number) for role in roles(pairs, 1)}
+            answer["both"] = hear(new, new, expected["both"])
+            answer["talker"] = hear(old, new, expected["talker"])
             answers[step] = answer
-            for name in (talker, listener):
+            for name in old.values():
                 nodes.stop(name)
-            talker, listener = new_talker, new_listener
-        for name in (talker, listener):
+            old = new
+        for name in old.values():
             nodes.stop(name)
     json.dump(answers, sys.stdout)
+
+
+def roles(pairs: Sequence[tuple[str, str]], side: int) -> list[str]:
+    return [pair[side] for pair in pairs]
 
 
 if __name__ == "__main__":
