@@ -59,9 +59,9 @@ Example:
   $ sros check --needs-renewal 30d keystore || \\
         sros renew keystore --all-expiring 30d
 
-Findings that the keystore's template accepts count as notes and share one line; --strict
-reports them like all others. Exit status: 1 if a finding of the --fail-on severity or higher is
-shown, else 0.""",
+Findings that the keystore's template accepts count as notes and share one line; with --strict,
+for example in CI, they count like all others. Exit status: 1 if a finding of the --fail-on
+severity or higher is shown, else 0.""",
 )
 @click.argument("targets", metavar="[policy|keystore|runtime] [PATH]...", nargs=-1, type=PATH)
 @click.option("--list", "as_list", is_flag=True, help="List all kinds of findings.")
@@ -364,7 +364,12 @@ def _summary(chosen: ChosenFindings) -> str:
     counted = [f"{number} {word}{'s' * (number != 1)}" for word, number in counts.items() if number]
     number = chosen.hidden
     hidden = f" (not shown: {number} note{'s' * (number != 1)}, --severity note)" if number else ""
-    return f"{', '.join(counted) or 'nothing found'}{hidden}"
+    number = len(chosen.accepted)
+    if not number:
+        return f"{', '.join(counted) or 'nothing found'}{hidden}"
+    accepted = f"{number} weakness{'es' * (number != 1)} that the template accepts"
+    first = f"{', '.join(counted)}, and" if counted else "nothing found but"
+    return f"{first} {accepted} (--strict makes them count){hidden}"
 
 
 def _counts(chosen: ChosenFindings) -> dict[str, int]:
@@ -377,7 +382,11 @@ def _print_json(chosen: ChosenFindings, _selection: FindingFilter) -> None:
         {
             "findings": [each.as_json() for each in chosen.shown],
             "accepted": [each.as_json() for each in chosen.accepted],
-            "counts": {**_counts(chosen), "hidden": chosen.hidden},
+            "counts": {
+                **_counts(chosen),
+                "accepted": len(chosen.accepted),
+                "hidden": chosen.hidden,
+            },
         }
     )
 

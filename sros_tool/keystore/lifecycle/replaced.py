@@ -89,9 +89,12 @@ _RIGHTS_SHOWN = 6
 
 
 def rights_text(rights: Sequence[Right]) -> str:
-    """Return rights as text, such as ``publish topic /a, call action /b``."""
+    """Return lost or gained rights as text, such as ``publish topic /a, call action /b``.
+
+    A denial that was added is lost, and one that was taken away is gained.
+    """
     shown = ", ".join(
-        each.describe() if each.qualifier is ALLOW else f"denial to {each.describe()}"
+        each.describe() + ("" if each.qualifier is ALLOW else " (by a denial)")
         for each in rights[:_RIGHTS_SHOWN]
     )
     more = len(rights) - _RIGHTS_SHOWN

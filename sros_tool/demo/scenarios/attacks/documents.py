@@ -261,8 +261,8 @@ ROWS: tuple[Row, ...] = (
         victims=forger.weaker_governance,
         tampered=True,
         open_because="DDS Security 1.1 cannot revoke a governance document",
-        remedy="after strengthening the governance: `sros rotate_ca`, so that nobody trusts the CA"
-        " that signed the weaker one",
+        remedy="after strengthening the governance (`sros update_keystore`): `sros rotate_ca "
+        "--permissions`, so that nobody trusts the CA that signed the weaker one",
     ),
     injection(
         "weaker governance, signed by the permissions CA",

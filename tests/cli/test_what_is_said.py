@@ -1,0 +1,145 @@
+"""What was taken away, or is still open, is said at once, with what ends it."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+from sros_tool.keystore.layout import enclave_path
+from sros_tool.keystore.reader import read_crl
+from tests.support.harness import (
+    Ended,
+    certificate,
+    policy_text,
+    publish,
+    snapshot,
+    sros,
+    topics_of,
+)
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """A keystore in which /robot may publish /scan and /secret, and /free everything."""
+    (tmp_path / "wide.xml").write_text(policy_text({"/robot": publish("/scan", "/secret")}))
+    (tmp_path / "narrow.xml").write_text(policy_text({"/robot": publish("/scan")}))
+    sros("generate_artifacts", "-k", "ks", "-e", "/free", "-p", "wide.xml", cwd=tmp_path).ok()
+    return tmp_path / "ks"
+
+
+def commands(text: str) -> list[list[str]]:
+    """The commands that a text names."""
+    return [shlex.split(each)[1:] for each in re.findall(r"`(sros [^`]+)`", text)]
+
+
+TAKES_AWAY = {
+    "create_permission": "create_permission ks /robot narrow.xml",
+    "generate_artifacts": "generate_artifacts -k ks -p narrow.xml",
+}
+
+
+@pytest.mark.parametrize("verb", TAKES_AWAY)
+def test_what_still_works_after_taking_a_right_away(verb: str, root: Path) -> None:
+    folder = enclave_path(root, "/robot")
+    before = certificate(folder / "cert.pem")
+    ended = sros(*TAKES_AWAY[verb].split(), cwd=root.parent).ok()
+    assert "/robot loses: publish topic /secret" in ended.err
+    (line,) = [each for each in ended.err.splitlines() if "works until" in each]
+    assert f"{before.not_valid_after_utc:%Y-%m-%d}" in line
+    assert "until they are restarted" in line
+    # What it names as the remedy runs, and ends it.
+    (command,) = commands(line)
+    sros(*command, cwd=root.parent).ok()
+    crl = read_crl(root)
+    assert crl
+    assert before.serial_number in {each.serial for each in crl.revoked}
+    assert certificate(folder / "cert.pem").subject != before.subject
+
+
+@pytest.mark.parametrize("verb", TAKES_AWAY)
+def test_taking_a_right_away_at_once(verb: str, root: Path) -> None:
+    folder, free = (enclave_path(root, each) for each in ("/robot", "/free"))
+    before, other = certificate(folder / "cert.pem"), certificate(free / "cert.pem")
+    words = [*TAKES_AWAY[verb].split(), "--revoke-old"]
+    state = snapshot(root)
+    would = sros(*words, "--dry-run", cwd=root.parent).ok()
+    assert snapshot(root) == state
+    assert "/robot would lose: publish topic /secret" in would.err
+    ended = sros(*words, cwd=root.parent).ok()
+    assert "works until" not in ended.err
+    assert "restart the processes of 2 enclaves" in ended.err
+    crl = read_crl(root)
+    assert crl
+    assert [each.serial for each in crl.revoked] == [before.serial_number]
+    assert "rt/secret" not in topics_of(folder)
+    assert certificate(folder / "cert.pem").subject != before.subject
+    assert certificate(free / "cert.pem") == other
+    assert sros("check", root, "--severity", "error").status == 0
+    # A renewal does not make the permissions of before fit again.
+    sros("renew", root, "/robot").ok()
+    assert certificate(folder / "cert.pem").subject != before.subject
+
+
+def test_gaining_a_right_leaves_nothing_behind(root: Path) -> None:
+    sros("create_permission", "ks", "/robot", "narrow.xml", cwd=root.parent).ok()
+    ended = sros("create_permission", "ks", "/robot", "wide.xml", cwd=root.parent).ok()
+    assert "/robot gains: publish topic /secret" in ended.err
+    assert "works until" not in ended.err
+
+
+def test_a_denial_takes_a_right_away(root: Path) -> None:
+    denied = '<topics publish="DENY"><topic>/secret</topic></topics>'
+    (root.parent / "denied.xml").write_text(
+        policy_text({"/robot": publish("/scan", "/secret") + denied})
+    )
+    ended = sros("create_permission", "ks", "/robot", "denied.xml", cwd=root.parent).ok()
+    assert "/robot loses: publish topic /secret (by a denial)" in ended.err
+
+
+# ── templates ──────────────────────────────────────────────────────────────────────────────
+
+
+def generate(root: Path, template: str) -> Ended:
+    words = ("generate_artifacts", "-k", root, "-e", "/new", "--template", template)
+    return sros(*words, cwd=root.parent)
+
+
+def test_another_template_for_an_existing_keystore_is_refused(root: Path) -> None:
+    """It was ignored, so who named production had an open keystore."""
+    before = snapshot(root)
+    ended = generate(root, "production")
+    assert ended.status == 2
+    assert snapshot(root) == before
+    assert "exists already, with the template development" in ended.err
+    (command,) = commands(ended.err)
+    sros(*command).ok()
+    sros(*command[:-1]).ok()  # without --dry-run
+    generate(root, "production").ok()
+    assert generate(root, "development").status == 2
+
+
+@pytest.mark.parametrize("same", ["development", "copy.toml"])
+def test_its_own_template_is_accepted(same: str, root: Path) -> None:
+    text = (root / "sros.toml").read_text()
+    (root.parent / "copy.toml").write_text(text.replace('name = "development"', 'name = "mine"'))
+    generate(root, same).ok()
+
+
+def test_what_a_new_keystore_leaves_open_is_said(tmp_path: Path) -> None:
+    ended = sros("generate_artifacts", "-k", tmp_path / "ks", "-e", "/a").ok()
+    assert "still open: by the template development, an enclave without a policy" in ended.err
+    (_, command) = commands(ended.err)
+    sros(*command).ok()
+    words = ("generate_artifacts", "-k", tmp_path / "other", "-e", "/a")
+    assert "still open" not in sros(*words, "--template", "production").ok().err
+
+
+def test_what_a_template_accepts_is_counted_and_fails_in_ci(tmp_path: Path) -> None:
+    sros("generate_artifacts", "-k", tmp_path / "ks", "-e", "/a").ok()
+    ended = sros("check", tmp_path / "ks").ok()
+    assert "an enclave that may do everything [keystore.allow-everything]" in ended.out
+    assert "nothing found but 2 weaknesses that the template accepts (--strict" in ended.err
+    assert sros("check", tmp_path / "ks", "--strict").status == 1
