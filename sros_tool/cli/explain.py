@@ -962,8 +962,9 @@ def _show_log(
         except SrosError:  # the log names an enclave of another keystore, or a path
             return None
 
+    text = read_log(log)
     findings = explain_log(
-        read_log(log), find, lambda enclave: options.context(enclave.domains), str(root or "")
+        text, find, lambda enclave: options.context(enclave.domains), str(root or "")
     )
     if as_json:
         notes = as_plain(_LOG_NOTES if findings else ())
@@ -975,7 +976,10 @@ def _show_log(
         if findings:
             print_notes(_LOG_NOTES)
         else:
-            click.echo("the log reports no refusal by DDS Security", err=True)
+            lines = text.count("\n") + (not text.endswith("\n")) if text else 0
+            number = "the log is empty" if not lines else f"of {lines} lines, none"
+            number += "" if not lines else " looks like a message of DDS Security"
+            click.echo(number, err=True)
     return 1 if findings else 0
 
 

@@ -7,7 +7,7 @@ and may contain colours and tracebacks.
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from shlex import quote
@@ -143,13 +143,18 @@ def _joined(lines: list[str]) -> Iterator[tuple[int, str]]:
 
 def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
     enclaves: dict[str, str] = {}
-    for number, line in lines:
+    following = deque(lines)
+    while following:
+        number, line = following.popleft()
         process, rest = labelled_line(line)
         if named := SECURITY_DIRECTORY.search(line):
             enclaves[process] = named["enclave"] or "/"
             continue
+        if following and (whole := _broken(process, line, rest, following[0][1])):
+            following.popleft()
+            line = rest = whole
         text = " ".join(rest.split())
-        meaning, match = _meaning_of(line, text)
+        meaning, match = _meaning_of(line, rest)
         if match:
             fields = {name: found or "" for name, found in match.groupdict().items()}
             if domain := DOMAIN_OF_LINE.search(line):
@@ -157,11 +162,26 @@ def _hits(lines: Iterable[tuple[int, str]]) -> Iterator[_Hit]:
             yield _Hit(number, text, process, enclaves.get(process, ""), meaning, fields)
 
 
-def _meaning_of(line: str, text: str) -> tuple[LogText, re.Match[str] | None]:
-    """Return the meaning of a line (``text`` without its label), and the match, if any."""
+def _broken(process: str, line: str, rest: str, following: str) -> str:
+    """Return the line that was broken in two, for instance by a terminal, or "".
+
+    It was if ``line`` is not understood, nor is the one that follows, and both together are.
+    """
+    other, end = labelled_line(following)
+    if other not in ("", process) or log_text(line) or log_text(following):
+        return ""
+    if denied_topic(line) or denied_topic(following) or SECURITY_DIRECTORY.search(following):
+        return ""
+    if not UNKNOWN.pattern.search(rest):
+        return ""
+    return next((each for each in (rest + end, f"{rest} {end}") if log_text(each)), "")
+
+
+def _meaning_of(line: str, rest: str) -> tuple[LogText, re.Match[str] | None]:
+    """Return the meaning of a line (``rest`` without its label), and the match, if any."""
     if found := log_text(line):
         return found
-    return UNKNOWN, None if denied_topic(line) else UNKNOWN.pattern.search(text)
+    return UNKNOWN, None if denied_topic(line) else UNKNOWN.pattern.search(rest)
 
 
 def _strongest(hits: Iterable[_Hit], reported: set[str]) -> Iterator[_Hit]:

@@ -166,6 +166,16 @@ _LOG_TEXTS: tuple[LogText, ...] = (
         "Restore it: `sros create_enclave KEYSTORE ENCLAVE`, or export the enclave again.", _FILES,
         refuses=Refused.PARTICIPANT,
     ),
+    _text(
+        "enclave-missing", _ROS,
+        r"SECURITY ERROR: unable to find a folder matching the (?:\w+ )?name '(?P<path>[^']*)'",
+        "no folder of the keystore is for the enclave {path}",
+        "Correct the name: `sros list_enclaves KEYSTORE` shows all names.",
+    ),
+    _text(
+        "not-started", _ROS, r"Unable to (?:run the command|print the environment): (?P<why>.+)",
+        "sros did not start the process: {why}", "Do what the line says, and start it again.",
+    ),
     # ── Cyclone DDS, meeting peers ─────────────────────────────────────────────────────────
     _text(
         "peer-refused", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed: "
@@ -175,12 +185,39 @@ _LOG_TEXTS: tuple[LogText, ...] = (
         _PEERS,
     ),
     _text(
-        "peer-handshake", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed",
+        "peer-handshake", _CYCLONE, r"(?:Begin|Process) handshake (?:request |reply )?failed"
+        r"|FSM: handshake (?:failed|timeout)|handshake \(lguid=\S+ rguid=\S+\) failed",
         "a PEER failed to authenticate: most often its key.pem is not the key of its cert.pem, "
         "which Cyclone DDS does not check for its own enclave; or it runs another DDS or version",
         "Run `sros verify` or `sros inspect` on the enclave of every peer.", (Fault.KEY_MISMATCH,),
     ),
+    _text(
+        "peer-governance", _CYCLONE, r"security_attributes mismatch",
+        "a PEER was refused: its governance protects other things than that of this process. Both "
+        "have enclaves of different keystores, or one was started before the governance changed",
+        f"{_PEERS} It also shows the governance. Export the enclaves again, and restart both.",
+    ),
+    _text(
+        "peer-unsecured", _CYCLONE, r"Non secure remote (?:reader|writer) \S+ is not allowed"
+        r"|from unauthenticated participant|downgrade participant \S+ to non-secure",
+        "a PEER was refused: it runs without DDS Security, or is not authenticated yet",
+        "Start the peer in its enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`.",
+    ),
     # ── Cyclone DDS, starting ──────────────────────────────────────────────────────────────
+    _text(
+        "plugin", _CYCLONE, r"Could not load (?:Authentication|Access Control|Cryptographic|"
+        r"security)\b|Could not find the function: \S+|security plugin (?:library path|init "
+        r"function|finalize function) is undefined|Error occurred while initializing \w[\w ]* plugin",
+        "a plugin of DDS Security (authentication, access control, cryptography) cannot be loaded, "
+        "so no secured process starts",
+        "Install Cyclone DDS with its plugins, as the distribution packages it; `sros doctor` "
+        "shows whether it enforces.",
+    ),
+    _text(
+        "property", _CYCLONE, r"required security property (?P<property>\S+) missing",
+        "the program secures its participant without naming {property}",
+        "Start it through an RMW of ROS 2, in an enclave: `sros run KEYSTORE ENCLAVE -- COMMAND`.",
+    ),
     _text(
         "certificate-expired", _CYCLONE, r"Certificate not valid: error: certificate has expired",
         "the certificate of the enclave or of its identity CA has expired; the message "
@@ -223,8 +260,9 @@ _LOG_TEXTS: tuple[LogText, ...] = (
         "Store key.pem without a passphrase, mode 0600.", (Fault.KEY_ENCRYPTED,),
     ),
     _text(
-        "pem-unreadable", _CYCLONE, r"Failed to parse (?:certificate|private key)",
-        "cert.pem or key.pem is not a PEM file (the message says certificate for both)",
+        "pem-unreadable", _CYCLONE, r"Failed to parse (?:certificate|private key)"
+        r"|Certificate is invalid: ",
+        "a certificate or key.pem is not a PEM file (the message says certificate for all)",
         "Restore the file.", (Fault.CERTIFICATE_MALFORMED, *_KEY, *_FILES),
     ),
     _text(
@@ -273,6 +311,19 @@ _LOG_TEXTS: tuple[LogText, ...] = (
         r"(?P<path>\S+)",
         "the file {path} is missing, empty or not readable", "Restore it.", _FILES,
     ),
+    _text(
+        "peer-refused", _CYCLONE, r"Remote secure participant \S+ not allowed"
+        r"|Plugin does not allow remote participant|Could not authenticate_peer_credential_token"
+        r"|Could not get remote participant \S+ permissions",
+        "a PEER was refused, not this process; another line, of this process or of the peer, says "
+        "why", _PEERS, weak=1,
+    ),
+    _text(
+        "participant", _CYCLONE, r"rmw_create_node: failed to create (?:DomainParticipant|domain)",
+        "the process could not join its domain, and this line does not say whether DDS Security, "
+        "the network interface or the domain is the reason: Cyclone DDS says it in an earlier "
+        "line, on standard error", _CHECK, _ALL, weak=2,
+    ),
     # ── Fast DDS, meeting peers ────────────────────────────────────────────────────────────
     _text(
         "peer-permissions-ca", _FAST, r"Remote participant PermissionsCA differs from local",
@@ -318,6 +369,14 @@ _LOG_TEXTS: tuple[LogText, ...] = (
         r"|Remote participant doesn't sent the signed permissions|Not receive remote permissions",
         "a PEER was refused, not this process: its permissions did not arrive or were not accepted",
         _PEERS,
+    ),
+    _text(
+        "crypto", _FAST, r"\[SECURITY_CRYPTO (?:Error|Warning)\]|EVP_(?:De|En)crypt|AESGCMGMAC"
+        r"|(?:Invalid|Malformed) Crypto(?:Token|Handle)|in fastcdr trying to (?:de)?"
+        r"(?:serialize|cipher)",
+        "a message of a peer could not be decrypted or verified: one side restarted, or has "
+        "another governance, or a packet was damaged or forged",
+        f"If it goes on, restart both sides. {_PEERS}",
     ),
     # ── Fast DDS, starting ─────────────────────────────────────────────────────────────────
     _text(
@@ -405,8 +464,14 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     ),
     # ── messages that follow others ────────────────────────────────────────────────────────
     _text(
+        "plugin-unset", _FAST, r"Authentication plugin not configured. Security will be disabled",
+        "the process RUNS UNSECURED: it has no enclave",
+        "Start it with `sros run KEYSTORE ENCLAVE -- COMMAND`, secured or not at all.",
+    ),
+    _text(
         "participant", _FAST, r"Error while configuring security plugin"
-        r"|Participant is not allowed with its own permissions file",
+        r"|Participant is not allowed with its own permissions file"
+        r"|SecurityManager::init :\s*\Z|Cryptography plugin not configured",
         "the process may not join; Fast DDS 2.14 gives the reason in another line, or in the file "
         "of ROS_SECURITY_LOG_FILE, and neither is in this log", _CHECK_OR_FILE, _ALL,
         unseen=_FILE, weak=1,
@@ -463,15 +528,36 @@ _LOG_TEXTS: tuple[LogText, ...] = (
 )  # fmt: skip
 """In the order of matching: the first text that matches a line counts."""
 
+_SUBJECT = (
+    r"DDS[-:. ]?sec|dds_sec|ROS_SECURITY_|\bsecurity|non.?secure|identity[_ ]ca|permissions?[_ ]ca"
+    r"|\bgovernance\b|\bpermissions\b|(?:cert|key|crl)\.pem|\.p7s\b|validate_(?:local|remote)_"
+    r"|PKCS ?#?7|\bS/?MIME|X\.?509|\bPEM\b|handshake|certificate|private key|authenticated\b|crypto"
+    r"|decrypt|access[ _]?control|\benclave|keystore|\bCRL\b"
+)
+"""Words that speak of DDS Security, or of security."""
+_TROUBLE = (
+    r"error|fail|cannot|can't|could not|couldn't|unable|invalid|refus|denied|expired|reject"
+    r"|disabled|not (?:allowed|found|valid|trusted|permitted|supported)|missing|mismatch|unknown"
+    r"|expect"
+)
+
 UNKNOWN = LogText(
     "not-understood",
     _ROS,
     re.compile(
-        r"\[SECURITY\w* (?:Error|Warning)\]"
-        r"|\[(?:EMERGENCY|ALERT|CRITICAL|ERROR|WARNING)\] \S+ \d+ \w+::\w+ :"
-        r"|\A\d+\.\d+ \[\d*\]\s+\S+: "
-        r".*(?:[Ss]ecurity|handshake|[Pp]ermission|[Cc]ertificate|crypto)"
+        r"\[\w*SECURITY\w* (?:Error|Warning)\]"
+        # Any line of the file of ROS_SECURITY_LOG_FILE: without trouble, it stays empty.
+        r"|\[[A-Z]+\] \S+\|\S+ \d+ \w+::\w+ :"
+        # Cyclone DDS; what it traces of success is no trouble.
+        r"|\A\d+\.\d+ \[\d*\]\s+\S+: (?!.*(?:DDS Security plugins have been loaded"
+        r"|using security settings from|allow non-secure remote|FSM: |handshake (?:delete|resend)"
+        r"|\) (?:processed|send tokens|succeeded)))"
+        rf".*(?:{_SUBJECT}|plugin|not allowed|token|encoded|authenticat|Could not (?:load|find))"
         r"|SECURITY ERROR"
+        # Any other program that speaks of security and of trouble, at no level that means none,
+        # but not the source in a traceback.
+        rf"|\A(?! {{4}}|(?:\[[\w.-]+\] )*\[(?:INFO|DEBUG)\])(?=.*?(?:{_TROUBLE})).*?(?:{_SUBJECT})",
+        re.IGNORECASE,
     ),
     "a line of DDS Security that sros does not know",
     "Read the line: it may matter. If it kept a node from starting, `sros check KEYSTORE` and "

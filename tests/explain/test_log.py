@@ -23,6 +23,9 @@ from tests.support.children import python, run
 from tests.support.harness import policy_text, publish, sros
 
 LOGS = Path(__file__).with_name("logs")
+CYCLONE_LINE = "1795242829.914522 [0]     recvUC: "
+FAST_LINE = "2026-01-01 12:00:00.000 [SECURITY Error] "
+FILE_LINE = "[1795309573.65] [EMERGENCY] 01.0f.78|0.0.1.c1 0 "
 FAST, FAST_14, CYCLONE = "fastdds_2.9.1", "fastdds_2.14.5", "cyclone_0.10.2"
 
 CAUSES = {
@@ -254,6 +257,17 @@ def test_cyclone_says_nothing_of_a_whole_enclave(keystore: Path, tmp_path: Path)
         ("fastdds_2.14.5.peer_of_a_CA_of_the_same_name.log", ["peer-signature"]),
         ("fastdds_2.14.5.peer_permissions_expired.log", ["peer-permissions"]),
         ("fastdds_2.14.5.peer_of_another_domain.log", ["peer-domain"]),
+        ("fastdds_2.14.5.permissions_ca_der.log", ["participant"]),
+        ("fastdds_2.14.5.permissions_ca_der.security.log", ["participant"]),
+        ("fastdds_2.14.5.certificate_der.security.log", ["identity"]),
+        ("cyclone_0.10.2.certificate_der.log", ["pem-unreadable"]),
+        ("cyclone_0.10.2.permissions_ca_der.log", ["pem-unreadable"]),
+        ("cyclone_0.10.2.plugin_missing.log", ["plugin"]),
+        ("cyclone_0.10.2.crypto_plugin_missing.log", ["plugin"]),
+        ("cyclone_0.10.2.plugin_without_init.log", ["plugin"]),
+        ("cyclone_0.10.2.property_missing.log", ["property"]),
+        ("cyclone_0.10.2.peer_of_another_governance.log", ["peer-governance"]),
+        ("cyclone_0.10.2.peer_of_other_data_protection.log", ["peer-governance"]),
         ("cyclone_0.10.2.key_encrypted.log", ["key-encrypted"]),
         ("cyclone_0.10.2.governance_tampered.log", ["signature"]),
     ],
@@ -288,10 +302,21 @@ def test_single_lines(line: str, name: str) -> None:
     "line",
     [
         "2026-01-01 12:00:00.000 [SECURITY Error] Cannot find local writer 01.0f|0.0.1.c1",
-        "2026-01-01 12:00:00.000 [SECURITY_CRYPTO Error] Invalid CryptoToken -> Function set",
+        "2026-01-01 12:00:00.000 [RTPS_SECURITY Error] Bad thing -> Function set",
+        "[1795309573.65] [INFORMATIONAL] 01.0f|0.0.1.c1 0 SecurityManager::init : Bad thing",
         "[1795309573.65] [EMERGENCY] 01.0f|0.0.1.c1 0 PKIDH::begin_handshake_request : Bad thing",
         "talker-1  | 1795242829.9 [0] python: Bad handshake",
         "1795242829.9 [0] python: Remote permissions could not be decoded by the security plugin",
+        "1795242829.9 [0] recvUC: Something of the Authentication plugin",
+        "1795242829.9 [0] dq.builtin: Access Control says no",
+        "1795242829.9 [0] recv: encoded submessage from a stranger",
+        "rclpy.RCLError: error creating node: SECURITY ERROR: something new",
+        "[ERROR] [1.0] [rmw_fastrtps_cpp]: failed to load identity_ca.cert.pem",
+        "[talker-1] [WARN] [1.0] [rmw_cyclonedds_cpp]: invalid security file governance.p7s",
+        "  what():  could not read permissions.p7s",
+        "robot | Expecting: TRUSTED CERTIFICATE",
+        "Nov 21 06:00:00 robot talker[12]: X509 certificate rejected",
+        "2026-01-01 12:00:00.000 [SECURITY Error] Not found the identity subj",
     ],
 )
 def test_what_is_not_understood_is_shown(line: str, tmp_path: Path) -> None:
@@ -302,6 +327,106 @@ def test_what_is_not_understood_is_shown(line: str, tmp_path: Path) -> None:
     (tmp_path / "robot.log").write_text(line)
     said = sros("explain", "--log", tmp_path / "robot.log")
     assert said.status == 1 and " ".join(line.split())[-20:] in said.out
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        (f"{CYCLONE_LINE}Could not load Access Control plugin.", "plugin"),
+        (f"{CYCLONE_LINE}Could not load Cryptographic library", "plugin"),
+        (f"{CYCLONE_LINE}Could not load security", "plugin"),
+        (f"{CYCLONE_LINE}Could not find the function: init_crypto", "plugin"),
+        (f"{CYCLONE_LINE}Error occurred while initializing Authentication plugin", "plugin"),
+        (f"{CYCLONE_LINE}Authentication security plugin library path is undefined", "plugin"),
+        (f"{CYCLONE_LINE}Non secure remote writer 1:2:3:403 is not allowed.", "peer-unsecured"),
+        (f"{CYCLONE_LINE}downgrade participant 1:2:3:1c1 to non-secure", "peer-unsecured"),
+        (
+            f"{CYCLONE_LINE}received encoded rtps message from unauthenticated participant",
+            "peer-unsecured",
+        ),
+        (f"{CYCLONE_LINE}Remote secure participant 1:2:3:1c1 not allowed", "peer-refused"),
+        (f"{CYCLONE_LINE}Plugin does not allow remote participant 1:2:3:1c1", "peer-refused"),
+        (
+            f"{CYCLONE_LINE}Could not get remote participant 1:2:3:1c1 permissions from plugin",
+            "peer-refused",
+        ),
+        (
+            f"{CYCLONE_LINE}handshake (lguid=1:2:3:1c1 rguid=2:3:4:1c1) failed: (10) Timed out",
+            "peer-handshake",
+        ),
+        (
+            f"{CYCLONE_LINE}match_remote_writer 1:2:3:403 with reader 1:2:3:504 "
+            "security_attributes mismatch: 0x8000007f.0x80000003 - 0x8000004f.0x80000001",
+            "peer-governance",
+        ),
+        ("RCLError: rmw_create_node: failed to create domain, error Error", "participant"),
+        (f"{FILE_LINE}SecurityManager::init : ", "participant"),
+        (f"{FILE_LINE}SecurityManager::init : Cryptography plugin not configured", "participant"),
+        (
+            f"{FILE_LINE}PKIDH::validate_local_identity : Error verifying private key",
+            "key-mismatch",
+        ),
+        (
+            f"{FILE_LINE}AccessControl::validate_remote_permissions : Remote participant "
+            "PermissionsCA differs from local",
+            "peer-permissions-ca",
+        ),
+        (f"{FAST_LINE}Remote participant PermissionsCA differs from local", "peer-permissions-ca"),
+        (
+            "[SECURITY Info] Authentication plugin not configured. Security will be disabled",
+            "plugin-unset",
+        ),
+        ("[SECURITY_CRYPTO Error] Invalid CryptoToken -> Function set_tokens", "crypto"),
+        (f"{FAST_LINE}Malformed CryptoTokenSequence", "crypto"),
+        (f"{FAST_LINE}Error in fastcdr trying to deserialize SecureDataHeader", "crypto"),
+        (
+            "[SECURITY_CRYPTO Warning] Unable to decode the payload. EVP_DecryptFinal function "
+            "returns an error",
+            "crypto",
+        ),
+        (
+            "SECURITY ERROR: unable to find a folder matching the name '/x' in '/ks/enclaves'.",
+            "enclave-missing",
+        ),
+        (
+            "Unable to run the command: a process cannot run in enclave /a. cert.pem: it expired",
+            "not-started",
+        ),
+        # Broken in two, by a terminal or by a log that cuts long lines.
+        (f"{FAST_LINE}Not found the identity subj\nect name in permissions file. CN=/t", "grant"),
+        (f"{FAST_LINE}Not found the identity\nsubject name in permissions file. CN=/t", "grant"),
+        (f"{CYCLONE_LINE}Certificate not\nvalid: error: certificate revoked", "revoked"),
+        (f"a-1 | {FAST_LINE}PKCS7 data verifi\na-1 | cation failed", "signature"),
+        (f"{CYCLONE_LINE}Permissions validity period exp\nired", "permissions-expired"),
+        (f"{FILE_LINE}PKIDH::init : Error obtaining private\n key /k/key.pem", "key-unreadable"),
+    ],
+)
+def test_every_shape_has_its_cause_and_a_remedy(text: str, name: str, tmp_path: Path) -> None:
+    (found,) = explained(f"before\n{text}\nafter")
+    assert (found.id, found.line) == (name, 2)
+    assert found.cause and found.remedy
+    (tmp_path / "robot.log").write_text(text)
+    assert sros("explain", "--log", tmp_path / "robot.log").status == 1
+
+
+def test_a_line_that_follows_an_unknown_one_is_not_swallowed() -> None:
+    unknown, known = f"{FAST_LINE}Something new", f"{FAST_LINE}PKCS7 data verification failed"
+    assert [each.id for each in explained(f"{unknown}\n{known}\n{unknown}")] == [
+        "not-understood", "signature",
+    ]  # fmt: skip
+    other = f"a-1 | {FAST_LINE}PKCS7 data verifi\nb-1 | cation failed"
+    assert [each.id for each in explained(other)] == ["not-understood"]
+
+
+def test_nothing_found_is_said_of_what_was_read(tmp_path: Path) -> None:
+    for text, said in (
+        ("", "the log is empty"),
+        ("one\ntwo\n", "of 2 lines, none looks like a message of DDS Security"),
+        ("one\ntwo", "of 2 lines, none looks like a message of DDS Security"),
+    ):
+        (tmp_path / "robot.log").write_text(text)
+        ended = sros("explain", "--log", tmp_path / "robot.log").ok()
+        assert ended.err.strip() == said
 
 
 def test_what_tells_more_counts() -> None:
@@ -335,6 +460,10 @@ def test_mixed_processes_are_told_apart() -> None:
         "all is well\n",
         "[INFO] [1.0] [talker]: the security of the building is checked\n",
         "Segmentation fault\n",
+        "[INFO] [1.0] [web]: the TLS certificate was not found in the cache\n",
+        f"{CYCLONE_LINE}DDS Security plugins have been loaded\n",
+        f"{CYCLONE_LINE}handshake (lguid=1:2:3:1c1 rguid=2:3:4:1c1) succeeded\n",
+        '    raise SrosError(f"cannot read the enclave {name}")\n',
         "[INFO] [1.0] [rcl]: Found security directory: /k",
     ],
 )
