@@ -48,10 +48,10 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
 
     PATH is a keystore, an enclave's folder, a file of certificates, a revocation list, a private
     key or a signed document (.p7s). The exit status is 1 if an enclave cannot run, a signature
-    does not verify, a certificate or signed document is missing from the keystore's ledger, or
-    lines of the ledger are missing or were changed.
+    does not verify or is missing (in a .p7s file, or with --ca), a certificate or signed document
+    is missing from the keystore's ledger, or lines of the ledger are missing or were changed.
     """
-    from sros_tool.errors import DocumentError
+    from sros_tool.errors import DocumentError, UsageError
     from sros_tool.keystore.describe import describe
 
     if not path.exists():
@@ -59,13 +59,20 @@ def inspect(path: Path, authority: Path | None, history: bool, as_json: bool) ->
     if history:
         return _show_history(path, as_json)
     described = describe(path, now=now(), authority=authority)
+    if authority and "signed" not in described:
+        raise UsageError(
+            f"--ca verifies a signed document, and '{path}' is of the kind {described['kind']}",
+            "",
+            "Leave --ca out, or name a governance.p7s or permissions.p7s.",
+        )
     if as_json:
         print_json(described)
     else:
         for line in _TEXT[described["kind"]](described):
             click.echo(visible(line))
-    bad = described.get("problems") or described.get("signature_verified") is False
-    return 1 if bad and described.get("signed") is not False else 0
+    if described.get("signed") is False:  # documents in clear, such as governance.xml, exist
+        return 1 if authority or path.suffix == ".p7s" else 0
+    return 1 if described.get("problems") or described.get("signature_verified") is False else 0
 
 
 def _show_history(root: Path, as_json: bool) -> int:

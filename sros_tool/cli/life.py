@@ -525,7 +525,12 @@ def _print_step(
     step: RotationStep, status: RotationStatus, *, together: bool, same_key: bool
 ) -> None:
     if not step.changes:
-        click.echo("nothing is left to do", err=True)
+        done = (
+            "the last rotation is complete"
+            if status.rotation.stage == "none"
+            else f"the keystore is at the stage {status.rotation.stage}"
+        )
+        click.echo(f"nothing is left to do: {done}", err=True)
         return
     if same_key:
         click.echo("renewed the identity CA with the same key; certificates it issued stay valid")

@@ -207,7 +207,7 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "plugin", _CYCLONE, r"Could not load (?:Authentication|Access Control|Cryptographic|"
         r"security)\b|Could not find the function: \S+|security plugin (?:library path|init "
-        r"function|finalize function) is undefined|Error occurred while initializing \w[\w ]* plugin",
+        r"function|finalize function) is undefined|Error occurred while initializing [\w ]+ plugin",
         "a plugin of DDS Security (authentication, access control, cryptography) cannot be loaded, "
         "so no secured process starts",
         "Install Cyclone DDS with its plugins, as the distribution packages it; `sros doctor` "

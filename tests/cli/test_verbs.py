@@ -378,6 +378,23 @@ def test_create_keystore_by_options(tmp_path: Path) -> None:
     assert (tmp_path / "ks/private/identity_ca.key.pem").is_symlink()
 
 
+def test_a_document_without_the_signature_that_was_asked_for_is_a_no(
+    keystore: Path, tmp_path: Path
+) -> None:
+    clear, signed = keystore / "enclaves/governance.xml", keystore / "enclaves/governance.p7s"
+    authority = keystore / "public/permissions_ca.cert.pem"
+    assert sros("inspect", signed, "--ca", authority).status == 0
+    assert sros("inspect", clear).status == 0
+    refused = sros("inspect", clear, "--ca", authority)
+    assert refused.status == 1 and "not signed" in refused.out
+    signed.write_bytes(clear.read_bytes())
+    assert sros("inspect", signed).status == 1
+    for path in (keystore, authority, keystore / "enclaves/a", keystore / "enclaves/a/key.pem"):
+        assert sros("inspect", path).status == 0 or path.is_dir()
+        ignored = sros("inspect", path, "--ca", authority)
+        assert ignored.status == 2 and "--ca verifies a signed document" in ignored.err
+
+
 def test_create_permission_replaces_and_says_so(keystore: Path, tmp_path: Path) -> None:
     (tmp_path / "p.xml").write_text(policy_text({"/a": publish("new"), "/b": publish("new")}))
     key = (keystore / "enclaves/a/key.pem").read_bytes()

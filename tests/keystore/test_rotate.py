@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 from collections.abc import Callable
@@ -608,6 +609,20 @@ def test_exports_can_be_replaced_during_a_rotation(separate: Path, tmp_path: Pat
 # ── the verb ───────────────────────────────────────────────────────────────────────────────
 
 
+@pytest.mark.parametrize("before", ["new", "same key", "replaced"])
+def test_nothing_is_retired_that_nothing_replaced(before: str, separate: Path) -> None:
+    if before == "same key":
+        sros("rotate_ca", separate, "--same-key").ok()
+    if before == "replaced":
+        sros("rotate_ca", separate, "--finish", "--identity", "--delete-old-key").ok()
+    ended = sros("rotate_ca", separate, "--to", "retire")
+    assert ended.status == (0 if before == "replaced" else 2), ended
+    if before != "replaced":
+        assert "no CA of keystore" in ended.err
+        (command,) = re.findall("`sros (.+?)`", ended.err)
+        sros(*command.split()).ok()
+
+
 def test_the_verb(separate: Path) -> None:
     told = json.loads(sros("rotate_ca", separate, "--json").ok().out)
     assert (told["stage"], told["next"], told["enclaves"]) == ("none", "distribute", 3)
@@ -624,6 +639,8 @@ def test_the_verb(separate: Path) -> None:
     assert "Cyclone DDS" in sros("rotate_ca", separate, "--to", "reissue").ok().err
     assert "nothing is left to do" in sros("rotate_ca", separate, "--to", "reissue").ok().err
     assert sros("rotate_ca", separate, "--finish").ok().out.startswith("retired the old CA")
+    again = sros("rotate_ca", separate, "--to", "retire").ok()
+    assert "nothing is left to do: the last rotation is complete" in again.err
     assert sros("rotate_ca", separate, "--same-key").ok().out.startswith("renewed the identity CA")
     assert sros("rotate_ca", separate, "--next", "--finish").status == 2
     assert sros("rotate_ca", separate, "--same-key", "--permissions").status == 2

@@ -8,6 +8,7 @@ stage is one transaction.
 from __future__ import annotations
 
 import secrets
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -53,6 +54,7 @@ from sros_tool.keystore.ledger import (
     append,
     certificate_entry,
     document_entry,
+    read_ledger,
 )
 from sros_tool.keystore.lifecycle.revocation_list import sign_list
 from sros_tool.keystore.lifecycle.rotation.state import (
@@ -178,6 +180,18 @@ def _refuse_edited(root: Path) -> None:
         )
 
 
+def _was_replaced(root: Path) -> bool:
+    """Return whether the ledger has a CA that another one replaced, perhaps of the same name."""
+    names = (certificates_of(root, f"{role}_ca") for role in ROLES)
+    trusted = {subject_text(each.subject) for certificates in names for each in certificates}
+    made = Counter(
+        each.subject
+        for each in read_ledger(root).entries
+        if each.what == "ca" and each.reason != SAME_KEY
+    )
+    return any(number > 1 or subject not in trusted for subject, number in made.items())
+
+
 def _target_stage(root: Path, rotation: Rotation, to: RotationStage | None) -> RotationStage:
     """Return the stage to go to; NONE if there is nothing to do.
 
@@ -187,6 +201,12 @@ def _target_stage(root: Path, rotation: Rotation, to: RotationStage | None) -> R
     if to is None:
         return rotation.next_stage()
     if to is RotationStage.RETIRE and rotation.stage is RotationStage.NONE:
+        if not _was_replaced(root):
+            raise UsageError(
+                f"no CA of keystore '{root}' is being replaced",
+                "There is no old CA to retire.",
+                f"Begin with `sros rotate_ca {root} --next`.",
+            )
         return RotationStage.NONE  # an earlier rotation is complete
     order = list(RotationStage)
     ahead = order.index(to) - order.index(rotation.stage)
