@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -14,7 +15,9 @@ from sros_tool.pki import smime
 from sros_tool.pki.certificates import load_certificate
 from sros_tool.pki.keys import load_key
 from sros_tool.resources import policies_dir
+from tests.policy.earlier_policies import EARLIER, policies
 from tests.support.harness import policy_text, publish, sros
+from tests.support.made_by_eloquent import EVERYTHING, make_eloquent
 
 PASSPHRASE = "the passphrase"
 _POLICY = policy_text({"/a": publish("chatter", "b/*"), "/b/c": publish("~/x")})
@@ -125,6 +128,9 @@ def make_corpus(root: Path) -> Corpus:
         frozenset((Endpoint("rt/chatter", "publish"), Endpoint("rq/addRequest", "subscribe"))),
     )
     (root / "observation.json").write_text(json.dumps(to_json(make_observation([node])), indent=1))
+    earlier = dict(policies(EARLIER))["private-gauge"]
+    (root / "earlier.xml").write_text(earlier)
+    make_eloquent(root / "flat", {"/a": EVERYTHING, "/n/b": ("rt/x",)}, now=datetime.now(UTC))
     (root / "shipped.xml").write_bytes((policies_dir() / "mobile_robot.xml").read_bytes())
     key = load_key((keystore / "private/identity_ca.key.pem").read_bytes(), "of the corpus")
     assert isinstance(key, ec.EllipticCurvePrivateKey)

@@ -26,6 +26,7 @@ from sros_tool.keystore.delivery.answer import import_answer
 from sros_tool.keystore.describe import describe
 from sros_tool.keystore.history import history
 from sros_tool.keystore.ledger import certificate_entry, read_ledger
+from sros_tool.keystore.lifecycle.adopt import adopt_keystore
 from sros_tool.keystore.lifecycle.rotation.state import read_rotation, rotation_status
 from sros_tool.keystore.rights import load_rights
 from sros_tool.keystore.template import parse_template, read_template, render_template
@@ -46,7 +47,7 @@ from sros_tool.pki.chains import chain_fault
 from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.pki.keys import load_key
 from sros_tool.pki.requests import key_digest, load_request
-from sros_tool.policy.document import read_policy, write_policy
+from sros_tool.policy.document import convert_policy, read_policy, write_policy
 from sros_tool.policy.rights import policy_rights
 from sros_tool.report.sources import read_source
 from sros_tool.translate import ros_rights
@@ -193,6 +194,12 @@ def _policy(data: bytes, place: Place) -> None:
     load_rights(place.folder / "drawn.xml")
 
 
+def _earlier_policy(data: bytes, place: Place) -> None:
+    converted = convert_policy(place.put("drawn.xml", data)).policy
+    written = place.put("converted.xml", write_policy(converted))
+    assert policy_rights(read_policy(written)) == policy_rights(converted)
+
+
 def _template(data: bytes, place: Place) -> None:
     template = read_template(place.put("template.toml", data))
     parse_template(render_template(template), "rendered")
@@ -231,6 +238,18 @@ def _answer(data: bytes, place: Place) -> None:
     import_answer(place.corpus.robot, data, now=NOW, dry_run=True)
 
 
+def _of_node(data: bytes, place: Place) -> None:
+    old = place.folder / "flat"
+    if not old.exists():
+        shutil.copytree(place.corpus.root / "flat", old)
+    for file in ("cert.pem", "permissions.p7s"):
+        if (b"CERTIFICATE" in data) is (file == "cert.pem"):
+            (old / "a" / file).write_bytes(data)
+        else:
+            shutil.copyfile(place.corpus.root / "flat/a" / file, old / "a" / file)
+    adopt_keystore(place.folder / "new", old, now=NOW, dry_run=True)
+
+
 CA = "ks/public/identity_ca.cert.pem"
 READERS: dict[str, Reader] = {
     "certificate": Reader(
@@ -257,6 +276,8 @@ READERS: dict[str, Reader] = {
     ),
     "governance": Reader(_governance, ("ks/enclaves/governance.xml",), 2),
     "policy": Reader(_policy, ("policy.xml", "shipped.xml"), 3),
+    "earlier policy": Reader(_earlier_policy, ("earlier.xml",)),
+    "earlier keystore": Reader(_of_node, ("flat/a/permissions.p7s", "flat/a/cert.pem")),
     "template": Reader(_template, ("ks/sros.toml",), 2),
     "scenario": Reader(_scenario, ("scenario.toml",), 2),
     "ledger": Reader(_ledger, ("ks/ledger.jsonl",)),
