@@ -408,11 +408,15 @@ def locate_enclave(folder: Path) -> tuple[Path, str]:
 
     Raises:
         DocumentError: ``folder`` is not below a folder named ``enclaves``.
+        KeystoreError: ``folder`` is that of a node in a keystore of ROS 2 Eloquent or earlier.
     """
     whole = Path(os.path.abspath(folder))  # noqa: PTH100 - must not follow links
     for above in (whole, *whole.parents):
         if above.name == ENCLAVES:
             return above.parent, f"/{'/'.join(whole.relative_to(above).parts)}"
+    for above in whole.parents:
+        if is_earlier_keystore(above):
+            refuse_earlier(above)
     raise DocumentError(
         f"'{folder}' is not below a folder named {ENCLAVES}",
         "rcl finds an enclave by its path below that folder.",
