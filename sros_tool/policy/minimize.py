@@ -399,8 +399,11 @@ def propose_wildcards(
     own = [right for right in rights if right.enclave == enclave and right.qualifier is ALLOW]
     rules = Rules(own)
     foreign = _foreign(enclave, rules, known)
+    present = Rules(right for right in own if is_expression(right.name))
+    # A large document does not list the names that its wildcards match, so these save nothing.
+    listed = (right for right in own if not present.cover(right))
     candidates: dict[frozenset[Right], WildcardProposal] = {}
-    for rule, found in _candidates(own).items():
+    for rule, found in _candidates(listed).items():
         other = candidates.get(frozenset(found))
         # Of wildcards for the same names, the longest one allows least.
         if other is None or len(rule.name) > len(other.rule.name):

@@ -223,6 +223,8 @@ FLEET = [f"/fleet/topic_{number}" for number in range(50)]
         ),
         (["/a", "/b", "/c", "/d"], [], []),
         (FLEET[:2], [], []),
+        ([*FLEET, "/fleet/*"], [], []),  # a large document leaves these names out already
+        ([*FLEET, "/fleet/topic_1*"], [], [("/fleet/topic_*", 39, [])]),
     ],
 )
 def test_proposed_wildcards(
