@@ -70,9 +70,10 @@ def make_folder(folder: Path) -> None:
     ):
         sros(*line.split(), cwd=folder).ok()
     make_eloquent(folder / "eloquent", {"/talker": EVERYTHING}, now=datetime.now(UTC))
-    for copy in ("turned", "broken", "lost", "wrecked"):
+    for copy in ("turned", "broken", "lost", "wrecked", "partial"):
         shutil.copytree(folder / "ks", folder / copy, symlinks=True)
     sros("rotate_ca", "turned", "--next", cwd=folder).ok()
+    (folder / "partial/enclaves/a/permissions.p7s").unlink()
     (folder / "lost/public/identity_ca.crl.pem").unlink()
     (folder / "broken/enclaves/b/cert.pem").write_text("x")
     ledger = folder / "broken/ledger.jsonl"
@@ -101,10 +102,13 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks /a /new"),
         Case("ks /a /new --dry-run"),
         Case("ks /a /A"),
+        Case("partial /a"),
     ),
     "create_permission": (Case("ks /a policy.xml"), Case("ks /a policy.xml --dry-run")),
     "generate_artifacts": (
-        Case("-k ks -p policy.xml -e /c"),
+        Case("-k ks -p policy.xml -e /spare"),
+        Case("-k ks -e /a"),
+        Case("-k partial -e /a"),
         Case("-k new -p policy.xml"),
         Case("-k new -p policy.xml --dry-run"),
     ),
@@ -166,9 +170,10 @@ CASES: dict[str, tuple[Case, ...]] = {
     ),
     "distribute_key": (
         Case("ks /a out"),
-        Case("ks /a out", before=("distribute_key ks /a out",)),
+        Case("ks /b out"),
         Case("ks --all out.tar.gz"),
-        Case("ks /a out --dry-run"),
+        Case("ks /b out --dry-run"),
+        Case("ks /b new.tar.gz --dry-run"),
         Case("ks /a - --dry-run"),
     ),
     "verify": (Case("out"), Case("out --domain 7 --at 2000-01-01", 1)),

@@ -139,7 +139,7 @@ class Seen:
             for key, each in value.items():
                 if key in schema.get("properties", {}):
                     under = f"{place}/properties/{key}"
-                    self._seen.add(f"{file}#{under}")
+                    self._seen |= {f"{file}#{under}", f"{file}#{under}={each}"}
                     self._walk(schema["properties"][key], each, file, under)
                 elif isinstance(schema.get("additionalProperties"), dict):
                     under = f"{place}/additionalProperties"
@@ -154,10 +154,13 @@ def _validator(reference: str) -> Draft202012Validator:
 
 
 def _properties(schema: Any, place: str) -> Iterator[str]:
-    """Yield the places of all properties in a schema."""
+    """Yield the places of all properties in a schema, and of all values of outcomes."""
     if isinstance(schema, dict):
         if "properties" in schema and "required" in schema:
             yield from (f"{place}/properties/{key}" for key in schema["properties"])
+            outcomes = schema["properties"].get("outcome", {}).get("enum", ())
+            if "denied" not in outcomes:  # the outcomes of vendors have tests of their own
+                yield from (f"{place}/properties/outcome={each}" for each in outcomes)
         for key, value in schema.items():
             yield from _properties(value, f"{place}/{key}")
     elif isinstance(schema, list):
