@@ -15,6 +15,17 @@ _CLOCK_BEHIND = "Often the clock of the robot is behind."
 _RENEW = "Renew it: `sros renew {root} {enclave}`."
 _NEW_KEY = "Give the enclave another key: `sros renew {root} {enclave} --new-key`."
 _CLOCK = "Set the clock of this host; if it is right, sign again: `sros renew {root} {enclave}`."
+_CLOCK_OF_CRL = (
+    "Set the clock of this host; if it is right, sign the list again: `sros crl {root} --refresh`, "
+    "and export it to the robots again."
+)
+_IN_EXPORT = {
+    _CLOCK: "Set the clock of this host; if it is right, sign again in the keystore that has the "
+    "CA keys: `sros renew {root} {enclave}`. Then export the enclave again.",
+    _CLOCK_OF_CRL: "Set the clock of this host; if it is right, sign the list again in the "
+    "keystore that has the CA keys: `sros crl {root} --refresh`. Then export the enclave again.",
+}
+"""What to do on a robot, of which not all is to be done in the keystore that has the CA keys."""
 _SIGN = "Sign the permissions again: `sros create_permission {root} {enclave} POLICY`."
 _COMPLETE = "Create the missing file: `sros create_enclave {root} {enclave}`."
 REPLACE = (
@@ -179,7 +190,7 @@ class Fault(Enum):
         "a revocation list that is not valid yet",
         f"Every participant is refused. {_CLOCK_BEHIND}",
         "RFC 5280, 5.1.2.4; Fast DDS 2.14.5.",
-        _CLOCK,
+        _CLOCK_OF_CRL,
     )
     CRL_EXPIRED = (
         "crl-expired",
@@ -330,8 +341,10 @@ class Fault(Enum):
     def remedy_in_export(self, file: str) -> str:
         """Return the remedy for this fault in ``file`` of an export, which has no CA keys."""
         text = self.remedy_in(file)
-        if "`" not in text or text is _CLOCK or self is Fault.GOVERNANCE_DOMAIN:
+        if "`" not in text or self is Fault.GOVERNANCE_DOMAIN:
             return text
+        if text in _IN_EXPORT:
+            return _IN_EXPORT[text]
         return f"In the keystore that has the CA keys: {text} Then export the enclave again."
 
 

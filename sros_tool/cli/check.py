@@ -28,7 +28,7 @@ from sros_tool.cli.common import (
 )
 from sros_tool.cli.progress import progress
 from sros_tool.dds.decision.vendors import MEASURED
-from sros_tool.errors import UsageError
+from sros_tool.errors import NOT_DONE, UsageError
 
 if TYPE_CHECKING:
     from sros_tool.checks.kind import Finding
@@ -331,7 +331,13 @@ def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> in
             click.echo(describe_lifetime(each, moment))
         for other in unreadable:
             click.echo(f"{other.name}  unknown: {other.error}")
-    return 1 if due or unreadable else 0
+        if not due and not unreadable:
+            one = len(found) == 1
+            enclaves = (
+                "the 1 enclave does not need" if one else f"none of {len(found)} enclaves needs"
+            )
+            click.echo(f"{enclaves} to be renewed ({text})", err=True)
+    return NOT_DONE if unreadable else 1 if due else 0
 
 
 def _print_text(chosen: ChosenFindings, _selection: FindingFilter) -> None:

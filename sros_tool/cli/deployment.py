@@ -264,6 +264,8 @@ def verify(
         state = (
             f"loadable in domain {each.domains}{until}"
             if each.loadable
+            else "its key is on its robot: verify it there"
+            if each.key_elsewhere
             else coloured("NOT LOADABLE")
         )
         click.echo(f"{each.name}  {state}")

@@ -83,6 +83,8 @@ def remedy(cause: Fault | str, root: str, enclave: str, file: str = "") -> str:
     if keystore and not _has_authorities(keystore):
         if "`" not in text or fault is Fault.GOVERNANCE_DOMAIN:
             return _filled(text, root, enclave, file)
+        if fault:
+            return _filled(fault.remedy_in_export(file), "KEYSTORE", enclave, file)
         mended = _filled(text, "KEYSTORE", enclave, file)
         return f"In the keystore that has the CA keys: {mended} Then export the enclave again."
     if keystore and fault:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pty
+import re
 import shutil
 import stat
 import subprocess
@@ -282,6 +283,33 @@ def test_verify_reports_faults_and_sets_its_exit_status(keystore: Path, tmp_path
     assert [each["name"] for each in said["enclaves"]] == ["/a", "/b"]
     assert {"enclave", "file", "text"} == set(said["findings"][0])
     assert sros("verify", out / "enclaves/a", "--at", "2099-01-01").status == 1
+
+
+def test_verify_at_home_says_which_keys_are_on_their_robots(keystore: Path, tmp_path: Path) -> None:
+    sros("sign_request", keystore, asked(tmp_path), "-o", tmp_path / "a.tgz").ok()
+    said = sros("verify", keystore)
+    assert "/arm/camera  its key is on its robot: verify it there\n" in said.out
+    assert "/a  loadable" in said.out
+    assert "camera/key.pem" not in said.out
+    (home,) = [
+        each
+        for each in json.loads(sros("verify", keystore, "--json").out)["enclaves"]
+        if each["name"] == "/arm/camera"
+    ]
+    assert (home["loadable"], home["key_elsewhere"]) == (False, True)
+    (keystore / "ledger.jsonl").unlink()  # as on a robot, where the key is lost
+    lost = sros("verify", keystore)
+    assert "/arm/camera  NOT LOADABLE\n" in lost.out and "camera/key.pem: error" in lost.out
+
+
+def test_verify_of_an_archive_says_how_to_unpack_it(keystore: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "the robot.tar.gz"
+    sros("distribute_key", keystore, "/a", archive).ok()
+    refused = sros("verify", archive)
+    assert refused.status == 2
+    unpack, _, verify = re.findall("`(.+?)`", refused.err)[0].rpartition(" && ")
+    assert shell(unpack, tmp_path).returncode == 0
+    sros(*verify.split()[1:], cwd=tmp_path).ok()
 
 
 def test_a_finding_outside_of_its_enclave_names_its_file_from_the_root(tmp_path: Path) -> None:

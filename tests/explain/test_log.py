@@ -201,6 +201,21 @@ def test_a_remedy_on_a_robot_is_for_the_keystore_at_home(keystore: Path) -> None
     )
 
 
+def test_a_clock_is_set_on_the_robot_and_not_at_home(keystore: Path) -> None:
+    BREAKAGES["permissions not yet valid"](Enclave(keystore))
+    shutil.rmtree(keystore / "private")
+    (keystore / "ledger.jsonl").unlink()
+    log = log_of(FAST_14, "permissions not yet valid")
+    found = sros("explain", keystore, ENCLAVE, "--log", log).out
+    verified = sros("verify", keystore).out
+    for said in (found, verified):
+        assert (
+            "Set the clock of this host; if it is right, sign again in the keystore that has the "
+            f"CA keys: `sros renew KEYSTORE {ENCLAVE}`. Then export the enclave again." in said
+        )
+        assert "CA keys: Set the clock" not in said
+
+
 @pytest.mark.dds
 @pytest.mark.parametrize("breakage", [each for each in BREAKAGES if each not in SILENT_ON_CYCLONE])
 def test_what_cyclone_says_now(breakage: str, keystore: Path, tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, tzinfo
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 from sros_tool.checks.keystores.enclaves import WAITS
@@ -14,7 +15,11 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
 from sros_tool.checks.registry import FindingFilter
 from sros_tool.errors import DocumentError
+from sros_tool.faults import Fault
+from sros_tool.keystore.delivery.archive import SUFFIXES
 from sros_tool.keystore.layout import (
+    KEY_FILE,
+    LEDGER,
     OPTIONAL_FILES,
     REQUIRED_FILES,
     enclave_path,
@@ -28,17 +33,22 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.reader import open_enclave
 from sros_tool.validity import iso
 
+_FILE_MISSING = f"enclave.{Fault.FILE_MISSING.id}"
 _FILES = (*REQUIRED_FILES, *OPTIONAL_FILES)
 
 
 @dataclass(frozen=True, slots=True)
 class ArrivedEnclave:
-    """An enclave on a robot: whether a process can run in it, in which domain, and until when."""
+    """An enclave on a robot: whether a process can run in it, in which domain, and until when.
+
+    ``key_elsewhere`` says that only its key is missing here, because it was made on its robot.
+    """
 
     name: str
     loadable: bool
     domains: str
     until: datetime | None
+    key_elsewhere: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +76,7 @@ class Arrival:
                     "loadable": each.loadable,
                     "domains": each.domains or None,
                     "valid_until": iso(each.until) if each.until else None,
+                    "key_elsewhere": each.key_elsewhere,
                 }
                 for each in self.enclaves
             ],
@@ -127,20 +138,40 @@ def verify_arrival(
         refuse_earlier(path)
         raise DocumentError(
             f"'{path}' is neither a keystore nor an enclave",
-            "It does not exist."
-            if not path.exists()
-            else "It has no enclaves folder with content, and neither cert.pem nor key.pem.",
-            "Name the folder that `sros distribute_key` or `sros import` has written to.",
+            _why_none(path),
+            f"Unpack it first: `mkdir robot && tar -xzf {quote(str(path))} -C robot && sros verify "
+            "robot`."
+            if path.is_file() and path.name.endswith(SUFFIXES)
+            else "Name the folder that `sros distribute_key` or `sros import` has written to.",
         )
-    found = keystore_findings(root, now=now, zone=zone, domain=domain, only=only, on_robot=True)
+    enclaves = tuple(_enclave(root, name, now, domain) for name in names)
+    elsewhere = {
+        str(enclave_path(root, each.name) / KEY_FILE) for each in enclaves if each.key_elsewhere
+    }
+    found = [
+        each
+        for each in keystore_findings(
+            root, now=now, zone=zone, domain=domain, only=only, on_robot=True
+        )
+        if not (each.file in elsewhere and each.id == _FILE_MISSING)
+    ]
     shown = FindingFilter().choose(found).shown
     return Arrival(
         path,
         root,
         kind,
-        tuple(_enclave(root, name, now, domain) for name in names),
+        enclaves,
         tuple(each for each in found if each in shown or each.kind is WAITS),
     )
+
+
+def _why_none(path: Path) -> str:
+    """Return why a path holds no enclaves."""
+    if not path.exists():
+        return "It does not exist."
+    if not path.is_dir():
+        return "It is a file."
+    return "It has no enclaves folder with content, and neither cert.pem nor key.pem."
 
 
 def _enclave(root: Path, name: str, now: datetime, domain: int | None) -> ArrivedEnclave:
@@ -149,4 +180,7 @@ def _enclave(root: Path, name: str, now: datetime, domain: int | None) -> Arrive
         return ArrivedEnclave(name, False, "", None)
     state = open_enclave(folder, now=now, domain=domain)
     domains = str(state.domains() or "")
-    return ArrivedEnclave(name, not state.problems, domains, state.valid_until())
+    # On the robot, where there is no ledger, a key that is missing is lost.
+    at_home = (root / LEDGER).is_file()
+    elsewhere = at_home and state.key_on_robot and not state.problems_at_home
+    return ArrivedEnclave(name, not state.problems, domains, state.valid_until(), elsewhere)
