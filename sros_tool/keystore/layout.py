@@ -359,9 +359,12 @@ def is_earlier_keystore(root: Path) -> bool:
 def refuse_earlier(root: Path) -> None:
     """Raise `KeystoreError` if ``root`` is a flat keystore of ROS 2 Eloquent or earlier, or a part.
 
-    A keystore of today is not refused, even if parts of an earlier one are in it.
+    A keystore of today, or its folder of enclaves, is not refused, even if parts of an earlier one
+    are in it.
     """
     if not root.is_dir() or is_keystore(root):
+        return
+    if root.name == ENCLAVES and is_keystore(root.parent):
         return
     if is_earlier_keystore(root):
         raise KeystoreError(
