@@ -187,6 +187,11 @@ def _permissions_of_another(old: Path) -> None:
     os.replace(old / "plant/permissions.p7s", old / "talker/permissions.p7s")
 
 
+def _forged_permissions(old: Path) -> None:
+    make_eloquent(old.with_name("second"), {"/plant": EVERYTHING}, now=NOW)
+    os.replace(old.with_name("second") / "plant/permissions.p7s", old / "plant/permissions.p7s")
+
+
 def _foreign_governance(old: Path) -> None:
     make_eloquent(old.with_name("second"), {}, now=NOW)
     os.replace(old.with_name("second") / "governance.p7s", old / "governance.p7s")
@@ -211,6 +216,7 @@ BROKEN: Mapping[str, tuple[Callable[[Path], None], str]] = {
     "a node with another key": (_other_key, "/talker: its key.pem is not the key"),
     "a certificate of another CA": (_foreign_certificate, "/talker: the CA of the keystore did"),
     "the permissions of another node": (_permissions_of_another, "has no grant for CN=/talker"),
+    "permissions that another CA signed": (_forged_permissions, "/plant: "),
     "a governance of another CA": (_foreign_governance, "the governance of"),
     "a node that no enclave can be": (
         lambda old: os.rename(old / "plant", old / "1plant"),

@@ -80,6 +80,9 @@ def test_the_old_and_the_new_ca_are_told_apart(root: Path) -> None:
             sros("inspect", root / "enclaves/a").ok().out
         )
         assert f"(SHA-256 {both[issuing]}), sha256" in sros("inspect", signed).ok().out
+        if len(authority_files(root)) == 1:
+            single = sros("check", root, "--strict").out
+            assert f"(SHA-256 {both[issuing]}) is identity CA and permissions CA" in single
         told = json.loads(sros("inspect", signed, "--json").ok().out)
         assert told["signer_sha256"].startswith(both[issuing])
     history_text = sros("inspect", root, "--history").out
