@@ -246,8 +246,8 @@ class Fault(Enum):
         'DDS) or "Could not find domain in governance" (Cyclone DDS, code 141).',
         "DDS-Security 1.1, 9.4.1.2; measured.",
         "Set ROS_DOMAIN_ID to a domain of the keystore: `sros env {root} {enclave} --domain ID` "
-        "prints the variables; for another domain, create a keystore with `sros create_keystore "
-        "--domain`.",
+        "prints the variables. To add a domain, name all of them in `sros update_keystore {root} "
+        "--domain IDS --allow-looser`.",
     )
     PERMISSIONS_EXPIRED = (
         "permissions-expired",

@@ -855,6 +855,8 @@ def _show_update(update: KeystoreUpdate, *, dry_run: bool, as_json: bool) -> Non
             f"{iso(update.works_until)} for whoever kept them with the key. To end it, {ends}.",
             err=True,
         )
+    if not dry_run:
+        print_restart(update.restart)
     for remark in update.remarks:
         click.echo(remark.text, err=True)
     if update.left:

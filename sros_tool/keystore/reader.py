@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cached_property, lru_cache
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, TypeVar
 
 from cryptography import x509
@@ -192,7 +193,8 @@ def check_domain(domains: DomainSet, domain: int | None, root: Path) -> None:
     raise KeystoreError(
         f"ROS_DOMAIN_ID is {domain}, but keystore '{root}' is for domain {domains} only",
         "In any other domain, DDS refuses a node with this keystore.",
-        f"Set ROS_DOMAIN_ID to {domains}, or create a keystore with --domain {domain}.",
+        f"Set ROS_DOMAIN_ID to {domains}, or add the domain with `sros update_keystore "
+        f"{quote(str(root))} --domain {domains},{domain} --allow-looser`.",
     )
 
 

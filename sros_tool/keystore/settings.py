@@ -46,8 +46,11 @@ def write_settings(transaction: Transaction, template: Template, now: datetime) 
 
 
 def recorded_settings(ledger: Ledger) -> Template | None:
-    """Return the settings that sros wrote last, or None if the ledger has none."""
-    for entry in reversed(ledger.entries):
+    """Return the settings that sros wrote last, or None if the ledger has none.
+
+    Only lines after the last gap count: others may be forged, or older than the settings.
+    """
+    for entry in reversed(ledger.certain):
         if entry.what == "settings":
             with suppress(tomllib.TOMLDecodeError, ValueError):
                 return parse_template(entry.settings, "")

@@ -61,8 +61,8 @@ def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
             raise KeystoreError(
                 f"keystore '{root}' is for domain {domains}, not for {wanted}",
                 "DDS would refuse the node.",
-                f"Set {DOMAIN} to {next(iter(domains))}, or create a keystore with"
-                f" --domain {wanted}.",
+                f"Set {DOMAIN} to {next(iter(domains))}, or add the domain with `sros "
+                f"update_keystore {shlex.quote(str(root))} --domain {domains},{wanted} --allow-looser`.",
             )
         return wanted
     return 0 if 0 in domains else next(iter(domains))

@@ -47,6 +47,7 @@ from sros_tool.translate import governance_for
 from tests.support import made_by_ros2
 from tests.support.harness import (
     certificate,
+    check_enclave_whole,
     check_whole,
     policy_text,
     publish,
@@ -423,6 +424,45 @@ def test_an_edit_is_found_and_taken_over_or_undone(case: str, root: Path, tmp_pa
     assert finding not in found(root)
     assert governance_of(root).domain_access_rules[0].rtps_protection_kind == "NONE"
     sound(root)
+
+
+def test_settings_that_cannot_be_read_are_written_again(root: Path) -> None:
+    text = (root / "sros.toml").read_bytes()
+    (root / "sros.toml").write_text("nonsense\n")
+    assert sros("update_keystore", root, "--take-edits").status == 2
+    assert "--discard-edits" in sros("update_keystore", root, "--template", "production").err
+    sros("update_keystore", root, "--discard-edits").ok()
+    assert (root / "sros.toml").read_bytes() == text
+    sound(root)
+
+
+def test_a_forged_record_does_not_hide_an_edit(root: Path) -> None:
+    """A line that somebody adds to the ledger is a gap, and says nothing of the settings."""
+    _weaker_settings(root)
+    ledger = root / "ledger.jsonl"
+    lines = ledger.read_text().splitlines()
+    (line,) = [each for each in lines if '"what":"settings"' in each]
+    forged = json.loads(line)
+    forged["settings"] = forged["settings"].replace('rtps = "SIGN"', 'rtps = "NONE"')
+    assert forged["settings"] in (root / "sros.toml").read_text()
+    del forged["previous"]
+    ledger.write_text("\n".join([*lines, json.dumps(forged)]) + "\n")
+    assert {"keystore.ledger-damaged", "governance.not-as-settings"} <= found(root)
+
+
+@pytest.mark.parametrize("stages", [1, 2])
+def test_during_a_rotation(stages: int, root: Path) -> None:
+    """The CA that issues then signs, and the rotation goes on."""
+    for _ in range(stages):
+        rotate_ca(root, now=NOW)
+    target = with_values(load_template("production"), [("authorities.validity", "10y")])
+    update_keystore(root, target, now=LATER, revoke_old=True)
+    for name in list_enclaves(root):
+        check_enclave_whole(enclave_path(root, name))
+        assert not open_enclave(enclave_path(root, name), now=LATER).problems
+    rotate_ca(root, now=LATER, finish=True)
+    sound(root)
+    assert load_settings(root) == target
 
 
 def test_a_comment_is_no_edit(root: Path) -> None:

@@ -19,7 +19,7 @@ from shlex import quote
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import Governance, parse_governance
 from sros_tool.dds.permissions import Grant
-from sros_tool.errors import KeystoreError, Note, SrosError, UsageError
+from sros_tool.errors import DocumentError, KeystoreError, Note, SrosError, UsageError
 from sros_tool.keystore.authorities.authority import Authorities, load_authorities
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
 from sros_tool.keystore.comparison import (
@@ -107,13 +107,15 @@ class PresentSettings:
     """The settings that are in force in a keystore, and what was edited by hand.
 
     ``settings`` are as sros wrote them last, with the protection of the signed ``governance``.
-    ``written`` are those that ``sros.toml`` states now; None for a keystore of ros2/sros2.
+    ``written`` are those that ``sros.toml`` states now; None if it cannot be read, or for a
+    keystore ``without_settings``, as ros2/sros2 makes them.
     """
 
     settings: Template
     written: Template | None
     governance: Governance
     edits: HandEdits
+    without_settings: bool = False
 
     @property
     def domains(self) -> DomainSet:
@@ -166,19 +168,27 @@ def present_settings(root: Path) -> PresentSettings:
 
     Raises:
         KeystoreError: ``root`` is no keystore, or its governance cannot be used.
-        DocumentError: its settings are malformed.
+        DocumentError: its settings are malformed, and no ledger has those of before.
     """
     list_enclaves(root)
     governance, ledger = governance_of(root), read_ledger(root)
-    loaded = load_settings(root)
-    written = loaded if (root / SETTINGS).exists() else None
     recorded = recorded_settings(ledger)
-    settings = with_places(recorded, loaded) if recorded and written else loaded
+    without_settings = not (root / SETTINGS).exists()
+    written, unreadable = None, ""
+    try:
+        loaded = load_settings(root)
+        written = None if without_settings else loaded
+    except DocumentError as error:
+        if recorded is None:
+            raise
+        loaded, unreadable = recorded, f"{error.what}: {error.why}".removesuffix(".")
+    settings = with_places(recorded, loaded) if recorded and not without_settings else loaded
     if protection := protection_for(governance):
         settings = replace(settings, protection=protection)
-    return PresentSettings(
-        settings, written, governance, hand_edits(root, ledger, written, governance)
-    )
+    edits = hand_edits(root, ledger, written, governance)
+    if unreadable:
+        edits = replace(edits, settings=(unreadable,))
+    return PresentSettings(settings, written, governance, edits, without_settings)
 
 
 def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, DomainSet]:
@@ -195,6 +205,8 @@ def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, Dom
             f"{SETTINGS} and {GOVERNANCE_XML} are as sros wrote them.",
             "Edit one of them first, or name what to change with --set or --template.",
         )
+    if present.written is None and not present.without_settings:
+        load_settings(root)  # raises what is wrong with them
     written = present.written or present.settings
     if not edits.governance:
         return written, present.domains
@@ -297,7 +309,7 @@ def update_keystore(
         pending = _pending(present, goal)
         done = pending[:1] if next_stage else pending
         step = goal if done == pending else _first_step(present, goal)
-        authorities = load_authorities(root, load_settings(root), keyring, now)
+        authorities = load_authorities(root, present.settings, keyring, now)
         updater = _Updater(transaction, present, step, authorities, now, revoke_old=revoke_old)
         if revoke_old and not pending:
             raise UsageError(
@@ -392,7 +404,7 @@ class _Updater:
             or before.permissions_validity != after.permissions_validity
             or present.domains != goal.domains
             # Rights that no ledger records would not be signed again once there are settings.
-            or present.written is None
+            or present.without_settings
         )
         self._recorded = RecordedRights(self._root)
         self._known = KnownKeys(self._root)
@@ -448,9 +460,10 @@ class _Updater:
             *compare_governance(self._present.governance, governance),
             *compare_settings(before, after, self._now),
         )
-        restart = bool(reissued) or governance != self._present.governance
+        restart = names if revoked or governance != self._present.governance else ()
+        restart = restart or tuple(each.name for each in reissued)
         remarks = [*(revoked.remarks if revoked else ())]
-        if restart and names:
+        if restart:
             disturbed = mismatch(self._present.governance, governance)
             text = _restart_remark(disturbed, revoked=bool(revoked))
             remarks.append(Note("keystore.restart", text))
@@ -469,7 +482,7 @@ class _Updater:
             tuple(each.name for each in reissued if not each.old),
             max(ends, default=None),
             revoked.count if revoked else 0,
-            names if restart else (),
+            restart,
             tuple(remarks),
             tuple(self._transaction.changes),
             self._writer.notes if reissued else (),
