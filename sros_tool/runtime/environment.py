@@ -62,7 +62,8 @@ def choose_domain(domains: DomainSet, wanted: int | None, root: Path) -> int:
                 f"keystore '{root}' is for domain {domains}, not for {wanted}",
                 "DDS would refuse the node.",
                 f"Set {DOMAIN} to {next(iter(domains))}, or add the domain with `sros "
-                f"update_keystore {shlex.quote(str(root))} --domain {domains},{wanted} --allow-looser`.",
+                f"update_keystore {shlex.quote(str(root))} --domain {domains},{wanted} "
+                "--allow-looser`.",
             )
         return wanted
     return 0 if 0 in domains else next(iter(domains))
