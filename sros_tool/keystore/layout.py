@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -377,19 +378,30 @@ def refuse_earlier(root: Path) -> None:
     if _holds_earlier_node(root):
         raise KeystoreError(
             f"'{root}' is not a valid keystore",
-            "It holds nodes of a keystore of ROS 2 Eloquent or earlier, without their CA.",
-            "Run `sros create_keystore NEW --from OLD` where the CA of that keystore OLD is, and "
+            f"It has folders of nodes outside of a folder named {ENCLAVES}, as keystores of ROS 2 "
+            "Eloquent or earlier have, and no CA.",
+            f"If they are of ROS 2 Foxy or later, move them into a folder {ENCLAVES}. Otherwise "
+            "run `sros create_keystore NEW --from OLD` where the CA of that keystore OLD is, and "
             "export the enclaves with `sros distribute_key NEW`.",
         )
 
 
 def _holds_earlier_node(root: Path) -> bool:
-    """Return whether one of the first folders below ``root`` is that of a node."""
-    walk = os.walk(root)
+    """Return whether one of the first folders below ``root`` is that of a node.
+
+    Its permissions are for its path: those of a copy elsewhere are not.
+    """
+    from sros_tool.xml import read_bytes  # completion uses this module without it
+
+    walk, top = os.walk(root), os.fspath(root)
     for _, (folder, folders, files) in zip(range(_MOST_FOLDERS), walk, strict=False):
         folders[:] = [each for each in folders if each not in _TOP_FOLDERS and each[0] != "."]
-        if folder != os.fspath(root) and {PERMISSIONS_CA_FILE, *_OF_NODE} <= set(files):
-            return True
+        if folder != top and {PERMISSIONS_CA_FILE, *_OF_NODE} <= set(files):
+            subject = f"CN={folder[len(top) :].replace(os.sep, '/')}<"
+            with suppress(DocumentError):
+                signed = read_bytes(Path(folder, PERMISSIONS_FILE), "permissions document")
+                if subject.encode(errors="surrogateescape") in signed:
+                    return True
     return False
 
 

@@ -118,7 +118,15 @@ def test_a_part_of_it_on_a_robot_is_explained(made: Path, tmp_path: Path) -> Non
     os.rename(_copy(made, tmp_path) / "talker", robot / "talker")
     for verb in ("inspect", "create_keystore"):
         ended = sros(verb, robot)
-        assert ended.status and "without their CA" in ended.err, ended
+        assert ended.status and "--from OLD` where the CA of that keystore" in ended.err, ended
+
+
+def test_a_copy_of_an_enclave_does_not_make_a_folder_an_earlier_keystore(
+    made: Path, tmp_path: Path
+) -> None:
+    _copy(made, tmp_path)
+    shutil.copytree(made / "talker", tmp_path / "robot/backup")
+    sros("create_keystore", tmp_path / "robot").ok()
 
 
 def test_taken_over_it_keeps_ca_keys_and_rights(made: Path, tmp_path: Path) -> None:
