@@ -14,13 +14,14 @@ from shlex import quote
 
 from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.decision.vendors import Vendor
+from sros_tool.errors import SrosError
 from sros_tool.explain.answer import Answer
 from sros_tool.explain.denials import Denial, nodes_served, read_denials, serving_node
 from sros_tool.explain.evaluator import Evaluator, JoinContext, LoadedEnclave
 from sros_tool.explain.question import Part, Question, ask
 from sros_tool.explain.remedy import remedy
 from sros_tool.faults import Fault
-from sros_tool.graph.observation import PUBLISH
+from sros_tool.graph.observation import PUBLISH, SUBSCRIBE
 from sros_tool.names import ACTION_SEPARATOR
 from sros_tool.policy.patterns import covers
 from sros_tool.runtime.vendor_log import (
@@ -282,8 +283,7 @@ class _Examiner:
             denial.process,
             denial.enclave,
             f"{who} may not {right} {name}: {by}",
-            f"`sros explain {self._root or 'KEYSTORE'} {quote(denial.enclave or 'ENCLAVE')} "
-            f"{right} {quote(name)}` shows what is missing in the policy.",
+            self._how_to_ask(denial, name),
         )
         enclave = None if denial.remote else self._find(denial.enclave)
         if enclave is None or not denial.direction:
@@ -299,6 +299,22 @@ class _Examiner:
         remedy = remedy.replace("ENCLAVE", enclave.name)
         return replace(
             finding, enclave=enclave.name, found=tuple(found), checked=True, remedy=remedy
+        )
+
+    def _how_to_ask(self, denial: Denial, name: str) -> str:
+        """Return the commands that show what a policy lacks for a topic, here called ``name``."""
+        root, enclave = self._root or "KEYSTORE", denial.enclave or "ENCLAVE"
+        commands = [
+            f"`sros explain {root} {quote(enclave)} {word} {quote(name)}`"
+            for word in _words_to_ask(denial, name)
+        ]
+        if commands:
+            shows = "shows" if len(commands) == 1 else "show"
+            return f"{' and '.join(commands)} {shows} what is missing in the policy."
+        folder = f"{root}/enclaves/{enclave.lstrip('/')}".rstrip("/")
+        return (
+            f"`sros inspect {quote(folder)}` shows what the permissions allow: no policy in ROS "
+            "terms can name this topic."
         )
 
     def _answer(self, enclave: LoadedEnclave, vendor: Vendor, question: Question) -> Answer:
@@ -392,23 +408,36 @@ def _nothing_found(enclave: LoadedEnclave) -> str:
 
 
 _HALVES = {
-    ("rq", "publish"): ("call", SERVICE_ENDS["rq"]),
-    ("rq", "subscribe"): ("serve", SERVICE_ENDS["rq"]),
-    ("rr", "publish"): ("serve", SERVICE_ENDS["rr"]),
-    ("rr", "subscribe"): ("call", SERVICE_ENDS["rr"]),
+    ("rq", "publish"): "call",
+    ("rq", "subscribe"): "serve",
+    ("rr", "publish"): "serve",
+    ("rr", "subscribe"): "call",
 }
 
 
 def _in_ros_terms(denial: Denial) -> tuple[str, str]:
     """Return the denied action, as a word of `question.WORDS`, and its ROS name."""
     prefix, topic = denial.topic[:2], denial.topic[2:]
-    if (prefix, denial.direction) in _HALVES:
-        word, end = _HALVES[prefix, denial.direction]
-        name, part, _ = topic.removesuffix(end).partition(ACTION_SEPARATOR)
+    if prefix in SERVICE_ENDS and topic.endswith(SERVICE_ENDS[prefix]):
+        name, part, _ = topic.removesuffix(SERVICE_ENDS[prefix]).partition(ACTION_SEPARATOR)
+        word = _HALVES.get((prefix, denial.direction), "use")
         return ("execute" if part and word == "serve" else word), name
     if prefix == "rt" and topic.startswith("/"):
         return denial.direction or "use", topic
     return denial.direction or "use", denial.topic
+
+
+def _words_to_ask(denial: Denial, name: str) -> tuple[str, ...]:
+    """Return the words of questions that `explain` answers about a denied topic."""
+    right, _ = _in_ros_terms(denial)
+    either = ("call", "serve") if denial.topic[:2] in SERVICE_ENDS else (PUBLISH, SUBSCRIBE)
+    words = either if right == "use" else (right,)
+    try:
+        for word in words:
+            ask(word, name)
+    except SrosError:  # a name that ROS does not have
+        return ()
+    return words
 
 
 def _question(denial: Denial) -> Question:

@@ -106,13 +106,13 @@ _ALL = (
     *_SIGNATURE, *_GRANT, *_DOCUMENT, Fault.GOVERNANCE_DOMAIN, Fault.PERMISSIONS_DOMAIN,
 )  # fmt: skip
 
-_CHECK = "Give `sros explain --log` the keystore and the enclave: it then finds the cause there."
-_FILE = "If ROS_SECURITY_LOG_FILE is set, give `sros explain --log` that file."
+_CHECK = "`sros explain KEYSTORE ENCLAVE --log LOG` finds the cause in the enclave."
+_FILE = "If ROS_SECURITY_LOG_FILE is set: `sros explain --log FILE`, with the file that it names."
 _CHECK_OR_FILE = f"{_CHECK} {_FILE}"
 _RENEW = "Renew it: `sros renew KEYSTORE ENCLAVE`."
 _SIGN = "Sign the permissions again: `sros create_permission KEYSTORE ENCLAVE POLICY`."
 _SIGN_ONE = (
-    f"Give `sros explain --log` the keystore and the enclave: it finds which one it is. {_SIGN} "
+    f"`sros explain KEYSTORE ENCLAVE --log LOG` finds which one it is. {_SIGN} "
     "Restore a governance from a backup: every enclave depends on it."
 )
 _READABLE = (

@@ -625,4 +625,6 @@ def test_what_a_log_says_does_not_become_a_command() -> None:
         "rt/x;reboot topic not found in allow rule. -> check_create_datawriter"
     )
     (found,) = explained(denied)
-    assert "explain KEYSTORE '/a;reboot' publish '/x;reboot'`" in found.remedy
+    assert "`sros inspect 'KEYSTORE/enclaves/a;reboot'`" in found.remedy
+    (found,) = explained(denied.replace("rt/x;reboot", "rt/x"))
+    assert "`sros explain KEYSTORE '/a;reboot' publish /x`" in found.remedy

@@ -1,0 +1,117 @@
+"""Every command of sros that a message of sros names can be run: verbs, options and arguments."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+
+import sros_tool
+from sros_tool.cli.program import program
+from sros_tool.explain.log import explain_log
+from tests.explain.broken import make_keystore
+from tests.explain.test_log import LOGS
+from tests.support.harness import sros
+
+PACKAGE = Path(sros_tool.__file__).parent
+OPTIONAL = re.compile(r"\[.*?\]|\.\.\.")
+
+
+def text_of(node: ast.AST) -> str | None:
+    """Return the text of a string; what is filled in later is the word `value`."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return re.sub(r"\{[\w.]*\}", "value", node.value)
+    if isinstance(node, ast.JoinedStr):
+        parts = (
+            text_of(each) if isinstance(each, ast.Constant) else "value" for each in node.values
+        )
+        return "".join(each or "" for each in parts)
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        left, right = text_of(node.left), text_of(node.right)
+        return None if left is None and right is None else (left or "value") + (right or "value")
+    return None
+
+
+def named_commands() -> Iterator[tuple[str, str]]:
+    """Yield every command of sros in backquotes, with its place."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            text = text_of(node)
+            for command in re.findall(r"`(?:[^`]*&& )?(sros [^`]+)`", text or ""):
+                if not re.search(r"-\w*value|valuevalue", command):  # an option filled in later
+                    yield command, f"{path.relative_to(PACKAGE)}:{getattr(node, 'lineno', 0)}"
+
+
+COMMANDS = dict(named_commands())
+
+
+def check_parses(command: str) -> None:
+    """Fail unless the program takes a command's verb, options and arguments."""
+    words = shlex.split(OPTIONAL.sub("", re.split(r" (?:\|\|?|&&) ", command)[0]))[1:]
+    with click.Context(program) as parent:
+        verb = program.get_command(parent, words[0]) if not words[0].startswith("-") else program
+        assert verb is not None, f"there is no verb {words[0]}"
+        if all(word.startswith("-") for word in words[1:]):  # the name of a verb, or of an option
+            options = {"--help", *(name for each in verb.params for name in each.opts)}
+            assert options.issuperset(words[1:]), f"{verb.name} has no {words[1:]}"
+        else:
+            verb.make_context(words[0], words[1:], parent=parent)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_named_command_is_one_of_the_program(command: str) -> None:
+    try:
+        check_parses(command)
+    except click.UsageError as error:
+        pytest.fail(f"{COMMANDS[command]}: `{command}`: {error.format_message()}")
+
+
+@pytest.mark.parametrize("command", ["sros rotate value", "sros renew --al", "sros renew a --al"])
+def test_a_command_that_is_none_is_noticed(command: str) -> None:
+    with pytest.raises((click.UsageError, AssertionError)):
+        check_parses(command)
+
+
+def test_there_are_commands() -> None:
+    assert len(COMMANDS) > 100
+
+
+@pytest.fixture(scope="module")
+def keystore(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    from datetime import UTC, datetime
+
+    return make_keystore(tmp_path_factory.mktemp("whole") / "ks", datetime.now(UTC))
+
+
+DENIALS = (
+    "rt/parameter_events topic not found in allow rule.",
+    "ros_discovery_info topic not found in allow rule. -> check_create_datawriter",
+    "rt/chatter topic not found in allow rule. -> check_create_datareader",
+    "rq/add_two_intsRequest topic not found in allow rule. -> check_create_datawriter",
+    "rr/go/_action/get_resultReply topic not found in allow rule. -> check_create_datareader",
+    "rq/add_two_intsRequest topic denied by deny rule.",
+    "odd-name topic not found in allow rule. -> check_create_datawriter",
+)
+
+
+@pytest.mark.parametrize("line", DENIALS)
+def test_a_denied_topic_names_a_question_that_can_be_asked(line: str, keystore: Path) -> None:
+    log = f"[rcl]: Found security directory: {keystore}/enclaves/talker_listener/talker\n{line}\n"
+    (found,) = explain_log(log, lambda _: None, lambda _: pytest.fail(line), str(keystore))
+    commands = re.findall("`(sros .+?)`", found.remedy)
+    assert commands
+    for command in commands:
+        asked = sros(*shlex.split(command)[1:])
+        assert asked.status in (0, 1), (command, asked)
+
+
+@pytest.mark.parametrize("log", sorted(LOGS.glob("*.log")), ids=lambda log: log.name)
+def test_every_remedy_for_a_log_is_a_command(log: Path, keystore: Path) -> None:
+    for found in explain_log(log.read_text(), lambda _: None, lambda _: pytest.fail("")):
+        for command in re.findall("`(sros .+?)`", found.remedy):
+            check_parses(command)
