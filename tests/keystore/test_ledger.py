@@ -220,7 +220,7 @@ def test_history_as_text_and_json(tmp_path: Path) -> None:
     assert "keyCompromise" in lines[8]
     document = json.loads(sros("inspect", root, "--history", "--json").ok().out)
     assert set(document) == {"version", "kind", "path", "entries", "unexplained", "gaps"}
-    assert len(document["entries"]) == 9
+    assert len(document["entries"]) == 10
     assert {*document["entries"][3]} == {*Entry.__slots__, "status", "path"}
     assert {entry["status"] for entry in document["entries"]} <= set(HistoryStatus)
     assert document["unexplained"] == []
