@@ -43,6 +43,7 @@ from sros_tool.keystore.template import (
     with_values,
 )
 from sros_tool.policy.document import read_policy
+from sros_tool.resources import policies_dir
 from sros_tool.translate import governance_for
 from tests.support import made_by_ros2
 from tests.support.harness import (
@@ -333,6 +334,27 @@ def test_one_ca_becomes_two(by_ros2: bool, tmp_path: Path) -> None:
         sound(root)
     assert present_settings(root).settings == before
     assert found(root) <= {"keystore.folder-open"}
+
+
+def test_a_keystore_of_ros2_can_be_renewed_after_an_update(tmp_path: Path) -> None:
+    """With settings, every right has to be in the ledger, so all are recorded."""
+    root = tmp_path / "ks"
+    made_by_ros2.make(root, "/free", "/robot", now=NOW)
+    assert present_settings(root).without_settings
+    target = with_values(present_settings(root).settings, [("protection.rtps", "ENCRYPT")])
+    assert update_keystore(root, target, now=LATER).signed == ("/free", "/robot")
+    renew(root, ["/robot"], now=LATER)
+    check_whole(root)
+
+
+def test_rights_of_a_policy_stay_even_if_they_are_the_default(root: Path) -> None:
+    policy = root.with_name("all.xml")
+    everything = (policies_dir() / "defaults/everything.xml").read_text()
+    policy.write_text(everything.replace('path="/"', 'path="/stated"'))
+    generate_artifacts(root, policies=[read_policy(policy)], now=NOW)
+    (lost,) = to(root, "production").rights
+    assert lost.enclave == "/free"
+    assert "rt/*" in topics_of(enclave_path(root, "/stated"))
 
 
 def test_two_cas_do_not_become_one(root: Path) -> None:
