@@ -266,7 +266,7 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("--list --include policy.*"),
         Case("keystore ks --needs-renewal 1d"),
         Case("keystore ks --needs-renewal 99y", 1),
-        Case("keystore broken --needs-renewal 1d", 1),
+        Case("keystore broken --needs-renewal 1d", 2),
     ),
     "env": (Case("ks /a"), Case("ks /a --domain 0"), Case("ks /none", 2), Case("ks /a /b", 2)),
     "demo": (Case("--list"),),

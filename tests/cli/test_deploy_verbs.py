@@ -296,7 +296,7 @@ def test_verify_at_home_says_which_keys_are_on_their_robots(keystore: Path, tmp_
         for each in json.loads(sros("verify", keystore, "--json").out)["enclaves"]
         if each["name"] == "/arm/camera"
     ]
-    assert (home["loadable"], home["key_elsewhere"]) == (False, True)
+    assert (home["loadable"], home["key_on_robot"]) == (False, True)
     (keystore / "ledger.jsonl").unlink()  # as on a robot, where the key is lost
     lost = sros("verify", keystore)
     assert "/arm/camera  NOT LOADABLE\n" in lost.out and "camera/key.pem: error" in lost.out

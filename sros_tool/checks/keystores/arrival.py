@@ -76,7 +76,7 @@ class Arrival:
                     "loadable": each.loadable,
                     "domains": each.domains or None,
                     "valid_until": iso(each.until) if each.until else None,
-                    "key_elsewhere": each.key_elsewhere,
+                    "key_on_robot": each.key_elsewhere,
                 }
                 for each in self.enclaves
             ],
