@@ -26,7 +26,16 @@ from sros_tool.keystore.layout import (
     search_enclaves,
 )
 from sros_tool.pki import smime
-from sros_tool.runtime.environment import DOMAIN, ENABLE, ENCLAVE, KEYSTORE, STRATEGY, domain_from
+from sros_tool.runtime.environment import (
+    DOMAIN,
+    ENABLE,
+    ENCLAVE,
+    KEYSTORE,
+    STRATEGY,
+    domain_from,
+    enclave_argument,
+)
+from sros_tool.runtime.rcl_security import choose_loadable
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
@@ -147,6 +156,15 @@ PROCESS_UNSECURED = FindingKind(
     "DDS-Security 1.1, 9.4.1.2 (allow_unauthenticated_participants is false).",
     "Start it with `sros run ROOT NAME -- COMMAND...`.",
 )
+PROCESS_RUNS_UNSECURED = FindingKind(
+    "runtime.process-runs-unsecured",
+    ERROR,
+    "a node that asks for security and runs without it",
+    "Its ROS_SECURITY_STRATEGY is not exactly `Enforce`, so rcl starts it unsecured where its "
+    "enclave or a file of it is missing: everybody on the network hears it and can send to it.",
+    "rcl 9 (rcl/src/rcl/security.c), rmw_dds_common (security.cpp); ran with ROS 2 Jazzy.",
+    "Stop it, and start it with `sros run ROOT NAME -- COMMAND...`.",
+)
 PROCESS_OUTDATED = FindingKind(
     "runtime.process-outdated",
     WARNING,
@@ -218,6 +236,7 @@ def _processes(state: RuntimeState) -> Iterator[Finding]:
         elif _is_secured(environment):
             rmws.setdefault(environment.get(RMW) or DEFAULT_RMW, []).append(process.label)
             yield from _outdated(process)
+            yield from _runs_unsecured(process)
         elif secured_here and _is_node_in_same_domain(process, state.environment):
             text = f"in domain {_domain(environment)}, with {ENABLE} not 'true'"
             yield PROCESS_UNSECURED.found(process.label, text)
@@ -257,6 +276,17 @@ def _outdated(process: Process) -> Iterator[Finding]:
     if newer:
         text = f"it started at {iso(process.started)}; {', '.join(newer)} of {name} changed later"
         yield PROCESS_OUTDATED.found(process.label, text)
+
+
+def _runs_unsecured(process: Process) -> Iterator[Finding]:
+    environment = process.environment
+    root = environment.get(KEYSTORE, "")
+    if "--ros-args" not in process.command or (root and not Path(root).is_absolute()):
+        return
+    with suppress(SrosError):  # with Enforce it did not start, or its files are gone since
+        choice = choose_loadable(environment, enclave_argument(process.command))
+        if choice.enclave is None:
+            yield PROCESS_RUNS_UNSECURED.found(process.label, choice.note)
 
 
 def _is_secured(environment: Mapping[str, str]) -> bool:
@@ -497,7 +527,9 @@ def _enclave(state: RuntimeState, root: Path, domain: int | None) -> Iterator[Fi
     if name not in names and not enclave_path(root, name).is_dir():
         close = difflib.get_close_matches(name, names, n=1)
         hint = f"; it has {close[0]}" if close else ""
-        yield ENCLAVE_NOT_FOUND.found(ENCLAVE, f"'{root}' has no enclave {name}{hint}")
+        enforced = state.environment.get(STRATEGY) == "Enforce"
+        effect = "" if enforced else f"; nodes RUN UNSECURED, as {STRATEGY} is not 'Enforce'"
+        yield ENCLAVE_NOT_FOUND.found(ENCLAVE, f"'{root}' has no enclave {name}{hint}{effect}")
         return
     found = keystore_findings(root, now=state.now, zone=state.zone, domain=domain, only=(name,))
     for each in found:

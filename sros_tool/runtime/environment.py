@@ -13,6 +13,7 @@ import re
 import shlex
 import shutil
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
@@ -185,6 +186,13 @@ def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
     if ros_args or _is_ros2_run(command) or _is_of_package(command):
         return (*command, _ROS_ARGS, "--enclave", enclave)
     return command
+
+
+def enclave_argument(command: Sequence[str]) -> str:
+    """Return the enclave of ``--ros-args --enclave`` in a command, or "/", the default of rcl."""
+    words = list(command[command.index(_ROS_ARGS) :]) if _ROS_ARGS in command else []
+    named = [value for word, value in pairwise(words) if _ENCLAVE_OPTION.match(word)]
+    return named[-1] if named else "/"
 
 
 def _is_ros2_run(command: Sequence[str]) -> bool:

@@ -105,6 +105,7 @@ CASES: dict[str, Change] = {
     "runtime.daemon-unsecured": running(1, **{ENABLE: None}),
     "runtime.daemon-differs": running(1, **{ENCLAVE: "/arm"}),
     "runtime.process-unsecured": running(0, **{ENABLE: None}),
+    "runtime.process-runs-unsecured": running(0, **{STRATEGY: "Permissive", ENCLAVE: "/gone"}),
     "runtime.process-outdated": _written_since,
     "runtime.mixed-vendors": running(0, **{RMW: "rmw_cyclonedds_cpp"}),
 }

@@ -160,6 +160,45 @@ def test_spelling(variables: dict[str, str], told: set[str]) -> None:
     assert found & SPELLING == told
 
 
+@pytest.mark.parametrize(
+    ("variables", "arguments", "unsecured"),
+    [
+        ({"STRATEGY": "Permissive"}, [], False),
+        ({"STRATEGY": "Permissive", "ENCLAVE_OVERRIDE": "/gone"}, [], True),
+        ({"STRATEGY": "enforce", "ENCLAVE_OVERRIDE": "/gone"}, [], True),
+        ({"STRATEGY": "Enforce", "ENCLAVE_OVERRIDE": "/gone"}, [], False),
+        ({"STRATEGY": "Permissive", "ENCLAVE_OVERRIDE": ""}, [], True),
+        ({"STRATEGY": "Permissive", "ENCLAVE_OVERRIDE": ""}, ["--enclave", "{name}"], False),
+        ({"STRATEGY": "Permissive", "ENCLAVE_OVERRIDE": ""}, ["-e", "/gone"], True),
+        ({"STRATEGY": "Permissive", "KEYSTORE": ""}, [], True),
+        ({"STRATEGY": "Permissive", "KEYSTORE": "relative"}, [], False),
+    ],
+)
+def test_a_node_that_asks_for_security_and_runs_without(
+    variables: dict[str, str], arguments: list[str], unsecured: bool, sound_one: RuntimeState
+) -> None:
+    node = sound_one.processes[0]
+    name = node.environment[ENCLAVE]
+    changed = replace(
+        node,
+        environment={
+            **node.environment,
+            **{f"ROS_SECURITY_{key}": value for key, value in variables.items()},
+        },
+        command=(*node.command, *(each.format(name=name) for each in arguments)),
+    )
+    state = replace(sound_one, processes=(changed,))
+    assert ("runtime.process-runs-unsecured" in ids(state)) is unsecured
+
+
+def test_a_missing_enclave_says_what_the_strategy_makes_of_it(sound_one: RuntimeState) -> None:
+    for strategy, unsecured in (("Enforce", False), ("Permissive", True)):
+        environment = {**sound_one.environment, ENCLAVE: "/gone", "ROS_SECURITY_STRATEGY": strategy}
+        found = runtime_findings(replace(sound_one, environment=environment))
+        (missing,) = [each for each in found if each.id == "runtime.enclave-not-found"]
+        assert ("RUN UNSECURED" in missing.text) is unsecured
+
+
 def test_what_no_enclave_leads_to_is_of_a_severity_that_is_shown(sound_one: RuntimeState) -> None:
     """Permissive runs unsecured, which is worse than not starting under Enforce."""
     found = {
