@@ -60,6 +60,8 @@ FOR_TESTS: tuple[tuple[str, str, Callable[[], bool]], ...] = (
         "Fast DDS for C++, as a second vendor",
         Path("/usr/include/fastdds/dds/domain/DomainParticipant.hpp").exists,
     ),
+    ("zsh", "a shell that evaluates what env prints", _command("zsh")),
+    ("fish", "another shell that does", _command("fish")),
     ("chromium", "a browser for the pages", _command("chromium")),
 )
 """Programs and libraries for the tests: package pattern, description, test of existence."""

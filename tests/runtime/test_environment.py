@@ -16,7 +16,12 @@ from pathlib import Path
 import pytest
 
 from sros_tool.errors import UsageError
-from sros_tool.runtime.environment import render_environment, with_enclave
+from sros_tool.runtime.environment import (
+    REFUSING,
+    render_environment,
+    render_refusal,
+    with_enclave,
+)
 from tests.support.children import run
 
 ADDED = ("--ros-args", "--enclave", "/arm")
@@ -126,6 +131,19 @@ def test_systemd_reads_what_it_gets(tmp_path: Path) -> None:
     found = dict(re.findall(r"\tEnvironment: (A\d+)=(.*)", said))
     assert found == {key: PATHS[name] for key, name in places.items()}
     assert "Unknown key 'Injected'" in said
+
+
+@pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="there is no systemd")
+def test_systemd_reads_a_refusal_as_variables_and_a_failing_step(tmp_path: Path) -> None:
+    unit = tmp_path / "node.service"
+    unit.write_text("[Service]\nType=oneshot\nExecStart=/bin/true\n" + render_refusal("systemd"))
+    env = {**os.environ, "SYSTEMD_LOG_LEVEL": "debug", "LC_ALL": "C.UTF-8"}
+    done = run(["systemd-analyze", "verify", "--man=no", unit], status=None, env=env)
+    said = done.stdout + done.stderr
+    found = dict(re.findall(r"\tEnvironment: (\w+)=(.*)", said))
+    assert {name: found[name] for name in REFUSING} == REFUSING
+    assert re.search(r"ExecStartPre:\s+Command Line: /bin/false", said), said
+    assert "Unknown key" not in said
 
 
 def test_docker_reads_what_it_gets() -> None:
