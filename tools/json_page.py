@@ -20,16 +20,17 @@ Every verb but `run` and `completion` takes `--json`, and prints one JSON object
 output. Its first key is `version`, which is 1: it is raised when a key goes or changes its \
 meaning. Keys may be added without that, so ignore those that you do not know.
 
-- The exit status is the same as without `--json`. Look at it first: after an error (status 2, or \
-1 for some) standard output is empty, and standard error has one paragraph. Only `env` then prints \
-variables with which no node starts.
+- The exit status is the same as without `--json`; look at it first. After an error, standard \
+output is empty, and standard error has one paragraph. Only `env` then prints variables with which \
+no node starts.
 - Notes and messages for people still go to standard error; `notes` has the notes, too.
 - With `--dry-run`, `dry_run` is true, and the object says what would be done.
 - Moments are in UTC, as `2027-05-21T12:50:48Z`; serial numbers and SHA-256 are lower-case \
 hexadecimal.
 
 Each verb has a JSON Schema (draft 2020-12) in `sros_tool/schemas/`, from which this page is made \
-by `python -m tools.json_page`. A key followed by `?` is left out where it has nothing to say; \
+by `python -m tools.json_page`; it is closed, and fits the sros that it ships with. A key followed \
+by `?` is left out where it has nothing to say; \
 `[]` stands for each element of a list, `*` for each key of an object.
 
 ```sh
