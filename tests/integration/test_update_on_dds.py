@@ -9,14 +9,20 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.dds.decision.vendors import Signers
 from sros_tool.dds.domains import DomainSet
 from sros_tool.keystore.comparison import mismatch
 from sros_tool.keystore.layout import enclave_path
 from sros_tool.keystore.lifecycle.create import create_enclaves, create_keystore, generate_artifacts
+from sros_tool.keystore.lifecycle.rotation.stages import rotate_ca
 from sros_tool.keystore.lifecycle.update import present_settings, update_keystore
 from sros_tool.keystore.reader import governance_of
 from sros_tool.keystore.template import NamedValues, load_template, with_values
+from sros_tool.pki import smime
+from sros_tool.pki.certificates import load_certificate
+from sros_tool.pki.keys import load_key
 from sros_tool.policy.document import read_policy
+from tests.integration.fastdds import fastdds_vendor
 from tests.integration.test_life_on_dds import (
     DOMAIN,
     HEARD,
@@ -165,3 +171,48 @@ def test_what_was_taken_away_works_until_it_is_revoked(
             Question((mixed, "/free"), listener, "/e"): REFUSED,
         }
     )
+
+
+def test_one_ca_becomes_two(ask: Ask, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    """In files of their own first, which DDS does not notice, and then by a rotation of one."""
+    cyclone = request.node.callspec.params["ask"] == "Cyclone DDS"
+    root = make(tmp_path / "ks", "sros2")
+    moments = [copy(root, "before")]
+    target = with_values(load_template("sros2"), [("authorities.layout", "separate")])
+    update_keystore(root, target, now=datetime.now(UTC))
+    moments.append(copy(root, "parted"))
+    for stage in ("distribute", "reissue", "retire"):
+        rotate_ca(root, roles=["permissions"] * (stage == "distribute"), now=datetime.now(UTC))
+        moments.append(copy(root, stage))
+    questions = {}
+    for number, (one, other) in enumerate(pairwise(moments)):
+        # Cyclone DDS trusts one CA at a time: after reissue, all are restarted together.
+        expected = SILENT if cyclone and other.name == "reissue" else HEARD
+        questions[Question((one, "/talker"), (other, "/listener"), f"/a{number}")] = expected
+        questions[Question((other, "/talker"), (one, "/listener"), f"/b{number}")] = expected
+    ask(questions)
+    rogues = [sign_itself(copy(moments[index], f"rogue{index}")) for index in (0, -1)]
+    ask(
+        {
+            Question((rogues[0], "/free"), (moments[0], "/listener"), "/secret"): BY_ITSELF,
+            Question((rogues[1], "/free"), (root, "/listener"), "/secret"): REFUSED,
+            Question((root, "/talker"), (root, "/listener"), "/secret"): HEARD,
+        }
+    )
+
+
+BY_ITSELF = HEARD if fastdds_vendor().traits.signers is Signers.CHAIN else f"{HEARD} or {REFUSED}"
+"""Fast DDS 2.14 accepts no other signer than the permissions CA, even if there is one CA."""
+
+
+def sign_itself(root: Path) -> Path:
+    """Let the enclave /free sign permissions for itself: everything, as it had."""
+    folder = enclave_path(root, "/free")
+    document = (folder / "permissions.xml").read_bytes()
+    certificate, key = (
+        (folder / "cert.pem").read_bytes(),
+        (folder / "key.pem").read_bytes(),
+    )
+    message = smime.sign(document, load_certificate(certificate, ""), load_key(key, ""))
+    (folder / "permissions.p7s").write_bytes(message)
+    return root
