@@ -228,7 +228,7 @@ def generate_artifacts(
 
 
 def _show(result: Creation, dry_run: bool, as_json: bool) -> None:
-    from sros_tool.validity import iso
+    from sros_tool.keystore.lifecycle.replaced import lasting_text
 
     if as_json:
         print_json(_creation_json(result, dry_run))
@@ -248,15 +248,8 @@ def _show(result: Creation, dry_run: bool, as_json: bool) -> None:
         print_closed(result.root, result.changes)
     _show_rights(result.replaced, dry_run, err=True)  # stdout is that of ros2/sros2
     for each in result.replaced:
-        if each.lost and each.works_until:
-            name, root = quote(each.enclave), quote(str(result.root))
-            click.echo(
-                f"{each.enclave}: what it lost works until {iso(each.works_until)} for whoever "
-                "kept its earlier permissions and its key, and in its processes until they are "
-                f"restarted. To end it, run `sros renew {root} {name} --revoke-old`, and restart "
-                "all processes, those of this enclave first.",
-                err=True,
-            )
+        if text := lasting_text(result.root, each):
+            click.echo(visible(text), err=True)
     if result.restart:
         print_restart(result.restart)
     for remark in result.remarks:

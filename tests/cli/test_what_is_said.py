@@ -83,6 +83,21 @@ def test_taking_a_right_away_at_once(verb: str, root: Path) -> None:
     assert certificate(folder / "cert.pem").subject != before.subject
 
 
+def test_a_request_that_is_answered_with_less(root: Path) -> None:
+    work = root.parent
+    for name, topics in (("more", ("/scan", "/secret")), ("less", ("/scan",))):
+        (work / f"{name}.xml").write_text(policy_text({"/remote": publish(*topics)}))
+    sros("create_request", "/remote", "robot", cwd=work).ok()
+    words = ("sign_request", "ks", "robot/enclaves/remote/request.pem", "--renew", "-p")
+    first = [word for word in words if word != "--renew"]
+    sros(*first, "more.xml", "-o", "one.tar.gz", cwd=work).ok()
+    assert "rights-lost" not in sros(*words, "more.xml", "-o", "two.tar.gz", cwd=work).ok().err
+    ended = sros(*words, "less.xml", "-o", "three.tar.gz", cwd=work).ok()
+    (line,) = [each for each in ended.err.splitlines() if "rights-lost" in each]
+    assert "/remote loses: publish topic /secret. /remote: what it lost works until" in line
+    sros(*commands(line)[0], cwd=work).ok()
+
+
 def test_gaining_a_right_leaves_nothing_behind(root: Path) -> None:
     sros("create_permission", "ks", "/robot", "narrow.xml", cwd=root.parent).ok()
     ended = sros("create_permission", "ks", "/robot", "wide.xml", cwd=root.parent).ok()

@@ -45,6 +45,13 @@ from sros_tool.keystore.layout import (
     list_enclaves,
 )
 from sros_tool.keystore.ledger import append, document_entry, read_ledger
+from sros_tool.keystore.lifecycle.replaced import (
+    EarlierPermissions,
+    earlier_permissions,
+    lasting_text,
+    replaced_rights,
+    rights_text,
+)
 from sros_tool.keystore.reader import (
     check_domain,
     load_governance,
@@ -148,7 +155,11 @@ def sign_request(
             renew and has_unique_part(_present_certificate(root, name).subject)
         )
         identity = NewIdentity(enclave_subject(name, unique=unique), request.public_key)
+        authority = authorities.permissions.certificate
+        earlier = earlier_permissions(root, name, authority) if renew else None
         issued = writer.write(Issuance(name, identity, rights))
+        if earlier:
+            notes += _lost_rights(root, earlier, issued, now)
         transaction.write(f"{enclave_folder(name)}/{REQUEST}", request.pem)
         link_shared_files(transaction, name, present_files(root, name))
         notes += [*issued.notes(), *writer.notes, *edit_notes(root, governance)]
@@ -254,6 +265,20 @@ def _new_key_note(root: Path, request: SigningRequest) -> list[Note]:
             f"stays valid until {until} for anyone who has that key.",
         )
     ]
+
+
+def _lost_rights(
+    root: Path, earlier: EarlierPermissions, issued: Issued, now: datetime
+) -> list[Note]:
+    """Return a note on rights that the enclave loses, and on what still works of them."""
+    (grant,) = issued.permissions.grants
+    replaced = replaced_rights(issued.issuance.name, earlier, grant, now)
+    text = lasting_text(root, replaced)
+    if not text:
+        return []
+    lost = f"{replaced.enclave} loses: {rights_text(replaced.lost)}."
+    again = "Then answer its request again with `sros sign_request --renew`."
+    return [Note("request.rights-lost", f"{lost} {text} {again}")]
 
 
 def _earlier_rights(root: Path, name: str, authority: x509.Certificate) -> EarlierRights:

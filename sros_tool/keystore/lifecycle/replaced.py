@@ -11,6 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from shlex import quote
 
 from cryptography import x509
 
@@ -22,6 +23,7 @@ from sros_tool.pki.certificates import subject_text, validity_of
 from sros_tool.policy.model import ALLOW
 from sros_tool.policy.rights import Right, compare
 from sros_tool.translate import grant_rights
+from sros_tool.validity import iso
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,3 +101,15 @@ def rights_text(rights: Sequence[Right]) -> str:
     )
     more = len(rights) - _RIGHTS_SHOWN
     return f"{shown} and {more} more" if more > 0 else shown
+
+
+def lasting_text(root: Path, replaced: ReplacedRights) -> str:
+    """Return what still works of the lost rights and what ends it, as sentences; "" if nothing."""
+    if not (replaced.lost and replaced.works_until):
+        return ""
+    command = f"`sros renew {quote(str(root))} {quote(replaced.enclave)} --revoke-old`"
+    return (
+        f"{replaced.enclave}: what it lost works until {iso(replaced.works_until)} for whoever "
+        "kept its earlier permissions and its key, and in its processes until they are restarted. "
+        f"To end it, run {command}, and restart all processes, those of this enclave first."
+    )
