@@ -168,12 +168,12 @@ def _broken(process: str, line: str, rest: str, following: str) -> str:
 
     It was if ``line`` is not understood, nor is the one that follows, and both together are.
     """
+    if not UNKNOWN.pattern.search(rest):  # first, because it is fast
+        return ""
     other, end = labelled_line(following)
     if other not in ("", process) or log_text(line) or log_text(following):
         return ""
     if denied_topic(line) or denied_topic(following) or SECURITY_DIRECTORY.search(following):
-        return ""
-    if not UNKNOWN.pattern.search(rest):
         return ""
     return next((each for each in (rest + end, f"{rest} {end}") if log_text(each)), "")
 

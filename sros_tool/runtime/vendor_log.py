@@ -207,7 +207,8 @@ _LOG_TEXTS: tuple[LogText, ...] = (
     _text(
         "plugin", _CYCLONE, r"Could not load (?:Authentication|Access Control|Cryptographic|"
         r"security)\b|Could not find the function: \S+|security plugin (?:library path|init "
-        r"function|finalize function) is undefined|Error occurred while initializing [\w ]+ plugin",
+        r"function|finalize function) is undefined"
+        r"|Error occurred while initializing [\w ]{1,40} plugin",
         "a plugin of DDS Security (authentication, access control, cryptography) cannot be loaded, "
         "so no secured process starts",
         "Install Cyclone DDS with its plugins, as the distribution packages it; `sros doctor` "
@@ -545,9 +546,9 @@ UNKNOWN = LogText(
     "not-understood",
     _ROS,
     re.compile(
-        r"\[\w*SECURITY\w* (?:Error|Warning)\]"
+        r"\[\w{0,40}SECURITY\w{0,40} (?:Error|Warning)\]"
         # Any line of the file of ROS_SECURITY_LOG_FILE: without trouble, it stays empty.
-        r"|\[[A-Z]+\] \S+\|\S+ \d+ \w+::\w+ :"
+        r"|\[[A-Z]{4,13}\] [^\s|]+\|[^\s|]+ \d+ \w+::\w+ :"
         # Cyclone DDS; what it traces of success is no trouble.
         r"|\A\d+\.\d+ \[\d*\]\s+\S+: (?!.*(?:DDS Security plugins have been loaded"
         r"|using security settings from|allow non-secure remote|FSM: |handshake (?:delete|resend)"
