@@ -726,11 +726,13 @@ def update_keystore(
             "--template.",
         )
     present = present_settings(root)
-    target, domains = present.settings, None
+    domains = None
     if template_name is not None:
         target = load_template(template_name)
     elif take_edits:
         target, domains = edited_settings(root, present)
+    else:
+        target = present.undone() if discard_edits else present.base()
     target = with_values(
         target,
         [_key_and_value(each) for each in values],
@@ -748,7 +750,8 @@ def update_keystore(
             next_stage=next_stage,
             allow_looser=allow_looser,
             revoke_old=revoke_old,
-            keep_edits=not (take_edits or discard_edits),
+            replace_edits=take_edits or discard_edits,
+            seen=present,
             keyring=keyring(),
             dry_run=dry_run,
             progress=step,

@@ -15,6 +15,8 @@ from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import NOTE
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, SrosError, UsageError
+from sros_tool.keystore.authorities.authority import load_authorities
+from sros_tool.keystore.authorities.keyring import IN_KEYSTORE
 from sros_tool.keystore.history import history
 from sros_tool.keystore.layout import enclave_path, list_enclaves
 from sros_tool.keystore.ledger import read_ledger
@@ -419,7 +421,7 @@ def test_an_edit_is_found_and_taken_over_or_undone(case: str, root: Path, tmp_pa
     # Nothing that signs the governance or writes the settings undoes it.
     for refused in (
         lambda: rotate_ca(root, now=LATER),
-        lambda: to(root, "production", keep_edits=True),
+        lambda: to(root, "production"),
     ):
         with pytest.raises(KeystoreError, match="edited by hand"):
             refused()
@@ -431,18 +433,18 @@ def test_an_edit_is_found_and_taken_over_or_undone(case: str, root: Path, tmp_pa
     target, domains = edited_settings(root, present_settings(root))
     if looser:
         with pytest.raises(UsageError, match="looser"):
-            update_keystore(root, target, domains, now=LATER)
+            update_keystore(root, target, domains, now=LATER, replace_edits=True)
     else:
-        update_keystore(root, target, domains, now=LATER)
+        update_keystore(root, target, domains, now=LATER, replace_edits=True)
         assert finding not in found(root)
         edit_again = snapshot(root)
         assert edit_again != edited
         return
-    update_keystore(root, present_settings(root).settings, now=LATER)
+    update_keystore(root, present_settings(root).undone(), now=LATER, replace_edits=True)
     assert {each: (root / each).read_bytes() for each in clean} == clean
     assert finding not in found(root)
     edit(root)
-    update_keystore(root, target, domains, now=LATER, allow_looser=True)
+    update_keystore(root, target, domains, now=LATER, allow_looser=True, replace_edits=True)
     assert finding not in found(root)
     assert governance_of(root).domain_access_rules[0].rtps_protection_kind == "NONE"
     sound(root)
@@ -485,6 +487,45 @@ def test_during_a_rotation(stages: int, root: Path) -> None:
     rotate_ca(root, now=LATER, finish=True)
     sound(root)
     assert load_settings(root) == target
+
+
+def test_settings_that_changed_meanwhile(root: Path) -> None:
+    """Two changes at once: the later one would undo the first, from which it did not start."""
+    seen = present_settings(root)
+    change(root, ("protection.rtps", "ENCRYPT"))
+    state = snapshot(root)
+    with pytest.raises(KeystoreError, match="have just changed"):
+        update_keystore(root, seen.settings, now=LATER, seen=seen, allow_looser=True)
+    assert snapshot(root) == state
+
+
+def test_a_governance_of_one_s_own_is_not_replaced_unasked(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    made_by_ros2.make(root, "/free", now=NOW)
+    _sign_governance(root, "<topic_expression>*<", "<topic_expression>rt/*<")
+    before = snapshot(root)
+    for words in (("--set", "permissions.validity=30d"), ("--domain", "0,7", "--allow-looser")):
+        ended = sros("update_keystore", root, *words)
+        assert (ended.status, "states what settings cannot" in ended.err) == (2, True), ended
+    assert snapshot(root) == before
+    sros("update_keystore", root, "--template", "production", "--allow-looser").ok()
+
+
+def _sign_governance(root: Path, old: str, new: str) -> None:
+    """Edit the governance as its owner does who signs it with another tool."""
+    _put(root / "enclaves/governance.xml", old, new)
+    authorities = load_authorities(root, load_settings(root), IN_KEYSTORE, NOW)
+    document = (root / "enclaves/governance.xml").read_bytes()
+    (root / "enclaves/governance.p7s").write_bytes(authorities.permissions.sign(document, "it"))
+
+
+def test_a_governance_that_was_signed_elsewhere(root: Path) -> None:
+    """The signed document counts: it is found, and undone or taken over."""
+    _sign_governance(root, "<rtps_protection_kind>SIGN", "<rtps_protection_kind>NONE")
+    assert "governance.not-as-settings" in found(root)
+    sros("update_keystore", root, "--discard-edits").ok()
+    assert governance_of(root).domain_access_rules[0].rtps_protection_kind == "SIGN"
+    assert "governance.not-as-settings" not in found(root)
 
 
 def test_a_comment_is_no_edit(root: Path) -> None:

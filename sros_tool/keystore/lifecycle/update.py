@@ -108,7 +108,7 @@ class PresentSettings:
 
     ``settings`` are as sros wrote them last, with the protection of the signed ``governance``.
     ``written`` are those that ``sros.toml`` states now; None if it cannot be read, or for a
-    keystore ``without_settings``, as ros2/sros2 makes them.
+    keystore ``without_settings``, as ros2/sros2 makes them.  ``recorded`` are those of the ledger.
     """
 
     settings: Template
@@ -116,11 +116,35 @@ class PresentSettings:
     governance: Governance
     edits: HandEdits
     without_settings: bool = False
+    recorded: Template | None = None
 
     @property
     def domains(self) -> DomainSet:
         """The domains of the signed governance."""
         return self.governance.domains().closed()
+
+    def undone(self) -> Template:
+        """Return the settings without the edits: as recorded, or else as the governance has it.
+
+        Raises:
+            KeystoreError: as `base`.
+        """
+        return self.recorded or self.base()
+
+    def base(self) -> Template:
+        """Return the settings that single changes start from.
+
+        Raises:
+            KeystoreError: no settings can state the governance, so a change would replace it.
+        """
+        if self.without_settings and protection_for(self.governance) is None:
+            raise KeystoreError(
+                "the governance of the keystore states what settings cannot",
+                "It has several domain rules, no rule for * at its end, or a rule for a DDS topic "
+                "that is no topic, service or action of ROS. A single change would replace it.",
+                "Name all settings with --template, which shows with --dry-run what it replaces.",
+            )
+        return self.settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,13 +206,14 @@ def present_settings(root: Path) -> PresentSettings:
         if recorded is None:
             raise
         loaded, unreadable = recorded, f"{error.what}: {error.why}".removesuffix(".")
-    settings = with_places(recorded, loaded) if recorded and not without_settings else loaded
+    recorded = with_places(recorded, loaded) if recorded and not without_settings else None
+    settings = recorded or loaded
     if protection := protection_for(governance):
         settings = replace(settings, protection=protection)
     edits = hand_edits(root, ledger, written, governance)
     if unreadable:
         edits = replace(edits, settings=(unreadable,))
-    return PresentSettings(settings, written, governance, edits, without_settings)
+    return PresentSettings(settings, written, governance, edits, without_settings, recorded)
 
 
 def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, DomainSet]:
@@ -265,7 +290,8 @@ def update_keystore(
     next_stage: bool = False,
     allow_looser: bool = False,
     revoke_old: bool = False,
-    keep_edits: bool = False,
+    replace_edits: bool = False,
+    seen: PresentSettings | None = None,
     keyring: Keyring = IN_KEYSTORE,
     dry_run: bool = False,
     progress: Progress | None = None,
@@ -281,7 +307,9 @@ def update_keystore(
         allow_looser: accept that something becomes possible that was not.
         revoke_old: issue all certificates again, with subjects that no earlier permissions fit, and
             revoke all earlier ones.
-        keep_edits: refuse if somebody edited the settings or the governance.
+        replace_edits: accept that ``target`` replaces what somebody edited by hand in the settings
+            or the governance, as ``target`` has those edits, or undoes them.
+        seen: the settings that ``target`` was made from.
         keyring: opens the keys of the CAs.
         dry_run: report the changes without making them.
         progress: called with the name of each enclave that is done.
@@ -289,14 +317,21 @@ def update_keystore(
     Raises:
         UsageError: something would become looser without ``allow_looser``, or ``target`` cannot be
             reached from here.
-        KeystoreError: an enclave cannot be issued again, or files were edited by hand.
+        KeystoreError: an enclave cannot be issued again, files were edited by hand, or the settings
+            are no longer those that were ``seen``.
     """
     if not dry_run:
         tidy(root)
     list_enclaves(root)
     with Transaction(root, dry_run=dry_run) as transaction:
         present = present_settings(root)
-        if keep_edits and present.edits:
+        if seen is not None and seen != present:
+            raise KeystoreError(
+                f"the settings of keystore '{root}' have just changed",
+                "Somebody else changed them meanwhile.",
+                "Nothing was changed. Run the command again.",
+            )
+        if present.edits and not replace_edits:
             raise KeystoreError(
                 f"files of keystore '{root}' were edited by hand: "
                 f"{'; '.join(present.edits.clauses())}",
