@@ -696,7 +696,7 @@ def update_keystore(
     By default all is changed at once. With --next, in two stages: first the certificates and
     permissions, after which processes are restarted one by one; then, with the same command, the
     governance. Where that changes the protection of messages, processes with the old one and with
-    the new one do not communicate (Cyclone DDS 0.10.2, Fast DDS 2.9.1): restart them together.
+    the new one do not communicate (Cyclone DDS 0.10.2, Fast DDS 2.14.5): restart them together.
 
     The exit status of a dry run is 1 if --allow-looser is needed and missing.
     """

@@ -222,11 +222,11 @@ def _text(value: bool | ProtectionKind) -> str:
 class Mismatch:
     """What does not communicate while one process has the old governance, another one the new.
 
-    Measured on Cyclone DDS 0.10.2 and Fast DDS 2.9.1, which agree: two participants with any
-    difference in the kinds of protection of the domain do not communicate at all, and two with any
-    difference in a topic rule not on its topics.  Join access control, unauthenticated
-    participants and further domains disturb nobody.  ``everything`` says that nothing
-    communicates; ``names`` are topics, services and actions in ROS terms.
+    Measured on Cyclone DDS 0.10.2, Fast DDS 2.9.1 and 2.14.5, which agree: two participants with
+    any difference in the kinds of protection of the domain do not communicate at all, and two with
+    any difference in a topic rule not on its topics.  Join access control, unauthenticated
+    participants and further domains disturb nobody.  ``everything`` says that nothing communicates;
+    ``names`` are topics, services and actions in ROS terms.
     """
 
     everything: bool = False
