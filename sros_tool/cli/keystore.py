@@ -281,12 +281,20 @@ def _show_rights(replaced: Sequence[ReplacedRights], dry_run: bool, *, err: bool
     """Print what enclaves lose and gain, on stdout or with ``err`` on stderr."""
     from sros_tool.keystore.lifecycle.replaced import rights_text
 
-    would = "would " if dry_run else ""
+    together: dict[tuple[str, str], list[str]] = {}
     for each in replaced:
         for verb, rights in (("lose", each.lost), ("gain", each.gained)):
             if rights:
-                text = f"{each.enclave} {would}{verb}{'' if dry_run else 's'}: "
-                click.echo(visible(text + rights_text(rights)), err=err)
+                together.setdefault((verb, rights_text(rights)), []).append(each.enclave)
+    for (verb, text), names in together.items():
+        word = f"would {verb}" if dry_run else verb if len(names) > 1 else f"{verb}s"
+        click.echo(visible(f"{_shown_names(names)} {word}: {text}"), err=err)
+
+
+def _shown_names(names: Sequence[str]) -> str:
+    """Return the first names, and the number of the others."""
+    more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
+    return f"{', '.join(names[:_NAMES_SHOWN])}{more}"
 
 
 @click.command(
@@ -833,9 +841,7 @@ def _show_update(update: KeystoreUpdate, *, dry_run: bool, as_json: bool) -> Non
     _show_rights(update.rights, dry_run)
     for names, what in ((update.renewed, "renewed"), (update.signed, "signed the permissions of")):
         if names and not dry_run:
-            shown = ", ".join(names[:_NAMES_SHOWN])
-            more = f" and {len(names) - _NAMES_SHOWN} more" if len(names) > _NAMES_SHOWN else ""
-            click.echo(f"{what} {shown}{more}")
+            click.echo(f"{what} {_shown_names(names)}")
     if dry_run:
         print_plan(update.root, update.changes)
     if not dry_run:

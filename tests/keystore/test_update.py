@@ -577,6 +577,15 @@ def test_a_dry_run_says_what_the_run_does_and_changes_nothing(root: Path) -> Non
     assert "--revoke-old" in text.err
 
 
+def test_enclaves_that_lose_the_same_share_a_line(root: Path) -> None:
+    create_enclaves(root, [f"/free{number}" for number in range(9)], now=NOW)
+    lines = sros("update_keystore", root, "--template", "production").ok().out.splitlines()
+    (line,) = [each for each in lines if " lose: " in each]
+    assert line.startswith(
+        "/free, /free0, /free1, /free2, /free3 and 5 more lose: publish topic /*"
+    )
+
+
 def test_a_looser_dry_run_is_refused_as_the_run_is(root: Path) -> None:
     words = ("update_keystore", root, "--set", "protection.rtps=NONE")
     assert sros(*words, "--dry-run").status == 1
