@@ -50,6 +50,7 @@ SLOWEST = (
     "test_revoke_in_rotation_on_dds",
     "test_life_on_dds",
     "test_rotate_on_dds",
+    "test_update_on_dds",
     "test_generate_policy",
     "test_demo_attacks",
     "test_nodes_fit_their_enclaves",
