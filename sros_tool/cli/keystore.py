@@ -764,7 +764,8 @@ def update_keystore(
             dry_run=dry_run,
             progress=step,
         )
-    _show_update(update, dry_run=dry_run, as_json=as_json)
+    undone = present.edits.clauses() if discard_edits else ()
+    _show_update(update, undone, dry_run=dry_run, as_json=as_json)
     refused = bool(update.looser()) and not allow_looser
     if refused:  # only a dry run comes here
         click.echo("this would be refused: it needs --allow-looser", err=True)
@@ -800,7 +801,10 @@ def _named_rule(text: str) -> NamedValues:
     return NamedValues(kind, name, tuple(_key_and_value(each) for each in words[2:]))
 
 
-def _show_update(update: KeystoreUpdate, *, dry_run: bool, as_json: bool) -> None:
+def _show_update(
+    update: KeystoreUpdate, undone: Sequence[str], *, dry_run: bool, as_json: bool
+) -> None:
+    """Print an update; ``undone`` are clauses about the edits by hand that it undoes."""
     from sros_tool.validity import iso
     from sros_tool.values import as_plain
 
@@ -825,7 +829,13 @@ def _show_update(update: KeystoreUpdate, *, dry_run: bool, as_json: bool) -> Non
                 "revoked": update.revoked,
                 "restart": list(update.restart),
                 "changes": changes_json(update.root, update.changes),
-                "notes": notes_json((*update.remarks, *update.notes)),
+                "notes": notes_json(
+                    (
+                        *(Note("keystore.edit-undone", each) for each in undone),
+                        *update.remarks,
+                        *update.notes,
+                    )
+                ),
             }
         )
         return
@@ -836,6 +846,8 @@ def _show_update(update: KeystoreUpdate, *, dry_run: bool, as_json: bool) -> Non
     verb = "would update" if dry_run else "updated"
     named = template if update.before != update.after else ""
     click.echo(visible(f"{verb} keystore '{update.root}'{named}"))
+    for clause in undone:
+        click.echo(visible(f"  {'undone':7}  {clause}"))
     for change in update.settings:
         click.echo(visible(f"  {change.effect:7}  {change}"))
     _show_rights(update.rights, dry_run)

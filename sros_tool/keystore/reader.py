@@ -155,11 +155,18 @@ def open_keystore(root: Path) -> OpenedKeystore:
 
 
 def load_settings(root: Path) -> Template:
-    """Return the settings of a keystore; without settings, the template for ros2/sros2."""
+    """Return the settings of a keystore; without settings, the template for ros2/sros2.
+
+    Raises:
+        DocumentError: the settings are malformed.
+    """
     from sros_tool.keystore.template import load_template, read_template
 
     path = root / SETTINGS
-    return read_template(path) if path.exists() else load_template("sros2")
+    if not path.exists():
+        return load_template("sros2")
+    remedy = "Correct the file, or write the settings of before again with `sros update_keystore "
+    return read_template(path, "settings file", f"{remedy}{quote(str(root))} --discard-edits`.")
 
 
 def load_governance(root: Path, authority: x509.Certificate) -> Governance:

@@ -94,19 +94,22 @@ def load_template(choice: str) -> Template:
     return read_template(path)
 
 
-def read_template(path: Path) -> Template:
-    """Return the template in a file; raise `DocumentError` if it is malformed."""
-    data = read_bytes(path, "template")
+def read_template(path: Path, what: str = "template", remedy: str = "") -> Template:
+    """Return the template in a file; raise `DocumentError` with ``remedy`` if it is malformed.
+
+    ``what`` names the kind of file in the error.
+    """
+    data = read_bytes(path, what)
     try:
         text = data.decode()
         return parse_template(text, path.stem)
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         why = str(error)
         raise DocumentError(
-            f"the template '{path}' is not valid TOML", f"{why[:1].upper()}{why[1:]}."
+            f"the {what} '{path}' is not valid TOML", f"{why[:1].upper()}{why[1:]}.", remedy
         ) from error
     except _TemplateError as error:
-        raise DocumentError(f"the template '{path}' is not valid", f"{error}.") from error
+        raise DocumentError(f"the {what} '{path}' is not valid", f"{error}.", remedy) from error
 
 
 class _TemplateError(ValueError):

@@ -450,14 +450,54 @@ def test_an_edit_is_found_and_taken_over_or_undone(case: str, root: Path, tmp_pa
     sound(root)
 
 
-def test_settings_that_cannot_be_read_are_written_again(root: Path) -> None:
-    text = (root / "sros.toml").read_bytes()
-    (root / "sros.toml").write_text("nonsense\n")
+def _append(path: str, text: bytes) -> Callable[[Path], None]:
+    def edit(root: Path) -> None:
+        with (root / path).open("ab") as file:
+            file.write(text)
+
+    return edit
+
+
+BROKEN: dict[str, tuple[Callable[[Path], None], str]] = {
+    "no TOML": (_append("sros.toml", b"foo =\n"), "is not valid TOML"),
+    "an unknown key": (_append("sros.toml", b"foo = 1\n"), "foo is not a known key"),
+    "no text": (_append("sros.toml", b"\xff\xfe"), "is not valid TOML"),
+    "no settings": (lambda root: (root / "sros.toml").unlink(), "there is no sros.toml"),
+    "no XML": (_append("enclaves/governance.xml", b"</foo"), "is not the signed governance"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_files_that_cannot_be_read_are_written_again(case: str, root: Path) -> None:
+    damage, clause = BROKEN[case]
+    clean = {each: (root / each).read_bytes() for each in ("sros.toml", "enclaves/governance.xml")}
+    damage(root)
+    assert "--discard-edits" in sros("check", root).out
     assert sros("update_keystore", root, "--take-edits").status == 2
     assert "--discard-edits" in sros("update_keystore", root, "--template", "production").err
-    sros("update_keystore", root, "--discard-edits").ok()
-    assert (root / "sros.toml").read_bytes() == text
+    note = json.loads(
+        sros("update_keystore", root, "--discard-edits", "--dry-run", "--json").ok().out
+    )["notes"][0]
+    assert (note["id"], clause in note["text"]) == ("keystore.edit-undone", True)
+    done = sros("update_keystore", root, "--discard-edits").ok()
+    assert "\n  undone   " in done.out
+    assert clause in done.out
+    assert {each: (root / each).read_bytes() for each in clean} == clean
     sound(root)
+
+
+def test_settings_that_cannot_be_read_are_called_settings(root: Path) -> None:
+    """Not a template, and with the command that writes them again, if the ledger has them."""
+    _append("sros.toml", b"foo = 1\n")(root)
+    for words in (("create_enclave", root, "/new"), ("renew", root, "/free"), ("inspect", root)):
+        err = sros(*words).err
+        assert f"the settings file '{root}/sros.toml' is not valid. " in err
+        assert f"`sros update_keystore {root} --discard-edits`" in err
+    ledger = root / "ledger.jsonl"
+    lines = [x for x in ledger.read_text().splitlines() if '"what":"settings"' not in x]
+    ledger.write_text("\n".join(lines) + "\n")
+    refused = sros("update_keystore", root, "--discard-edits")
+    assert (refused.status, "restore it from a backup" in refused.err) == (2, True)
 
 
 def test_a_forged_record_does_not_hide_an_edit(root: Path) -> None:

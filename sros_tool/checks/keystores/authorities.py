@@ -230,7 +230,8 @@ SETTINGS_MISSING = FindingKind(
     "New enclaves then follow the defaults of ros2/sros2: without a policy they may do "
     "everything, for ten years.",
     "sros: sros.toml holds the settings of a keystore.",
-    "Restore sros.toml from a backup.",
+    "Run `sros update_keystore ROOT --discard-edits`, which writes the settings that the ledger "
+    "has. If it has none, restore sros.toml from a backup.",
 )
 SETTINGS_EDITED = FindingKind(
     "keystore.settings-edited",

@@ -107,8 +107,9 @@ class PresentSettings:
     """The settings that are in force in a keystore, and what was edited by hand.
 
     ``settings`` are as sros wrote them last, with the protection of the signed ``governance``.
-    ``written`` are those that ``sros.toml`` states now; None if it cannot be read, or for a
-    keystore ``without_settings``, as ros2/sros2 makes them.  ``recorded`` are those of the ledger.
+    ``written`` are those that ``sros.toml`` states now; None if it is missing or cannot be read,
+    and for a keystore ``without_settings``, as ros2/sros2 makes them.  ``recorded`` are those of
+    the ledger.
     """
 
     settings: Template
@@ -192,21 +193,28 @@ def present_settings(root: Path) -> PresentSettings:
 
     Raises:
         KeystoreError: ``root`` is no keystore, or its governance cannot be used.
-        DocumentError: its settings are malformed, and no ledger has those of before.
+        DocumentError: its settings are malformed, and the ledger does not have those of before.
     """
     list_enclaves(root)
     governance, ledger = governance_of(root), read_ledger(root)
     recorded = recorded_settings(ledger)
-    without_settings = not (root / SETTINGS).exists()
+    missing = not (root / SETTINGS).exists()
+    without_settings = missing and recorded is None
     written, unreadable = None, ""
     try:
-        loaded = load_settings(root)
-        written = None if without_settings else loaded
+        loaded = recorded if missing and recorded else load_settings(root)
+        written = None if missing else loaded
+        unreadable = f"there is no {SETTINGS}" if missing and recorded else ""
     except DocumentError as error:
         if recorded is None:
-            raise
+            raise DocumentError(
+                error.what,
+                error.why,
+                "The ledger does not have the settings of before: correct the file, or restore it "
+                "from a backup.",
+            ) from error
         loaded, unreadable = recorded, f"{error.what}: {error.why}".removesuffix(".")
-    recorded = with_places(recorded, loaded) if recorded and not without_settings else None
+    recorded = with_places(recorded, loaded) if recorded else None
     settings = recorded or loaded
     if protection := protection_for(governance):
         settings = replace(settings, protection=protection)
@@ -232,6 +240,12 @@ def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, Dom
         )
     if present.written is None and not present.without_settings:
         load_settings(root)  # raises what is wrong with them
+        raise KeystoreError(
+            f"there is no {SETTINGS} in keystore '{root}', so it states no change",
+            "",
+            "Write the settings of before again with `sros update_keystore "
+            f"{quote(str(root))} --discard-edits`.",
+        )
     written = present.written or present.settings
     if not edits.governance:
         return written, present.domains
