@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from itertools import chain, islice
 from math import isfinite
@@ -26,6 +27,7 @@ from sros_tool.dds.permissions import Criteria, Grant, Rule, render_permissions
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import GOVERNANCE_XML
 from sros_tool.keystore.settings import edit_remedy
+from sros_tool.keystore.template import Template
 from sros_tool.names import ROS_DISCOVERY_TOPIC, is_expression
 from sros_tool.pki import smime
 from sros_tool.pki.certificates import subject_text
@@ -483,18 +485,37 @@ def check_governance(enclave: CheckedEnclave, *, only_differing: bool) -> Iterat
     yield from governance_findings(enclave.keystore, governance, file)
 
 
+@dataclass(frozen=True, slots=True)
+class _Chosen:
+    """Whether settings lead to a governance with the same finding."""
+
+    kind: FindingKind
+    text: str
+    domains: DomainSet
+
+    def __call__(self, settings: Template) -> bool:
+        governance = governance_for(settings.protection, self.domains)
+        found = (each for rule in governance.domain_access_rules for each in _rule_findings(rule))
+        return (self.kind, self.text) in found
+
+
+def _rule_findings(rule: DomainRule) -> Iterator[tuple[FindingKind, str]]:
+    yield from _domain_rule(rule)
+    yield from _topic_rules(rule)
+
+
 def governance_findings(
     keystore: CheckedKeystore, governance: Governance, file: str
 ) -> Iterator[Finding]:
     """Yield findings about what a governance document leaves unprotected; ``file`` is its path."""
     domains = governance.domains().closed()
-    accepted = keystore.accepts(lambda s: governance == governance_for(s.protection, domains))
+
     for rule in governance.domain_access_rules:
         subject = f"domain {rule.domains}"
-        for kind, text in (*_domain_rule(rule), *_topic_rules(rule)):
+        for kind, text in _rule_findings(rule):
             # A template may choose open topics; no template chooses to lose messages.
-            chosen = "" if kind is SIGNED_PAYLOAD else accepted
-            yield kind.found(subject, text, file, accepted=chosen)
+            by = "" if kind is SIGNED_PAYLOAD else keystore.accepts(_Chosen(kind, text, domains))
+            yield kind.found(subject, text, file, accepted=by)
         for problem in _domain_problems(rule.domains):
             yield GOVERNANCE_DOMAIN_RANGE.found(subject, f"the range {problem}", file)
     yield from _copy(keystore)

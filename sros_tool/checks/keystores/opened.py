@@ -27,7 +27,7 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Ledger
 from sros_tool.keystore.reader import OpenedEnclave, open_keystore
 from sros_tool.keystore.settings import HandEdits, hand_edits
-from sros_tool.keystore.template import Template
+from sros_tool.keystore.template import Template, load_template, template_names
 from sros_tool.pki.crl import RevocationList
 from sros_tool.policy.model import Policy
 from sros_tool.xml import read_bytes
@@ -71,11 +71,14 @@ class CheckedKeystore:
     def accepts(self, chosen: Callable[[Template], bool]) -> str:
         """Return text naming the template or keystore that accepts a weakness; "" if none does.
 
-        ``chosen`` returns whether the settings chose the weakness.  Without settings (ros2/sros2)
-        nothing accepts it.
+        ``chosen`` returns whether settings choose the weakness.  It is asked of the template as it
+        ships with sros: what the settings of this keystore changed, the template never accepted.
+        Without settings (ros2/sros2) nothing accepts it.
         """
         if self.settings:
-            return f"template {self.settings.name}" if chosen(self.settings) else ""
+            name = self.settings.name
+            template = load_template(name) if name in template_names() else self.settings
+            return f"template {name}" if chosen(template) else ""
         return "" if self.is_home else "keystore that it was exported from"
 
     def shown(self, path: str | Path) -> str:
