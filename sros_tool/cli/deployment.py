@@ -41,6 +41,7 @@ from sros_tool.errors import DocumentError, UsageError
 if TYPE_CHECKING:
     from cryptography import x509
 
+    from sros_tool.errors import Note
     from sros_tool.keystore.delivery.answer import ImportedEnclave
     from sros_tool.keystore.delivery.export import ExportSelection
     from sros_tool.keystore.delivery.request import Requested
@@ -96,6 +97,7 @@ def distribute_key(
     target = PATH.convert(rest[-1], None, None)
     _check_target(root, rest[-1])
     selection = select(root, names, patterns, every=every)
+    notes: tuple[Note, ...] = ()
     if target == _STREAM:
         if not dry_run:
             _refuse_json(as_json)
@@ -115,6 +117,7 @@ def distribute_key(
                 root, selection.names, target, now=now(), force=force, dry_run=dry_run
             )
         where, done = f"'{target}'", bool(export.changes) and not dry_run
+        notes = export.notes
         below = target.parent if target.name.endswith(SUFFIXES) else target
         changes = changes_json(below, export.changes)
         if dry_run and not as_json:
@@ -128,7 +131,9 @@ def distribute_key(
     for name in selection.names if done and not as_json else ():
         click.echo(f"exported enclave {name} to {where}", err=target == _STREAM)
     if as_json:
-        print_json(_export_json(root, target, selection, changes, dry_run))
+        print_json(_export_json(root, target, selection, changes, notes, dry_run))
+    else:
+        print_notes(notes)
     for name in selection.left_out:
         click.echo(f"left out enclave {name}: its key was made on its robot", err=True)
 
@@ -138,6 +143,7 @@ def _export_json(
     target: Path,
     selection: ExportSelection,
     changes: list[dict[str, str]],
+    notes: tuple[Note, ...],
     dry_run: bool,
 ) -> dict[str, Any]:
     from sros_tool.keystore.delivery.archive import SUFFIXES
@@ -161,7 +167,7 @@ def _export_json(
         ],
         "left_out": list(selection.left_out),
         "changes": changes,
-        "notes": [],
+        "notes": notes_json(notes),
     }
 
 

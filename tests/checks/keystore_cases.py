@@ -245,6 +245,20 @@ def _(bench: Bench) -> None:
     bench.permissions((end, f"<not_after>{year + 8}-01-01T00:00:00Z"))
 
 
+@case("enclave.crl-older", "keystore.enclave-revoked")
+def _(bench: Bench) -> None:
+    """A robot got all enclaves; /gone was revoked, and of the others one was exported again."""
+    bench.checked = bench.root.with_name("robot")
+    for line in (
+        "create_enclave ROOT /gone /kept",
+        "distribute_key ROOT --all ROBOT",
+        "revoke ROOT /gone",
+        "distribute_key ROOT /base ROBOT --force",
+    ):
+        words = line.replace("ROOT", str(bench.root)).replace("ROBOT", str(bench.checked)).split()
+        sros(*words, env={"SROS_CA_PASSPHRASE": SECRET}).ok()
+
+
 @case("enclave.waits-for-answer")
 def _(bench: Bench) -> None:
     folder = bench.path("enclaves/new")

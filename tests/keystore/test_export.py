@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import shutil
+import subprocess
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -22,7 +25,7 @@ from sros_tool.keystore.lifecycle.renew import renew
 from sros_tool.keystore.lifecycle.revoke import revoke
 from sros_tool.keystore.template import load_template
 from sros_tool.policy.document import read_policy
-from tests.support.harness import policy_text, publish, snapshot
+from tests.support.harness import policy_text, publish, snapshot, sros
 
 NOW = datetime.now(UTC)
 NAMES = ("/arm/camera", "/arm/gripper", "/armada", "/base")
@@ -264,7 +267,8 @@ def test_a_revoked_enclave_on_the_robot_is_a_finding(fleet: Path, tmp_path: Path
     revoke(fleet, ["/base"], now=NOW)
     distribute(fleet, ["/armada"], tmp_path / "robot", now=NOW)
     crl = tmp_path / "robot/enclaves/armada/crl.pem"
-    assert not verify_arrival(tmp_path / "robot", now=NOW).findings
+    (finding,) = verify_arrival(tmp_path / "robot", now=NOW).findings
+    assert finding.id == "keystore.enclave-revoked"
     shutil.copy(crl, tmp_path / "robot/enclaves/base")
     (finding,) = verify_arrival(tmp_path / "robot", now=NOW).findings
     assert "revoked" in finding.text
@@ -296,3 +300,15 @@ def test_an_update_replaces_the_files_of_an_earlier_export(fleet: Path, tmp_path
     distribute(fleet, ["/base", "/armada"], tmp_path / "robot", now=NOW, force=True)
     assert not verify_arrival(tmp_path / "robot", now=NOW).findings
     assert not [path for path in os.listdir(tmp_path / "robot") if path.startswith(".")]
+
+
+def test_an_enclave_that_the_keystore_lost_is_named(keystore: Path, tmp_path: Path) -> None:
+    robot = tmp_path / "the robot"
+    distribute(keystore, ["/a", "/b"], robot, now=NOW)
+    sros("revoke", keystore, "/a").ok()
+    ended = sros("distribute_key", keystore, "--all", robot, "--force").ok()
+    assert f"'{robot}' also has enclave /a" in ended.err
+    subprocess.run(["sh", "-c", re.findall(r"rm -r .*", ended.err)[0]], check=True)
+    assert not (robot / "enclaves/a").exists()
+    again = sros("distribute_key", keystore, "--all", robot, "--force", "--json").ok()
+    assert json.loads(again.out)["notes"] == []

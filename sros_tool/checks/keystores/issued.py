@@ -19,6 +19,7 @@ from sros_tool.checks.policies import ENCLAVE_NAMES, within_root
 from sros_tool.dds.portable import mistaken_names, some_pairs
 from sros_tool.errors import SrosError
 from sros_tool.keystore.layout import (
+    CRL_FILE,
     IDENTITY_CA_FILE,
     PERMISSIONS_CA_FILE,
     ROLES,
@@ -26,9 +27,11 @@ from sros_tool.keystore.layout import (
     enclave_path,
 )
 from sros_tool.keystore.rights import load_rights
-from sros_tool.pki.certificates import fingerprints
+from sros_tool.pki.certificates import fingerprints, load_certificates
+from sros_tool.pki.crl import load_crl, signed_by
 from sros_tool.policy.rights import Right, compare, policy_rights
 from sros_tool.translate import grant_rights
+from sros_tool.xml import read_bytes
 
 SERIAL_TWICE = FindingKind(
     "keystore.serial-twice",
@@ -101,6 +104,24 @@ AUTHORITIES_DIFFER = FindingKind(
     "Export the enclave again from the keystore of the other enclaves, or create it again there.",
 )
 
+REVOKED_BY_NEWER_LIST = FindingKind(
+    "keystore.enclave-revoked",
+    ERROR,
+    "an enclave that a newer revocation list revokes",
+    "It was revoked after it was exported. It can still start, and communicates with all processes "
+    "that have not loaded the newer list.",
+    "RFC 5280, 5; rmw_dds_common (crl.pem).",
+    "Remove the enclave's folder from the robot.",
+)
+OLDER_LIST = FindingKind(
+    "enclave.crl-older",
+    WARNING,
+    "an enclave with an older revocation list than another one",
+    "Its processes communicate with enclaves that the newer list revokes.",
+    "RFC 5280, 5.2.3; rmw_dds_common (crl.pem).",
+    "Export the enclave again, with `sros distribute_key ROOT NAME TARGET --force`.",
+)
+
 ROOT_ENCLAVE = FindingKind(
     "keystore.root-enclave",
     WARNING,
@@ -132,6 +153,8 @@ class EnclaveSummary:
     governance: str
     unique: bool
     trusted: tuple[frozenset[str], ...]
+    list_number: int
+    """The number of its revocation list, if a CA that it trusts signed it; -1 without one."""
 
 
 def summary_of(enclave: CheckedEnclave) -> EnclaveSummary | None:
@@ -155,7 +178,29 @@ def summary_of(enclave: CheckedEnclave) -> EnclaveSummary | None:
         else "",
         len(certificate.subject.rdns) > 1,
         tuple(_trusted(enclave.state.files.get(name, b"")) for name in _AUTHORITY_FILES),
+        _list_number(enclave),
     )
+
+
+def _list_number(enclave: CheckedEnclave) -> int:
+    path = enclave.folder / CRL_FILE
+    if not path.exists():
+        return -1
+    try:
+        data = read_bytes(path, "revocation list")
+    except SrosError:
+        return -1  # another check reports it
+    return _number_if_signed(data, enclave.state.files.get(IDENTITY_CA_FILE, b""))
+
+
+@lru_cache(maxsize=8)
+def _number_if_signed(data: bytes, authority: bytes) -> int:
+    try:
+        crl = load_crl(data, CRL_FILE)
+        authentic = any(signed_by(crl.list, each) for each in load_certificates(authority, ""))
+    except SrosError:
+        return -1
+    return crl.number if authentic else -1
 
 
 @lru_cache(maxsize=8)
@@ -186,6 +231,7 @@ def check_issued(
         yield ROOT_ENCLAVE.found("/", text, str(enclave_path(keystore.root, "/")))
     yield from _trust(keystore, summaries)
     yield from _exported_governance(keystore, summaries)
+    yield from _lists(keystore, summaries)
     yield from _ledger(keystore, summaries)
     if keystore.policies:
         wanted = {each.path for policy in keystore.policies for each in policy.enclaves}
@@ -234,6 +280,26 @@ def _exported_governance(
             file = f"{keystore.root}/{enclave_folder(each.name)}/governance.p7s"
             text = f"its governance differs from the one of {copies[0].name}"
             yield GOVERNANCE_DIFFERS.found(each.name, text, file)
+
+
+def _lists(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:
+    """Yield findings about enclaves of one CA whose revocation list is not the newest one."""
+    for issuer in dict.fromkeys(each.issuer for each in summaries):
+        enclaves = [each for each in summaries if each.issuer == issuer]
+        newest = max(enclaves, key=lambda each: each.list_number)
+        older = [each for each in enclaves if each.list_number < newest.list_number]
+        if not older:
+            continue
+        path = enclave_path(keystore.root, newest.name) / CRL_FILE
+        crl = load_crl(read_bytes(path, "revocation list"), f"'{path}'")
+        for each in older:
+            folder = str(enclave_path(keystore.root, each.name))
+            of = f"the one of {newest.name} has number {newest.list_number}"
+            if crl.revokes(each.serial):
+                yield REVOKED_BY_NEWER_LIST.found(each.name, f"{of}, and revokes it", folder)
+            elif each.list_number >= 0 or not keystore.crl:  # another check reports a missing list
+                own = f"has number {each.list_number}" if each.list_number >= 0 else "is missing"
+                yield OLDER_LIST.found(each.name, f"its list {own}, {of}", f"{folder}/{CRL_FILE}")
 
 
 def _ledger(keystore: CheckedKeystore, summaries: Sequence[EnclaveSummary]) -> Iterator[Finding]:

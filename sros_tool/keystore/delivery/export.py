@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from shlex import quote
 
-from sros_tool.errors import KeystoreError
+from sros_tool.errors import KeystoreError, Note
 from sros_tool.files import staged_file
 from sros_tool.folders import Folder
 from sros_tool.keystore.delivery.archive import SUFFIXES, file_mode, pack
@@ -23,6 +24,7 @@ from sros_tool.keystore.layout import (
     enclave_path,
     key_on_robot,
     list_enclaves,
+    search_enclaves,
     select_enclaves,
 )
 from sros_tool.keystore.missing import no_such_enclave
@@ -42,11 +44,12 @@ _ANSWER_AGAIN = (
 
 @dataclass(frozen=True, slots=True)
 class Export:
-    """The result of an export: the enclaves and the changes below ``target``."""
+    """The result of an export: the enclaves and the changes below ``target``, and notes."""
 
     target: Path
     enclaves: tuple[str, ...]
     changes: tuple[Change, ...]
+    notes: tuple[Note, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,10 +109,22 @@ def distribute(
     """
     files = _collect(root, names, now)
     if target.name.endswith(_ARCHIVE_SUFFIXES):
-        changes = _write_archive(target, files, force, dry_run)
-    else:
-        changes = _write_folder(root, target, files, force, dry_run)
-    return Export(target, tuple(names), changes)
+        return Export(target, tuple(names), _write_archive(target, files, force, dry_run))
+    changes = _write_folder(root, target, files, force, dry_run)
+    return Export(target, tuple(names), changes, tuple(_notes(root, target)))
+
+
+def _notes(root: Path, target: Path) -> Iterator[Note]:
+    """Yield a note for each enclave of an earlier export that the keystore does not have now."""
+    existing = set(list_enclaves(root))
+    for name in search_enclaves(target)[0]:
+        if name not in existing:
+            yield Note(
+                "export.not-in-keystore",
+                f"'{target}' also has enclave {name}, which keystore '{root}' does not have; if it "
+                f"was revoked, remove it from the robot, too: rm -r "
+                f"{quote(str(enclave_path(target, name)))}",
+            )
 
 
 @dataclass(frozen=True, slots=True)
