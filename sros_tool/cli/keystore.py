@@ -764,6 +764,10 @@ def update_keystore(
             dry_run=dry_run,
             progress=step,
         )
+    layout = any(key == "authorities.layout" for key, _ in map(_key_and_value, values))
+    shared = next((r.text for r in update.remarks if r.id == "keystore.one-authority"), "")
+    if layout and shared and not update.done:
+        raise UsageError("update_keystore cannot do more to separate the CAs", shared)
     undone = present.edits.clauses() if discard_edits else ()
     _show_update(update, undone, dry_run=dry_run, as_json=as_json)
     refused = bool(update.looser()) and not allow_looser
@@ -841,6 +845,8 @@ def _show_update(
         return
     if not update.done:
         click.echo("nothing is left to do", err=True)
+        for remark in update.remarks:
+            click.echo(remark.text, err=True)
         return
     template = f": template {update.before} -> {update.after}"
     verb = "would update" if dry_run else "updated"

@@ -38,6 +38,7 @@ from sros_tool.pki.certificates import common_name, digest, pem
 from sros_tool.pki.keys import generate_key, key_pem
 from sros_tool.policy.document import read_policy
 from tests.keystore.test_transaction import DIED, in_child
+from tests.support import made_by_ros2
 from tests.support.harness import check_enclave_whole, policy_text, publish, remains, snapshot, sros
 
 NOW = datetime.now(UTC)
@@ -586,13 +587,27 @@ def test_an_enclave_of_another_ca_stops_everything(separate: Path, tmp_path: Pat
     refused(lambda: rotate_ca(separate, now=NOW), separate, "enclave /b cannot be moved")
 
 
-def test_a_ca_never_ends_before_the_old_one_unasked(tmp_path: Path) -> None:
+def test_a_ca_ends_before_the_old_one_only_if_it_was_chosen(tmp_path: Path) -> None:
     template = replace(load_template("production"), authority_validity=timedelta(days=3650))
     root = tmp_path / "ks"
     create_keystore(root, template=template, now=NOW)
     update_keystore(root, replace(template, authority_validity=timedelta(days=90)), now=NOW)
+    shutil.copytree(root, other := tmp_path / "other")
+    (note,) = rotate_ca(root, now=NOW).notes
+    assert (note.id, "is 90d" in note.text) == ("keystore.ca-expires-earlier", True)
+    for done in (
+        rotate_ca(root, now=NOW, finish=True),
+        rotate_ca(other, now=NOW, validity=timedelta(days=90)),
+    ):
+        assert note.id not in {each.id for each in done.notes}
+
+
+def test_no_default_replaces_a_ca_by_one_that_ends_before(tmp_path: Path) -> None:
+    """A keystore of ros2/sros2 has no settings that could choose it."""
+    root = tmp_path / "ks"
+    made_by_ros2.make(root, "/a", now=NOW)
+    rotate_ca(root, now=NOW, validity=timedelta(days=7300), finish=True)
     refused(lambda: rotate_ca(root, now=NOW), root, "expire before the old")
-    rotate_ca(root, now=NOW, validity=timedelta(days=90))
 
 
 def test_exports_can_be_replaced_during_a_rotation(separate: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -336,6 +337,29 @@ def test_one_ca_becomes_two(by_ros2: bool, tmp_path: Path) -> None:
         sound(root)
     assert present_settings(root).settings == before
     assert found(root) <= {"keystore.folder-open"}
+
+
+def test_what_is_left_until_each_ca_has_its_own_key(tmp_path: Path) -> None:
+    """Every command that is printed on the way runs as it is printed, though the CA is shorter."""
+    root = make(tmp_path, "sros2")
+    parting = ("update_keystore", root, "--set", "authorities.layout=separate")
+    assert "`sros rotate_ca" in to(root, "production").remarks[-1].text
+    for stage in ("none", "distribute"):
+        words = f"sros rotate_ca {root}{' --permissions' if stage == 'none' else ''} --next"
+        (remedy,) = [
+            each.remedy
+            for each in keystore_findings(root, now=LATER)
+            if each.id == "keystore.one-authority"
+        ]
+        assert re.findall("`(.+?)`", remedy) == [words]
+        refused = sros(*parting)
+        assert (refused.status, f"`{words}`" in refused.err) == (2, True), refused
+        again = sros("update_keystore", root, "--template", "production").ok()
+        assert ("nothing is left" in again.err, f"`{words}`" in again.err) == (True, True)
+        sros(*words.split()[1:]).ok()
+    assert "nothing is left" in sros(*parting).ok().err
+    sros("rotate_ca", root, "--next").ok()
+    assert found(root) == set()
 
 
 def test_a_keystore_of_ros2_can_be_renewed_after_an_update(tmp_path: Path) -> None:

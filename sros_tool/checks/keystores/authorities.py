@@ -27,7 +27,9 @@ from sros_tool.keystore.layout import (
     ca_key,
     key_path,
 )
+from sros_tool.keystore.lifecycle.rotation.state import RotationStage, read_rotation
 from sros_tool.keystore.loading import authority_refusals, refusals_text
+from sros_tool.keystore.reader import authority_files
 from sros_tool.keystore.settings import edit_remedy
 from sros_tool.pki.certificates import (
     authority_text,
@@ -424,7 +426,22 @@ def shared_ca_findings(
     if identity.public_key() == permissions.public_key():
         text = f"{authority_text(identity)} is identity CA and permissions CA"
         accepted = keystore.accepts(lambda settings: not settings.separate_authorities)
-        yield ONE_AUTHORITY.found("the CAs", text, file, accepted=accepted)
+        remedy = _separation(keystore) if keystore.is_home else ""
+        yield ONE_AUTHORITY.found("the CAs", text, file, remedy=remedy, accepted=accepted)
+
+
+def _separation(keystore: CheckedKeystore) -> str:
+    """Return what is left to do until identity CA and permissions CA have keys of their own."""
+    try:
+        stage = read_rotation(keystore.root).stage
+        files = authority_files(keystore.root)
+    except SrosError:  # `sros rotate_ca` reports it
+        return ""
+    if stage is not RotationStage.NONE:
+        text = f"Go on with the rotation that is under way (stage {stage}): restart all processes, "
+        text += "and run `sros rotate_ca ROOT --next`."
+        return text if len(files) > 1 else f"{text} Once it is complete: {ONE_AUTHORITY.remedy}"
+    return "Run `sros rotate_ca ROOT --permissions --next`." if len(files) > 1 else ""
 
 
 def _revocation_list(keystore: CheckedKeystore) -> Iterator[Finding]:

@@ -85,11 +85,10 @@ from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.parallel import Progress
-from sros_tool.pki.certificates import enclave_subject, has_unique_part, same_key, validity_of
+from sros_tool.pki.certificates import enclave_subject, has_unique_part, same_key
 from sros_tool.pki.keys import PublicKey
 from sros_tool.policy.rights import compare
 from sros_tool.translate import governance_for, grant_rights, permissions_for, protection_for
-from sros_tool.validity import span_text, window
 from sros_tool.xml import read_bytes
 
 
@@ -678,8 +677,8 @@ class _Updater:
         if self._goal.settings.separate_authorities and shared:
             text = (
                 "Identity CA and permissions CA have files of their own now, and still the same "
-                "key, so an enclave can sign its own permissions: replace the permissions CA with "
-                f"{self._rotation(f' --{PERMISSIONS}')}."
+                "key, so an enclave can sign its own permissions, until the permissions CA is "
+                f"replaced: {self._rotation(f' --{PERMISSIONS}')}."
             )
             return [Note("keystore.one-authority", text)]
         if any(e.effect is Effect.TIGHTER and e.key.startswith("protection") for e in changes):
@@ -693,13 +692,14 @@ class _Updater:
         return []
 
     def _rotation(self, role: str) -> str:
-        """Return the command that begins to replace the CA of permissions, or with "" both."""
-        span = self._goal.settings.authority_validity
-        old = validity_of(self._authorities.permissions.certificate).not_after
-        # A CA that expires before the one that it replaces has to be asked for.
-        earlier = window(self._now, span).not_after < old
-        validity = f" --ca-validity {span_text(span)}" if earlier else ""
-        return f"`sros rotate_ca {quote(str(self._root))}{role} --next{validity}`"
+        """Return the command that begins to replace CAs, or goes on with it, as a clause.
+
+        ``role`` is the option for one of them, or "".
+        """
+        command = f"sros rotate_ca {quote(str(self._root))}"
+        if read_rotation(self._root).stage is RotationStage.NONE:
+            return f"`{command}{role} --next` begins that"
+        return f"`{command} --next` goes on with the rotation that is under way"
 
 
 def _restart_remark(disturbed: Mismatch, *, revoked: bool) -> str:

@@ -43,6 +43,7 @@ from sros_tool.keystore.layout import (
     RETIRED,
     ROLES,
     ROTATION,
+    SETTINGS,
     ca_key,
     enclave_folder,
     enclave_path,
@@ -94,7 +95,7 @@ from sros_tool.pki.certificates import (
     subject_text,
 )
 from sros_tool.pki.keys import PublicKey, algorithm, is_weak
-from sros_tool.validity import Span, Window, window
+from sros_tool.validity import Span, Window, span_text, window
 from sros_tool.xml import read_bytes
 
 
@@ -370,10 +371,30 @@ class _Rotator:
         )
         for each in successors:
             if validity is None:
-                _check_later(each.old[0], each.new.certificate)
+                self._note_earlier(each.old[0], each.new.certificate)
             self._entries.append(certificate_entry(self._now, "ca", each.new.certificate))
         self.replacements = [each.replacement() for each in successors]
         return successors
+
+    def _note_earlier(self, old: x509.Certificate, new: x509.Certificate) -> None:
+        """Note that a new CA expires before the old one because the settings say so.
+
+        Raises:
+            UsageError: it does, and the keystore has no settings, so nobody chose it.
+        """
+        if not (self._root / SETTINGS).exists():
+            _check_later(old, new)
+        elif new.not_valid_after_utc < old.not_valid_after_utc:
+            text = (
+                f"the new CA expires at {new.not_valid_after_utc:%Y-%m-%d}, before the old one "
+                f"({old.not_valid_after_utc:%Y-%m-%d}): authorities.validity of the settings is "
+                f"{span_text(self._template.authority_validity)}. --ca-validity would choose "
+                "another one."
+            )
+            # Both CAs usually have the same dates, and one note is enough then.
+            self.notes = tuple(
+                dict.fromkeys((*self.notes, Note("keystore.ca-expires-earlier", text)))
+            )
 
     def _distribute(self, successors: list[_Successor]) -> None:
         for each in successors:
@@ -464,7 +485,7 @@ class _Rotator:
 
         writer.for_each(self._names, reissue, progress)
         self._entries += writer.entries
-        self.notes = writer.notes
+        self.notes += writer.notes
         if identity:
             self.notes += tuple(known.shared_notes(self._names))
 
