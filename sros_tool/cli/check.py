@@ -437,9 +437,11 @@ Example:
   Cyclone DDS (libddsc)        enforces security  Cyclone DDS 0.10.2
       with an enclave made by sros, it created the allowed writer on /chatter
       and refused the denied writer and reader on /sros_not_allowed: ...
-  DDS Security can be enforced here.
+  DDS Security can be enforced here, by Cyclone DDS (libddsc), but NOT by ROS
+  nodes: rmw_fastrtps_cpp does not enforce it. The ROS 2 packages of ...
 
-Exit status: 1 if nothing here enforces security, or if a finding is an error; else 0.""",
+Exit status: 1 if the RMW that ROS nodes use here does not enforce security (without
+any RMW: if nothing here does), or if a finding is an error; else 0.""",
 )
 @json_option
 def doctor(as_json: bool) -> None:
@@ -469,5 +471,5 @@ def doctor(as_json: bool) -> None:
             if each.severity >= WARNING:
                 click.echo()
                 echo_finding(each)
-    if not diagnosis.enforces or any(each.severity >= ERROR for each in findings):
+    if not diagnosis.sound or any(each.severity >= ERROR for each in findings):
         sys.exit(1)

@@ -393,9 +393,14 @@ def _policy_of(policy: Path | None, enclave: str) -> Enclave | None:
     read = read_policy(policy)
     found = read.enclave(enclave)
     if found is None and not _is_enclave(Path(enclave)):
-        there = ", ".join(each.path for each in read.enclaves)
+        from sros_tool.keystore.missing import likely_names
+
+        there = [each.path for each in read.enclaves]
+        meant = likely_names(enclave, there)
         raise PolicyError(
-            f"unable to find enclave {enclave} in the policy '{policy}'", f"It has {there}."
+            f"unable to find enclave {enclave} in the policy '{policy}'",
+            f"It has {', '.join(there)}.",
+            f"Perhaps you mean {' or '.join(meant)}." if meant else "",
         )
     return found
 
@@ -504,6 +509,8 @@ def _answer_lines(
     enclave: LoadedEnclave, answer: Answer, why: str, policy: Path | None
 ) -> Iterator[str]:
     """Yield the answer for one vendor as lines; ``why`` is the reason to choose this vendor."""
+    from sros_tool.explain.answer import template_default
+
     decision, grant = answer.decision, answer.grant
     may = f"yes: {enclave.name} may" if answer.allowed else f"no: {enclave.name} may not"
     documented = ", as documented" if answer.as_documented else ""
@@ -523,8 +530,14 @@ def _answer_lines(
         stated = f"{line.qualifier.value} {line.right} {line.name}"
         yield _row("from", f"{_shown(line.source)}: {stated}")
     if answer.policy_sha256 and policy is None and decision.rule is not None:
-        digest = answer.policy_sha256[:12]
-        yield _row("from", f"a policy file with the digest {digest}; name it with --policy")
+        digest = answer.policy_sha256
+        default = template_default(digest)
+        yield _row(
+            "from",
+            f"the default of the keystore's template, {default}: no policy file has been signed"
+            if default
+            else f"a policy file with the digest {digest[:12]}; name it with --policy",
+        )
     if answer.allowed:
         yield _row("protected", ", ".join(_protection_words(answer)))
     elif answer.denied_by:
@@ -832,6 +845,7 @@ def _show_reach(
 ) -> int:
     """Print which enclaves one enclave can influence and learn from; return 0."""
     from sros_tool.explain.reach import OF_EVERY_NODE, Network
+    from sros_tool.keystore.missing import likely_names
     from sros_tool.keystore.rights import load_rights
 
     if root is None and len(rest) == 1:
@@ -844,9 +858,11 @@ def _show_reach(
     if source.kind == "keystore":
         _check_there(source.path, enclave)
     if enclave not in network.enclaves:
+        meant = likely_names(enclave, network.enclaves)
         raise KeystoreError(
             f"enclave {enclave} has no rights in '{source.path}'",
             f"Enclaves with rights: {', '.join(network.enclaves[:5]) or 'none'}.",
+            f"Perhaps you mean {' or '.join(meant)}." if meant else "",
         )
     with progress("following the rights"):
         reach = network.reach(enclave)

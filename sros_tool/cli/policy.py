@@ -491,6 +491,12 @@ Example:
     metavar="OLD",
     help="Convert the policy OLD of version 0.1.0 to the present format.",
 )
+@click.option(
+    "--with-node-rights",
+    "complete",
+    is_flag=True,
+    help="With --convert: add what every node of today's ROS 2 needs (common/node.xml).",
+)
 @output_option("Write the converted policy to FILE.")
 @force_option
 @json_option
@@ -498,6 +504,7 @@ Example:
 def policies(
     target: Path | None,
     earlier: Path | None,
+    complete: bool,
     output: Path | None,
     force: bool,
     as_json: bool,
@@ -506,8 +513,9 @@ def policies(
     """List the policies that ship with sros and their enclaves, or copy the policies.
 
     --convert gives a policy of version 0.1.0 (ROS 2 Crystal to Eloquent) the present format, with
-    the same rights: each node becomes an enclave with the node's name. The result is one file:
-    includes are resolved, and comments are lost. The exit status is 1 if a part was left out.
+    the same rights: each node becomes an enclave with the node's name. Nodes of a later ROS 2 need
+    more, which --with-node-rights adds. The result is one file: includes are resolved, and comments
+    are lost. The exit status is 1 if a part was left out.
     """
     from sros_tool.files import write_new_folder
     from sros_tool.policy.document import read_policy
@@ -517,9 +525,11 @@ def policies(
     if earlier is not None:
         if target is not None:
             raise UsageError("--convert and --copy exclude each other")
-        return _convert(earlier, output, force=force, as_json=as_json, dry_run=dry_run)
-    if output or force:
-        raise UsageError("--output and --force are for --convert only")
+        return _convert(
+            earlier, output, complete=complete, force=force, as_json=as_json, dry_run=dry_run
+        )
+    if output or force or complete:
+        raise UsageError("--with-node-rights, --output and --force are for --convert only")
     source = policies_dir()
     if target is not None:
         if os.path.lexists(target):
@@ -556,15 +566,29 @@ def policies(
 
 
 def _convert(
-    earlier: Path, output: Path | None, *, force: bool, as_json: bool, dry_run: bool
+    earlier: Path,
+    output: Path | None,
+    *,
+    complete: bool,
+    force: bool,
+    as_json: bool,
+    dry_run: bool,
 ) -> int:
     """Convert a policy; return the exit status."""
-    from sros_tool.policy.document import convert_policy, read_policy, write_policy
+    from sros_tool.policy.document import (
+        convert_policy,
+        read_policy,
+        with_node_rights,
+        write_policy,
+    )
+    from sros_tool.resources import policies_dir
 
     if output:
         check_output(output, force=force)
     converted = convert_policy(earlier)
     policy = converted.policy
+    if complete:
+        policy = with_node_rights(policy, policies_dir())
     document = write_policy(policy)
     if read_policy(output or earlier, document) != policy:
         raise PolicyError(
@@ -601,9 +625,13 @@ def _convert(
         click.echo(visible(f"left out: {each.text}"), err=True)
     if saved:
         click.echo(saved, err=True)
-        click.echo(
-            "the rights are the old ones; nodes of a later ROS 2 need more, such as to publish "
-            f"/rosout from a namespace: look with `sros check {quote(str(output))}`",
-            err=True,
-        )
+        if not complete:
+            again = f"{quote(str(earlier))} -o {quote(str(output))} --force"
+            click.echo(
+                "the rights are the old ones; nodes of a later ROS 2 need more, such as to publish "
+                "/rosout from a namespace: add it with `sros policies --convert "
+                f"{again} --with-node-rights`",
+                err=True,
+            )
+        click.echo(f"look at the result with `sros check {quote(str(output))}`", err=True)
     return 1 if converted.left_out else 0

@@ -15,6 +15,7 @@ from sros_tool.demo.scenarios.isolation import ISOLATION
 from sros_tool.demo.scenarios.policies import DEFAULT_TOPIC
 from sros_tool.keystore.template import load_template
 from sros_tool.runtime.cyclone import INSTALL_ADVICE
+from sros_tool.runtime.rmw import RMW
 from sros_tool.runtime.stacks import ROS_ADVICE, Stack, survey
 from sros_tool.values import as_plain
 
@@ -34,6 +35,33 @@ class Diagnosis:
         return any(stack.enforces for stack in self.stacks)
 
     @property
+    def ros(self) -> Stack | None:
+        """The RMW that ROS nodes use here, or None if no RMW is installed."""
+        return next((each for each in self.stacks if each.kind == "rmw" and each.present), None)
+
+    @property
+    def sound(self) -> bool:
+        """Whether ROS nodes here are secured by their RMW; without an RMW, whether any DDS is."""
+        return self.enforces if self.ros is None else self.ros.enforces is True
+
+    @property
+    def conclusion(self) -> str:
+        """What enforces security here and what does not, as sentences."""
+        if not self.enforces:
+            return f"Nothing here enforces DDS Security. {self.advice}"
+        named = " and ".join(each.name for each in self.stacks if each.enforces)
+        able = f"DDS Security can be enforced here, by {named}"
+        ros = self.ros
+        if ros is None:
+            return f"{able}. No RMW is installed here, so ROS nodes were not tried."
+        if ros.enforces:
+            return f"{able}."
+        fault = "does not enforce it" if ros.enforces is False else "could not be tried"
+        other = next((e.rmw for e in self.stacks if e.kind == "rmw" and e.enforces and e.rmw), "")
+        advice = f"Set {RMW}={other}, which enforces it." if other else ROS_ADVICE
+        return f"{able}, but NOT by ROS nodes: {ros.rmw or 'their RMW'} {fault}. {advice}"
+
+    @property
     def advice(self) -> str:
         """The packages to install if no stack enforces security, else ""."""
         return "" if self.enforces else f"{INSTALL_ADVICE} {ROS_ADVICE}"
@@ -42,6 +70,7 @@ class Diagnosis:
         """Return the diagnosis as `sros doctor --json` shows it."""
         return {
             "enforces": self.enforces,
+            "ros_enforces": self.ros.enforces if self.ros else None,
             "stacks": as_plain(self.stacks),
             "advice": self.advice,
         }
@@ -66,12 +95,7 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
         identity = f"{stack.dds} {stack.version}".strip() if stack.present else ""
         lines.append(f"{stack.name:<{width}}  {_answer(stack):<19}  {identity}".rstrip())
         lines += _indented([stack.evidence, stack.where, stack.advice])
-    lines += [
-        "",
-        "DDS Security can be enforced here."
-        if diagnosis.enforces
-        else f"Nothing here enforces DDS Security. {diagnosis.advice}",
-    ]
+    lines += ["", diagnosis.conclusion]
     return "\n".join(lines)
 
 

@@ -151,6 +151,18 @@ def recorded_policy(root: Path, signed: bytes) -> str:
     return next(found, "")
 
 
+def template_default(digest: str) -> str:
+    """Return which default of keystore templates has this digest (`recorded_policy`), or "".
+
+    It is "everything" or "node_basics", a value of the template's ``permissions.default``.
+    """
+    from sros_tool.policy.document import read_policy
+    from sros_tool.resources import policies_dir
+
+    files = sorted((policies_dir() / "defaults").glob("*.xml"))
+    return next((f.stem for f in files if read_policy(f).enclaves[0].digest == digest), "")
+
+
 def deciding_lines(policy: Enclave, answer: Answer) -> tuple[PolicyLine, ...]:
     """Return the names in an enclave's policy that the deciding rule of an answer comes from.
 

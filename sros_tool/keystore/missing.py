@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from sros_tool.errors import InvalidNameError, KeystoreError, SrosError
@@ -15,6 +15,8 @@ _SHOWN = 5
 """The number of enclaves that an error names; it counts the others."""
 _ALIKE = 0.75
 """The lowest similarity (`difflib`) of a typo: one of four letters differs, or two of eight."""
+_WHOLE_ALIKE = 0.9
+"""The lowest similarity of a typo in a whole name: names of one namespace begin alike."""
 
 
 def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
@@ -32,7 +34,8 @@ def no_such_enclave(root: Path, name: str, there: Collection[str]) -> SrosError:
     names = sorted(there)
     more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
     why = f"The keystore has {', '.join(names[:_SHOWN]) or 'no enclave'}{more}."
-    return KeystoreError(what, why, f"Create it with `sros create_enclave {root} {name}`.")
+    create = f"`sros create_enclave {root} {name}`"
+    return KeystoreError(what, why, f"If it is not a typo, create it with {create}.")
 
 
 def _revocation(root: Path, name: str) -> Entry | None:
@@ -65,16 +68,21 @@ def likely_names(name: str, there: Collection[str]) -> tuple[str, ...]:
     """Return at most three enclaves that a mistyped ``name`` may mean.
 
     These are the enclaves whose names end with ``name``, because people leave out the namespace;
-    if there are none, the enclaves whose last part is spelled almost alike.
+    if there are none, the enclaves whose last part is spelled almost alike, and else those whose
+    whole name is.  Capital letters do not count.
     """
-    end = "/" + name.strip("/")
+    end = "/" + name.strip("/").lower()
     if end == "/":
         return ()
-    found = [each for each in there if each.endswith(end)]
+    lower = {each: each.lower() for each in there}
+    found = [each for each in there if lower[each].endswith(end)]
     if not found:
-        last = {each: each.rpartition("/")[2] for each in there}
-        alike = difflib.get_close_matches(
-            end.rpartition("/")[2], set(last.values()), n=3, cutoff=_ALIKE
-        )
-        found = [each for each in there if last[each] in alike]
-    return tuple(sorted(found)[:3])
+        last = {each: text.rpartition("/")[2] for each, text in lower.items()}
+        found = _alike(end.rpartition("/")[2], last, _ALIKE)
+    return tuple(sorted(found or _alike(end, lower, _WHOLE_ALIKE))[:3])
+
+
+def _alike(text: str, texts: Mapping[str, str], least: float) -> list[str]:
+    """Return the enclaves whose text (the value) is spelled almost as ``text``."""
+    alike = difflib.get_close_matches(text, set(texts.values()), n=3, cutoff=least)
+    return [each for each, written in texts.items() if written in alike]

@@ -72,7 +72,8 @@ def load_rights(path: Path) -> RightsSource:
         )
     data = read_bytes(path, "file")
     signed = b"multipart/signed" in data[:1000].lower()
-    if not signed and parse(data, f"'{path}'").tag == "policy":
+    # read_policy says how a policy of an earlier format, with <profiles> at the top, is converted.
+    if not signed and parse(data, f"'{path}'").tag in ("policy", "profiles"):
         policy = read_policy(path)
         return RightsSource(path, "policy", policy_rights(policy), None, True, ())
     return _document_rights(path, "permissions", path)

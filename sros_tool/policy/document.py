@@ -258,6 +258,8 @@ _XML_ATTRIBUTES = ("{http://www.w3.org/XML/1998/namespace}",)
 _VERSION = re.compile(r"0\.2\.[0-9]+\Z")
 _EARLIER = "Version 0.1.0, of ROS 2 Crystal to Eloquent, has nodes in place of enclaves."
 _EARLIER_BLOCKS = ("profiles", "contexts")
+_EARLIER_ROOTS = ("profiles",)
+"""The elements of earlier formats that are converted without a <policy> around them."""
 _QUALIFIERS = {qualifier.value: qualifier for qualifier in Qualifier}
 
 
@@ -274,6 +276,9 @@ def read_policy(path: Path, content: bytes | None = None) -> Policy:
 
 
 class _Reader:
+    _other_roots: tuple[str, ...] = ()
+    """The root elements that are read besides <policy>."""
+
     def __init__(self, path: Path, content: bytes | None) -> None:
         self._shown = path
         self._file = Path(os.path.realpath(path))
@@ -311,12 +316,15 @@ class _Reader:
     def _root(self) -> tuple[etree._Element, IncludedFile]:
         root = self._includer.load(self._file)
         place = IncludedFile(self._file)
-        if root.tag != "policy":
-            raise PolicyError(
-                f"{self._where(root, place)}: the file is not a policy",
-                f"Its root element is <{tag_of(root)}>, not <policy>.",
-                "" if root.tag != "profile" else "It is a fragment for other policies to include.",
-            )
+        if root.tag not in ("policy", *self._other_roots):
+            why = f"Its root element is <{tag_of(root)}>, not <policy>."
+            remedy = ""
+            if root.tag == "profile":
+                remedy = "It is a fragment for other policies to include."
+            elif root.tag in _EARLIER_ROOTS:
+                why += f" {_EARLIER}"
+                remedy = self._how_to_convert()
+            raise PolicyError(f"{self._where(root, place)}: the file is not a policy", why, remedy)
         return root, place
 
     def _how_to_convert(self) -> str:
@@ -428,7 +436,11 @@ class _Reader:
         items = self._children(element, place)
         names = tuple(self._name(*self._expect(child, at, item), node) for child, at in items)
         if not names:
-            raise PolicyError(f"{self._where(element, place)}: <{kind}> names no {item}")
+            raise PolicyError(
+                f"{self._where(element, place)}: <{kind}> names no {item}",
+                "",
+                f"Remove the element, or name one: <{item}>NAME</{item}>.",
+            )
         lines: tuple[int, ...] = ()
         if all(at.file == place.file for _, at in items):  # names can be included one by one
             lines = tuple(child.sourceline or 0 for child, _ in items)
@@ -538,8 +550,58 @@ def convert_policy(path: Path) -> ConvertedPolicy:
     return _EarlierReader(path, None).converted()
 
 
+_ONE_NODE = f"""<policy version="{VERSION}" xmlns:xi="http://www.w3.org/2001/XInclude">
+<enclaves><enclave path="/node"><profiles><profile ns="/" node="node">
+<xi:include href="common/node.xml" xpointer="xpointer(/profile/*)"/>
+</profile></profiles></enclave></enclaves></policy>"""
+
+
+def with_node_rights(policy: Policy, folder: Path) -> Policy:
+    """Return the policy with what every node needs added to each profile that lacks it.
+
+    ``folder`` has ``common/node.xml``, which says what every node of ROS 2 needs.
+    """
+    needed = read_policy(folder / "node.xml", _ONE_NODE.encode()).enclaves[0].all_profiles()[0]
+
+    def completed(profile: Profile) -> Profile:
+        present = {
+            (right, expand(name, profile.ns, profile.node))
+            for group in profile.groups
+            for name in group.names
+            for right, _ in group.rights
+        }
+        added = []
+        for group in needed.groups:
+            lacking = tuple(
+                name
+                for name in group.names
+                if not present.issuperset(
+                    (right, expand(name, profile.ns, profile.node)) for right, _ in group.rights
+                )
+            )
+            if lacking:
+                added.append(Group(group.kind, group.rights, lacking))
+        return replace(profile, groups=(*profile.groups, *added))
+
+    return replace(
+        policy,
+        enclaves=tuple(
+            replace(
+                enclave,
+                profiles=tuple(
+                    replace(block, profiles=tuple(map(completed, block.profiles)))
+                    for block in enclave.profiles
+                ),
+            )
+            for enclave in policy.enclaves
+        ),
+    )
+
+
 class _EarlierReader(_Reader):
     """Reader of a policy of an earlier format."""
+
+    _other_roots = _EARLIER_ROOTS
 
     def __init__(self, path: Path, content: bytes | None) -> None:
         super().__init__(path, content)
@@ -548,9 +610,12 @@ class _EarlierReader(_Reader):
     def converted(self) -> ConvertedPolicy:
         root, place = self._root()
         where = self._where(root, place)
-        self._attributes(root, place, optional=("version",))
-        version = root.get("version", "")
-        blocks = self._children(root, place)
+        if root.tag in _EARLIER_ROOTS:
+            version, blocks = "", [(root, place)]
+        else:
+            self._attributes(root, place, optional=("version",))
+            version = root.get("version", "")
+            blocks = self._children(root, place)
         tags = [tag_of(child) for child, _ in blocks]
         if _VERSION.match(version) and tags == ["enclaves"]:
             raise PolicyError(

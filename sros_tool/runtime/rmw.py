@@ -70,11 +70,9 @@ def rmw_implementations(environment: Mapping[str, str]) -> tuple[str, ...]:
 
     Searches the prefixes in AMENT_PREFIX_PATH, and the prefix of this Python, which wheels use.
     """
-    prefixes = [*environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
     found = {
         file.name
-        for prefix in prefixes
-        if prefix
+        for prefix in _prefixes(environment)
         for file in Path(prefix, _RMW_INDEX).glob("*")
         if file.name != _NOT_AN_RMW
     }
@@ -82,15 +80,51 @@ def rmw_implementations(environment: Mapping[str, str]) -> tuple[str, ...]:
     return tuple(sorted(found, key=lambda name: (name != preferred, name)))
 
 
+def _prefixes(environment: Mapping[str, str]) -> list[str]:
+    paths = environment.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    return [each for each in (*paths, sys.prefix) if each]
+
+
+def built_without_security(rmw: str, environment: Mapping[str, str]) -> bool:
+    """Return whether an installed RMW surely has no DDS Security, without starting it.
+
+    The library of an rmw_fastrtps has the message "this Fast DDS version doesn't have the security
+    libraries" only if it was built without them (rmw_fastrtps of Jazzy, participant.cpp). False
+    says nothing: only `sros doctor` tries what an RMW enforces.
+    """
+    if not rmw.startswith("rmw_fastrtps"):
+        return False
+    for prefix in _prefixes(environment):
+        if Path(prefix, _RMW_INDEX, rmw).exists():
+            try:
+                with Path(prefix, "lib", _FAST_LIBRARY).open("rb") as file:
+                    return _NO_SECURITY in file.read(_MOST_BYTES)
+            except OSError:
+                return False
+    return False
+
+
+_FAST_LIBRARY = "librmw_fastrtps_shared_cpp.so"
+_NO_SECURITY = b"have the security libraries"
+_MOST_BYTES = 16 * 1024 * 1024
+
+
 def vendor_here(environment: Mapping[str, str]) -> tuple[Vendor, str]:
     """Return the DDS vendor of this machine, and the reason as a short text.
 
-    It is the vendor of $RMW_IMPLEMENTATION, else of an installed RMW, else Fast DDS.
+    It is the vendor of $RMW_IMPLEMENTATION, else of an installed RMW, else Fast DDS.  The text says
+    so if that RMW was built without DDS Security.
     """
     named = environment.get(RMW, "")
     if vendor := vendor_of(named):
-        return vendor, f"{RMW} is {named}"
+        return vendor, f"{RMW} is {named}{_without_security(named, environment)}"
     for rmw in rmw_implementations(environment):
         if vendor := vendor_of(rmw):
-            return vendor, f"{rmw} is installed here"
+            return vendor, f"{rmw} is installed here{_without_security(rmw, environment)}"
     return Vendor.FAST, "the default of ROS 2 Jazzy"
+
+
+def _without_security(rmw: str, environment: Mapping[str, str]) -> str:
+    if not built_without_security(rmw, environment):
+        return ""
+    return ", but here it is built without security and enforces nothing"

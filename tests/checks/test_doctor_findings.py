@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 
@@ -47,8 +48,35 @@ def test_findings(as_json: bool, bench: Bench, monkeypatch: pytest.MonkeyPatch) 
     assert "enclave.file-empty" in broken
 
 
-def test_status_0_where_nothing_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "examine", lambda *_: Diagnosis((RMW, CYCLONE)))
+SECURE = replace(RMW, name="rclpy with rmw_s", enforces=True, rmw="rmw_s")
+ABSENT = replace(RMW, present=False, enforces=None, rmw="")
+UNTRIED = replace(RMW, enforces=None)
+BY = "DDS Security can be enforced here, by "
+
+
+@pytest.mark.parametrize(
+    ("stacks", "status", "said", "ros"),
+    [
+        ((SECURE, CYCLONE), 0, f"{BY}rclpy with rmw_s and Cyclone DDS.", True),
+        ((CYCLONE,), 0, f"{BY}Cyclone DDS. No RMW is installed", None),
+        ((ABSENT, CYCLONE), 0, f"{BY}Cyclone DDS. No RMW is installed", None),
+        ((RMW, CYCLONE), 1, "but NOT by ROS nodes: rmw_x does not enforce it. The ROS 2", False),
+        ((UNTRIED, CYCLONE), 1, "but NOT by ROS nodes: rmw_x could not be tried.", None),
+        ((RMW, SECURE), 1, "rmw_x does not enforce it. Set RMW_IMPLEMENTATION=rmw_s", False),
+        ((RMW,), 1, "Nothing here enforces DDS Security.", False),
+    ],
+)
+def test_the_status_is_about_the_nodes_of_ros(
+    stacks: tuple[Stack, ...],
+    status: int,
+    said: str,
+    ros: bool | None,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(doctor, "examine", lambda *_: Diagnosis(stacks))
     # Other tests run secured processes on this machine, and doctor looks at those, too.
     monkeypatch.setattr(runtime, "running_processes", lambda: iter(()))
-    assert sros("doctor", env={}).ok().out.endswith("DDS Security can be enforced here.\n")
+    ended = sros("doctor", env={})
+    assert ended.status == status
+    assert said in ended.out.rpartition("\n\n")[2]
+    assert json.loads(sros("doctor", "--json", env={}).out)["ros_enforces"] is ros

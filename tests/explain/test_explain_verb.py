@@ -62,7 +62,7 @@ def test_a_question_loads_only_what_answers_it(whole: Path) -> None:
     )
     *lines, names = run([sys.executable, "-c", code]).stdout.splitlines()
     assert lines[0].startswith("yes")
-    assert len(names.split()) <= 52
+    assert len(names.split()) <= 54
     assert not set(names.split()).intersection(
         f"sros_tool.{each}"
         for each in ("explain.change", "explain.remedy", "keystore.transaction", "runtime.stacks")
@@ -428,6 +428,17 @@ def test_the_policy_that_is_not_named_is_told_by_its_digest(whole: Path) -> None
     assert answer(whole, ENCLAVE, "publish", "/chatter")["policy_sha256"] == digest
     named = explain(whole, ENCLAVE, "publish", "/chatter", "--policy", POLICY)
     assert digest[:12] not in named.out
+
+
+@pytest.mark.parametrize("template", ["development", "production"])
+def test_the_default_of_the_template_is_no_policy_file(template: str, tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", template).ok()
+    sros("create_enclave", root, "/plain").ok()
+    found = explain(root, "/plain", "publish", "/parameter_events")
+    assert found.status == 0
+    assert "from      the default of the keystore's template" in found.out
+    assert "digest" not in found.out and "--policy" not in found.out
 
 
 # ── who, and reach ─────────────────────────────────────────────────────────────────────────

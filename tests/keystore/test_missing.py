@@ -24,6 +24,8 @@ THERE = ("/mobile_robot/base", "/mobile_robot/teleop", "/mobile_robot/velocity_m
         ("/mobile_robot/telop", ("/mobile_robot/teleop",)),
         ("/telop", ("/mobile_robot/teleop",)),
         ("/base", ("/arm/base", "/mobile_robot/base")),
+        ("/MOBILE_ROBOT/TELEOP", ("/mobile_robot/teleop",)),
+        ("/mobile_robot_velocity_mux", ("/mobile_robot/velocity_mux",)),
         ("/mobile_robot", ()),
         ("/camera", ()),
         ("/", ()),
@@ -43,7 +45,10 @@ def test_the_error_names_who_may_be_meant_and_does_not_say_to_make_it() -> None:
 
 def test_where_nobody_is_meant_the_error_says_who_is_there() -> None:
     text = str(no_such_enclave(Path("robot"), "/camera", [*THERE, "/x", "/y"]))
-    assert "/x and 1 more. Create it with `sros create_enclave robot /camera`." in text
+    assert (
+        "/x and 1 more. If it is not a typo, create it with `sros create_enclave robot /camera`."
+        in text
+    )
 
 
 def test_a_name_that_could_not_be_made_is_told_so() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import PolicyError
 from sros_tool.policy.document import convert_policy, read_policy
 from sros_tool.policy.model import Policy
+from sros_tool.policy.rights import policy_rights
 from sros_tool.translate import permissions_for
 from sros_tool.validity import Window
 from tests.policy.earlier_policies import EARLIER, FRAGMENTS, PRESENT, policies
@@ -185,3 +187,34 @@ def any_time() -> Window:
     from datetime import UTC, datetime
 
     return Window(datetime(2026, 1, 1, tzinfo=UTC), datetime(2027, 1, 1, tzinfo=UTC))
+
+
+_ALONE = """<profiles>
+  <profile ns="/arm" node="talker"><topics publish="ALLOW"><topic>chatter</topic></topics></profile>
+  <profile ns="/" node="listener">
+    <topics subscribe="ALLOW"><topic>/arm/chatter</topic></topics>
+    <topics publish="ALLOW"><topic>/rosout</topic></topics>
+  </profile>
+</profiles>"""
+
+
+def test_profiles_without_a_policy_around_them(tmp_path: Path) -> None:
+    old, new = _files(tmp_path, _ALONE), tmp_path / "new.xml"
+    for verb in (("check", "policy", old), ("diff_policy", old, old)):
+        ended = sros(*verb)
+        assert f"sros policies --convert {old} -o" in ended.out + ended.err
+    sros("policies", "--convert", old, "-o", new).ok()
+    assert [each.path for each in read_policy(new).enclaves] == ["/arm/talker", "/listener"]
+
+
+def test_what_every_node_needs_is_added_on_request(tmp_path: Path) -> None:
+    old, new = _files(tmp_path, _ALONE), tmp_path / "new.xml"
+    said = sros("policies", "--convert", old, "-o", new).ok().err
+    before = policy_rights(read_policy(new))
+    assert sros("check", "policy", new).status == 1
+    (command,) = re.findall(r"`sros (policies --convert [^`]*)`", said)
+    sros(*command.split()).ok()
+    assert "nothing found" in sros("check", "policy", new).ok().err
+    assert before < policy_rights(read_policy(new))
+    assert new.read_text().count("/rosout") == 2, "what a profile has is not added again"
+    assert sros("policies", "--with-node-rights").status == 2

@@ -265,3 +265,15 @@ def test_includes_give_what_lxml_gives_or_are_refused(odd: bool) -> None:
 
     compare()
     assert read, "nothing was compared"
+
+
+def test_a_group_that_names_nothing_is_to_be_removed(tmp_path: Path) -> None:
+    file = tmp_path / "p.xml"
+    file.write_text(
+        '<policy version="0.2.0"><enclaves><enclave path="/a"><profiles>'
+        '<profile ns="/" node="a"><topics publish="ALLOW"></topics></profile>'
+        "</profiles></enclave></enclaves></policy>"
+    )
+    with pytest.raises(PolicyError, match="<topics> names no topic") as caught:
+        read_policy(file)
+    assert "Remove the element" in str(caught.value)
