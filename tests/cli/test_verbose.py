@@ -47,7 +47,7 @@ def test_twice_reports_the_files_as_well(
     keystore: Path, before: str, after: tuple[str, ...]
 ) -> None:
     done = sros(before, "create_enclave", keystore, "/a", *after).ok()
-    assert "read the template" in done.err
+    assert "read the settings file" in done.err
     assert "create enclaves/a/key.pem" in done.err
 
 
