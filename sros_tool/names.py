@@ -29,6 +29,24 @@ PARAMETER_SERVICES = (
 NODE_SERVICES = (*PARAMETER_SERVICES, "get_type_description")
 """All services that a node of ROS 2 Jazzy offers under its own name, as ``~/NAME``."""
 
+READING_SERVICES = (
+    "_container/list_nodes",
+    "describe_parameters",
+    "get_available_states",
+    "get_available_transitions",
+    "get_logger_levels",
+    "get_parameter_types",
+    "get_parameters",
+    "get_state",
+    "get_transition_graph",
+    "get_type_description",
+    "list_parameters",
+)
+"""Services of nodes, as ``~/NAME``, that answer questions and change nothing.
+
+Sources: rcl_interfaces, lifecycle_msgs, composition_interfaces and type_description_interfaces.
+"""
+
 DISTRIBUTIONS = (
     "ardent", "bouncy", "crystal", "dashing", "eloquent", "foxy", "galactic", "humble", "iron",
     "jazzy", "kilted", "rolling",

@@ -201,7 +201,8 @@ Example:
 @click.option(
     "--infrastructure",
     is_flag=True,
-    help="With --reach, count /parameter_events too, which all nodes share.",
+    help="With --reach, count /parameter_events too, which all nodes share, and requests that only"
+    " ask, such as get_parameters.",
 )
 @click.option("--log", metavar="FILE", help="Explain the lines of a DDS log; - is standard input.")
 @json_option
@@ -844,7 +845,7 @@ def _show_reach(
     as_json: bool,
 ) -> int:
     """Print which enclaves one enclave can influence and learn from; return 0."""
-    from sros_tool.explain.reach import OF_EVERY_NODE, Network
+    from sros_tool.explain.reach import OF_EVERY_NODE, QUESTIONS, Network
     from sros_tool.keystore.missing import likely_names
     from sros_tool.keystore.rights import load_rights
 
@@ -853,8 +854,8 @@ def _show_reach(
     if rest:
         raise UsageError("--reach takes one enclave, and no question")
     source = load_rights(root or policy or keystore_from_environment())
-    without = () if infrastructure else OF_EVERY_NODE
-    network = Network(source.rights, without=without, **_uncontrolled(source))
+    without, questions = ((), ()) if infrastructure else (OF_EVERY_NODE, QUESTIONS)
+    network = Network(source.rights, without=without, questions=questions, **_uncontrolled(source))
     if source.kind == "keystore":
         _check_there(source.path, enclave)
     if enclave not in network.enclaves:
@@ -867,14 +868,17 @@ def _show_reach(
     with progress("following the rights"):
         reach = network.reach(enclave)
     if as_json:
-        print_json({"path": str(source.path), "left_out": list(without), **_reach_json(reach)})
+        print_json(
+            {"path": str(source.path), "left_out": [*without, *questions], **_reach_json(reach)}
+        )
     else:
         for line in _reach_lines(reach):
             click.echo(line)
     print_notes(source.notes)
     if without and not as_json:
-        text = f"left out: {', '.join(without)}, which every node writes and reads"
-        click.echo(f"{text} (include it with --infrastructure)", err=True)
+        text = f"left out: {', '.join(without)}, which every node writes and reads, and requests "
+        text += "that only ask nodes about themselves, such as get_parameters and get_state"
+        click.echo(f"{text} (include them with --infrastructure)", err=True)
     return 0
 
 

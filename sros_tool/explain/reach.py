@@ -1,10 +1,11 @@
 """The reach of an enclave: the enclaves it can influence and learn from, over several hops.
 
 An enclave that publishes a topic influences all that may subscribe to it.  A service carries
-information in both directions: the request to the server, the reply to the client; an action
-consists of services and topics.  All of them are DDS topics, and are treated as such.  If both
-sides have wildcards, there is a hop if they share a name that neither side is denied.  Every
-enclave, with any rights, can write or read the topics that the governance leaves open.
+information in both directions: the request to the server, the reply to the client; requests that
+only ask (`QUESTIONS`) can be left out.  An action consists of services and topics.  All of them are
+DDS topics, and are treated as such.  If both sides have wildcards, there is a hop if they share a
+name that neither side is denied.  Every enclave, with any rights, can write or read the topics that
+the governance leaves open.
 
 This module reads no files.
 """
@@ -19,9 +20,9 @@ from functools import lru_cache
 from itertools import product
 
 from sros_tool.dds.governance import Governance
-from sros_tool.names import ACTION_SEPARATOR, is_expression
+from sros_tool.names import ACTION_SEPARATOR, READING_SERVICES, is_expression
 from sros_tool.policy.model import DENY
-from sros_tool.policy.patterns import common_name, literal_prefix, matches, overlap
+from sros_tool.policy.patterns import common_name, covers, literal_prefix, matches, overlap
 from sros_tool.policy.rights import Right
 from sros_tool.translate import SERVICE_ENDS, dds_names
 
@@ -59,6 +60,8 @@ def unguarded(governance: Governance) -> Iterator[Unguarded]:
 
 OF_EVERY_NODE = ("/parameter_events",)
 """Topics of every node: if they counted, every enclave would influence every other one."""
+QUESTIONS = tuple(f"*/{name}" for name in READING_SERVICES)
+"""Services whose requests change nothing: who calls them learns, and influences nobody."""
 
 _WRITER_RIGHTS = {
     "rt": ("topics", "publish", ""),
@@ -90,8 +93,9 @@ class Hop:
         return f"{self.source} {self.arrow()}"
 
     def arrow(self) -> str:
-        """Return text like ``-publish /x-> /b``."""
-        return f"-{self.right} {self.name}-> {self.target}"
+        """Return text like ``-publish /x-> /b``, or ``-call action /go-> /b``."""
+        kind = " action" if self.kind == "actions" else ""
+        return f"-{self.right}{kind} {self.name}-> {self.target}"
 
 
 HopPath = tuple[Hop, ...]
@@ -174,7 +178,8 @@ _Used = set[tuple[str, tuple[str, ...]]]
 class Network:
     """All enclaves of a system, connected by the topics that they may write and read.
 
-    ``without`` are topics (ROS names) to ignore.  All enclaves in ``everybody`` may use the
+    ``without`` are topics (ROS names) to ignore, ``questions`` are services (names or wildcards)
+    whose requests are ignored.  All enclaves in ``everybody`` may use the
     ``unguarded`` topics, independently of their rights.
     """
 
@@ -183,6 +188,7 @@ class Network:
         rights: Iterable[Right],
         *,
         without: Collection[str] = (),
+        questions: Collection[str] = (),
         unguarded: Iterable[Unguarded] = (),
         everybody: Iterable[str] = (),
     ) -> None:
@@ -194,11 +200,12 @@ class Network:
             for direction, topic in _topics(right):
                 into[right.enclave, direction].add(topic)
         ignored = ["rt" + name for name in without]
+        ignored += [f"rq/{name.lstrip('/')}{SERVICE_ENDS['rq']}" for name in questions]
         for (enclave, direction), topics in sorted(allowed.items()):
             outside = sorted(denied[enclave, direction].union(ignored))
             for topic in sorted(topics, key=_plain_first):
                 met = tuple(each for each in outside if overlap(each, topic))
-                if topic not in met:
+                if not any(each == topic or covers(each, topic) for each in met):
                     ends[direction].append(_Access(enclave, topic, met))
         for each, enclave in product(dict.fromkeys(unguarded), everybody):
             outside = sorted({*each.without, *ignored})

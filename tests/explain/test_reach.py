@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sros_tool.explain.reach import OF_EVERY_NODE, Network, Unguarded, path_text
+from sros_tool.explain.reach import OF_EVERY_NODE, QUESTIONS, Network, Unguarded, path_text
 from sros_tool.policy.model import ALLOW, DENY
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Right, Rules
@@ -51,8 +51,8 @@ def test_services_carry_both_ways() -> None:
 
 def test_actions_carry_both_ways_and_are_told_as_such() -> None:
     reach = Network(rights("/client call /go", "/server execute /go")).reach("/client")
-    assert path_text(reach.influences["/server"]) == "/client -call /go-> /server"
-    assert path_text(reach.learns_from["/server"]) == "/server -execute /go-> /client"
+    assert path_text(reach.influences["/server"]) == "/client -call action /go-> /server"
+    assert path_text(reach.learns_from["/server"]) == "/server -execute action /go-> /client"
     assert reach.influences["/server"][0].kind == "actions"
 
 
@@ -119,6 +119,26 @@ def test_names_that_do_not_count() -> None:
 def test_nobody_reaches_itself_through_itself_and_circles_end() -> None:
     found = [*CHAIN, *rights("/c publish /z", "/a subscribe /z", "/a subscribe /x")]
     assert reached(found, "/a") == ({"/b", "/c"}, {"/b", "/c"})
+
+
+@pytest.mark.parametrize(
+    "asked",
+    ["/b/get_parameters", "/*/get_parameters", "/ns/b/get_state", "/*/_container/list_nodes"],
+)
+@pytest.mark.parametrize("served", ["/*", ""])
+def test_a_question_changes_nothing(asked: str, served: str) -> None:
+    found = rights(f"/look request {asked}", f"/b reply {served or asked}")
+    with_questions = Network(found).reach("/look")
+    assert set(with_questions.influences) == {"/b"}
+    without = Network(found, questions=QUESTIONS).reach("/look")
+    assert (set(without.influences), set(without.learns_from)) == (set(), {"/b"})
+
+
+def test_requests_that_change_something_count() -> None:
+    found = rights("/c request /b/set_parameters", "/d request /*", "/b reply /*")
+    network = Network(found, questions=QUESTIONS)
+    assert {hop.target for hop in network.hops("/c")} == {"/b"}
+    assert {hop.target for hop in network.hops("/d")} == {"/b"}
 
 
 def test_hops_of_one_enclave() -> None:
