@@ -188,6 +188,26 @@ def governance_for(protection: DomainProtection, domains: DomainSet) -> Governan
     )
 
 
+def hidden_protections(protection: DomainProtection) -> list[tuple[str, str]]:
+    """Return pairs of protected names ("topic /camera/*") where the second hides the first.
+
+    A hidden protection never applies: for each of its DDS topics, a rule before decides.  As narrow
+    rules stand first, that is a rule for the same topics.
+    """
+    found = []
+    earlier: list[tuple[str, str]] = []
+    for named in protection.named:
+        own = _expressions(named)
+        by = [
+            next((at for one, at in earlier if covers(one, each) and covers(each, one)), "")
+            for each in own
+        ]
+        if all(by):
+            found.append((str(named), by[0]))
+        earlier += [(each, str(named)) for each in own]
+    return found
+
+
 def _expressions(named: NamedProtection) -> list[str]:
     """Return the DDS topics of a ROS name, for both sides of a service or action."""
     expressions: dict[str, None] = {}

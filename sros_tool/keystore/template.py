@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import parse_toml
-from sros_tool.names import expression_problem
+from sros_tool.names import expand, expression_problem
 from sros_tool.pki.token_uri import refuse_pin
-from sros_tool.policy.patterns import matches
+from sros_tool.policy.patterns import covers, matches
 from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.resources import templates_dir
 from sros_tool.validity import Span, duration_text, parse_duration, parse_span, span_text
@@ -240,6 +240,7 @@ def with_values(
         values: keys, such as ``protection.rtps``, with their new values as text.
         rules: protection of names, each in place of the one that the name has.
         dropped: kinds and names (``topic``, ``/camera/*``) whose own protection is removed.
+            Names without a leading / count from the root, as in a template.
 
     Raises:
         UsageError: a key or value is not one of a template, or a dropped name has no protection.
@@ -248,7 +249,7 @@ def with_values(
     protection = table["protection"]
     for kind, name in [*dropped, *((each.kind, each.name) for each in rules)]:
         entries = protection.get(kind, [])
-        left = [each for each in entries if each["names"] != [name]]
+        left = [each for each in entries if not _means(each["names"][0], name)]
         if (kind, name) in dropped and len(left) == len(entries):
             raise UsageError(
                 f"the {kind} {name} has no protection of its own",
@@ -258,7 +259,8 @@ def with_values(
         protection[kind] = left
     for each in rules:
         typed = {key: _typed(value) for key, value in each.values}
-        protection.setdefault(each.kind, []).append({"names": [each.name], **typed})
+        name = each.name if each.name.startswith("~") else expand(each.name, "/", "")
+        protection.setdefault(each.kind, []).append({"names": [name], **typed})
     for key, value in values:
         *path, last = key.split(".")
         inner: Any = table
@@ -275,6 +277,12 @@ def with_values(
         return _template(table, template.name)
     except _TemplateError as error:
         raise UsageError(f"the settings would not be valid: {error}") from error
+
+
+def _means(one: str, other: str) -> bool:
+    """Return whether two names in settings match the same names."""
+    one, other = (expand(each, "/", "") for each in (one, other))
+    return covers(one, other) and covers(other, one)
 
 
 class NamedValues(NamedTuple):

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+from sros_tool.names import expand
+
 
 class Level(StrEnum):
     """The strength of a protection; the long forms also prove which writer a message came from."""
@@ -35,6 +37,10 @@ class NamedProtection:
     kind: str
     name: str
     protection: TopicProtection
+
+    def __str__(self) -> str:
+        """Return kind and absolute name, as in "topic /camera/*"."""
+        return f"{self.kind.removesuffix('s')} {expand(self.name, '/', '')}"
 
 
 @dataclass(frozen=True, slots=True)

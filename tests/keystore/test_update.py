@@ -46,7 +46,7 @@ from sros_tool.keystore.template import (
     with_values,
 )
 from sros_tool.policy.document import read_policy
-from sros_tool.resources import policies_dir
+from sros_tool.resources import policies_dir, templates_dir
 from sros_tool.translate import governance_for
 from tests.support import made_by_ros2
 from tests.support.harness import (
@@ -236,6 +236,70 @@ def test_rules_for_names(root: Path) -> None:
     assert expressions == ["rt/camera/*", "*"]
     to(root, with_values(present_settings(root).settings, dropped=[("topic", "/camera/*")]))
     assert load_settings(root) == load_template("development")
+
+
+SIGNED = ("data=NONE", "metadata=SIGN")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "named"),
+    [
+        ("topic /cam/*", "topic cam/*", "topic /cam/*"),
+        ("topic cam/*", "topic /cam/*", "topic /cam/*"),
+        ("service reset", "service reset", "service /reset"),
+    ],
+)
+def test_a_rule_replaces_the_one_for_the_same_names(
+    first: str, second: str, named: str, root: Path
+) -> None:
+    for name, values in ((first, SIGNED), (second, ("data=ENCRYPT",))):
+        sros("update_keystore", root, "--rule", " ".join((name, *values)), "--allow-looser").ok()
+    for settings in (load_settings(root), present_settings(root).settings):
+        (rule,) = settings.protection.named
+        assert (str(rule), rule.protection.data) == (named, "ENCRYPT")
+    assert "governance.unreachable-rule" not in found(root)
+    kind, _, name = first.partition(" ")
+    sros("update_keystore", root, "--drop-rule", f"{kind} {name}").ok()
+    assert load_settings(root).protection.named == ()
+
+
+def test_a_rule_that_would_never_apply_is_refused(root: Path, tmp_path: Path) -> None:
+    before = snapshot(root)
+    rules = [x for data in ("NONE", "ENCRYPT") for x in ("--rule", f"topic /cam/* data={data}")]
+    template = tmp_path / "mine.toml"
+    text = (templates_dir() / "development.toml").read_text()
+    text += '[[protection.topic]]\nnames = ["/cam/*", "cam/*"]\ndata = "SIGN"\n'
+    template.write_text(text)
+    for words in (rules, ("--template", template)):
+        ended = sros("update_keystore", root, *words, "--allow-looser")
+        assert (ended.status, "topic /cam/* twice" in ended.err) == (2, True), ended
+        assert snapshot(root) == before
+    # What a keystore has already does not stop other changes, and no template accepts it.
+    sros("create_keystore", other := tmp_path / "other", "--template", template).ok()
+    (finding,) = [
+        each
+        for each in keystore_findings(other, now=LATER)
+        if each.id == "governance.unreachable-rule"
+    ]
+    assert not finding.accepted
+    sros("update_keystore", other, "--set", "permissions.validity=90d").ok()
+    sros("update_keystore", other, "--rule", "topic cam/* data=ENCRYPT").ok()
+    assert "governance.unreachable-rule" not in found(other)
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (("--rule", "topic cam/* data=SIGN"), "topic /cam/*"),
+        (("--set", "protection.default.data=SIGN"), "everything without"),
+    ],
+)
+def test_signing_payloads_alone_is_warned_of(words: tuple[str, ...], name: str, root: Path) -> None:
+    for dry_run in (("--dry-run",), ("--next",)):
+        err = sros("update_keystore", root, *words, "--allow-looser", *dry_run).ok().err
+        assert f"Fast DDS up to 2.14.5 loses messages of {name}" in err
+    assert "loses" not in sros("update_keystore", root, "--set", "permissions.validity=90d").err
+    assert "governance.signed-payload" in found(root)
 
 
 def test_own_copies_of_the_governance_follow(root: Path) -> None:

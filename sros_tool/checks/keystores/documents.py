@@ -513,8 +513,10 @@ def governance_findings(
     for rule in governance.domain_access_rules:
         subject = f"domain {rule.domains}"
         for kind, text in _rule_findings(rule):
-            # A template may choose open topics; no template chooses to lose messages.
-            by = "" if kind is SIGNED_PAYLOAD else keystore.accepts(_Chosen(kind, text, domains))
+            # A template may choose open topics; no template chooses to lose messages, or a rule
+            # that does nothing.
+            own = kind in (SIGNED_PAYLOAD, UNREACHABLE_TOPIC_RULE)
+            by = "" if own else keystore.accepts(_Chosen(kind, text, domains))
             yield kind.found(subject, text, file, accepted=by)
         for problem in _domain_problems(rule.domains):
             yield GOVERNANCE_DOMAIN_RANGE.found(subject, f"the range {problem}", file)

@@ -87,8 +87,15 @@ from sros_tool.keystore.transaction.transaction import Transaction
 from sros_tool.parallel import Progress
 from sros_tool.pki.certificates import enclave_subject, has_unique_part, same_key
 from sros_tool.pki.keys import PublicKey
+from sros_tool.policy.protection import DomainProtection, Level
 from sros_tool.policy.rights import compare
-from sros_tool.translate import governance_for, grant_rights, permissions_for, protection_for
+from sros_tool.translate import (
+    governance_for,
+    grant_rights,
+    hidden_protections,
+    permissions_for,
+    protection_for,
+)
 from sros_tool.xml import read_bytes
 
 
@@ -288,6 +295,14 @@ def _checked_target(root: Path, present: PresentSettings, target: Template) -> T
             "2.9.1).",
             "Add --set authorities.layout=separate to keep them, or create another keystore.",
         )
+    known = hidden_protections(present.settings.protection)
+    for hidden, by in hidden_protections(target.protection):
+        if (hidden, by) not in known:
+            raise UsageError(
+                f"the settings would protect {hidden} twice, and the second rule would never apply",
+                f"The rule for {by} decides on the same names.",
+                "State one rule for them.",
+            )
     return with_places(with_values(target), present.settings)
 
 
@@ -366,6 +381,8 @@ def update_keystore(
                 f"To replace and revoke certificates, run `sros renew {root} NAME --revoke-old`.",
             )
         update = updater.update(done, pending, keyring, progress)
+        lost = _signed_payloads(present.settings.protection, goal.settings.protection)
+        update = replace(update, remarks=(*update.remarks, *lost))
         if not dry_run and not allow_looser and (looser := update.looser()):
             raise UsageError(
                 f"the update would make keystore '{root}' looser: {'; '.join(looser)}",
@@ -397,6 +414,29 @@ def _first_step(present: PresentSettings, goal: _Goal) -> _Goal:
         description=present.settings.description,
     )
     return _Goal(settings, present.domains)
+
+
+def _signed_payloads(before: DomainProtection, after: DomainProtection) -> list[Note]:
+    """Return a note if payloads become signed only, with which Fast DDS loses messages."""
+    old, new = (
+        {
+            name
+            for name, data in (
+                ("everything without protection of its own", side.default.data),
+                *((str(each), each.protection.data) for each in side.named),
+            )
+            if data is Level.SIGN
+        }
+        for side in (before, after)
+    )
+    if not new - old:
+        return []
+    text = (
+        f"With data=SIGN, Fast DDS up to 2.14.5 loses messages of {', '.join(sorted(new - old))}: "
+        "those whose length is not a multiple of four. Take data=NONE with metadata=SIGN, which "
+        "signs the payload with its submessage, or data=ENCRYPT."
+    )
+    return [Note("governance.signed-payload", text)]
 
 
 def _pending(present: PresentSettings, goal: _Goal) -> tuple[UpdateStage, ...]:
