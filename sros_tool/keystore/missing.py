@@ -60,7 +60,8 @@ def _was_revoked(root: Path, entry: Entry) -> SrosError:
     return KeystoreError(
         f"enclave {entry.enclave} of keystore '{root}' was revoked at {entry.time}{reason}",
         f"Its files are in '{folder}'." if folder.is_dir() else "",
-        f"To use it again, create it with `sros create_enclave {root} {entry.enclave}`.",
+        f"To use it again, with another key: `sros generate_artifacts -k {root} -e {entry.enclave} "
+        "-p POLICY_FILE`.",
     )
 
 

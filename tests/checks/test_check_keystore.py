@@ -31,14 +31,32 @@ def ids(root: Path, now: datetime = NOW) -> list[str]:
 
 
 @pytest.mark.parametrize("template", ["sros2", "development", "production"])
-def test_nothing_is_found_in_what_sros_makes(template: str, tmp_path: Path) -> None:
-    root = tmp_path / "ks"
+def test_only_an_open_enclave_is_found_in_what_sros_makes(template: str, tmp_path: Path) -> None:
+    root, policy = tmp_path / "ks", tmp_path / "policy.xml"
+    policy.write_text(policy_text({"/a": publish("x")}))
     sros("create_keystore", root, "--template", template).ok()
     sros("create_enclave", root, "/a").ok()
+    ended = sros("check", "keystore", root)
+    assert ended.status == (template != "production"), ended
+    assert ("keystore.allow-everything" in ended.out) == (template != "production")
+    sros("create_permission", root, "/a", policy).ok()
     ended = sros("check", "keystore", root).ok()
     named = "keystore.one-authority" in ended.out
     assert named == (template == "sros2")
     assert sros("check", root, "--strict").status == (template != "production")
+
+
+def test_a_template_accepts_nothing_that_was_opened_later(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", "production").ok()
+    sros("create_enclave", root, "/a").ok()
+    sros("check", root).ok()
+    words = ("update_keystore", root, "--allow-looser", "--set")
+    sros(*words, "protection.rtps=NONE", "--set", "protection.default.data=NONE").ok()
+    sros(*words, "protection.default.metadata=NONE").ok()
+    ended = sros("check", root)
+    assert ended.status == 1
+    assert "accepted by" not in ended.out
 
 
 def test_a_folder_that_is_named_like_a_family_is_that_folder(tmp_path: Path) -> None:
@@ -70,7 +88,7 @@ def test_one_authority_that_nobody_chose(tmp_path: Path) -> None:
 
 def test_weaknesses_of_single_files(tmp_path: Path) -> None:
     root = tmp_path / "ks"
-    sros("create_keystore", root).ok()
+    sros("create_keystore", root, "--template", "production").ok()
     sros("create_enclave", root, "/a", "/b").ok()
     assert ids(root) == []
     (root / "enclaves/a/key.pem").chmod(0o644)
@@ -84,7 +102,7 @@ def test_weaknesses_of_single_files(tmp_path: Path) -> None:
 
 def test_a_revocation_list_that_ends(tmp_path: Path) -> None:
     root = tmp_path / "ks"
-    sros("create_keystore", root).ok()
+    sros("create_keystore", root, "--template", "production").ok()
     sros("create_enclave", root, "/a", "/b").ok()
     sros("revoke", root, "/b").ok()
     assert ids(root) == []
@@ -93,7 +111,7 @@ def test_a_revocation_list_that_ends(tmp_path: Path) -> None:
 
 def test_a_key_on_its_robot_is_no_fault(tmp_path: Path) -> None:
     root, robot = tmp_path / "ks", tmp_path / "robot"
-    sros("create_keystore", root).ok()
+    sros("create_keystore", root, "--template", "production").ok()
     sros("create_request", "/arm", robot).ok()
     answer = tmp_path / "answer.tar.gz"
     sros("sign_request", root, robot / "enclaves/arm/request.pem", "-o", answer).ok()

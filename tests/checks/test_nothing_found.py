@@ -44,7 +44,9 @@ def life(root: Path, template: str) -> Iterator[tuple[str, Path]]:
 @pytest.mark.parametrize("template", template_names())
 def test_nothing_is_found(template: str, tmp_path: Path) -> None:
     for step, path in life(tmp_path, template):
-        ended = sros("check", path)
+        # By the other templates, /extra and /arm may do everything without a policy.
+        left_out = () if template == "production" else ("--exclude", "keystore.allow-everything")
+        ended = sros("check", path, *left_out)
         assert ended.status == 0, (step, ended)
         accepted = [line for line in ended.out.splitlines() if line.startswith("accepted by the ")]
         assert ended.out.splitlines() == accepted, step

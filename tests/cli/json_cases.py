@@ -259,8 +259,8 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("ks --dry-run"),
     ),
     "check": (
-        Case("ks"),
-        Case("ks --severity note"),
+        Case("ks", 1),
+        Case("ks --severity note", 1),
         Case("broken", 1),
         Case("empty --list"),
         Case("--list --include policy.*"),

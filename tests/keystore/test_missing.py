@@ -71,8 +71,8 @@ def test_of_a_revoked_enclave_it_says_since_when(tmp_path: Path) -> None:
     )
     said = (
         f"enclave /camera of keystore '{root}' was revoked at {entry.time} (keyCompromise). Its "
-        f"files are in '{root}/revoked/{serial}'. To use it again, create it with "
-        f"`sros create_enclave {root} /camera`."
+        f"files are in '{root}/revoked/{serial}'. To use it again, with another key: "
+        f"`sros generate_artifacts -k {root} -e /camera -p POLICY_FILE`."
     )
     assert str(no_such_enclave(root, "/camera", list_enclaves(root))) == said
     for words in (("/camera", "publish", "/x"), ("--reach", "/camera")):

@@ -273,8 +273,9 @@ def _revoked_before(
         raise KeystoreError(
             f"a policy names {', '.join(unasked)}, revoked in keystore '{root}'",
             "Its policy would create it again, and `distribute_key --all` would export it.",
-            "Remove it from the policy; or, to have it again with another key, create it by its "
-            f"name first: `sros create_enclave {quote(str(root))} {' '.join(unasked)}`.",
+            "Remove it from the policy; or, to have it again with another key and the rights of "
+            f"the policy, name it, too: `sros generate_artifacts -k {quote(str(root))} -e "
+            f"{' '.join(unasked)} -p POLICY_FILE`.",
         )
     return [
         Note(
