@@ -303,9 +303,11 @@ def print_restart(names: Sequence[str]) -> None:
     """Print on stderr that the processes of the enclaves ``names`` have to be restarted."""
     if not names:
         return
-    shown = ", ".join(names[:_MAX_NAMES]) + (", ..." if len(names) > _MAX_NAMES else "")
+    more = len(names) - _MAX_NAMES
+    shown = ", ".join(names[:_MAX_NAMES]) + (f" and {more} more, see --json" if more > 0 else "")
     number = "1 enclave" if len(names) == 1 else f"{len(names)} enclaves"
-    click.echo(f"restart the processes of {number} for it to take effect: {shown}", err=True)
+    text = f"restart the processes of {number} for it to take effect: {shown}"
+    click.echo(f"{text}; where they run from an export, export them again first", err=True)
 
 
 def check_output(output: Path, *, force: bool) -> None:
