@@ -235,9 +235,15 @@ def _show(result: Creation, dry_run: bool, as_json: bool) -> None:
     elif dry_run:
         print_plan(result.root, result.changes)
     else:
+        same = {each.enclave for each in result.replaced if not (each.lost or each.gained)}
+        again = [name for name in result.changed if name in same]
         for names, text in (
             (result.created, "created enclave {}"),
-            (result.changed, "replaced the permissions of enclave {}"),
+            (
+                [name for name in result.changed if name not in same],
+                "replaced the permissions of enclave {}",
+            ),
+            (again, "signed the permissions of enclave {} again, with the same rights"),
             (result.completed, "completed enclave {}"),
         ):
             for name in names:
@@ -723,8 +729,15 @@ def update_keystore(
         raise UsageError("give only one of --template, --take-edits and --discard-edits")
     chosen = (template_name, values, rules, dropped, domain, take_edits, discard_edits)
     if not any(each not in (None, (), False) for each in chosen):
+        again = f"sros update_keystore {quote(str(root))} --template production --next"
         raise UsageError(
-            "no change is named", "", "Name one with --template, --set, --rule or --domain."
+            "no change is named",
+            "A keystore does not keep the goal of a change of which only the first stage is done."
+            if next_stage
+            else "",
+            f"Name the goal again, with the same options as for that stage, for example `{again}`."
+            if next_stage
+            else "Name one with --template, --set, --rule or --domain.",
         )
     if take_edits and next_stage:
         raise UsageError(
@@ -769,7 +782,19 @@ def update_keystore(
     if layout and shared and not update.done:
         raise UsageError("update_keystore cannot do more to separate the CAs", shared)
     undone = present.edits.clauses() if discard_edits else ()
-    _show_update(update, undone, dry_run=dry_run, as_json=as_json)
+    # What the first stage issued is not old; only another domain makes permissions of it old.
+    options = {
+        "--template": [template_name] if template_name is not None else [],
+        "--set": values,
+        "--rule": rules,
+        "--drop-rule": dropped,
+        "--domain": [domain] if domain is not None else [],
+    }
+    flags = ("--next", *(["--allow-looser"] * allow_looser))
+    flags += ("--revoke-old",) * (revoke_old and domain is not None)
+    words = [each for name, given in options.items() for one in given for each in (name, one)]
+    again = " ".join(map(quote, ("sros", "update_keystore", str(root), *words, *flags)))
+    _show_update(update, undone, again, dry_run=dry_run, as_json=as_json)
     refused = bool(update.looser()) and not allow_looser
     if refused:  # only a dry run comes here
         click.echo("this would be refused: it needs --allow-looser", err=True)
@@ -806,9 +831,13 @@ def _named_rule(text: str) -> NamedValues:
 
 
 def _show_update(
-    update: KeystoreUpdate, undone: Sequence[str], *, dry_run: bool, as_json: bool
+    update: KeystoreUpdate, undone: Sequence[str], again: str, *, dry_run: bool, as_json: bool
 ) -> None:
-    """Print an update; ``undone`` are clauses about the edits by hand that it undoes."""
+    """Print an update.
+
+    ``undone`` are clauses about the edits by hand that it undoes, ``again`` is the command of the
+    stage that is left.
+    """
     from sros_tool.validity import iso
     from sros_tool.values import as_plain
 
@@ -882,8 +911,7 @@ def _show_update(
     if update.left:
         click.echo(
             f"stage {update.done[-1]} {'would be' if dry_run else 'is'} done; left: "
-            f"{', '.join(update.left)}. Run the same command again once the processes were "
-            "restarted.",
+            f"{', '.join(update.left)}. Once the processes were restarted, run `{visible(again)}`.",
             err=True,
         )
     print_notes(update.notes)

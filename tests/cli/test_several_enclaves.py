@@ -23,7 +23,7 @@ def ks(tmp_path: Path) -> Path:
 VERBS = {
     "renew {}": "renewed enclave ",
     "revoke {}": "revoked enclave ",
-    "create_permission {} p.xml": "replaced the permissions of enclave ",
+    "create_permission {} p.xml": "signed the permissions of enclave ",
     "distribute_key {} robot": "exported enclave ",
 }
 CHOICES = {

@@ -400,6 +400,8 @@ def test_create_permission_replaces_and_says_so(keystore: Path, tmp_path: Path) 
     key = (keystore / "enclaves/a/key.pem").read_bytes()
     ended = sros("create_permission", keystore, "/a", tmp_path / "p.xml").ok()
     assert ended.out == "replaced the permissions of enclave /a\n"
+    again = sros("create_permission", keystore, "/a", tmp_path / "p.xml").ok()
+    assert again.out == "signed the permissions of enclave /a again, with the same rights\n"
     assert topics_of(keystore / "enclaves/a") == {"rt/new", "ros_discovery_info"}
     assert "rt/new" not in topics_of(keystore / "enclaves/b")
     assert (keystore / "enclaves/a/key.pem").read_bytes() == key

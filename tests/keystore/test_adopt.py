@@ -248,9 +248,12 @@ def test_what_cannot_be_taken_over_is_refused_as_a_whole(case: str, tmp_path: Pa
 def test_nothing_else_can_be_chosen_and_nothing_else_taken_over(tmp_path: Path) -> None:
     make(tmp_path / "foxy", "/a", now=NOW)
     _eloquent(tmp_path / "old")
-    for other in (tmp_path / "foxy", tmp_path / "nothing"):
+    for other, used in ((tmp_path / "foxy", True), (tmp_path / "nothing", False)):
         refused = sros("create_keystore", tmp_path / "new", "--from", other)
-        assert refused.status and "used as it is" in refused.err
+        assert refused.status == 2
+        said = {"used as it is": used, f"`sros check {other}`": used, "Name the folder": not used}
+        assert {each: each in refused.err for each in said} == said
+    sros("list_enclaves", tmp_path / "foxy").ok()
     for words in (("--template", "production"), ("--domain", "3"), ("--encrypt-ca-keys",)):
         ended = sros("create_keystore", tmp_path / "new", "--from", tmp_path / "old", *words)
         assert ended.status == 2 and f"{words[0]} and --from exclude" in ended.err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -352,6 +353,37 @@ def test_the_stages(root: Path) -> None:
     assert load_settings(root) == target
     third = to(root, target, next_stage=True)
     assert (third.done, third.changes) == ((), ())
+
+
+def printed(err: str) -> list[str]:
+    """The words of the command that is printed for the stage that is left."""
+    (command,) = re.findall("restarted, run `sros (.+?)`", err)
+    return shlex.split(command)
+
+
+def test_the_command_of_the_second_stage(root: Path) -> None:
+    """It runs as it is printed, and revokes nothing that the first stage issued."""
+    first = sros("update_keystore", root, "--template", "production", "--next", "--revoke-old").ok()
+    assert "renewed /free, /robot" in first.out
+    forgotten = sros("update_keystore", root, "--next")
+    assert (forgotten.status, "Name the goal again" in forgotten.err) == (2, True)
+    second = sros(*printed(first.err)).ok()
+    assert "renewed" not in second.out
+    assert load_settings(root) == load_template("production")
+    crl = read_crl(root)
+    assert crl
+    assert len(crl.revoked) == 2
+    sound(root)
+
+
+def test_another_domain_revokes_in_both_stages(root: Path) -> None:
+    """The second one signs permissions for it, so those of the first stage are old, too."""
+    words = ("--domain", "0,7", "--rule", "topic /a data=NONE", "--set", "permissions.validity=9d")
+    first = sros("update_keystore", root, *words, "--next", "--allow-looser", "--revoke-old").ok()
+    again = printed(first.err)
+    assert {"topic /a data=NONE", "0,7", "--allow-looser", "--revoke-old"} <= set(again)
+    assert "renewed /free, /robot" in sros(*again).ok().out
+    assert str(present_settings(root).domains) == "0,7"
 
 
 def test_revoking_the_old(root: Path) -> None:

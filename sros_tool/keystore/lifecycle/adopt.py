@@ -11,6 +11,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
+from shlex import quote
 
 from cryptography import x509
 
@@ -47,6 +48,7 @@ from sros_tool.keystore.layout import (
     earlier_nodes,
     enclave_folder,
     is_earlier_keystore,
+    is_keystore,
 )
 from sros_tool.keystore.ledger import Entry, append, certificate_entry, document_entry
 from sros_tool.keystore.lifecycle.create import Creation, check_free, place_notes
@@ -120,10 +122,16 @@ def adopt_keystore(
         tidy(root)
     check_free(root)
     if not is_earlier_keystore(earlier):
+        if is_keystore(earlier):
+            raise KeystoreError(
+                f"'{earlier}' is a keystore of ROS 2 Foxy or later",
+                "It is used as it is: there is nothing to take over, and no other keystore to "
+                "create.",
+                f"Name it where a verb takes a keystore, as in `sros check {quote(str(earlier))}`.",
+            )
         raise KeystoreError(
             f"'{earlier}' is not a keystore of ROS 2 Eloquent or earlier",
-            f"It has neither {EARLIER_CA} nor {EARLIER_CA_KEY}. A keystore of ROS 2 Foxy or later "
-            "is used as it is.",
+            f"It has neither {EARLIER_CA} nor {EARLIER_CA_KEY}.",
             "Name the folder that has them.",
         )
     with Folder(earlier) as folder:
