@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from datetime import tzinfo
 from functools import cache
 from pathlib import Path
@@ -225,9 +226,10 @@ def explain(
 ) -> int:
     """Show whether DDS lets an enclave do something, by which rule, and how to change that.
 
-    call and serve apply to services, execute to actions; with --type action, call applies to an
-    action. ROOT is a keystore, here or on a robot; ENCLAVE can also be an enclave's folder. With
-    --policy and no keystore, the policy itself is explained, before anything is signed.
+    call and serve apply to services, execute to actions; call and serve apply to an action if the
+    rights have an action NAME and no service NAME; --type decides it. ROOT is a keystore, here or on
+    a robot; ENCLAVE can also be an enclave's folder. With --policy and no keystore, the policy itself
+    is explained, before anything is signed.
 
     The exit status is 0 if it is allowed (with --who: to any enclave), and 1 if it is denied; with
     --log, 1 if the log reports a fault.
@@ -327,6 +329,10 @@ def _show_answer(
     context = options.context(enclave.domains)
     chosen, why = _vendor_of(vendor)
     evaluator = Evaluator(chosen, enclave, context)
+    taken: list[Note] = []
+    if not kind and (action := _action_meant(evaluator, question, policy)):
+        taken = _taken_for_action(question, action)
+        question = action
     answer = evaluator.explain(question)
     if all_vendors:
         others = {v: Evaluator(v, enclave, context) for v in Vendor if v is not chosen}
@@ -346,7 +352,12 @@ def _show_answer(
         word, _, head = next(lines).partition(":")
         click.echo(f"{coloured(word)}:{visible(head)}")
         _echo(lines)
-    notes = [*_provenance_notes(answer, policy), *_other_type(evaluator, answer, kind)]
+    notes = [
+        *taken,
+        *_provenance_notes(answer, policy),
+        *_other_type(evaluator, answer, kind),
+        *_other_name(answer, enclave),
+    ]
     if not all_vendors:
         measured = [
             answer if v is chosen else Evaluator(v, enclave, context).answer(question)
@@ -485,12 +496,58 @@ def _provenance_notes(answer: Answer, policy: Path | None) -> list[Note]:
     return [Note(f"explain.policy-{answer.provenance}", text)]
 
 
+def _action_meant(evaluator: Evaluator, question: Question, policy: Path | None) -> Question | None:
+    """Return the question about an action, if that is what the rights show the name to be.
+
+    The rights of the enclave come first; those of the policy and of the keystore are read only if
+    the service is denied.
+    """
+    if question.word not in ("call", "serve"):
+        return None
+    from sros_tool.explain.question import about_action
+    from sros_tool.keystore.layout import is_keystore
+    from sros_tool.keystore.rights import load_rights
+    from sros_tool.translate import grant_rights
+
+    answer = evaluator.answer(question)
+    name = evaluator.enclave.name
+    found = set(grant_rights(name, answer.grant)) if answer.grant else set()
+    if not answer.allowed:
+        root = evaluator.enclave.root
+        for path in (policy, root if root and is_keystore(root) else None):
+            if path:
+                with suppress(SrosError, OSError):
+                    found |= load_rights(path).rights
+    return about_action(question, found)
+
+
+def _taken_for_action(question: Question, action: Question) -> list[Note]:
+    text = (
+        f"{action.name} is an action in the rights here, and no service: {question.word} is taken "
+        f"for '{action}'; --type service asks about a service."
+    )
+    return [Note("explain.an-action", text)]
+
+
+def _other_name(answer: Answer, enclave: LoadedEnclave) -> list[Note]:
+    """Return a note with the names that may be meant, if the enclave has rights to such names."""
+    if answer.allowed or answer.problems or not answer.question.right:
+        return []
+    from sros_tool.explain.change import likely_names
+
+    names = likely_names(answer, enclave)
+    if not names:
+        return []
+    text = f"the enclave may {answer.question.word} {' and '.join(names)}: perhaps that is meant."
+    return [Note("explain.likely-name", text)]
+
+
 def _other_type(evaluator: Evaluator, answer: Answer, kind: str | None) -> list[Note]:
     """Return a note if the enclave may not call a service, but may call an action of this name."""
     from sros_tool.explain.question import ask
 
     question = answer.question
-    if question.word != "call" or kind or answer.allowed:
+    if question.word != "call" or question.type != "service" or kind or answer.allowed:
         return []
     action = ask("call", question.name, "action")
     if not evaluator.answer(action).allowed:
@@ -771,9 +828,10 @@ def _show_who(
     as_json: bool,
 ) -> int:
     """Print which enclaves of the keystore may do something; return 0 if any may, else 1."""
-    from sros_tool.explain.question import ask
+    from sros_tool.explain.question import about_action, ask
     from sros_tool.explain.who import who
     from sros_tool.keystore.layout import check_keystore, select_enclaves
+    from sros_tool.keystore.rights import load_rights
 
     if not 1 <= len(rest) <= 2:
         raise UsageError(
@@ -784,8 +842,15 @@ def _show_who(
     keystore = root or keystore_from_environment()
     check_keystore(keystore)
     names = select_enclaves(keystore, (), patterns) if patterns else None
+    taken: list[Note] = []
     with progress("asking"):
         found = who(keystore, question, chosen, options.context, at=options.at, names=names)
+        # A name that an enclave has as a service is one; a wildcard shows nothing about it.
+        if not kind and all(each.wildcard for each in found if each.outcome.ok):
+            rights = load_rights(keystore).rights if question.type == "service" else ()
+            if action := about_action(question, rights):
+                taken, question = _taken_for_action(question, action), action
+                found = who(keystore, action, chosen, options.context, at=options.at, names=names)
     allowed = any(each.outcome.ok for each in found)
     if as_json:
         print_json(
@@ -802,12 +867,13 @@ def _show_who(
             click.echo(line)
         documented = ", as documented" if chosen.documented_only else ""
         click.echo(f"{question}, on {chosen.title} ({why}{documented})", err=True)
-        if question.word == "call" and not kind and not allowed:
+        if question.type == "service" and question.word == "call" and not kind and not allowed:
             action = ask("call", question.name, "action")
             as_action = who(keystore, action, chosen, options.context, at=options.at, names=names)
             if any(each.outcome.ok for each in as_action):
                 text = f"enclaves may {action}: add --type action if it is an action."
                 print_notes([Note("explain.an-action", text)])
+    print_notes(taken)
     return 0 if allowed else 1
 
 

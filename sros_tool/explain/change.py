@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from difflib import get_close_matches
 
 from lxml import etree
 
@@ -15,9 +16,11 @@ from sros_tool.dds.decision.answers import AccessVerb
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
 from sros_tool.explain.answer import Answer, lines_of_right
-from sros_tool.explain.evaluator import Evaluator, plan_enclave
+from sros_tool.explain.denials import nodes_served
+from sros_tool.explain.evaluator import Evaluator, LoadedEnclave, plan_enclave
+from sros_tool.names import NODE_SERVICES, is_expression
 from sros_tool.policy.document import write_policy
-from sros_tool.policy.model import DENY, Enclave, Group, Policy, Profile, Profiles, Source
+from sros_tool.policy.model import ALLOW, DENY, Enclave, Group, Policy, Profile, Profiles, Source
 from sros_tool.policy.rights import Right, profile_rights
 from sros_tool.translate import dds_names, grant_rights
 
@@ -72,7 +75,7 @@ def smallest_change(evaluator: Evaluator, answer: Answer) -> PolicyChange | None
             return PolicyChange(
                 tuple(add),
                 tuple(lift),
-                _addition(add[0], enclave.policy) if add else "",
+                _addition(add[0], _places(enclave.policy, answer)) if add else "",
                 tuple(_edits(lift, enclave.policy)) if enclave.policy else (),
             )
         if tried.decision.reason in _NO_RULE and wanted not in present:
@@ -125,24 +128,67 @@ def _blocking(rights: Iterable[Right], answer: Answer) -> list[Right]:
     return own or other
 
 
-def _addition(right: Right, policy: Enclave | None) -> str:
-    """Return a policy with one right, in the profile of the node that it belongs to."""
-    ns, node = _node_for(right, policy)
+_ANY_NODE = ("/", "*")
+"""Namespace and name of a profile for any node: DDS decides by the enclave alone."""
+
+
+def _addition(right: Right, places: Iterable[tuple[str, str]]) -> str:
+    """Return a policy with one right, in the profile of the node that it belongs to.
+
+    It belongs to the node with the longest namespace around the right's name, of ``places``
+    (namespace and name of nodes).  Without any, no name of a node is invented.
+    """
+    known = list(places)
+    fitting = [each for each in known if right.name.startswith(each[0].rstrip("/") + "/")]
+    ns, node = max(fitting or known, key=lambda each: len(each[0]), default=_ANY_NODE)
     group = Group(right.kind, ((right.right, right.qualifier),), (right.name,))
     enclave = Enclave(right.enclave, (Profiles((Profile(ns, node, (group,)),)),))
     return write_policy(Policy((enclave,))).decode().rstrip()
 
 
-def _node_for(right: Right, policy: Enclave | None) -> tuple[str, str]:
-    """Return namespace and name of the node with the longest namespace around the right's name."""
-    profiles = policy.all_profiles() if policy else ()
-    fitting = [
-        each for each in profiles if right.name.startswith(each.ns.rstrip("/") + "/")
-    ] or list(profiles)
-    if not fitting:
-        return "/", right.enclave.rpartition("/")[2] or "node"
-    best = max(fitting, key=lambda each: len(each.ns))
-    return best.ns, best.node
+def _places(policy: Enclave | None, answer: Answer) -> Iterator[tuple[str, str]]:
+    """Yield namespace and name of an enclave's nodes.
+
+    Without its policy, these are the nodes whose standard services its permissions allow.
+    """
+    if policy:
+        yield from ((each.ns, each.node) for each in policy.all_profiles())
+        return
+    for node in nodes_served((each.right, each.name) for each in _granted(answer)):
+        ns, _, name = node.rpartition("/")
+        yield ns or "/", name
+
+
+def _granted(answer: Answer) -> Iterator[Right]:
+    if answer.grant:
+        yield from grant_rights("", answer.grant)
+
+
+_ALIKE = 0.9
+"""The lowest similarity (`difflib`) of a typo in a ROS name."""
+
+
+def likely_names(answer: Answer, enclave: LoadedEnclave) -> tuple[str, ...]:
+    """Return at most three names of the same right that the denied name of a question may mean.
+
+    For a standard service of a node, these are the services of the enclave's nodes; for any other
+    name, those that are spelled almost alike.
+    """
+    question = answer.question
+    names = {
+        each.name
+        for each in _present_rights(enclave.policy, enclave.name, answer)
+        if (each.right, each.qualifier) == (question.right, ALLOW) and not is_expression(each.name)
+    } - {question.name}
+    last = question.name.rpartition("/")[2]
+    if question.type == "service" and last in NODE_SERVICES:
+        own = sorted(each for each in names if each.rpartition("/")[2] == last)
+        return tuple(own) if len(own) <= _SHOWN else ()
+    return tuple(get_close_matches(question.name, sorted(names), n=_SHOWN, cutoff=_ALIKE))
+
+
+_SHOWN = 3
+"""The number of names that are proposed at most."""
 
 
 def _edits(lift: list[Right], policy: Enclave) -> Iterator[GroupEdit]:

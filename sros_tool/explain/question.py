@@ -6,6 +6,7 @@ execute for actions.  Mapping of names: ROS 2 design "Topic and Service name map
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from sros_tool.dds.decision.answers import AccessVerb
@@ -121,6 +122,24 @@ def ask(word: str, name: str = "", kind: str | None = None) -> Question:
             f"Leave --type out, or write --type {fitting[0]}.",
         )
     return Question(word, chosen, _RIGHTS[word, chosen], _checked(name, word, chosen))
+
+
+_OF_ACTIONS = {"call": "call", "serve": "execute"}
+
+
+def about_action(question: Question, rights: Iterable[Right]) -> Question | None:
+    """Return the question about the action of this name, if the rights have no such service.
+
+    Clients say call and servers say serve of both, and an action's name looks like that of a
+    service.  Returns None if ``rights`` do not show that the name is an action, or if the question
+    is about something else.
+    """
+    if question.type != "service" or question.word not in _OF_ACTIONS:
+        return None
+    kinds = {each.kind for each in rights if each.name == question.name}
+    if "actions" not in kinds or "services" in kinds:
+        return None
+    return ask(_OF_ACTIONS[question.word], question.name, "action")
 
 
 def _checked(name: str, word: str, kind: str) -> str:

@@ -127,4 +127,4 @@ def vendor_here(environment: Mapping[str, str]) -> tuple[Vendor, str]:
 def _without_security(rmw: str, environment: Mapping[str, str]) -> str:
     if not built_without_security(rmw, environment):
         return ""
-    return ", but here it is built without security and enforces nothing"
+    return ", built without security: it enforces nothing"

@@ -384,29 +384,101 @@ def test_call_is_of_a_service_unless_said_otherwise(whole: Path) -> None:
     assert answer(whole, ENCLAVE, "request", "/go")["question"]["right"] == "request"
 
 
-def test_an_action_that_was_taken_for_a_service(tmp_path: Path) -> None:
-    policy = policies_dir() / "fibonacci.xml"
-    asked = ("/fibonacci/client", "call", "/fibonacci", "--policy", policy)
-    found = explain(*asked)
-    assert found.status == 1
-    assert "note [explain.an-action]" in found.err
-    as_action = explain(*asked, "--type", "action")
-    assert (as_action.status, as_action.err) == (0, "")
-    assert explain(*asked, "--type", "service").err == ""
-    assert "an-action" not in explain("/fibonacci/server", *asked[1:]).err
+SERVER, CLIENT = "/fibonacci/server", "/fibonacci/client"
 
 
-def test_an_action_that_was_taken_for_a_service_of_anybody(tmp_path: Path) -> None:
-    root = tmp_path / "ks"
+@pytest.fixture(scope="module")
+def fibonacci(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("fibonacci") / "ks"
     sros("create_keystore", root, "--template", "production").ok()
     sros("generate_artifacts", "-k", root, "-p", policies_dir() / "fibonacci.xml").ok()
-    found = explain(root, "--who", "call", "/fibonacci")
-    assert found.status == 1
-    assert "note [explain.an-action]" in found.err
-    as_action = explain(root, "--who", "call", "/fibonacci", "--type", "action")
-    assert as_action.out.splitlines()[0] == "/fibonacci/client"
+    return root
+
+
+@pytest.mark.parametrize(
+    ("enclave", "word", "question", "status"),
+    [
+        (CLIENT, "call", "call action /fibonacci", 0),
+        (SERVER, "call", "call action /fibonacci", 1),
+        (SERVER, "serve", "execute action /fibonacci", 0),
+        (CLIENT, "serve", "execute action /fibonacci", 1),
+    ],
+)
+@pytest.mark.parametrize("by", ["keystore", "policy"])
+def test_a_name_that_is_an_action_is_asked_about_as_one(
+    enclave: str, word: str, question: str, status: int, by: str, fibonacci: Path
+) -> None:
+    place = (fibonacci,) if by == "keystore" else ("--policy", policies_dir() / "fibonacci.xml")
+    words = (enclave, word, "/fibonacci")
+    found = explain(*place, *words) if by == "keystore" else explain(*words, *place)
+    assert found.status == status
+    assert f" {question}, on " in found.out.splitlines()[0]
+    assert "note [explain.an-action]" in found.err and question in found.err
+    assert "<service>" not in found.out, "no right to a service is proposed"
+    chosen = explain(*place, *words, "--type", "service")
+    assert chosen.status == 1 and f"{word} service /fibonacci" in chosen.out
+    assert "an-action" not in chosen.err
+
+
+def test_a_name_that_is_an_action_is_asked_about_as_one_of_everybody(fibonacci: Path) -> None:
+    for word, who in (("call", CLIENT), ("serve", SERVER)):
+        found = explain(fibonacci, "--who", word, "/fibonacci")
+        assert (found.status, found.out) == (0, f"{who}\n1 of 2 enclaves may\n")
+        assert "note [explain.an-action]" in found.err
+    as_action = explain(fibonacci, "--who", "call", "/fibonacci", "--type", "action")
+    assert as_action.out.splitlines()[0] == CLIENT
     assert "an-action" not in as_action.err
-    assert "an-action" not in explain(root, "--who", "call", "/nothing").err
+    assert "an-action" not in explain(fibonacci, "--who", "call", "/nothing").err
+    assert "an-action" not in explain(fibonacci, CLIENT, "call", "/nothing").err
+
+
+def test_an_action_is_one_where_wildcards_allow_services(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root).ok()
+    sros("generate_artifacts", "-k", root, "-p", policies_dir() / "fibonacci.xml").ok()
+    sros("create_enclave", root, "/everything").ok()
+    found = explain(root, "--who", "call", "/fibonacci")
+    assert CLIENT in found.out and "/everything  by the wildcard" in found.out
+    assert "call action /fibonacci" in found.err
+
+
+def test_a_name_that_is_a_service_as_well_stays_one(tmp_path: Path) -> None:
+    policy = tmp_path / "p.xml"
+    policy.write_text(
+        '<policy version="0.2.0"><enclaves><enclave path="/a"><profiles>'
+        '<profile ns="/" node="a"><actions call="ALLOW"><action>/go</action></actions>'
+        '<services reply="ALLOW"><service>/go</service></services></profile>'
+        "</profiles></enclave></enclaves></policy>"
+    )
+    found = explain("/a", "call", "/go", "--policy", policy)
+    assert found.status == 1 and "may not call service /go" in found.out
+    assert "add --type action" in found.err
+
+
+@pytest.mark.parametrize(
+    ("template", "profile"),
+    [
+        # node_basics allow the parameter services of every node: none of them is known by name.
+        ("production", '<profile ns="/" node="*">'),
+    ],
+)
+def test_a_change_invents_no_node(template: str, profile: str, tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root, "--template", template).ok()
+    sros("create_enclave", root, "/arm/driver").ok()
+    found = explain(root, "/arm/driver", "publish", "/x")
+    assert profile in found.out
+
+
+def test_a_change_is_for_the_node_that_the_permissions_are_for(whole: Path) -> None:
+    node = read_policy(POLICY).enclaves[0].all_profiles()[0]
+    found = explain(whole, ENCLAVE, "publish", "/nothing")
+    assert f'<profile ns="{node.ns}" node="{node.node}">' in found.out
+    own = f"{node.ns.rstrip('/')}/{node.node}/get_parameters"
+    meant = explain(whole, ENCLAVE, "serve", "/elsewhere/get_parameters")
+    assert f"note [explain.likely-name]: the enclave may serve {own}" in meant.err
+    assert "may publish /chatter: " in explain(whole, ENCLAVE, "publish", "/chater").err
+    assert "likely-name" not in explain(whole, ENCLAVE, "publish", "/nothing").err
 
 
 def test_a_key_that_stays_on_its_robot(keystore: Path, tmp_path: Path) -> None:
