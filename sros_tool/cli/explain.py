@@ -227,9 +227,9 @@ def explain(
     """Show whether DDS lets an enclave do something, by which rule, and how to change that.
 
     call and serve apply to services, execute to actions; call and serve apply to an action if the
-    rights have an action NAME and no service NAME; --type decides it. ROOT is a keystore, here or on
-    a robot; ENCLAVE can also be an enclave's folder. With --policy and no keystore, the policy itself
-    is explained, before anything is signed.
+    rights have an action NAME and no service NAME; --type decides it. ROOT is a keystore, here or
+    on a robot; ENCLAVE can also be an enclave's folder. With --policy and no keystore, the policy
+    itself is explained, before anything is signed.
 
     The exit status is 0 if it is allowed (with --who: to any enclave), and 1 if it is denied; with
     --log, 1 if the log reports a fault.
