@@ -348,6 +348,25 @@ def ros_rights(rule: Rule) -> tuple[RosRight, ...]:
     return tuple(rest + rights)
 
 
+_EVERY_TOPIC = frozenset({"*", "rt/*"})
+
+
+def allows_everything(grant: Grant) -> bool:
+    """Return whether a grant allows to publish and to subscribe every ROS topic.
+
+    Denials are ignored, unless everything is allowed only by default.
+    """
+    allowed = [rule for rule in grant.rules if rule.allow]
+    wide = [
+        {topic for criteria in criterias for topic in criteria.topics} & _EVERY_TOPIC
+        for criterias in (
+            [each for rule in allowed for each in rule.publish],
+            [each for rule in allowed for each in rule.subscribe],
+        )
+    ]
+    return all(wide) or (grant.default_allow and not any(not rule.allow for rule in grant.rules))
+
+
 def grant_rights(enclave: str, grant: Grant) -> frozenset[Right]:
     """Return the rights that a grant gives ``enclave``, without ``ros_discovery_info``.
 

@@ -302,6 +302,21 @@ def test_taken_over_it_can_get_the_settings_of_another_template(tmp_path: Path) 
         assert not open_enclave(enclave_path(new, name), now=datetime.now(UTC), domain=0).problems
 
 
+def test_taken_over_nodes_that_may_do_everything_are_named(tmp_path: Path) -> None:
+    """Their rights are not those of today's default, so they stay, and that is said."""
+    old, new = tmp_path / "old", tmp_path / "new"
+    make_eloquent(old, {**NODES, "/all": ("*",)}, now=NOW)
+    sros("create_keystore", new, "--from", old).ok()
+    sros("create_enclave", new, "/free").ok()
+    words = ("update_keystore", new, "--template", "production")
+    for more in (("--dry-run",), ("--next",)):
+        ended = sros(*words, *more).ok()
+        assert "Still open: /all may do everything as before" in ended.err
+        assert f"`sros create_permission {new} /all POLICY_FILE`" in ended.err
+    assert load_rights(new).sound
+    assert "Still open" not in sros(*words).ok().err
+
+
 def test_a_ca_that_has_expired_is_refused(tmp_path: Path) -> None:
     make_eloquent(tmp_path / "old", NODES, now=NOW - timedelta(days=4000))
     ended = sros("create_keystore", tmp_path / "new", "--from", tmp_path / "old")

@@ -23,6 +23,7 @@ from sros_tool.keystore.layout import (
 )
 from sros_tool.keystore.reader import weaknesses
 from sros_tool.pki.certificates import common_name_of, subject_text, validity_of
+from sros_tool.translate import allows_everything
 from sros_tool.validity import BACKDATE, Span, Window, iso, parse_iso
 from sros_tool.xml import read_bytes
 
@@ -164,7 +165,6 @@ WAITS = FindingKind(
 
 _SOON = timedelta(days=30)
 _LONG = timedelta(days=2 * 366)
-_EVERY_TOPIC = frozenset({"*", "rt/*"})
 
 
 def check_enclave(enclave: CheckedEnclave) -> Iterator[Finding]:
@@ -255,15 +255,7 @@ def _expires_soon(window: Window, now: datetime) -> bool:
 
 def _rights(enclave: CheckedEnclave, grant: Grant) -> Iterator[Finding]:
     file, keystore = enclave.file("permissions.p7s"), enclave.keystore
-    allowed = [rule for rule in grant.rules if rule.allow]
-    wide = [
-        {topic for criteria in criterias for topic in criteria.topics} & _EVERY_TOPIC
-        for criterias in (
-            [each for rule in allowed for each in rule.publish],
-            [each for rule in allowed for each in rule.subscribe],
-        )
-    ]
-    if all(wide) or (grant.default_allow and not any(not rule.allow for rule in grant.rules)):
+    if allows_everything(grant):
         # No template accepts it: whoever checks a keystore asks whether its robot is closed.
         accepted = keystore.accepts(lambda _: False)
         text = "the permissions allow publishing and subscribing every topic"

@@ -90,6 +90,7 @@ from sros_tool.pki.keys import PublicKey
 from sros_tool.policy.protection import DomainProtection, Level
 from sros_tool.policy.rights import compare
 from sros_tool.translate import (
+    allows_everything,
     governance_for,
     grant_rights,
     hidden_protections,
@@ -462,6 +463,17 @@ class _Reissued:
     old: Superseded | None
 
 
+@dataclass(frozen=True, slots=True)
+class _KeptOpen:
+    """An enclave that may do everything, and still may when enclaves without a policy may not.
+
+    ``reissued`` has what was issued for it, or None.
+    """
+
+    name: str
+    reissued: _Reissued | None
+
+
 class _Updater:
     """Writer of one update, within a transaction."""
 
@@ -494,6 +506,7 @@ class _Updater:
             # Rights that no ledger records would not be signed again once there are settings.
             or present.without_settings
         )
+        self._kept_open: tuple[str, ...] = ()
         self._recorded = RecordedRights(self._root)
         self._known = KnownKeys(self._root)
         self._writer = EnclaveWriter(
@@ -556,6 +569,7 @@ class _Updater:
             text = _restart_remark(disturbed, revoked=bool(revoked))
             remarks.append(Note("keystore.restart", text))
             remarks.append(Note("keystore.export-again", self._exports(names)))
+        remarks += self._still_open()
         remarks += self._open_tasks(settings)
         ends = [each.works_until for each in rights if each.works_until]
         return KeystoreUpdate(
@@ -587,16 +601,26 @@ class _Updater:
         if same and not self._permissions:
             return []
 
-        def work(name: str) -> _Reissued | UnreadableEnclave | None:
+        closes = before.default_permissions == EVERYTHING != after.default_permissions
+
+        def work(name: str) -> _Reissued | _KeptOpen | UnreadableEnclave | None:
             try:
-                return self._reissue_one(read_credentials(self._root, name))
+                state = read_credentials(self._root, name)
+                done = self._reissue_one(state)
+                same = done is None or not done.rights.lost
+                if closes and same and allows_everything(state.grant):
+                    return _KeptOpen(name, done)
+                return done
             except SrosError as error:
                 return UnreadableEnclave(name, error)
 
         found = self._writer.for_each(names, work, progress).values()
         unreadable = tuple(each for each in found if isinstance(each, UnreadableEnclave))
         refuse_unreadable(unreadable, "updated")
-        return [each for each in found if isinstance(each, _Reissued)]
+        opened = [each for each in found if isinstance(each, _KeptOpen)]
+        self._kept_open = tuple(each.name for each in opened)
+        reissued = [each.reissued if isinstance(each, _KeptOpen) else each for each in found]
+        return [each for each in reissued if isinstance(each, _Reissued)]
 
     def _reissue_one(self, state: Credentials) -> _Reissued | None:
         name = state.name
@@ -710,6 +734,18 @@ class _Updater:
             text += f"; for {', '.join(remote)}, answer the request again (`sros sign_request "
             text += f"{root} REQUEST --renew`)"
         return f"{text}."
+
+    def _still_open(self) -> list[Note]:
+        if not self._kept_open:
+            return []
+        which = "these enclaves" if len(self._kept_open) > 1 else "this enclave"
+        text = (
+            f"Still open: {', '.join(self._kept_open)} may do everything as before, because the "
+            "new default is for enclaves without a policy, and the rights of "
+            f"{which} are not those of the old default. State them with `sros create_permission "
+            f"{quote(str(self._root))} {' '.join(map(quote, self._kept_open))} POLICY_FILE`."
+        )
+        return [Note("keystore.kept-open", text)]
 
     def _open_tasks(self, changes: Sequence[SettingChange]) -> list[Note]:
         identity = self._authorities.identity.certificate
