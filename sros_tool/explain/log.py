@@ -36,6 +36,7 @@ from sros_tool.runtime.vendor_log import (
     log_text,
     plain_refusal,
     plain_text,
+    style_of,
 )
 from sros_tool.translate import SERVICE_ENDS, grant_rights
 
@@ -236,19 +237,22 @@ class _Examiner:
         """Return the finding for one group of equal messages."""
         first = hits[0]
         meaning = first.meaning
+        vendor = style_of(first.text) if meaning is UNKNOWN else meaning.vendor
+        named = self._find(first.enclave)
+        remedy_of = self._with_names(meaning.remedy, named, first)
         plain = LogFinding(
             meaning.id,
-            meaning.vendor,
+            vendor,
             first.line,
             len(hits),
             first.text,
             first.process,
             first.enclave,
             first.cause,
-            meaning.remedy.format(**first.quoted),
+            remedy_of,
         )
         examined = meaning.faults or meaning.id == "service"
-        enclave = self._find(first.enclave) if examined else None
+        enclave = named if examined else None
         if enclave is None:
             return plain
         answer = self._answer(enclave, meaning.vendor or Vendor.FAST, ask("join"))
@@ -257,7 +261,8 @@ class _Examiner:
             return replace(plain, enclave=enclave.name, found=_nodes(answer), checked=True)
         causes = causes or list(self._wrong_domain(enclave, answer, first))
         remedies = list(dict.fromkeys(remedy for _, remedy in causes if remedy))
-        nothing = f"{_nothing_found(enclave)} {meaning.unseen.format(**first.quoted)}".rstrip()
+        unseen = self._with_names(meaning.unseen, enclave, first)
+        nothing = f"{_nothing_found(enclave)} {unseen}".rstrip()
         return replace(
             plain,
             enclave=enclave.name,
@@ -265,6 +270,16 @@ class _Examiner:
             checked=True,
             remedy=" ".join(remedies) if remedies else nothing,
         )
+
+    def _with_names(self, text: str, enclave: LoadedEnclave | None, hit: _Hit) -> str:
+        """Return a remedy with the keystore and the enclave that the user named, and the fields."""
+        names = {"KEYSTORE": self._root, "ENCLAVE": enclave.name if enclave else ""}
+        for word, name in names.items():
+            if name:
+                plain = quote(name).replace("{", "{{").replace("}", "}}")
+                # Not the KEYSTORE in ROS_SECURITY_KEYSTORE.
+                text = plain.join(re.split(rf"\b{word}\b", text))
+        return text.format(**hit.quoted)
 
     def denial(self, denial: Denial, named: list[tuple[int, str]]) -> LogFinding:
         """Return the finding for a denied topic; ``named`` are the lines that name it."""

@@ -529,13 +529,23 @@ _LOG_TEXTS: tuple[LogText, ...] = (
 )  # fmt: skip
 """In the order of matching: the first text that matches a line counts."""
 
-_SUBJECT = (
-    r"DDS[-:. ]?sec|dds_sec|ROS_SECURITY_|\bsecurity|non.?secure|identity[_ ]ca|permissions?[_ ]ca"
-    r"|\bgovernance\b|\bpermissions\b|(?:cert|key|crl)\.pem|\.p7s\b|validate_(?:local|remote)_"
-    r"|PKCS ?#?7|\bS/?MIME|X\.?509|\bPEM\b|handshake|certificate|private key|authenticated\b|crypto"
-    r"|decrypt|access[ _]?control|\benclave|keystore|\bCRL\b"
+_OF_DDS_SECURITY = (
+    r"DDS[-:. ]?sec|dds_sec|ROS_SECURITY_|identity[_ ]ca|permissions[_ ]ca"
+    r"|(?:cert|key|crl)\.pem|(?:governance|permissions)\.(?:p7s|xml)|\.p7s\b"
+    r"|validate_(?:local|remote)_|PKCS ?#?7|\bS/?MIME|X\.?509|TRUSTED CERTIFICATE"
 )
-"""Words that speak of DDS Security, or of security."""
+"""Words that nothing but DDS Security and its files bring into the log of a robot."""
+_SUBJECT = (
+    rf"{_OF_DDS_SECURITY}|\bsecurity|non.?secure|permissions?[_ ]ca|\bgovernance\b|\bpermissions\b"
+    r"|\bPEM\b|handshake|certificate|private key|authenticated\b|crypto|decrypt"
+    r"|access[ _]?control|\benclave|keystore|\bCRL\b"
+)
+"""Words that speak of DDS Security, or of the security or the packages of something else."""
+_MIDDLEWARE = (
+    r"\b(?:rcl|rmw)\w{0,40}\b|fast.?(?:dds|rtps)|cyclone|\bdds|openssl|\bwhat\(\): "
+    r"|\[\w{1,40} (?:Error|Warning)\]"
+)
+"""The origins of a message of the middleware: loggers, libraries, categories of Fast DDS."""
 _TROUBLE = (
     r"error|fail|cannot|can't|could not|couldn't|unable|invalid|refus|denied|expired|reject"
     r"|disabled|not (?:allowed|found|valid|trusted|permitted|supported)|missing|mismatch|unknown"
@@ -555,9 +565,11 @@ UNKNOWN = LogText(
         r"|\) (?:processed|send tokens|succeeded)))"
         rf".*(?:{_SUBJECT}|plugin|not allowed|token|encoded|authenticat|Could not (?:load|find))"
         r"|SECURITY ERROR"
-        # Any other program that speaks of security and of trouble, at no level that means none,
-        # but not the source in a traceback.
-        rf"|\A(?! {{4}}|(?:\[[\w.-]+\] )*\[(?:INFO|DEBUG)\])(?=.*?(?:{_TROUBLE})).*?(?:{_SUBJECT})",
+        # Any other program that speaks of DDS Security and of trouble, or the middleware that
+        # speaks of security and of trouble, at no level that means none, but not the source in a
+        # traceback.  A node may have a package, a list or a key of its own that has such a name.
+        rf"|\A(?! {{4}}|(?:\[[\w.-]+\] )*\[(?:INFO|DEBUG)\])(?=.*?(?:{_TROUBLE}))"
+        rf"(?:(?=.*?(?:{_MIDDLEWARE})).*?(?:{_SUBJECT})|.*?(?:{_OF_DDS_SECURITY}))",
         re.IGNORECASE,
     ),
     "a line of DDS Security that sros does not know",
@@ -565,6 +577,22 @@ UNKNOWN = LogText(
     "`sros explain KEYSTORE ENCLAVE join` check all that DDS checks.",
 )
 """The meaning of a line that looks like a DDS Security message but is not in `_LOG_TEXTS`."""
+
+_STYLES = (
+    (Vendor.CYCLONE, re.compile(r"\A\d+\.\d+ \[\d*\]\s+\S+: ")),
+    (
+        Vendor.FAST,
+        re.compile(
+            r"\[\w{0,40} (?:Error|Warning)\]|\[[A-Z]{4,13}\] [^\s|]+\|[^\s|]+ \d+ \w+::\w+ :"
+        ),
+    ),
+)
+
+
+def style_of(line: str) -> Vendor | None:
+    """Return the vendor whose log has lines of this form, or None; ``line`` has no label."""
+    return next((vendor for vendor, style in _STYLES if style.search(line)), None)
+
 
 # ── the lines around a text ────────────────────────────────────────────────────────────────
 

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.explain import evaluator
 from sros_tool.explain.evaluator import LoadedEnclave, load_enclave
 from sros_tool.explain.log import LogFinding, explain_log
@@ -329,6 +330,8 @@ def test_single_lines(line: str, name: str) -> None:
         "[ERROR] [1.0] [rmw_fastrtps_cpp]: failed to load identity_ca.cert.pem",
         "[talker-1] [WARN] [1.0] [rmw_cyclonedds_cpp]: invalid security file governance.p7s",
         "  what():  could not read permissions.p7s",
+        "  what():  failed to use the enclave",
+        "[ERROR] [1.0] [rclcpp_lifecycle]: failed with the security of the node",
         "robot | Expecting: TRUSTED CERTIFICATE",
         "Nov 21 06:00:00 robot talker[12]: X509 certificate rejected",
         "2026-01-01 12:00:00.000 [SECURITY Error] Not found the identity subj",
@@ -422,6 +425,48 @@ def test_every_shape_has_its_cause_and_a_remedy(text: str, name: str, tmp_path: 
     assert found.cause and found.remedy
     (tmp_path / "robot.log").write_text(text)
     assert sros("explain", "--log", tmp_path / "robot.log").status == 1
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "[ERROR] [launch]: Could not find a package called security_tools",
+        "[launch] [ERROR] Access control list loaded",
+        "[ERROR] [1.0] [door]: access control denied a visitor, the certificate is missing",
+        "Error: insufficient permissions to open /dev/ttyUSB0",
+        "crypto wallet not found in the keystore",
+    ],
+)
+def test_a_bare_word_of_another_program_is_no_message_of_dds_security(line: str) -> None:
+    assert explained(line) == ()
+    (found,) = explained(f"{line}: [rmw_fastrtps_cpp] failed")  # the middleware says it
+    assert found.id == "not-understood"
+
+
+@pytest.mark.parametrize(
+    ("line", "vendor"),
+    [
+        ("2026-01-01 12:00:00.000 [SECURITY Error] Bad thing -> Function set", Vendor.FAST),
+        ("talker-1  | [RTPS_SECURITY Error] Bad thing -> Function set", Vendor.FAST),
+        ("[1795309573.65] [EMERGENCY] 01.0f|0.0.1.c1 0 PKIDH::init : Bad thing", Vendor.FAST),
+        ("1795242829.9 [0] python: Bad handshake", Vendor.CYCLONE),
+        ("[ERROR] [1.0] [rmw_fastrtps_cpp]: failed to load identity_ca.cert.pem", None),
+    ],
+)
+def test_an_unknown_line_has_the_vendor_of_its_form(line: str, vendor: Vendor | None) -> None:
+    (found,) = explained(line)
+    assert (found.id, found.vendor) == ("not-understood", vendor)
+
+
+def test_a_remedy_names_the_keystore_and_the_enclave_that_the_user_named(
+    keystore: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "robot.log").write_text("[SECURITY Error] Bad thing -> Function set\n")
+    named = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log").out
+    assert f"`sros explain {keystore} {ENCLAVE} join`" in named
+    assert "KEYSTORE" not in named and " ENCLAVE" not in named
+    unnamed = sros("explain", "--log", tmp_path / "robot.log").out
+    assert "`sros explain KEYSTORE ENCLAVE join`" in unnamed
 
 
 def test_a_line_that_follows_an_unknown_one_is_not_swallowed() -> None:
