@@ -301,8 +301,11 @@ class _Examiner:
             self._how_to_ask(denial, name),
         )
         enclave = None if denial.remote else self._find(denial.enclave)
-        if enclave is None or not denial.direction:
+        if enclave is None:
             return finding
+        if not denial.direction:
+            named_remedy = finding.remedy.replace("ENCLAVE", quote(enclave.name))
+            return replace(finding, remedy=named_remedy)
         answer = self._answer(enclave, denial.vendor, _question(denial))
         if answer.allowed:
             found = ["the present permissions allow it"]

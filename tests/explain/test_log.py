@@ -465,6 +465,11 @@ def test_a_remedy_names_the_keystore_and_the_enclave_that_the_user_named(
     named = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "robot.log").out
     assert f"`sros explain {keystore} {ENCLAVE} join`" in named
     assert "KEYSTORE" not in named and " ENCLAVE" not in named
+    (tmp_path / "denied.log").write_text(
+        "1795242829.9 [0] python: Local topic permission denied: rt/x denied by default rule\n"
+    )
+    denied = sros("explain", keystore, ENCLAVE, "--log", tmp_path / "denied.log").out
+    assert f"`sros explain {keystore} {ENCLAVE} publish /x`" in denied
     unnamed = sros("explain", "--log", tmp_path / "robot.log").out
     assert "`sros explain KEYSTORE ENCLAVE join`" in unnamed
 
