@@ -455,19 +455,20 @@ def test_a_name_that_is_a_service_as_well_stays_one(tmp_path: Path) -> None:
     assert "add --type action" in found.err
 
 
-@pytest.mark.parametrize(
-    ("template", "profile"),
-    [
-        # node_basics allow the parameter services of every node: none of them is known by name.
-        ("production", '<profile ns="/" node="*">'),
-    ],
-)
-def test_a_change_invents_no_node(template: str, profile: str, tmp_path: Path) -> None:
-    root = tmp_path / "ks"
-    sros("create_keystore", root, "--template", template).ok()
+@pytest.mark.parametrize("by_policy", [False, True])
+def test_a_change_invents_no_node(by_policy: bool, tmp_path: Path) -> None:
+    root, policy = tmp_path / "ks", tmp_path / "p.xml"
+    sros("create_keystore", root, "--template", "production").ok()
     sros("create_enclave", root, "/arm/driver").ok()
+    if by_policy:  # one whose permissions name no node, also not by a wildcard
+        policy.write_text(
+            '<policy version="0.2.0"><enclaves><enclave path="/arm/driver"><profiles>'
+            '<profile ns="/" node="n"><topics publish="ALLOW"><topic>/y</topic></topics></profile>'
+            "</profiles></enclave></enclaves></policy>"
+        )
+        sros("create_permission", root, "/arm/driver", policy).ok()
     found = explain(root, "/arm/driver", "publish", "/x")
-    assert profile in found.out
+    assert '<profile ns="/" node="*">' in found.out
 
 
 def test_a_change_is_for_the_node_that_the_permissions_are_for(whole: Path) -> None:
