@@ -67,7 +67,11 @@ def sign_crl(
     this_update: datetime,
     next_update: datetime,
 ) -> bytes:
-    """Return a revocation list as PEM, signed with ``key``, the key of the CA ``issuer``."""
+    """Return a revocation list as PEM, signed with ``key``, the key of the CA ``issuer``.
+
+    Raises:
+        PkiError: a serial number is negative, or has more than 159 bits.
+    """
     builder = (
         x509.CertificateRevocationListBuilder()
         .issuer_name(issuer.subject)
@@ -77,6 +81,12 @@ def sign_crl(
         .add_extension(authority_identifier(issuer), critical=False)
     )
     for each in revoked:
+        if not 0 < each.serial < 1 << 159:
+            raise PkiError(
+                f"the serial number {each.serial:x} cannot be put on a revocation list",
+                "Serial numbers are positive, and have at most 159 bits (RFC 5280, 4.1.2.2).",
+                "Sign the list with the program that issued that certificate.",
+            )
         entry = (
             x509.RevokedCertificateBuilder().serial_number(each.serial).revocation_date(each.date)
         )

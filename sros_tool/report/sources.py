@@ -6,6 +6,7 @@ Enclave keys are read only to report faults such as a key that does not fit its 
 
 from __future__ import annotations
 
+import os
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Set
@@ -249,7 +250,7 @@ def _without_paths(finding: PicturedFinding, path: Path) -> PicturedFinding:
 
 def _without_path(text: str, path: Path) -> str:
     """Return ``text`` with every form of the source's path replaced by its base name."""
-    places = {str(path), str(path.absolute()), str(path.resolve())}
+    places = {str(path), str(path.absolute()), os.path.realpath(path)}
     for place in sorted(places, key=len, reverse=True):
         if "/" in place and place != "/":
             text = text.replace(place, _base_name(path))

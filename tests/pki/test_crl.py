@@ -11,8 +11,9 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
+from sros_tool.errors import PkiError
 from sros_tool.pki.certificates import Issuer, authority_identifier, common_name, issue_ca, pem
-from sros_tool.pki.crl import lists_as_revoked, load_crl, refusal_of
+from sros_tool.pki.crl import Revoked, lists_as_revoked, load_crl, refusal_of, sign_crl
 from sros_tool.pki.keys import PrivateKey, generate_key
 from sros_tool.validity import Window
 from tests.integration.forged_signatures import Node
@@ -142,6 +143,16 @@ def test_a_certificate_with_a_negative_serial_number(listed: bool, tmp_path: Pat
     done = run(command, cwd=tmp_path, status=None)
     assert ("certificate revoked" in done.stderr) is listed
     assert lists_as_revoked(crl, certificate.serial_number) is listed
+
+
+@pytest.mark.parametrize("serial", [-1, 0, 1 << 159, (1 << 175) + 1])
+def test_a_serial_number_that_no_list_holds_is_refused(serial: int) -> None:
+    key, window = generate_key(), Window(NOW - DAY, NOW + DAY)
+    ca = issue_ca(key, common_name("CA"), window)
+    times = {"this_update": NOW - DAY, "next_update": NOW + DAY}
+    assert load_crl(sign_crl(ca, key, [Revoked((1 << 159) - 1, NOW)], number=1, **times), "")
+    with pytest.raises(PkiError, match=f"the serial number {serial:x} cannot be put"):
+        sign_crl(ca, key, [Revoked(serial, NOW)], number=1, **times)
 
 
 def signed_again(changed: Node, key: PrivateKey) -> bytes:

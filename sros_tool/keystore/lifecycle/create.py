@@ -388,7 +388,7 @@ def check_free(root: Path) -> None:
     if is_keystore(root):
         raise _already_exists(root)
     refuse_earlier(root)
-    if root.resolve() == Path("/"):
+    if os.path.realpath(root) == "/":  # unlike Path.resolve, it does not fail at a loop of links
         raise KeystoreError(
             "the root of the file system cannot be a keystore", "", "Choose another path."
         )
