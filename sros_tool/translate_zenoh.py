@@ -160,13 +160,13 @@ def _allowed_names(stated: Iterable[StatedRight]) -> Iterator[tuple[str, str]]:
         else:
             denied.setdefault(each.right.right, {}).setdefault(each.right.name, each.source)
     for (right, wide), place in sorted(allowed.items()):
-        for name in listed_names(wide, place):
+        for name in _listed_names(wide, place):
             without = denied.get(right, {})
             if any(name == each or covers(each, name) for each in without):
                 continue
-            for each, source in without.items():
-                if overlap(each, name):
-                    raise _exception_in_wildcard(right, name, place, each, source)
+            for other, source in without.items():
+                if overlap(other, name):
+                    raise _exception_in_wildcard(right, name, place, other, source)
             yield right, name
 
 
@@ -182,7 +182,7 @@ def _exception_in_wildcard(
     )
 
 
-def listed_names(name: str, place: Source) -> list[str]:
+def _listed_names(name: str, place: Source) -> list[str]:
     """Return the names of an expression without its sets of characters: one for each choice.
 
     Raises:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import click
 
 from sros_tool.cli.common import (
+    KEYSTORE_VARIABLE,
     PATH,
+    complete_file,
     domain_of,
     dry_run_option,
     json_option,
     keyring,
+    keystore_from_environment,
     now,
     print_closed,
     print_json,
@@ -21,6 +25,7 @@ from sros_tool.cli.common import (
     ros_domain,
     visible,
 )
+from sros_tool.cli.progress import progress
 from sros_tool.cli.written import changes_json, notes_json
 from sros_tool.errors import UsageError
 
@@ -39,8 +44,13 @@ Exit status: 0 written, or up to date; with --check 1 if a file is missing or
 out of date; 2 if it could not be done, such as for a policy that Zenoh cannot
 enforce.""",
 )
-@click.argument("root", type=PATH)
-@click.argument("policy_files", metavar="POLICY...", type=PATH, nargs=-1, required=True)
+@click.argument(
+    "words",
+    metavar="[ROOT] POLICY...",
+    nargs=-1,
+    required=True,
+    shell_complete=lambda _ctx, _parameter, incomplete: complete_file(incomplete),
+)
 @click.option(
     "-o", "--output", type=PATH, metavar="DIR", help="Write below DIR, not into the keystore."
 )
@@ -66,8 +76,7 @@ enforce.""",
 @dry_run_option
 @json_option
 def zenoh(
-    root: Path,
-    policy_files: tuple[Path, ...],
+    words: tuple[str, ...],
     output: Path | None,
     router: str,
     endpoint: str,
@@ -98,17 +107,19 @@ def zenoh(
     wanted = domain_of(domain)
     if wanted is None:
         wanted = ros_domain()
+    root, policy_files = _root_and_policies(words)
     policies = [read_policy(path) for path in policy_files]
     chosen = choose_domain(open_keystore(root).domains, wanted, root)
-    result = write_zenoh_files(
-        root,
-        policies,
-        ZenohNetwork(router, endpoint, Mode(mode), chosen),
-        now=now(),
-        output=output,
-        keyring=keyring(),
-        dry_run=dry_run or only_check,
-    )
+    with progress("translating"):
+        result = write_zenoh_files(
+            root,
+            policies,
+            ZenohNetwork(router, endpoint, Mode(mode), chosen),
+            now=now(),
+            output=output,
+            keyring=keyring(),
+            dry_run=dry_run or only_check,
+        )
     if as_json:
         print_json(
             {
@@ -148,3 +159,17 @@ def zenoh(
     print_notes(result.notes)
     if only_check and result.restart:
         raise SystemExit(1)
+
+
+def _root_and_policies(words: tuple[str, ...]) -> tuple[Path, list[Path]]:
+    """Return the keystore, which may also be that of the environment, and the policy files."""
+    paths = [PATH.convert(each, None, None) for each in words]
+    if os.environ.get(KEYSTORE_VARIABLE) and not paths[0].is_dir():
+        return keystore_from_environment(), paths
+    if len(paths) < 2:
+        raise UsageError(
+            "zenoh takes a keystore and one or more policies",
+            "",
+            f"Name both, or set {KEYSTORE_VARIABLE}.",
+        )
+    return paths[0], paths[1:]

@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 
-ANY_PART, ANY_CHUNK, ANY_CHUNKS = "$*", "*", "**"
+ANY_PART, ANY_CHUNKS = "$*", "**"
+_ANY_CHUNK = "*"
 _MANY = 65536
 
 
@@ -25,11 +26,11 @@ def canonical(chunks: Iterable[str]) -> str:
         while ANY_PART + ANY_PART in chunk:
             chunk = chunk.replace(ANY_PART + ANY_PART, ANY_PART)
         if chunk == ANY_PART:
-            chunk = ANY_CHUNK
+            chunk = _ANY_CHUNK
         if found and found[-1] == ANY_CHUNKS:
             if chunk == ANY_CHUNKS:
                 continue
-            if chunk == ANY_CHUNK:
+            if chunk == _ANY_CHUNK:
                 found.insert(-1, chunk)
                 continue
         found.append(chunk)
@@ -75,9 +76,9 @@ def _chunk_includes(wide: str, narrow: str) -> bool:
         return True
     if narrow == ANY_CHUNKS or "*" not in wide or narrow.startswith("@"):
         return False
-    if wide == ANY_CHUNK:
+    if wide == _ANY_CHUNK:
         return True
-    if narrow == ANY_CHUNK:
+    if narrow == _ANY_CHUNK:
         return False
     first, *others = wide.split(ANY_PART)
     # "\0" is no character of a key: what only a wildcard includes.

@@ -1,8 +1,9 @@
-"""The written files enforce the policy on real Zenoh, between sessions that speak as rmw_zenoh does."""
+"""The written files enforce the policy on real Zenoh, between sessions like those of rmw_zenoh."""
 
 from __future__ import annotations
 
 import json
+import os
 import socket
 import sys
 from pathlib import Path
@@ -15,7 +16,7 @@ from tests.support.harness import policy_text, publish, sros
 
 pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
 
-pytestmark = pytest.mark.dds
+pytestmark = pytest.mark.zenoh
 WORLD = Path(__file__).with_name("zenoh_world.py")
 
 
@@ -59,7 +60,7 @@ def play(what: str, folder: Path, mode: str = "peer") -> Any:
         ).ok()
     done = run(
         [sys.executable, "-P", WORLD, what, folder / "ks", folder / "foreign"],
-        env={"PYTHONPATH": ":".join(filter(None, sys.path)), "PATH": "/usr/bin:/bin"},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
     )
     return json.loads(done.stdout)
 
@@ -98,3 +99,9 @@ def test_only_a_certificate_of_the_keystore_gets_a_connection(keystores: Path) -
 
 def test_another_enclave_cannot_play_the_router(keystores: Path) -> None:
     assert play("routers", keystores, "client") == {"/other": False, "/router": True}
+
+
+def test_zenoh_decides_as_sros_says(keystores: Path) -> None:
+    observed = play("decisions", keystores, "client")
+    assert observed["different"] == {"put": {}, "query": {}, "reply": {}}
+    assert min(observed["happened"].values()) > 20

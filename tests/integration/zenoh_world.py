@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import random
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -20,6 +21,9 @@ import zenoh
 import zenoh.ext
 
 from sros_tool.runtime.netns import enter_isolation, try_isolation
+from sros_tool.zenoh.access import AccessControl, AccessRule, Flow, Message, RemoteRights
+from sros_tool.zenoh.configuration import Configuration, Mode
+from tests.support.children import LONG
 
 TYPE = "std_msgs::msg::dds_::String_/RIHS01_" + "0" * 64
 GRAPH = "@ros2_lv/0/**"
@@ -83,9 +87,9 @@ class World:
     def __init__(self, keystore: Path, *, rules: bool) -> None:
         self.keystore = keystore
         self.rules = rules
-        self.sessions: list[zenoh.Session] = []
+        self.sessions: list[Any] = []
 
-    def open(self, enclave: str, file: str = "session.json5", **how: Any) -> zenoh.Session:
+    def open(self, enclave: str, file: str = "session.json5", **how: Any) -> Any:
         """Open a session of an enclave."""
         how.setdefault("rules", self.rules)
         session = zenoh.open(configured(self.keystore, enclave, file, **how))
@@ -256,8 +260,8 @@ def entrances(keystore: Path, foreign: Path) -> dict[str, Any]:
                 found[name] = False
         without = json.loads((keystore / "enclaves/talker/session.json5").read_text())
         try:
-            zenoh.open(zenoh.Config.from_json5(json.dumps(without))).close()
-            found["without paths"] = True
+            with zenoh.open(zenoh.Config.from_json5(json.dumps(without))):
+                found["without paths"] = True
         except zenoh.ZError:
             found["without paths"] = False
     return found
@@ -277,22 +281,118 @@ def passed_on(keystore: Path, router: str) -> bool:
         )
         talker, listener = at.open("/talker"), at.open("/listener")
         heard: set[str] = set()
-        subscriber = listener.declare_subscriber(
-            key("/chatter"), lambda each: heard.add(text(each))
-        )
+        kept = listener.declare_subscriber(key("/chatter"), lambda each: heard.add(text(each)))
         for _ in range(20 if router != "/router" else 1):
             talker.put(key("/chatter"), "chatter")
             time.sleep(0.1)
         if router == "/router":
             until(lambda: bool(heard), lambda: talker.put(key("/chatter"), "chatter"))
-        subscriber.undeclare()
+        del kept
         return bool(heard)
+
+
+MESSAGES = {
+    "put": (
+        ("/talker", Flow.INGRESS, Message.PUT, 0),
+        ("/talker", Flow.EGRESS, Message.DECLARE_SUBSCRIBER, 1),
+        ("/listener", Flow.INGRESS, Message.DECLARE_SUBSCRIBER, 1),
+        ("/listener", Flow.EGRESS, Message.PUT, 0),
+    ),
+    "query": (
+        ("/talker", Flow.INGRESS, Message.QUERY, 0),
+        ("/listener", Flow.INGRESS, Message.DECLARE_QUERYABLE, 1),
+        ("/listener", Flow.EGRESS, Message.QUERY, 0),
+    ),
+    "reply": (
+        ("/listener", Flow.INGRESS, Message.REPLY, 2),
+        ("/talker", Flow.EGRESS, Message.REPLY, 2),
+    ),
+}
+"""The messages by which /talker puts or asks and /listener hears or answers, past the router: who,
+direction, message, and the key: of the first one, of the declaration, or of the reply.
+
+A publisher sends nothing that nobody seems to want; one with a wildcard key sends all the same.
+"""
+
+
+def drawn_rule(draw: random.Random, base: str) -> tuple[str, ...]:
+    """Key expressions below a base; often all that is needed, sometimes nothing."""
+    forms = (("a",), ("*",), ("$*a",), ("a$*",), ("**",), ("b",), ("a", "b"), ("*", "**"))
+    weights = (8, 8, 3, 3, 6, 1, 1, 2)
+    chosen = draw.choices(forms, weights)[0]
+    return (f"{base}/{'/'.join(chosen)}",)
+
+
+def decisions(keystore: Path, count: int) -> dict[str, Any]:
+    """Compare what `AccessControl` says with what a router does, on random rules and messages."""
+    draw = random.Random(15)
+    rules: dict[str, list[AccessRule]] = {"/talker": [], "/listener": []}
+    cases = []
+    for number in range(count):
+        base = f"t/{number}"
+        for who, flow, message, _ in (each for of in MESSAGES.values() for each in of):
+            if draw.random() < 0.95:
+                rules[who].append(AccessRule(flow, (message,), drawn_rule(draw, base)))
+        asked, declared = (f"{base}/{draw.choices(('a', '*', '**'), (6, 1, 1))[0]}" for _ in "12")
+        cases.append((asked, declared, f"{base}/a"))
+    rules = {who: draw.sample(of, len(of)) for who, of in rules.items()}
+    control = AccessControl(tuple(RemoteRights(who, tuple(of)) for who, of in rules.items()))
+    written = Configuration(Mode.ROUTER, (), (), control)
+    seen: dict[str, set[int]] = {"put": set(), "query": set(), "reply": set()}
+    with world(keystore, rules=False) as at:
+        enforced = json.loads(written.render())["access_control"]
+        at.open("/router", "router.json5", rules=True, access_control=enforced)
+        talker, listener = at.open("/talker"), at.open("/listener")
+        kept: list[Any] = []
+        for number, (_, declared, answer) in enumerate(cases):
+
+            def reply(query: Any, number: int = number, answer: str = answer) -> None:
+                with query:
+                    seen["query"].add(number)
+                    query.reply(answer, "answer")
+
+            def hear(_: Any, number: int = number) -> None:
+                seen["put"].add(number)
+
+            kept += [
+                listener.declare_subscriber(declared, hear),
+                listener.declare_queryable(declared, reply),
+            ]
+        publishers = [talker.declare_publisher(asked) for asked, _, _ in cases]
+        time.sleep(4 * PAUSE)
+        for number, (asked, _, _) in enumerate(cases):
+            publishers[number].put("x")
+            got = talker.get(asked, target=zenoh.QueryTarget.ALL, timeout=10.0)
+            if any(each.ok is not None for each in got):
+                seen["reply"].add(number)
+        time.sleep(4 * PAUSE)
+    told: dict[str, set[int]] = {
+        what: {
+            number
+            for number, names in enumerate(cases)
+            if all(
+                control.allows(who, flow, message, names[place])
+                or (message is Message.DECLARE_SUBSCRIBER and who == "/talker" and "*" in names[0])
+                for who, flow, message, place in of
+            )
+        }
+        for what, of in MESSAGES.items()
+    }
+    told["reply"] &= told["query"]
+    return {
+        "different": {
+            what: {n: [*cases[n], n in told[what]] for n in sorted(told[what] ^ seen[what])}
+            for what in seen
+        },
+        "happened": {what: len(seen[what]) for what in seen},
+    }
 
 
 PLAYS: dict[str, Callable[[Path, Path], Any]] = {
     "secured": lambda keystore, _: communicate(keystore, rules=True),
     "open": lambda keystore, _: communicate(keystore, rules=False),
     "entrances": entrances,
+    "decisions": lambda keystore, _: decisions(keystore, 1000 if LONG else 200),
     "routers": lambda keystore, _: {
         each: passed_on(keystore, each) for each in ("/other", "/router")
     },
