@@ -29,6 +29,8 @@ from sros_tool.cli.progress import progress
 from sros_tool.cli.written import changes_json, notes_json
 from sros_tool.errors import UsageError
 
+_DONE = {"create": "wrote", "replace": "replaced", "remove": "removed"}
+
 
 @click.command(
     "zenoh",
@@ -120,6 +122,9 @@ def zenoh(
             keyring=keyring(),
             dry_run=dry_run or only_check,
         )
+    # A document and the signed one next to it are written together.
+    documents = [each for each in result.changes if each.path.endswith(".json5")]
+    changed = {each.path for each in documents}
     if as_json:
         print_json(
             {
@@ -134,7 +139,7 @@ def zenoh(
                     {
                         "enclave": name,
                         "path": str(result.folder / path),
-                        "current": name not in result.restart,
+                        "current": path not in changed,
                     }
                     for name, path in result.files.items()
                 ],
@@ -144,20 +149,20 @@ def zenoh(
             }
         )
     elif only_check:
-        for name in result.restart:
-            click.echo(visible(f"out of date: {result.folder / result.files[name]}"))
+        for each in documents:
+            click.echo(visible(f"out of date: {result.folder / each.path}"))
     elif dry_run:
         print_plan(result.folder, result.changes)
     else:
-        for name in result.restart:
-            click.echo(visible(f"wrote {result.folder / result.files[name]}"))
-    if not result.restart:
+        for each in documents:
+            click.echo(visible(f"{_DONE[each.action]} {result.folder / each.path}"))
+    if not documents:
         click.echo("the files of Zenoh are up to date", err=True)
     if not (dry_run or only_check):
         print_closed(result.folder, result.changes)
         print_restart(result.restart)
     print_notes(result.notes)
-    if only_check and result.restart:
+    if only_check and documents:
         raise SystemExit(1)
 
 

@@ -64,6 +64,7 @@ SESSION_FILE, ROUTER_FILE = "session.json5", "router.json5"
 """The configurations of Zenoh for the processes of an enclave, and for the router's enclave."""
 ZENOH_SIGNED = {SESSION_FILE: "session.p7s", ROUTER_FILE: "router.p7s"}
 """The same documents signed by the permissions CA: Zenoh itself verifies nothing."""
+ZENOH_FILES = (*ZENOH_SIGNED, *ZENOH_SIGNED.values())
 
 REQUEST = "request.pem"
 """The signing request of an enclave whose key was made on its robot and stays there."""

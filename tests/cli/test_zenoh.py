@@ -43,8 +43,11 @@ def control(folder: Path, path: str) -> Any:
 
 def test_files_are_signed_whole_and_the_same_again(folder: Path) -> None:
     ended = sros("zenoh", "ks", "p.xml", cwd=folder).ok()
-    assert ended.out.splitlines() == [f"wrote ks/enclaves/{each}" for each in
-        ("a/session.json5", "b/session.json5", "router/router.json5")]  # fmt: skip
+    assert ended.out.splitlines() == [
+        "wrote ks/enclaves/router/router.json5",
+        "wrote ks/enclaves/a/session.json5",
+        "wrote ks/enclaves/b/session.json5",
+    ]
     assert "restart the processes of 3 enclaves" in ended.err
     authority = load_ca_certificate(folder / "ks", "permissions")
     for path, signed in SIGNED.items():
@@ -116,7 +119,8 @@ def test_what_was_changed_is_out_of_date_and_written_again(
     checked = sros("zenoh", "ks", "p.xml", "--check", cwd=folder)
     assert (checked.status, checked.out) == (1, f"out of date: ks/{path}\n")
     assert snapshot(folder) == before
-    assert sros("zenoh", "ks", "p.xml", cwd=folder).ok().out == f"wrote ks/{path}\n"
+    verb = "wrote" if change == "missing" else "replaced"
+    assert sros("zenoh", "ks", "p.xml", cwd=folder).ok().out == f"{verb} ks/{path}\n"
     sros("zenoh", "ks", "p.xml", "--check", cwd=folder).ok()
 
 
@@ -159,3 +163,41 @@ def test_an_enclave_without_policy_is_named(folder: Path) -> None:
     ended = sros("zenoh", "ks", "p.xml", "--json", cwd=folder).ok()
     (note,) = json.loads(ended.out)["notes"]
     assert note["id"] == "zenoh.without-policy" and "/hole" in note["text"]
+
+
+def test_a_revoked_certificate_that_zenoh_still_accepts_is_noted(folder: Path) -> None:
+    sros("zenoh", "ks", "p.xml", cwd=folder).ok()
+    sros("revoke", "ks", "/a", cwd=folder).ok()
+    assert not (folder / "ks" / SESSION).exists()
+    assert "was revoked" in sros("zenoh", "ks", "p.xml", cwd=folder).err
+    sros("generate_artifacts", "-k", "ks", "-p", "p.xml", "-e", "/a", cwd=folder).ok()
+    ended = sros("zenoh", "ks", "p.xml", "--json", cwd=folder).ok()
+    notes = {each["id"]: each["text"] for each in json.loads(ended.out)["notes"]}
+    assert "a revoked certificate of /a has not expired" in notes["zenoh.revoked-name"]
+
+
+def test_an_export_has_the_file_of_its_enclave_alone(folder: Path) -> None:
+    sros("zenoh", "ks", "p.xml", cwd=folder).ok()
+    sros("distribute_key", "ks", "/a", "robot", cwd=folder).ok()
+    found = sorted(each.name for each in (folder / "robot").rglob("session.*"))
+    assert found == ["session.json5", "session.p7s"]
+    assert (folder / "robot" / SESSION).read_bytes() == (folder / "ks" / SESSION).read_bytes()
+    sros("verify", "robot", cwd=folder).ok()
+    assert "unknown" not in sros("check", "ks", "--severity", "note", cwd=folder).out
+
+
+def test_files_that_no_policy_states_any_more_are_removed(folder: Path) -> None:
+    sros("zenoh", "ks", "p.xml", cwd=folder).ok()
+    only_a = policy_text({"/a": publish("/x")})
+    (folder / "a.xml").write_text(only_a)
+    by_hand = folder / "ks/enclaves/hole/session.json5"
+    by_hand.write_text("{}")
+    checked = sros("zenoh", "ks", "a.xml", "--check", cwd=folder)
+    assert checked.status == 1
+    assert "out of date: ks/enclaves/b/session.json5" in checked.out.splitlines()
+    ended = sros("zenoh", "ks", "a.xml", cwd=folder).ok()
+    assert "removed ks/enclaves/b/session.json5" in ended.out.splitlines()
+    assert "restart the processes of 3 enclaves" in ended.err
+    assert not list((folder / "ks/enclaves/b").glob("session.*"))
+    assert by_hand.read_text() == "{}"
+    sros("zenoh", "ks", "a.xml", "--check", cwd=folder).ok()

@@ -24,6 +24,7 @@ from sros_tool.keystore.layout import (
     enclave_names,
     enclave_path,
 )
+from sros_tool.keystore.ledger import read_ledger
 from sros_tool.keystore.lifecycle.create import rights_by_enclave
 from sros_tool.keystore.missing import no_such_enclave
 from sros_tool.keystore.reader import (
@@ -47,6 +48,7 @@ from sros_tool.translate_zenoh import (
     remote_rights,
     stated_rights,
 )
+from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.access import AccessControl, Flow, Message, RemoteRights
 from sros_tool.zenoh.configuration import Configuration, Mode
@@ -96,8 +98,9 @@ def write_zenoh_files(
 ) -> ZenohFiles:
     """Write the configuration of the router and of every enclave of the policies: all or none.
 
-    Files that are as they would be written, with a valid signature, stay as they are.  They go
-    into the enclaves of the keystore ``root``, or into the same places of the folder ``output``.
+    Files that are as they would be written, with a valid signature, stay as they are; those of
+    enclaves that no policy states any more are removed.  They go into the enclaves of the keystore
+    ``root``, or into the same places of the folder ``output``.
 
     Raises:
         KeystoreError: an enclave is missing, or its signed permissions are not those of the policy.
@@ -116,6 +119,7 @@ def write_zenoh_files(
         for path, document in documents.items()
         if not _is_current(folder / path, document, certificate)
     }
+    stale = _stale(root, folder, documents)
     authority = None
     if outdated and not dry_run:
         authority = load_authority(root, PERMISSIONS, load_settings(root), keyring, now)
@@ -123,16 +127,20 @@ def write_zenoh_files(
         for path, document in outdated.items():
             transaction.write(path, document)
             transaction.write(_signed_path(path), _signed(authority, document))
+        for path in stale:
+            transaction.remove(path)
+            transaction.remove(_signed_path(path))
         transaction.commit()
         changes = tuple(transaction.changes)
     names = {_router_path(network.router): network.router}
     names |= {_session_path(name): name for name in stated}
+    without = {path: name for name in enclave_names(root) for path in _paths(name) if path in stale}
     return ZenohFiles(
         folder,
         {names[path]: path for path in documents},
         changes,
-        tuple(sorted(names[path] for path in outdated)),
-        _notes(root, stated, network),
+        tuple(sorted({names[path] for path in outdated} | set(without.values()))),
+        (*_notes(root, stated, network), *_revoked_names(root, (*stated, network.router), now)),
     )
 
 
@@ -199,6 +207,22 @@ def _documents(stated: Mapping[str, Enclave], network: ZenohNetwork) -> dict[str
     return documents
 
 
+def _stale(root: Path, folder: Path, documents: Mapping[str, bytes]) -> list[str]:
+    """Return the files that sros made for enclaves that no policy states any more."""
+    return [
+        path
+        for name in enclave_names(root)
+        for path in _paths(name)
+        if path not in documents
+        and (folder / path).is_file()
+        and (folder / _signed_path(path)).is_file()
+    ]
+
+
+def _paths(name: str) -> tuple[str, str]:
+    return _router_path(name), _session_path(name)
+
+
 def _router_path(name: str) -> str:
     return f"{enclave_folder(name)}/{ROUTER_FILE}"
 
@@ -238,6 +262,32 @@ def _notes(root: Path, stated: Mapping[str, Enclave], network: ZenohNetwork) -> 
             "zenoh.without-policy",
             f"no policy states what {named} may do on Zenoh: these enclaves get no file, and the "
             "others deny them everything.",
+        ),
+    )
+
+
+def _revoked_names(root: Path, names: Sequence[str], now: datetime) -> tuple[Note, ...]:
+    """Return a note on names that revoked certificates have, too, until they expire."""
+    entries = read_ledger(root).entries
+    revoked = {each.serial for each in entries if each.what == "revocation"}
+    again = sorted(
+        {
+            each.enclave
+            for each in entries
+            if each.what == "certificate"
+            and each.serial in revoked
+            and each.enclave in names
+            and each.not_after >= iso(now)
+        }
+    )
+    if not again:
+        return ()
+    return (
+        Note(
+            "zenoh.revoked-name",
+            f"a revoked certificate of {', '.join(again)} has not expired: Zenoh has no revocation "
+            "list, and gives whoever has it the rights of that enclave. Give the enclave another "
+            "name, or replace the identity CA with `sros rotate_ca`.",
         ),
     )
 
