@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from sros_tool.keystore.lifecycle import zenoh as lifecycle
 from sros_tool.keystore.reader import load_ca_certificate
 from sros_tool.pki import smime
+from sros_tool.policy.model import Enclave
+from sros_tool.translate_zenoh import remote_rights
+from sros_tool.zenoh.access import AccessRule, Flow, Message, RemoteRights
 from tests.support.harness import policy_text, publish, snapshot, sros
 
 SESSION, ROUTER = "enclaves/a/session.json5", "enclaves/router/router.json5"
@@ -201,3 +206,29 @@ def test_files_that_no_policy_states_any_more_are_removed(folder: Path) -> None:
     assert not list((folder / "ks/enclaves/b").glob("session.*"))
     assert by_hand.read_text() == "{}"
     sros("zenoh", "ks", "a.xml", "--check", cwd=folder).ok()
+
+
+def test_a_signature_of_another_keystore_does_not_count(folder: Path) -> None:
+    sros("generate_artifacts", "-k", "other", "-p", "p.xml", "-e", "/router", cwd=folder).ok()
+    for keystore in ("ks", "other"):
+        sros("zenoh", keystore, "p.xml", cwd=folder).ok()
+    assert (folder / "other" / SESSION).read_bytes() == (folder / "ks" / SESSION).read_bytes()
+    shutil.copy(folder / "other" / SIGNED[SESSION], folder / "ks" / SIGNED[SESSION])
+    checked = sros("zenoh", "ks", "p.xml", "--check", cwd=folder)
+    assert (checked.status, checked.out) == (1, f"out of date: ks/{SESSION}\n")
+
+
+@pytest.mark.parametrize("lost", [True, False])
+def test_rules_that_are_not_the_policy_are_not_written(
+    lost: bool, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def wrong(enclave: Enclave, domain: int) -> RemoteRights:
+        rights = remote_rights(enclave, domain)
+        wider = AccessRule(Flow.EGRESS, (Message.PUT,), (f"{domain}/**",))
+        return replace(rights, rules=rights.rules[1:] if lost else (*rights.rules, wider))
+
+    monkeypatch.setattr(lifecycle, "remote_rights", wrong)
+    before = snapshot(folder)
+    ended = sros("zenoh", "ks", "p.xml", cwd=folder)
+    assert (ended.status, "would not have the intended content" in ended.err) == (2, True)
+    assert snapshot(folder) == before

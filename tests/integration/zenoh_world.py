@@ -56,18 +56,18 @@ def configured(
     """
     folder = keystore / "enclaves" / enclave[1:]
     document = json.loads((folder / file).read_text())
-    tls = document["transport"]["link"]["tls"]
-    tls["root_ca_certificate"] = str(folder / "identity_ca.cert.pem")
+    paths = {"root_ca_certificate": "identity_ca.cert.pem"}
     for side in _SIDES if certificate else ():
-        tls[f"{side}_private_key"] = str(folder / "key.pem")
-        tls[f"{side}_certificate"] = str(folder / "cert.pem")
+        paths |= {f"{side}_private_key": "key.pem", f"{side}_certificate": "cert.pem"}
     if not certificate:
-        tls["enable_mtls"] = False
+        document["transport"]["link"]["tls"]["enable_mtls"] = False
         document["listen"]["endpoints"] = []
     if not rules:
         del document["access_control"]
-    document |= changes
-    return zenoh.Config.from_json5(json.dumps(document))
+    config = zenoh.Config.from_json5(json.dumps(document | changes))
+    for name, path in paths.items():  # as ZENOH_CONFIG_OVERRIDE does
+        config.insert_json5(f"transport/link/tls/{name}", json.dumps(str(folder / path)))
+    return config
 
 
 def until(happened: Callable[[], bool], again: Callable[[], object] = lambda: None) -> bool:
