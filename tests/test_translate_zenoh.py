@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import random
+from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
 
 import pytest
 
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.permissions import Permissions
 from sros_tool.errors import PolicyError
 from sros_tool.names import expression_problem
 from sros_tool.policy.document import read_policy
-from sros_tool.policy.model import Enclave
+from sros_tool.policy.model import ALLOW, Enclave, Group, Profile, Profiles
+from sros_tool.policy.model import DENY as DENY_
+from sros_tool.policy.model import RIGHTS as RIGHTS_OF
 from sros_tool.policy.patterns import matches
 from sros_tool.policy.rights import Rules
 from sros_tool.resources import policies_dir
+from sros_tool.translate import dds_names, permissions_for
 from sros_tool.translate_zenoh import (
     chunks_of,
     control_of_router,
@@ -22,11 +28,14 @@ from sros_tool.translate_zenoh import (
     remote_rights,
     stated_rights,
 )
+from sros_tool.validity import Window
 from sros_tool.zenoh.access import AccessControl, Flow, Message
 from sros_tool.zenoh.key_expressions import canonical, includes
+from tests.support.children import LONG
 from tests.support.harness import policy_text, publish
 
 IN, OUT = Flow.INGRESS, Flow.EGRESS
+VALIDITY = Window(datetime(2027, 1, 1, tzinfo=UTC), datetime(2028, 1, 1, tzinfo=UTC))
 TYPE = "std_msgs::msg::dds_::String_/RIHS01_00"
 
 
@@ -197,10 +206,6 @@ def test_the_shipped_policies_give_the_same_rights_as_on_dds(file: str) -> None:
     """Each enclave is asked about every name of its policy, in each right that such names have."""
     policy = read_policy(policies_dir() / file)
     stated = {each.path: [one.right for one in stated_rights(each)] for each in policy.enclaves}
-    uses = {
-        "publish": (IN, Message.PUT), "subscribe": (OUT, Message.PUT),
-        "request": (IN, Message.QUERY), "reply": (OUT, Message.QUERY),
-    }  # fmt: skip
     names = {(e.kind, e.name) for of in stated.values() for e in of if "*" not in e.name}
     for each in policy.enclaves:
         if each.path == "/mobile_robot/recorder":  # reads all but the camera
@@ -210,8 +215,60 @@ def test_the_shipped_policies_give_the_same_rights_as_on_dds(file: str) -> None:
         control, rules = AccessControl((remote_rights(each, 0),)), Rules(stated[each.path])
         for kind, name in names:
             for right in ("publish", "subscribe") if kind == "topics" else ("request", "reply"):
-                told = control.allows(each.path, *uses[right], f"0{name}/{TYPE}")
+                told = control.allows(each.path, *USES[right], f"0{name}/{TYPE}")
                 assert told == rules.allow(each.path, right, name), (each.path, right, name)
+
+
+USES = {
+    "publish": (IN, Message.PUT), "subscribe": (OUT, Message.PUT),
+    "request": (IN, Message.QUERY), "reply": (OUT, Message.QUERY),
+}  # fmt: skip
+
+
+def test_random_policies_give_the_same_rights_as_on_dds_or_an_error() -> None:
+    """DDS is asked by its own engine, from the permissions of the same enclave."""
+    draw, translated = random.Random(15), 0
+    for _ in range(3000 if LONG else 300):
+        enclave = drawn_enclave(draw)
+        try:
+            control = AccessControl((remote_rights(enclave, 0),))
+        except PolicyError:
+            continue
+        translated += 1
+        document = permissions_for(
+            enclave, subject="CN=/e", validity=VALIDITY, domains=DomainSet.of((0, 0))
+        )
+        for name, (right, use) in product(NAMES, USES.items()):
+            names = dds_names(right, name)
+            on_dds = all(
+                rule_allows(document, topic, publish=written)
+                for topics, written in ((names.publish, True), (names.subscribe, False))
+                for topic in topics
+            )
+            told = control.allows("/e", *use, f"0{name}/{TYPE}")
+            assert told == on_dds, (enclave, right, name)
+    assert translated > 100
+
+
+def rule_allows(permissions: Permissions, topic: str, *, publish: bool) -> bool:
+    """The first rule that matches a topic decides; without one it is denied."""
+    for rule in permissions.grants[0].rules:
+        criteria = rule.publish if publish else rule.subscribe
+        if any(matches(each, topic) for one in criteria for each in one.topics):
+            return rule.allow
+    return False
+
+
+def drawn_enclave(draw: random.Random) -> Enclave:
+    """An enclave with some rights and denials, on names of which some have wildcards."""
+    names = ["/a", "/b", "/ab", "/a/b", "/ab/a", "/a/b/aab", "/a*", "/*b", "/a/*", "/*", "/[ab]"]
+    groups = []
+    for _ in range(draw.randint(1, 5)):
+        kind = draw.choice(("topics", "services"))
+        right = draw.choice(RIGHTS_OF[kind])
+        qualifier = DENY_ if draw.random() < 0.3 else ALLOW
+        groups.append(Group(kind, ((right, qualifier),), tuple(draw.sample(names, 2))))
+    return Enclave("/e", (Profiles((Profile("/", "n", tuple(groups)),)),))
 
 
 def test_a_session_trusts_its_router_with_its_own_rights_alone(tmp_path: Path) -> None:

@@ -52,7 +52,7 @@ def play(what: str, folder: Path, mode: str = "peer") -> Any:
     """Write the files, for a port of this world's own, and return what was observed."""
     with socket.socket() as free:  # where no network of its own is allowed
         free.bind(("127.0.0.1", 0))
-        endpoint = f"127.0.0.1:{free.getsockname()[1]}"
+        endpoint = f"localhost:{free.getsockname()[1]}"
     for name in ("ks", "foreign"):
         sros(
             *("zenoh", folder / name, folder / "policy.xml"),

@@ -184,8 +184,8 @@ def _check_permissions(root: Path, name: str, enclave: Enclave, now: datetime) -
         side = "permissions" if sign == "-" else "policy"
         raise KeystoreError(
             f"the permissions of enclave {name} are not those of the policy",
-            f"Only the {side} has: {first.qualifier} {first.describe()}. What DDS and what Zenoh "
-            "enforces would differ.",
+            f"Only the {side} has: {first.qualifier} {first.describe()}. DDS and Zenoh would "
+            "enforce different rights.",
             f"Run `sros generate_artifacts -k {quote(str(root))} -p "
             f"{quote(enclave.source.file or 'POLICY')}` first.",
         )
