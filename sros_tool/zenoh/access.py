@@ -108,11 +108,10 @@ def joined(rules: Iterable[AccessRule]) -> tuple[AccessRule, ...]:
 
 
 def _needed(keys: set[str]) -> tuple[str, ...]:
-    wide = [each for each in keys if "$*" in each or "**" in each or "/*/" in each]
     return tuple(
         sorted(
             each
             for each in keys
-            if not any(other != each and includes(other, each) for other in wide)
+            if not any(other != each and includes(other, each) for other in keys)
         )
     )

@@ -42,7 +42,11 @@ def includes(wide: str, narrow: str) -> bool:
     """Return whether ``wide`` includes every key that ``narrow`` stands for, as Zenoh decides."""
     if wide == narrow:
         return True
-    return "*" in wide and _chunks_include(tuple(wide.split("/")), tuple(narrow.split("/")))
+    # Most expressions differ before their first wildcard; "/**" may stand for nothing.
+    begin, wildcard, _ = wide.partition("*")
+    if not wildcard or not narrow.startswith(begin.rstrip("$/")):
+        return False
+    return _chunks_include(tuple(wide.split("/")), tuple(narrow.split("/")))
 
 
 def _chunks_include(wide: Sequence[str], narrow: Sequence[str]) -> bool:

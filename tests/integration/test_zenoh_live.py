@@ -74,6 +74,7 @@ def test_who_may_communicates_and_nobody_else(keystores: Path, mode: str) -> Non
         "answered": ["server"],
         "nodes": ["other", "talker"],
         "history": ["map"],
+        "same_enclave": ["twin"],
     }
 
 

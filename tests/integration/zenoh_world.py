@@ -156,6 +156,7 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             at.open(f"/{each}") for each in ("talker", "keeper", "listener")
         )
         server, client = at.open("/server"), at.open("/client")
+        one, two = at.open("/other"), at.open("/other")
         other = at.open("/other", rules=False)
         heard: set[str] = set()
         overheard: set[str] = set()
@@ -206,6 +207,9 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             )
         )
         until(lambda: bool(late))
+        twin: set[str] = set()
+        kept.append(two.declare_subscriber(key("/elsewhere"), lambda each: twin.add(text(each))))
+        until(lambda: bool(twin), lambda: one.put(key("/elsewhere"), "twin"))
         time.sleep(PAUSE)
         return {
             "heard": sorted(heard),
@@ -214,6 +218,7 @@ def communicate(keystore: Path, *, rules: bool) -> dict[str, Any]:
             "answered": sorted(answered),
             "nodes": sorted(seen),
             "history": sorted(late),
+            "same_enclave": sorted(twin),
         }
 
 
