@@ -18,8 +18,8 @@ PACKAGE = PROJECT / "sros_tool"
 LAYERS = {
     1: {"errors", "faults", "names", "owners", "validity", "values"}
     | {"xml", "files", "folders", "parallel", "resources"},
-    2: {"pki", "policy", "dds"},
-    3: {"translate"},
+    2: {"pki", "policy", "dds", "zenoh"},
+    3: {"translate", "translate_zenoh"},
     4: {"keystore", "graph", "runtime"},
     5: {"checks", "explain", "demo", "report"},
     6: {"api", "cli"},

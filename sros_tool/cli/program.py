@@ -60,6 +60,7 @@ FAMILIES: dict[str, dict[str, VerbEntry]] = {
         "import": VerbEntry(
             "deployment", "Install a signed answer on the robot.", attribute="import_verb"
         ),
+        "zenoh": VerbEntry("zenoh", "Write the files that make Zenoh enforce policies."),
     },
     "Policy": {
         "generate_policy": VerbEntry("generate_policy", "Learn a policy from the running robot."),
@@ -236,6 +237,7 @@ _PHRASES = {
     "demo": "run the demo",
     "policies": "show the policies",
     "crl": "show or sign the revocation list",
+    "zenoh": "write the files of Zenoh",
     "completion": "print the completion script",
     "doctor": "examine this machine",
     "audit": "audit the robot",

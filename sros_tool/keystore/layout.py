@@ -60,6 +60,12 @@ REQUIRED_FILES = (
 CRL_FILE = "crl.pem"
 OPTIONAL_FILES = (CRL_FILE,)
 
+SESSION_FILE, ROUTER_FILE = "session.json5", "router.json5"
+"""The configurations of Zenoh for the processes of an enclave, and for the router's enclave."""
+ZENOH_SIGNED = {SESSION_FILE: "session.p7s", ROUTER_FILE: "router.p7s"}
+"""The same documents signed by the permissions CA: Zenoh itself verifies nothing."""
+ZENOH_FILES = (*ZENOH_SIGNED, *ZENOH_SIGNED.values())
+
 REQUEST = "request.pem"
 """The signing request of an enclave whose key was made on its robot and stays there."""
 SEAL = "answer.p7s"
@@ -116,7 +122,7 @@ _MOST_FOLDERS = 1000
 
 _TOP_FILES = frozenset((SETTINGS, LEDGER, LEDGER_HEAD, ROTATION))
 _OF_NODE = (CERTIFICATE_FILE, KEY_FILE, PERMISSIONS_FILE)
-_FILE_TYPES = (".pem", ".p7s", ".xml")
+_FILE_TYPES = (".pem", ".p7s", ".xml", ".json5")
 _TOP_FOLDERS = frozenset((ENCLAVES, PUBLIC, PRIVATE, REVOKED, RETIRED))
 
 

@@ -33,7 +33,7 @@ NEW_NAMES = {("create_request", "name")}
 """Arguments that are a name which does not exist yet."""
 GROWS = {
     "create_enclave", "generate_artifacts", "update_keystore", "renew", "revoke", "rotate_ca",
-    "distribute_key", "verify", "diff_policy", "explain", "view", "check",
+    "distribute_key", "verify", "diff_policy", "explain", "view", "check", "zenoh",
 }  # fmt: skip
 
 
@@ -99,6 +99,7 @@ def made(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "create_request /r asking",
         "sign_request ks asking/enclaves/r/request.pem -o answer.tar.gz",
         "generate_artifacts -k late -p p.xml",
+        "generate_artifacts -k zenoh -p p.xml -e /router",
     ):
         sros(*line.split(), cwd=folder).ok()
     (folder / "damaged/enclaves/a/cert.pem").write_text("damaged")
@@ -125,6 +126,7 @@ STATUS: dict[str, tuple[str, str, str]] = {
     "revoke": ("ks /a", NEVER, "ks /nobody"),
     "rotate_ca": ("ks --next", NEVER, "nothing --next"),
     "crl": ("ks", NEVER, "nothing"),
+    "zenoh": ("zenoh p.xml", "zenoh p.xml --check", "nothing p.xml"),
     "distribute_key": ("ks /a out", NEVER, "ks /nobody out"),
     "verify": ("robot", "damaged", "nothing"),
     "create_request": ("/new out", NEVER, "/r asking"),

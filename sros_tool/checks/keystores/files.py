@@ -29,6 +29,7 @@ from sros_tool.keystore.layout import (
     SEAL,
     SETTINGS,
     STAGE,
+    ZENOH_FILES,
     UnreadPath,
     enclave_folder,
 )
@@ -169,7 +170,15 @@ UNKNOWN_FILE = FindingKind(
 
 _KEY_FOLDERS = (PRIVATE, ENCLAVES, REVOKED, RETIRED)
 _MOST_READ = 65536
-_KNOWN = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml", REQUEST, SEAL, "governance.xml")
+_KNOWN = (
+    *REQUIRED_FILES,
+    *OPTIONAL_FILES,
+    *ZENOH_FILES,
+    "permissions.xml",
+    REQUEST,
+    SEAL,
+    "governance.xml",
+)
 _TOP = (SETTINGS, LEDGER, LEDGER_HEAD, ROTATION)
 _KNOWN_ANYWHERE = re.compile(
     r".*\.(?:cert|key|crl)\.pem\Z|.*\.p11\Z|.*\.srl\Z|index\.txt.*|serial.*"

@@ -19,6 +19,7 @@ from sros_tool.keystore.layout import (
     OPTIONAL_FILES,
     PRIVATE,
     REQUIRED_FILES,
+    ZENOH_FILES,
     check_readable,
     enclave_folder,
     enclave_path,
@@ -175,7 +176,7 @@ def _collect(root: Path, names: Sequence[str], now: datetime) -> dict[str, bytes
         ):
             raise _holds_ca_key(folder / KEY_FILE)
         with Folder(root) as opened:
-            for file in (*REQUIRED_FILES, *OPTIONAL_FILES):
+            for file in (*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES):
                 path = f"{enclave_folder(name)}/{file}"
                 if (folder / file).exists():
                     files[path] = opened.read_inside(path)

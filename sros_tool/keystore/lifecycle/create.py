@@ -231,7 +231,7 @@ def generate_artifacts(
     Raises:
         KeystoreError: a policy names a revoked enclave that ``enclaves`` does not name.
     """
-    wanted = _rights_by_enclave(enclaves, policies)
+    wanted = rights_by_enclave(enclaves, policies)
     if not dry_run:
         tidy(root)
     if create is None or is_keystore(root):
@@ -303,7 +303,7 @@ def refuse_other_template(root: Path, template: Template) -> None:
         )
 
 
-def _rights_by_enclave(
+def rights_by_enclave(
     names: Sequence[str], policies: Sequence[Policy]
 ) -> dict[str, Enclave | None]:
     """Map enclaves to their rights in the policies, or None; raise if two policies differ."""

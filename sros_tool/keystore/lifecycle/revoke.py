@@ -19,6 +19,7 @@ from sros_tool.keystore.layout import (
     REQUEST,
     REQUIRED_FILES,
     REVOKED,
+    ZENOH_FILES,
     enclave_folder,
     list_enclaves,
 )
@@ -36,7 +37,7 @@ from sros_tool.pki.crl import REASONS, SUPERSEDED, Revoked
 from sros_tool.pki.requests import key_digest
 from sros_tool.validity import iso
 
-_FILES = (*REQUIRED_FILES, *OPTIONAL_FILES, "permissions.xml", REQUEST)
+_FILES = (*REQUIRED_FILES, *OPTIONAL_FILES, *ZENOH_FILES, "permissions.xml", REQUEST)
 _PRIVATE = "key.pem"
 
 

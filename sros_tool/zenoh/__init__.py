@@ -1,0 +1,1 @@
+"""The language of Zenoh: key expressions, access control and configurations."""

@@ -1,0 +1,123 @@
+"""Configurations of Zenoh processes as rmw_zenoh reads them, without paths and without keys.
+
+A file replaces the whole default of rmw_zenoh, so it also repeats those of its values that differ
+from Zenoh's own and that ROS needs (rmw_zenoh_cpp/config/DEFAULT_RMW_ZENOH_*_CONFIG.json5).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+from sros_tool.zenoh.access import AccessControl
+
+
+class Mode(StrEnum):
+    """How a process takes part in the network."""
+
+    ROUTER = "router"
+    PEER = "peer"
+    """Connects to the router, and directly to the processes that the router tells it of."""
+    CLIENT = "client"
+    """Connects to the router alone, which passes on all data."""
+
+
+_QUERY_MILLISECONDS = 600_000
+"""How long rmw_zenoh waits for a reply; Zenoh's own default of 10 s would end long calls."""
+
+
+@dataclass(frozen=True, slots=True)
+class Configuration:
+    """The configuration of one Zenoh process: where it listens and connects, and what it enforces.
+
+    Endpoints have the form ``tls/HOST:PORT``.
+    """
+
+    mode: Mode
+    listen: tuple[str, ...]
+    connect: tuple[str, ...]
+    access_control: AccessControl
+
+    def render(self) -> bytes:
+        """Return the file: JSON, the same for equal configurations.
+
+        TLS has no files yet: a session that is not told where its key is does not open.
+        """
+        return (json.dumps(self._document(), indent=1) + "\n").encode()
+
+    def _document(self) -> dict[str, Any]:
+        return {
+            "mode": self.mode.value,
+            "connect": {"endpoints": list(self.connect)},
+            "listen": {"endpoints": list(self.listen)},
+            "scouting": {
+                # A multicast group would be neither encrypted nor filtered.
+                "multicast": {"enabled": False},
+                "gossip": {
+                    "enabled": self.mode is not Mode.CLIENT,
+                    "target": {"router": ["router", "peer"], "peer": ["router"]},
+                    "autoconnect": {"router": [], "peer": ["router", "peer"]},
+                },
+            },
+            "timestamping": {"enabled": {"router": True, "peer": True, "client": True}},
+            "queries_default_timeout": _QUERY_MILLISECONDS,
+            "transport": {
+                "link": {
+                    # Without the list, an endpoint tcp/... would be open next to tls/... .
+                    "protocols": ["tls"],
+                    "tls": {
+                        "enable_mtls": True,
+                        # Certificates of enclaves name an enclave, not a host: the rules ask for
+                        # that name, and no subject is without one.
+                        "verify_name_on_connect": False,
+                        "close_link_on_expiration": True,
+                    },
+                },
+                # Shared memory between processes of a host would not be encrypted.
+                "shared_memory": {"enabled": False},
+            },
+            "adminspace": {"enabled": False},
+            "access_control": _access_control(self.access_control),
+        }
+
+
+def _access_control(control: AccessControl) -> dict[str, Any]:
+    rules: list[dict[str, Any]] = []
+    policies = []
+    for remote in control.remotes:
+        names = []
+        for number, rule in enumerate(remote.rules):
+            names.append(f"{remote.common_name}#{number}")
+            rules.append(
+                {
+                    "id": names[-1],
+                    "permission": "allow",
+                    "flows": [rule.flow.value],
+                    "messages": [each.value for each in rule.messages],
+                    "key_exprs": list(rule.key_expressions),
+                }
+            )
+        policies.append({"rules": names, "subjects": [remote.common_name]})
+    return {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": [
+            {"id": each.common_name, "cert_common_names": [each.common_name]}
+            for each in control.remotes
+        ],
+        "policies": policies,
+    }
+
+
+_ENDPOINT = re.compile(r"(?:[A-Za-z0-9.-]+|\[[0-9A-Fa-f:.]+\]):(\d{1,5})\Z", re.ASCII)
+_MOST_PORT = 65535
+
+
+def is_endpoint(text: str) -> bool:
+    """Return whether ``text`` is ``HOST:PORT``, with a name or an address and a port from 1."""
+    found = _ENDPOINT.match(text)
+    return bool(found and 0 < int(found[1]) <= _MOST_PORT)

@@ -1,0 +1,99 @@
+"""Key expressions of Zenoh: their canonical form, and whether one includes another.
+
+A key expression has chunks, with "/" between them.  ``*`` stands for one chunk, ``**`` for any
+number of them, ``$*`` for any part of a chunk.  No wildcard matches a chunk that begins with ``@``.
+Source: zenoh.io "Key Expressions"; measured with the wheel 1.10.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import lru_cache
+
+ANY_PART, ANY_CHUNKS = "$*", "**"
+_ANY_CHUNK = "*"
+_MANY = 65536
+
+
+def canonical(chunks: Iterable[str]) -> str:
+    """Return the key expression of ``chunks`` in the only form that Zenoh accepts.
+
+    A chunk that is only ``$*`` becomes ``*``, and of wildcards that follow each other, each ``*``
+    stands before one ``**``.  Rules in another form keep a session from opening.
+    """
+    found: list[str] = []
+    for chunk in chunks:
+        while ANY_PART + ANY_PART in chunk:
+            chunk = chunk.replace(ANY_PART + ANY_PART, ANY_PART)
+        if chunk == ANY_PART:
+            chunk = _ANY_CHUNK
+        if found and found[-1] == ANY_CHUNKS:
+            if chunk == ANY_CHUNKS:
+                continue
+            if chunk == _ANY_CHUNK:
+                found.insert(-1, chunk)
+                continue
+        found.append(chunk)
+    return "/".join(found)
+
+
+@lru_cache(maxsize=_MANY)
+def includes(wide: str, narrow: str) -> bool:
+    """Return whether ``wide`` includes every key that ``narrow`` stands for, as Zenoh decides."""
+    if wide == narrow:
+        return True
+    # Most expressions differ before their first wildcard; "/**" may stand for nothing.
+    begin, wildcard, _ = wide.partition("*")
+    if not wildcard or not narrow.startswith(begin.rstrip("$/")):
+        return False
+    return _chunks_include(tuple(wide.split("/")), tuple(narrow.split("/")))
+
+
+def _chunks_include(wide: Sequence[str], narrow: Sequence[str]) -> bool:
+    """Return whether chunks include others: the set of reached places grows chunk by chunk."""
+    reached = _onward({0}, wide)
+    for chunk in narrow:
+        following = set()
+        for at in reached:
+            if at == len(wide):
+                continue
+            if wide[at] == ANY_CHUNKS and not chunk.startswith("@"):
+                following.add(at)
+            elif _chunk_includes(wide[at], chunk):
+                following.add(at + 1)
+        reached = _onward(following, wide)
+    return len(wide) in reached
+
+
+def _onward(reached: set[int], wide: Sequence[str]) -> set[int]:
+    """Return ``reached``, and the places after each ``**``, which may stand for no chunk."""
+    found = set(reached)
+    for at in sorted(reached):
+        while at < len(wide) and wide[at] == ANY_CHUNKS:
+            at += 1
+            found.add(at)
+    return found
+
+
+def _chunk_includes(wide: str, narrow: str) -> bool:
+    if wide == narrow:
+        return True
+    if narrow == ANY_CHUNKS or "*" not in wide or narrow.startswith("@"):
+        return False
+    if wide == _ANY_CHUNK:
+        return True
+    if narrow == _ANY_CHUNK:
+        return False
+    first, *others = wide.split(ANY_PART)
+    # "\0" is no character of a key: what only a wildcard includes.
+    text = narrow.replace(ANY_PART, "\0")
+    *middle, last = others
+    at, end = len(first), len(text) - len(last)
+    if end < at or not text.startswith(first) or not text.endswith(last):
+        return False
+    for part in middle:
+        at = text.find(part, at, end)
+        if at < 0:
+            return False
+        at += len(part)
+    return True

@@ -1,0 +1,108 @@
+"""The written files enforce the policy on real Zenoh, between sessions like those of rmw_zenoh."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.support.children import run
+from tests.support.harness import policy_text, publish, sros
+
+pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
+
+pytestmark = pytest.mark.zenoh
+WORLD = Path(__file__).with_name("zenoh_world.py")
+
+
+def subscribe(*names: str) -> str:
+    return publish(*names).replace("publish", "subscribe")
+
+
+POLICY = policy_text(
+    {
+        "/talker": publish("/chatter"),
+        "/keeper": publish("/secret", "/map"),
+        "/listener": subscribe("/chatter", "/secret", "/map"),
+        "/server": '<services reply="ALLOW"><service>/add</service></services>',
+        "/client": '<services request="ALLOW"><service>/add</service></services>',
+        "/other": publish("/elsewhere") + subscribe("/elsewhere"),
+    }
+)
+
+
+@pytest.fixture(scope="module")
+def keystores(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two keystores with the same enclaves, of different CAs."""
+    folder = tmp_path_factory.mktemp("zenoh")
+    (folder / "policy.xml").write_text(POLICY)
+    for name in ("ks", "foreign"):
+        sros("create_keystore", folder / name, "--template", "production").ok()
+        sros("create_enclave", folder / name, "/router").ok()
+        sros("generate_artifacts", "-k", folder / name, "-p", folder / "policy.xml").ok()
+    return folder
+
+
+def play(what: str, folder: Path, mode: str = "peer") -> Any:
+    """Write the files, for a port of this world's own, and return what was observed."""
+    with socket.socket() as free:  # where no network of its own is allowed
+        free.bind(("127.0.0.1", 0))
+        endpoint = f"localhost:{free.getsockname()[1]}"
+    for name in ("ks", "foreign"):
+        sros(
+            *("zenoh", folder / name, folder / "policy.xml"),
+            *("--endpoint", endpoint, "--mode", mode),
+        ).ok()
+    done = run(
+        [sys.executable, "-P", WORLD, what, folder / "ks", folder / "foreign"],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    )
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("mode", ["peer", "client"])
+def test_who_may_communicates_and_nobody_else(keystores: Path, mode: str) -> None:
+    assert play("secured", keystores, mode) == {
+        "heard": ["chatter", "keeper"],
+        "overheard": [],
+        "executed": ["client"],
+        "answered": ["server"],
+        "nodes": ["other", "talker"],
+        "history": ["map"],
+        "same_enclave": ["twin"],
+    }
+
+
+def test_without_the_rules_each_of_these_attacks_succeeds(keystores: Path) -> None:
+    observed = play("open", keystores)
+    assert set(observed["heard"]) >= {"other", "wildcard", "wildcards", "talker"}
+    assert set(observed["overheard"]) >= {"chatter", "keeper", "server"}
+    assert "other" in observed["executed"]
+    assert "thief" in observed["answered"]
+    assert "spoofed" in observed["nodes"]
+
+
+def test_only_a_certificate_of_the_keystore_gets_a_connection(keystores: Path) -> None:
+    assert play("entrances", keystores, "client") == {
+        "ours": True,
+        "foreign": False,
+        "none": False,
+        "tcp": False,
+        "ours again": True,
+        "without paths": False,
+    }
+
+
+def test_another_enclave_cannot_play_the_router(keystores: Path) -> None:
+    assert play("routers", keystores, "client") == {"/other": False, "/router": True}
+
+
+def test_zenoh_decides_as_sros_says(keystores: Path) -> None:
+    observed = play("decisions", keystores, "client")
+    assert observed["different"] == {"put": {}, "query": {}, "reply": {}}
+    assert min(observed["happened"].values()) > 20

@@ -1,0 +1,290 @@
+"""Rights of policies become access control of Zenoh: exactly, or an error with the place."""
+
+from __future__ import annotations
+
+import random
+from datetime import UTC, datetime
+from itertools import product
+from pathlib import Path
+
+import pytest
+
+from sros_tool.dds.domains import DomainSet
+from sros_tool.dds.permissions import Permissions
+from sros_tool.errors import PolicyError
+from sros_tool.names import expression_problem
+from sros_tool.policy.document import read_policy
+from sros_tool.policy.model import ALLOW, Enclave, Group, Profile, Profiles
+from sros_tool.policy.model import DENY as DENY_
+from sros_tool.policy.model import RIGHTS as RIGHTS_OF
+from sros_tool.policy.patterns import matches
+from sros_tool.policy.rights import Rules
+from sros_tool.resources import policies_dir
+from sros_tool.translate import dds_names, permissions_for
+from sros_tool.translate_zenoh import (
+    chunks_of,
+    control_of_router,
+    control_of_session,
+    remote_rights,
+    stated_rights,
+)
+from sros_tool.validity import Window
+from sros_tool.zenoh.access import AccessControl, Flow, Message
+from sros_tool.zenoh.key_expressions import canonical, includes
+from tests.support.children import LONG
+from tests.support.harness import policy_text, publish
+
+IN, OUT = Flow.INGRESS, Flow.EGRESS
+VALIDITY = Window(datetime(2027, 1, 1, tzinfo=UTC), datetime(2028, 1, 1, tzinfo=UTC))
+TYPE = "std_msgs::msg::dds_::String_/RIHS01_00"
+
+
+def enclave(tmp_path: Path, groups: str, path: str = "/robot/n") -> Enclave:
+    file = tmp_path / "policy.xml"
+    file.write_text(policy_text({path: groups}))
+    return read_policy(file).enclaves[0]
+
+
+def keys(name: str) -> list[str]:
+    return [canonical(("0", *each, "*", "*")) for each in chunks_of(name)]
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("/chatter", ["0/chatter/*/*"]),
+        ("/ns/_hidden", ["0/ns/_hidden/*/*"]),
+        ("/*", ["0/*/*/*/**"]),
+        ("/cam*", ["0/cam$*/*/*/**"]),
+        ("/*cam", ["0/**/$*cam/*/*"]),
+        ("/cam/*", ["0/cam/*/*/*/**"]),
+        ("/a/*/b", ["0/a/*/**/b/*/*"]),
+        ("/a*b", ["0/a$*b/*/*", "0/a$*/**/$*b/*/*"]),
+        ("/*a*", ["0/**/$*a$*/*/*/**"]),
+        ("*/chatter", ["0/chatter/*/*", "0/*/**/chatter/*/*"]),
+    ],
+)
+def test_names(name: str, expected: list[str]) -> None:
+    assert keys(name) == expected
+
+
+NAMES = [
+    "/" + "/".join(parts)
+    for count in (1, 2, 3)
+    for parts in product(("a", "b", "ab", "aab"), repeat=count)
+]
+
+
+def test_a_wildcard_matches_the_same_names_in_both_worlds() -> None:
+    draw = random.Random(15)
+    tried = 0
+    while tried < 400:
+        text = "/" + "".join(draw.choice("aab/**") for _ in range(draw.randint(1, 7)))
+        if expression_problem(text):
+            continue
+        tried += 1
+        expressions = keys(text)
+        for name in NAMES:
+            key = f"0{name}/{TYPE}"
+            said = any(includes(each, key) for each in expressions)
+            assert said == matches(text, name), (text, name, expressions)
+
+
+RIGHTS = {
+    "publish": [
+        (IN, Message.PUT, ""), (IN, Message.DELETE, ""), (OUT, Message.DECLARE_SUBSCRIBER, ""),
+        (IN, Message.REPLY, ""), (IN, Message.PUT, "/@adv/pub/1/2/_"),
+        (IN, Message.DECLARE_QUERYABLE, "/@adv/pub/1/2/_"),
+        (IN, Message.LIVELINESS_TOKEN, "/@adv/pub/1/2/_"), (OUT, Message.QUERY, "/@adv/**"),
+        (OUT, Message.DECLARE_SUBSCRIBER, "/@adv/**"),
+        (OUT, Message.DECLARE_LIVELINESS_SUBSCRIBER, "/@adv/**"),
+    ],
+    "request": [
+        (IN, Message.QUERY, ""), (OUT, Message.REPLY, ""), (OUT, Message.DECLARE_QUERYABLE, ""),
+    ],
+}  # fmt: skip
+RIGHTS["subscribe"] = [(flow.opposite(), message, end) for flow, message, end in RIGHTS["publish"]]
+RIGHTS["reply"] = [(flow.opposite(), message, end) for flow, message, end in RIGHTS["request"]]
+GROUP = {
+    "publish": publish("/x"),
+    "subscribe": publish("/x").replace("publish", "subscribe"),
+    "request": '<services request="ALLOW"><service>/x</service></services>',
+    "reply": '<services reply="ALLOW"><service>/x</service></services>',
+}
+NAMED = [*product(Flow, Message, ["", "/@adv/pub/1/2/_", "/@adv/**"])]
+
+
+@pytest.mark.parametrize("right", RIGHTS)
+def test_a_right_is_exactly_these_messages(right: str, tmp_path: Path) -> None:
+    rights = remote_rights(enclave(tmp_path, GROUP[right]), 0)
+    control = AccessControl((rights,))
+    key = f"0/x/{TYPE}"
+    allowed = {each for each in NAMED if control.allows("/robot/n", *each[:2], key + each[2])}
+    advanced = {each for each in allowed if each[2]}
+    assert {each for each in allowed if not each[2]} == {e for e in RIGHTS[right] if not e[2]}
+    assert advanced >= {each for each in RIGHTS[right] if each[2]}
+    assert bool(advanced) == (right in ("publish", "subscribe"))
+    for other in (f"0/y/{TYPE}", f"0/x/y/{TYPE}", f"1/x/{TYPE}", "0/**", "0/*/*/*", "0/x/**"):
+        assert not any(control.allows("/robot/n", *each[:2], other) for each in NAMED), other
+    assert not any(control.allows("/robot", *each[:2], key) for each in NAMED)
+
+
+def test_an_action_is_its_services_and_topics(tmp_path: Path) -> None:
+    group = '<actions execute="ALLOW"><action>/a</action></actions>'
+    control = AccessControl((remote_rights(enclave(tmp_path, group), 0),))
+
+    def allowed(flow: Flow, message: Message, name: str) -> bool:
+        return control.allows("/robot/n", flow, message, f"0/a/_action/{name}/{TYPE}")
+
+    for name in ("send_goal", "cancel_goal", "get_result"):
+        assert allowed(OUT, Message.QUERY, name) and not allowed(IN, Message.QUERY, name)
+    for name in ("feedback", "status"):
+        assert allowed(IN, Message.PUT, name) and not allowed(OUT, Message.PUT, name)
+
+
+def test_a_token_of_the_graph_names_its_own_enclave(tmp_path: Path) -> None:
+    control = AccessControl((remote_rights(enclave(tmp_path, publish("/x")), 0),))
+
+    def allowed(flow: Flow, message: Message, key: str) -> bool:
+        return control.allows("/robot/n", flow, message, key)
+
+    token = Message.LIVELINESS_TOKEN
+    assert allowed(IN, token, "@ros2_lv/0/z/0/0/NN/%robot%n/%/n")
+    assert allowed(IN, token, "@ros2_lv/0/z/0/1/MP/%robot%n/%/n/%x/t/h/q")
+    assert not allowed(IN, token, "@ros2_lv/0/z/0/0/NN/%robot%other/%/n")
+    assert not allowed(IN, token, "@ros2_lv/0/z/0/0/NN/*/%/n")
+    assert not allowed(IN, token, "@ros2_lv/1/z/0/0/NN/%robot%n/%/n")
+    assert allowed(OUT, token, "@ros2_lv/0/z/0/0/NN/%robot%other/%/n")
+    assert allowed(IN, Message.LIVELINESS_QUERY, "@ros2_lv/0/**")
+    assert not allowed(IN, Message.LIVELINESS_QUERY, "@ros2_lv/**")
+
+
+DENY = '<topics {}="DENY"><topic>{}</topic></topics>'
+
+
+@pytest.mark.parametrize(
+    ("groups", "allowed", "refused"),
+    [
+        (publish("/a", "/b") + DENY.format("publish", "/b"), ["/a"], ["/b"]),
+        (publish("/a", "/b") + DENY.format("publish", "/*"), [], ["/a", "/b"]),
+        (publish("/a*") + DENY.format("publish", "/*"), [], ["/a", "/ab"]),
+        (publish("/a*") + DENY.format("publish", "/b*"), ["/a", "/ab"], ["/b"]),
+        (publish("/a*") + DENY.format("subscribe", "/a"), ["/a", "/ab"], ["/b"]),
+        (publish("/c[0-2]") + DENY.format("publish", "/c1"), ["/c0", "/c2"], ["/c1", "/c3"]),
+        (publish("/c[ab]*"), ["/ca", "/cbx/y"], ["/cc"]),
+    ],
+)
+def test_denials_are_subtracted(
+    groups: str, allowed: list[str], refused: list[str], tmp_path: Path
+) -> None:
+    control = AccessControl((remote_rights(enclave(tmp_path, groups), 0),))
+    for name in (*allowed, *refused):
+        told = control.allows("/robot/n", IN, Message.PUT, f"0{name}/{TYPE}")
+        assert told == (name in allowed), name
+
+
+@pytest.mark.parametrize(
+    ("groups", "text"),
+    [
+        (publish("/a*") + "\n" + DENY.format("publish", "/ab"), "policy.xml:2: DENY publish /ab"),
+        ("\n" + publish("/a?"), "policy.xml:2: the name /a?"),
+        (publish("/[!a]b"), "policy.xml:1: the name /[!a]b"),
+        (publish("/[a-z][a-z]"), "policy.xml:1: the name /[a-z][a-z]"),
+    ],
+)
+def test_what_zenoh_cannot_enforce_is_refused_with_its_line(
+    groups: str, text: str, tmp_path: Path
+) -> None:
+    with pytest.raises(PolicyError) as caught:
+        remote_rights(enclave(tmp_path, groups), 0)
+    assert text in caught.value.what
+    assert "List the names" in caught.value.remedy
+
+
+@pytest.mark.parametrize("file", sorted(each.name for each in policies_dir().glob("*.xml")))
+def test_the_shipped_policies_give_the_same_rights_as_on_dds(file: str) -> None:
+    """Each enclave is asked about every name of its policy, in each right that such names have."""
+    policy = read_policy(policies_dir() / file)
+    stated = {each.path: [one.right for one in stated_rights(each)] for each in policy.enclaves}
+    names = {(e.kind, e.name) for of in stated.values() for e in of if "*" not in e.name}
+    for each in policy.enclaves:
+        if each.path == "/mobile_robot/recorder":  # reads all but the camera
+            with pytest.raises(PolicyError, match=r"recorder.xml:11: DENY subscribe /front_camera"):
+                remote_rights(each, 0)
+            continue
+        control, rules = AccessControl((remote_rights(each, 0),)), Rules(stated[each.path])
+        for kind, name in names:
+            for right in ("publish", "subscribe") if kind == "topics" else ("request", "reply"):
+                told = control.allows(each.path, *USES[right], f"0{name}/{TYPE}")
+                assert told == rules.allow(each.path, right, name), (each.path, right, name)
+
+
+USES = {
+    "publish": (IN, Message.PUT), "subscribe": (OUT, Message.PUT),
+    "request": (IN, Message.QUERY), "reply": (OUT, Message.QUERY),
+}  # fmt: skip
+
+
+def test_random_policies_give_the_same_rights_as_on_dds_or_an_error() -> None:
+    """DDS is asked by its own engine, from the permissions of the same enclave."""
+    draw, translated = random.Random(15), 0
+    for _ in range(3000 if LONG else 300):
+        enclave = drawn_enclave(draw)
+        try:
+            control = AccessControl((remote_rights(enclave, 0),))
+        except PolicyError:
+            continue
+        translated += 1
+        document = permissions_for(
+            enclave, subject="CN=/e", validity=VALIDITY, domains=DomainSet.of((0, 0))
+        )
+        for name, (right, use) in product(NAMES, USES.items()):
+            names = dds_names(right, name)
+            on_dds = all(
+                rule_allows(document, topic, publish=written)
+                for topics, written in ((names.publish, True), (names.subscribe, False))
+                for topic in topics
+            )
+            told = control.allows("/e", *use, f"0{name}/{TYPE}")
+            assert told == on_dds, (enclave, right, name)
+    assert translated > 100
+
+
+def rule_allows(permissions: Permissions, topic: str, *, publish: bool) -> bool:
+    """The first rule that matches a topic decides; without one it is denied."""
+    for rule in permissions.grants[0].rules:
+        criteria = rule.publish if publish else rule.subscribe
+        if any(matches(each, topic) for one in criteria for each in one.topics):
+            return rule.allow
+    return False
+
+
+def drawn_enclave(draw: random.Random) -> Enclave:
+    """An enclave with some rights and denials, on names of which some have wildcards."""
+    names = ["/a", "/b", "/ab", "/a/b", "/ab/a", "/a/b/aab", "/a*", "/*b", "/a/*", "/*", "/[ab]"]
+    groups = []
+    for _ in range(draw.randint(1, 5)):
+        kind = draw.choice(("topics", "services"))
+        right = draw.choice(RIGHTS_OF[kind])
+        qualifier = DENY_ if draw.random() < 0.3 else ALLOW
+        groups.append(Group(kind, ((right, qualifier),), tuple(draw.sample(names, 2))))
+    return Enclave("/e", (Profiles((Profile("/", "n", tuple(groups)),)),))
+
+
+def test_a_session_trusts_its_router_with_its_own_rights_alone(tmp_path: Path) -> None:
+    text = policy_text({"/a": publish("/x"), "/b": publish("/y")})
+    (tmp_path / "p.xml").write_text(text)
+    remotes = {e.path: remote_rights(e, 0) for e in read_policy(tmp_path / "p.xml").enclaves}
+    put_x, put_y = (Message.PUT, f"0/x/{TYPE}"), (Message.PUT, f"0/y/{TYPE}")
+    for direct in (True, False):
+        session = control_of_session("/a", "/router", remotes, direct=direct)
+        assert session.allows("/router", OUT, *put_x)
+        assert not session.allows("/router", IN, *put_x)
+        assert not session.allows("/router", OUT, *put_y)
+        assert session.allows("/b", IN, *put_y) == direct
+        assert not session.allows("/b", IN, *put_x)
+        assert not session.allows("", IN, *put_x)
+    router = control_of_router(remotes)
+    assert router.allows("/a", IN, *put_x) and router.allows("/b", IN, *put_y)
+    assert not router.allows("/a", IN, *put_y)
+    assert not router.allows("/router", IN, *put_x)
