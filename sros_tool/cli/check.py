@@ -305,11 +305,14 @@ def _shown(finding: Finding) -> Finding:
 
 def _needs_renewal(root: Path, text: str, moment: datetime, as_json: bool) -> int:
     from sros_tool.keystore.expiry import describe_lifetime, parse_threshold, survey
+    from sros_tool.keystore.reader import load_settings
     from sros_tool.validity import iso
 
     threshold = parse_threshold(text)
     found, unreadable = survey(root)
-    due = [each for each in found if each.due(threshold, moment)]
+    settings = load_settings(root)
+    lasting = (each for each in found if settings.longest_validity(each.name) is None)
+    due = [each for each in lasting if each.due(threshold, moment)]
     if as_json:
         print_json(
             {

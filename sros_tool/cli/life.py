@@ -54,7 +54,8 @@ Example:
 @click.option(
     "--all-expiring",
     metavar="DURATION|PERCENT",
-    help="Also renew enclaves that expire within 30d, or have used 66% of their validity.",
+    help="Also renew enclaves that expire within 30d, or have used 66% of their validity; "
+    "enclaves that are short-lived have to be named.",
 )
 @click.option("--new-key", is_flag=True, help="Create new keys as well.")
 @click.option(

@@ -107,3 +107,15 @@ def test_permissions_of_an_older_certificate_are_short_too(tmp_path: Path) -> No
     ((found,), _) = survey(root)
     assert found.permissions.not_after - found.permissions.not_before - BACKDATE == DAY
     assert found.certificate.not_after - found.permissions.not_after > 300 * DAY
+
+
+def test_a_short_lived_enclave_is_renewed_by_its_name_alone(tmp_path: Path) -> None:
+    root = tmp_path / "ks"
+    sros("create_keystore", root).ok()
+    create(root)
+    assert sros("check", "keystore", root, "--needs-renewal", "30d").ok()
+    due = sros("check", "keystore", root, "--needs-renewal", "99y")
+    assert (due.status, SHORT in due.out, LONG in due.out) == (1, False, True)
+    assert sros("renew", root, "--all-expiring", "99y").ok().out == f"renewed enclave {LONG}\n"
+    renewed = sros("renew", root, SHORT, "--all-expiring", "30d").ok()
+    assert renewed.out == f"renewed enclave {SHORT}\n"

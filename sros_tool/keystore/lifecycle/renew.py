@@ -123,7 +123,9 @@ def renew(
         existing = list_enclaves(root) if expiring or revoke_old else ()
         thresholds: dict[str, Threshold | None] = dict.fromkeys(names)
         if expiring is not None:
-            thresholds |= {name: expiring for name in existing if name not in thresholds}
+            # A short-lived enclave, such as a person's, ends unless somebody renews it by its name.
+            chosen = (each for each in existing if template.longest_validity(each) is None)
+            thresholds |= {name: expiring for name in chosen if name not in thresholds}
 
         def renew_one(name: str) -> Superseded | UnreadableEnclave | None:
             return renewer.renew_if_due(name, thresholds[name])
