@@ -10,6 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from sros_tool.dds.decision import matching
 from sros_tool.dds.decision.matching import ExpressionIndex, matches
 from sros_tool.dds.decision.vendors import Style
 from tests.support.children import LONG
@@ -68,3 +69,20 @@ def test_positions_are_those_of_one_after_the_other(texts: list[str], name: str)
 def test_both_ways_takes_the_name_for_an_expression_too() -> None:
     assert ExpressionIndex(Style.FNMATCH, ["rt/open"], both_ways=True).first("rt/o*") == 0
     assert ExpressionIndex(Style.FNMATCH, ["rt/open"]).first("rt/o*") is None
+
+
+@pytest.mark.parametrize("part", ["[", "[-a", "[a", "[!a", "[]", "[a-", "[[:x:]"])
+def test_many_unclosed_sets_take_linear_time(part: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A permissions document of a few kilobytes took half a minute."""
+    read = 0
+
+    def counted(text: str, index: int) -> tuple[str | None, str | None, int]:
+        nonlocal read
+        read += 1
+        return token(text, index)
+
+    token = matching._token
+    monkeypatch.setattr(matching, "_token", counted)
+    expression = part * 1000 + "[=]=]"
+    assert matches(Style.FNMATCH, expression, expression) in (True, False)
+    assert 0 < read < 4 * len(expression)

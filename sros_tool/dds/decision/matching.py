@@ -39,7 +39,7 @@ def _matcher(style: Style, expression: str) -> _Matcher | None:
     """Return a function that matches names; None if ``expression`` matches only itself."""
     if _SPECIAL.isdisjoint(expression):
         return None
-    take_set = _fnmatch_set if style is Style.FNMATCH else _cyclone_set
+    take_set = _FnmatchSets(expression).take if style is Style.FNMATCH else _cyclone_set
     segments = [""]  # the text between stars
     index = 0
     while index < len(expression):
@@ -130,40 +130,83 @@ def _set_of(members: list[str], negated: bool) -> str:
     return f"[{'^' if negated else ''}{''.join(members)}]"
 
 
-def _fnmatch_set(text: str, start: int) -> tuple[str, int]:
-    """Return the set after ``[`` as glibc reads it, and the index after the set.
+class _FnmatchSets:
+    """Reads the sets of an expression as glibc does, in linear time."""
 
-    After an unknown class or symbol, and after a range without its end, no further character
-    matches.  In all other cases, or if ``[`` was in it before, an unclosed set is a plain ``[``.
+    def __init__(self, text: str) -> None:
+        self._text = text
+        self._known: dict[int, tuple[bool, bool]] = {}
+
+    def take(self, text: str, start: int) -> tuple[str, int]:
+        """Return the set after ``[``, and the index after the set.
+
+        After an unknown class or symbol, and after a range without its end, no further character
+        matches.  In all other cases, or if ``[`` was in it before, an unclosed set is a plain
+        ``[``.
+        """
+        index = start
+        negated = text[index : index + 1] in ("!", "^")
+        index += negated
+        closed, plain = self._end_of(index, first=True)
+        if not closed:
+            return (re.escape("[") if plain else _NEVER), start
+        members: list[str] = []
+        goes_on = first = True
+        while first or text[index] != "]":
+            first = False
+            low, high, index = _token(text, index)
+            goes_on = goes_on and low is not None and high is not None
+            if goes_on and low is high:
+                members.append(low or "")
+            elif goes_on and low and high and low[-1] <= high[-1]:
+                members.append(f"{low}-{high}")
+        return (_set_of(members, negated) if goes_on or not negated else _NEVER), index + 1
+
+    def _end_of(self, index: int, *, first: bool) -> tuple[bool, bool]:
+        """Return whether a set whose members go on at ``index`` is closed, and plain if not.
+
+        What was found for an index is kept: many unclosed sets would take quadratic time.
+        """
+        text, opening = self._text, re.escape("[")
+        path: list[tuple[int, bool | None]] = []
+        closed, plain = False, True
+        while index < len(text):
+            if not first and text[index] == "]":
+                closed = True
+                break
+            if not first and index in self._known:
+                closed, plain = self._known[index]
+                break
+            low, high, after = _token(text, index)
+            decided = None
+            if low is None or high is None:
+                decided = False
+            elif low is high and low == opening:
+                decided = True
+            path.append((-1 if first else index, decided))
+            index, first = after, False
+        for place, decided in reversed(path):
+            plain = plain if decided is None else decided
+            self._known[place] = closed, plain
+        return closed, plain
+
+
+def _token(text: str, index: int) -> tuple[str | None, str | None, int]:
+    """Return the first and the last member of a class, a range or a character, and what follows.
+
+    None stands for a member that glibc does not know.
     """
-    index = start
-    negated = text[index : index + 1] in ("!", "^")
-    index += negated
-    members: list[str] = []
-    goes_on = True
-    first = True
-    while index < len(text):
-        if text[index] == "]" and not first:
-            return (_set_of(members, negated) if goes_on or not negated else _NEVER), index + 1
-        first = False
-        if found := _CLASS.match(text, index):
-            low = high = _CLASSES.get(found[1])
-            index = found.end()
-        elif found := _EQUIVALENT.match(text, index):
-            low = high = re.escape(found[1])
-            index = found.end()
-        else:
-            low, index = _member(text, index)
-            high = low
-            if text[index : index + 1] == "-" and text[index + 1 : index + 2] != "]":
-                high, index = _member(text, index + 1)
-        goes_on = goes_on and low is not None and high is not None
-        if goes_on and low is high:
-            members.append(low or "")
-        elif goes_on and low and high and low[-1] <= high[-1]:
-            members.append(f"{low}-{high}")
-    opening = re.escape("[")
-    return (opening if goes_on or opening in members else _NEVER), start
+    if found := _CLASS.match(text, index):
+        known = _CLASSES.get(found[1])
+        return known, known, found.end()
+    if found := _EQUIVALENT.match(text, index):
+        equivalent = re.escape(found[1])
+        return equivalent, equivalent, found.end()
+    low, index = _member(text, index)
+    high = low
+    if text[index : index + 1] == "-" and text[index + 1 : index + 2] != "]":
+        high, index = _member(text, index + 1)
+    return low, high, index
 
 
 def _member(text: str, index: int) -> tuple[str | None, int]:
