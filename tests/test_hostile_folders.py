@@ -375,11 +375,11 @@ def test_a_lock_file_with_two_names_changes_no_owner(keystore: Path, outside: Pa
 
 def test_the_lock_is_of_one_holder_at_a_time(keystore: Path) -> None:
     with Folder(keystore) as one, Folder(keystore) as two:
-        first = locking.KeystoreLock(one)
+        first = locking.KeystoreLock(one).acquire()
         with pytest.raises(KeystoreError, match="is busy"):
-            locking.KeystoreLock(two, wait=0.0)
+            locking.KeystoreLock(two).acquire(wait=0.0)
         first.release()
-        locking.KeystoreLock(two, wait=0.0).release()
+        locking.KeystoreLock(two).acquire(wait=0.0).release()
     assert not (keystore / LOCK).exists()
 
 
@@ -393,10 +393,10 @@ def test_releasing_a_lock_leaves_the_lock_of_the_next_holder(
     def unlink_then_another_locks(folder: Folder, path: str, **options: bool) -> None:
         unlink(folder, path, **options)
         if not taken:
-            taken.append(locking.KeystoreLock(two, wait=0.0))
+            taken.append(locking.KeystoreLock(two).acquire(wait=0.0))
 
     with Folder(keystore) as one, Folder(keystore) as two:
-        first = locking.KeystoreLock(one)
+        first = locking.KeystoreLock(one).acquire()
         monkeypatch.setattr(Folder, "unlink", unlink_then_another_locks)
         first.release()
         assert (keystore / LOCK).exists()
@@ -417,7 +417,7 @@ def test_a_lock_that_a_full_disk_holds_once_is_released(
         unlink(folder, path, **options)
 
     with Folder(keystore) as one:
-        first = locking.KeystoreLock(one)
+        first = locking.KeystoreLock(one).acquire()
         monkeypatch.setattr(Folder, "unlink", refuse_once)
         first.release()
     assert refused == [LOCK]

@@ -6,9 +6,11 @@ import contextlib
 import errno
 import fcntl
 import os
+import signal
 import stat
 import time
-from collections.abc import Callable
+from collections.abc import Iterator
+from typing import Self
 
 from sros_tool.errors import KeystoreError
 from sros_tool.folders import Folder
@@ -25,43 +27,62 @@ class KeystoreLock:
     a lock on the folder itself could be taken by everybody who may read the folder.
     """
 
-    def __init__(self, folder: Folder, wait: float | None = None) -> None:
-        """Lock the keystore in ``folder``; wait for it for ``wait`` seconds (default: 60).
+    def __init__(self, folder: Folder) -> None:
+        self._folder = folder
+        self._handle = -1
+
+    @property
+    def held(self) -> bool:
+        """Whether this process holds the lock."""
+        return self._handle >= 0
+
+    def acquire(self, wait: float | None = None) -> Self:
+        """Lock the keystore; wait for it for ``wait`` seconds (default: 60).
+
+        Whoever calls it calls `release` also if it raises: a signal may come just after the file
+        was made.
 
         Raises:
             KeystoreError: another process held the lock for ``wait`` seconds.
         """
-        self._folder = folder
         wait = _LOCK_SECONDS if wait is None else wait
-        self._handle = _until(time.monotonic() + wait, self._try)
-        if self._handle < 0:
+        deadline = time.monotonic() + wait
+        while not self._try() and time.monotonic() < deadline:
+            time.sleep(_PAUSE)
+        if not self.held:
             raise KeystoreError(
-                f"keystore '{folder.path}' is busy",
+                f"keystore '{self._folder.path}' is busy",
                 f"Another process has been writing to it for {wait:.0f} seconds.",
                 "Try again when that process has finished.",
             )
+        return self
 
-    def _try(self) -> int:
-        """Return the descriptor of the locked file, or -1."""
+    def _try(self) -> bool:
+        """Return whether the lock could be taken now."""
         try:
-            handle = self._folder.open_private(LOCK)
+            with _signals_held_back():
+                handle = self._folder.open_private(LOCK)
+                if stat.S_ISREG(os.fstat(handle).st_mode) and _locked(handle):
+                    if self._is_there(handle):
+                        self._handle = handle
+                        return True
+                    os.close(handle)
+                    return False
         except FileNotFoundError:
-            return -1  # another process removed it between two looks at it
+            return False  # another process removed it between two looks at it
         except PermissionError:
             if self._folder.state(LOCK) is None:
                 raise  # this user cannot write to the folder
-            return -1  # root made the file just now, and hands it over to the owner
+            return False  # root made the file just now, and hands it over to the owner
         except OSError as error:
             if error.errno not in (errno.ELOOP, errno.ENXIO):  # a link, a socket
                 raise
             raise self._in_the_way() from error
-        if not stat.S_ISREG(os.fstat(handle).st_mode):
-            os.close(handle)
-            raise self._in_the_way()
-        if _locked(handle) and self._is_there(handle):
-            return handle
+        regular = stat.S_ISREG(os.fstat(handle).st_mode)
         os.close(handle)
-        return -1
+        if not regular:
+            raise self._in_the_way()
+        return False
 
     def _in_the_way(self) -> KeystoreError:
         return KeystoreError(
@@ -102,7 +123,11 @@ def _locked(handle: int) -> bool:
     return True
 
 
-def _until(deadline: float, attempt: Callable[[], int]) -> int:
-    while (handle := attempt()) < 0 and time.monotonic() < deadline:
-        time.sleep(_PAUSE)
-    return handle
+@contextlib.contextmanager
+def _signals_held_back() -> Iterator[None]:
+    """Let no signal end the work between making a file and noting that it was made."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

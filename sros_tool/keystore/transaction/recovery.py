@@ -45,6 +45,7 @@ def tidy(root: Path) -> None:
     with Folder(root, for_owner=True) as folder:
         lock = KeystoreLock(folder)
         try:
+            lock.acquire()
             recover(folder)
         finally:
             lock.release()

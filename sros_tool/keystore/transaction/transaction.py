@@ -131,6 +131,7 @@ class Transaction:
             _LOG.info("began to create the keystore '%s'", self.root)
             return
         self._lock = KeystoreLock(self._in)
+        self._lock.acquire()
         recover(self._in)
         check_readable(self.root)
         for path in (STAGE, f"{STAGE}/{ADDED}", f"{STAGE}/{AFTER}"):
@@ -163,7 +164,7 @@ class Transaction:
             if self._sibling:
                 with Folder(self.root.parent) as parent, contextlib.suppress(OSError):
                     parent.remove_tree(self._sibling)
-            elif self._lock:
+            elif self._lock and self._lock.held:
                 recover(self._in)
         finally:
             if self._lock:
