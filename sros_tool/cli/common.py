@@ -10,7 +10,7 @@ import select
 import stat
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime, timedelta, timezone, tzinfo
 from pathlib import Path
@@ -274,7 +274,7 @@ def print_notes(notes: Sequence[Note]) -> None:
 def print_plan(root: Path, changes: Sequence[Change]) -> None:
     """Print the changes that a dry run did not make."""
     for change in changes:
-        click.echo(f"would {change.action} {root / change.path}")
+        click.echo(visible_line(f"would {change.action} {root / change.path}"))
     if not changes:
         click.echo("nothing would change")
 
@@ -299,15 +299,25 @@ _MAX_NAMES = 5
 """Number of enclaves that a message names."""
 
 
-def print_restart(names: Sequence[str]) -> None:
-    """Print on stderr that the processes of the enclaves ``names`` have to be restarted."""
+def print_remarks(remarks: Iterable[Note]) -> None:
+    """Print remarks on a result on stderr, each on a line."""
+    for remark in remarks:
+        click.echo(visible(remark.text), err=True)
+
+
+def print_restart(names: Sequence[str], *, exported: bool = True) -> None:
+    """Print on stderr that the processes of the enclaves ``names`` have to be restarted.
+
+    With ``exported`` also that exports of them are out of date.
+    """
     if not names:
         return
     more = len(names) - _MAX_NAMES
     shown = ", ".join(names[:_MAX_NAMES]) + (f" and {more} more, see --json" if more > 0 else "")
     number = "1 enclave" if len(names) == 1 else f"{len(names)} enclaves"
     text = f"restart the processes of {number} for it to take effect: {shown}"
-    click.echo(f"{text}; where they run from an export, export them again first", err=True)
+    again = "; where they run from an export, export them again first" if exported else ""
+    click.echo(visible(text + again), err=True)
 
 
 def check_output(output: Path, *, force: bool) -> None:

@@ -24,6 +24,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     print_plan,
+    print_remarks,
     print_restart,
     ros_domain,
     several_enclaves,
@@ -258,8 +259,7 @@ def _show(result: Creation, dry_run: bool, as_json: bool) -> None:
             click.echo(visible(text), err=True)
     if result.restart:
         print_restart(result.restart)
-    for remark in result.remarks:
-        click.echo(remark.text, err=True)
+    print_remarks(result.remarks)
     print_notes(result.notes)
 
 
@@ -874,8 +874,7 @@ def _show_update(
         return
     if not update.done:
         click.echo("nothing is left to do", err=True)
-        for remark in update.remarks:
-            click.echo(remark.text, err=True)
+        print_remarks(update.remarks)
         return
     template = f": template {update.before} -> {update.after}"
     verb = "would update" if dry_run else "updated"
@@ -905,9 +904,8 @@ def _show_update(
             err=True,
         )
     if not dry_run:
-        print_restart(update.restart)
-    for remark in update.remarks:
-        click.echo(remark.text, err=True)
+        print_restart(update.restart, exported=False)
+    print_remarks(update.remarks)
     if update.left:
         click.echo(
             f"stage {update.done[-1]} {'would be' if dry_run else 'is'} done; left: "

@@ -21,6 +21,7 @@ from sros_tool.cli.common import (
     print_json,
     print_notes,
     print_plan,
+    print_remarks,
     print_restart,
     several_enclaves,
     split_root,
@@ -149,8 +150,7 @@ def _print_replaced(result: Renewal) -> None:
         click.echo(f"{what}, unless revoked: see --revoke-old", err=True)
     elif result.restart:
         print_restart(result.restart)
-    for remark in result.remarks:
-        click.echo(remark.text, err=True)
+    print_remarks(result.remarks)
 
 
 def _complete_reason(
@@ -235,8 +235,7 @@ def revoke(
     if not dry_run:
         print_closed(root, result.changes)
     print_restart(result.restart)
-    for remark in result.remarks:
-        click.echo(remark.text, err=True)
+    print_remarks(result.remarks)
 
 
 def _revocation_json(result: Revocation, reason: str, dry_run: bool) -> dict[str, Any]:
@@ -290,8 +289,7 @@ def crl(root: Path | None, refresh: bool, as_json: bool, dry_run: bool) -> int:
         if not dry_run:
             print_closed(root, result.changes)
             print_restart(result.restart)
-        for remark in result.remarks:
-            click.echo(remark.text, err=True)
+        print_remarks(result.remarks)
     lists = read_lists(root)
     soon = bool(lists) and min(each.next_update for each in lists) - now() < timedelta(days=30)
     if as_json:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -127,6 +128,23 @@ def test_reading_and_a_failing_verb_leave_the_modes(root: Path) -> None:
     sros("inspect", root).ok()
     assert sros("renew", root, "/no_such_enclave").status
     assert open_to_others(root) == before
+
+
+def test_a_commit_that_fails_leaves_the_modes(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    (root / "enclaves/d/key.pem").chmod(0o644)
+    before = snapshot(root)
+    opened = open_to_others(root)
+    with monkeypatch.context() as broken:
+        broken.setattr("sros_tool.keystore.transaction.transaction.write_manifest", full)
+        assert sros("renew", root, "/a").status == 2
+    assert snapshot(root) == before
+    assert open_to_others(root) == opened
+    renewed = sros("renew", root, "/a").ok()
+    assert f"closed to other users, who could open them until now: {root}" in renewed.err
+    assert open_to_others(root) == set()
 
 
 def test_a_key_with_a_name_elsewhere_and_a_link_stay_as_they_are(

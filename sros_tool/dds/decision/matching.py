@@ -183,11 +183,12 @@ class _FnmatchSets:
                 decided = False
             elif low is high and low == opening:
                 decided = True
-            path.append((-1 if first else index, decided))
+            path.append((index, decided))
             index, first = after, False
         for place, decided in reversed(path):
             plain = plain if decided is None else decided
-            self._known[place] = closed, plain
+            if text[place] != "]":  # the first member of a set may be one; later it closes the set
+                self._known[place] = closed, plain
         return closed, plain
 
 

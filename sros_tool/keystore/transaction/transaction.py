@@ -323,9 +323,10 @@ class Transaction:
         Raises:
             KeystoreError: another process has created the keystore meanwhile.
         """
-        if self.changes and not self._new_root:
-            self._close_keys()
-        if self.dry_run or not self.changes:
+        if not self.changes:
+            return
+        if self.dry_run:
+            self.changes += [Change(CLOSE, path) for path in self._open_keys()]
             return
         folder = self._in
         if self._new_root:
@@ -341,16 +342,17 @@ class Transaction:
         self._report_commit()
         with contextlib.suppress(OSError, SrosError):  # already committed; `_end` tries again
             complete(folder, self._moves)
+        for path in self._open_keys():
+            with contextlib.suppress(OSError):  # `check` finds what stays open
+                folder.close_to_others(path)
+                if not folder.mode(path) & 0o077:
+                    self.changes.append(Change(CLOSE, path))
 
-    def _close_keys(self) -> None:
-        for path in _open_keys(self.root):
-            if path in self._staged:
-                continue
-            if not self.dry_run:
-                with contextlib.suppress(OSError):  # `check` finds what stays open
-                    self._in.close_to_others(path)
-            if self.dry_run or not self._in.mode(path) & 0o077:
-                self.changes.append(Change(CLOSE, path))
+    def _open_keys(self) -> list[str]:
+        """Return the paths that other users can open, except those that this change writes."""
+        if self._new_root:
+            return []
+        return [path for path in _open_keys(self.root) if path not in self._staged]
 
     def _report_commit(self) -> None:
         _LOG.info("committed %d changes to the keystore '%s'", len(self.changes), self.root)
