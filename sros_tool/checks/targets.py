@@ -1,4 +1,4 @@
-"""Checks of any path: a policy, a keystore, an enclave, or a folder of policies."""
+"""Checks of any path: a policy, a keystore, an enclave, a Zenoh configuration, or a folder."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 from sros_tool.checks.keystores.keystore import keystore_findings
 from sros_tool.checks.kind import Finding
 from sros_tool.checks.policies import policy_file_findings
+from sros_tool.checks.zenoh import configuration_findings
 from sros_tool.errors import DocumentError, SrosError
 from sros_tool.keystore.layout import (
     REQUIRED_FILES,
@@ -40,8 +41,11 @@ class Circumstances:
 def path_findings(path: Path, at: Circumstances) -> list[Finding]:
     """Return the findings at a path: a policy, a keystore, an enclave, or a folder of policies.
 
-    Raises `DocumentError` for any other path.
+    A file ``*.json5`` or ``*.json`` is a configuration of Zenoh.  Raises `DocumentError` for any
+    other path.
     """
+    if path.suffix in (".json5", ".json") and not path.is_dir():
+        return list(configuration_findings(path))
     if is_keystore(path):
         return _keystore(path, at, None)
     enclave = path if path.is_dir() else path.parent

@@ -97,3 +97,24 @@ def _chunk_includes(wide: str, narrow: str) -> bool:
             return False
         at += len(part)
     return True
+
+
+def expression_problem(text: str) -> str:
+    """Return why Zenoh does not accept a key expression, or "" if it does.
+
+    Wildcards stand as a chunk of their own or as ``$*``, and only in the canonical form.
+    """
+    chunks = text.split("/")
+    if "" in chunks:
+        return "it begins or ends with '/', or has two of them"
+    if "#" in text or "?" in text:
+        return "'#' and '?' are no characters of a key"
+    for chunk in chunks:
+        if chunk in (_ANY_CHUNK, ANY_CHUNKS):
+            continue
+        rest = chunk.replace(ANY_PART, "")
+        if "*" in rest or "$" in rest:
+            return f"in {chunk!r} a wildcard has to be '$*'"
+    if text != (right := canonical(chunks)):
+        return f"it has to be written {right!r}"
+    return ""

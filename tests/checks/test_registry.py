@@ -15,7 +15,13 @@ from sros_tool.checks.registry import KINDS, FindingFilter
 from sros_tool.checks.sarif import sarif
 from sros_tool.dds.decision.vendors import Vendor
 from sros_tool.errors import UsageError
-from tests.checks import keystore_cases, policy_cases, runtime_cases, test_policy_findings
+from tests.checks import (
+    keystore_cases,
+    policy_cases,
+    runtime_cases,
+    test_policy_findings,
+    zenoh_cases,
+)
 from tests.checks.bench import Bench
 from tests.support.harness import sros
 
@@ -29,6 +35,7 @@ def test_every_finding_has_a_test_that_brings_it_about() -> None:
         *test_policy_findings.FOUND_OTHERWISE,
         *keystore_cases.CASES,
         *runtime_cases.CASES,
+        *zenoh_cases.CASES,
     }
     assert tested == set(KINDS)
     assert len(KINDS) >= 50
@@ -37,7 +44,7 @@ def test_every_finding_has_a_test_that_brings_it_about() -> None:
 @pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.id)
 def test_kinds_are_complete(kind: Any) -> None:
     assert re.fullmatch(
-        r"(policy|keystore|enclave|permissions|governance|portable|runtime)\."
+        r"(policy|keystore|enclave|permissions|governance|portable|zenoh|runtime)\."
         r"[a-z0-9]+(-[a-z0-9]+)*",
         kind.id,
     )

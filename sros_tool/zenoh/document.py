@@ -1,0 +1,394 @@
+"""Reading the configuration of a Zenoh process, whoever wrote it: JSON5 or JSON.
+
+Only what security depends on becomes values; `ConfigurationDocument.unknown` names the rest that no
+version up to 1.10 has.  What Zenoh does not accept is an error, as a process with it does not open.
+Source: commons/zenoh-config of zenoh 1.9; compared with the wheel 1.10.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TypeVar
+
+from sros_tool.errors import DocumentError
+from sros_tool.zenoh.access import Flow, Message
+from sros_tool.zenoh.configuration import Mode
+from sros_tool.zenoh.enforcement import PROPERTIES, AclPolicy, AclRule, AclSubject, Enforcement
+from sros_tool.zenoh.json5 import MOST_BYTES, Json5Error, Json5Object, parse_json5
+from sros_tool.zenoh.key_expressions import expression_problem
+
+_E = TypeVar("_E", bound=StrEnum)
+
+_SECTIONS = frozenset(
+    {"id", "metadata", "mode", "region_name", "gateway", "connect", "listen", "open", "scouting"}
+    | {"timestamping", "queries_default_timeout", "routing", "aggregation", "qos", "transport"}
+    | {"adminspace", "namespace", "downsampling", "access_control", "low_pass_filter", "stats"}
+    | {"plugins_loading", "plugins"}
+)
+_TLS_FILES = (
+    "root_ca_certificate",
+    "listen_private_key",
+    "listen_certificate",
+    "connect_private_key",
+    "connect_certificate",
+)
+_TLS = frozenset(
+    {*_TLS_FILES, *(f"{each}_base64" for each in _TLS_FILES), "enable_mtls"}
+    | {"verify_name_on_connect", "close_link_on_expiration", "so_sndbuf", "so_rcvbuf"}
+)
+_LISTEN: Mapping[Mode, tuple[str, ...]] = {
+    Mode.ROUTER: ("tcp/[::]:7447",),
+    Mode.PEER: ("tcp/[::]:0",),
+    Mode.CLIENT: (),
+}
+"""Where a process listens whose configuration does not say it."""
+_LINK_PROTOCOLS = frozenset(
+    {"tcp", "udp", "tls", "quic", "serial", "unixpipe", "unixsock-stream", "vsock", "ws"}
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ZenohEndpoint:
+    """Where a process listens or connects: ``PROTOCOL/ADDRESS?METADATA#KEY=VALUE;...``."""
+
+    text: str
+
+    @property
+    def protocol(self) -> str:
+        """What stands before the first slash, such as "tls"."""
+        return self.text.partition("/")[0]
+
+    @property
+    def address(self) -> str:
+        """Its address without metadata and options, such as "localhost:7447"."""
+        return self.text.partition("/")[2].partition("#")[0].partition("?")[0]
+
+    @property
+    def options(self) -> Mapping[str, str]:
+        """Its own options, which count in place of those of the section ``tls``."""
+        pairs = (each.partition("=") for each in self.text.partition("#")[2].split(";") if each)
+        return {name: value for name, _, value in pairs}
+
+
+@dataclass(frozen=True, slots=True)
+class TlsOptions:
+    """The options of TLS that decide whom a process accepts, with Zenoh's defaults.
+
+    ``mutual``: who connects has to show a certificate.  ``verifies_name``: who listens has to have
+    the host of the endpoint in its certificate.  ``closes_on_expiration``: a connection ends when
+    the certificate of the other side expires.  ``named`` are the certificates and keys that it
+    names, such as "root_ca_certificate".
+    """
+
+    mutual: bool = False
+    verifies_name: bool = True
+    closes_on_expiration: bool = False
+    named: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigurationDocument:
+    """The configuration of a Zenoh process: what security depends on, with Zenoh's defaults.
+
+    ``protocols`` are the only ones for endpoints, None for all.  ``namespace`` stands before every
+    key of the process.  ``lines`` are the lines of settings, by their paths with "/" between the
+    parts; ``unknown`` the paths of settings that no version of Zenoh up to 1.10 accepts.
+    """
+
+    name: str
+    mode: Mode = Mode.PEER
+    listen: tuple[ZenohEndpoint, ...] = ()
+    connect: tuple[ZenohEndpoint, ...] = ()
+    protocols: tuple[str, ...] | None = None
+    tls: TlsOptions = TlsOptions()
+    shared_memory: bool = True
+    multicast: bool = True
+    gossip: bool = True
+    adminspace: bool = False
+    adminspace_readable: bool = True
+    adminspace_writable: bool = False
+    namespace: str | None = None
+    plugins: tuple[str, ...] = ()
+    access: Enforcement = field(default_factory=Enforcement)
+    unknown: tuple[str, ...] = ()
+    lines: Mapping[str, int] = field(default_factory=dict, compare=False, repr=False)
+
+    def line_of(self, path: str) -> int:
+        """Return the line of a setting, or else of the nearest one that contains it, or 1."""
+        while path and path not in self.lines:
+            path = path.rpartition("/")[0]
+        return self.lines.get(path, 1)
+
+
+def parse_configuration(data: bytes, name: str) -> ConfigurationDocument:
+    """Return the configuration that a file states; ``name`` is the file's name in errors.
+
+    Raises:
+        DocumentError: the file has more than 16 MiB, is not JSON5, or Zenoh would not accept it.
+    """
+    return _configuration(_root(data, name), name)
+
+
+def _root(data: bytes, name: str) -> _Section:
+    if len(data) > MOST_BYTES:
+        raise DocumentError(
+            f"the Zenoh configuration '{name}' is too large",
+            f"It has more than {MOST_BYTES // 1024**2} MiB.",
+        )
+    try:
+        value = parse_json5(data.decode())
+    except UnicodeDecodeError as error:
+        raise DocumentError(
+            f"the Zenoh configuration '{name}' is not UTF-8",
+            f"The byte at {error.start} is none of a text.",
+        ) from error
+    except Json5Error as error:
+        raise DocumentError(
+            f"the Zenoh configuration '{name}' is not JSON5",
+            f"Line {error.line}: {error.problem}.",
+        ) from error
+    if not isinstance(value, Json5Object):
+        raise DocumentError(
+            f"'{name}' is not a Zenoh configuration", "It is not an object with settings."
+        )
+    return _Section(name, "", value)
+
+
+@dataclass(frozen=True, slots=True)
+class _Section:
+    """An object of the file ``name``, at a path that is empty for the whole file."""
+
+    name: str
+    path: str
+    value: Json5Object
+
+    def refused(self, member: str, problem: str) -> DocumentError:
+        line = self.value.lines.get(member, self.value.line)
+        path = "/".join(each for each in (self.path, member) if each)
+        return DocumentError(
+            f"the Zenoh configuration '{self.name}' is not one that Zenoh accepts",
+            f"Line {line}: {path} {problem}.",
+        )
+
+    def section(self, member: str) -> _Section:
+        value = self.value.get(member, Json5Object(self.value.line))
+        if not isinstance(value, Json5Object):
+            raise self.refused(member, "is not an object")
+        return _Section(self.name, f"{self.path}/{member}".lstrip("/"), value)
+
+    def boolean(self, member: str, default: bool, *, nullable: bool = True) -> bool:
+        value = self.value.get(member, default)
+        if value is None and nullable:
+            return default
+        if not isinstance(value, bool):
+            raise self.refused(member, "is neither true nor false")
+        return value
+
+    def text(self, member: str) -> str | None:
+        value = self.value.get(member)
+        if value is not None and not isinstance(value, str):
+            raise self.refused(member, "is not a text")
+        return value
+
+    def choice(self, member: str, kind: type[_E]) -> _E | None:
+        text = self.text(member)
+        return None if text is None else self._chosen(member, text, kind)
+
+    def _chosen(self, member: str, text: str, kind: type[_E]) -> _E:
+        try:
+            return kind(text)
+        except ValueError:
+            known = ", ".join(each.value for each in kind)
+            raise self.refused(member, f"is {text[:40]!r}, and none of: {known}") from None
+
+    def texts(self, member: str) -> tuple[str, ...] | None:
+        value = self.value.get(member)
+        if value is None:
+            return None
+        if not isinstance(value, list) or not all(isinstance(each, str) for each in value):
+            raise self.refused(member, "is not a list of texts")
+        return tuple(value)
+
+    def needed_texts(self, member: str) -> tuple[str, ...]:
+        found = self.texts(member)
+        if not found:
+            raise self.refused(member, "is missing or empty")
+        return found
+
+    def choices(self, member: str, kind: type[_E]) -> tuple[_E, ...] | None:
+        found = self.texts(member)
+        if found is None:
+            return None
+        if not found:
+            raise self.refused(member, "is empty")
+        return tuple(dict.fromkeys(self._chosen(member, each, kind) for each in found))
+
+    def sections(self, member: str) -> tuple[_Section, ...] | None:
+        value = self.value.get(member)
+        if value is None:
+            return None
+        if not isinstance(value, list) or not all(isinstance(each, Json5Object) for each in value):
+            raise self.refused(member, "is not a list of objects")
+        return tuple(
+            _Section(self.name, f"{self.path}/{member}[{number}]", each)
+            for number, each in enumerate(value)
+        )
+
+    def only(self, known: Collection[str]) -> None:
+        for member in self.unknown(known):
+            raise self.refused(member[:40], "is not a setting that sros knows")
+
+    def unknown(self, known: Collection[str]) -> Iterator[str]:
+        return (each for each in self.value if each not in known)
+
+
+def _configuration(root: _Section, name: str) -> ConfigurationDocument:
+    mode = root.choice("mode", Mode) or Mode.PEER
+    link = root.section("transport").section("link")
+    tls = link.section("tls")
+    multicast, gossip = (root.section("scouting").section(each) for each in ("multicast", "gossip"))
+    admin = root.section("adminspace")
+    permissions = admin.section("permissions")
+    shared = root.section("transport").section("shared_memory")
+    unknown = [*root.unknown(_SECTIONS), *(f"{tls.path}/{each}" for each in tls.unknown(_TLS))]
+    return ConfigurationDocument(
+        name,
+        mode,
+        _endpoints(root.section("listen"), mode, _LISTEN[mode]),
+        _endpoints(root.section("connect"), mode, ()),
+        link.texts("protocols"),
+        TlsOptions(
+            tls.boolean("enable_mtls", False),
+            tls.boolean("verify_name_on_connect", True),
+            tls.boolean("close_link_on_expiration", False),
+            tuple(each for each in _TLS_FILES if tls.text(each) or tls.text(f"{each}_base64")),
+        ),
+        shared.boolean("enabled", True, nullable=False),
+        multicast.boolean("enabled", True),
+        gossip.boolean("enabled", True),
+        admin.boolean("enabled", False, nullable=False),
+        permissions.boolean("read", True, nullable=False),
+        permissions.boolean("write", False, nullable=False),
+        root.text("namespace"),
+        tuple(root.section("plugins").value),
+        _enforcement(root.section("access_control")),
+        tuple(unknown),
+        dict(_lines(root.value, "")),
+    )
+
+
+def _endpoints(
+    section: _Section, mode: Mode, default: tuple[str, ...]
+) -> tuple[ZenohEndpoint, ...]:
+    """Return the endpoints of a section, which may state others for each mode."""
+    if isinstance(section.value.get("endpoints"), Json5Object):
+        section = section.section("endpoints")
+        section.only([each.value for each in Mode])
+        found = section.texts(mode.value) or ()
+    elif "endpoints" in section.value:
+        stated = section.texts("endpoints")
+        if stated is None:
+            raise section.refused("endpoints", "is null")
+        found = stated
+    else:
+        found = default
+    for each in found:
+        if not all(each.partition("/")):
+            raise section.refused("", f"has {each[:80]!r}, which is not PROTOCOL/ADDRESS")
+    return tuple(map(ZenohEndpoint, found))
+
+
+class _Permission(StrEnum):
+    ALLOW = "allow"
+    DENY = "deny"
+
+
+def _enforcement(section: _Section) -> Enforcement:
+    section.only(("enabled", "default_permission", "rules", "subjects", "policies"))
+    enabled = section.boolean("enabled", False, nullable=False)
+    default = section.choice("default_permission", _Permission)
+    lists = {each: section.sections(each) for each in ("rules", "subjects", "policies")}
+    if enabled and (missing := [each for each, value in lists.items() if value is None]):
+        raise section.refused("", f"is on without the list {missing[0]!r}")
+    rules = tuple(map(_rule, lists["rules"] or ()))
+    subjects = tuple(map(_subject, lists["subjects"] or ()))
+    policies = tuple(map(_policy, lists["policies"] or ()))
+    found = Enforcement(enabled, default is _Permission.ALLOW, rules, subjects, policies)
+    if enabled:
+        _check_ids(section, found)
+    return found
+
+
+def _id(section: _Section) -> str:
+    found = section.text("id")
+    if not found or not found.strip():
+        raise section.refused("id", "is missing or empty")
+    return found
+
+
+def _rule(section: _Section) -> AclRule:
+    section.only(("id", "permission", "flows", "messages", "key_exprs"))
+    permission = section.choice("permission", _Permission)
+    messages = section.choices("messages", Message)
+    if permission is None or messages is None:
+        raise section.refused("", f"has no {'messages' if permission else 'permission'!r}")
+    keys = section.needed_texts("key_exprs")
+    for each in keys:
+        if problem := expression_problem(each):
+            raise section.refused("key_exprs", f"has {each[:80]!r}: {problem}")
+    return AclRule(
+        _id(section),
+        permission is _Permission.ALLOW,
+        section.choices("flows", Flow) or tuple(Flow),
+        messages,
+        keys,
+        section.value.line,
+    )
+
+
+def _subject(section: _Section) -> AclSubject:
+    section.only(("id", *PROPERTIES))
+    values = {each: section.texts(each) for each in PROPERTIES}
+    for member, value in values.items():
+        if value is not None and not all(each.strip() for each in value or ("",)):
+            raise section.refused(member, "is empty, or has an empty value")
+    for each in values["link_protocols"] or ():
+        if each not in _LINK_PROTOCOLS:
+            raise section.refused("link_protocols", f"has {each[:40]!r}, which is no protocol")
+    return AclSubject(_id(section), **values, line=section.value.line)
+
+
+def _policy(section: _Section) -> AclPolicy:
+    section.only(("id", "rules", "subjects"))
+    section.text("id")
+    return AclPolicy(section.needed_texts("rules"), section.needed_texts("subjects"))
+
+
+def _check_ids(section: _Section, found: Enforcement) -> None:
+    """Refuse ids that occur twice, and policies that name a rule or subject that there is not."""
+    for member, of in (("rules", found.rules), ("subjects", found.subjects)):
+        ids = [each.id for each in of]
+        if twice := next((each for each in _repeated(ids)), None):
+            raise section.refused(member, f"has the id {twice[:80]!r} twice")
+        for policy in found.policies:
+            named: tuple[str, ...] = getattr(policy, member)
+            for each in set(named) - set(ids):
+                raise section.refused("policies", f"names {each[:80]!r}, which {member} has not")
+
+
+def _repeated(ids: Iterable[str]) -> Iterator[str]:
+    seen: set[str] = set()
+    for each in ids:
+        if each in seen:
+            yield each
+        seen.add(each)
+
+
+def _lines(value: Json5Object, path: str) -> Iterator[tuple[str, int]]:
+    for name, line in value.lines.items():
+        yield path + name, line
+        inner = value[name]
+        if isinstance(inner, Json5Object) and not path.startswith("access_control"):
+            yield from _lines(inner, f"{path}{name}/")

@@ -1,0 +1,213 @@
+"""Access control as any configuration of Zenoh may state it, and what it decides.
+
+`sros_tool.zenoh.access` is the part of it that sros writes: only permission, only by certificate.
+Sources: zenoh 1.9, authorization.rs and access_control.rs; compared with the wheel 1.10.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from itertools import product
+
+from sros_tool.zenoh.access import Flow, Message
+from sros_tool.zenoh.key_expressions import includes
+
+
+@dataclass(frozen=True, slots=True)
+class Remote:
+    """A remote process as access control sees it; None is what it does not have.
+
+    ``common_name`` is the first one of its certificate, ``link_protocol`` such as "tls", and
+    ``interfaces`` are the network interfaces of the own host that the connection uses.
+    """
+
+    common_name: str | None = None
+    link_protocol: str | None = "tls"
+    username: str | None = None
+    interfaces: tuple[str, ...] = ()
+    zid: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AclRule:
+    """Messages in some directions, on keys that ``key_expressions`` include: allowed or denied.
+
+    ``line`` is its line in the file.
+    """
+
+    id: str
+    allows: bool
+    flows: tuple[Flow, ...]
+    messages: tuple[Message, ...]
+    key_expressions: tuple[str, ...]
+    line: int = field(default=0, compare=False)
+
+
+@dataclass(frozen=True, slots=True)
+class AclSubject:
+    """Remote processes that have one of the values of every property; None stands for any value."""
+
+    id: str
+    cert_common_names: tuple[str, ...] | None = None
+    usernames: tuple[str, ...] | None = None
+    interfaces: tuple[str, ...] | None = None
+    link_protocols: tuple[str, ...] | None = None
+    zids: tuple[str, ...] | None = None
+    line: int = field(default=0, compare=False)
+
+    def matches_everybody(self) -> bool:
+        """Return whether it has no property, and so matches every process."""
+        return all(getattr(self, name) is None for name in PROPERTIES)
+
+
+PROPERTIES = tuple(each.name for each in fields(AclSubject) if each.name not in ("id", "line"))
+"""The names of a subject's properties."""
+
+
+@dataclass(frozen=True, slots=True)
+class AclPolicy:
+    """Which rules hold for which subjects, by their ids: an entry of Zenoh's ``policies``."""
+
+    rules: tuple[str, ...]
+    subjects: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class AccessDecision:
+    """Whether a message passes, and why.
+
+    ``rules`` are the ids of the rules that decide it, none if the default does; ``subjects`` the
+    ids of all subjects that match the remote process; ``why`` is a clause that says the reason.
+    """
+
+    allowed: bool
+    rules: tuple[str, ...]
+    subjects: tuple[str, ...]
+    why: str
+
+
+_Combination = tuple[str | None, ...]
+"""One value for each of `PROPERTIES`, None for any."""
+
+
+@dataclass(frozen=True)
+class Enforcement:
+    """The access control of a process: whether it is on, its rules, subjects and policies."""
+
+    enabled: bool = False
+    allows_by_default: bool = False
+    rules: tuple[AclRule, ...] = ()
+    subjects: tuple[AclSubject, ...] = ()
+    policies: tuple[AclPolicy, ...] = ()
+
+    def rules_of(self, subject: str) -> tuple[AclRule, ...]:
+        """Return the rules that policies apply to a subject, by its id."""
+        return self._rules_of.get(subject, ())
+
+    def subjects_of(self, remote: Remote) -> tuple[AclSubject, ...]:
+        """Return the subjects that match a remote process, in the order of the file."""
+        ids = {each for one in self._matching(remote) for each in self._combinations[one]}
+        return tuple(each for each in self.subjects if each.id in ids)
+
+    def decide(self, remote: Remote, flow: Flow, message: Message, key: str) -> AccessDecision:
+        """Return whether a message from or to a remote process passes.
+
+        ``key`` is the key or key expression of the message: a rule applies if one of its own
+        includes that as a whole.  Subjects of the same values are one, and in it DENY wins.
+        Between different subjects that match, one that allows is enough; under default ALLOW that
+        is each one without a rule that denies.
+        """
+        if not self.enabled:
+            return AccessDecision(True, (), (), "access control is off")
+        subjects = tuple(each.id for each in self.subjects_of(remote))
+        default = "ALLOW" if self.allows_by_default else "DENY"
+        if not self._rules_of:
+            return self._by_default(subjects, f"no rule is in force, and the default is {default}")
+        if not subjects:
+            return self._by_default((), f"no subject matches, and the default is {default}")
+        denying: list[str] = []
+        for combination in self._matching(remote):
+            applying = [
+                rule
+                for rule in self._in_force[combination].get((flow, message), ())
+                if any(includes(each, key) for each in rule.key_expressions)
+            ]
+            denied = [rule.id for rule in applying if not rule.allows]
+            allowed = [rule.id for rule in applying if rule.allows]
+            if denied:
+                denying += denied
+            elif allowed or self.allows_by_default:
+                why = f"rule {allowed[0]} allows it" if allowed else "the default is ALLOW"
+                return AccessDecision(True, _once(allowed), subjects, why)
+        if denying:
+            return AccessDecision(False, _once(denying), subjects, f"rule {denying[0]} denies it")
+        return AccessDecision(False, (), subjects, "no rule allows it, and the default is DENY")
+
+    def _by_default(self, subjects: tuple[str, ...], why: str) -> AccessDecision:
+        return AccessDecision(self.allows_by_default, (), subjects, why)
+
+    @cached_property
+    def _combinations(self) -> Mapping[_Combination, tuple[str, ...]]:
+        """The ids of the subjects for each combination of their values."""
+        found: dict[_Combination, list[str]] = {}
+        for subject in self.subjects:
+            values = (getattr(subject, name) or (None,) for name in PROPERTIES)
+            for combination in product(*values):
+                found.setdefault(combination, []).append(subject.id)
+        return {one: _once(ids) for one, ids in found.items()}
+
+    @cached_property
+    def _rules_of(self) -> Mapping[str, tuple[AclRule, ...]]:
+        rules = {each.id: each for each in self.rules}
+        found: dict[str, dict[str, AclRule]] = {}
+        for policy in self.policies:
+            for subject in policy.subjects:
+                found.setdefault(subject, {}).update((each, rules[each]) for each in policy.rules)
+        return {subject: tuple(of.values()) for subject, of in found.items()}
+
+    @cached_property
+    def _in_force(
+        self,
+    ) -> Mapping[_Combination, Mapping[tuple[Flow, Message], tuple[AclRule, ...]]]:
+        found: dict[_Combination, dict[tuple[Flow, Message], dict[str, AclRule]]] = {}
+        for combination, ids in self._combinations.items():
+            of = found.setdefault(combination, {})
+            for rule in (rule for each in ids for rule in self.rules_of(each)):
+                for place in product(rule.flows, rule.messages):
+                    of.setdefault(place, {})[rule.id] = rule
+        return {
+            combination: {place: tuple(rules.values()) for place, rules in of.items()}
+            for combination, of in found.items()
+        }
+
+    @cached_property
+    def _combinations_by_name(self) -> Mapping[str | None, tuple[_Combination, ...]]:
+        found: dict[str | None, list[_Combination]] = {}
+        for each in self._combinations:
+            found.setdefault(each[0], []).append(each)
+        return {name: tuple(of) for name, of in found.items()}
+
+    def _matching(self, remote: Remote) -> list[_Combination]:
+        values: tuple[tuple[str | None, ...], ...] = (
+            (remote.common_name,),
+            (remote.username,),
+            remote.interfaces,
+            (remote.link_protocol,),
+            (remote.zid,),
+        )
+        by_name = self._combinations_by_name
+        named = () if remote.common_name is None else by_name.get(remote.common_name, ())
+        return [
+            combination
+            for combination in (*named, *by_name.get(None, ()))
+            if all(
+                wanted is None or wanted in there
+                for wanted, there in zip(combination, values, strict=True)
+            )
+        ]
+
+
+def _once(ids: Iterable[str]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(ids))
