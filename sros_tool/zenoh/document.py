@@ -7,6 +7,7 @@ Source: commons/zenoh-config of zenoh 1.9; compared with the wheel 1.10.2.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -47,6 +48,7 @@ _LISTEN: Mapping[Mode, tuple[str, ...]] = {
 _LINK_PROTOCOLS = frozenset(
     {"tcp", "udp", "tls", "quic", "serial", "unixpipe", "unixsock-stream", "vsock", "ws"}
 )
+_ZID = re.compile(r"[1-9a-f][0-9a-f]{0,31}", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
@@ -357,6 +359,9 @@ def _subject(section: _Section) -> AclSubject:
     for each in values["link_protocols"] or ():
         if each not in _LINK_PROTOCOLS:
             raise section.refused("link_protocols", f"has {each[:40]!r}, which is no protocol")
+    for each in values["zids"] or ():
+        if not _ZID.fullmatch(each):
+            raise section.refused("zids", f"has {each[:40]!r}, which is no id of a session")
     return AclSubject(_id(section), **values, line=section.value.line)
 
 

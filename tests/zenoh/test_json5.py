@@ -1,0 +1,120 @@
+"""JSON5 is read as Zenoh itself reads it, and hostile texts are refused at once."""
+
+from __future__ import annotations
+
+import json
+import random
+from typing import Any
+
+import pytest
+
+from sros_tool.zenoh.json5 import Json5Error, parse_json5
+from tests.support.children import LONG
+
+ACCEPTED = {
+    "{a:1,}": {"a": 1},
+    "[1,'x',\"y\",]": [1, "x", "y"],
+    "/*c*/{// d\n a /*e*/ : .5, 'b': 5., c: +1, $d_: -0x1F}": {
+        "a": 0.5, "b": 5.0, "c": 1, "$d_": -31,
+    },
+    '"\\x41\\u0042\\\n\\q\\0\\v"': "ABq\0\v",
+    '"\\ud83d\\ude00"': "\U0001f600",
+    "\ufeff\u2028 null": None,
+    "[true,false,-Infinity]": [True, False, float("-inf")],
+    "{\\u0061b: 1}": {"ab": 1},
+}  # fmt: skip
+REFUSED = {
+    "": "it ends too early",
+    "{a:1": "it ends too early",
+    "{a:1} 2": "unexpected '2'",
+    "[1,,2]": "unexpected ','",
+    "{a 1}": "unexpected '1'",
+    "{1:1}": "unexpected '1'",
+    "01": "unexpected '01'",
+    "nul": "unexpected 'nul'",
+    "'a\nb'": "unexpected",
+    "/* open": "unexpected",
+    "{a:1,'a':2}": "'a' is named twice",
+    '"\\ud800"': "half a character",
+    "[" * 101 + "]" * 101: "more than 100 levels",
+}
+
+
+@pytest.mark.parametrize(("text", "value"), ACCEPTED.items())
+def test_accepted(text: str, value: object) -> None:
+    assert parse_json5(text) == value
+
+
+@pytest.mark.parametrize(("text", "problem"), REFUSED.items())
+def test_refused(text: str, problem: str) -> None:
+    with pytest.raises(Json5Error, match=problem.replace("[", r"\[")):
+        parse_json5(text)
+
+
+def test_lines() -> None:
+    value = parse_json5('{ // one\n/* two\nthree */ a: 1,\r\n b: {\n c: "x\\\ny", d: 2}}')
+    assert value.lines == {"a": 3, "b": 4}
+    assert value["b"].lines == {"c": 5, "d": 6}
+    with pytest.raises(Json5Error) as caught:
+        parse_json5("{\n\n!}")
+    assert caught.value.line == 3
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[" * 10**6,
+        "{a:" * 10**6,
+        "/*" * 10**6,
+        " " * 10**6 + "!",
+        "'" + "\\" * 10**6,
+        '"' + "a" * 10**6,
+        "9" * 10**6 + "x",
+        "a" * 10**6,
+    ],
+    ids=range(8),
+)
+def test_hostile_texts_are_refused_in_linear_time(text: str) -> None:
+    with pytest.raises(Json5Error) as caught:
+        parse_json5(text)
+    assert len(caught.value.problem) < 200
+
+
+def drawn_text(draw: random.Random, depth: int = 3) -> str:
+    """A random text that often is JSON5."""
+    space = draw.choice(["", "", " ", "\n", "/* x */", "// y\n", "\u00a0"])
+    kind = draw.random()
+    if depth and kind < 0.25:
+        inner = ",".join(drawn_text(draw, depth - 1) for _ in range(draw.randint(0, 3)))
+        return f"{space}[{inner}{draw.choice(['', '', ','])}]"
+    if depth and kind < 0.5:
+        names = draw.sample(["a", "'b c'", '"d"', "$e", "_f1", "\\u0067"], draw.randint(0, 3))
+        inner = ",".join(f"{each}{space}:{drawn_text(draw, depth - 1)}" for each in names)
+        return f"{{{inner}{draw.choice(['', '', ','])}}}{space}"
+    scalars = ["1", "-2", "+3", "0x1f", ".5", "5.", "1e3", "1.5E-1", "true", "false", "null"]
+    scalars += ["'x'", '"y\\n"', "'\\x41'", '"\\u00e9"', "'a\\\nb'", "'it\\'s'", '"\\q"', "''"]
+    broken = ["01", "1a", "tru", "'", '"', "\\", "-", "--1", "0x", "1e", "1.e", "@", "'\n'"]
+    return space + draw.choice(scalars * 4 + broken)
+
+
+def test_texts_are_read_as_zenoh_reads_them() -> None:
+    zenoh = pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
+
+    def theirs(text: str) -> Any:
+        try:
+            config = zenoh.Config.from_json5(f"{{metadata:{text}}}")
+            return json.loads(config.get_json("metadata"))
+        except zenoh.ZError:
+            return "refused"
+
+    def ours(text: str) -> Any:
+        try:
+            return parse_json5(f"{{metadata:{text}}}")["metadata"]
+        except Json5Error:
+            return "refused"
+
+    draw = random.Random(15)
+    texts = [drawn_text(draw) for _ in range(100_000 if LONG else 3000)]
+    different = [text for text in texts if theirs(text) != ours(text)]
+    assert different == []
+    assert 0.3 < sum(ours(each) != "refused" for each in texts) / len(texts) < 0.95
