@@ -89,24 +89,31 @@ def stated_rights(enclave: Enclave) -> tuple[StatedRight, ...]:
 
 
 def remote_rights(enclave: Enclave, domain: int) -> RemoteRights:
-    """Return what a process allows to processes of ``enclave`` in a ROS domain.
+    """Return what a process allows to processes of ``enclave`` in a ROS domain: `remote_of`."""
+    return remote_of(enclave.path, {domain: stated_rights(enclave)})
+
+
+def remote_of(enclave: str, stated: Mapping[int, Iterable[StatedRight]]) -> RemoteRights:
+    """Return what a process allows to processes of an enclave with rights ``stated`` by ROS domain.
 
     That includes the graph, which every node needs: to announce nodes, topics and services under
     the name of its own enclave, and to see those of all others.
 
     Raises:
-        PolicyError: the policy states what rules of Zenoh cannot state; the text names the place.
+        PolicyError: a right is one that rules of Zenoh cannot state; the text names the place.
     """
-    rules = list(_graph_rules(enclave.path, domain))
-    for right, name in _allowed_names(stated_rights(enclave)):
-        for chunks in chunks_of(name):
-            key = canonical((str(domain), *chunks, *_ANY_TYPE))
-            history = canonical((str(domain), *chunks, *_ANY_TYPE, *_ADVANCED))
-            rules += [
-                AccessRule(flow, messages, (history if below else key,))
-                for flow, messages, below in _MESSAGES[right]
-            ]
-    return RemoteRights(enclave.path, joined(rules))
+    rules: list[AccessRule] = []
+    for domain, rights in stated.items():
+        rules += _graph_rules(enclave, domain)
+        for right, name in _allowed_names(rights):
+            for chunks in chunks_of(name):
+                key = canonical((str(domain), *chunks, *_ANY_TYPE))
+                history = canonical((str(domain), *chunks, *_ANY_TYPE, *_ADVANCED))
+                rules += [
+                    AccessRule(flow, messages, (history if below else key,))
+                    for flow, messages, below in _MESSAGES[right]
+                ]
+    return RemoteRights(enclave, joined(rules))
 
 
 def _graph_rules(enclave: str, domain: int) -> Iterator[AccessRule]:
@@ -173,9 +180,9 @@ def _allowed_names(stated: Iterable[StatedRight]) -> Iterator[tuple[str, str]]:
 def _exception_in_wildcard(
     right: str, name: str, place: Source, denied: str, source: Source
 ) -> PolicyError:
+    where = f"line {place.line} of '{place.file}' allows" if place.line else "they allow"
     return PolicyError(
-        f"{source}: DENY {right} {denied} cannot be said to Zenoh, because line {place.line} of "
-        f"'{place.file}' allows {name}",
+        f"{source}: DENY {right} {denied} cannot be said to Zenoh, because {where} {name}",
         "A denial inside a wildcard does not hold in Zenoh: it lets through whoever asks or "
         "publishes with a wildcard.",
         f"List the names to {right} in place of {name}.",

@@ -1,17 +1,15 @@
-"""The verb that writes the configurations of Zenoh for the enclaves of a keystore."""
+"""The verb that gives a keystore its Zenoh network, and the files with which Zenoh enforces it."""
 
 from __future__ import annotations
 
-import os
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from sros_tool.cli.common import (
-    KEYSTORE_VARIABLE,
     PATH,
-    complete_file,
-    domain_of,
     dry_run_option,
     json_option,
     keyring,
@@ -22,12 +20,16 @@ from sros_tool.cli.common import (
     print_notes,
     print_plan,
     print_restart,
-    ros_domain,
     visible,
 )
 from sros_tool.cli.progress import progress
 from sros_tool.cli.written import changes_json, notes_json
 from sros_tool.errors import UsageError
+
+if TYPE_CHECKING:
+    from sros_tool.keystore.lifecycle.create import Creation
+    from sros_tool.keystore.template import Template
+    from sros_tool.zenoh.network import ZenohNetwork
 
 _DONE = {"create": "wrote", "replace": "replaced", "remove": "removed"}
 
@@ -36,145 +38,153 @@ _DONE = {"create": "wrote", "replace": "replaced", "remove": "removed"}
     "zenoh",
     epilog="""\b
 Example:
-  $ sros create_enclave keystore /router
-  $ sros generate_artifacts -k keystore -p policy.xml
-  $ sros zenoh keystore policy.xml
+  $ sros zenoh keystore
+  created enclave /router
   wrote keystore/enclaves/router/router.json5
   wrote keystore/enclaves/talker/session.json5
+  $ sros zenoh keystore --mode peer --endpoint robot:7447 --listen [::]:7447
+  $ sros zenoh keystore --check
 
 Exit status: 0 written, or up to date; with --check 1 if a file is missing or
-out of date; 2 if it could not be done, such as for a policy that Zenoh cannot
+out of date; 2 if it could not be done, such as for rights that Zenoh cannot
 enforce.""",
 )
-@click.argument(
-    "words",
-    metavar="[ROOT] POLICY...",
-    nargs=-1,
-    required=True,
-    shell_complete=lambda _ctx, _parameter, incomplete: complete_file(incomplete),
-)
-@click.option(
-    "-o", "--output", type=PATH, metavar="DIR", help="Write below DIR, not into the keystore."
-)
-@click.option(
-    "--router", default="/router", show_default=True, metavar="NAME", help="Enclave of the router."
-)
+@click.argument("root", type=PATH, required=False)
+@click.option("--router", metavar="NAME", help="Enclave of the router; usually /router.")
 @click.option(
     "--endpoint",
-    default="localhost:7447",
-    show_default=True,
+    "endpoints",
+    multiple=True,
     metavar="HOST:PORT",
-    help="Where the router listens, and all others connect.",
+    help="Where sessions connect to the router; usually localhost:7447. May be repeated.",
+)
+@click.option(
+    "--listen",
+    multiple=True,
+    metavar="HOST:PORT",
+    help="Where the router listens, if not at the endpoints. May be repeated.",
 )
 @click.option(
     "--mode",
-    type=click.Choice(["peer", "client"]),
-    default="peer",
-    show_default=True,
-    help="peer: sessions also connect to each other. client: to the router alone.",
+    type=click.Choice(["client", "peer"]),
+    help="client (usual): sessions connect to the router alone. peer: also to each other.",
 )
-@click.option("--domain", metavar="ID", help="The ROS domain; by default $ROS_DOMAIN_ID.")
+@click.option("--domain", metavar="IDS", help="ROS domains; usually those of the keystore.")
+@click.option("--off", is_flag=True, help="Remove the files, and keep none in step any more.")
 @click.option("--check", "only_check", is_flag=True, help="Write nothing; say what is out of date.")
 @dry_run_option
 @json_option
 def zenoh(
-    words: tuple[str, ...],
-    output: Path | None,
-    router: str,
-    endpoint: str,
-    mode: str,
+    root: Path | None,
+    router: str | None,
+    endpoints: tuple[str, ...],
+    listen: tuple[str, ...],
+    mode: str | None,
     domain: str | None,
+    off: bool,
     only_check: bool,
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    """Write the files that make Zenoh enforce the policies, for nodes on rmw_zenoh.
+    """Write the files with which Zenoh enforces the rights of the keystore ROOT (rmw_zenoh).
 
-    Every enclave of the policies gets session.json5, and the router's enclave router.json5, each
-    with the same document signed next to it. The permissions of the enclaves have to be those of
-    the policies.
+    Every enclave gets session.json5, and the router's enclave router.json5, each with the same
+    document signed next to it.  They state the rights of the signed permissions.  The choices are
+    kept in the keystore's settings, and from then on every verb that changes the keystore keeps
+    the files in step.
     """
-    from sros_tool.keystore.lifecycle.zenoh import ZenohNetwork, write_zenoh_files
-    from sros_tool.keystore.reader import open_keystore
-    from sros_tool.policy.document import read_policy
-    from sros_tool.runtime.environment import choose_domain
-    from sros_tool.zenoh.configuration import Mode, is_endpoint
+    from sros_tool.keystore.layout import ZENOH_FILES, check_keystore
+    from sros_tool.keystore.lifecycle.zenoh import set_zenoh
+    from sros_tool.keystore.reader import load_settings
 
-    if not is_endpoint(endpoint):
-        raise UsageError(
-            f"--endpoint {endpoint!r} is not HOST:PORT",
-            "",
-            "Write for example localhost:7447, 192.168.1.2:7447 or [::1]:7447.",
-        )
-    wanted = domain_of(domain)
-    if wanted is None:
-        wanted = ros_domain()
-    root, policy_files = _root_and_policies(words)
-    policies = [read_policy(path) for path in policy_files]
-    chosen = choose_domain(open_keystore(root).domains, wanted, root)
-    with progress("translating"):
-        result = write_zenoh_files(
-            root,
-            policies,
-            ZenohNetwork(router, endpoint, Mode(mode), chosen),
-            now=now(),
-            output=output,
-            keyring=keyring(),
-            dry_run=dry_run or only_check,
+    root = root or keystore_from_environment()
+    check_keystore(root)
+    settings = load_settings(root)
+    chosen = {
+        "router": router,
+        "endpoints": ",".join(endpoints),
+        "listen": ",".join(listen),
+        "mode": mode,
+        "domains": _domains(domain),
+    }
+    given = {f"zenoh.{key}": text for key, text in chosen.items() if text}
+    if off and given:
+        raise UsageError("--off takes no other choice of the network", "", "Leave one of them out.")
+    network = None if off else _network(settings, given)
+    with progress("writing the files of Zenoh"):
+        result = set_zenoh(
+            root, network, now=now(), keyring=keyring(), dry_run=dry_run or only_check
         )
     # A document and the signed one next to it are written together.
-    documents = [each for each in result.changes if each.path.endswith(".json5")]
-    changed = {each.path for each in documents}
+    actions = {
+        each.path: each.action for each in result.changes if Path(each.path).name in ZENOH_FILES
+    }
+    changed = dict.fromkeys(map(_document, actions))
     if as_json:
-        print_json(
-            {
-                "keystore": str(root),
-                "folder": str(result.folder),
-                "dry_run": dry_run or only_check,
-                "router": router,
-                "endpoint": endpoint,
-                "mode": mode,
-                "domain": chosen,
-                "files": [
-                    {
-                        "enclave": name,
-                        "path": str(result.folder / path),
-                        "current": path not in changed,
-                    }
-                    for name, path in result.files.items()
-                ],
-                "restart": list(result.restart),
-                "changes": changes_json(result.folder, result.changes),
-                "notes": notes_json(result.notes),
-            }
-        )
+        print_json(_json(result, network, changed, dry_run=dry_run or only_check))
     elif only_check:
-        for each in documents:
-            click.echo(visible(f"out of date: {result.folder / each.path}"))
+        for path in changed:
+            click.echo(visible(f"out of date: {root / path}"))
     elif dry_run:
-        print_plan(result.folder, result.changes)
+        print_plan(root, result.changes)
     else:
-        for each in documents:
-            click.echo(visible(f"{_DONE[each.action]} {result.folder / each.path}"))
-    if not documents:
+        for name in result.created:
+            click.echo(f"created enclave {name}")
+        for path in changed:
+            click.echo(visible(f"{_DONE[actions.get(path, 'replace')]} {root / path}"))
+    if not result.changes:
         click.echo("the files of Zenoh are up to date", err=True)
     if not (dry_run or only_check):
-        print_closed(result.folder, result.changes)
+        print_closed(root, result.changes)
         print_restart(result.restart)
     print_notes(result.notes)
-    if only_check and documents:
+    if only_check and result.changes:
         raise SystemExit(1)
 
 
-def _root_and_policies(words: tuple[str, ...]) -> tuple[Path, list[Path]]:
-    """Return the keystore, which may also be that of the environment, and the policy files."""
-    paths = [PATH.convert(each, None, None) for each in words]
-    if os.environ.get(KEYSTORE_VARIABLE) and not paths[0].is_dir():
-        return keystore_from_environment(), paths
-    if len(paths) < 2:
-        raise UsageError(
-            "zenoh takes a keystore and one or more policies",
-            "",
-            f"Name both, or set {KEYSTORE_VARIABLE}.",
-        )
-    return paths[0], paths[1:]
+def _network(settings: Template, given: dict[str, str]) -> ZenohNetwork:
+    """Return the network of the settings, or the usual one, with the values that are ``given``."""
+    from sros_tool.keystore.template import with_values
+    from sros_tool.zenoh.network import ZenohNetwork
+
+    network = settings.zenoh or ZenohNetwork()
+    found = with_values(replace(settings, zenoh=network), list(given.items())).zenoh
+    return found or network
+
+
+def _domains(text: str | None) -> str:
+    """Return domain ids such as ``3-5,9`` one by one."""
+    from sros_tool.dds.domains import DomainSet
+
+    return ",".join(map(str, DomainSet.parse(text, "--domain"))) if text else ""
+
+
+def _document(path: str) -> str:
+    """Return the path of the document to which a file of Zenoh belongs."""
+    return path.removesuffix(".p7s").removesuffix(".json5") + ".json5"
+
+
+def _json(
+    result: Creation, network: ZenohNetwork | None, changed: dict[str, None], *, dry_run: bool
+) -> dict[str, Any]:
+    return {
+        "keystore": str(result.root),
+        "dry_run": dry_run,
+        "network": {
+            "router": network.router,
+            "endpoints": list(network.endpoints),
+            "listen": list(network.listening()),
+            "mode": network.mode.value,
+            "domains": list(network.domains or result.domains),
+        }
+        if network
+        else None,
+        "files": [
+            {"enclave": name, "path": str(result.root / path), "current": path not in changed}
+            for name, path in result.zenoh.files.items()
+        ],
+        "created": list(result.created),
+        "restart": list(result.restart),
+        "changes": changes_json(result.root, result.changes),
+        "notes": notes_json(result.notes),
+    }

@@ -15,6 +15,7 @@ from sros_tool.keystore.template import EVERYTHING, Template
 from sros_tool.policy.patterns import common_name, covers, overlap
 from sros_tool.translate import service_of
 from sros_tool.validity import Span, duration_text, span_text, window
+from sros_tool.zenoh.network import ZenohNetwork
 
 
 class Effect(StrEnum):
@@ -283,6 +284,7 @@ def _settings_changes(old: Template, new: Template, now: datetime) -> Iterator[S
             effect = Effect.LOOSER if after == open_value else Effect.TIGHTER
             one, other = _choice_text(key, before), _choice_text(key, after)
             yield SettingChange(effect, key, one, other, words[effect is Effect.TIGHTER])
+    yield from _zenoh_changes(old.zenoh, new.zenoh)
     rotated = "holds for the CAs that `sros rotate_ca` makes"
     listed = "holds for the next revocation list, also of `sros crl --refresh`"
     for key, one, other, meaning in (
@@ -316,6 +318,30 @@ def _short_lived_changes(old: Template, new: Template) -> Iterator[SettingChange
         one, other = (duration_text(each) if each else "as others" for each in (before, after))
         meaning = f"what is issued for {name} expires {'later' if longer else 'earlier'}"
         yield SettingChange(effect, f"enclaves {name}.validity", one, other, meaning)
+
+
+def _zenoh_changes(old: ZenohNetwork | None, new: ZenohNetwork | None) -> Iterator[SettingChange]:
+    """Yield what changes in a Zenoh network."""
+    if old is None or new is None:
+        if old != new:
+            one, other = (each.mode.value if each else "none" for each in (old, new))
+            meaning = "enclaves get files for Zenoh" if new else "no files for Zenoh are kept"
+            yield SettingChange(Effect.LATER, "zenoh", one, other, meaning)
+        return
+    for key, meaning in (
+        ("router", "the other enclaves trust this one as the router"),
+        ("endpoints", "sessions connect there"),
+        ("listen", "the router listens there"),
+        ("mode", "how sessions reach each other"),
+        ("domains", "ROS domains of the network, within those of the governance"),
+    ):
+        before, after = getattr(old, key), getattr(new, key)
+        if before != after:
+            one, other = (
+                ",".join(map(str, each)) or "(as usual)" if isinstance(each, tuple) else str(each)
+                for each in (before, after)
+            )
+            yield SettingChange(Effect.LATER, f"zenoh.{key}", one, other, meaning)
 
 
 _CHOICES = (

@@ -166,7 +166,13 @@ def _governance_edit(root: Path) -> str:
 
 
 def with_places(template: Template, places: Template) -> Template:
-    """Return ``template`` with the places of the CA keys of ``places``."""
+    """Return ``template`` with what no other template changes: where the CA keys of ``places`` are.
+
+    Unless it has a Zenoh network of its own, it gets that of ``places``, too.
+    """
     return replace(
-        template, identity_key=places.identity_key, permissions_key=places.permissions_key
+        template,
+        identity_key=places.identity_key,
+        permissions_key=places.permissions_key,
+        zenoh=template.zenoh or places.zenoh,
     )

@@ -13,15 +13,18 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from sros_tool.dds.domains import MAX_DOMAIN
 from sros_tool.errors import DocumentError, SrosError, UsageError
 from sros_tool.files import parse_toml
-from sros_tool.names import expand, expression_problem
+from sros_tool.names import check_enclave_name, expand, expression_problem
 from sros_tool.pki.token_uri import refuse_pin
 from sros_tool.policy.patterns import covers, matches
 from sros_tool.policy.protection import DomainProtection, Level, NamedProtection, TopicProtection
 from sros_tool.resources import templates_dir
 from sros_tool.validity import Span, duration_text, parse_duration, parse_span, span_text
 from sros_tool.xml import read_bytes
+from sros_tool.zenoh.configuration import Mode, is_endpoint
+from sros_tool.zenoh.network import ZenohNetwork
 
 DEFAULT_TEMPLATE = "development"
 EVERYTHING, NODE_BASICS = "everything", "node_basics"
@@ -47,7 +50,8 @@ class Template:
     certificate or document.  ``default_permissions`` is `EVERYTHING` or `NODE_BASICS`.
     ``identity_key`` and ``permissions_key`` are the URIs of CA keys outside of the keystore.  With
     ``unique_subject``, the subject of every certificate has a unique part.  ``short_lived`` are
-    enclaves whose certificates and permissions expire earlier than the others.
+    enclaves whose certificates and permissions expire earlier than the others.  ``zenoh`` is the
+    network for which enclaves get configurations of Zenoh, or None.
     """
 
     name: str
@@ -64,6 +68,7 @@ class Template:
     unique_subject: bool = False
     revocation_validity: timedelta = timedelta(days=3650)
     short_lived: tuple[ShortLived, ...] = ()
+    zenoh: ZenohNetwork | None = None
 
     def longest_validity(self, enclave: str) -> timedelta | None:
         """Return the longest validity of a short-lived enclave; None for all others."""
@@ -147,6 +152,7 @@ def _template(values: object, name: str) -> Template:
         unique_subject=certificates.flag("unique_subject", False),
         revocation_validity=revocation.duration("validity", "10y"),
         short_lived=tuple(_short_lived(table)),
+        zenoh=_zenoh(table.table("zenoh")) if table.has("zenoh") else None,
     )
     for part in (authorities, certificates, permissions, revocation, table):
         part.finish()
@@ -188,6 +194,8 @@ def render_template(template: Template) -> str:
     for named in protection.named:
         lines += [f"\n[[protection.{items[named.kind]}]]", f"names = [{_toml(named.name)}]"]
         lines += _topic_lines(named.protection)
+    if template.zenoh:
+        lines += ["\n[zenoh]", *_zenoh_lines(template.zenoh)]
     return "\n".join(lines) + "\n"
 
 
@@ -205,6 +213,40 @@ def _short_lived(table: _Table) -> Iterator[ShortLived]:
         entry.finish()
 
 
+def _zenoh(table: _Table) -> ZenohNetwork:
+    usual = ZenohNetwork()
+    network = ZenohNetwork(
+        table.text("router", usual.router),
+        tuple(table.texts("endpoints", list(usual.endpoints))),
+        tuple(table.texts("listen", [])),
+        Mode(table.one_of("mode", (Mode.CLIENT.value, Mode.PEER.value), usual.mode.value)),
+        tuple(sorted(set(table.numbers("domains", MAX_DOMAIN)))),
+    )
+    try:
+        check_enclave_name(network.router)
+    except SrosError as error:
+        raise _TemplateError(f"{table.path}.router: {error}".removesuffix(".")) from error
+    for key in ("endpoints", "listen"):
+        for each in getattr(network, key):
+            if not is_endpoint(each):
+                raise _TemplateError(
+                    f"{table.path}.{key} has {each!r}, which is not HOST:PORT, such as "
+                    "localhost:7447 or [::1]:7447"
+                )
+    table.finish()
+    return network
+
+
+def _zenoh_lines(network: ZenohNetwork) -> Iterator[str]:
+    yield f"router = {_toml(network.router)}"
+    for key in ("endpoints", "listen"):
+        if texts := getattr(network, key):
+            yield f"{key} = [{', '.join(map(_toml, texts))}]"
+    yield f"mode = {_toml(network.mode)}"
+    if network.domains:
+        yield f"domains = {list(network.domains)}"
+
+
 def settings_values(template: Template) -> dict[str, str]:
     """Map the keys of a template, such as ``protection.rtps``, to their values as text.
 
@@ -217,6 +259,9 @@ def settings_values(template: Template) -> dict[str, str]:
             for name, inner in value.items():
                 add(f"{key}.{name}" if key else name, inner)
         elif isinstance(value, list):
+            if not all(isinstance(entry, dict) for entry in value):
+                found[key] = ",".join(map(str, value))
+                return
             for entry in value:
                 for name in entry["names"]:
                     add(f"{key} {name}", {k: v for k, v in entry.items() if k != "names"})
@@ -258,7 +303,7 @@ def with_values(
             )
         protection[kind] = left
     for each in rules:
-        typed = {key: _typed(value) for key, value in each.values}
+        typed = {key: _typed("", value) for key, value in each.values}
         name = each.name if each.name.startswith("~") else expand(each.name, "/", "")
         protection.setdefault(each.kind, []).append({"names": [name], **typed})
     for key, value in values:
@@ -266,13 +311,19 @@ def with_values(
         inner: Any = table
         for part in path:
             inner = inner.get(part) if isinstance(inner, dict) else None
+        if path == ["zenoh"] and inner is None:
+            raise UsageError(
+                "the keystore has no files for Zenoh yet, so no settings of them",
+                "",
+                "Write them first, for example with `sros zenoh KEYSTORE --mode peer`.",
+            )
         if not path or not isinstance(inner, dict) or isinstance(inner.get(last), dict):
             raise UsageError(
                 f"{key!r} is not a setting of a keystore",
                 "",
                 "Name one such as protection.rtps, permissions.validity or permissions.default.",
             )
-        inner[last] = _typed(value)
+        inner[last] = _typed(key, value)
     try:
         return _template(table, template.name)
     except _TemplateError as error:
@@ -293,7 +344,11 @@ class NamedValues(NamedTuple):
     values: tuple[tuple[str, str], ...]
 
 
-def _typed(text: str) -> str | bool:
+def _typed(key: str, text: str) -> str | bool | list[str] | list[int]:
+    if key in ("zenoh.endpoints", "zenoh.listen"):
+        return text.split(",")
+    if key == "zenoh.domains":
+        return [int(each) if each.isdecimal() else -1 for each in text.split(",")]
     return {"true": True, "false": False}.get(text, text)
 
 
@@ -399,6 +454,9 @@ class _Table:
     def _at(self, key: str) -> str:
         return f"{self.path}.{key}" if self.path else key
 
+    def has(self, key: str) -> bool:
+        return key in self._values
+
     def table(self, key: str) -> _Table:
         return _Table(self._values.pop(key, {}), self._at(key))
 
@@ -413,17 +471,25 @@ class _Table:
     def text(self, key: str, default: str | None = None) -> str:
         return str(self._take(key, str, default))
 
-    def texts(self, key: str) -> list[str]:
-        values = self._take(key, list)
-        if not values or not all(isinstance(value, str) for value in values):
+    def texts(self, key: str, default: list[str] | None = None) -> list[str]:
+        """Return a list of texts, which is empty only if that is the ``default``."""
+        values = self._take(key, list, default)
+        if not (values or default == []) or not all(isinstance(value, str) for value in values):
             raise _TemplateError(f"{self._at(key)} is not a list of names")
+        return list(values)
+
+    def numbers(self, key: str, most: int) -> list[int]:
+        """Return a list of numbers from 0 to ``most``, which may be missing."""
+        values = self._take(key, list, [])
+        if not all(type(value) is int and 0 <= value <= most for value in values):
+            raise _TemplateError(f"{self._at(key)} is not a list of numbers from 0 to {most}")
         return list(values)
 
     def flag(self, key: str, default: bool) -> bool:
         return bool(self._take(key, bool, default))
 
-    def one_of(self, key: str, choices: tuple[str, ...]) -> str:
-        value = self.text(key)
+    def one_of(self, key: str, choices: tuple[str, ...], default: str | None = None) -> str:
+        value = self.text(key, default)
         if value not in choices:
             raise _TemplateError(f"{self._at(key)} is {value!r}, not one of {', '.join(choices)}")
         return value

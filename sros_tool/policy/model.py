@@ -32,13 +32,13 @@ DENY = Qualifier.DENY
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """The file and line (from 1) that something was read from."""
+    """The file and line (from 1) that something was read from; without a line it is 0."""
 
     file: str
     line: int
 
     def __str__(self) -> str:
-        return f"{self.file}:{self.line}"
+        return f"{self.file}:{self.line}" if self.line else self.file
 
 
 _NOWHERE = Source("", 0)

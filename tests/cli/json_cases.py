@@ -66,7 +66,7 @@ def make_folder(folder: Path) -> None:
         "create_enclave single /a",
         "revoke single /a",
         "rotate_ca single --next",
-        "generate_artifacts -k zenoh -p policy.xml -e /router /spare",
+        "generate_artifacts -k zenoh -p policy.xml -e /spare",
         "create_keystore elsewhere --identity-key file:identity.pem",
     ):
         sros(*line.split(), cwd=folder).ok()
@@ -160,11 +160,10 @@ CASES: dict[str, tuple[Case, ...]] = {
         Case("lost --refresh"),
     ),
     "zenoh": (
-        Case("zenoh policy.xml"),
-        Case("zenoh policy.xml --dry-run --mode client"),
-        Case("zenoh policy.xml -o there --dry-run"),
-        Case("zenoh policy.xml --check", 1),
-        Case("zenoh policy.xml --check", before=("zenoh zenoh policy.xml",)),
+        Case("zenoh"),
+        Case("zenoh --dry-run --mode peer"),
+        Case("zenoh --check", 1),
+        Case("zenoh --check", before=("zenoh zenoh",)),
     ),
     "rotate_ca": (
         Case("ks"),
@@ -304,7 +303,7 @@ ERRORS = {
     "revoke": "ks /none",
     "rotate_ca": "ks --to retire --next",
     "crl": "none",
-    "zenoh": "none policy.xml",
+    "zenoh": "none",
     "distribute_key": "ks /none out",
     "verify": "none",
     "create_request": "/r robot",

@@ -99,7 +99,7 @@ def made(made_keystore: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         "create_request /r asking",
         "sign_request ks asking/enclaves/r/request.pem -o answer.tar.gz",
         "generate_artifacts -k late -p p.xml",
-        "generate_artifacts -k zenoh -p p.xml -e /router",
+        "generate_artifacts -k zenoh -p p.xml",
     ):
         sros(*line.split(), cwd=folder).ok()
     (folder / "damaged/enclaves/a/cert.pem").write_text("damaged")
@@ -126,7 +126,7 @@ STATUS: dict[str, tuple[str, str, str]] = {
     "revoke": ("ks /a", NEVER, "ks /nobody"),
     "rotate_ca": ("ks --next", NEVER, "nothing --next"),
     "crl": ("ks", NEVER, "nothing"),
-    "zenoh": ("zenoh p.xml", "zenoh p.xml --check", "nothing p.xml"),
+    "zenoh": ("zenoh", "zenoh --check", "nothing"),
     "distribute_key": ("ks /a out", NEVER, "ks /nobody out"),
     "verify": ("robot", "damaged", "nothing"),
     "create_request": ("/new out", NEVER, "/r asking"),

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from sros_tool.keystore.lifecycle import zenoh as lifecycle
+from sros_tool.keystore.issuing import zenoh as issuing
 from sros_tool.keystore.reader import load_ca_certificate
 from sros_tool.pki import smime
-from sros_tool.policy.model import Enclave
-from sros_tool.translate_zenoh import remote_rights
+from sros_tool.translate_zenoh import StatedRight, remote_of
 from sros_tool.zenoh.access import AccessRule, Flow, Message, RemoteRights
 from tests.support.harness import policy_text, publish, snapshot, sros
 
@@ -28,12 +28,11 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("zenoh")
     subscribe = publish("/x").replace("publish", "subscribe")
     (folder / "p.xml").write_text(policy_text({"/a": publish("/x"), "/b": subscribe}))
-    (folder / "more.xml").write_text(policy_text({"/a": publish("/x", "/y")}))
     (folder / "router.xml").write_text(policy_text({"/router": publish("/x")}))
     hole = publish("/c*") + '\n<topics publish="DENY"><topic>/cd</topic></topics>'
     (folder / "hole.xml").write_text(policy_text({"/hole": hole}))
-    sros("generate_artifacts", "-k", "ks", "-p", "p.xml", "-p", "hole.xml", "-e", "/router",
-         cwd=folder).ok()  # fmt: skip
+    sros("generate_artifacts", "-k", "ks", "-p", "p.xml", "-e", "/router", cwd=folder).ok()
+    sros("update_keystore", "ks", "--set", "permissions.default=node_basics", cwd=folder).ok()
     return folder
 
 
@@ -47,7 +46,7 @@ def control(folder: Path, path: str) -> Any:
 
 
 def test_files_are_signed_whole_and_the_same_again(folder: Path) -> None:
-    ended = sros("zenoh", "ks", "p.xml", cwd=folder).ok()
+    ended = sros("zenoh", "ks", cwd=folder).ok()
     assert ended.out.splitlines() == [
         "wrote ks/enclaves/router/router.json5",
         "wrote ks/enclaves/a/session.json5",
@@ -63,16 +62,13 @@ def test_files_are_signed_whole_and_the_same_again(folder: Path) -> None:
         assert b"PRIVATE" not in document and str(folder).encode() not in document
         assert b".pem" not in document
     before = snapshot(folder)
-    again = sros("zenoh", "ks", "p.xml", cwd=folder).ok()
+    again = sros("zenoh", "ks", cwd=folder).ok()
     assert (again.out, "up to date" in again.err) == ("", True)
     assert snapshot(folder) == before
-    sros("zenoh", "ks", "p.xml", "-o", "out", cwd=folder).ok()
-    for path in SIGNED:
-        assert (folder / "out" / path).read_bytes() == (folder / "ks" / path).read_bytes()
 
 
 def test_every_file_has_the_rights_of_all_by_name_and_denies_the_rest(folder: Path) -> None:
-    sros("zenoh", "ks", "p.xml", cwd=folder).ok()
+    sros("zenoh", "ks", "--mode", "peer", cwd=folder).ok()
     names = {
         path: [each["cert_common_names"] for each in control(folder / "ks", path)["subjects"]]
         for path in SIGNED
@@ -82,21 +78,27 @@ def test_every_file_has_the_rights_of_all_by_name_and_denies_the_rest(folder: Pa
         said = control(folder / "ks", path)
         assert (said["enabled"], said["default_permission"]) == (True, "deny")
         assert {each["permission"] for each in said["rules"]} == {"allow"}
-    sros("zenoh", "ks", "p.xml", "--mode", "client", cwd=folder).ok()
+    sros("zenoh", "ks", "--mode", "client", cwd=folder).ok()
     subjects = control(folder / "ks", SESSION)["subjects"]
     assert [each["cert_common_names"] for each in subjects] == [["/router"]]
 
 
 def test_the_choices_reach_the_files(folder: Path) -> None:
-    words = ("--endpoint", "10.0.0.1:7000", "--mode", "client", "--json")
-    shown = json.loads(sros("zenoh", "ks", "p.xml", *words, cwd=folder).ok().out)
-    assert (shown["endpoint"], shown["mode"], shown["domain"]) == ("10.0.0.1:7000", "client", 0)
+    words = ("--endpoint", "10.0.0.1:7000", "--listen", "[::]:7000", "--json")
+    shown = json.loads(sros("zenoh", "ks", *words, cwd=folder).ok().out)
+    assert shown["network"] == {
+        "router": "/router",
+        "endpoints": ["10.0.0.1:7000"],
+        "listen": ["[::]:7000"],
+        "mode": "client",
+        "domains": [0],
+    }
     session = json.loads((folder / "ks" / SESSION).read_text())
     router = json.loads((folder / "ks" / ROUTER).read_text())
     assert (session["mode"], router["mode"]) == ("client", "router")
     assert session["connect"]["endpoints"] == ["tls/10.0.0.1:7000"]
     assert session["listen"]["endpoints"] == []
-    assert router["listen"]["endpoints"] == ["tls/10.0.0.1:7000"]
+    assert router["listen"]["endpoints"] == ["tls/[::]:7000"]
     for each in (session, router):
         link = each["transport"]["link"]
         assert (link["protocols"], link["tls"]["enable_mtls"]) == (["tls"], True)
@@ -111,8 +113,8 @@ def test_the_choices_reach_the_files(folder: Path) -> None:
 def test_what_was_changed_is_out_of_date_and_written_again(
     path: str, change: str, folder: Path
 ) -> None:
-    sros("zenoh", "ks", "p.xml", cwd=folder).ok()
-    sros("zenoh", "ks", "p.xml", "--check", cwd=folder).ok()
+    sros("zenoh", "ks", cwd=folder).ok()
+    sros("zenoh", "ks", "--check", cwd=folder).ok()
     file = folder / "ks" / (SIGNED[path] if change == "signature" else path)
     if change == "missing":
         file.unlink()
@@ -121,39 +123,47 @@ def test_what_was_changed_is_out_of_date_and_written_again(
     if change == "signature":
         file.write_bytes(b"x")
     before = snapshot(folder)
-    checked = sros("zenoh", "ks", "p.xml", "--check", cwd=folder)
+    checked = sros("zenoh", "ks", "--check", cwd=folder)
     assert (checked.status, checked.out) == (1, f"out of date: ks/{path}\n")
     assert snapshot(folder) == before
     verb = "wrote" if change == "missing" else "replaced"
-    assert sros("zenoh", "ks", "p.xml", cwd=folder).ok().out == f"{verb} ks/{path}\n"
-    sros("zenoh", "ks", "p.xml", "--check", cwd=folder).ok()
+    assert sros("zenoh", "ks", cwd=folder).ok().out == f"{verb} ks/{path}\n"
+    sros("zenoh", "ks", "--check", cwd=folder).ok()
 
 
 def test_a_dry_run_says_what_is_written(folder: Path) -> None:
     before = snapshot(folder)
-    would = sros("zenoh", "ks", "p.xml", "--dry-run", cwd=folder).ok()
+    would = sros("zenoh", "ks", "--dry-run", cwd=folder).ok()
     assert f"would create ks/{SESSION}" in would.out.splitlines()
     assert snapshot(folder) == before
 
 
 def test_the_keystore_may_be_that_of_the_environment(folder: Path) -> None:
     env = {"ROS_SECURITY_KEYSTORE": str(folder / "ks")}
-    sros("zenoh", "p.xml", env=env, cwd=folder).ok()
+    sros("zenoh", env=env, cwd=folder).ok()
     assert (folder / "ks" / SESSION).exists()
+
+
+def test_the_enclave_of_the_router_is_made_with_what_every_node_needs(folder: Path) -> None:
+    ended = sros("zenoh", "ks", "--router", "/way", cwd=folder).ok()
+    assert ended.out.splitlines()[0] == "created enclave /way"
+    assert "/way" not in ended.err, "no process of it runs yet"
+    shown = sros("explain", "ks", "/way", "publish", "/x", cwd=folder)
+    assert shown.status == 1, shown.out
+    assert not (folder / "ks" / ROUTER).exists()
 
 
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (("ks", "more.xml"), "Only the policy has: ALLOW publish topic /y"),
-        (("ks", "router.xml"), "the enclave /router of the router has rights"),
-        (("ks", "hole.xml"), "hole.xml:2: DENY publish /cd cannot be said to Zenoh"),
-        (("ks", "p.xml", "--router", "/nobody"), "enclave /nobody does not exist"),
-        (("ks", "p.xml", "--endpoint", "tcp/localhost:1"), "is not HOST:PORT"),
-        (("ks", "p.xml", "--endpoint", "localhost:70000"), "is not HOST:PORT"),
-        (("ks", "p.xml", "--domain", "7"), "is for domain 0, not for 7"),
-        (("nothing", "p.xml"), "is not a valid keystore"),
-        (("p.xml",), "takes a keystore and one or more policies"),
+        (("ks", "--router", "/a"), "the enclave /a has rights of its own"),
+        (("ks", "--router", "way"), "zenoh.router"),
+        (("ks", "--endpoint", "tcp/localhost:1"), "is not HOST:PORT"),
+        (("ks", "--endpoint", "localhost:70000"), "is not HOST:PORT"),
+        (("ks", "--domain", "7"), "the Zenoh network has domain 7, and keystore 'ks' only 0"),
+        (("ks", "--off", "--mode", "peer"), "--off takes no other choice"),
+        (("nothing",), "is not a valid keystore"),
+        ((), "ROS_SECURITY_KEYSTORE"),
     ],
 )
 def test_refused_and_nothing_is_written(words: tuple[str, ...], text: str, folder: Path) -> None:
@@ -164,25 +174,17 @@ def test_refused_and_nothing_is_written(words: tuple[str, ...], text: str, folde
     assert snapshot(folder) == before
 
 
-def test_an_enclave_without_policy_is_named(folder: Path) -> None:
-    ended = sros("zenoh", "ks", "p.xml", "--json", cwd=folder).ok()
-    (note,) = json.loads(ended.out)["notes"]
-    assert note["id"] == "zenoh.without-policy" and "/hole" in note["text"]
-
-
 def test_a_revoked_certificate_that_zenoh_still_accepts_is_noted(folder: Path) -> None:
-    sros("zenoh", "ks", "p.xml", cwd=folder).ok()
+    sros("zenoh", "ks", cwd=folder).ok()
     sros("revoke", "ks", "/a", cwd=folder).ok()
     assert not (folder / "ks" / SESSION).exists()
-    assert "was revoked" in sros("zenoh", "ks", "p.xml", cwd=folder).err
-    sros("generate_artifacts", "-k", "ks", "-p", "p.xml", "-e", "/a", cwd=folder).ok()
-    ended = sros("zenoh", "ks", "p.xml", "--json", cwd=folder).ok()
-    notes = {each["id"]: each["text"] for each in json.loads(ended.out)["notes"]}
-    assert "a revoked certificate of /a has not expired" in notes["zenoh.revoked-name"]
+    again = ("generate_artifacts", "-k", "ks", "-p", "p.xml", "-e", "/a")
+    notes = sros(*again, cwd=folder).ok().err
+    assert "a revoked certificate of /a has not expired" in notes
 
 
 def test_an_export_has_the_file_of_its_enclave_alone(folder: Path) -> None:
-    sros("zenoh", "ks", "p.xml", cwd=folder).ok()
+    sros("zenoh", "ks", cwd=folder).ok()
     sros("distribute_key", "ks", "/a", "robot", cwd=folder).ok()
     found = sorted(each.name for each in (folder / "robot").rglob("session.*"))
     assert found == ["session.json5", "session.p7s"]
@@ -191,44 +193,39 @@ def test_an_export_has_the_file_of_its_enclave_alone(folder: Path) -> None:
     assert "unknown" not in sros("check", "ks", "--severity", "note", cwd=folder).out
 
 
-def test_files_that_no_policy_states_any_more_are_removed(folder: Path) -> None:
-    sros("zenoh", "ks", "p.xml", cwd=folder).ok()
-    only_a = policy_text({"/a": publish("/x")})
-    (folder / "a.xml").write_text(only_a)
-    by_hand = folder / "ks/enclaves/hole/session.json5"
+def test_off_removes_what_sros_made_and_keeps_no_file_in_step(folder: Path) -> None:
+    sros("zenoh", "ks", cwd=folder).ok()
+    by_hand = folder / "ks/enclaves/session.json5"
     by_hand.write_text("{}")
-    checked = sros("zenoh", "ks", "a.xml", "--check", cwd=folder)
-    assert checked.status == 1
-    assert "out of date: ks/enclaves/b/session.json5" in checked.out.splitlines()
-    ended = sros("zenoh", "ks", "a.xml", cwd=folder).ok()
+    ended = sros("zenoh", "ks", "--off", cwd=folder).ok()
     assert "removed ks/enclaves/b/session.json5" in ended.out.splitlines()
     assert "restart the processes of 3 enclaves" in ended.err
-    assert not list((folder / "ks/enclaves/b").glob("session.*"))
-    assert by_hand.read_text() == "{}"
-    sros("zenoh", "ks", "a.xml", "--check", cwd=folder).ok()
+    assert [*(folder / "ks").rglob("session.*"), *(folder / "ks").rglob("router.*")] == [by_hand]
+    sros("create_permission", "ks", "/a", "p.xml", cwd=folder).ok()
+    assert not (folder / "ks" / SESSION).exists()
 
 
 def test_a_signature_of_another_keystore_does_not_count(folder: Path) -> None:
     sros("generate_artifacts", "-k", "other", "-p", "p.xml", "-e", "/router", cwd=folder).ok()
     for keystore in ("ks", "other"):
-        sros("zenoh", keystore, "p.xml", cwd=folder).ok()
+        sros("zenoh", keystore, cwd=folder).ok()
     assert (folder / "other" / SESSION).read_bytes() == (folder / "ks" / SESSION).read_bytes()
     shutil.copy(folder / "other" / SIGNED[SESSION], folder / "ks" / SIGNED[SESSION])
-    checked = sros("zenoh", "ks", "p.xml", "--check", cwd=folder)
+    checked = sros("zenoh", "ks", "--check", cwd=folder)
     assert (checked.status, checked.out) == (1, f"out of date: ks/{SESSION}\n")
 
 
 @pytest.mark.parametrize("lost", [True, False])
-def test_rules_that_are_not_the_policy_are_not_written(
+def test_rules_that_are_not_the_permissions_are_not_written(
     lost: bool, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def wrong(enclave: Enclave, domain: int) -> RemoteRights:
-        rights = remote_rights(enclave, domain)
-        wider = AccessRule(Flow.EGRESS, (Message.PUT,), (f"{domain}/**",))
+    def wrong(enclave: str, stated: Mapping[int, Sequence[StatedRight]]) -> RemoteRights:
+        rights = remote_of(enclave, stated)
+        wider = AccessRule(Flow.EGRESS, (Message.PUT,), ("0/**",))
         return replace(rights, rules=rights.rules[1:] if lost else (*rights.rules, wider))
 
-    monkeypatch.setattr(lifecycle, "remote_rights", wrong)
+    monkeypatch.setattr(issuing, "remote_of", wrong)
     before = snapshot(folder)
-    ended = sros("zenoh", "ks", "p.xml", cwd=folder)
+    ended = sros("zenoh", "ks", cwd=folder)
     assert (ended.status, "would not have the intended content" in ended.err) == (2, True)
     assert snapshot(folder) == before

@@ -54,10 +54,7 @@ def play(what: str, folder: Path, mode: str = "peer") -> Any:
         free.bind(("127.0.0.1", 0))
         endpoint = f"localhost:{free.getsockname()[1]}"
     for name in ("ks", "foreign"):
-        sros(
-            *("zenoh", folder / name, folder / "policy.xml"),
-            *("--endpoint", endpoint, "--mode", mode),
-        ).ok()
+        sros("zenoh", folder / name, "--endpoint", endpoint, "--mode", mode).ok()
     done = run(
         [sys.executable, "-P", WORLD, what, folder / "ks", folder / "foreign"],
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},

@@ -28,6 +28,8 @@ from sros_tool.keystore.template import (
 )
 from sros_tool.policy.protection import Level
 from sros_tool.translate import governance_for, protection_for
+from sros_tool.zenoh.configuration import Mode
+from sros_tool.zenoh.network import ZenohNetwork
 
 NOW = datetime(2026, 11, 22, tzinfo=UTC)
 ZERO = DomainSet.of((0, 0))
@@ -172,6 +174,7 @@ def test_every_field_of_the_settings_is_compared() -> None:
         "unique_subject",
         "revocation_validity",
         "short_lived",
+        "zenoh",
     }
     assert {each.name for each in fields(Template)} == seen
 
@@ -262,3 +265,12 @@ def test_what_was_rendered_is_read_again() -> None:
 
     template = with_values(PRODUCTION, rules=[CAMERA])
     assert parse_template(render_template(template), "") == template
+
+
+def test_each_choice_of_a_zenoh_network_is_compared() -> None:
+    here = replace(PRODUCTION, zenoh=ZenohNetwork())
+    there = ZenohNetwork("/way", ("robot:1",), ("[::]:1",), Mode.PEER, (0,))
+    changes = compare_settings(here, replace(here, zenoh=there), NOW)
+    assert [each.key for each in changes] == [f"zenoh.{each.name}" for each in fields(ZenohNetwork)]
+    (change,) = compare_settings(PRODUCTION, here, NOW)
+    assert (change.key, change.before, change.after) == ("zenoh", "none", "client")

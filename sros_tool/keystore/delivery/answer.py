@@ -18,7 +18,14 @@ from sros_tool.keystore.authorities.authority import Authority
 from sros_tool.keystore.delivery.archive import unpack
 from sros_tool.keystore.delivery.trust import check_same_authority, refuse_ca_keystore, trusted_in
 from sros_tool.keystore.known_keys import KnownKeys
-from sros_tool.keystore.layout import ENCLAVES, OPTIONAL_FILES, REQUIRED_FILES, SEAL, enclave_folder
+from sros_tool.keystore.layout import (
+    ENCLAVES,
+    OPTIONAL_FILES,
+    REQUIRED_FILES,
+    SEAL,
+    ZENOH_FILES,
+    enclave_folder,
+)
 from sros_tool.keystore.reader import (
     OpenedEnclave,
     open_enclave,
@@ -42,6 +49,7 @@ from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
 _KEY = "key.pem"
+_OPTIONAL = (*OPTIONAL_FILES, *ZENOH_FILES)
 _REQUIRED = tuple(file for file in REQUIRED_FILES if file != _KEY)
 _AGAIN = "Have the request signed again, and import the new answer."
 _SEALED = re.compile(rb"sros answer (?:1|2\nnumber ([1-9][0-9]{0,12}))\n")
@@ -121,7 +129,7 @@ def _read_answer(data: bytes) -> RequestAnswer:
             raise DocumentError("it is not the answer for one enclave")
         name = check_enclave_name(own[0].removeprefix(ENCLAVES).removesuffix("/cert.pem") or "/")
         folder = enclave_folder(name)
-        welcome = {f"{folder}/{file}" for file in (*_REQUIRED, *OPTIONAL_FILES)}
+        welcome = {f"{folder}/{file}" for file in (*_REQUIRED, *_OPTIONAL)}
         if strange := sorted(files.keys() - welcome):
             raise DocumentError(f"it holds {strange[0]!r}, which does not belong to an answer")
         if missing := [file for file in _REQUIRED if f"{folder}/{file}" not in files]:
@@ -242,7 +250,7 @@ def import_answer(
             present = folder / path
             if not present.is_file() or read_bytes(present, "file") != content:
                 transaction.write(path, content)
-        for file in OPTIONAL_FILES:
+        for file in _OPTIONAL:
             if answer.file(file) is None and (place / file).exists():
                 transaction.remove(f"{enclave_folder(name)}/{file}")
         transaction.commit()

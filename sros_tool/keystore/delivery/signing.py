@@ -31,6 +31,7 @@ from sros_tool.keystore.issuing.enclave import (
     shared_files,
     stated_enclave,
 )
+from sros_tool.keystore.issuing.zenoh import KeptZenoh, ZenohChange, keep_zenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -40,6 +41,7 @@ from sros_tool.keystore.layout import (
     PERMISSIONS_FILE,
     REQUEST,
     SEAL,
+    ZENOH_FILES,
     enclave_folder,
     enclave_path,
     list_enclaves,
@@ -163,7 +165,18 @@ def sign_request(
         transaction.write(f"{enclave_folder(name)}/{REQUEST}", request.pem)
         link_shared_files(transaction, name, present_files(root, name))
         notes += [*issued.notes(), *writer.notes, *edit_notes(root, governance)]
-        files = _answer_files(root, issued)
+        permissions = authorities.permissions
+        kept = keep_zenoh(
+            transaction,
+            template.zenoh,
+            domains,
+            permissions.certificate,
+            lambda: permissions,
+            now,
+            ZenohChange(writer.grants, stated={name: stated}),
+        )
+        notes += kept.notes
+        files = _answer_files(root, issued, kept)
         number = read_ledger(root).next_number()
         sealed = seal(files, number, authorities.permissions)
         _check_result(RequestAnswer(name, files, sealed), request, now)
@@ -300,7 +313,7 @@ def _present_certificate(root: Path, name: str) -> x509.Certificate:
     return read_certificate(path)
 
 
-def _answer_files(root: Path, issued: Issued) -> dict[str, bytes]:
+def _answer_files(root: Path, issued: Issued, zenoh: KeptZenoh) -> dict[str, bytes]:
     """Map the paths of the answer's files to their content, sorted by path."""
     name = issued.issuance.name
     folder = enclave_folder(name)
@@ -309,6 +322,12 @@ def _answer_files(root: Path, issued: Issued) -> dict[str, bytes]:
         f"{folder}/{PERMISSIONS_FILE}": issued.document,
     }
     shared = {GOVERNANCE_FILE: GOVERNANCE_P7S, **shared_files(root, name)}
+    for file in ZENOH_FILES if name in zenoh.files else ():
+        path = f"{folder}/{file}"
+        if path in zenoh.written:
+            files[path] = zenoh.written[path]
+        elif (root / path).is_file():
+            shared[file] = path
     with Folder(root) as opened:
         for file, source in shared.items():
             files[f"{folder}/{file}"] = data = opened.read_inside(source)

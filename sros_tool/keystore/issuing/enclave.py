@@ -148,7 +148,8 @@ class EnclaveWriter:
     """Writer of enclaves: issues certificates and permissions within one transaction.
 
     ``identity`` signs certificates, ``permissions`` signs permissions.  ``entries`` are for the
-    ledger.  ``notes`` report CAs that expire too early for the validity that the template chooses.
+    ledger, ``grants`` the new permissions of enclaves.  ``notes`` report CAs that expire too early
+    for the validity that the template chooses.
     """
 
     def __init__(
@@ -161,6 +162,7 @@ class EnclaveWriter:
         permissions: Authority | None,
     ) -> None:
         self.entries: list[Entry] = []
+        self.grants: dict[str, Grant] = {}
         self._transaction = transaction
         self._template = template
         self._now = now
@@ -214,6 +216,7 @@ class EnclaveWriter:
                 policy=policy,
             )
         )
+        (self.grants[name],) = permissions.grants
         short = self._template.longest_validity(name) is not None
         return Issued(issuance, certificate, permissions, message, short_lived=short)
 
@@ -262,20 +265,24 @@ class EnclaveWriter:
         """
         own_process = os.getpid()
 
-        def work_on(part: Sequence[str]) -> tuple[list[Result], list[Entry], Staged]:
+        def work_on(
+            part: Sequence[str],
+        ) -> tuple[list[Result], list[Entry], dict[str, Grant], Staged]:
             mark, first, results = self._transaction.mark(), len(self.entries), []
             for name in part:
                 results.append(work(name))
                 if progress and os.getpid() == own_process:
                     progress(name)
-            return results, self.entries[first:], self._transaction.since(mark)
+            grants = {name: self.grants[name] for name in part if name in self.grants}
+            return results, self.entries[first:], grants, self._transaction.since(mark)
 
         slices = [(names, work_on(names))] if self._key_on_token else map_slices(names, work_on)
         found: dict[str, Result] = {}
-        for index, (part, (results, entries, staged)) in enumerate(slices):
+        for index, (part, (results, entries, grants, staged)) in enumerate(slices):
             if index:  # this process did the first slice, forked workers did the others
                 self._transaction.absorb(staged)
                 self.entries += entries
+                self.grants |= grants
                 for name in part if progress else ():
                     progress(name)  # type: ignore[misc]
             found |= zip(part, results, strict=True)

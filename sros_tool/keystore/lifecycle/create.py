@@ -37,6 +37,7 @@ from sros_tool.keystore.issuing.enclave import (
     stated_enclave,
 )
 from sros_tool.keystore.issuing.governance import write_governance
+from sros_tool.keystore.issuing.zenoh import KeptZenoh, ZenohChange, keep_zenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -60,9 +61,18 @@ from sros_tool.keystore.lifecycle.replaced import (
 )
 from sros_tool.keystore.lifecycle.revoke import Superseded, revoke_superseded
 from sros_tool.keystore.missing import no_such_enclave
-from sros_tool.keystore.reader import check_domain, load_governance, load_settings, read_certificate
-from sros_tool.keystore.settings import edit_notes, with_places, write_settings
-from sros_tool.keystore.template import Template, template_names
+from sros_tool.keystore.reader import (
+    check_domain,
+    load_governance,
+    load_settings,
+    read_certificate,
+)
+from sros_tool.keystore.settings import (
+    edit_notes,
+    with_places,
+    write_settings,
+)
+from sros_tool.keystore.template import NODE_BASICS, Template, template_names
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
 from sros_tool.keystore.transaction.transaction import Transaction
@@ -94,7 +104,8 @@ class Creation:
     ``created`` are the new enclaves, ``changed`` the enclaves with new permissions, ``completed``
     the enclaves that got missing files, and ``kept`` the enclaves without changes.  ``replaced``
     are the rights that changed with the permissions.  ``restart`` are the enclaves whose processes
-    trust revoked certificates until they are restarted, ``remarks`` notes about open tasks.
+    have to be restarted: they trust revoked certificates, or have other rules for Zenoh.
+    ``remarks`` are notes about open tasks; ``zenoh`` are the configurations for Zenoh.
     """
 
     root: Path
@@ -110,6 +121,7 @@ class Creation:
     replaced: tuple[ReplacedRights, ...] = ()
     restart: tuple[str, ...] = ()
     remarks: tuple[Note, ...] = ()
+    zenoh: KeptZenoh = KeptZenoh()  # noqa: RUF009 - frozen
 
 
 def create_keystore(
@@ -202,8 +214,8 @@ def create_permission(
             raise no_such_enclave(root, name, existing)
     wanted = {name: stated_enclave(policy, name) for name in names}
     with Transaction(root, dry_run=dry_run) as transaction:
-        keystore = _open_keystore(transaction, domain, keyring, now)
-        return _write_enclaves(
+        keystore = open_to_issue(transaction, domain, keyring, now)
+        return write_enclaves(
             transaction, keystore, dict(wanted), now, revoke_old=revoke_old, keyring=keyring
         )
 
@@ -231,15 +243,15 @@ def generate_artifacts(
     Raises:
         KeystoreError: a policy names a revoked enclave that ``enclaves`` does not name.
     """
-    wanted = rights_by_enclave(enclaves, policies)
+    wanted = _rights_by_enclave(enclaves, policies)
     if not dry_run:
         tidy(root)
     if create is None or is_keystore(root):
         check_keystore(root)
         with Transaction(root, dry_run=dry_run) as transaction:
-            keystore = _open_keystore(transaction, domain, keyring, now)
+            keystore = open_to_issue(transaction, domain, keyring, now)
             again = _revoked_before(keystore, wanted, enclaves, root)
-            creation = _write_enclaves(
+            creation = write_enclaves(
                 transaction,
                 keystore,
                 wanted,
@@ -255,7 +267,7 @@ def generate_artifacts(
     check_domain(domains, domain, root)
     with Transaction(root, fresh=True, dry_run=dry_run) as transaction:
         keystore = _write_keystore(transaction, create, domains, keyring, now, _NONE_IMPORTED)
-        creation = _write_enclaves(transaction, keystore, wanted, now, progress)
+        creation = write_enclaves(transaction, keystore, wanted, now, progress)
     return replace(creation, notes=(*creation.notes, *place_notes(root)))
 
 
@@ -303,7 +315,7 @@ def refuse_other_template(root: Path, template: Template) -> None:
         )
 
 
-def rights_by_enclave(
+def _rights_by_enclave(
     names: Sequence[str], policies: Sequence[Policy]
 ) -> dict[str, Enclave | None]:
     """Map enclaves to their rights in the policies, or None; raise if two policies differ."""
@@ -341,9 +353,10 @@ class _Keystore:
     notes: tuple[Note, ...] = ()
 
 
-def _open_keystore(
+def open_to_issue(
     transaction: Transaction, domain: int | None, keyring: Keyring, now: datetime
 ) -> _Keystore:
+    """Return an existing keystore; ``domain``, if given, has to be one of its governance."""
     root = transaction.root
     template = load_settings(root)
     authorities = load_authorities(root, template, keyring, now)
@@ -459,7 +472,7 @@ class _Outcome(Enum):
     KEPT = "kept"
 
 
-def _write_enclaves(
+def write_enclaves(
     transaction: Transaction,
     keystore: _Keystore,
     wanted: Mapping[str, Enclave | None],
@@ -469,7 +482,13 @@ def _write_enclaves(
     revoke_old: bool = False,
     keyring: Keyring = IN_KEYSTORE,
 ) -> Creation:
-    """Create or complete the enclaves, sign the permissions of their policies, and commit."""
+    """Create or complete the enclaves, sign the permissions of their policies, and commit.
+
+    A keystore with a Zenoh network gets the enclave of its router, too.
+    """
+    network = keystore.template.zenoh
+    if network and network.router not in keystore.names:
+        wanted = {network.router: None, **wanted}
     writer = EnclaveWriter(
         transaction,
         keystore.template,
@@ -498,10 +517,20 @@ def _write_enclaves(
             now,
         )
         entries += revoked.entries
-    append(transaction, entries, keystore.authorities.identity, now)
-    transaction.commit()
     outcomes = {name: each.outcome for name, each in done.items()}
     created = _names_with(outcomes, _Outcome.CREATED)
+    permissions = keystore.authorities.permissions
+    kept = keep_zenoh(
+        transaction,
+        network,
+        keystore.domains,
+        permissions.certificate,
+        lambda: permissions,
+        now,
+        ZenohChange(writer.grants, stated=wanted),
+    )
+    append(transaction, entries, keystore.authorities.identity, now)
+    transaction.commit()
     return Creation(
         transaction.root,
         keystore.template,
@@ -517,10 +546,12 @@ def _write_enclaves(
             *(writer.notes if writer.entries else ()),
             *name_notes({*keystore.names, *created}, created),
             *keystore.notes,
+            *kept.notes,
         ),
         tuple(each.replaced for each in done.values() if each.replaced),
-        keystore.names if revoked else (),
+        keystore.names if revoked else tuple(e for e in kept.restart if e not in created),
         revoked.remarks if revoked else (),
+        kept,
     )
 
 
@@ -565,7 +596,7 @@ def _write_enclave(
             identity = NewIdentity(enclave_subject(name, unique=True), public)
     rights = None
     if policy or PERMISSIONS_FILE not in present:
-        enclave = policy or default_rights(keystore.template, name)
+        enclave = policy or _default_rights(keystore.template, name)
         rights = StatedRights(enclave, keystore.domains)
     issued = writer.write(Issuance(name, identity, rights))
     link_shared_files(transaction, name, present)
@@ -582,6 +613,13 @@ def _write_enclave(
         return _Written(_Outcome.CHANGED, notes, replaced, superseded)
     completed = len(transaction.changes) > before
     return _Written(_Outcome.COMPLETED if completed else _Outcome.KEPT, notes)
+
+
+def _default_rights(template: Template, name: str) -> Enclave:
+    """Return the rights of a new enclave without a policy; the router of Zenoh only routes."""
+    if template.zenoh and template.zenoh.router == name:
+        template = replace(template, default_permissions=NODE_BASICS)
+    return default_rights(template, name)
 
 
 def _identity(

@@ -25,6 +25,7 @@ from sros_tool.keystore.issuing.enclave import (
     NewIdentity,
     RecordedRights,
 )
+from sros_tool.keystore.issuing.zenoh import KeptZenoh, ZenohChange, keep_zenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     KEY_FILE,
@@ -148,6 +149,19 @@ def renew(
                 transaction, replaced, authorities.identity, template, keyring, existing, now
             )
             entries += revoked.entries
+        permissions = authorities.permissions
+        kept = KeptZenoh()
+        if replaced and template.zenoh:
+            kept = keep_zenoh(
+                transaction,
+                template.zenoh,
+                governance_of(root).domains().closed(),
+                permissions.certificate,
+                lambda: permissions,
+                now,
+                ZenohChange(writer.grants),
+            )
+            notes += kept.notes
         append(transaction, entries, authorities.identity, now)
         transaction.commit()
     return Renewal(
@@ -157,7 +171,7 @@ def renew(
         notes,
         None if revoked else max((each.not_after for each in valid), default=None),
         revoked.count if revoked else 0,
-        existing if revoked else (),
+        existing if revoked else kept.restart,
         revoked.remarks if revoked else (),
     )
 

@@ -12,10 +12,12 @@ from cryptography import x509
 from sros_tool.errors import KeystoreError, Note, UsageError
 from sros_tool.keystore.authorities.authority import Authority, load_authority
 from sros_tool.keystore.authorities.keyring import IN_KEYSTORE, Keyring
+from sros_tool.keystore.issuing.zenoh import KeptZenoh, ZenohChange, keep_zenoh
 from sros_tool.keystore.layout import (
     CRL,
     IDENTITY,
     OPTIONAL_FILES,
+    PERMISSIONS,
     REQUEST,
     REQUIRED_FILES,
     REVOKED,
@@ -26,7 +28,12 @@ from sros_tool.keystore.layout import (
 from sros_tool.keystore.ledger import Entry, Ledger, append, certificate_entry, read_ledger
 from sros_tool.keystore.lifecycle.revocation_list import RevocationListSigner, put_away
 from sros_tool.keystore.missing import no_such_enclave
-from sros_tool.keystore.reader import load_settings, read_certificate
+from sros_tool.keystore.reader import (
+    governance_of,
+    load_ca_certificate,
+    load_settings,
+    read_certificate,
+)
 from sros_tool.keystore.template import Template
 from sros_tool.keystore.transaction.recovery import tidy
 from sros_tool.keystore.transaction.stage import Change
@@ -114,6 +121,17 @@ def revoke(
         next_update, signed = lists.sign(revoked, remaining, incomplete=until_retired)
         entries += signed
         _link_everywhere(transaction, remaining)
+        kept = KeptZenoh()
+        if template.zenoh:
+            kept = keep_zenoh(
+                transaction,
+                template.zenoh,
+                governance_of(root).domains().closed(),
+                load_ca_certificate(root, PERMISSIONS),
+                lambda: load_authority(root, PERMISSIONS, template, keyring, now),
+                now,
+                ZenohChange(gone=names),
+            )
         append(transaction, entries, authority, now)
         transaction.commit()
     return Revocation(
@@ -122,7 +140,7 @@ def revoke(
         remaining,
         next_update,
         tuple(transaction.changes),
-        (*lists.remarks, *_remarks_on_lack(root, ledger, present)),
+        (*lists.remarks, *_remarks_on_lack(root, ledger, present), *kept.notes),
     )
 
 

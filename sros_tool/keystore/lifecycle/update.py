@@ -46,6 +46,7 @@ from sros_tool.keystore.issuing.enclave import (
     default_rights,
 )
 from sros_tool.keystore.issuing.governance import write_governance
+from sros_tool.keystore.issuing.zenoh import KeptZenoh, ZenohChange, keep_zenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     GOVERNANCE_XML,
@@ -254,6 +255,13 @@ def edited_settings(root: Path, present: PresentSettings) -> tuple[Template, Dom
             f"{quote(str(root))} --discard-edits`.",
         )
     written = present.written or present.settings
+    if present.settings.zenoh and not written.zenoh:
+        raise KeystoreError(
+            f"{SETTINGS} of keystore '{root}' has no table [zenoh] any more",
+            "The files of Zenoh would stay, and nothing would keep them in step.",
+            f"End it with `sros zenoh {quote(str(root))} --off`, after `sros update_keystore "
+            f"{quote(str(root))} --discard-edits`.",
+        )
     if not edits.governance:
         return written, present.domains
     path = root / GOVERNANCE_XML
@@ -555,6 +563,7 @@ class _Updater:
                 self._now,
             )
             entries += revoked.entries
+        kept = self._keep_zenoh() if done else KeptZenoh()
         append(self._transaction, entries, self._authorities.identity, self._now)
         rights = tuple(each.rights.revoked() if revoked else each.rights for each in reissued)
         settings = (
@@ -562,7 +571,7 @@ class _Updater:
             *compare_settings(before, after, self._now),
         )
         restart = names if revoked or governance != self._present.governance else ()
-        restart = restart or tuple(each.name for each in reissued)
+        restart = restart or tuple(sorted({*(each.name for each in reissued), *kept.restart}))
         remarks = [*(revoked.remarks if revoked else ())]
         if restart:
             disturbed = mismatch(self._present.governance, governance)
@@ -587,7 +596,19 @@ class _Updater:
             restart,
             tuple(remarks),
             tuple(self._transaction.changes),
-            self._writer.notes if reissued else (),
+            (*(self._writer.notes if reissued else ()), *kept.notes),
+        )
+
+    def _keep_zenoh(self) -> KeptZenoh:
+        permissions = self._authorities.permissions
+        return keep_zenoh(
+            self._transaction,
+            self._goal.settings.zenoh,
+            self._goal.domains,
+            permissions.certificate,
+            lambda: permissions,
+            self._now,
+            ZenohChange(self._writer.grants),
         )
 
     # ── enclaves ───────────────────────────────────────────────────────────────────────────

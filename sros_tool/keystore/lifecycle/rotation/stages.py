@@ -28,6 +28,7 @@ from sros_tool.keystore.issuing.enclave import (
     NewIdentity,
     RecordedRights,
 )
+from sros_tool.keystore.issuing.zenoh import ZenohChange, keep_zenoh
 from sros_tool.keystore.known_keys import KnownKeys
 from sros_tool.keystore.layout import (
     CERTIFICATE_FILE,
@@ -486,6 +487,18 @@ class _Rotator:
         writer.for_each(self._names, reissue, progress)
         self._entries += writer.entries
         self.notes += writer.notes
+        if permissions:
+            signer = permissions.new
+            kept = keep_zenoh(
+                self._transaction,
+                self._template.zenoh,
+                governance_of(self._root).domains().closed(),
+                signer.certificate,
+                lambda: signer,
+                self._now,
+                ZenohChange(writer.grants),
+            )
+            self.notes += kept.notes
         if identity:
             self.notes += tuple(known.shared_notes(self._names))
 

@@ -1,0 +1,189 @@
+"""Every change of a keystore keeps its files for Zenoh in step, and names what to restart."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from sros_tool.keystore.reader import load_ca_certificate
+from sros_tool.pki import smime
+from tests.support.harness import policy_text, publish, snapshot, sros
+
+FIRST = policy_text({"/a": publish("/x"), "/b": publish("/y")})
+MORE = policy_text({"/a": publish("/x", "/z")})
+NEW = policy_text({"/new": publish("/n")})
+HOLE = policy_text(
+    {"/hole": publish("/c*") + '\n<topics publish="DENY"><topic>/c?d</topic></topics>'}
+)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a keystore in each mode; only to be copied."""
+    folder = tmp_path_factory.mktemp("kept")
+    for name, text in (("first", FIRST), ("more", MORE), ("new", NEW), ("hole", HOLE)):
+        (folder / f"{name}.xml").write_text(text)
+    for mode in ("client", "peer"):
+        sros("create_keystore", mode, "--template", "production", cwd=folder).ok()
+        sros("generate_artifacts", "-k", mode, "-p", "first.xml", cwd=folder).ok()
+        sros("zenoh", mode, "--mode", mode, cwd=folder).ok()
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "w", symlinks=True))
+
+
+def in_step(root: Path) -> None:
+    """The files are what the keystore needs, and signed by its permissions CA."""
+    assert sros("zenoh", root, "--check").status == 0
+    authority = load_ca_certificate(root, "permissions")
+    documents = list((root / "enclaves").rglob("*.json5"))
+    assert documents
+    for each in documents:
+        smime.parse(each.with_suffix(".p7s").read_bytes()).verify(authority)
+
+
+ALL = ["/a", "/b", "/router"]
+
+
+@pytest.mark.parametrize(
+    ("words", "client", "peer"),
+    [
+        (("generate_artifacts", "-k", "{}", "-p", "more.xml"), ["/a", "/router"], ALL),
+        (("generate_artifacts", "-k", "{}", "-p", "first.xml"), [], []),
+        (("generate_artifacts", "-k", "{}", "-p", "new.xml"), ["/router"], ALL),
+        (("create_enclave", "{}", "/c"), ["/router"], ALL),
+        (("create_permission", "{}", "/a", "more.xml"), ["/a", "/router"], ALL),
+        (("renew", "{}", "/a"), [], []),
+        (("renew", "{}", "/a", "--new-key"), [], []),
+        (("update_keystore", "{}", "--set", "zenoh.endpoints=robot:7447"), ALL, ALL),
+        (("update_keystore", "{}", "--set", "zenoh.listen=[::]:7447"), ["/router"], ["/router"]),
+        (("zenoh", "{}"), [], []),
+    ],
+)
+def test_the_files_follow_and_exactly_what_changed_is_restarted(
+    words: tuple[str, ...], client: list[str], peer: list[str], folder: Path
+) -> None:
+    for mode, expected in (("client", client), ("peer", peer)):
+        root = folder / mode
+        before = {path: path.read_bytes() for path in root.rglob("*.json5")}
+        shown = sros(*(each.format(mode) for each in words), "--json", cwd=folder).ok()
+        in_step(root)
+        assert sorted(json.loads(shown.out)["restart"]) == expected
+        changed = {path for path in before if path.read_bytes() != before[path]}
+        assert {"/" + each.parent.name for each in changed} == set(expected)
+
+
+def test_a_revoked_enclave_has_no_rights_any_more(folder: Path) -> None:
+    for mode in ("client", "peer"):
+        shown = sros("revoke", mode, "/a", "--json", cwd=folder).ok()
+        assert json.loads(shown.out)["restart"] == ["/b", "/router"]
+        in_step(folder / mode)
+        assert "/a#" not in (folder / mode / "enclaves/router/router.json5").read_text()
+        assert not (folder / mode / "enclaves/a").exists()
+
+
+def test_a_signed_request_brings_its_files(folder: Path) -> None:
+    (folder / "far.xml").write_text(policy_text({"/far": publish("/f")}))
+    sros("create_request", "/far", "robot", cwd=folder).ok()
+    request = "robot/enclaves/far/request.pem"
+    answer = ("-p", "far.xml", "-o", "far.tar.gz")
+    sros("sign_request", "client", request, *answer, cwd=folder).ok()
+    in_step(folder / "client")
+    sros("import", "far.tar.gz", "robot", cwd=folder).ok()
+    for name in ("session.json5", "session.p7s"):
+        here, there = (folder / each / "enclaves/far" / name for each in ("client", "robot"))
+        assert here.read_bytes() == there.read_bytes()
+
+
+def test_a_rotation_of_both_cas_ends_in_step_at_every_stage(folder: Path) -> None:
+    sros("revoke", "peer", "/b", cwd=folder).ok()
+    before = (folder / "peer/enclaves/a/session.p7s").read_bytes()
+    for _ in range(3):
+        sros("rotate_ca", "peer", "--next", cwd=folder).ok()
+        in_step(folder / "peer")
+    assert (folder / "peer/enclaves/a/session.p7s").read_bytes() != before
+    sros("rotate_ca", "client", "--finish", cwd=folder).ok()
+    in_step(folder / "client")
+
+
+def test_more_domains_reach_the_rules(folder: Path) -> None:
+    sros("update_keystore", "client", "--domain", "0,7", "--allow-looser", cwd=folder).ok()
+    in_step(folder / "client")
+    text = (folder / "client/enclaves/router/router.json5").read_text()
+    assert '"7/x/*/*"' in text and '"0/x/*/*"' in text
+
+
+def test_rights_that_zenoh_cannot_enforce_are_refused_with_their_line(folder: Path) -> None:
+    before = snapshot(folder)
+    ended = sros("generate_artifacts", "-k", "client", "-p", "hole.xml", cwd=folder)
+    assert ended.status == 2 and "hole.xml:2: DENY publish" in ended.err
+    assert snapshot(folder) == before
+
+
+def test_the_routers_enclave_gets_no_rights(folder: Path) -> None:
+    (folder / "router.xml").write_text(policy_text({"/router": publish("/x")}))
+    before = snapshot(folder)
+    ended = sros("create_permission", "client", "/router", "router.xml", cwd=folder)
+    assert ended.status == 2 and "/router, the enclave of the Zenoh router" in ended.err
+    assert snapshot(folder) == before
+
+
+def test_permissions_that_were_put_back_give_no_rights(folder: Path) -> None:
+    """Their signature is as valid as ever, but the ledger knows later ones."""
+    root = folder / "client"
+    sros("create_permission", "client", "/a", "more.xml", cwd=folder).ok()
+    kept = (root / "enclaves/a/permissions.p7s").read_bytes()
+    sros("create_permission", "client", "/a", "first.xml", cwd=folder).ok()
+    (root / "enclaves/a/permissions.p7s").write_bytes(kept)
+    ended = sros("create_enclave", "client", "/c", cwd=folder).ok()
+    assert "/a gets no configuration for Zenoh" in ended.err
+    assert "/z/" not in (root / "enclaves/router/router.json5").read_text()
+    assert not (root / "enclaves/a/session.json5").exists()
+
+
+def test_a_template_may_choose_the_network(folder: Path) -> None:
+    text = (Path(__file__).parents[2] / "keystore_templates/production.toml").read_text()
+    (folder / "robot.toml").write_text(
+        f'{text}\n[zenoh]\nrouter = "/way"\nendpoints = ["robot:7447"]\nmode = "peer"\n'
+    )
+    sros("create_keystore", "ks", "--template", "robot.toml", cwd=folder).ok()
+    ended = sros("generate_artifacts", "-k", "ks", "-p", "first.xml", cwd=folder).ok()
+    assert "created enclave /way" in ended.out
+    in_step(folder / "ks")
+    session = json.loads((folder / "ks/enclaves/a/session.json5").read_text())
+    assert (session["mode"], session["connect"]["endpoints"]) == ("peer", ["tls/robot:7447"])
+
+
+@pytest.mark.parametrize(
+    ("line", "text"),
+    [
+        ('mode = "router"', "zenoh.mode is 'router', not one of client, peer"),
+        ("endpoints = []", "zenoh.endpoints is not a list"),
+        ('endpoints = ["tls/robot:1"]', "which is not HOST:PORT"),
+        ('router = "router"', "zenoh.router"),
+        ("domains = [231]", "zenoh.domains is not a list of numbers from 0 to 230"),
+        ("port = 1", "zenoh.port is not a known key"),
+    ],
+)
+def test_a_template_with_another_network_is_refused(line: str, text: str, folder: Path) -> None:
+    production = (Path(__file__).parents[2] / "keystore_templates/production.toml").read_text()
+    (folder / "robot.toml").write_text(f"{production}\n[zenoh]\n{line}\n")
+    ended = sros("create_keystore", "ks", "--template", "robot.toml", cwd=folder)
+    assert ended.status == 2 and text in ended.err
+    assert not (folder / "ks").exists()
+
+
+def test_a_table_that_was_taken_out_by_hand_is_no_silent_end(folder: Path) -> None:
+    path = folder / "client/sros.toml"
+    text = path.read_text()
+    path.write_text(text[: text.index("\n[zenoh]")] + "\n")
+    ended = sros("update_keystore", "client", "--take-edits", cwd=folder)
+    assert ended.status == 2 and "sros zenoh client --off" in ended.err
+    sros("update_keystore", "client", "--discard-edits", cwd=folder).ok()
+    in_step(folder / "client")
