@@ -131,6 +131,18 @@ def _graph_rules(enclave: str, domain: int) -> Iterator[AccessRule]:
     yield AccessRule(_OUT, asking, (everything,))
 
 
+def domains_of(control: AccessControl) -> set[int]:
+    """Return the ROS domains in which rules let processes ask for the graph, as every node does."""
+    asked = {
+        tuple(key.split("/"))
+        for remote in control.remotes
+        for rule in remote.rules
+        if _M.LIVELINESS_QUERY in rule.messages
+        for key in rule.key_expressions
+    }
+    return {int(key[1]) for key in asked if len(key) == 3 and key[1].isdecimal()}
+
+
 def control_of_router(remotes: Mapping[str, RemoteRights]) -> AccessControl:
     """Return what the router enforces: the rights of every enclave, by the enclave's name."""
     return AccessControl(tuple(remotes[each] for each in sorted(remotes)))

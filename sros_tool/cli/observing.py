@@ -100,9 +100,9 @@ def observer_environment(
             domain_from(os.environ)
             return {}
         return {DOMAIN: str(domain_from({DOMAIN: domain}) or 0)}
-    from sros_tool.cli.running import loadable_environment
+    from sros_tool.cli.enclave_environment import loadable_environment
 
-    return loadable_environment(keystore or keystore_from_environment(), enclave, domain)
+    return loadable_environment(keystore or keystore_from_environment(), enclave, domain).variables
 
 
 def observe(

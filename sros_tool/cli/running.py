@@ -5,12 +5,9 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-import stat
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
-from shlex import quote
 from typing import Any
 
 import click
@@ -19,11 +16,13 @@ from sros_tool.cli.common import (
     check_one_format,
     complete_keystore_and_enclave,
     json_option,
-    now,
     print_json,
+    print_notes,
     split_root,
 )
-from sros_tool.errors import KeystoreError, UnavailableError, UsageError
+from sros_tool.cli.enclave_environment import RMWS, loadable_environment
+from sros_tool.cli.written import notes_json
+from sros_tool.errors import UnavailableError, UsageError
 
 _COMMAND = "sros.command"
 _WORDS = click.argument(
@@ -38,6 +37,17 @@ _DOMAIN = click.option(
 )
 
 
+def _complete_rmw(_ctx: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the RMWs that sros knows to secure."""
+    return [each for each in RMWS if each.startswith(incomplete)]
+
+
+_RMW = click.option(
+    "--rmw",
+    metavar="NAME",
+    shell_complete=_complete_rmw,
+    help="The RMW of the process, such as rmw_zenoh_cpp. [default: $RMW_IMPLEMENTATION]",
+)
 _ACCEPT_KEY = click.option(
     "--accept-readable-key",
     is_flag=True,
@@ -81,7 +91,7 @@ def _refusal_printed(form: str, as_json: bool) -> Iterator[None]:
         from sros_tool.runtime.environment import REFUSING, render_refusal
 
         if as_json:
-            print_json({"keystore": None, "enclave": None, "variables": REFUSING})
+            print_json({"keystore": None, "enclave": None, "variables": REFUSING, "notes": []})
         else:
             click.echo(render_refusal(form), nl=False)
         raise
@@ -123,19 +133,23 @@ Example:
     help="For a shell, a systemd unit or Docker; json has names and values alone.",
 )
 @_DOMAIN
+@_RMW
 @_ACCEPT_KEY
 @json_option
 def env(
     words: tuple[str, ...],
     form: str,
     domain: str | None,
+    rmw: str | None,
     accept_readable_key: bool,
     as_json: bool,
 ) -> None:
     """Print the environment variables that make a process run in the enclave NAME.
 
     The strategy is Enforce: a process that cannot run in the enclave does not start. If the
-    variables cannot be given, those that are printed let no node start.
+    variables cannot be given, those that are printed let no node start. With rmw_zenoh_cpp, which
+    ignores ROS_SECURITY_*, they also name the configuration that `sros zenoh` wrote, and replace
+    those of Zenoh that are set.
     """
     from sros_tool.runtime.environment import render_environment
 
@@ -143,12 +157,21 @@ def env(
     root, rest = split_root(words)
     if len(rest) != 1:
         raise UsageError("env takes a keystore and one enclave")
-    variables = loadable_environment(root, rest[0], domain, accept_key=accept_readable_key)
-    text = render_environment(variables, "json" if as_json else form)
+    found = loadable_environment(root, rest[0], domain, rmw, accept_key=accept_readable_key)
+    text = render_environment(found.variables, "json" if as_json else form)
+    notes = [*found.notes, *found.enclave_notes]
     if as_json:
-        print_json({"keystore": str(root), "enclave": rest[0], "variables": variables})
+        print_json(
+            {
+                "keystore": str(root),
+                "enclave": rest[0],
+                "variables": found.variables,
+                "notes": notes_json(notes),
+            }
+        )
     else:
         click.echo(text, nl=False)
+        print_notes(notes)
 
 
 class _WithCommand(click.Command):
@@ -187,6 +210,7 @@ Example:
     shell_complete=complete_keystore_and_enclave,
 )
 @_DOMAIN
+@_RMW
 @_ACCEPT_KEY
 @click.option("--no-ros-args", is_flag=True, help="Add no arguments to COMMAND.")
 @click.pass_context
@@ -194,6 +218,7 @@ def run(
     ctx: click.Context,
     words: tuple[str, ...],
     domain: str | None,
+    rmw: str | None,
     accept_readable_key: bool,
     no_ros_args: bool,
 ) -> None:
@@ -202,15 +227,15 @@ def run(
     The enclave is checked first, so that problems are reported here and not by an obscure message
     of the middleware. A COMMAND that is known to start a ROS node (`ros2 run`, or an executable of
     a ROS package) gets the arguments `--ros-args --enclave NAME`, so that the ROS graph shows the
-    enclave.
+    enclave; with rmw_zenoh_cpp nobody accepts a node in the graph without it.
     """
-    from sros_tool.runtime.environment import with_enclave
+    from sros_tool.runtime.environment import enclave_argument, with_enclave
 
     root, rest = split_root(words)
     name, command = rest[0] if rest else "", [*rest[1:], *ctx.meta[_COMMAND]]
     if not command:
         raise UsageError("no command is given", "", "Write `sros run ROOT NAME -- COMMAND...`.")
-    variables = loadable_environment(root, name, domain, accept_key=accept_readable_key)
+    found = loadable_environment(root, name, domain, rmw, accept_key=accept_readable_key)
     program = shutil.which(command[0])
     if program is None:
         raise UsageError(
@@ -225,77 +250,14 @@ def run(
             f"added {added}, so that the ROS graph shows the enclave (--no-ros-args: do not)",
             err=True,
         )
+    print_notes(found.notes)
+    if enclave_argument(command) != name:
+        print_notes(found.enclave_notes)
     sys.stdout.flush()
     sys.stderr.flush()
     for ignored in (signal.SIGPIPE, signal.SIGXFSZ):  # Python ignores them, and COMMAND would too
         signal.signal(ignored, signal.SIG_DFL)
-    os.execve(program, command, {**os.environ, **variables})
-
-
-def loadable_environment(
-    root: Path, name: str, domain_text: str | None, *, accept_key: bool = False
-) -> dict[str, str]:
-    """Return the environment variables of an enclave after checking that a process can run in it.
-
-    ``domain_text`` is the value of --domain; None stands for $ROS_DOMAIN_ID.  ``accept_key``
-    accepts a private key that other users can read.
-
-    Raises:
-        UsageError: the domain or the enclave's name is invalid.
-        KeystoreError: the enclave does not exist, a process cannot run in it, or others can read
-            its private key.
-    """
-    from sros_tool.keystore.layout import (
-        KEY_FILE,
-        check_keystore,
-        enclave_path,
-        has_enclave,
-        list_enclaves,
-    )
-    from sros_tool.keystore.missing import no_such_enclave
-    from sros_tool.keystore.reader import open_enclave
-    from sros_tool.names import check_enclave_name
-    from sros_tool.runtime.environment import (
-        DOMAIN,
-        choose_domain,
-        domain_from,
-        secured_environment,
-    )
-
-    if domain_text == "":
-        raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
-    wanted = domain_from(os.environ if domain_text is None else {DOMAIN: domain_text})
-    check_enclave_name(name)
-    check_keystore(root)
-    if not has_enclave(root, name):
-        raise no_such_enclave(root, name, list_enclaves(root))
-    folder = enclave_path(root, name)
-    state = open_enclave(folder, now=now())
-    domains = state.domains()
-    domain = choose_domain(domains, wanted, root) if domains else 0
-    state = open_enclave(folder, now=now(), domain=domain)
-    if state.problems:
-        raise KeystoreError(
-            f"a process cannot run in enclave {name}",
-            "; ".join(map(str, state.problems)) + ".",
-            f"See `sros inspect {folder}`.",
-        )
-    if not accept_key:
-        _check_key_closed(folder / KEY_FILE, root, name)
-    return secured_environment(root, name, domain)
-
-
-def _check_key_closed(key: Path, root: Path, name: str) -> None:
-    """Raise `KeystoreError` if users other than the owner can read a private key."""
-    mode = stat.S_IMODE(key.stat().st_mode)
-    if mode & 0o077:
-        raise KeystoreError(
-            f"others can read the private key of enclave {name}",
-            f"The mode of '{key}' is {mode:04o}: whoever has read the key can act as the enclave.",
-            f"Run `chmod 600 {quote(str(key))}`. If others had access, give the enclave another "
-            f"key: `sros renew {quote(str(root))} {name} --new-key --revoke-old`. To run it "
-            "nevertheless, add --accept-readable-key.",
-        )
+    os.execve(program, command, {**os.environ, **found.variables})
 
 
 @click.command(

@@ -18,6 +18,7 @@ from pathlib import Path
 
 from sros_tool.dds.domains import DomainSet
 from sros_tool.errors import KeystoreError, UsageError
+from sros_tool.runtime.zenoh_environment import REFUSING_ZENOH
 
 KEYSTORE = "ROS_SECURITY_KEYSTORE"
 ENABLE = "ROS_SECURITY_ENABLE"
@@ -81,8 +82,13 @@ def secured_environment(root: Path, name: str, domain: int) -> dict[str, str]:
     }
 
 
-REFUSING: Mapping[str, str] = {KEYSTORE: "", ENABLE: "true", STRATEGY: "Enforce"}
-"""Variables with which rcl starts no node."""
+REFUSING: Mapping[str, str] = {
+    KEYSTORE: "",
+    ENABLE: "true",
+    STRATEGY: "Enforce",
+    **REFUSING_ZENOH,
+}
+"""Variables with which rcl starts no node with any RMW, and rmw_zenoh_cpp no router."""
 
 
 def render_refusal(form: str) -> str:
@@ -167,6 +173,7 @@ _UNREADABLE: dict[str, Callable[[str], bool]] = {
 
 _ROS_ARGS = "--ros-args"
 _ENCLAVE_OPTION = re.compile(r"(?:-e|--enclave)\Z")
+_ZENOH_ROUTER = "rmw_zenohd"
 _PYTHON = re.compile(r"python[\d.]*\Z")
 
 
@@ -174,14 +181,16 @@ def with_enclave(command: Sequence[str], enclave: str) -> tuple[str, ...]:
     """Return the command with ``--ros-args --enclave`` added, if it certainly starts a ROS node.
 
     It does if it is ``ros2 run``, runs an executable or Python script of a ROS package
-    (``lib/PACKAGE/NAME``), or has ``--ros-args``.  Other commands, and commands that already name
-    an enclave, are returned unchanged.
+    (``lib/PACKAGE/NAME``), or has ``--ros-args``.  Other commands, the router of rmw_zenoh_cpp, and
+    commands that already name an enclave, are returned unchanged.
     """
     command = tuple(command)
     if Path(command[0]).name == "ros2" and not _is_ros2_run(command):
         return command
     ros_args = command[command.index(_ROS_ARGS) :] if _ROS_ARGS in command else ()
     if any(_ENCLAVE_OPTION.match(word) for word in ros_args):
+        return command
+    if any(Path(word).name == _ZENOH_ROUTER for word in command):
         return command
     if ros_args or _is_ros2_run(command) or _is_of_package(command):
         return (*command, _ROS_ARGS, "--enclave", enclave)

@@ -85,6 +85,18 @@ def _prefixes(environment: Mapping[str, str]) -> list[str]:
     return [each for each in (*paths, sys.prefix) if each]
 
 
+def chosen_rmw(named: str | None, environment: Mapping[str, str]) -> str:
+    """Return the RMW that a process would use, as far as it is certain, or "".
+
+    ``named`` is what the user chose; without it, that is $RMW_IMPLEMENTATION, or the only
+    installed RMW, which rmw_implementation then loads.
+    """
+    if named or environment.get(RMW):
+        return named or environment[RMW]
+    installed = rmw_implementations(environment)
+    return installed[0] if len(installed) == 1 else ""
+
+
 def built_without_security(rmw: str, environment: Mapping[str, str]) -> bool:
     """Return whether an installed RMW surely has no DDS Security, without starting it.
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from sros_tool.zenoh.access import AccessControl
+from sros_tool.errors import DocumentError
+from sros_tool.zenoh.access import AccessControl, AccessRule, Flow, Message, RemoteRights
 
 
 class Mode(StrEnum):
@@ -111,6 +112,44 @@ def _access_control(control: AccessControl) -> dict[str, Any]:
         ],
         "policies": policies,
     }
+
+
+def parse_rendered(data: bytes, name: str) -> Configuration:
+    """Return a configuration as `Configuration.render` writes it; ``name`` is for errors.
+
+    Raises:
+        DocumentError: it is not exactly as sros writes it, so it may have another meaning.
+    """
+    try:
+        document = json.loads(data)
+        control = document["access_control"]
+        rules = {
+            each["id"]: AccessRule(
+                Flow(each["flows"][0]),
+                tuple(map(Message, each["messages"])),
+                tuple(each["key_exprs"]),
+            )
+            for each in control["rules"]
+        }
+        remotes = tuple(
+            RemoteRights(each["subjects"][0], tuple(rules[rule] for rule in each["rules"]))
+            for each in control["policies"]
+        )
+        found = Configuration(
+            Mode(document["mode"]),
+            tuple(document["listen"]["endpoints"]),
+            tuple(document["connect"]["endpoints"]),
+            AccessControl(remotes),
+        )
+        same = found.render() == data
+    except (ValueError, KeyError, IndexError, TypeError, RecursionError):
+        same = False
+    if not same:
+        raise DocumentError(
+            f"{name} is not a Zenoh configuration as sros writes it",
+            "Something else wrote it, or somebody changed it by hand.",
+        )
+    return found
 
 
 _ENDPOINT = re.compile(r"(?:[A-Za-z0-9.-]+|\[[0-9A-Fa-f:.]+\]):(\d{1,5})\Z", re.ASCII)

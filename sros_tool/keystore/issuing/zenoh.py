@@ -316,7 +316,7 @@ class _RightsReader:
                 return error.what
         if not isinstance(grant, Grant):
             return grant
-        stated = {each: _recorded_rights(name, grant, each) for each in self._domains}
+        stated = {each: recorded_rights(name, grant, each) for each in self._domains}
         try:
             rights = remote_of(name, stated)
         except PolicyError:
@@ -375,7 +375,7 @@ def _prove(enclave: str, remote: RemoteRights, stated: Mapping[int, Sequence[Sta
                     )
 
 
-def _recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRight, ...]:
+def recorded_rights(enclave: str, grant: Grant, domain: int) -> tuple[StatedRight, ...]:
     """Return the ROS rights that signed permissions give an enclave in a ROS domain.
 
     A topic ``*`` without a ROS name, as ros2/sros2 grants it, stands for all topics and services if

@@ -1,0 +1,241 @@
+"""The environment of an enclave for a process here, given only if the process can run in it."""
+
+from __future__ import annotations
+
+import os
+import stat
+from dataclasses import dataclass
+from pathlib import Path
+from shlex import quote
+from typing import TYPE_CHECKING
+
+from sros_tool.cli.common import now
+from sros_tool.errors import KeystoreError, Note, UsageError
+
+if TYPE_CHECKING:
+    from sros_tool.dds.domains import DomainSet
+    from sros_tool.keystore.reader import OpenedEnclave
+    from sros_tool.keystore.zenoh import OpenedZenoh
+
+RMWS = (
+    "rmw_connextdds",
+    "rmw_cyclonedds_cpp",
+    "rmw_fastrtps_cpp",
+    "rmw_fastrtps_dynamic_cpp",
+    "rmw_zenoh_cpp",
+)
+"""The RMWs that ``--rmw`` takes: those that enforce security with the files of an enclave."""
+
+
+@dataclass(frozen=True, slots=True)
+class EnclaveEnvironment:
+    """The environment variables of an enclave, and notes on them.
+
+    ``enclave_notes`` are for nodes that are not started with ``--ros-args --enclave``.
+    """
+
+    variables: dict[str, str]
+    notes: tuple[Note, ...] = ()
+    enclave_notes: tuple[Note, ...] = ()
+
+
+def loadable_environment(
+    root: Path,
+    name: str,
+    domain_text: str | None = None,
+    rmw: str | None = None,
+    *,
+    accept_key: bool = False,
+) -> EnclaveEnvironment:
+    """Return the environment of an enclave after checking that a process can run in it.
+
+    Args:
+        root: the keystore, or an export of it.
+        name: the enclave.
+        domain_text: the value of --domain; None stands for $ROS_DOMAIN_ID.
+        rmw: the value of --rmw; None stands for $RMW_IMPLEMENTATION.
+        accept_key: accept a private key that other users can read.
+
+    Raises:
+        UsageError: the domain, the RMW or the enclave's name is invalid.
+        KeystoreError: the enclave does not exist, a process cannot run in it, or others can read
+            its private key.
+    """
+    from sros_tool.keystore.layout import (
+        KEY_FILE,
+        check_keystore,
+        enclave_path,
+        has_enclave,
+        list_enclaves,
+    )
+    from sros_tool.keystore.missing import no_such_enclave
+    from sros_tool.keystore.reader import open_enclave
+    from sros_tool.names import check_enclave_name
+    from sros_tool.runtime.environment import (
+        DOMAIN,
+        choose_domain,
+        domain_from,
+        secured_environment,
+    )
+    from sros_tool.runtime.rmw import RMW
+
+    if domain_text == "":
+        raise UsageError("--domain is empty", "", "Name a domain, or leave the option out.")
+    wanted = domain_from(os.environ if domain_text is None else {DOMAIN: domain_text})
+    with_zenoh = _uses_zenoh(rmw)
+    check_enclave_name(name)
+    check_keystore(root)
+    if not has_enclave(root, name):
+        raise no_such_enclave(root, name, list_enclaves(root))
+    folder = enclave_path(root, name)
+    state = open_enclave(folder, now=now())
+    domains = state.domains()
+    zenoh = _opened_zenoh(root, name, state) if with_zenoh else None
+    if zenoh and domains:
+        wanted = _zenoh_domain(root, zenoh, wanted, domains)
+    domain = choose_domain(domains, wanted, root) if domains else 0
+    state = open_enclave(folder, now=now(), domain=domain)
+    if state.problems:
+        raise KeystoreError(
+            f"a process cannot run in enclave {name}",
+            "; ".join(map(str, state.problems)) + ".",
+            f"See `sros inspect {folder}`.",
+        )
+    if not accept_key:
+        _check_key_closed(folder / KEY_FILE, root, name)
+    variables = secured_environment(root, name, domain)
+    if zenoh:
+        return _zenoh_environment(folder, name, zenoh, variables)
+    return EnclaveEnvironment({**variables, RMW: rmw} if rmw else variables)
+
+
+def _check_key_closed(key: Path, root: Path, name: str) -> None:
+    """Raise `KeystoreError` if users other than the owner can read a private key."""
+    mode = stat.S_IMODE(key.stat().st_mode)
+    if mode & 0o077:
+        raise KeystoreError(
+            f"others can read the private key of enclave {name}",
+            f"The mode of '{key}' is {mode:04o}: whoever has read the key can act as the enclave.",
+            f"Run `chmod 600 {quote(str(key))}`. If others had access, give the enclave another "
+            f"key: `sros renew {quote(str(root))} {name} --new-key --revoke-old`. To run it "
+            "nevertheless, add --accept-readable-key.",
+        )
+
+
+# ── Zenoh ──────────────────────────────────────────────────────────────────────────────────
+
+
+def _uses_zenoh(rmw: str | None) -> bool:
+    """Return whether a process would use rmw_zenoh_cpp.
+
+    Raises:
+        UsageError: it would use an RMW of which sros knows no security.
+    """
+    from sros_tool.runtime.rmw import RMW, chosen_rmw, middleware_of
+    from sros_tool.runtime.zenoh_environment import RMW_ZENOH
+
+    if rmw is not None and rmw not in RMWS:
+        raise UsageError(
+            f"--rmw {rmw!r} is not an RMW that sros knows to enforce security",
+            "",
+            f"Choose one of {', '.join(RMWS)}.",
+        )
+    chosen = chosen_rmw(rmw, os.environ)
+    if chosen == RMW_ZENOH:
+        return True
+    if (middleware := middleware_of(chosen)) and middleware.name == "Zenoh":
+        raise UsageError(
+            f"{RMW} is {chosen!r}, which is not an RMW that sros knows to enforce security",
+            f"Of those on Zenoh, sros knows only {RMW_ZENOH}.",
+            f"Set {RMW} to another one, or name one with --rmw.",
+        )
+    return False
+
+
+def _opened_zenoh(root: Path, name: str, state: OpenedEnclave) -> OpenedZenoh:
+    """Return the Zenoh configurations of an enclave.
+
+    Raises:
+        KeystoreError: it has none, or one that its permissions CA did not sign as it is, or that
+            does not state the rights of its permissions.
+    """
+    from sros_tool.keystore.layout import PUBLIC, enclave_path
+    from sros_tool.keystore.zenoh import ZenohFault, open_zenoh
+
+    found = open_zenoh(enclave_path(root, name), name, state)
+    if not found.problems:
+        return found
+    write = f"`sros zenoh {quote(str(root))}`"
+    if not (root / PUBLIC).is_dir():
+        write = "`sros zenoh KEYSTORE` where the CA keys are, and export the enclave again"
+    if found.problems[0].fault is ZenohFault.MISSING and not found.files:
+        raise KeystoreError(
+            f"enclave {name} has no configuration for rmw_zenoh_cpp",
+            "rmw_zenoh_cpp ignores ROS_SECURITY_*: without session.json5 the process would run "
+            "unsecured.",
+            f"Write it: {write}. For DDS, name another RMW with --rmw.",
+        )
+    raise KeystoreError(
+        f"a process of rmw_zenoh_cpp cannot run in enclave {name}",
+        "; ".join(map(str, found.problems)) + ".",
+        f"Write the files again: {write}.",
+    )
+
+
+def _zenoh_domain(
+    root: Path, zenoh: OpenedZenoh, wanted: int | None, domains: DomainSet
+) -> int | None:
+    """Return the domain that a process should use, one of those that its configuration is for.
+
+    Raises:
+        KeystoreError: the configuration is not for the ``wanted`` domain.
+    """
+    own = zenoh.domains()
+    if not own:
+        return wanted
+    if wanted is None:
+        return next((each for each in own if each in domains), own[0])
+    if wanted not in own:
+        raise KeystoreError(
+            f"the Zenoh configuration is for domain {', '.join(map(str, own))}, not for {wanted}",
+            "Its rules deny everything in any other domain.",
+            f"Set ROS_DOMAIN_ID to {own[0]}, or write the files for more domains: `sros zenoh "
+            f"{quote(str(root))} --domain ID`.",
+        )
+    return wanted
+
+
+def _zenoh_environment(
+    folder: Path, name: str, zenoh: OpenedZenoh, variables: dict[str, str]
+) -> EnclaveEnvironment:
+    from sros_tool.keystore.layout import (
+        CERTIFICATE_FILE,
+        IDENTITY_CA_FILE,
+        KEY_FILE,
+        ROUTER_FILE,
+        SESSION_FILE,
+    )
+    from sros_tool.runtime.zenoh_environment import (
+        ROUTER_URI,
+        SESSION_URI,
+        replaced_notes,
+        zenoh_environment,
+    )
+
+    place = folder.absolute()
+    uris = {SESSION_URI: SESSION_FILE, ROUTER_URI: ROUTER_FILE}
+    variables |= zenoh_environment(
+        {uri: str(place / file) for uri, file in uris.items() if file in zenoh.configurations},
+        place / IDENTITY_CA_FILE,
+        place / CERTIFICATE_FILE,
+        place / KEY_FILE,
+    )
+    needed: tuple[Note, ...] = ()
+    if SESSION_FILE in zenoh.configurations:
+        text = (
+            f"start every node with `--ros-args --enclave {name}`: on Zenoh, others drop the "
+            "graph token of a node that names another enclave or none, and do not find its "
+            "topics and services."
+        )
+        needed = (Note("zenoh.enclave-argument", text),)
+    return EnclaveEnvironment(variables, tuple(replaced_notes(os.environ, variables)), needed)
