@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from itertools import combinations, product
 from pathlib import Path
 
-from sros_tool.checks.kind import ERROR, Finding, FindingKind
+from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
 from sros_tool.errors import DocumentError
+from sros_tool.policy.patterns import ComparisonLimit
 from sros_tool.xml import read_bytes
-from sros_tool.zenoh.document import ConfigurationDocument, parse_configuration
+from sros_tool.zenoh.access import Message
+from sros_tool.zenoh.configuration import Mode
+from sros_tool.zenoh.document import ConfigurationDocument, ZenohEndpoint, parse_configuration
+from sros_tool.zenoh.enforcement import PROPERTIES, AclRule, AclSubject, Enforcement
+from sros_tool.zenoh.key_expressions import includes, intersects, widest
+
+_MEASURED = "Zenoh 1.10.2, measured."
+_BY_SROS = "Let `sros zenoh` write the files: rules for each enclave, by its name."
 
 MALFORMED = FindingKind(
     "zenoh.malformed",
@@ -18,15 +27,192 @@ MALFORMED = FindingKind(
     "Zenoh 1.10.2 (commons/zenoh-config), measured.",
     "Correct the file.",
 )
-NO_ACCESS_CONTROL = FindingKind(
-    "zenoh.no-access-control",
+UNKNOWN_SETTING = FindingKind(
+    "zenoh.unknown-setting",
     ERROR,
-    "a process of Zenoh without access control",
-    "Whoever gets a connection to it publishes, hears, calls and serves everything: also a router "
-    "without rights of its own, to which a session connects.",
-    "Zenoh 1.10.2, measured.",
-    "Let `sros zenoh` write the files of a keystore.",
+    "a setting that Zenoh does not have",
+    "Zenoh refuses the whole file, so that no session opens and no router starts. The name is "
+    "misspelt, or of another version.",
+    "Zenoh 1.10.2 (commons/zenoh-config), measured.",
+    "Correct the name, or remove the setting.",
 )
+ROUTER_WITHOUT_RULES = FindingKind(
+    "zenoh.router-without-rules",
+    ERROR,
+    "a router without access control",
+    "It passes on everything between everybody who gets a connection: whoever has any certificate "
+    "of the CA publishes, hears, calls and serves everything.",
+    _MEASURED,
+    _BY_SROS,
+)
+SESSION_WITHOUT_RULES = FindingKind(
+    "zenoh.session-without-rules",
+    ERROR,
+    "a session without access control",
+    "Whoever plays the router, or in mode peer connects to it directly, reads everything that it "
+    "publishes and sends it anything, past the rules of the real router.",
+    _MEASURED,
+    _BY_SROS,
+)
+DEFAULT_ALLOW = FindingKind(
+    "zenoh.default-allow",
+    ERROR,
+    "access control that allows what no rule denies",
+    "A denial holds neither against a query nor against a put with a wildcard, and a process that "
+    "matches two subjects is denied only what both deny.",
+    _MEASURED,
+    'Write "default_permission": "deny", and rules that allow.',
+)
+NOTHING_ALLOWED = FindingKind(
+    "zenoh.nothing-allowed",
+    WARNING,
+    "access control under which no message passes",
+    "There is no policy that gives a subject a rule, and the default is to deny: Zenoh opens, and "
+    "drops everything without a message.",
+    _MEASURED,
+    _BY_SROS,
+)
+EVERYBODY = FindingKind(
+    "zenoh.subject-of-everybody",
+    ERROR,
+    "a subject without a name",
+    "A property that a subject does not state matches every process, an interface and a protocol "
+    "are not identities, and a process chooses its zid itself. So the rules hold for everybody "
+    "who gets a connection.",
+    "Zenoh 1.9 (authorization.rs); 1.10.2 measured.",
+    'Name each enclave by "cert_common_names".',
+)
+SELF_LIMITING = FindingKind(
+    "zenoh.self-limiting",
+    ERROR,
+    "a session whose rules bind only itself",
+    "No rule names another process: they say what this one may do, and only while it obeys. Any "
+    "other process with a certificate of the CA publishes to it, and reads from it.",
+    "zenoh_security_tools writes such files; Zenoh 1.10.2, measured.",
+    _BY_SROS,
+)
+DENY_IN_WILDCARD = FindingKind(
+    "zenoh.deny-in-wildcard",
+    ERROR,
+    "a denial that a wildcard passes",
+    "A rule applies to a message only if it includes the key of the message as a whole. A put, a "
+    "query or a subscription with a wildcard is not included in the denial, but is allowed, and "
+    "reaches what was denied.",
+    "Zenoh 1.5.1, 1.6.2 and 1.10.2, measured.",
+    "Allow the names that are meant, and remove the denial.",
+)
+DENY_OVERRULED = FindingKind(
+    "zenoh.deny-overruled",
+    ERROR,
+    "a denial that another subject overrules",
+    "Where a process matches two subjects, it is enough that one of them allows a message.",
+    "Zenoh 1.6.2 and 1.10.2, measured.",
+    "Use one subject for each name, and rules that allow.",
+)
+OVERLAPPING = FindingKind(
+    "zenoh.overlapping-subjects",
+    WARNING,
+    "subjects that match the same process",
+    "Such a process has the rights of both; up to Zenoh 1.5.1, those of one of them, by chance.",
+    "Zenoh 1.5.1 (issue 2137 of zenoh) and 1.10.2, measured.",
+    "Use one subject for each name.",
+)
+UNUSED = FindingKind(
+    "zenoh.unused",
+    WARNING,
+    "a rule or a subject without effect",
+    "No policy connects it: a rule that nobody has neither allows nor denies anything.",
+    "Zenoh 1.9 (authorization.rs).",
+    "Name it in a policy, or remove it.",
+)
+PLAIN_ENDPOINT = FindingKind(
+    "zenoh.plain-endpoint",
+    ERROR,
+    "an endpoint without TLS",
+    "What passes there is neither encrypted nor authenticated: everybody on the network reads it, "
+    "and gets a connection without a certificate.",
+    _MEASURED,
+    "Write tls/HOST:PORT.",
+)
+ENDPOINT_REFUSED = FindingKind(
+    "zenoh.endpoint-refused",
+    ERROR,
+    "an endpoint of a protocol that the configuration excludes",
+    "Zenoh does not start when it should listen there, and never connects.",
+    _MEASURED,
+    "Change the endpoint, or transport/link/protocols.",
+)
+PROTOCOLS_OPEN = FindingKind(
+    "zenoh.protocols-open",
+    WARNING,
+    "protocols without encryption are not excluded",
+    "An endpoint tcp/... that is added, for instance by ZENOH_CONFIG_OVERRIDE, or that another "
+    "process names, is used next to tls/... .",
+    _MEASURED,
+    'Write "protocols": ["tls"] in transport/link.',
+)
+NO_MUTUAL_TLS = FindingKind(
+    "zenoh.no-mutual-tls",
+    ERROR,
+    "a listener that asks for no certificate",
+    "Everybody gets a connection; nobody has a name that a rule could ask for.",
+    _MEASURED,
+    'Write "enable_mtls": true in transport/link/tls.',
+)
+NAME_NOT_VERIFIED = FindingKind(
+    "zenoh.name-not-verified",
+    ERROR,
+    "a session that accepts anybody as its router",
+    "It does not compare the name of the endpoint with the certificate there, and trusts the "
+    "public CAs of the web besides its own: without rules that ask for a name, the owner of any "
+    "such certificate can play the router.",
+    "Zenoh 1.9 (TLS link) and 1.10.2 (its log).",
+    "Name the router in the subjects of access control, or verify_name_on_connect with a "
+    "certificate for its host.",
+)
+EXPIRED_STAYS = FindingKind(
+    "zenoh.expired-stays",
+    WARNING,
+    "a connection outlives its certificate",
+    "A process keeps its connection after its certificate has expired, for as long as it runs.",
+    _MEASURED,
+    'Write "close_link_on_expiration": true in transport/link/tls.',
+)
+SHARED_MEMORY = FindingKind(
+    "zenoh.shared-memory",
+    WARNING,
+    "shared memory between the processes of a host",
+    "Messages of more than 3 KB lie there unencrypted, whatever TLS does, and stay there after "
+    "both processes have ended.",
+    _MEASURED,
+    'Write "enabled": false in transport/shared_memory; Zenoh\'s default is true.',
+)
+MULTICAST = FindingKind(
+    "zenoh.multicast",
+    WARNING,
+    "multicast scouting",
+    "Everybody on the network learns, without a certificate, of each process and its endpoints, "
+    "and can answer a session that looks for a router.",
+    _MEASURED,
+    'Write "enabled": false in scouting/multicast; Zenoh\'s default is true.',
+)
+ADMIN_SPACE = FindingKind(
+    "zenoh.admin-space",
+    WARNING,
+    "Zenoh's admin space",
+    "It shows sessions, connections and the configuration; where it can be written, it changes "
+    "them.",
+    _MEASURED,
+    'Write "enabled": false in adminspace.',
+)
+
+_ENCRYPTED = ("tls", "quic")
+_LINK, _TLS, _ACCESS = "transport/link", "transport/link/tls", "access_control"
+_WITH_WILDCARDS = frozenset(Message) - {Message.REPLY, Message.LIVELINESS_TOKEN}
+"""The messages that can name a key with wildcards."""
+_FEW = 3
+_COMPARISON = 20
+"""What comparing two subjects counts, in characters."""
 
 
 def configuration_findings(path: Path) -> Iterator[Finding]:
@@ -37,12 +223,255 @@ def configuration_findings(path: Path) -> Iterator[Finding]:
     except DocumentError as error:
         yield MALFORMED.found(str(path), str(error), str(path))
         return
-    yield from _access(document)
+    yield from document_findings(document)
 
 
-def _access(document: ConfigurationDocument) -> Iterator[Finding]:
+def document_findings(document: ConfigurationDocument) -> Iterator[Finding]:
+    """Yield the findings in a configuration."""
+    for each in document.unknown:
+        yield _at(document, UNKNOWN_SETTING, each, f"Zenoh up to 1.10 has no {each}")
+    yield from _links(document)
+    yield from _openness(document)
     if not document.access.enabled:
-        line = document.line_of("access_control/enabled")
-        yield NO_ACCESS_CONTROL.found(
-            document.mode.value, "access_control is off", document.name, line
-        )
+        kind = ROUTER_WITHOUT_RULES if document.mode is Mode.ROUTER else SESSION_WITHOUT_RULES
+        yield _at(document, kind, f"{_ACCESS}/enabled", "access_control is off")
+        return
+    yield from _rules(document)
+    yield from _subjects(document)
+    yield from _denials(document)
+
+
+def _at(document: ConfigurationDocument, kind: FindingKind, path: str, text: str) -> Finding:
+    return kind.found(document.mode.value, text, document.name, document.line_of(path))
+
+
+# ── connections ────────────────────────────────────────────────────────────────────────────
+
+
+def _links(document: ConfigurationDocument) -> Iterator[Finding]:
+    both = (("listen", document.listen), ("connect", document.connect))
+    for what, endpoints in both:
+        for each in endpoints:
+            allowed = document.protocols is None or each.protocol in document.protocols
+            if not allowed:
+                text = f"{what} has {each.text}, and the protocols are {_listed(document)}"
+                yield _at(document, ENDPOINT_REFUSED, f"{what}/endpoints", text)
+            elif each.protocol not in _ENCRYPTED:
+                default = "" if f"{what}/endpoints" in document.lines else ", by default"
+                text = f"{what} has {each.text}{default}"
+                yield _at(document, PLAIN_ENDPOINT, f"{what}/endpoints", text)
+    if not any(_encrypted(each) for _, endpoints in both for each in endpoints):
+        return
+    if document.protocols is None or set(document.protocols) - set(_ENCRYPTED):
+        text = f"the protocols are {_listed(document)}"
+        yield _at(document, PROTOCOLS_OPEN, f"{_LINK}/protocols", text)
+    for each in document.listen:
+        if _encrypted(each) and not _option(each, "enable_mtls", document.tls.mutual):
+            text = f"it listens at {each.text}, and enable_mtls is off"
+            yield _at(document, NO_MUTUAL_TLS, f"{_TLS}/enable_mtls", text)
+    yield from _names(document)
+    closing = "close_link_on_expiration"
+    for each in (each for _, endpoints in both for each in endpoints if _encrypted(each)):
+        if not _option(each, closing, document.tls.closes_on_expiration):
+            text = f"{closing} is off for {each.text}"
+            yield _at(document, EXPIRED_STAYS, f"{_TLS}/{closing}", text)
+            break
+
+
+def _names(document: ConfigurationDocument) -> Iterator[Finding]:
+    """Yield a finding if whoever has any accepted certificate can play the router."""
+    unverified = [
+        each
+        for each in document.connect
+        if _encrypted(each)
+        and not _option(each, "verify_name_on_connect", document.tls.verifies_name)
+    ]
+    access = document.access
+    if unverified and (not access.enabled or access.allows_by_default or _of_everybody(document)):
+        text = f"verify_name_on_connect is off for {unverified[0].text}"
+        yield _at(document, NAME_NOT_VERIFIED, f"{_TLS}/verify_name_on_connect", text)
+
+
+def _encrypted(endpoint: ZenohEndpoint) -> bool:
+    return endpoint.protocol in _ENCRYPTED
+
+
+def _option(endpoint: ZenohEndpoint, name: str, otherwise: bool) -> bool:
+    """Return an option of TLS: an endpoint's own one counts in place of the section's."""
+    own = endpoint.options.get(name)
+    return otherwise if own is None else own == "true"
+
+
+def _listed(document: ConfigurationDocument) -> str:
+    return "not limited" if document.protocols is None else ", ".join(document.protocols) or "none"
+
+
+def _openness(document: ConfigurationDocument) -> Iterator[Finding]:
+    for kind, on, path in (
+        (SHARED_MEMORY, document.shared_memory, "transport/shared_memory"),
+        (MULTICAST, document.multicast, "scouting/multicast"),
+    ):
+        if on:
+            stated = "on" if f"{path}/enabled" in document.lines else "on, by default"
+            yield _at(document, kind, f"{path}/enabled", f"{path} is {stated}")
+    if document.adminspace and (document.adminspace_readable or document.adminspace_writable):
+        can = "it can be written" if document.adminspace_writable else "it can be read"
+        yield _at(document, ADMIN_SPACE, "adminspace/enabled", f"adminspace is on, and {can}")
+
+
+# ── access control ─────────────────────────────────────────────────────────────────────────
+
+
+def _rules(document: ConfigurationDocument) -> Iterator[Finding]:
+    access = document.access
+    if access.allows_by_default:
+        text = "default_permission is allow"
+        yield _at(document, DEFAULT_ALLOW, f"{_ACCESS}/default_permission", text)
+    elif not any(rule.allows for each in access.subjects for rule in access.rules_of(each.id)):
+        text = "no policy gives a subject a rule that allows"
+        yield _at(document, NOTHING_ALLOWED, f"{_ACCESS}/policies", text)
+        return
+    used = {rule.id for each in access.subjects for rule in access.rules_of(each.id)}
+    idle = [(f"rule {each.id}", each.line) for each in access.rules if each.id not in used]
+    idle += [
+        (f"subject {each.id}", each.line)
+        for each in access.subjects
+        if not access.rules_of(each.id)
+    ]
+    for what, line in idle:
+        yield UNUSED.found(what, f"no policy has {what}", document.name, line)
+
+
+def _of_everybody(document: ConfigurationDocument) -> list[AclSubject]:
+    """Return the subjects without a name that have a rule that allows something."""
+    access = document.access
+    return [
+        each
+        for each in access.subjects
+        if each.cert_common_names is None
+        and each.usernames is None
+        and (access.allows_by_default or any(rule.allows for rule in access.rules_of(each.id)))
+    ]
+
+
+def _subjects(document: ConfigurationDocument) -> Iterator[Finding]:
+    access = document.access
+    open_to_all = _of_everybody(document)
+    if (
+        document.mode is not Mode.ROUTER
+        and open_to_all
+        and len(open_to_all) == len([each for each in access.subjects if access.rules_of(each.id)])
+    ):
+        text = f"no subject has a name: {_ids(open_to_all)}"
+        yield SELF_LIMITING.found(document.mode.value, text, document.name, open_to_all[0].line)
+    else:
+        for each in open_to_all:
+            text = f"subject {each.id} has {_described(each)}, and rules that allow"
+            yield EVERYBODY.found(f"subject {each.id}", text, document.name, each.line)
+    pairs = list(_overlapping(access.subjects))
+    if pairs:
+        first, second = pairs[0]
+        more = f", and {len(pairs) - 1} more pairs" if len(pairs) > 1 else ""
+        text = f"subjects {first.id} and {second.id} can match the same process{more}"
+        yield OVERLAPPING.found(f"subject {second.id}", text, document.name, second.line)
+
+
+def _overlapping(subjects: Sequence[AclSubject]) -> Iterator[tuple[AclSubject, AclSubject]]:
+    limit = ComparisonLimit()
+    kinds: dict[tuple[str, ...], list[AclSubject]] = {}
+    for each in subjects:  # two that state the same properties match the same process as one
+        stated = tuple(name for name in PROPERTIES if getattr(each, name) is not None)
+        kinds.setdefault(stated, []).append(each)
+    for one, other in combinations(kinds.values(), 2):
+        for pair in product(one, other):
+            if pair[0].overlaps(pair[1]):
+                yield pair
+            else:
+                limit.spend(_COMPARISON)
+
+
+def _ids(subjects: Sequence[AclSubject]) -> str:
+    more = f" and {len(subjects) - _FEW} more" if len(subjects) > _FEW else ""
+    return ", ".join(each.id for each in subjects[:_FEW]) + more
+
+
+def _described(subject: AclSubject) -> str:
+    stated = [name for name in PROPERTIES if getattr(subject, name) is not None]
+    return f"only {' and '.join(stated)}" if stated else "no property"
+
+
+def _denials(document: ConfigurationDocument) -> Iterator[Finding]:
+    """Yield a finding for each rule whose denial something passes."""
+    access, limit = document.access, ComparisonLimit()
+    reported: set[tuple[str, str]] = set()
+    for subject in access.subjects:
+        others = [each for each in access.subjects if each.overlaps(subject)]
+        for rule in access.rules_of(subject.id):
+            if rule.allows:
+                continue
+            for kind, text in (
+                (DENY_IN_WILDCARD, _wildcard_past(rule, subject, access, limit)),
+                (DENY_OVERRULED, _overruled(rule, others, access, limit)),
+            ):
+                if text and (kind.id, rule.id) not in reported:
+                    reported.add((kind.id, rule.id))
+                    yield kind.found(f"rule {rule.id}", text, document.name, rule.line)
+
+
+def _wildcard_past(
+    rule: AclRule, subject: AclSubject, access: Enforcement, limit: ComparisonLimit
+) -> str:
+    """Return how a message with a wildcard passes a rule that denies, or "" if none does."""
+    rules = access.rules_of(subject.id)
+    for flow, message in product(rule.flows, rule.messages):
+        if message not in _WITH_WILDCARDS:
+            continue
+        same = [each for each in rules if flow in each.flows and message in each.messages]
+        denied = [key for each in same if not each.allows for key in each.key_expressions]
+        for key in rule.key_expressions:
+            if access.allows_by_default:
+                passing = [(widest(key), "the default")]
+            else:
+                passing = [
+                    (wide, f"rule {each.id}")
+                    for each in same
+                    if each.allows
+                    for wide in each.key_expressions
+                    if _meet(wide, key, limit)
+                ]
+            for wide, by in passing:
+                if not any(includes(each, wide) for each in denied):
+                    return f"{flow} {message} of {key} is denied, and {by} allows that of {wide}"
+    return ""
+
+
+def _overruled(
+    rule: AclRule, others: Sequence[AclSubject], access: Enforcement, limit: ComparisonLimit
+) -> str:
+    """Return which of the subjects that match the same processes allows what a rule denies."""
+    for other, flow, message in product(others, rule.flows, rule.messages):
+        same = [
+            each
+            for each in access.rules_of(other.id)
+            if flow in each.flows and message in each.messages
+        ]
+        denied = [key for each in same if not each.allows for key in each.key_expressions]
+        allowed = [key for each in same if each.allows for key in each.key_expressions]
+        for key in rule.key_expressions:
+            if access.allows_by_default:
+                passing = [key]
+            else:
+                passing = [
+                    key if includes(wide, key) else wide
+                    for wide in allowed
+                    if _meet(wide, key, limit)
+                ]
+            for each in passing:
+                if not any(includes(wide, each) for wide in denied):
+                    return f"subject {other.id} allows {flow} {message} of {each}"
+    return ""
+
+
+def _meet(one: str, other: str, limit: ComparisonLimit) -> bool:
+    limit.spend(len(one) + len(other))
+    return intersects(one, other)

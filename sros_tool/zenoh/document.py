@@ -11,6 +11,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
+from math import prod
 from typing import TypeVar
 
 from sros_tool.errors import DocumentError
@@ -48,6 +49,7 @@ _LISTEN: Mapping[Mode, tuple[str, ...]] = {
 _LINK_PROTOCOLS = frozenset(
     {"tcp", "udp", "tls", "quic", "serial", "unixpipe", "unixsock-stream", "vsock", "ws"}
 )
+_MOST_MEANT = 1_000_000
 _ZID = re.compile(r"[1-9a-f][0-9a-f]{0,31}", re.ASCII)
 
 
@@ -112,7 +114,6 @@ class ConfigurationDocument:
     adminspace_readable: bool = True
     adminspace_writable: bool = False
     namespace: str | None = None
-    plugins: tuple[str, ...] = ()
     access: Enforcement = field(default_factory=Enforcement)
     unknown: tuple[str, ...] = ()
     lines: Mapping[str, int] = field(default_factory=dict, compare=False, repr=False)
@@ -274,7 +275,6 @@ def _configuration(root: _Section, name: str) -> ConfigurationDocument:
         permissions.boolean("read", True, nullable=False),
         permissions.boolean("write", False, nullable=False),
         root.text("namespace"),
-        tuple(root.section("plugins").value),
         _enforcement(root.section("access_control")),
         tuple(unknown),
         dict(_lines(root.value, "")),
@@ -320,6 +320,7 @@ def _enforcement(section: _Section) -> Enforcement:
     found = Enforcement(enabled, default is _Permission.ALLOW, rules, subjects, policies)
     if enabled:
         _check_ids(section, found)
+    _check_size(section, found)
     return found
 
 
@@ -381,6 +382,26 @@ def _check_ids(section: _Section, found: Enforcement) -> None:
             named: tuple[str, ...] = getattr(policy, member)
             for each in set(named) - set(ids):
                 raise section.refused("policies", f"names {each[:80]!r}, which {member} has not")
+
+
+def _check_size(section: _Section, found: Enforcement) -> None:
+    """Refuse a file whose few lines mean many millions of decisions."""
+    values = {
+        each.id: prod(len(getattr(each, name) or (None,)) for name in PROPERTIES)
+        for each in found.subjects
+    }
+    places = {each.id: len(each.flows) * len(each.messages) for each in found.rules}
+    meant = sum(values.values()) + sum(
+        sum(places.get(each, 0) for each in policy.rules)
+        * sum(values.get(each, 0) for each in policy.subjects)
+        for policy in found.policies
+    )
+    if meant > _MOST_MEANT:
+        raise DocumentError(
+            f"the access control of '{section.name}' is too large",
+            f"Its subjects and policies stand for {meant:.0e} rules; sros reads at most "
+            f"{_MOST_MEANT:.0e}.",
+        )
 
 
 def _repeated(ids: Iterable[str]) -> Iterator[str]:

@@ -57,9 +57,15 @@ class AclSubject:
     zids: tuple[str, ...] | None = None
     line: int = field(default=0, compare=False)
 
-    def matches_everybody(self) -> bool:
-        """Return whether it has no property, and so matches every process."""
-        return all(getattr(self, name) is None for name in PROPERTIES)
+    def overlaps(self, other: AclSubject) -> bool:
+        """Return whether a process can match both as two subjects: with the rights of either.
+
+        Where both state the same properties, what matches both is one subject to Zenoh.
+        """
+        pairs = [(getattr(self, name), getattr(other, name)) for name in PROPERTIES]
+        return any((one is None) is not (two is None) for one, two in pairs) and all(
+            one is None or two is None or not set(one).isdisjoint(two) for one, two in pairs
+        )
 
 
 PROPERTIES = tuple(each.name for each in fields(AclSubject) if each.name not in ("id", "line"))

@@ -1,4 +1,4 @@
-"""Key expressions of Zenoh: their canonical form, and whether one includes another.
+"""Key expressions of Zenoh: their canonical form, and whether they include or intersect others.
 
 A key expression has chunks, with "/" between them.  ``*`` stands for one chunk, ``**`` for any
 number of them, ``$*`` for any part of a chunk.  No wildcard matches a chunk that begins with ``@``.
@@ -7,7 +7,7 @@ Source: zenoh.io "Key Expressions"; measured with the wheel 1.10.2.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import lru_cache
 
 ANY_PART, ANY_CHUNKS = "$*", "**"
@@ -97,6 +97,61 @@ def _chunk_includes(wide: str, narrow: str) -> bool:
             return False
         at += len(part)
     return True
+
+
+def widest(expression: str) -> str:
+    """Return the widest expression that a wildcard makes of one: all but chunks with ``@``."""
+    chunks = expression.split("/")
+    return canonical(each if each.startswith("@") else ANY_CHUNKS for each in chunks)
+
+
+def intersects(one: str, other: str) -> bool:
+    """Return whether some key belongs to both expressions, as Zenoh decides."""
+    return _sequences_intersect(one.split("/"), other.split("/"), ANY_CHUNKS, _chunks_intersect)
+
+
+def _chunks_intersect(one: str, other: str) -> bool:
+    if one == other:
+        return True
+    if ANY_CHUNKS in (one, other):
+        return not (one + other).replace(ANY_CHUNKS, "").startswith("@")
+    if one.startswith("@") or other.startswith("@"):
+        return False
+    if _ANY_CHUNK in (one, other):
+        return True
+    if "*" not in one and "*" not in other:
+        return False
+    # "\0" is no character of a key: here it stands for any characters.
+    left, right = (each.replace(ANY_PART, "\0") for each in (one, other))
+    return _sequences_intersect(left, right, "\0", lambda a, b: "\0" in (a, b) or a == b)
+
+
+def _sequences_intersect(
+    one: Sequence[str], other: Sequence[str], many: str, meet: Callable[[str, str], bool]
+) -> bool:
+    """Return whether sequences can be the same where ``many`` stands for any number of members.
+
+    ``meet`` says whether two members can be the same one.
+    """
+    reached = {0}
+    for left in (*one, None):
+        for at in sorted(reached):
+            while at < len(other) and other[at] == many:
+                at += 1
+                reached.add(at)
+        if left is None:
+            break
+        following: set[int] = set()
+        for at in sorted(reached):
+            if left == many:
+                following.add(at)
+                while at < len(other) and meet(left, other[at]):
+                    at += 1
+                    following.add(at)
+            elif at < len(other) and meet(left, other[at]):
+                following.add(at if other[at] == many else at + 1)
+        reached = following
+    return len(other) in reached
 
 
 def expression_problem(text: str) -> str:

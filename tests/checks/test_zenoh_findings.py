@@ -9,7 +9,7 @@ import pytest
 
 from sros_tool.checks.zenoh import configuration_findings
 from sros_tool.zenoh.configuration import Mode
-from tests.checks.zenoh_cases import CASES, sound
+from tests.checks.zenoh_cases import ALLOW, CASES, HARMLESS, rule, sound
 from tests.support.harness import sros
 
 
@@ -31,6 +31,45 @@ def test_found(id: str, tmp_path: Path) -> None:  # noqa: A002
     assert id in found(tmp_path, document)
 
 
+@pytest.mark.parametrize("id", HARMLESS)
+def test_not_found(id: str, tmp_path: Path) -> None:  # noqa: A002
+    document = sound()
+    HARMLESS[id](document)
+    assert id not in found(tmp_path, document)
+
+
+def test_an_endpoint_can_switch_off_mutual_tls(tmp_path: Path) -> None:
+    document = sound(Mode.ROUTER)
+    assert found(tmp_path, document) == set()
+    document["listen"]["endpoints"] = ["tls/[::]:7447#enable_mtls=false"]
+    assert found(tmp_path, document) == {"zenoh.no-mutual-tls"}
+
+
+def test_a_denial_holds_where_nothing_wider_is_allowed(tmp_path: Path) -> None:
+    document = sound()
+    rule("yes", "allow", "0/*/*/*", "/talker")(document)
+    rule("no", "deny", "0/**", "/talker")(document)
+    assert "zenoh.deny-in-wildcard" not in found(tmp_path, document)
+
+
+def test_under_default_allow_a_denial_of_everything_holds(tmp_path: Path) -> None:
+    document = sound()
+    ALLOW(document)
+    rule("no", "deny", "**", "/talker")(document)
+    assert "zenoh.deny-in-wildcard" not in found(tmp_path, document)
+    rule("less", "deny", "@ros2_lv/0/**", "/router")(document)
+    assert "zenoh.deny-in-wildcard" in found(tmp_path, document)
+
+
+def test_the_defaults_of_zenoh_are_open(tmp_path: Path) -> None:
+    assert found(tmp_path, {"mode": "router"}) == {
+        "zenoh.plain-endpoint",
+        "zenoh.router-without-rules",
+        "zenoh.shared-memory",
+        "zenoh.multicast",
+    }
+
+
 def test_check_takes_a_configuration(tmp_path: Path) -> None:
     file = tmp_path / "session.json5"
     file.write_text(json.dumps(sound()))
@@ -38,6 +77,6 @@ def test_check_takes_a_configuration(tmp_path: Path) -> None:
     file.write_text("{mode: 'client', // open\n}")
     ended = sros("check", file)
     assert ended.status == 1
-    assert "session.json5:1: error: a process of Zenoh without access control" in ended.out
+    assert "session.json5:1: error: a session without access control" in ended.out
     file.write_text("{mode: 'client'")
     assert "Line 1: it ends too early" in sros("check", file).out

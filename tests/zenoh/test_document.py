@@ -62,7 +62,6 @@ def test_everything_that_is_read() -> None:
             },
             "adminspace": {"enabled": True, "permissions": {"read": False, "write": True}},
             "namespace": "robot",
-            "plugins": {"rest": {"http_port": 8000}},
             **control(default_permission="allow"),
         }
     )
@@ -78,7 +77,7 @@ def test_everything_that_is_read() -> None:
     assert (document.multicast, document.gossip, document.shared_memory) == (False, False, False)
     assert document.adminspace
     assert (document.adminspace_readable, document.adminspace_writable) == (False, True)
-    assert (document.namespace, document.plugins) == ("robot", ("rest",))
+    assert document.namespace == "robot"
     access = document.access
     assert (access.enabled, access.allows_by_default) == (True, True)
     assert access.rules[0].flows == tuple(Flow)
@@ -173,6 +172,13 @@ def test_what_is_accepted_with_access_control_opens() -> None:
     ):
         assert read(value).access.enabled
         zenoh.open(zenoh.Config.from_json5(json.dumps(value | settings))).close()
+
+
+def test_a_short_file_that_means_too_much() -> None:
+    many = [str(each) for each in range(1, 4000)]
+    subject = {"id": "s", "cert_common_names": many, "usernames": many}
+    with pytest.raises(DocumentError, match="stand for 3e.07 rules"):
+        read(control(subjects=[subject]))
 
 
 def test_settings_by_their_order_are_not_read() -> None:

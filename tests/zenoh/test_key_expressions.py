@@ -6,7 +6,12 @@ import random
 
 import pytest
 
-from sros_tool.zenoh.key_expressions import canonical, includes
+from sros_tool.zenoh.key_expressions import (
+    canonical,
+    expression_problem,
+    includes,
+    intersects,
+)
 from tests.support.children import LONG
 
 
@@ -58,14 +63,58 @@ def drawn_expression(draw: random.Random) -> str:
     return canonical(chunk() for _ in range(draw.randint(1, 5)))
 
 
-def test_zenoh_itself_includes_the_same() -> None:
+def test_zenoh_itself_says_the_same() -> None:
+    """Also whether two expressions intersect."""
     zenoh = pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
-    draw, included = random.Random(15), 0
+    draw, included, met = random.Random(15), 0, 0
     count = 1_000_000 if LONG else 100_000
     for _ in range(count):
         wide, narrow = drawn_expression(draw), drawn_expression(draw)
         # The constructor refuses what is not canonical.
-        told = zenoh.KeyExpr(wide).includes(zenoh.KeyExpr(narrow))
+        one, other = zenoh.KeyExpr(wide), zenoh.KeyExpr(narrow)
+        told = one.includes(other)
         assert includes(wide, narrow) is told, (wide, narrow)
         included += told
+        told = one.intersects(other)
+        assert intersects(wide, narrow) is told, (wide, narrow)
+        met += told
     assert included > count // 20
+    assert included + count // 20 < met < count // 2
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("a/*/@b/**/c$*d", ""),
+        ("", "begins"),
+        ("a//b", "begins"),
+        ("a/b#", "no characters"),
+        ("a*", "has to be '$*'"),
+        ("$a", "has to be '$*'"),
+        ("**/*", "has to be written '*/**'"),
+        ("a$*$*", "has to be written 'a$*'"),
+    ],
+)
+def test_what_is_no_expression(text: str, problem: str) -> None:
+    found = expression_problem(text)
+    assert problem in found
+    assert bool(found) is bool(problem)
+
+
+def drawn_text(draw: random.Random) -> str:
+    return "".join(draw.choice(["a", "/", "*", "**", "$*", "$", "@", "/", "#"]) for _ in range(5))
+
+
+def test_zenoh_itself_accepts_the_same() -> None:
+    zenoh = pytest.importorskip("zenoh", reason="the wheel eclipse-zenoh is missing")
+    draw, accepted = random.Random(15), 0
+    for _ in range(20_000):
+        text = drawn_text(draw)
+        try:
+            zenoh.KeyExpr(text)
+            problem = False
+        except zenoh.ZError:
+            problem = True
+        assert bool(expression_problem(text)) is problem, text
+        accepted += not problem
+    assert accepted > 200
