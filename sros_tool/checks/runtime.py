@@ -12,6 +12,13 @@ from pathlib import Path
 
 from sros_tool.checks.keystores.keystore import joined, keystore_findings
 from sros_tool.checks.kind import ERROR, NOTE, WARNING, Finding, FindingKind
+from sros_tool.checks.zenoh_environment import (
+    PROCESS_OPEN,
+    enforces_nothing,
+    is_zenoh,
+    named_files,
+    zenoh_environment_findings,
+)
 from sros_tool.dds.domains import DomainSet
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import KeystoreError, SrosError
@@ -37,6 +44,7 @@ from sros_tool.runtime.environment import (
 )
 from sros_tool.runtime.rcl_security import choose_loadable
 from sros_tool.runtime.rmw import DEFAULT_RMW, RMW
+from sros_tool.runtime.zenoh_environment import ROUTER_URI, SESSION_URI
 from sros_tool.validity import iso
 from sros_tool.xml import read_bytes
 
@@ -119,7 +127,7 @@ RMW_INSECURE = FindingKind(
     ERROR,
     "an RMW that does not enforce DDS Security",
     "The RMW was built without security, or does not use DDS. Nodes fail, or run unsecured.",
-    "Found by a test (`sros doctor`); rmw_zenoh reads none of the files of an enclave.",
+    "Found by a test (`sros doctor`).",
     "Use an RMW that enforces security according to `sros doctor`.",
 )
 CLOCK_BEHIND = FindingKind(
@@ -183,7 +191,8 @@ MIXED_VENDORS = FindingKind(
     "Use the same RMW for all secured nodes that communicate.",
 )
 
-_NOT_DDS = ("rmw_zenoh", "rmw_email", "rmw_iceoryx")
+_NOT_DDS = ("rmw_email", "rmw_iceoryx")
+_ZENOH_ROUTER = "rmw_zenohd"
 _DAEMON = ("_ros2_daemon", "ros2cli.daemon", "ros2-daemon")
 _TOLERANCE = timedelta(minutes=2)
 _LOADED = ("cert.pem", "permissions.p7s", "governance.p7s", "crl.pem", "identity_ca.cert.pem")
@@ -192,6 +201,7 @@ _LOADED = ("cert.pem", "permissions.p7s", "governance.p7s", "crl.pem", "identity
 def _check_host(state: RuntimeState) -> Iterator[Finding]:
     """Yield findings about the RMW, the clock, and the running processes."""
     yield from _rmw(state)
+    yield from zenoh_environment_findings(state.environment)
     yield from _clock(state)
     yield from _processes(state)
 
@@ -237,6 +247,7 @@ def _processes(state: RuntimeState) -> Iterator[Finding]:
             rmws.setdefault(environment.get(RMW) or DEFAULT_RMW, []).append(process.label)
             yield from _outdated(process)
             yield from _runs_unsecured(process)
+            yield from _zenoh_process(process)
         elif secured_here and _is_node_in_same_domain(process, state.environment):
             text = f"in domain {_domain(environment)}, with {ENABLE} not 'true'"
             yield PROCESS_UNSECURED.found(process.label, text)
@@ -263,19 +274,36 @@ def _daemon(process: Process, wanted: Mapping[str, str]) -> Iterator[Finding]:
 
 
 def _outdated(process: Process) -> Iterator[Finding]:
+    if is_zenoh(process.environment):
+        loaded = [path for _, path in named_files(process.environment) if path.is_absolute()]
+        text = ", ".join(str(each) for each in loaded if _is_newer(each, process.started))
+        if text:
+            yield PROCESS_OUTDATED.found(
+                process.label, f"it started at {iso(process.started)}; {text} changed later"
+            )
+        return
     root, name = process.environment.get(KEYSTORE, ""), process.environment.get(ENCLAVE, "")
     if not (root.startswith("/") and name.startswith("/")):
         return
     folder = enclave_path(Path(root), name)
-    newer = [
-        file
-        for file in _LOADED
-        if (folder / file).exists()
-        and datetime.fromtimestamp((folder / file).stat().st_mtime, UTC) > process.started
-    ]
+    newer = [file for file in _LOADED if _is_newer(folder / file, process.started)]
     if newer:
         text = f"it started at {iso(process.started)}; {', '.join(newer)} of {name} changed later"
         yield PROCESS_OUTDATED.found(process.label, text)
+
+
+def _is_newer(path: Path, started: datetime) -> bool:
+    with suppress(OSError, ValueError):
+        return datetime.fromtimestamp(path.stat().st_mtime, UTC) > started
+    return False
+
+
+def _zenoh_process(process: Process) -> Iterator[Finding]:
+    is_router = any(_ZENOH_ROUTER in Path(word).name for word in process.command[:3])
+    if is_zenoh(process.environment) and (is_router or "--ros-args" in process.command):
+        variable = ROUTER_URI if is_router else SESSION_URI
+        if why := enforces_nothing(process.environment, variable):
+            yield PROCESS_OPEN.found(process.label, why)
 
 
 def _runs_unsecured(process: Process) -> Iterator[Finding]:

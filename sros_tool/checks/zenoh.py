@@ -12,7 +12,12 @@ from sros_tool.policy.patterns import ComparisonLimit
 from sros_tool.xml import read_bytes
 from sros_tool.zenoh.access import Message
 from sros_tool.zenoh.configuration import Mode
-from sros_tool.zenoh.document import ConfigurationDocument, ZenohEndpoint, parse_configuration
+from sros_tool.zenoh.document import (
+    ENCRYPTED,
+    ConfigurationDocument,
+    ZenohEndpoint,
+    parse_configuration,
+)
 from sros_tool.zenoh.enforcement import PROPERTIES, AclRule, AclSubject, Enforcement
 from sros_tool.zenoh.key_expressions import includes, intersects, widest
 
@@ -206,7 +211,6 @@ ADMIN_SPACE = FindingKind(
     'Write "enabled": false in adminspace.',
 )
 
-_ENCRYPTED = ("tls", "quic")
 _LINK, _TLS, _ACCESS = "transport/link", "transport/link/tls", "access_control"
 _WITH_WILDCARDS = frozenset(Message) - {Message.REPLY, Message.LIVELINESS_TOKEN}
 """The messages that can name a key with wildcards."""
@@ -256,22 +260,22 @@ def _links(document: ConfigurationDocument) -> Iterator[Finding]:
             if not allowed:
                 text = f"{what} has {each.text}, and the protocols are {_listed(document)}"
                 yield _at(document, ENDPOINT_REFUSED, f"{what}/endpoints", text)
-            elif each.protocol not in _ENCRYPTED:
+            elif not each.is_encrypted():
                 default = "" if f"{what}/endpoints" in document.lines else ", by default"
                 text = f"{what} has {each.text}{default}"
                 yield _at(document, PLAIN_ENDPOINT, f"{what}/endpoints", text)
-    if not any(_encrypted(each) for _, endpoints in both for each in endpoints):
+    if not any(each.is_encrypted() for _, endpoints in both for each in endpoints):
         return
-    if document.protocols is None or set(document.protocols) - set(_ENCRYPTED):
+    if document.protocols is None or set(document.protocols) - ENCRYPTED:
         text = f"the protocols are {_listed(document)}"
         yield _at(document, PROTOCOLS_OPEN, f"{_LINK}/protocols", text)
     for each in document.listen:
-        if _encrypted(each) and not _option(each, "enable_mtls", document.tls.mutual):
+        if each.is_encrypted() and not _option(each, "enable_mtls", document.tls.mutual):
             text = f"it listens at {each.text}, and enable_mtls is off"
             yield _at(document, NO_MUTUAL_TLS, f"{_TLS}/enable_mtls", text)
     yield from _names(document)
     closing = "close_link_on_expiration"
-    for each in (each for _, endpoints in both for each in endpoints if _encrypted(each)):
+    for each in (each for _, endpoints in both for each in endpoints if each.is_encrypted()):
         if not _option(each, closing, document.tls.closes_on_expiration):
             text = f"{closing} is off for {each.text}"
             yield _at(document, EXPIRED_STAYS, f"{_TLS}/{closing}", text)
@@ -283,17 +287,13 @@ def _names(document: ConfigurationDocument) -> Iterator[Finding]:
     unverified = [
         each
         for each in document.connect
-        if _encrypted(each)
+        if each.is_encrypted()
         and not _option(each, "verify_name_on_connect", document.tls.verifies_name)
     ]
     access = document.access
     if unverified and (not access.enabled or access.allows_by_default or _of_everybody(document)):
         text = f"verify_name_on_connect is off for {unverified[0].text}"
         yield _at(document, NAME_NOT_VERIFIED, f"{_TLS}/verify_name_on_connect", text)
-
-
-def _encrypted(endpoint: ZenohEndpoint) -> bool:
-    return endpoint.protocol in _ENCRYPTED
 
 
 def _option(endpoint: ZenohEndpoint, name: str, otherwise: bool) -> bool:

@@ -46,10 +46,13 @@ _LISTEN: Mapping[Mode, tuple[str, ...]] = {
     Mode.CLIENT: (),
 }
 """Where a process listens whose configuration does not say it."""
+ENCRYPTED = frozenset({"tls", "quic"})
+"""The protocols that encrypt, and authenticate by certificates."""
 _LINK_PROTOCOLS = frozenset(
     {"tcp", "udp", "tls", "quic", "serial", "unixpipe", "unixsock-stream", "vsock", "ws"}
 )
 _MOST_MEANT = 1_000_000
+_MOST_PARTS = 10
 _ZID = re.compile(r"[1-9a-f][0-9a-f]{0,31}", re.ASCII)
 
 
@@ -68,6 +71,10 @@ class ZenohEndpoint:
     def address(self) -> str:
         """Its address without metadata and options, such as "localhost:7447"."""
         return self.text.partition("/")[2].partition("#")[0].partition("?")[0]
+
+    def is_encrypted(self) -> bool:
+        """Return whether its protocol encrypts, and has certificates."""
+        return self.protocol in ENCRYPTED
 
     @property
     def options(self) -> Mapping[str, str]:
@@ -125,13 +132,42 @@ class ConfigurationDocument:
         return self.lines.get(path, 1)
 
 
-def parse_configuration(data: bytes, name: str) -> ConfigurationDocument:
+def parse_configuration(
+    data: bytes, name: str, overrides: Iterable[tuple[str, str]] = ()
+) -> ConfigurationDocument:
     """Return the configuration that a file states; ``name`` is the file's name in errors.
+
+    ``overrides`` are paths of settings and their values in JSON5, which replace those of the file,
+    as the pairs of ZENOH_CONFIG_OVERRIDE do.
 
     Raises:
         DocumentError: the file has more than 16 MiB, is not JSON5, or Zenoh would not accept it.
     """
-    return _configuration(_root(data, name), name)
+    root = _root(data, name)
+    for path, value in overrides:
+        _override(root, path, value)
+    return _configuration(root, name)
+
+
+def _override(root: _Section, path: str, value: str) -> None:
+    """Replace a setting; what Zenoh does not accept is an error, as it does not start with it."""
+    *parents, last = (each for each in path.split("/") if each) if path.strip("/") else [""]
+    inner = root.value
+    try:
+        if not last or len(parents) >= _MOST_PARTS:
+            raise Json5Error("no setting has that name", 0)
+        for each in parents:
+            found = inner.setdefault(each, Json5Object(0))
+            if not isinstance(found, Json5Object) or each == "endpoints":
+                raise Json5Error("no setting has that name", 0)
+            inner = found
+        inner[last] = parse_json5(value)
+        inner.lines[last] = 0
+    except Json5Error as error:
+        raise DocumentError(
+            f"ZENOH_CONFIG_OVERRIDE sets {path[:80]!r} to what Zenoh does not accept",
+            f"In {value[:80]!r}: {error.problem}.",
+        ) from error
 
 
 def _root(data: bytes, name: str) -> _Section:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import timedelta
 
 from sros_tool.checks.runtime import Process, RuntimeState
+from tests.checks import zenoh_cases
 from tests.checks.bench import Bench
 
 Change = Callable[[RuntimeState, Bench], RuntimeState]
@@ -16,6 +18,16 @@ ENABLE, STRATEGY = "ROS_SECURITY_ENABLE", "ROS_SECURITY_STRATEGY"
 KEYSTORE, ENCLAVE = "ROS_SECURITY_KEYSTORE", "ROS_SECURITY_ENCLAVE_OVERRIDE"
 DOMAIN, RMW = "ROS_DOMAIN_ID", "RMW_IMPLEMENTATION"
 UNSECURED = {DOMAIN: "0"}
+SESSION, OVERRIDE = "ZENOH_SESSION_CONFIG_URI", "ZENOH_CONFIG_OVERRIDE"
+TLS = "transport/link/tls"
+PATHS = (
+    "root_ca_certificate",
+    *(
+        f"{side}_{what}"
+        for side in ("listen", "connect")
+        for what in ("private_key", "certificate")
+    ),
+)
 
 
 def sound_state(bench: Bench) -> RuntimeState:
@@ -82,6 +94,35 @@ def _without_ca_keys(state: RuntimeState, bench: Bench) -> RuntimeState:
     return having(**{KEYSTORE: str(bench.export())})(state, bench)
 
 
+def on_zenoh(text: str | None = None, **variables: str | None) -> Change:
+    """Everything on rmw_zenoh_cpp, with a session file as sros writes it, or one with a text."""
+
+    def change(state: RuntimeState, bench: Bench) -> RuntimeState:
+        file = bench.root.parent / "session.json5"
+        file.write_text(json.dumps(zenoh_cases.sound()) if text is None else text)
+        paths = {name: f"/{name}.pem" for name in PATHS}
+        stated = {
+            RMW: "rmw_zenoh_cpp",
+            SESSION: str(file),
+            OVERRIDE: ";".join(f'{TLS}/{name}="{path}"' for name, path in paths.items()),
+            **variables,
+        }
+        old = (state.now - timedelta(days=1)).timestamp()
+        os.utime(file, (old, old))
+        for index in range(len(state.processes)):
+            state = running(index, **stated)(state, bench)
+        return having(**stated)(state, bench)
+
+    return change
+
+
+def session_written_since(state: RuntimeState, bench: Bench) -> RuntimeState:
+    state = on_zenoh()(state, bench)
+    moment = (state.now + timedelta(minutes=1)).timestamp()
+    os.utime(state.environment[SESSION], (moment, moment))
+    return state
+
+
 CASES: dict[str, Change] = {
     "runtime.enable-misspelt": having(**{ENABLE: "True"}),
     "runtime.not-enabled": having(**{ENABLE: None}),
@@ -100,13 +141,20 @@ CASES: dict[str, Change] = {
         state, bench
     ),
     "runtime.rmw-not-installed": having(**{RMW: "rmw_connextdds"}),
-    "runtime.rmw-without-security": having(**{RMW: "rmw_zenoh_cpp"}),
+    "runtime.rmw-without-security": having(**{RMW: "rmw_email_cpp"}),
     "runtime.clock-behind": _written_in_the_future,
     "runtime.daemon-unsecured": running(1, **{ENABLE: None}),
     "runtime.daemon-differs": running(1, **{ENCLAVE: "/arm"}),
     "runtime.process-unsecured": running(0, **{ENABLE: None}),
     "runtime.process-runs-unsecured": running(0, **{STRATEGY: "Permissive", ENCLAVE: "/gone"}),
     "runtime.process-outdated": _written_since,
+    "runtime.zenoh-open": on_zenoh(**{SESSION: None}),
+    "runtime.zenoh-file-not-found": on_zenoh(**{SESSION: "/nowhere/session.json5"}),
+    "runtime.zenoh-overridden": on_zenoh(
+        **{OVERRIDE: 'connect/endpoints=["tls/a:1"];access_control/enabled=false'}
+    ),
+    "runtime.zenoh-no-certificate": on_zenoh(**{OVERRIDE: None}),
+    "runtime.zenoh-process-open": on_zenoh(**{OVERRIDE: "/access_control/enabled=false"}),
     "runtime.mixed-vendors": running(0, **{RMW: "rmw_cyclonedds_cpp"}),
 }
 SOUND: Change = _without_ca_keys

@@ -21,9 +21,12 @@ from tests.checks.runtime_cases import (
     DOMAIN,
     ENCLAVE,
     KEYSTORE,
+    OVERRIDE,
     SOUND,
     having,
+    on_zenoh,
     running,
+    session_written_since,
     sound_state,
 )
 from tests.support.children import wait_for
@@ -69,6 +72,46 @@ def test_found(expected: str, sound_one: RuntimeState, bench: Bench, tmp_path: P
             os.utime(path, (begin, begin))
         assert expected not in ids(sound_one)
     assert expected in ids(CASES[expected](state, bench))
+
+
+def test_nothing_on_zenoh_with_a_session_file(sound_one: RuntimeState, bench: Bench) -> None:
+    assert ids(on_zenoh()(sound_one, bench)) == set()
+    other_router = {OVERRIDE: 'connect/endpoints=["tls/robot:7447"]'}
+    assert "runtime.zenoh-overridden" not in ids(on_zenoh(**other_router)(sound_one, bench))
+
+
+def test_a_session_file_that_changed_since_the_start(sound_one: RuntimeState, bench: Bench) -> None:
+    assert "runtime.process-outdated" not in ids(on_zenoh()(sound_one, bench))
+    assert "runtime.process-outdated" in ids(session_written_since(sound_one, bench))
+
+
+@pytest.mark.parametrize(
+    ("variables", "text", "expected"),
+    [
+        ({}, "{mode: 'client'", "zenoh.malformed"),
+        ({}, "{}", "zenoh.session-without-rules"),
+        ({OVERRIDE: "mode"}, None, "runtime.zenoh-no-certificate"),
+        ({OVERRIDE: "mode=client"}, None, "zenoh.malformed"),
+        ({OVERRIDE: "mode/x=1"}, None, "zenoh.malformed"),
+        ({OVERRIDE: "=1;;x;a/b/c/d/e/f/g/h/i/j/k/l=1"}, None, "zenoh.malformed"),
+        ({OVERRIDE: 'listen/endpoints=["tcp/[::]:7447"]'}, None, "zenoh.endpoint-refused"),
+        (
+            {OVERRIDE: 'listen/endpoints=["tcp/[::]:7447"];transport/link/protocols=null'},
+            None,
+            "zenoh.plain-endpoint",
+        ),
+        ({OVERRIDE: 'access_control/default_permission="allow"'}, None, "zenoh.default-allow"),
+        ({OVERRIDE: "transport/shared_memory/enabled=true"}, None, "zenoh.shared-memory"),
+    ],
+)
+def test_what_an_override_makes_of_a_session_file(
+    variables: dict[str, str],
+    text: str | None,
+    expected: str,
+    sound_one: RuntimeState,
+    bench: Bench,
+) -> None:
+    assert expected in ids(on_zenoh(text, **variables)(sound_one, bench))
 
 
 def test_what_keeps_the_enclave_from_loading_is_found_too(sound_one: RuntimeState) -> None:
