@@ -8,13 +8,20 @@ from fnmatch import fnmatchcase
 from types import ModuleType
 
 from sros_tool.checks import policies, runtime, zenoh, zenoh_environment
-from sros_tool.checks.keystores import authorities, documents, enclaves, files, issued
+from sros_tool.checks.keystores import (
+    authorities,
+    documents,
+    enclaves,
+    files,
+    issued,
+    zenoh_files,
+)
 from sros_tool.checks.kind import NOTE, WARNING, Finding, FindingKind, Severity, by_id
 from sros_tool.errors import UsageError
 
 _MODULES = (
     *(policies, files, authorities, enclaves, documents, issued),
-    *(zenoh, zenoh_environment, runtime),
+    *(zenoh_files, zenoh, zenoh_environment, runtime),
 )
 
 

@@ -450,3 +450,57 @@ CASES |= {
     "enclave.not-in-policy": lambda b: _policy(b, ('path="/arm"', 'path="/other"')),
     "keystore.enclave-missing": lambda b: _policy(b, ('path="/arm"', 'path="/other"')),
 }
+
+
+# ── Zenoh ──────────────────────────────────────────────────────────────────────────────────
+
+_SESSION, _SIGNED = "enclaves/base/session.json5", "enclaves/base/session.p7s"
+
+
+def with_zenoh(bench: Bench) -> Path:
+    """Give the keystore a Zenoh network, and return the configuration of an enclave."""
+    sros("zenoh", bench.root, env={"SROS_CA_PASSPHRASE": SECRET}).ok()
+    return bench.path(_SESSION)
+
+
+@case("zenoh.missing")
+def _(bench: Bench) -> None:
+    with_zenoh(bench).unlink()
+
+
+@case("zenoh.unsigned")
+def _(bench: Bench) -> None:
+    with_zenoh(bench)
+    bench.path(_SIGNED).unlink()
+
+
+@case("zenoh.other-document")
+def _(bench: Bench) -> None:
+    document = with_zenoh(bench)
+    document.write_bytes(document.read_bytes().replace(b"deny", b"allow"))
+
+
+@case("zenoh.out-of-date")
+def _(bench: Bench) -> None:
+    with_zenoh(bench)
+    for file in (_SESSION, _SIGNED):
+        shutil.copy(bench.path(file.replace("base", "arm")), bench.path(file))
+
+
+@case("zenoh.left-over")
+def _(bench: Bench) -> None:
+    with_zenoh(bench)
+    for file in (_SESSION, _SIGNED):
+        shutil.copy(bench.path(file), bench.path(file.replace("base", "router")))
+
+
+@case("zenoh.left-out")
+def _(bench: Bench) -> None:
+    with_zenoh(bench)
+    bench.path("enclaves/base/permissions.p7s").unlink()
+
+
+@case("zenoh.cannot-be-made")
+def _(bench: Bench) -> None:
+    with_zenoh(bench)
+    shutil.rmtree(bench.path("enclaves/router"))

@@ -28,6 +28,7 @@ from sros_tool.checks.keystores.issued import (
     wanted_rights,
 )
 from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore, read_keystore
+from sros_tool.checks.keystores.zenoh_files import check_network, check_own_zenoh
 from sros_tool.checks.kind import Finding
 from sros_tool.dds.governance import parse_governance
 from sros_tool.errors import SrosError
@@ -95,6 +96,7 @@ def keystore_findings(
         found = [*common, *check_issued(keystore, issued), *found]
     else:
         found = [*check_files(keystore, names), *found]
+    found += check_network(keystore, only)
     real_root = os.path.realpath(root)
     located = (_at_real_file(each, root, real_root) for each in found)
     return joined([_with_names(each, root) for each in located])
@@ -110,6 +112,7 @@ def _enclave_findings(
     yield from check_governance(enclave, only_differing=only_differing)
     yield from check_vendors(enclave, outside=bool(documents))
     yield from check_policy(enclave, wanted)
+    yield from check_own_zenoh(enclave)
 
 
 def joined(findings: Sequence[Finding]) -> list[Finding]:

@@ -212,6 +212,18 @@ def _drifted(
     return tuple(found)
 
 
+def zenoh_drift(
+    root: Path, network: ZenohNetwork, domains: DomainSet, authority: x509.Certificate
+) -> tuple[tuple[Drifted, ...], Mapping[str, str]]:
+    """Return the configurations that are not as they shall be, and who gets none with the reason.
+
+    Raises:
+        SrosError: the rights of an enclave cannot be stated to Zenoh, or the router has no enclave.
+    """
+    wanted = _zenoh_documents(root, network, domains, authority)
+    return _drifted(root, wanted, authority), wanted.left_out
+
+
 def _zenoh_documents(
     root: Path,
     network: ZenohNetwork,

@@ -1,0 +1,157 @@
+"""Checks of the Zenoh configurations of a keystore: signature, and the rights of the permissions.
+
+In the keystore itself they are compared with what `sros zenoh` would write; on a robot, with the
+permissions of the enclave that has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+
+from sros_tool.checks.keystores.opened import CheckedEnclave, CheckedKeystore
+from sros_tool.checks.kind import ERROR, WARNING, Finding, FindingKind
+from sros_tool.errors import SrosError
+from sros_tool.keystore.issuing.zenoh import Drift, Drifted, zenoh_drift
+from sros_tool.keystore.layout import PERMISSIONS, SETTINGS, enclave_path
+from sros_tool.keystore.reader import open_enclave, open_keystore
+from sros_tool.keystore.zenoh import OpenedZenoh, ZenohFault, open_zenoh
+
+_AGAIN = "Run `sros zenoh ROOT`, and restart the processes that it names."
+_SOURCE = "sros (docs/zenoh.md); Zenoh 1.10 verifies no signature of its configuration."
+
+MISSING = FindingKind(
+    "zenoh.missing",
+    ERROR,
+    "an enclave without its Zenoh configuration",
+    "Processes of rmw_zenoh_cpp do not run in it with `sros run`; without sros, they run with the "
+    "default of rmw_zenoh_cpp, which is open.",
+    _SOURCE,
+    _AGAIN,
+)
+UNSIGNED = FindingKind(
+    "zenoh.unsigned",
+    ERROR,
+    "a Zenoh configuration that the permissions CA has not signed",
+    "Whoever could write the file chose its rules: the process may enforce nothing.",
+    _SOURCE,
+    _AGAIN,
+)
+OTHER_DOCUMENT = FindingKind(
+    "zenoh.other-document",
+    ERROR,
+    "a Zenoh configuration that is not the signed one next to it",
+    "Somebody changed it after it was signed, and Zenoh reads it as it is now.",
+    _SOURCE,
+    f"Find out who did. {_AGAIN}",
+)
+OUT_OF_DATE = FindingKind(
+    "zenoh.out-of-date",
+    ERROR,
+    "a Zenoh configuration that does not state the rights of the signed permissions",
+    "DDS and Zenoh enforce different rights: one of them an earlier policy.",
+    _SOURCE,
+    _AGAIN,
+)
+LEFT_OVER = FindingKind(
+    "zenoh.left-over",
+    WARNING,
+    "a signed Zenoh configuration that its enclave should not have",
+    "A process that uses it enforces rules that the keystore no longer keeps in step.",
+    _SOURCE,
+    "Run `sros zenoh ROOT`, or remove all with `sros zenoh ROOT --off`.",
+)
+LEFT_OUT = FindingKind(
+    "zenoh.left-out",
+    WARNING,
+    "an enclave that has no rights on Zenoh",
+    "It gets no configuration, and all others deny it everything.",
+    _SOURCE,
+    "Renew it with `sros renew ROOT NAME`, or revoke it if nobody needs it.",
+)
+CANNOT_BE_MADE = FindingKind(
+    "zenoh.cannot-be-made",
+    ERROR,
+    "a Zenoh network whose configurations cannot be made",
+    "The keystore's settings have one, and its permissions or its enclaves do not fit it, so "
+    "nothing keeps the files in step.",
+    _SOURCE,
+    "Run `sros zenoh ROOT --dry-run` and do what it says.",
+)
+
+_KINDS = {
+    ZenohFault.MISSING: MISSING,
+    ZenohFault.UNREADABLE: UNSIGNED,
+    ZenohFault.UNSIGNED: UNSIGNED,
+    ZenohFault.SIGNATURE: UNSIGNED,
+    ZenohFault.OTHER_DOCUMENT: OTHER_DOCUMENT,
+    ZenohFault.MALFORMED: OUT_OF_DATE,
+    ZenohFault.OUT_OF_DATE: OUT_OF_DATE,
+}
+"""The kind of each fault; that of another name is ``enclave.name-mismatch``."""
+
+
+def check_own_zenoh(enclave: CheckedEnclave) -> Iterator[Finding]:
+    """Yield findings about an enclave's Zenoh configurations, if it has any, by its own files.
+
+    For a keystore with settings of its network, `check_network` finds them, and more.
+    """
+    settings = enclave.keystore.settings
+    if settings and settings.zenoh:
+        return
+    opened = open_zenoh(enclave.folder, enclave.name, enclave.state)
+    if opened.files:
+        yield from _of_opened(enclave, opened)
+
+
+def _of_opened(enclave: CheckedEnclave, opened: OpenedZenoh) -> Iterator[Finding]:
+    for problem in opened.problems:
+        if kind := _KINDS.get(problem.fault):
+            text = problem.text if problem.text != "missing" else f"{problem.file} is missing"
+            remedy = kind.remedy
+            if not enclave.keystore.is_home:
+                remedy = (
+                    "In the keystore that has the CA keys: run `sros zenoh KEYSTORE`. Then export "
+                    "the enclave again."
+                )
+            yield kind.found(enclave.name, text, enclave.file(problem.file), remedy=remedy)
+
+
+def check_network(
+    keystore: CheckedKeystore, only: Collection[str] | None = None
+) -> Iterator[Finding]:
+    """Yield findings about a keystore's Zenoh network, or about the part of some enclaves in it."""
+    network = keystore.settings.zenoh if keystore.settings else None
+    authorities = keystore.authorities.get(PERMISSIONS)
+    if network is None or not authorities:
+        return
+    try:
+        domains = open_keystore(keystore.root).domains
+    except SrosError:  # a finding of each enclave
+        return
+    try:
+        drifts, left_out = zenoh_drift(keystore.root, network, domains, authorities[0])
+    except SrosError as error:
+        yield CANNOT_BE_MADE.found("zenoh", str(error), keystore.shown(SETTINGS))
+        return
+    for each in drifts:
+        if only is None or each.enclave in only:
+            yield from _of_drift(keystore, each)
+    for name, why in left_out.items():
+        if only is None or name in only:
+            yield LEFT_OUT.found(name, why.rstrip("."), str(enclave_path(keystore.root, name)))
+
+
+def _of_drift(keystore: CheckedKeystore, drift: Drifted) -> Iterator[Finding]:
+    """Yield findings about a configuration that is not as it should be, with what is wrong."""
+    file = keystore.shown(drift.path)
+    if drift.kind is Drift.STALE:
+        yield LEFT_OVER.found(drift.enclave, "the keystore has none for it", file)
+        return
+    if drift.kind is Drift.MISSING:
+        yield MISSING.found(drift.enclave, "it is missing, or cannot be read", file)
+        return
+    state = open_enclave(enclave_path(keystore.root, drift.enclave), now=keystore.now)
+    enclave = CheckedEnclave(keystore, drift.enclave, state)
+    found = list(_of_opened(enclave, open_zenoh(enclave.folder, drift.enclave, state)))
+    text = "it is not what the settings and the permissions of the keystore give"
+    yield from found or [OUT_OF_DATE.found(drift.enclave, text, file)]

@@ -1,0 +1,114 @@
+"""What is found in the Zenoh configurations of a keystore, of an enclave and of an export."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.support.harness import policy_text, publish, sros
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a keystore that has a Zenoh network, and an export; only to be copied."""
+    folder = tmp_path_factory.mktemp("zenoh")
+    (folder / "p.xml").write_text(policy_text({"/a": publish("/x"), "/b": publish("/y")}))
+    (folder / "more.xml").write_text(policy_text({"/a": publish("/x", "/more")}))
+    sros("generate_artifacts", "-k", "ks", "-p", "p.xml", cwd=folder).ok()
+    sros("zenoh", "ks", cwd=folder).ok()
+    sros("distribute_key", "ks", "/a", "/router", "robot", cwd=folder).ok()
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "w", symlinks=True))
+
+
+def found(folder: Path, *words: str) -> list[tuple[str, str]]:
+    """The ids of the findings about Zenoh, with the files."""
+    shown = json.loads(sros("check", *words, "--json", "--include", "zenoh.*", cwd=folder).out)
+    return [(each["id"], each["file"]) for each in shown["findings"]]
+
+
+@pytest.mark.parametrize("mode", ["client", "peer"])
+def test_nothing_where_the_files_are_in_step(mode: str, folder: Path) -> None:
+    sros("zenoh", "ks", "--mode", mode, cwd=folder).ok()
+    sros("create_permission", "ks", "/a", "more.xml", cwd=folder).ok()
+    sros("distribute_key", "ks", "/a", "/router", "robot", "--force", cwd=folder).ok()
+    for place in ("ks", "ks/enclaves/a", "ks/enclaves/router", "robot", "robot/enclaves/router"):
+        assert found(folder, place) == [], place
+    sros("verify", "robot", cwd=folder).ok()
+
+
+def test_a_keystore_without_a_network_needs_no_files(folder: Path) -> None:
+    sros("zenoh", "ks", "--off", cwd=folder).ok()
+    assert found(folder, "ks") == []
+
+
+def test_a_change_that_is_also_signed_is_found_by_comparison_with_the_keystore(
+    folder: Path,
+) -> None:
+    """A file of the router of earlier rights is signed, and no permissions of its own tell."""
+    router = folder / "ks/enclaves/router"
+    earlier = shutil.copytree(router, folder / "earlier")
+    sros("create_permission", "ks", "/a", "more.xml", cwd=folder).ok()
+    for file in ("router.json5", "router.p7s"):
+        shutil.copy(earlier / file, router / file)
+    wanted = [("zenoh.out-of-date", "ks/enclaves/router/router.json5")]
+    assert found(folder, "ks") == found(folder, "ks/enclaves/router") == wanted
+    assert found(folder, "ks/enclaves/a") == []
+    sros("zenoh", "ks", cwd=folder).ok()
+    assert found(folder, "ks") == []
+
+
+DAMAGE = {
+    "session.p7s": "zenoh.unsigned",
+    "session.json5": "zenoh.missing",
+}
+
+
+@pytest.mark.parametrize("file", DAMAGE)
+def test_what_is_missing_on_a_robot(file: str, folder: Path) -> None:
+    (folder / "robot/enclaves/a" / file).unlink()
+    assert found(folder, "robot") == [(DAMAGE[file], f"robot/enclaves/a/{file}")]
+    ended = sros("verify", "robot", cwd=folder)
+    assert ended.status == 1
+    assert f"{file} is missing" in ended.err + ended.out
+    assert (
+        "In the keystore that has the CA keys: run `sros zenoh KEYSTORE`" in ended.err + ended.out
+    )
+
+
+def test_a_session_of_earlier_permissions_on_a_robot(folder: Path) -> None:
+    sros("create_permission", "ks", "/a", "more.xml", cwd=folder).ok()
+    shutil.copy(folder / "ks/enclaves/a/permissions.p7s", folder / "robot/enclaves/a")
+    wanted = [("zenoh.out-of-date", "robot/enclaves/a/session.json5")]
+    assert found(folder, "robot") == found(folder, "robot/enclaves/a") == wanted
+    shown = json.loads(sros("verify", "robot", "--json", cwd=folder).out)
+    assert not shown["ok"]
+    assert [(each["enclave"], each["file"]) for each in shown["findings"]] == [
+        ("/a", "session.json5")
+    ]
+
+
+def test_a_configuration_of_another_keystore(folder: Path) -> None:
+    sros("generate_artifacts", "-k", "foreign", "-p", "p.xml", cwd=folder).ok()
+    sros("zenoh", "foreign", cwd=folder).ok()
+    for file in ("session.json5", "session.p7s"):
+        shutil.copy(folder / "foreign/enclaves/a" / file, folder / "robot/enclaves/a" / file)
+    assert found(folder, "robot") == [("zenoh.unsigned", "robot/enclaves/a/session.p7s")]
+
+
+def test_hostile_configurations_are_findings(folder: Path) -> None:
+    for text in (b"", b"[" * 100_000, b"\xff\x00", b'{"access_control": {}}', b"\x1b[2J"):
+        (folder / "robot/enclaves/a/session.json5").write_bytes(text)
+        ended = sros("verify", "robot", cwd=folder)
+        assert ended.status == 1
+        assert "\x1b" not in ended.out + ended.err
+        assert found(folder, "robot") == [
+            ("zenoh.other-document", "robot/enclaves/a/session.json5")
+        ]
